@@ -1,0 +1,182 @@
+"""The only file that imports zenoh: sessions, keys, bytes in and out. It computes nothing."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import TypeVar
+
+import zenoh
+
+from common.errors import UserError
+from common.inbox import Call, Inbox, Sample
+from common.messages import Reply, Request, Stamped
+from common.topics import Query, Topic, alive_key, topic_of
+from common.wire import ENCODING, DecodeError, Message
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+R = TypeVar("R", bound=Reply)
+
+
+@dataclass(frozen=True)
+class Link:
+    """Where a session connects and listens; endpoints as zenoh writes them, such as tcp/127.0.0.1:7447."""
+
+    robot: str = "robot"
+    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
+    router: bool = False
+    multicast: bool = False
+
+
+def _config(link: Link) -> zenoh.Config:
+    config = zenoh.Config()
+    settings = {
+        "mode": "router" if link.router else "peer",
+        "connect/endpoints": link.connect,
+        "connect/timeout_ms": -1,  # a router that is not there yet is waited for, in the background
+        "connect/exit_on_failure": False,
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
+        "listen/endpoints": link.listen,
+        "scouting/multicast/enabled": link.multicast,
+        "transport/shared_memory/enabled": False,  # drops silently when a receiver stalls (zenoh issue 2628)
+        "timestamping/enabled": True,
+    }
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+class Bus:
+    """One session, bound to one robot's keys."""
+
+    def __init__(self, session: zenoh.Session, robot: str) -> None:
+        """Use `open_bus`."""
+        self.robot = robot
+        self._session = session
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._declared: list[object] = []  # zenoh undeclares what nobody holds
+        self._lock = threading.Lock()
+
+    def put(self, topic: Topic, payload: bytes, service: str = "*", key: str | None = None) -> None:
+        """Publish bytes on the topic's key, or on ``key`` where a replay names it."""
+        self.publisher(topic, service, key).put(payload)
+
+    def publisher(self, topic: Topic, service: str = "*", key: str | None = None) -> zenoh.Publisher:
+        """The publisher of a key, declared once."""
+        key = key or topic.key(self.robot, service)
+        with self._lock:
+            if key not in self._publishers:
+                self._publishers[key] = self._session.declare_publisher(
+                    key,
+                    encoding=zenoh.Encoding(ENCODING).with_schema(topic.message.__name__),
+                    congestion_control=zenoh.CongestionControl.BLOCK,
+                )
+            return self._publishers[key]
+
+    def wait_matching(self, topic: Topic, timeout: float, service: str = "*", key: str | None = None) -> bool:
+        """Whether somebody subscribes to the topic within ``timeout`` s; a put before that may be lost."""
+        publisher = self.publisher(topic, service, key)
+        return wait_until(lambda: bool(publisher.matching_status.matching), timeout)
+
+    def subscribe(self, topic: Topic, inbox: Inbox, *, keep_all: bool = False, robot: str | None = None) -> None:
+        """Move the topic's payloads to ``inbox`` by the topic's queue policy, or all of them."""
+        newest = topic.queue == "newest" and not keep_all
+
+        def move(sample: zenoh.Sample) -> None:
+            stamp = sample.timestamp
+            published = int(stamp.get_time().timestamp() * 1e9) if stamp is not None else 0
+            entry = Sample(topic, str(sample.key_expr), sample.payload.to_bytes(), published, time.time_ns())
+            inbox.put(entry, newest_only=newest)
+
+        self._declared.append(self._session.declare_subscriber(topic.key(robot or self.robot), move))
+
+    def serve(self, query: Query, inbox: Inbox, service: str = "*") -> None:
+        """Move requests to ``inbox``; the loop answers them."""
+
+        def move(call: zenoh.Query) -> None:
+            payload = call.payload.to_bytes() if call.payload is not None else b""
+            key = query.key(self.robot, service)
+
+            def reply(answer: bytes) -> None:
+                with suppress(zenoh.ZError):  # the asker may be gone
+                    call.reply(key, answer, encoding=zenoh.Encoding(ENCODING).with_schema(query.reply.__name__))
+                call.drop()
+
+            def refuse(why: str) -> None:
+                with suppress(zenoh.ZError):
+                    call.reply_err(why.encode())
+                call.drop()
+
+            inbox.put(Call(query, payload, reply, refuse))
+
+        self._declared.append(self._session.declare_queryable(query.key(self.robot, service), move, complete=True))
+
+    def ask(self, query: Query, request: Request, reply: type[R], timeout: float = 5.0, service: str = "*") -> R:
+        """The first answer; raises UserError where nobody answers, the answer is an error, or makes no sense."""
+        key = query.key(self.robot, service)
+        answers = self._session.get(key, payload=request.encode(), encoding=ENCODING, timeout=timeout)
+        for answer in answers:
+            if answer.ok is not None:
+                try:
+                    return reply.decode(answer.ok.payload.to_bytes())
+                except DecodeError as error:
+                    raise UserError(f"{key}: the answer makes no sense: {error}") from None
+            if answer.err is not None and (why := answer.err.payload.to_string()) != "Timeout":
+                raise UserError(f"{key}: refused: {why}")
+        who = service if service != "*" else query.server
+        raise UserError(f"nobody answers {key} within {timeout:g} s: is the {who} running? `presage doctor` looks")
+
+    def declare_alive(self, service: str) -> None:
+        """Say that the service is there, until the session ends. Declare it last: order is kept."""
+        self._declared.append(self._session.liveliness().declare_token(alive_key(self.robot, service)))
+
+    def alive(self, timeout: float = 1.0) -> set[str]:
+        """Services of this robot that are there now."""
+        replies = self._session.liveliness().get(alive_key(self.robot), timeout=timeout)
+        return {str(r.ok.key_expr).rsplit("/", 1)[-1] for r in replies if r.ok is not None}
+
+    def watch_alive(self, changed: Callable[[str, bool], None]) -> None:
+        """Call ``changed(service, is_there)`` for those there now and at every change, from another thread."""
+
+        def move(sample: zenoh.Sample) -> None:
+            changed(str(sample.key_expr).rsplit("/", 1)[-1], sample.kind == zenoh.SampleKind.PUT)
+
+        subscriber = self._session.liveliness().declare_subscriber(alive_key(self.robot), move, history=True)
+        self._declared.append(subscriber)
+
+    def linked(self) -> bool:
+        """Whether any other session is reached."""
+        return bool(list(self._session.info.routers_zid()) or list(self._session.info.peers_zid()))
+
+
+@contextmanager
+def open_bus(link: Link) -> Iterator[Bus]:
+    """A session for the block; raises UserError where the endpoints cannot be used."""
+    zenoh.init_log_from_env_or("error")
+    try:
+        session = zenoh.open(_config(link))
+    except zenoh.ZError as error:
+        text = str(error)
+        if "in use" in text:
+            raise UserError(f"port in use: {' '.join(link.listen)}; choose another with --listen") from None
+        raise UserError(f"no session with connect {link.connect}, listen {link.listen}: {text.split(' at /')[0]}") from None
+    with session:
+        yield Bus(session, link.robot)
+
+
+def wait_until(condition: Callable[[], bool], timeout: float, period: float = 0.02) -> bool:
+    """Whether ``condition`` comes true within ``timeout`` s."""
+    deadline = time.monotonic() + timeout
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(period)
+    return True
+
+
+__all__ = ["DEFAULT_ENDPOINT", "Bus", "Link", "Message", "Stamped", "open_bus", "topic_of", "wait_until"]

@@ -1,0 +1,143 @@
+"""Settings: defaults in code, then an optional YAML file, then the environment, then the command line.
+
+One class a service; the environment's names, the command line and its help follow from the fields.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import sys
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, TypeVar
+
+import yaml
+from pydantic import Field, ValidationError
+from pydantic_settings import (
+    BaseSettings,
+    CliApp,
+    CliSettingsSource,
+    InitSettingsSource,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    SettingsError,
+)
+
+from common.bus import DEFAULT_ENDPOINT, Link
+from common.errors import UserError
+
+_file_values: ContextVar[dict[str, Any]] = ContextVar("_file_values")
+S = TypeVar("S", bound="ServiceSettings")
+
+
+class ServiceSettings(BaseSettings):
+    """What every service can be told."""
+
+    model_config = SettingsConfigDict(
+        env_prefix="PRESAGE_",
+        env_ignore_empty=True,
+        extra="forbid",
+        frozen=True,
+        cli_kebab_case=True,
+        cli_implicit_flags=True,
+        cli_hide_none_type=True,
+    )
+    service: ClassVar[str] = "service"
+
+    robot: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$", description="name in the keys presage/ROBOT/TOPIC")] = (
+        "robot"
+    )
+    connect: Annotated[str, Field(description="zenoh endpoints to connect to, comma-separated; empty: none")] = (
+        DEFAULT_ENDPOINT
+    )
+    listen: Annotated[str, Field(description="zenoh endpoints to listen on, comma-separated; loopback unless told")] = (
+        "tcp/127.0.0.1:0"
+    )
+    multicast: Annotated[bool, Field(description="also find other sessions by multicast")] = False
+    log_level: Annotated[str, Field(pattern="^(debug|info|warning|error)$", description="debug, info, warning, error")] = (
+        "info"
+    )
+    log_json: Annotated[bool, Field(description="log lines as JSON")] = False
+    config: Annotated[Path | None, Field(description="YAML file of settings, with a section for each service")] = None
+    print_config: Annotated[bool, Field(description="print the effective settings as YAML and end")] = False
+
+    def link(self) -> Link:
+        """The session these settings ask for."""
+        return Link(self.robot, split_endpoints(self.connect), split_endpoints(self.listen), multicast=self.multicast)
+
+    def effective(self) -> dict[str, Any]:
+        """Every setting as it holds, plain types."""
+        return self.model_dump(mode="json", exclude={"config", "print_config"})
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Command line (put first by pydantic) over arguments over environment over file."""
+        return init_settings, env_settings, InitSettingsSource(settings_cls, _file_values.get({}))
+
+
+def split_endpoints(text: str) -> tuple[str, ...]:
+    """Comma-separated endpoints."""
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def load_settings(cls: type[S], argv: list[str] | None = None) -> S:
+    """Settings of a service from all sources; raises UserError in one line. ``--print-config`` prints and ends."""
+    argv = sys.argv[1:] if argv is None else argv
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early.add_argument("--config", type=Path)
+    path = early.parse_known_args(argv)[0].config
+    values = _read_file(cls, path) if path else {}
+    token = _file_values.set(values)
+    try:
+        source: CliSettingsSource[S] = CliSettingsSource(
+            cls,
+            cli_prog_name=f"python -m services.{cls.service}",
+            formatter_class=_Help,
+        )
+        settings = CliApp.run(cls, cli_args=argv, cli_settings_source=source)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        name = ".".join(map(str, first["loc"])) or "settings"
+        raise UserError(
+            f"{name}: {first['msg']} (--{name.replace('_', '-')}, PRESAGE_{name.upper()}{f' or {path}' if path else ''})"
+        ) from None
+    except SettingsError as error:
+        raise UserError(" ".join(str(error).split())) from None
+    finally:
+        _file_values.reset(token)
+    if settings.print_config:
+        print(yaml.safe_dump({cls.service: settings.effective()}, sort_keys=False), end="")
+        raise SystemExit(0)
+    return settings
+
+
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """The docstring's own lines, dedented."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return super()._fill_text(inspect.cleandoc(text), width, indent)
+
+
+def _read_file(cls: type[ServiceSettings], path: Path) -> dict[str, Any]:
+    """Top-level keys hold for every service that knows them, the section named after the service for it alone."""
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: no YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(data, dict):
+        raise UserError(f"{path}: a map of settings is expected")
+    shared = {k: v for k, v in data.items() if not isinstance(v, dict) and k in cls.model_fields}
+    section = data.get(cls.service) or {}
+    if not isinstance(section, dict):
+        raise UserError(f"{path}: {cls.service}: a map of settings is expected")
+    return {**shared, **section}

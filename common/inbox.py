@@ -1,0 +1,89 @@
+"""What arrives, in order, until a service has time for it. Filled by zenoh's threads, emptied by one loop."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter, OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from common.topics import MAX_BYTES, Query, Topic
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One payload as it came."""
+
+    topic: Topic
+    key: str
+    payload: bytes
+    published_ns: int  # wall time at the publisher, 0 if unknown
+    received_ns: int  # wall time here
+
+
+@dataclass(frozen=True)
+class Call:
+    """One request as it came; exactly one of the two answers is owed."""
+
+    query: Query
+    payload: bytes
+    reply: Callable[[bytes], None]
+    refuse: Callable[[str], None]
+
+
+class Inbox:
+    """A bounded queue in which a newest-only key takes one place, and every drop is counted."""
+
+    def __init__(self, capacity: int = 10_000, max_bytes: int = 1 << 28) -> None:
+        """Hold at most ``capacity`` entries and ``max_bytes`` bytes of payload."""
+        self.capacity, self.max_bytes = capacity, max_bytes
+        self.received: Counter[str] = Counter()  # by key
+        self.dropped: Counter[str] = Counter()
+        self.oversized: Counter[str] = Counter()
+        self._entries: OrderedDict[object, Sample | Call] = OrderedDict()
+        self._bytes = 0
+        self._serial = 0
+        self._changed = threading.Condition()  # reentrant: a signal handler may wake us inside wait
+
+    def put(self, entry: Sample | Call, *, newest_only: bool = False) -> None:
+        """Add an entry; where a newest-only key still waits, the new one takes the old one's place."""
+        size = len(entry.payload)
+        key = entry.key if isinstance(entry, Sample) else entry.query.name
+        with self._changed:
+            self.received[key] += 1
+            if size > (MAX_BYTES if isinstance(entry, Sample) else 64 * MAX_BYTES):
+                self.oversized[key] += 1
+                return
+            self._serial += 1
+            slot: object = key if newest_only else self._serial
+            old = self._entries.get(slot)
+            if old is not None:
+                self._bytes -= len(old.payload)
+                self.dropped[key] += 1
+            elif len(self._entries) >= self.capacity or self._bytes + size > self.max_bytes:
+                self.dropped[key] += 1
+                if isinstance(entry, Call):
+                    entry.refuse("too many requests wait")
+                return
+            self._entries[slot] = entry
+            self._bytes += size
+            self._changed.notify()
+
+    def get(self, timeout: float) -> Sample | Call | None:
+        """The oldest entry, waiting at most ``timeout`` s for one; None when none came."""
+        with self._changed:
+            if not self._entries and timeout > 0:
+                self._changed.wait(timeout)
+            if not self._entries:
+                return None
+            _, entry = self._entries.popitem(last=False)
+            self._bytes -= len(entry.payload)
+            return entry
+
+    def wake(self) -> None:
+        """End a wait early."""
+        with self._changed:
+            self._changed.notify_all()
+
+    def __len__(self) -> int:
+        return len(self._entries)

@@ -1,0 +1,241 @@
+"""Every message that crosses the bus. SI units; the frame stands in each field's comment (REP-103, REP-105).
+
+Frames: `map` is the world, `odom` drifts, `base_link` is the robot's centre, `laser` the scanner.
+A new field gets a default; a field never changes its type. docs/messages.md is written from this file.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, model_validator
+
+from common.robot import Robot
+from common.scanner import Scanner
+from common.wire import Count, Finite, Floats, Matrix3, Message, Name, NotNegative, Poses, Positive, Ranges, Text
+from common.world import Obstacle, World
+
+
+class Pose(Message):
+    """A pose in the plane; its frame is said where it is used."""
+
+    x: Finite  # m
+    y: Finite  # m
+    yaw: Finite = 0.0  # rad, counter-clockwise from x
+
+    def array(self) -> npt.NDArray[np.float64]:
+        """(3,) x, y, yaw."""
+        return np.array([self.x, self.y, self.yaw])
+
+    @classmethod
+    def of(cls, pose: npt.ArrayLike) -> Pose:
+        """From (3,) x, y, yaw."""
+        x, y, yaw = np.asarray(pose, float)
+        return cls(x=float(x), y=float(y), yaw=float(yaw))
+
+
+class Twist(Message):
+    """A velocity in base_link (geometry_msgs/Twist, in the plane)."""
+
+    vx: Finite = 0.0  # m/s, forward
+    vy: Finite = 0.0  # m/s, left; 0 for a differential drive
+    wz: Finite = 0.0  # rad/s, counter-clockwise
+
+    def array(self) -> npt.NDArray[np.float64]:
+        """(3,) vx, vy, wz."""
+        return np.array([self.vx, self.vy, self.wz])
+
+
+class Stamped(Message):
+    """What every topic's message begins with."""
+
+    stamp_ns: Count  # ns, time of the measurement this message is about (simulation or sensor time, not wall time)
+    seq: Count = 0  # counts the publisher's messages on this key, from 0; a gap is a loss
+
+
+class Scan(Stamped):
+    """One sweep of the scanner (sensor_msgs/LaserScan)."""
+
+    angle_min: Finite  # rad, first beam, laser
+    angle_increment: Finite  # rad, between beams
+    range_min: NotNegative  # m
+    range_max: Positive  # m
+    ranges: Ranges  # (B,) m; +inf no return, -inf too close (REP-117)
+    mount: Pose = Pose(x=0.0, y=0.0)  # the scanner's pose in base_link
+    scan_time: NotNegative = 0.0  # s, between scans
+    frame_id: Name = "laser"
+
+    def angles(self) -> npt.NDArray[np.float64]:
+        """(B,) rad, beam directions in laser."""
+        return self.angle_min + self.angle_increment * np.arange(len(self.ranges))
+
+
+class Odom(Stamped):
+    """Dead reckoning (nav_msgs/Odometry)."""
+
+    pose: Pose  # base_link in odom
+    twist: Twist  # base_link
+    covariance: Matrix3  # (3, 3) of x, y, yaw since the start; m², m rad, rad²
+    frame_id: Name = "odom"
+
+
+class Truth(Stamped):
+    """What only a simulator knows."""
+
+    pose: Pose  # base_link in map
+    twist: Twist  # base_link
+    contact: bool = False  # the body touches something
+    stopped: bool = False  # the obstacle stop holds the wheels back
+    frame_id: Name = "map"
+
+
+class Belief(Stamped):
+    """The estimator's posterior about the pose, one for each scan, with that scan's stamp."""
+
+    state: Literal["localising", "tracking", "ambiguous", "lost"]
+    pose: Pose  # base_link in map
+    covariance: Matrix3 | None = None  # (3, 3) of x, y, yaw in map; None: this estimator has none
+    xi: Annotated[Floats, Field(description="prediction error in pose space")]
+    # (3,) xi = dg' Pi (o - g), the negative gradient of accuracy in map: 1/m, 1/m, 1/rad (nats)
+    curvature: Matrix3 | None = None  # (3, 3) dg' Pi dg, Gauss-Newton Hessian of F at the pose, map
+    free_energy: Finite  # nats, accuracy + complexity
+    accuracy: Finite  # nats, -ln p(o | pose)
+    complexity: Finite = 0.0  # nats, how far the posterior is from the prior
+    estimator: Name = ""
+    frame_id: Name = "map"
+
+    @model_validator(mode="after")
+    def _shapes(self) -> Belief:
+        if self.xi.shape != (3,):
+            raise ValueError(f"xi has {self.xi.shape}, not (3,)")
+        for name in ("covariance", "curvature"):
+            matrix = getattr(self, name)
+            if matrix is not None and matrix.shape != (3, 3):
+                raise ValueError(f"{name} has {matrix.shape}, not (3, 3)")
+        return self
+
+
+class Prediction(Stamped):
+    """The scan the estimator expected, beam for beam beside the scan of the same stamp."""
+
+    angle_min: Finite  # rad, laser
+    angle_increment: Finite  # rad
+    ranges: Ranges  # (B,) m, g(pose)
+    sigma: Floats = np.zeros(0, np.float32)  # (B,) m, stated standard deviation; empty: none stated
+    frame_id: Name = "laser"
+
+
+class Goal(Stamped):
+    """Where the robot prefers to be."""
+
+    pose: Pose  # base_link in map
+    tolerance: Positive = 0.2  # m, reached within it
+    cancel: bool = False  # forget the goal and stand
+
+
+class CmdVel(Stamped):
+    """A velocity command; its stamp is that of the scan it answers, so that an old one is known as old."""
+
+    twist: Twist  # base_link
+
+
+class Status(Stamped):
+    """What the controller is doing, and why."""
+
+    state: Literal["idle", "navigating", "reached", "blocked", "lost"]
+    reason: Text = ""
+    goal: Pose | None = None  # base_link in map
+    goal_seq: Count = 0  # which goal this is about
+    distance: NotNegative | None = None  # m, from the believed pose to the goal
+
+
+class TopicHealth(Message):
+    """Counters of one key in one service since its start."""
+
+    key: Name
+    received: Count = 0
+    published: Count = 0
+    dropped: Count = 0  # older than the newest, by the topic's queue policy, or a full queue
+    undecodable: Count = 0
+    rate: NotNegative = 0.0  # Hz over the last second
+
+
+class Health(Stamped):
+    """A service's pulse, once a second of wall time."""
+
+    service: Name
+    uptime: NotNegative  # s, wall time
+    topics: list[TopicHealth] = []
+    counters: dict[str, Count] = {}  # noqa: RUF012 - pydantic copies defaults
+    note: Text = ""  # what the service waits for or last complained of
+
+
+class Request(Message):
+    """What a queryable is asked; this one needs nothing."""
+
+
+class Reply(Message):
+    """What a queryable answers."""
+
+    ok: bool = True
+    reason: Text = ""  # why not, where ok is false
+
+
+class PoseRequest(Request):
+    """Carry the robot, or the belief, to a pose."""
+
+    pose: Pose  # base_link in map
+
+
+class LocaliseRequest(Request):
+    """Begin localisation anew, from a pose or from nothing."""
+
+    pose: Pose | None = None  # base_link in map
+
+
+class ResetRequest(Request):
+    """Begin the simulation anew."""
+
+    seed: Count | None = None  # None keeps the seed
+
+
+class ObstacleRequest(Request):
+    """Change the furniture of a running simulator."""
+
+    action: Literal["add", "move", "remove"]
+    name: Name
+    obstacle: Obstacle | None = None  # for add and move, in map
+
+
+class SampleRequest(Request):
+    """Ask what the scanner would see from poses."""
+
+    poses: Poses  # (N, 3) base_link in map
+    beams: Annotated[int, Field(ge=2, le=100_000)] | None = None  # None: the scanner's own count
+    noise: bool = False
+    seed: Count = 0  # of the noise
+
+
+class SampleReply(Reply):
+    """Scans, row by row."""
+
+    scanner: Scanner | None = None
+    ranges: Ranges = np.zeros(0, np.float32)  # (N * B,) m, row-major
+
+
+class WorldReply(Reply):
+    """What the scanner's side knows of itself."""
+
+    world: World | None = None
+    scanner: Scanner | None = None
+    robot: Robot | None = None
+
+
+class ConfigReply(Reply):
+    """Effective configuration and versions of a service."""
+
+    service: Name = ""
+    config: Text = ""  # JSON
+    versions: dict[str, str] = {}  # noqa: RUF012

@@ -1,0 +1,235 @@
+"""The loop every service runs, written once: open, receive, step, publish, health, end on SIGTERM or Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import time
+from abc import ABC
+from collections import Counter
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+
+from common.bus import Bus, open_bus
+from common.config import ServiceSettings, load_settings
+from common.errors import UserError
+from common.inbox import Call, Inbox, Sample
+from common.log import Logger, OncePerSecond, logger, set_up_logging
+from common.messages import ConfigReply, Health, Reply, Request, Stamped, TopicHealth
+from common.topics import CONFIG, HEALTH, Query, Topic
+from common.versions import versions
+from common.wire import DecodeError
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+S = TypeVar("S", bound=ServiceSettings)
+HEALTH_PERIOD = 1.0  # s
+
+
+class Service(ABC):
+    """A service's thin shell: what it hears, what it does then. Override what is needed."""
+
+    name: ClassVar[str]
+    inputs: ClassVar[tuple[Topic, ...]] = ()
+    queries: ClassVar[tuple[Query, ...]] = ()
+    keep_all: ClassVar[bool] = False  # every payload of every input, whatever the queue policy
+
+    def __init__(self, settings: ServiceSettings) -> None:
+        """Keep the settings; whatever may fail belongs in `open`."""
+        self.settings = settings
+        self.log: Logger = logger(self.name)
+        self.counters: Counter[str] = Counter()  # shown in health
+        self.note = ""  # shown in health
+        self._loop: Loop | None = None
+
+    @property
+    def loop(self) -> Loop:
+        """The running loop."""
+        if self._loop is None:
+            raise RuntimeError(f"{self.name} does not run")
+        return self._loop
+
+    def open(self) -> None:
+        """Before the first message; raise UserError to end with one line."""
+
+    def on_sample(self, sample: Sample) -> None:
+        """A payload came; decoded and passed on unless a service wants the bytes."""
+        try:
+            message = sample.topic.message.decode(sample.payload)
+        except DecodeError as error:
+            self.loop.reject(sample.key, str(error))
+            return
+        self.on_message(sample.topic, message)
+
+    def on_message(self, topic: Topic, message: Stamped) -> None:
+        """A valid message came."""
+
+    def on_request(self, query: Query, request: Request) -> Reply:
+        """A valid request came; the answer."""
+        return Reply(ok=False, reason=f"{self.name} does not answer {query.name} ({type(request).__name__})")
+
+    def due(self) -> float | None:
+        """Seconds until `on_timer` is wanted; None: not."""
+        return None
+
+    def on_timer(self) -> None:
+        """The time asked for in `due` has come."""
+
+    def close(self) -> None:
+        """After the last message."""
+
+    def publish(self, topic: Topic, message: Stamped) -> None:
+        """Send a message with the next sequence number of its key."""
+        self.loop.publish(topic, message)
+
+
+class Loop:
+    """Runs one service on one session."""
+
+    def __init__(self, service: Service, bus: Bus, inbox: Inbox) -> None:
+        """Subscribe and serve; what arrives from now on waits in ``inbox``."""
+        self.service, self.bus, self.inbox = service, bus, inbox
+        self.published: Counter[str] = Counter()  # by key
+        self.undecodable: Counter[str] = Counter()
+        self.failed = 0
+        self._may_log = OncePerSecond()
+        self._stopping = False
+        self._began = self._health_at = time.monotonic()
+        self._before: Counter[str] = Counter()
+        service._loop = self  # noqa: SLF001 - the two halves of one thing
+
+    def run(self) -> None:
+        """Until `stop`."""
+        service, bus = self.service, self.bus
+        service.open()
+        for topic in service.inputs:
+            bus.subscribe(topic, self.inbox, keep_all=service.keep_all)
+        for query in service.queries:
+            bus.serve(query, self.inbox)
+        bus.serve(CONFIG, self.inbox, service.name)
+        bus.declare_alive(service.name)
+        service.log.info("ready", robot=bus.robot)
+        try:
+            while not self._stopping:
+                self._turn()
+        finally:
+            service.close()
+
+    def stop(self) -> None:
+        """End after the current step; safe from a signal handler."""
+        self._stopping = True
+        self.inbox.wake()
+
+    def publish(self, topic: Topic, message: Stamped) -> None:
+        """Send with the key's next sequence number."""
+        key = topic.key(self.bus.robot, self.service.name)
+        numbered = message.model_copy(update={"seq": self.published[key]})
+        self.bus.put(topic, numbered.encode(), self.service.name)
+        self.published[key] += 1
+
+    def reject(self, key: str, why: str) -> None:
+        """Count a payload that could not be used; say so once a second at most."""
+        self.undecodable[key if len(self.undecodable) < 1000 else "others"] += 1
+        if self._may_log(key):
+            self.service.log.warning("payload dropped", key=key, why=why, so_far=self.undecodable[key])
+
+    def _turn(self) -> None:
+        due = self.service.due()
+        until_health = self._health_at - time.monotonic()
+        event = self.inbox.get(max(0.0, min(until_health, 0.5 if due is None else due)))
+        if isinstance(event, Sample):
+            self._guard(lambda: self.service.on_sample(event))
+        elif isinstance(event, Call):
+            self._answer(event)
+        due = self.service.due()
+        if due is not None and due <= 0:
+            self._guard(self.service.on_timer)
+        if time.monotonic() >= self._health_at:
+            self._health_at += HEALTH_PERIOD
+            self.publish(HEALTH, self._health())
+
+    def _guard(self, step: Callable[[], None]) -> None:
+        """No input stops a service: what a step raises is counted and logged with its traceback."""
+        try:
+            step()
+        except UserError:
+            raise
+        except Exception:
+            self.failed += 1
+            if self._may_log("failed"):
+                self.service.log.exception("step failed", so_far=self.failed)
+
+    def _answer(self, call: Call) -> None:
+        try:
+            request = call.query.request.decode(call.payload)
+        except DecodeError as error:
+            self.reject(call.query.name, str(error))
+            call.refuse(str(error))
+            return
+        try:
+            reply = self._config() if call.query is CONFIG else self.service.on_request(call.query, request)
+        except UserError as error:
+            reply = call.query.reply(ok=False, reason=str(error))
+        except Exception as error:
+            self.failed += 1
+            self.service.log.exception("request failed", query=call.query.name)
+            call.refuse(f"{self.service.name} failed: {type(error).__name__}: {error}")
+            return
+        call.reply(reply.encode())
+
+    def _config(self) -> ConfigReply:
+        config = json.dumps(self.service.settings.effective())
+        return ConfigReply(service=self.service.name, config=config, versions=versions())
+
+    def _health(self) -> Health:
+        inbox, total = self.inbox, Counter[str]()
+        total.update(inbox.received)
+        total.update(self.published)
+        rows = [
+            TopicHealth(
+                key=key[:200],
+                received=inbox.received[key],
+                published=self.published[key],
+                dropped=inbox.dropped[key],
+                undecodable=self.undecodable[key] + inbox.oversized[key],
+                rate=max(0, total[key] - self._before[key]) / HEALTH_PERIOD,
+            )
+            for key in sorted(total)[:200]
+        ]
+        self._before = total
+        counters: dict[str, int] = {**self.service.counters, "failed": self.failed}
+        return Health(
+            stamp_ns=time.time_ns(),
+            service=self.service.name,
+            uptime=time.monotonic() - self._began,
+            topics=rows,
+            counters=counters,
+            note=self.service.note,
+        )
+
+
+def main(settings_class: type[S], make: Callable[[S], Service], argv: list[str] | None = None) -> None:
+    """Run a service as a process; ends it with status 0, or 2 and one line where the user can mend something."""
+    try:
+        settings = load_settings(settings_class, argv)
+        set_up_logging(settings.log_level, as_json=settings.log_json)
+        service = make(settings)
+        with open_bus(settings.link()) as bus:
+            loop = Loop(service, bus, Inbox())
+
+            def stop(_signal: int, _frame: FrameType | None) -> None:
+                loop.stop()
+
+            signal.signal(signal.SIGTERM, stop)
+            signal.signal(signal.SIGINT, stop)
+            loop.run()
+        service.log.info("ended")
+    except UserError as error:
+        sys.exit(_fail(settings_class.service, error))
+
+
+def _fail(service: str, error: Any) -> int:
+    print(f"{service}: {error}", file=sys.stderr)
+    return 2

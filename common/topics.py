@@ -1,0 +1,85 @@
+"""THE TABLE: every topic and queryable, once. Recorder, health, docs, `presage topics` and tests derive from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from common import messages as m
+
+ROOT = "presage"
+MAX_BYTES = 1 << 20  # a larger payload is not even queued
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One row: what is sent, by whom, how often, and what a full queue does."""
+
+    name: str
+    message: type[m.Stamped]
+    publisher: str  # the service(s) that publish it
+    rate: float  # Hz nominal; 0: when something happens
+    queue: Literal["newest", "all"]  # what a receiver keeps that falls behind; the recorder keeps all of everything
+    recorded: bool = True
+    per_service: bool = False  # one key a service, beneath the topic's own
+    about: str = ""
+
+    def key(self, robot: str, service: str = "*") -> str:
+        """The key expression; for a per-service topic ``service`` is the last chunk."""
+        return f"{ROOT}/{robot}/{self.name}" + (f"/{service}" if self.per_service else "")
+
+
+@dataclass(frozen=True)
+class Query:
+    """One queryable: request in, reply out."""
+
+    name: str
+    request: type[m.Request]
+    reply: type[m.Reply]
+    server: str
+    per_service: bool = False
+    about: str = ""
+
+    def key(self, robot: str, service: str = "*") -> str:
+        """The key expression."""
+        return f"{ROOT}/{robot}/{self.name}" + (f"/{service}" if self.per_service else "")
+
+
+SCAN = Topic("scan", m.Scan, "simulator", 15, "newest", about="what the laser sees")
+ODOM = Topic("odom", m.Odom, "simulator", 15, "newest", about="dead reckoning, drifts")
+TRUTH = Topic("truth", m.Truth, "simulator", 15, "newest", about="where the robot really is")
+BELIEF = Topic("belief", m.Belief, "estimator", 15, "newest", about="where the estimator believes it is, and F")
+PREDICTION = Topic("prediction", m.Prediction, "estimator", 15, "newest", about="the scan expected at the belief")
+CMD_VEL = Topic("cmd_vel", m.CmdVel, "controller", 15, "newest", about="velocity command")
+GOAL = Topic("goal", m.Goal, "presage goal, viewer", 0, "newest", about="where to go")
+STATUS = Topic("status", m.Status, "controller", 15, "newest", about="what the controller does, and why")
+HEALTH = Topic("health", m.Health, "every service", 1, "all", per_service=True, about="counters of a service")
+
+TOPICS: tuple[Topic, ...] = (SCAN, ODOM, TRUTH, BELIEF, PREDICTION, GOAL, CMD_VEL, STATUS, HEALTH)
+
+TELEPORT = Query("teleport", m.PoseRequest, m.Reply, "simulator", about="carry the robot to a pose")
+RESET = Query("reset", m.ResetRequest, m.Reply, "simulator", about="begin anew, with a seed")
+PAUSE = Query("pause", m.Request, m.Reply, "simulator", about="stop the simulation's clock")
+RESUME = Query("resume", m.Request, m.Reply, "simulator", about="let it run on")
+OBSTACLE = Query("obstacle", m.ObstacleRequest, m.Reply, "simulator", about="add, move or remove furniture")
+SAMPLE = Query("sample", m.SampleRequest, m.SampleReply, "simulator", about="the scans seen from a batch of poses")
+WORLD = Query("world", m.Request, m.WorldReply, "simulator", about="world, scanner and robot as data")
+LOCALISE = Query("localise", m.LocaliseRequest, m.Reply, "estimator", about="begin localisation anew")
+CONFIG = Query("config", m.Request, m.ConfigReply, "every service", per_service=True, about="effective configuration")
+
+QUERIES: tuple[Query, ...] = (TELEPORT, RESET, PAUSE, RESUME, OBSTACLE, SAMPLE, WORLD, LOCALISE, CONFIG)
+
+
+def alive_key(robot: str, service: str = "*") -> str:
+    """Liveliness token of a service."""
+    return f"{ROOT}/{robot}/alive/{service}"
+
+
+def topic_of(key: str) -> Topic | None:
+    """The row a concrete key belongs to, or None."""
+    parts = key.split("/")
+    for topic in TOPICS:
+        depth = 4 if topic.per_service else 3
+        if len(parts) == depth and parts[0] == ROOT and parts[2] == topic.name:
+            return topic
+    return None
