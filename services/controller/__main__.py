@@ -1,0 +1,8 @@
+"""`python -m services.controller`."""
+
+from common.service import main
+from services.controller.service import ControllerService
+from services.controller.settings import ControllerSettings
+
+if __name__ == "__main__":
+    main(ControllerSettings, ControllerService)

@@ -1,0 +1,22 @@
+"""`python -m services.estimator`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from common.service import main
+from services.estimator.settings import EstimatorSettings
+
+if TYPE_CHECKING:
+    from common.service import Service
+
+
+def make(settings: EstimatorSettings) -> Service:
+    """Torch is imported here, so that --help answers at once."""
+    from services.estimator.service import EstimatorService  # noqa: PLC0415
+
+    return EstimatorService(settings)
+
+
+if __name__ == "__main__":
+    main(EstimatorSettings, make)

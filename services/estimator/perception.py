@@ -1,0 +1,94 @@
+"""Preset `paper`: perception by gradient descent on the free energy, one step a scan (equation 3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from services.estimator.free_energy import Gradient, gradient
+
+if TYPE_CHECKING:
+    from common.se2 import Array
+    from services.estimator.decoder import GenerativeModel
+
+State = Literal["localising", "tracking", "lost"]
+
+
+@dataclass(frozen=True)
+class Descent:
+    """The paper's parameters. Sigma_o = 1 m² on every beam, as there."""
+
+    alpha: float = 5e-4  # m², step size
+    beta: float = 0.0  # weight of the goal's attraction in perception; 0 leaves the goal to the controller
+    iterations: int = 1  # gradient steps a scan
+    max_step: float = 0.5  # m, a longer step of one scan is shortened
+    settled_step: float = 0.05  # m, mean step below which the belief counts as settled
+    settled_misfit: float = 2.0  # times the model's own error on test scans
+    window: int = 10  # scans over which step and misfit are averaged
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What one scan made of the belief."""
+
+    pose: Array  # (3,) base_link in map
+    predicted: Array  # (B,) m, g at the pose
+    gradient: Gradient
+    state: State
+
+
+@dataclass
+class PaperEstimator:
+    """Belief about (x, y); the heading is known and frozen, there is no covariance and no prior in time."""
+
+    model: GenerativeModel
+    model_error: float  # m, mean absolute error of the model's beams on test scans
+    bounds: tuple[float, float, float, float]  # m, the belief stays within x0, y0, x1, y1
+    pose: Array  # (3,) initial belief
+    settings: Descent = field(default_factory=Descent)
+
+    def __post_init__(self) -> None:
+        """Nothing is known of the first steps."""
+        self._steps: list[float] = []
+        self._misfits: list[float] = []
+        self._was_tracking = False
+
+    def restart(self, pose: Array) -> None:
+        """Believe ``pose`` (3,) and localise anew."""
+        self.pose = np.array(pose, float)
+        self.__post_init__()
+
+    def update(self, ranges: Array, goal: Array | None = None) -> Estimate:
+        """Descend F for a scan of usable ranges (B,) m; ``goal`` (3,) attracts the belief where beta > 0."""
+        precision = np.ones(len(ranges))
+        before = self.pose
+        g_goal = self.model.predict(goal)[0] if goal is not None and self.settings.beta > 0 else None
+        for _ in range(self.settings.iterations):
+            g, dg = self.model.predict(self.pose)
+            step = self.settings.alpha * gradient(ranges, g, dg, precision, g_goal, self.settings.beta).descent
+            length = float(np.hypot(step[0], step[1]))
+            self.pose = self._inside(self.pose + step * min(1.0, self.settings.max_step / max(length, 1e-12)))
+        g, dg = self.model.predict(self.pose)
+        final = gradient(ranges, g, dg, precision, g_goal, self.settings.beta)
+        state = self._judge(float(np.hypot(*(self.pose - before)[:2])), float(np.mean(np.abs(ranges - g))))
+        return Estimate(self.pose.copy(), g, final, state)
+
+    def _inside(self, pose: Array) -> Array:
+        x0, y0, x1, y1 = self.bounds
+        return np.array([np.clip(pose[0], x0, x1), np.clip(pose[1], y0, y1), pose[2]])
+
+    def _judge(self, step: float, misfit: float) -> State:
+        """Tracking once steps are short and the scan fits about as well as the model can; lost when it no longer does."""
+        window = self.settings.window
+        self._steps = [*self._steps, step][-window:]
+        self._misfits = [*self._misfits, misfit][-window:]
+        fits = float(np.mean(self._misfits)) < self.settings.settled_misfit * self.model_error
+        settled = len(self._steps) == window and float(np.mean(self._steps)) < self.settings.settled_step
+        if self._was_tracking:
+            # Twice the misfit that was needed to begin: no flicker at the border.
+            self._was_tracking = float(np.mean(self._misfits)) < 2 * self.settings.settled_misfit * self.model_error
+            return "tracking" if self._was_tracking else "lost"
+        self._was_tracking = settled and fits
+        return "tracking" if self._was_tracking else "localising"
