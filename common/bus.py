@@ -164,7 +164,9 @@ def open_bus(link: Link) -> Iterator[Bus]:
         text = str(error)
         if "in use" in text:
             raise UserError(f"port in use: {' '.join(link.listen)}; choose another with --listen") from None
-        raise UserError(f"no session with connect {link.connect}, listen {link.listen}: {text.split(' at /')[0]}") from None
+        raise UserError(
+            f"no session with connect {link.connect}, listen {link.listen}: {text.split(' at /', maxsplit=1)[0]}"
+        ) from None
     with session:
         yield Bus(session, link.robot)
 

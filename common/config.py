@@ -18,6 +18,7 @@ from pydantic_settings import (
     BaseSettings,
     CliApp,
     CliSettingsSource,
+    EnvSettingsSource,
     InitSettingsSource,
     PydanticBaseSettingsSource,
     SettingsConfigDict,
@@ -44,10 +45,13 @@ class ServiceSettings(BaseSettings):
         cli_hide_none_type=True,
     )
     service: ClassVar[str] = "service"
+    program: ClassVar[str] = ""  # in --help; empty: python -m services.NAME
+    # Fields that PRESAGE_<FIELD> and a shared line of the file do not reach: PRESAGE_<SERVICE>_<FIELD> sets them.
+    private: ClassVar[frozenset[str]] = frozenset()
 
-    robot: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$", description="name in the keys presage/ROBOT/TOPIC")] = (
-        "robot"
-    )
+    robot: Annotated[
+        str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$", description="name in the keys presage/ROBOT/TOPIC")
+    ] = "robot"
     connect: Annotated[str, Field(description="zenoh endpoints to connect to, comma-separated; empty: none")] = (
         DEFAULT_ENDPOINT
     )
@@ -55,9 +59,9 @@ class ServiceSettings(BaseSettings):
         "tcp/127.0.0.1:0"
     )
     multicast: Annotated[bool, Field(description="also find other sessions by multicast")] = False
-    log_level: Annotated[str, Field(pattern="^(debug|info|warning|error)$", description="debug, info, warning, error")] = (
-        "info"
-    )
+    log_level: Annotated[
+        str, Field(pattern="^(debug|info|warning|error)$", description="debug, info, warning, error")
+    ] = "info"
     log_json: Annotated[bool, Field(description="log lines as JSON")] = False
     config: Annotated[Path | None, Field(description="YAML file of settings, with a section for each service")] = None
     print_config: Annotated[bool, Field(description="print the effective settings as YAML and end")] = False
@@ -76,11 +80,15 @@ class ServiceSettings(BaseSettings):
         settings_cls: type[BaseSettings],
         init_settings: PydanticBaseSettingsSource,
         env_settings: PydanticBaseSettingsSource,
-        dotenv_settings: PydanticBaseSettingsSource,
-        file_secret_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003
+        file_secret_settings: PydanticBaseSettingsSource,  # noqa: ARG003
     ) -> tuple[PydanticBaseSettingsSource, ...]:
         """Command line (put first by pydantic) over arguments over environment over file."""
-        return init_settings, env_settings, InitSettingsSource(settings_cls, _file_values.get({}))
+        own = EnvSettingsSource(settings_cls, env_prefix=f"PRESAGE_{cls.service.upper()}_")
+        shared = {name: value for name, value in env_settings().items() if name not in cls.private}
+        environment = {**shared, **{name: value for name, value in own().items() if name in cls.private}}
+        file = InitSettingsSource(settings_cls, _file_values.get({}))
+        return init_settings, InitSettingsSource(settings_cls, environment), file
 
 
 def split_endpoints(text: str) -> tuple[str, ...]:
@@ -99,15 +107,16 @@ def load_settings(cls: type[S], argv: list[str] | None = None) -> S:
     try:
         source: CliSettingsSource[S] = CliSettingsSource(
             cls,
-            cli_prog_name=f"python -m services.{cls.service}",
+            cli_prog_name=cls.program or f"python -m services.{cls.service}",
             formatter_class=_Help,
         )
         settings = CliApp.run(cls, cli_args=argv, cli_settings_source=source)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         name = ".".join(map(str, first["loc"])) or "settings"
+        prefix = f"PRESAGE_{cls.service.upper()}_" if name in cls.private else "PRESAGE_"
         raise UserError(
-            f"{name}: {first['msg']} (--{name.replace('_', '-')}, PRESAGE_{name.upper()}{f' or {path}' if path else ''})"
+            f"{name}: {first['msg']} (--{name.replace('_', '-')}, {prefix}{name.upper()}{f' or {path}' if path else ''})"
         ) from None
     except SettingsError as error:
         raise UserError(" ".join(str(error).split())) from None
@@ -136,7 +145,8 @@ def _read_file(cls: type[ServiceSettings], path: Path) -> dict[str, Any]:
         raise UserError(f"{path}: no YAML ({' '.join(str(error).split())})") from None
     if not isinstance(data, dict):
         raise UserError(f"{path}: a map of settings is expected")
-    shared = {k: v for k, v in data.items() if not isinstance(v, dict) and k in cls.model_fields}
+    known = cls.model_fields.keys() - cls.private
+    shared = {k: v for k, v in data.items() if not isinstance(v, dict) and k in known}
     section = data.get(cls.service) or {}
     if not isinstance(section, dict):
         raise UserError(f"{path}: {cls.service}: a map of settings is expected")

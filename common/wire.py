@@ -37,14 +37,14 @@ class Binary:
     row: tuple[int, ...] = ()
     values: Literal["finite", "ranges"] = "finite"
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: PLW3201
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Bytes or anything numpy reads goes in, a read-only array comes out, bytes go on the wire."""
         return core_schema.no_info_plain_validator_function(
             self.validate,
             serialization=core_schema.plain_serializer_function_ser_schema(lambda array: array.tobytes()),
         )
 
-    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:  # noqa: PLW3201
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         """MessagePack's bin type has no JSON twin; the x- keys say how to read it."""
         return {"type": "string", "contentEncoding": "binary", "x-dtype": self.dtype, "x-shape": ["N", *self.row]}
 
@@ -98,7 +98,7 @@ class Message(BaseModel):
             first = error.errors(include_url=False, include_context=False, include_input=False)[0]
             field = ".".join(map(str, first["loc"])) or "payload"
             raise DecodeError(f"{cls.__name__}.{field}: {first['msg']}") from None
-        except Exception as error:  # msgpack raises many kinds, and a hostile payload may find another
+        except Exception as error:  # noqa: BLE001 - msgpack raises many kinds, and a hostile payload may find another
             raise DecodeError(f"{cls.__name__}: no MessagePack ({type(error).__name__}: {error})") from None
 
     @classmethod

@@ -58,7 +58,9 @@ class Navigator:
         clearance = float(self.world.clearance(goal.pose.array()[:2])[0])
         if clearance < self.robot.radius:
             where = f"({goal.pose.x:.2f}, {goal.pose.y:.2f}) in {self.world.name}"
-            return f"goal refused: {where} is {'inside something' if clearance < 0 else f'{clearance:.2f} m from a wall'}"
+            return (
+                f"goal refused: {where} is {'inside something' if clearance < 0 else f'{clearance:.2f} m from a wall'}"
+            )
         return None
 
     def step(self, belief: Belief) -> tuple[CmdVel, Status]:
@@ -72,7 +74,9 @@ class Navigator:
         self._velocity, held_back = safety.limit_velocity(ramped, self._points, self.robot)
         self._watch_progress(belief.stamp_ns, held_back=held_back)
         vx, vy, wz = map(float, self._velocity)
-        return CmdVel(stamp_ns=belief.stamp_ns, twist=Twist(vx=vx, vy=vy, wz=wz)), self.status(belief.stamp_ns, distance)
+        return CmdVel(stamp_ns=belief.stamp_ns, twist=Twist(vx=vx, vy=vy, wz=wz)), self.status(
+            belief.stamp_ns, distance
+        )
 
     def _wanted(self, belief: Belief, pose: Array, distance: float | None) -> Array:
         """The command free energy asks for, before any limit; (3,) in base_link."""

@@ -36,7 +36,7 @@ class ControllerService(Service):
         world = load_world(options.world) if options.world else None
         self.navigator = Navigator(robot, Preference(gamma=options.gamma, reach=options.reach), world)
 
-    def on_message(self, topic: Topic, message: Stamped) -> None:
+    def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
         """A belief is answered by a command of the same stamp."""
         if isinstance(message, Scan):
             self.navigator.hear_scan(message)

@@ -12,11 +12,12 @@ from common.config import ServiceSettings
 class ControllerSettings(ServiceSettings):
     """Action controller: from each belief, and the goal preferred, a velocity command.
 
-    examples:
+    Examples:
       python -m services.controller
       python -m services.controller --max-speed 0.5      more careful
       python -m services.controller --world ''           do not check goals against a world
       presage goal 15 1.5                                gives it something to do
+
     """
 
     service: ClassVar[str] = "controller"

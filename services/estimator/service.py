@@ -52,7 +52,7 @@ class EstimatorService(Service):
             model, card = weights.load(path)
             model.predict(np.array([*card.world.center(), card.heading]))
 
-    def on_message(self, topic: Topic, message: Stamped) -> None:
+    def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
         """A scan makes a belief; a goal is remembered."""
         if isinstance(message, Goal):
             self.goal = None if message.cancel else message
@@ -89,7 +89,7 @@ class EstimatorService(Service):
         except UserError as error:
             self.counters["unfit_scans"] += 1
             if self.note != str(error):
-                self.log.error("scan refused", why=str(error))
+                self.log.warning("scan refused", why=str(error))
             self.note = str(error)
             return False
         self.note = ""
@@ -111,7 +111,9 @@ class EstimatorService(Service):
     def _check_geometry(self, scan: Scan) -> None:
         assert self.card is not None  # noqa: S101 - set by _load
         scanner = self.card.scanner
-        off = np.abs([scan.angle_min - scanner.angle_min, (scan.angle_increment - scanner.angle_increment) * scanner.beams])
+        off = np.abs(
+            [scan.angle_min - scanner.angle_min, (scan.angle_increment - scanner.angle_increment) * scanner.beams]
+        )
         if off.max() > ANGLE_TOLERANCE or np.abs(scan.mount.array() - np.array(scanner.mount)).max() > ANGLE_TOLERANCE:
             raise UserError(
                 f"the scan's beams or mounting are not those of {scanner.name} that the weights were trained for; "

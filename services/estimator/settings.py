@@ -13,11 +13,12 @@ from common.config import ServiceSettings
 class EstimatorSettings(ServiceSettings):
     """Free-energy estimator: from each scan a belief about the pose, and the scan it expected.
 
-    examples:
+    Examples:
       python -m services.estimator                                    the paper's preset in the corridor
       python -m services.estimator --world my.yaml --models trained   your world, your weights
       python -m services.estimator --initial-pose 3,1.5,90            start from a known pose (m, m, deg)
       PRESAGE_ALPHA=0.001 python -m services.estimator --print-config
+
     """
 
     service: ClassVar[str] = "estimator"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -73,7 +72,9 @@ def available(folder: Path, world: str, preset: str) -> dict[int, Path]:
 
 def train_command(world: str, preset: str, scanner: str = "tim571", beams: int | None = None) -> str:
     """What a user types to make missing weights."""
-    return f"presage train --world {world} --preset {preset} --scanner {scanner}" + (f" --beams {beams}" if beams else "")
+    return f"presage train --world {world} --preset {preset} --scanner {scanner}" + (
+        f" --beams {beams}" if beams else ""
+    )
 
 
 def save(path: Path, decoder: Decoder, card: ModelCard) -> None:

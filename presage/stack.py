@@ -1,0 +1,224 @@
+"""Starts services as processes, prefixes their lines, waits until each is alive, and ends them all, whatever happens."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from types import FrameType, TracebackType
+
+from common.bus import Bus, Link
+from common.errors import UserError
+
+COLOURS = {"router": 37, "simulator": 36, "estimator": 35, "controller": 33, "recorder": 32}
+GRACE = 5.0  # s between asking a process to end and ending it
+# Who is asked first: the robot stops before its eyes close, and the recorder sees all of it.
+ENDING = ("controller", "estimator", "simulator", "recorder", "router")
+
+
+@dataclass
+class Process:
+    """One child and the thread that passes its lines on."""
+
+    name: str
+    child: subprocess.Popen[str]
+    reader: threading.Thread
+    lines: list[str] = field(default_factory=list)  # the last few, to explain an end
+
+
+class Stack:
+    """Child processes of one session; a context manager that leaves none behind."""
+
+    def __init__(self, robot: str, port: int | None = None, *, quiet: bool = False) -> None:
+        """``port`` on loopback for the router, or a free one."""
+        self.port = port if port is not None else free_port()
+        self.robot, self.quiet = robot, quiet
+        self.processes: dict[str, Process] = {}
+
+    @property
+    def endpoint(self) -> str:
+        """Where the router listens."""
+        return f"tcp/127.0.0.1:{self.port}"
+
+    def link(self) -> Link:
+        """For a session of our own beside the children."""
+        return Link(robot=self.robot, connect=(self.endpoint,))
+
+    def start_router(self) -> None:
+        """The router first; raises UserError where the port is taken."""
+        check_port(self.port)
+        self._spawn("router", ["-m", "common.router", "--listen", self.endpoint])
+        deadline = time.monotonic() + 20
+        while not accepts(self.port):
+            self.check()
+            if time.monotonic() > deadline:
+                raise UserError(f"the router did not listen on {self.endpoint} within 20 s")
+            time.sleep(0.02)
+
+    def start(self, service: str, *args: str) -> None:
+        """A service, connected to this session's router."""
+        self._spawn(service, ["-m", f"services.{service}", *args])
+
+    def wait_alive(self, bus: Bus, timeout: float = 60.0) -> None:
+        """Until every started service has its liveliness token; raises UserError naming who is missing or ended."""
+        wanted = set(self.processes) - {"router"}
+        deadline = time.monotonic() + timeout
+        while missing := wanted - bus.alive(timeout=0.5):
+            self.check()
+            if time.monotonic() > deadline:
+                raise UserError(f"not alive within {timeout:g} s: {', '.join(sorted(missing))}; their lines are above")
+            time.sleep(0.05)
+
+    def ended(self) -> list[str]:
+        """Names of children that are gone."""
+        return [name for name, process in self.processes.items() if process.child.poll() is not None]
+
+    def check(self) -> None:
+        """Raises UserError with the last line of a child that ended though nobody asked it to."""
+        for name in self.ended():
+            process = self.processes[name]
+            process.reader.join(timeout=1)
+            last = process.lines[-1] if process.lines else "without a word"
+            raise UserError(f"{name} ended with status {process.child.returncode}: {last}")
+
+    def _spawn(self, name: str, args: list[str]) -> None:
+        environment = {
+            **os.environ,
+            "PRESAGE_CONNECT": self.endpoint,
+            "PRESAGE_ROBOT": self.robot,
+            "PYTHONUNBUFFERED": "1",
+        }
+        parent = os.getpid()
+        child = subprocess.Popen(  # noqa: S603 - our own modules
+            [sys.executable, *args],
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            start_new_session=True,  # Ctrl-C is ours to pass on, in order
+            preexec_fn=lambda: _die_with(parent),  # noqa: PLW1509 - one call, before any thread of the child
+        )
+        process = Process(name, child, threading.Thread(target=lambda: self._pass_on(process), daemon=True))
+        process.reader.start()
+        self.processes[name] = process
+
+    def _pass_on(self, process: Process) -> None:
+        assert process.child.stdout is not None  # noqa: S101 - asked for above
+        colour = f"\033[{COLOURS.get(process.name, 0)}m" if sys.stderr.isatty() else ""
+        for line in process.child.stdout:
+            process.lines = [*process.lines[-20:], line.rstrip()]
+            if not self.quiet:
+                print(
+                    f"{colour}{process.name:>10} |{chr(27) + '[0m' if colour else ''} {line.rstrip()}", file=sys.stderr
+                )
+
+    def stop(self, name: str) -> int:
+        """End one child cleanly; its status."""
+        process = self.processes.pop(name)
+        return _end(process)
+
+    def close(self) -> None:
+        """End all, in order; those that do not listen are killed."""
+        for name in sorted(self.processes, key=lambda n: ENDING.index(n) if n in ENDING else -1):
+            self.stop(name)
+
+    def __enter__(self) -> Stack:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with ignoring_interrupts():
+            self.close()
+
+
+def _end(process: Process) -> int:
+    child = process.child
+    if child.poll() is None:
+        child.terminate()
+        try:
+            child.wait(GRACE)
+        except subprocess.TimeoutExpired:
+            print(f"{process.name} did not end within {GRACE:g} s and is killed", file=sys.stderr)
+            child.kill()
+            child.wait()
+    process.reader.join(timeout=1)
+    if child.stdout is not None:
+        child.stdout.close()
+    return child.returncode
+
+
+def _die_with(parent: int) -> None:
+    """Linux: end this process when its parent ends, even by SIGKILL."""
+    pr_set_pdeathsig = 1
+    libc = ctypes.CDLL(None, use_errno=True)
+    if hasattr(libc, "prctl"):
+        libc.prctl(pr_set_pdeathsig, signal.SIGTERM)
+        if os.getppid() != parent:  # it ended before we asked
+            os._exit(1)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """SIGTERM and SIGHUP end the block as Ctrl-C does, so that what it started is ended too."""
+
+    def interrupt(_signal: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    before = {s: signal.signal(s, interrupt) for s in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def ignoring_interrupts() -> Iterator[None]:
+    """A second Ctrl-C does not cut the cleaning short."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before: dict[int, Callable[[int, FrameType | None], object] | int | None] = {
+        s: signal.signal(s, signal.SIG_IGN) for s in numbers
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)  # type: ignore[arg-type]
+
+
+def free_port() -> int:
+    """A TCP port on loopback that is free now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def accepts(port: int) -> bool:
+    """Whether somebody listens on the loopback port."""
+    with socket.socket() as probe:
+        probe.settimeout(0.5)
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def check_port(port: int) -> None:
+    """Raises UserError where the loopback port is taken."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as error:
+            raise UserError(
+                f"port {port} on 127.0.0.1 cannot be used ({error.strerror}): is another session running? "
+                f"Choose another with --port, or 0 for any free one"
+            ) from None

@@ -1,0 +1,212 @@
+"""`presage train`: ask the scanner on the bus what it sees from random poses, learn to predict it, write weights."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from common.bus import Bus, Link, open_bus, wait_until
+from common.errors import UserError
+from common.messages import Request, SampleReply, SampleRequest, WorldReply
+from common.robot import Robot
+from common.scanner import SCANNERS, Scanner
+from common.topics import SAMPLE, WORLD
+from common.versions import commit, versions
+from common.world import World, load_world
+from presage.stack import Stack
+from services.estimator import training, weights
+from services.estimator.checkpoint import Checkpoint
+from services.estimator.decoder import Normalisation, Shape
+from services.estimator.training import Data, Recipe, Trainer, usable_ranges
+
+TEST_SAMPLES = 1000
+BLOCK = 500  # poses a request
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to train."""
+
+    world: str
+    preset: str
+    scanner: str
+    beams: int | None
+    out: Path
+    samples: int
+    recipe: Recipe
+    shape_hidden: int = 128
+    shape_channels: int = 8
+
+
+def train(job: Job, link: Link, console: Console) -> Path:
+    """The weights' path; raises UserError in one line."""
+    if job.scanner not in SCANNERS:
+        raise UserError(f"no scanner {job.scanner!r}: choose one of {', '.join(SCANNERS)}")
+    world, scanner = load_world(job.world), SCANNERS[job.scanner].with_beams(job.beams)
+    path = weights.path_of(job.out, world.name, job.preset, scanner.beams)
+    described = {"world": world.model_dump(mode="json"), "scanner": scanner.model_dump(mode="json"), "n": job.samples}
+    checkpoint = Checkpoint(job.out / f".{path.stem}.unfinished", {**described, **asdict(job.recipe)})
+    heading = float(world.start_pose(Robot().radius)[2])
+    rng = np.random.default_rng(job.recipe.seed)
+    with Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console
+    ) as bar:
+        data = {}
+        for name, count in (("train", job.samples), ("test", TEST_SAMPLES)):
+            poses = np.column_stack([world.sample_free(count, rng, Robot().radius), np.full(count, heading)])
+            kept = checkpoint.samples(name)
+            if kept is None:
+                with scanner_on_bus(link, job, world, scanner, console) as bus:
+                    noise_seed = job.recipe.seed if name == "train" else None  # test against what is, not noise
+                    kept = collect(bus, poses, scanner, noise_seed, bar, f"{name} samples")
+                checkpoint.keep_samples(name, kept)
+            data[name] = kept
+        trainer, seconds = _fit(job, world, scanner, data, checkpoint, bar)
+    _write(job, world, scanner, heading, data, trainer, seconds, path)
+    checkpoint.finish()
+    card = weights.load(path)[1]
+    console.print(
+        f"{path}: {path.stat().st_size / 1e6:.2f} MB; test error mean {card.test_l1_mean:.3f} m, "
+        f"median {card.test_l1_median:.3f} m; {seconds:.0f} s"
+    )
+    return path
+
+
+@contextmanager
+def scanner_on_bus(link: Link, job: Job, world: World, scanner: Scanner, console: Console) -> Iterator[Bus]:
+    """A bus on which this scanner in this world answers `sample`: the one that is there, or a simulator of our own."""
+    with open_bus(link) as bus:
+        if wait_until(bus.linked, 1.0) and _answers(bus, world, scanner, console):
+            yield bus
+            return
+    with Stack("training", quiet=True) as stack:
+        stack.start_router()
+        stack.start("simulator", "--world", job.world, "--scanner", job.scanner, *_beams(job), "--pace", "realtime")
+        with open_bus(stack.link()) as bus:
+            stack.wait_alive(bus)
+            yield bus
+
+
+def _beams(job: Job) -> list[str]:
+    return ["--beams", str(job.beams)] if job.beams is not None else []
+
+
+def _answers(bus: Bus, world: World, scanner: Scanner, console: Console) -> bool:
+    """Whether the scanner on the bus is the one asked for, in the same world; says so where not."""
+    try:
+        here = bus.ask(WORLD, Request(), WorldReply, timeout=1.0)
+    except UserError:
+        return False
+    if here.world is not None and here.world.name == world.name and here.scanner is not None:
+        same = {"name", "fov", "mount", "range_max"}
+        if here.scanner.model_dump(include=same) == scanner.model_dump(include=same):
+            console.print(f"samples come from the running scanner {here.scanner.name} in {world.name}")
+            return True
+    console.print("the running session has another world or scanner; a simulator of our own is started")
+    return False
+
+
+def collect(
+    bus: Bus,
+    poses: np.ndarray[tuple[int, ...], np.dtype[np.float64]],
+    scanner: Scanner,
+    seed: int | None,
+    bar: Progress,
+    title: str,
+) -> Data:
+    """Scans from ``poses`` (N, 3), in blocks; with noise of ``seed``, or none."""
+    task = bar.add_task(title, total=len(poses))
+    rows = []
+    for number, start in enumerate(range(0, len(poses), BLOCK)):
+        block = poses[start : start + BLOCK]
+        request = SampleRequest(
+            poses=block, beams=scanner.beams, noise=seed is not None, seed=(seed or 0) * 100_003 + number
+        )
+        reply = bus.ask(SAMPLE, request, SampleReply, timeout=60.0)
+        if not reply.ok or reply.scanner is None:
+            raise UserError(f"the scanner refuses to be sampled: {reply.reason or 'it does not describe itself'}")
+        if len(reply.ranges) != len(block) * scanner.beams:
+            raise UserError(f"the scanner answered {len(reply.ranges)} ranges for {len(block)} x {scanner.beams}")
+        rows.append(usable_ranges(reply.ranges.reshape(len(block), -1).astype(np.float64), scanner.range_max))
+        bar.advance(task, len(block))
+    return Data(poses, np.concatenate(rows))
+
+
+def _fit(
+    job: Job, world: World, scanner: Scanner, data: dict[str, Data], checkpoint: Checkpoint, bar: Progress
+) -> tuple[Trainer, float]:
+    x0, y0, x1, y1 = world.bounds
+    norm = Normalisation(
+        ((x0 + x1) / 2, (y0 + y1) / 2), ((x1 - x0) / 2, (y1 - y0) / 2), float(data["train"].ranges.max())
+    )
+    shape = Shape(scanner.beams, job.shape_hidden, job.shape_channels)
+    trainer = Trainer(shape, norm, job.recipe, data["train"], data["test"])
+    if checkpoint.restore(trainer):
+        bar.console.print(f"going on after epoch {trainer.progress.epoch} of an interrupted run")
+    task = bar.add_task("epochs", total=job.recipe.epochs, completed=trainer.progress.epoch)
+    began = time.monotonic()
+
+    def report(progress: training.Progress) -> None:
+        checkpoint.save(trainer)
+        test = progress.test_l1[-1]
+        bar.update(task, completed=progress.epoch, description=f"epochs, test error {test:.3f} m")
+
+    trainer.run(report)
+    return trainer, time.monotonic() - began
+
+
+def _write(
+    job: Job,
+    world: World,
+    scanner: Scanner,
+    heading: float,
+    data: dict[str, Data],
+    trainer: Trainer,
+    seconds: float,
+    path: Path,
+) -> None:
+    """Errors are measured on the weights as they will be read, in half precision."""
+    model_state = {name: tensor.half().float() for name, tensor in trainer.decoder.state_dict().items()}
+    trainer.decoder.load_state_dict(model_state)
+    with torch.no_grad():
+        predicted = weights.PaperModel(trainer.decoder, trainer.norm).ranges(data["test"].poses)
+    error = np.abs(predicted - data["test"].ranges)
+    recipe = job.recipe
+    card = weights.ModelCard(
+        preset=job.preset, world=world, scanner=scanner, heading=heading, samples=job.samples, epochs=recipe.epochs,
+        batch=recipe.batch, learning_rate=recipe.learning_rate, seed=recipe.seed, hidden=job.shape_hidden,
+        channels=job.shape_channels, center=trainer.norm.center, half_size=trainer.norm.half_size,
+        range_scale=trainer.norm.range_scale, test_samples=TEST_SAMPLES, test_l1_mean=float(error.mean()),
+        test_l1_median=float(np.median(error)), curve_train_l1=[round(v, 5) for v in trainer.progress.train_l1],
+        curve_test_l1=[round(v, 5) for v in trainer.progress.test_l1], training_s=round(seconds, 1), commit=commit(),
+        command="presage " + " ".join(sys.argv[1:]), versions=versions(),
+    )  # fmt: skip
+    weights.save(path, trainer.decoder, card)
+    _draw_curve(card, path.with_suffix(".png"))
+
+
+def _draw_curve(card: weights.ModelCard, png: Path) -> None:
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    epochs = np.arange(1, len(card.curve_test_l1) + 1)
+    axes.plot(epochs, card.curve_train_l1, color="#0072B2", label=f"{card.samples} training samples")
+    axes.plot(epochs, card.curve_test_l1, color="#D55E00", label=f"{card.test_samples} test samples")
+    axes.set(
+        xlabel="epoch", ylabel="L1 error (m, mean over beams)", yscale="log",
+        title=f"{card.preset} in {card.world.name}, {card.scanner.beams} beams",
+    )  # fmt: skip
+    axes.grid(alpha=0.3, which="both")
+    axes.legend()
+    figure.savefig(png, dpi=120)

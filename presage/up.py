@@ -1,0 +1,69 @@
+"""`presage up`: the whole system on this machine, until Ctrl-C."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from rich.console import Console
+
+from common.bus import open_bus
+from common.world import load_world
+from presage.stack import Stack
+
+
+def run_up(
+    *,
+    world: str,
+    beams: int,
+    drive: str,
+    pace: str,
+    seed: int,
+    record: Path | None,
+    robot: str,
+    port: int,
+    console: Console,
+) -> None:
+    """Start, wait until all are alive, say what can be done, and watch; a service that ends is named, not restarted."""
+    load_world(world)  # one clear line now rather than three from the children
+    with Stack(robot, port or None) as stack:
+        stack.start_router()
+        lockstep = pace == "lockstep"
+        if record is not None:
+            stack.start("recorder", "--directory", str(record))
+        stack.start("estimator", "--world", world)
+        if drive == "holonomic":
+            stack.start("controller", "--world", world, *(["--belief-timeout", "20"] if lockstep else []))
+        else:
+            console.print("the paper's preset does not turn: no controller is started for a differential drive")
+        waits = ",".join(sorted(set(stack.processes) - {"router"}))
+        simulator = ["--world", world, "--beams", str(beams), "--drive", drive, "--pace", pace, "--seed", str(seed)]
+        stack.start("simulator", *simulator, *(["--wait-for", waits] if lockstep else []))
+        with open_bus(stack.link()) as bus:
+            stack.wait_alive(bus)
+        where = "" if port == 7447 else f" --connect {stack.endpoint}"
+        console.print(
+            f"[bold green]all alive[/] at {stack.endpoint}. In another terminal: "
+            f"presage goal 15 1.5 --wait{where} | presage echo belief{where} | presage hz{where}. Ctrl-C ends all.",
+            soft_wrap=True,
+        )
+        _watch(stack, console)
+
+
+def _watch(stack: Stack, console: Console) -> None:
+    """Until interrupted, or until nobody is left."""
+    said: set[str] = set()
+    while True:
+        for name in stack.ended():
+            if name not in said:
+                said.add(name)
+                process = stack.processes[name]
+                again = "common.router" if name == "router" else f"services.{name}"
+                console.print(
+                    f"[bold red]{name} ended with status {process.child.returncode}[/]; it is not restarted. "
+                    f"Start it again with: PRESAGE_CONNECT={stack.endpoint} python -m {again}",
+                    soft_wrap=True,
+                )
+        if len(said) == len(stack.processes):
+            stack.check()
+        time.sleep(0.2)
