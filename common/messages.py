@@ -69,7 +69,7 @@ class Scan(Stamped):
 
     def angles(self) -> npt.NDArray[np.float64]:
         """(B,) rad, beam directions in laser."""
-        return self.angle_min + self.angle_increment * np.arange(len(self.ranges))
+        return self.angle_min + self.angle_increment * np.arange(len(self.ranges), dtype=np.float64)
 
 
 class Odom(Stamped):
@@ -167,7 +167,7 @@ class Health(Stamped):
 
     service: Name
     uptime: NotNegative  # s, wall time
-    topics: list[TopicHealth] = []
+    topics: list[TopicHealth] = []  # noqa: RUF012
     counters: dict[str, Count] = {}  # noqa: RUF012 - pydantic copies defaults
     note: Text = ""  # what the service waits for or last complained of
 

@@ -37,7 +37,7 @@ class Scanner(BaseModel):
 
     def angles(self) -> Array:
         """(B,) beam directions, rad in laser."""
-        return self.angle_min + self.angle_increment * np.arange(self.beams)
+        return self.angle_min + self.angle_increment * np.arange(self.beams, dtype=np.float64)
 
     def with_beams(self, beams: int | None) -> Scanner:
         """The same scanner with another number of beams over the same field of view."""

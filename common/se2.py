@@ -1,4 +1,4 @@
-"""Poses in the plane, SE(2): arrays (..., 3) of x m, y m, yaw rad (REP-103: x forward, y left, yaw counter-clockwise)."""
+"""Poses in the plane, SE(2): arrays (..., 3) of x m, y m, yaw rad (REP-103: x forward, y left, yaw to the left)."""
 
 from __future__ import annotations
 

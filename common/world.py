@@ -143,7 +143,7 @@ class World(_Model):
         Raises UserError where there is no such place.
         """
         x0, y0, x1, y1 = self.bounds
-        room = self.free_space.buffer(-clearance)
+        room = shapely.buffer(self.free_space, -clearance)
         if room.is_empty:
             raise UserError(f"world {self.name!r} has no place {clearance} m clear of everything")
         found: list[Array] = []
@@ -156,7 +156,7 @@ class World(_Model):
         """(3,) the start, or where none is stated the free place nearest the centre."""
         if self.start is not None:
             return np.array([self.start.x, self.start.y, np.deg2rad(self.start.yaw_deg)])
-        room = self.free_space.buffer(-clearance)
+        room = shapely.buffer(self.free_space, -clearance)
         if room.is_empty:
             raise UserError(f"world {self.name!r} has no place {clearance} m clear of everything")
         nearest = shapely.shortest_line(room, shapely.Point(self.center()))
@@ -190,7 +190,7 @@ class World(_Model):
             under = middle**2 - (px**2 + py**2 - radius**2)
             near = middle - np.sqrt(np.where(under >= 0, under, np.nan))
             best = np.fmin(best, np.where(near >= 0, near, np.inf))
-        return best
+        return np.asarray(best)
 
 
 def _check_ring(ring: list[tuple[float, float]]) -> None:

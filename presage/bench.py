@@ -102,10 +102,10 @@ def _measure(
         ).encode()  # fmt: skip
         began = time.perf_counter()
         bus.put(SCAN, payload)
-        there = _await(commands, lambda p, s=stamp: CmdVel.decode(p).stamp_ns == s)  # type: ignore[misc]
+        there = _await(commands, lambda p, s=stamp: CmdVel.decode(p).stamp_ns == s)
         middle = time.perf_counter()
         raw.put(ODOM, payload)
-        back = _await(returns, lambda p, sent=payload: p == sent)  # type: ignore[misc]
+        back = _await(returns, lambda p, sent=payload: p == sent)
         end = time.perf_counter()
         if number >= WARM_UP:
             lost += (not there) + (not back)
@@ -113,8 +113,10 @@ def _measure(
             raw_ms += [(end - middle) * 1e3] if back else []
         time.sleep(max(0.0, 1 / rate - (time.perf_counter() - began)))
     return {
-        "scan_to_command_median_ms": float(np.median(loop_ms)), "scan_to_command_p99_ms": float(np.percentile(loop_ms, 99)),
-        "zenoh_round_trip_median_ms": float(np.median(raw_ms)), "zenoh_round_trip_p99_ms": float(np.percentile(raw_ms, 99)),
+        "scan_to_command_median_ms": float(np.median(loop_ms)),
+        "scan_to_command_p99_ms": float(np.percentile(loop_ms, 99)),
+        "zenoh_round_trip_median_ms": float(np.median(raw_ms)),
+        "zenoh_round_trip_p99_ms": float(np.percentile(raw_ms, 99)),
         "payload_bytes": len(payload), "beams": len(clean), "scans": scans, "rate_hz": rate, "unanswered": lost,
         "seed": 0, "commit": commit(), "versions": versions(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores", "arguments": sys.argv[1:],

@@ -128,7 +128,7 @@ def teleport(
 ) -> None:
     """Carry the simulated robot off, unseen by its odometry.
 
-    Example: `presage teleport 9 1.5`. The paper's preset knows the heading it was trained at alone (90 deg in corridor).
+    Example: `presage teleport 9 1.5`. The paper's preset knows one heading alone: 90 deg in corridor.
     """
     from common.messages import Pose  # noqa: PLC0415
     from presage.tools import teleport as carry  # noqa: PLC0415
@@ -226,7 +226,7 @@ def train(
     Examples: `presage train --world corridor --beams 622`; `presage train --world my.yaml --out trained --epochs 20`.
     """
     from presage.train import Job  # noqa: PLC0415
-    from presage.train import train as learn
+    from presage.train import train as learn  # noqa: PLC0415
     from services.estimator.training import Recipe  # noqa: PLC0415
 
     if preset != "paper":

@@ -37,7 +37,7 @@ class Demo:
     beams: int = 622
     seed: int = 0
     pace: str = "realtime"
-    port: int = 7447
+    port: int | None = None  # None: any free one
 
 
 def run_demo(demo: Demo, stack: Stack, console: Console) -> tuple[Path, bool]:
@@ -75,7 +75,7 @@ def _goal(demo: Demo, world: World) -> tuple[float, float]:
     """The goal asked for, or a free place at the far end of the paper's corridor, at least 12 m away."""
     robot, start = Robot(), world.start_pose(Robot().radius)
     if demo.goal is None:
-        x0, y0, x1, y1 = world.bounds
+        _, y0, _, y1 = world.bounds
         free = world.sample_free(2000, np.random.default_rng(demo.seed), robot.radius + 0.3)
         straight = free[np.abs(free[:, 1] - start[1]) < 0.1 * (y1 - y0)]  # the preset goes in a straight line
         far = straight[np.argmax(np.abs(straight[:, 0] - start[0]))] if len(straight) else free[0]

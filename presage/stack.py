@@ -1,4 +1,4 @@
-"""Starts services as processes, prefixes their lines, waits until each is alive, and ends them all, whatever happens."""
+"""Starts services as processes, prefixes their lines, waits until they are alive, ends them whatever happens."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import FrameType, TracebackType
+
+from typing_extensions import Self
 
 from common.bus import Bus, Link
 from common.errors import UserError
@@ -132,7 +134,7 @@ class Stack:
         for name in sorted(self.processes, key=lambda n: ENDING.index(n) if n in ENDING else -1):
             self.stop(name)
 
-    def __enter__(self) -> Stack:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
@@ -194,7 +196,7 @@ def ignoring_interrupts() -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)  # type: ignore[arg-type]
+            signal.signal(number, handler)
 
 
 def free_port() -> int:

@@ -27,7 +27,7 @@ from common.world import World, load_world
 from presage.stack import Stack
 from services.estimator import training, weights
 from services.estimator.checkpoint import Checkpoint
-from services.estimator.decoder import Normalisation, Shape
+from services.estimator.decoder import Normalisation, PaperModel, Shape
 from services.estimator.training import Data, Recipe, Trainer, usable_ranges
 
 TEST_SAMPLES = 1000
@@ -180,7 +180,7 @@ def _write(
     model_state = {name: tensor.half().float() for name, tensor in trainer.decoder.state_dict().items()}
     trainer.decoder.load_state_dict(model_state)
     with torch.no_grad():
-        predicted = weights.PaperModel(trainer.decoder, trainer.norm).ranges(data["test"].poses)
+        predicted = PaperModel(trainer.decoder, trainer.norm).ranges(data["test"].poses)
     error = np.abs(predicted - data["test"].ranges)
     recipe = job.recipe
     card = weights.ModelCard(

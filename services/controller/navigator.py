@@ -95,7 +95,7 @@ class Navigator:
             return stand
         if self.state == "lost" or self.reason.startswith("standing"):
             self.state, self.reason = "navigating", ""
-        observed = observed_position(pose, belief.xi, belief.curvature)
+        observed = observed_position(pose, belief.xi.astype(np.float64), belief.curvature)
         preferred = preferred_position(observed, self.goal.pose.array(), self.preference.reach)
         self._action = next_action(self._action, observed, preferred, float(pose[2]), self.preference)
         return np.array([self._action[0], self._action[1], 0.0])

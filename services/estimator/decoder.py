@@ -54,7 +54,8 @@ class Decoder(nn.Module):
             blocks += [nn.Conv1d(width, width, 3, padding=1), nn.ReLU()]
         self.blocks = nn.Sequential(*blocks)
         self.out = nn.Conv1d(width, 1, 1)
-        nn.init.constant_(self.out.bias, 0.2)  # ReLU at the output: begin where it is alive  # type: ignore[arg-type]
+        assert self.out.bias is not None  # noqa: S101 - asked for by default
+        nn.init.constant_(self.out.bias, 0.2)  # ReLU at the output: begin where it is alive
 
     def forward(self, position: torch.Tensor) -> torch.Tensor:
         """(N, 2) to (N, B)."""
@@ -70,9 +71,9 @@ class Normalisation:
     half_size: tuple[float, float]  # m
     range_scale: float  # m, a normalised range of 1
 
-    def position(self, poses: Array) -> torch.Tensor:
+    def position(self, poses: Array, dtype: torch.dtype = torch.float32) -> torch.Tensor:
         """(N, 2) in [-1, 1] from poses (N, 3) in map."""
-        return torch.as_tensor((poses[:, :2] - np.array(self.center)) / np.array(self.half_size), dtype=torch.float32)
+        return torch.as_tensor((poses[:, :2] - np.array(self.center)) / np.array(self.half_size), dtype=dtype)
 
 
 class PaperModel:
@@ -81,6 +82,7 @@ class PaperModel:
     def __init__(self, decoder: Decoder, norm: Normalisation) -> None:
         """Wrap a decoder for inference."""
         self.decoder, self.norm = decoder.eval().requires_grad_(requires_grad=False), norm
+        self.dtype = next(decoder.parameters()).dtype
 
         def ranges_of(position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
             ranges = self.decoder(position[None])[0]
@@ -90,7 +92,7 @@ class PaperModel:
 
     def predict(self, pose: Array) -> tuple[Array, Array]:
         """See GenerativeModel; the derivative by yaw is zero, for the paper freezes it."""
-        jacobian, ranges = self._with_jacobian(self.norm.position(pose[None])[0])
+        jacobian, ranges = self._with_jacobian(self.norm.position(pose[None], self.dtype)[0])
         full = np.zeros((len(ranges), 3))
         full[:, :2] = jacobian.double().numpy() * self.norm.range_scale / np.array(self.norm.half_size)
         return ranges.double().numpy() * self.norm.range_scale, full
@@ -98,5 +100,5 @@ class PaperModel:
     def ranges(self, poses: Array) -> Array:
         """(N, B) m expected at poses (N, 3)."""
         with torch.no_grad():
-            parts = [self.decoder(part) for part in self.norm.position(poses).split(1000)]
+            parts = [self.decoder(part) for part in torch.split(self.norm.position(poses, self.dtype), 1000)]
         return torch.cat(parts).double().numpy() * self.norm.range_scale

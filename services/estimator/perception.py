@@ -80,7 +80,7 @@ class PaperEstimator:
         return np.array([np.clip(pose[0], x0, x1), np.clip(pose[1], y0, y1), pose[2]])
 
     def _judge(self, step: float, misfit: float) -> State:
-        """Tracking once steps are short and the scan fits about as well as the model can; lost when it no longer does."""
+        """Tracking once steps are short and the scan fits as well as the model can; lost when it no longer does."""
         window = self.settings.window
         self._steps = [*self._steps, step][-window:]
         self._misfits = [*self._misfits, misfit][-window:]

@@ -58,7 +58,7 @@ class Trainer:
         positions, ranges = self._train
         # The order depends on seed and epoch alone, so that a resumed run sees the batches it would have seen.
         order = torch.randperm(len(positions), generator=torch.Generator().manual_seed(recipe.seed * 100_003 + epoch))
-        batches = order.split(recipe.batch)
+        batches = torch.split(order, recipe.batch)
         total = 0.0
         self.decoder.train()
         for number, batch in enumerate(batches):
@@ -67,7 +67,7 @@ class Trainer:
                 group["lr"] = recipe.learning_rate * 0.5 * (1 + np.cos(np.pi * done))
             loss = (self.decoder(positions[batch]) - ranges[batch]).abs().mean()
             self.optimiser.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
+            loss.backward()
             self.optimiser.step()
             total += loss.item() * len(batch)
         self.progress.train_l1.append(total / len(positions) * self.norm.range_scale)
@@ -78,9 +78,9 @@ class Trainer:
         positions, ranges = self._test
         self.decoder.eval()
         with torch.no_grad():
-            total = sum(
-                float((self.decoder(p) - r).abs().sum())
-                for p, r in zip(positions.split(1000), ranges.split(1000), strict=True)
+            total: float = sum(
+                (self.decoder(p) - r).abs().sum().item()
+                for p, r in zip(torch.split(positions, 1000), torch.split(ranges, 1000), strict=True)
             )
         return total / ranges.numel() * self.norm.range_scale
 

@@ -1,0 +1,46 @@
+"""Generative models and scans for tests: the exact ray caster, and a small decoder trained on it in seconds."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from common import se2
+from common.scanner import SCANNERS
+from common.world import World
+from services.estimator.decoder import Normalisation
+from services.estimator.training import Data
+
+ROOM = World(
+    name="room",
+    boundary=[(0, 0), (6, 0), (6, 4), (0, 4)],
+    obstacles=[{"box": {"center": (2, 3), "size": (0.6, 0.4), "yaw_deg": 20}}, {"circle": {"center": (4.5, 3), "radius": 0.4}}],
+)
+SCANNER = SCANNERS["tim571"].with_beams(64)
+HEADING = np.pi / 2
+
+
+class ExactModel:
+    """The ray caster as a generative model; its derivative by central differences."""
+
+    def __init__(self, world: World, step: float = 1e-4) -> None:
+        self.world, self.step = world, step
+
+    def ranges(self, poses: np.ndarray) -> np.ndarray:
+        return self.world.ray_distances(se2.compose(poses, SCANNER.mount), SCANNER.angles())
+
+    def predict(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        offsets = self.step * np.eye(3)
+        seen = self.ranges(np.concatenate([pose[None], pose + offsets, pose - offsets]))
+        return seen[0], ((seen[1:4] - seen[4:]) / (2 * self.step)).T
+
+
+def posed_scans(count: int, seed: int, world: World = ROOM) -> Data:
+    """Scans from random places at the one heading."""
+    places = world.sample_free(count, np.random.default_rng(seed), 0.3)
+    poses = np.column_stack([places, np.full(count, HEADING)])
+    return Data(poses, ExactModel(world).ranges(poses))
+
+
+def normalisation(world: World = ROOM) -> Normalisation:
+    x0, y0, x1, y1 = world.bounds
+    return Normalisation(((x0 + x1) / 2, (y0 + y1) / 2), ((x1 - x0) / 2, (y1 - y0) / 2), 6.0)
