@@ -59,8 +59,15 @@ class Decoder(nn.Module):
 
     def forward(self, position: torch.Tensor) -> torch.Tensor:
         """(N, 2) to (N, B)."""
-        features = self.fully(position).unflatten(1, (self.shape.channels, self.start))
-        return torch.relu(self.out(self.blocks(features)))[:, 0, : self.shape.beams]
+        values = position
+        for layer in self.layers():
+            values = layer(values)
+        return values[:, 0, : self.shape.beams]
+
+    def layers(self) -> list[nn.Module]:
+        """Every layer in order; each is affine, a ReLU, or the unflattening into channels."""
+        unflatten = nn.Unflatten(1, (self.shape.channels, self.start))
+        return [*self.fully, unflatten, *self.blocks, self.out, nn.ReLU()]
 
 
 @dataclass(frozen=True)
@@ -84,18 +91,30 @@ class PaperModel:
         self.decoder, self.norm = decoder.eval().requires_grad_(requires_grad=False), norm
         self.dtype = next(decoder.parameters()).dtype
 
-        def ranges_of(position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-            ranges = self.decoder(position[None])[0]
-            return ranges, ranges
-
-        self._with_jacobian = torch.func.jacfwd(ranges_of, has_aux=True)
-
     def predict(self, pose: Array) -> tuple[Array, Array]:
         """See GenerativeModel; the derivative by yaw is zero, for the paper freezes it."""
-        jacobian, ranges = self._with_jacobian(self.norm.position(pose[None], self.dtype)[0])
+        with torch.no_grad():
+            ranges, tangents = self._forward_mode(self.norm.position(pose[None], self.dtype))
         full = np.zeros((len(ranges), 3))
-        full[:, :2] = jacobian.double().numpy() * self.norm.range_scale / np.array(self.norm.half_size)
+        full[:, :2] = tangents.T.double().numpy() * self.norm.range_scale / np.array(self.norm.half_size)
         return ranges.double().numpy() * self.norm.range_scale, full
+
+    def _forward_mode(self, position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Ranges (B,) and their derivatives (2, B): a batch of the value, two tangents and a zero, layer by layer.
+
+        An affine layer maps a tangent to layer(tangent) - layer(0), a ReLU passes it where the value is positive.
+        Faster than torch's generic forward mode on a network this small.
+        """
+        rows = torch.cat([position, torch.eye(2, dtype=self.dtype), torch.zeros(1, 2, dtype=self.dtype)])
+        for layer in self.decoder.layers():
+            if isinstance(layer, nn.ReLU):
+                rows = rows * (rows[:1] > 0)
+                continue
+            rows = layer(rows)
+            if not isinstance(layer, nn.Unflatten):
+                rows = torch.cat([rows[:1], rows[1:3] - rows[3:], torch.zeros_like(rows[3:])])
+        flat = rows[:, 0, : self.decoder.shape.beams]
+        return flat[0], flat[1:3]
 
     def ranges(self, poses: Array) -> Array:
         """(N, B) m expected at poses (N, 3)."""
