@@ -25,7 +25,7 @@ class Preference:
 
     gamma: float = 0.3  # action step size a scan
     horizon: float = 1.0  # s, d(pose)/d(action): a velocity held that long
-    reach: float = 1.0  # m, the goal attracts the belief by this much at most
+    reach: float = 2.0  # m, the goal attracts the belief by this much at most
     action_precision: float = 1.0  # s²/m² relative to the pose's 1/m²: prior that a robot stands; damps the sum
 
 

@@ -28,5 +28,5 @@ class ControllerSettings(ServiceSettings):
     max_speed: Annotated[float, Field(gt=0, le=10, description="m/s")] = 1.0
     acceleration: Annotated[float, Field(gt=0, le=20, description="m/s²")] = 1.0
     gamma: Annotated[float, Field(gt=0, lt=1, description="action step size a scan (eq. 4)")] = 0.3
-    reach: Annotated[float, Field(gt=0, le=100, description="m by which the goal attracts the belief at most")] = 1.0
+    reach: Annotated[float, Field(gt=0, le=100, description="m by which the goal attracts the belief at most")] = 2.0
     belief_timeout: Annotated[float, Field(gt=0, le=60, description="s without a belief until the robot stands")] = 0.5

@@ -1,0 +1,22 @@
+"""`python -m services.simulator`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from common.service import main
+from services.simulator.settings import SimulatorSettings
+
+if TYPE_CHECKING:
+    from common.service import Service
+
+
+def make(settings: SimulatorSettings) -> Service:
+    """Imports pybullet here, so that --help answers at once."""
+    from services.simulator.service import SimulatorService  # noqa: PLC0415
+
+    return SimulatorService(settings)
+
+
+if __name__ == "__main__":
+    main(SimulatorSettings, make)

@@ -1,0 +1,133 @@
+"""The world and the robot's body in pybullet: shapes, motion with contacts, rays. One client for each `Physics`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pybullet
+
+from common import se2
+from common.robot import Robot
+from common.se2 import Array
+from common.world import Obstacle, World
+
+SUBSTEP = 1 / 240  # s
+LASER_HEIGHT = 0.1  # m
+WALL_HEIGHT = 0.5  # m, from below the floor, so that no ray sees an edge
+CIRCLE_CORNERS = 360  # 0.02 mm off at a radius of 0.5 m
+RAYS_A_CALL = 16_000  # pybullet takes 16 384
+MOTOR_FORCE = (300.0, 300.0, 100.0)  # N, N, N m: ten times what the limits of acceleration need
+WORLD_GROUP, ROBOT_GROUP = 1, 2  # rays see group 1 alone, not the body they start in
+
+
+class Physics:
+    """Bodies and motion. Poses are of base_link in map."""
+
+    def __init__(self, world: World, robot: Robot, pose: Array) -> None:
+        """Build everything; call `close` at the end."""
+        self.client = pybullet.connect(pybullet.DIRECT)
+        self.robot = robot
+        p = pybullet
+        p.setPhysicsEngineParameter(fixedTimeStep=SUBSTEP, deterministicOverlappingPairs=1, physicsClientId=self.client)
+        self.body = p.loadURDF(
+            str(Path(__file__).with_name("robot.urdf")), useFixedBase=True, physicsClientId=self.client
+        )
+        for link in range(-1, p.getNumJoints(self.body, physicsClientId=self.client)):
+            p.setCollisionFilterGroupMask(self.body, link, ROBOT_GROUP, WORLD_GROUP, physicsClientId=self.client)
+        self.shapes: dict[str, int] = {}
+        self._add_ring("boundary", np.array(world.boundary))
+        self.place(pose)
+
+    def close(self) -> None:
+        """Give the client back."""
+        pybullet.disconnect(physicsClientId=self.client)
+
+    def add(self, name: str, obstacle: Obstacle) -> None:
+        """Put a piece of furniture into the world."""
+        if obstacle.circle is not None:
+            angle = np.arange(CIRCLE_CORNERS) * 2 * np.pi / CIRCLE_CORNERS
+            unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+            # Between inscribed and circumscribed, so that the error has no sign.
+            radius = obstacle.circle.radius * (1 + (np.pi / CIRCLE_CORNERS) ** 2 / 4)
+            self._add_ring(name, np.array(obstacle.circle.center) + radius * unit)
+        else:
+            ring = obstacle.ring()
+            assert ring is not None  # noqa: S101 - not a circle
+            self._add_ring(name, ring)
+
+    def remove(self, name: str) -> None:
+        """Take a piece of furniture away."""
+        pybullet.removeBody(self.shapes.pop(name), physicsClientId=self.client)
+
+    def _add_ring(self, name: str, ring: Array) -> None:
+        """Walls along a closed ring (V, 2) m, as triangles: rays and contacts are exact, concave rings too."""
+        count = len(ring)
+        low, high = (np.column_stack([ring, np.full(count, z)]) for z in (-WALL_HEIGHT, WALL_HEIGHT))
+        i, j = np.arange(count), np.roll(np.arange(count), -1)
+        walls = np.concatenate([np.stack([i, j, j + count], -1), np.stack([i, j + count, i + count], -1)])
+        shape = pybullet.createCollisionShape(
+            pybullet.GEOM_MESH,
+            vertices=np.concatenate([low, high]).tolist(),
+            indices=walls.ravel().tolist(),
+            flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
+            physicsClientId=self.client,
+        )
+        body = pybullet.createMultiBody(0, shape, physicsClientId=self.client)
+        pybullet.setCollisionFilterGroupMask(
+            body, -1, WORLD_GROUP, WORLD_GROUP | ROBOT_GROUP, physicsClientId=self.client
+        )
+        self.shapes[name] = body
+
+    def place(self, pose: Array) -> None:
+        """Carry the robot to a pose (3,), standing."""
+        for joint in range(3):
+            pybullet.resetJointState(self.body, joint, float(pose[joint]), 0.0, physicsClientId=self.client)
+
+    def pose(self) -> Array:
+        """(3,) where the robot is."""
+        states = pybullet.getJointStates(self.body, [0, 1, 2], physicsClientId=self.client)
+        x, y, yaw = (state[0] for state in states)
+        return np.array([x, y, float(se2.wrap(yaw))])
+
+    def twist(self) -> Array:
+        """(3,) its velocity in base_link."""
+        states = pybullet.getJointStates(self.body, [0, 1, 2], physicsClientId=self.client)
+        vx, vy, wz = (state[1] for state in states)
+        return np.array([*se2.rotate(-states[2][0], [vx, vy]), wz])
+
+    def drive(self, twist: Array) -> bool:
+        """One substep with the wheels at ``twist`` (3,) in base_link; whether the body touched something."""
+        yaw = pybullet.getJointState(self.body, 2, physicsClientId=self.client)[0]
+        target = [*se2.rotate(yaw, twist[:2]).tolist(), float(twist[2])]
+        pybullet.setJointMotorControlArray(
+            self.body,
+            [0, 1, 2],
+            pybullet.VELOCITY_CONTROL,
+            targetVelocities=target,
+            forces=list(MOTOR_FORCE),
+            physicsClientId=self.client,
+        )
+        pybullet.stepSimulation(physicsClientId=self.client)
+        contacts: Any = pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client)
+        return any(contact[8] <= 0 or contact[9] > 0 for contact in contacts)
+
+    def ranges(self, lasers: Array, angles: Array, reach: float) -> Array:
+        """(N, B) m from laser poses (N, 3) in map along ``angles`` (B,); +inf where nothing is hit within ``reach``."""
+        heading = (lasers[:, 2:3] + angles).ravel()
+        origin = np.column_stack([np.repeat(lasers[:, :2], len(angles), axis=0), np.full(len(heading), LASER_HEIGHT)])
+        end = origin + reach * np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(heading))])
+        found = np.empty(len(heading))
+        for start in range(0, len(heading), RAYS_A_CALL):
+            part = slice(start, start + RAYS_A_CALL)
+            hits = pybullet.rayTestBatch(
+                origin[part].tolist(),
+                end[part].tolist(),
+                numThreads=1,
+                collisionFilterMask=WORLD_GROUP,
+                physicsClientId=self.client,
+            )
+            found[part] = [hit[2] if hit[0] >= 0 else np.inf for hit in hits]
+        return (found * reach).reshape(len(lasers), len(angles))
+

@@ -1,0 +1,192 @@
+"""The simulator's thin shell: pace, topics and requests around `Simulation`."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from common.errors import UserError
+from common.messages import (
+    CmdVel,
+    ObstacleRequest,
+    PoseRequest,
+    Reply,
+    Request,
+    ResetRequest,
+    SampleReply,
+    SampleRequest,
+    Stamped,
+    WorldReply,
+)
+from common.robot import Robot
+from common.service import Service
+from common.topics import (
+    CMD_VEL,
+    OBSTACLE,
+    ODOM,
+    PAUSE,
+    RESET,
+    RESUME,
+    SAMPLE,
+    SCAN,
+    TELEPORT,
+    TRUTH,
+    WORLD,
+    Query,
+    Topic,
+)
+from common.world import load_world
+from services.simulator.odometry import Drift
+from services.simulator.settings import SimulatorSettings
+from services.simulator.simulation import Setup, Simulation
+
+MAX_SAMPLE = 4_000_000  # ranges an answer, 16 MB
+LATE = 1.0  # s behind real time, beyond which it is not caught up
+
+
+class SimulatorService(Service):
+    """The world as a process."""
+
+    name: ClassVar[str] = "simulator"
+    inputs: ClassVar[tuple[Topic, ...]] = (CMD_VEL,)
+    queries: ClassVar[tuple[Query, ...]] = (TELEPORT, RESET, PAUSE, RESUME, OBSTACLE, SAMPLE, WORLD)
+
+    def __init__(self, settings: SimulatorSettings) -> None:
+        """The world is built in `open`."""
+        super().__init__(settings)
+        self.options = settings
+        self.paused = False
+        self._sent: tuple[Stamped, Stamped, Stamped] | None = None  # the observation of now, once published
+        self._next = 0.0  # wall time of the next step, or in lockstep of the next complaint
+        self._alive: set[str] = set()
+        self._wait_for = {name for name in settings.wait_for.split(",") if name} if self.lockstep else set()
+
+    @property
+    def lockstep(self) -> bool:
+        """Whether each scan waits for its command."""
+        return self.options.pace == "lockstep"
+
+    def open(self) -> None:
+        """Build world and robot; begin once those waited for are there."""
+        options = self.options
+        drift = Drift(options.turn_by_turn, options.turn_by_path, options.path_by_path, options.path_by_turn)
+        robot = Robot(drive=options.drive)
+        scanner = options.the_scanner()
+        self.setup = Setup(load_world(options.world), scanner, robot, options.start_pose(), options.seed, drift)
+        self.simulation = Simulation(self.setup)
+        self._next = time.monotonic()
+        if self._wait_for:
+            self.note = f"waits for {', '.join(sorted(self._wait_for))}"
+            self.log.info(self.note)
+            self.loop.bus.watch_alive(self._changed)
+
+    def _changed(self, service: str, there: bool) -> None:  # noqa: FBT001 - zenoh's thread; the set alone is shared
+        if there:
+            self._alive.add(service)
+        else:
+            self._alive.discard(service)
+
+    def close(self) -> None:
+        """Give the physics back."""
+        self.simulation.close()
+
+    def due(self) -> float | None:
+        """Until the next step, or in lockstep until the scan is sent again."""
+        if self.paused:
+            return None
+        if self._wait_for:
+            return 0.0 if self._wait_for <= self._alive else 0.05
+        return 0.0 if self.options.pace == "fast" else self._next - time.monotonic()
+
+    def on_timer(self) -> None:
+        """Step, by the pace asked for."""
+        if self._wait_for:
+            self._wait_for, self.note = set(), ""
+            self._next = time.monotonic()
+        if self._sent is None:
+            self._observe()
+        elif self.lockstep:
+            stamp, wait = self.simulation.stamp_ns, self.options.lockstep_deadline
+            self.log.warning(
+                "lockstep: no command answered the scan, it is sent again; are estimator and controller running?",
+                stamp_ns=stamp, waited_s=wait,
+            )  # fmt: skip
+            self.counters["scans_sent_again"] += 1
+            self._publish()
+        else:
+            self.simulation.advance()
+            self._observe()
+
+    def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
+        """A command; in lockstep the one that answers the scan of now lets time go on."""
+        if not isinstance(message, CmdVel):
+            return
+        if self.lockstep and message.stamp_ns != self.simulation.stamp_ns:
+            self.counters["stale_commands"] += 1
+            return
+        if not self.simulation.command(message.stamp_ns, message.twist):
+            self.counters["stale_commands"] += 1
+            return
+        if self.lockstep and not self.paused and self._sent is not None:
+            self.simulation.advance()
+            self._observe()
+
+    def _observe(self) -> None:
+        self._sent = self.simulation.observe()
+        self._publish()
+
+    def _publish(self) -> None:
+        """Truth and odometry first: who acts on the scan finds them there."""
+        assert self._sent is not None  # noqa: S101 - just set
+        for topic, message in zip((ODOM, TRUTH, SCAN), self._sent, strict=True):
+            self.publish(topic, message)
+        now = time.monotonic()
+        if self.lockstep:
+            self._next = now + self.options.lockstep_deadline
+        else:
+            self._next += self.simulation.period_ns * 1e-9
+            if now - self._next > LATE:
+                self.counters["late"] += 1
+                self._next = now
+
+    def on_request(self, query: Query, request: Request) -> Reply:
+        """Do what is asked, or say why not."""
+        if query is WORLD:
+            simulation = self.simulation
+            return WorldReply(world=simulation.world, scanner=self.setup.scanner, robot=self.setup.robot)
+        if isinstance(request, SampleRequest):
+            return self._sample(request)
+        if isinstance(request, PoseRequest):
+            self.simulation.teleport(request.pose.array())
+        elif isinstance(request, ObstacleRequest):
+            self.simulation.change(request.action, request.name, request.obstacle)
+        elif isinstance(request, ResetRequest):
+            self._reset(request.seed)
+        elif query is PAUSE or query is RESUME:
+            self._pause(paused=query is PAUSE)
+        else:
+            return super().on_request(query, request)
+        self.log.info(query.name, request=str(request))
+        return Reply()
+
+    def _pause(self, *, paused: bool) -> None:
+        self.paused = paused
+        self.note = "paused" if paused else ""
+        # In lockstep the answer may have come during the pause: the scan is sent again at once.
+        self._next = time.monotonic()
+
+    def _reset(self, seed: int | None) -> None:
+        self.setup = replace(self.setup, seed=self.setup.seed if seed is None else seed)
+        self.simulation.close()
+        self.simulation = Simulation(self.setup)
+        self._sent, self._next = None, time.monotonic()
+
+    def _sample(self, request: SampleRequest) -> SampleReply:
+        scanner = self.setup.scanner.with_beams(request.beams)
+        if len(request.poses) * scanner.beams > MAX_SAMPLE:
+            raise UserError(f"{len(request.poses)} poses x {scanner.beams} beams are more than {MAX_SAMPLE}: ask in parts")
+        ranges = self.simulation.sample(request.poses, request.beams, request.seed if request.noise else None)
+        return SampleReply(scanner=scanner, ranges=np.asarray(ranges, np.float32).ravel())

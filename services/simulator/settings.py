@@ -1,0 +1,61 @@
+"""What the simulator can be told."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from common.config import ServiceSettings
+from common.errors import UserError
+from common.scanner import SCANNERS, Scanner
+
+
+class SimulatorSettings(ServiceSettings):
+    """Simulator: a mobile base with a laser scanner in a world, in pybullet.
+
+    examples:
+      python -m services.simulator                                   the corridor, in real time
+      python -m services.simulator --world maze --drive differential
+      python -m services.simulator --world my.yaml --start 2,1,90    x m, y m, yaw deg
+      python -m services.simulator --beams 622 --pace lockstep --seed 7
+    """
+
+    service: ClassVar[str] = "simulator"
+
+    world: Annotated[str, Field(description="shipped world or world file")] = "corridor"
+    scanner: Annotated[str, Field(description=f"one of {', '.join(SCANNERS)}")] = "tim571"
+    beams: Annotated[int | None, Field(ge=2, le=100_000, description="instead of the scanner's own number")] = None
+    noise: Annotated[float | None, Field(ge=0, le=1, description="instead of the scanner's own sigma, m")] = None
+    drive: Annotated[Literal["holonomic", "differential"], Field(description="holonomic or differential")] = "holonomic"
+    start: Annotated[
+        str, Field(pattern=r"^$|^-?[\d.]+,-?[\d.]+(,-?[\d.]+)?$", description="x,y[,yaw_deg]; none: the world's own")
+    ] = ""
+    seed: Annotated[int, Field(ge=0, description="of all noise")] = 0
+    pace: Annotated[
+        Literal["realtime", "fast", "lockstep"],
+        Field(description="realtime; fast: as fast as it goes; lockstep: each scan waits for the command that answers it"),
+    ] = "realtime"
+    lockstep_deadline: Annotated[float, Field(gt=0, description="s until a scan nobody answered is sent again")] = 5.0
+    wait_for: Annotated[str, Field(description="lockstep: services that must be alive before the first scan")] = (
+        "estimator,controller"
+    )
+    turn_by_turn: Annotated[float, Field(ge=0, description="odometry alpha 1, rad²/rad")] = 1e-3
+    turn_by_path: Annotated[float, Field(ge=0, description="odometry alpha 2, rad²/m")] = 5e-4
+    path_by_path: Annotated[float, Field(ge=0, description="odometry alpha 3, m²/m")] = 1e-3
+    path_by_turn: Annotated[float, Field(ge=0, description="odometry alpha 4, m²/rad")] = 1e-4
+
+    def the_scanner(self) -> Scanner:
+        """The scanner asked for; raises UserError for an unknown one."""
+        if self.scanner not in SCANNERS:
+            raise UserError(f"no scanner {self.scanner!r}: choose one of {', '.join(SCANNERS)}")
+        scanner = SCANNERS[self.scanner].with_beams(self.beams)
+        return scanner if self.noise is None else scanner.model_copy(update={"sigma": self.noise})
+
+    def start_pose(self) -> tuple[float, float, float] | None:
+        """x m, y m, yaw rad, or None."""
+        if not self.start:
+            return None
+        x, y, *yaw = (float(part) for part in self.start.split(","))
+        return x, y, float(np.deg2rad(yaw[0])) if yaw else 0.0

@@ -1,0 +1,203 @@
+"""A robot with a scanner in a world: commands in, scans, odometry and truth out. Simulation time, no clock, no bus."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import shapely
+
+from common import safety, se2
+from common.errors import UserError
+from common.messages import Odom, Pose, Scan, Truth, Twist
+from common.robot import Robot
+from common.scanner import Scanner
+from common.se2 import Array
+from common.world import Obstacle, World
+from services.simulator.odometry import Drift, Odometer
+from services.simulator.physics import SUBSTEP, Physics
+
+BLOCK = 200  # poses of a sample at once
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Everything a run depends on."""
+
+    world: World
+    scanner: Scanner
+    robot: Robot = field(default_factory=Robot)
+    start: tuple[float, float, float] | None = None  # x m, y m, yaw rad; None: the world's own
+    seed: int = 0
+    drift: Drift = field(default_factory=Drift)
+    obstacle_stop: bool = True  # off only to test that contacts are real
+
+
+class Simulation:
+    """Same setup and commands, same bytes."""
+
+    def __init__(self, setup: Setup) -> None:
+        """At time 0; raises UserError where the robot would stand in a wall."""
+        self.setup, self.world = setup, _named(setup.world)
+        robot, scanner = setup.robot, setup.scanner
+        pose = np.array(setup.start) if setup.start is not None else self.world.start_pose(robot.radius)
+        if (why := self.why_not(pose)) is not None:
+            raise UserError(f"start {why}")
+        self.physics = Physics(self.world, robot, pose)
+        for obstacle in self.world.obstacles:
+            self.physics.add(obstacle.name, obstacle)
+        scan_seed, odom_seed = np.random.SeedSequence(setup.seed).spawn(2)
+        self._noise = np.random.default_rng(scan_seed)
+        self.odometer = Odometer(setup.drift, np.random.default_rng(odom_seed))
+        self.substeps = max(1, round(1 / (scanner.rate * SUBSTEP)))
+        self.steps = 0
+        self._velocity = np.zeros(3)  # what the wheels are told, after ramp
+        self._command: tuple[int, Array] | None = None  # stamp and twist
+        self._contact = self._stopped = False
+        self._points = np.zeros((0, 2))
+
+    def close(self) -> None:
+        """Give the physics back."""
+        self.physics.close()
+
+    @property
+    def period_ns(self) -> int:
+        """Between scans."""
+        return round(self.substeps * SUBSTEP * 1e9)
+
+    @property
+    def stamp_ns(self) -> int:
+        """Simulation time."""
+        return self.steps * self.period_ns
+
+    def command(self, stamp_ns: int, twist: Twist) -> bool:
+        """Take a command; False where it answers a scan too old, or one that never was."""
+        age = self.stamp_ns - stamp_ns
+        if age < 0 or age > self.setup.robot.command_timeout * 1e9:
+            return False
+        self._command = (stamp_ns, safety.clip_twist(twist.array(), self.setup.robot))
+        return True
+
+    def advance(self) -> None:
+        """One scan period."""
+        wanted = self._wanted()
+        before = self.physics.pose()
+        self._contact = False
+        for _ in range(self.substeps):
+            self._velocity = safety.ramp(self._velocity, wanted, self.setup.robot, SUBSTEP)
+            self._contact |= self.physics.drive(self._velocity)
+        self.odometer.move(before, self.physics.pose())
+        self.steps += 1
+
+    def _wanted(self) -> Array:
+        """The velocity to aim at: the command while it is fresh, no faster than what the last scan shows allows."""
+        self._stopped = False
+        if self._command is None or self.stamp_ns - self._command[0] > self.setup.robot.command_timeout * 1e9:
+            return np.zeros(3)
+        if not self.setup.obstacle_stop:
+            return self._command[1]
+        # The wheels may still turn another way than commanded: brake for that way too.
+        _, moving_blocked = safety.limit_velocity(self._velocity, self._points, self.setup.robot)
+        wanted, self._stopped = safety.limit_velocity(self._command[1], self._points, self.setup.robot)
+        return np.zeros(3) if moving_blocked and not self._stopped else wanted
+
+    def observe(self) -> tuple[Odom, Truth, Scan]:
+        """What is measured now; draws the scanner's noise."""
+        pose, twist, scanner = self.physics.pose(), self.physics.twist(), self.setup.scanner
+        exact = self._see(pose[None])[0]
+        ranges = scanner.limit(exact + scanner.sigma * self._noise.standard_normal(len(exact)))
+        moving = Twist(vx=float(twist[0]), vy=float(twist[1]), wz=float(twist[2]))
+        odometer = self.odometer
+        odom = Odom(
+            stamp_ns=self.stamp_ns, pose=Pose.of(odometer.pose), twist=moving, covariance=odometer.covariance.copy()
+        )
+        truth = Truth(
+            stamp_ns=self.stamp_ns, pose=Pose.of(pose), twist=moving, contact=self._contact, stopped=self._stopped
+        )
+        scan = Scan(
+            stamp_ns=self.stamp_ns,
+            angle_min=scanner.angle_min,
+            angle_increment=scanner.angle_increment,
+            range_min=scanner.range_min,
+            range_max=scanner.range_max,
+            ranges=ranges.astype(np.float32),
+            mount=Pose.of(scanner.mount),
+            scan_time=1 / scanner.rate,
+        )
+        self._points = safety.scan_points(scan)
+        return odom, truth, scan
+
+    def _see(self, poses: Array, scanner: Scanner | None = None) -> Array:
+        """(N, B) m without noise or limits from base_link poses (N, 3)."""
+        scanner = scanner or self.setup.scanner
+        lasers = se2.compose(poses, np.array(scanner.mount))
+        # A little beyond the limit, so that noise decides about a return at the limit.
+        return self.physics.ranges(lasers, scanner.angles(), scanner.range_max + 6 * scanner.sigma + 1e-6)
+
+    def sample(self, poses: Array, beams: int | None, noise_seed: int | None) -> Array:
+        """(N, B) m seen from poses (N, 3), with noise of a seed or none; the robot and its noise do not notice."""
+        scanner = self.setup.scanner.with_beams(beams)
+        inside = self.world.clearance(poses[:, :2]) <= 0
+        if inside.any():
+            x, y, _ = poses[int(np.argmax(inside))]
+            raise UserError(f"{inside.sum()} of {len(poses)} poses are inside a wall or outside, such as ({x:.2f}, {y:.2f})")
+        rows = [self._see(poses[i : i + BLOCK], scanner) for i in range(0, len(poses), BLOCK)]
+        ranges = np.concatenate(rows) if rows else np.zeros((0, scanner.beams))
+        if noise_seed is not None:
+            ranges = ranges + scanner.sigma * np.random.default_rng(noise_seed).standard_normal(ranges.shape)
+        return scanner.limit(ranges)
+
+    def why_not(self, pose: Array) -> str | None:
+        """Why the robot cannot stand at a pose (3,), or None."""
+        clearance, radius = float(self.world.clearance(pose[:2])[0]), self.setup.robot.radius
+        if clearance >= radius:
+            return None
+        what = "is inside a wall or outside" if clearance < 0 else f"is {clearance:.2f} m from a wall of"
+        return f"({pose[0]:.2f}, {pose[1]:.2f}) {what} {self.world.name!r}; the robot needs {radius:g} m around it"
+
+    def teleport(self, pose: Array) -> None:
+        """Carry the robot off, standing; odometry does not notice. Raises UserError inside a wall."""
+        if (why := self.why_not(pose)) is not None:
+            raise UserError(why)
+        self.physics.place(pose)
+        self._velocity, self._command = np.zeros(3), None
+
+    def change(self, action: str, name: str, obstacle: Obstacle | None) -> None:
+        """Add, move or remove furniture; raises UserError with the reason where it cannot be."""
+        known = {o.name: o for o in self.world.obstacles}
+        if (name in known) == (action == "add"):
+            there = ", ".join(known) or "none"
+            raise UserError(f"there is {'already an' if action == 'add' else 'no'} obstacle {name!r} (there: {there})")
+        if not name or name == "boundary":
+            raise UserError(f"an obstacle needs a name of its own, not {name!r}")
+        if action != "remove":
+            if obstacle is None:
+                raise UserError(f"{action} needs the obstacle's shape")
+            self._check_place(obstacle)
+        kept = [o for o in self.world.obstacles if o.name != name]
+        if action != "add":
+            self.physics.remove(name)
+        if action != "remove" and obstacle is not None:
+            obstacle = obstacle.model_copy(update={"name": name})
+            self.physics.add(name, obstacle)
+            kept.append(obstacle)
+        # Built anew, for a copy would keep the old world's cached geometry.
+        self.world = World(name=self.world.name, boundary=self.world.boundary, obstacles=kept, start=self.world.start)
+
+    def _check_place(self, obstacle: Obstacle) -> None:
+        shape = obstacle.shape()
+        if not shapely.intersects(shapely.Polygon(self.world.boundary), shape):
+            raise UserError("the obstacle would stand outside the world")
+        if shapely.distance(shape, shapely.Point(self.physics.pose()[:2])) < self.setup.robot.radius:
+            raise UserError("the obstacle would stand on the robot")
+
+
+def _named(world: World) -> World:
+    """Every obstacle with a name, so that it can be moved."""
+    taken = {o.name for o in world.obstacles if o.name}
+    if len(taken) < sum(bool(o.name) for o in world.obstacles):
+        raise UserError(f"world {world.name!r}: two obstacles have the same name")
+    named = [
+        o if o.name else o.model_copy(update={"name": f"obstacle-{number}"}) for number, o in enumerate(world.obstacles)
+    ]
+    return World(name=world.name, boundary=world.boundary, obstacles=named, start=world.start)
