@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import zenoh
 
@@ -34,7 +34,7 @@ class Link:
 
 
 def _config(link: Link) -> zenoh.Config:
-    config = zenoh.Config()
+    config: zenoh.Config = zenoh.Config()
     settings = {
         "mode": "router" if link.router else "peer",
         "connect/endpoints": link.connect,
@@ -80,7 +80,7 @@ class Bus:
 
     def wait_matching(self, topic: Topic, timeout: float, service: str = "*", key: str | None = None) -> bool:
         """Whether somebody subscribes to the topic within ``timeout`` s; a put before that may be lost."""
-        publisher = self.publisher(topic, service, key)
+        publisher: Any = self.publisher(topic, service, key)  # zenoh's stub has the status wrong
         return wait_until(lambda: bool(publisher.matching_status.matching), timeout)
 
     def subscribe(self, topic: Topic, inbox: Inbox, *, keep_all: bool = False, robot: str | None = None) -> None:
@@ -105,12 +105,12 @@ class Bus:
             def reply(answer: bytes) -> None:
                 with suppress(zenoh.ZError):  # the asker may be gone
                     call.reply(key, answer, encoding=zenoh.Encoding(ENCODING).with_schema(query.reply.__name__))
-                call.drop()
+                call.drop()  # type: ignore[no-untyped-call]
 
             def refuse(why: str) -> None:
                 with suppress(zenoh.ZError):
                     call.reply_err(why.encode())
-                call.drop()
+                call.drop()  # type: ignore[no-untyped-call]
 
             inbox.put(Call(query, payload, reply, refuse))
 
@@ -164,9 +164,10 @@ def open_bus(link: Link) -> Iterator[Bus]:
         text = str(error)
         if "in use" in text:
             raise UserError(f"port in use: {' '.join(link.listen)}; choose another with --listen") from None
-        raise UserError(
-            f"no session with connect {link.connect}, listen {link.listen}: {text.split(' at /', maxsplit=1)[0]}"
-        ) from None
+        # Zenoh appends its own source line, and wraps some messages in the name of a Rust enum.
+        why = " ".join(text.split(" at /", maxsplit=1)[0].split()).removeprefix('Json5Err(Message { msg: "')
+        asked = f"connect {', '.join(link.connect) or 'none'}, listen {', '.join(link.listen) or 'none'}"
+        raise UserError(f"no session with {asked}: {why}; an endpoint is written like {DEFAULT_ENDPOINT}") from None
     with session:
         yield Bus(session, link.robot)
 

@@ -37,7 +37,6 @@ class ServiceSettings(BaseSettings):
 
     model_config = SettingsConfigDict(
         env_prefix="PRESAGE_",
-        env_ignore_empty=True,
         extra="forbid",
         frozen=True,
         cli_kebab_case=True,
@@ -79,14 +78,16 @@ class ServiceSettings(BaseSettings):
         cls,
         settings_cls: type[BaseSettings],
         init_settings: PydanticBaseSettingsSource,
-        env_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,  # noqa: ARG003
         dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003
         file_secret_settings: PydanticBaseSettingsSource,  # noqa: ARG003
     ) -> tuple[PydanticBaseSettingsSource, ...]:
         """Command line (put first by pydantic) over arguments over environment over file."""
-        own = EnvSettingsSource(settings_cls, env_prefix=f"PRESAGE_{cls.service.upper()}_")
-        shared = {name: value for name, value in env_settings().items() if name not in cls.private}
-        environment = {**shared, **{name: value for name, value in own().items() if name in cls.private}}
+        # Only here is an empty value none at all (compose files pass such); on the command line '' says something.
+        shared = EnvSettingsSource(settings_cls, env_ignore_empty=True)()
+        own = EnvSettingsSource(settings_cls, env_prefix=f"PRESAGE_{cls.service.upper()}_", env_ignore_empty=True)()
+        environment = {k: v for k, v in shared.items() if k not in cls.private}
+        environment |= {k: v for k, v in own.items() if k in cls.private}
         file = InitSettingsSource(settings_cls, _file_values.get({}))
         return init_settings, InitSettingsSource(settings_cls, environment), file
 
@@ -114,9 +115,9 @@ def load_settings(cls: type[S], argv: list[str] | None = None) -> S:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         name = ".".join(map(str, first["loc"])) or "settings"
-        prefix = f"PRESAGE_{cls.service.upper()}_" if name in cls.private else "PRESAGE_"
+        variable = f"PRESAGE_{cls.service.upper()}_{name.upper()}" if name in cls.private else f"PRESAGE_{name.upper()}"
         raise UserError(
-            f"{name}: {first['msg']} (--{name.replace('_', '-')}, {prefix}{name.upper()}{f' or {path}' if path else ''})"
+            f"{name}: {first['msg']} (--{name.replace('_', '-')}, {variable}{f' or {path}' if path else ''})"
         ) from None
     except SettingsError as error:
         raise UserError(" ".join(str(error).split())) from None

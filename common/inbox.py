@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 from common.topics import MAX_BYTES, Query, Topic
 
+MAX_KEYS = 1000  # counted by name; a sender that invents keys must not fill memory
+
 
 @dataclass(frozen=True)
 class Sample:
@@ -43,19 +45,21 @@ class Inbox:
         self._entries: OrderedDict[object, Sample | Call] = OrderedDict()
         self._bytes = 0
         self._serial = 0
+        self._counted: set[str] = set()
         self._changed = threading.Condition()  # reentrant: a signal handler may wake us inside wait
 
     def put(self, entry: Sample | Call, *, newest_only: bool = False) -> None:
         """Add an entry; where a newest-only key still waits, the new one takes the old one's place."""
         size = len(entry.payload)
-        key = entry.key if isinstance(entry, Sample) else entry.query.name
+        full_key = entry.key if isinstance(entry, Sample) else entry.query.name
         with self._changed:
+            key = self.counted_as(full_key)
             self.received[key] += 1
             if size > (MAX_BYTES if isinstance(entry, Sample) else 64 * MAX_BYTES):
                 self.oversized[key] += 1
                 return
             self._serial += 1
-            slot: object = key if newest_only else self._serial
+            slot: object = full_key if newest_only else self._serial
             old = self._entries.get(slot)
             if old is not None:
                 self._bytes -= len(old.payload)
@@ -68,6 +72,13 @@ class Inbox:
             self._entries[slot] = entry
             self._bytes += size
             self._changed.notify()
+
+    def counted_as(self, key: str) -> str:
+        """The name a key is counted under: its own, or ``others`` when there are too many."""
+        if key not in self._counted and len(self._counted) >= MAX_KEYS:
+            return "others"
+        self._counted.add(key)
+        return key
 
     def get(self, timeout: float) -> Sample | Call | None:
         """The oldest entry, waiting at most ``timeout`` s for one; None when none came."""

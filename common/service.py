@@ -96,7 +96,7 @@ class Loop:
         self.failed = 0
         self._may_log = OncePerSecond()
         self._stopping = False
-        self._began = self._health_at = time.monotonic()
+        self._began = self._health_at = self._counted_at = time.monotonic()
         self._before: Counter[str] = Counter()
         service._loop = self  # noqa: SLF001 - the two halves of one thing
 
@@ -131,9 +131,10 @@ class Loop:
 
     def reject(self, key: str, why: str) -> None:
         """Count a payload that could not be used; say so once a second at most."""
-        self.undecodable[key if len(self.undecodable) < 1000 else "others"] += 1
-        if self._may_log(key):
-            self.service.log.warning("payload dropped", key=key, why=why, so_far=self.undecodable[key])
+        name = self.inbox.counted_as(key)
+        self.undecodable[name] += 1
+        if self._may_log(name):
+            self.service.log.warning("payload dropped", key=key, why=why, so_far=self.undecodable[name])
 
     def _turn(self) -> None:
         due = self.service.due()
@@ -146,9 +147,10 @@ class Loop:
         due = self.service.due()
         if due is not None and due <= 0:
             self._guard(self.service.on_timer)
-        if time.monotonic() >= self._health_at:
-            self._health_at += HEALTH_PERIOD
-            self.publish(HEALTH, self._health())
+        if (now := time.monotonic()) >= self._health_at:
+            late = now - self._health_at > HEALTH_PERIOD  # after a long step one pulse, not all that were missed
+            self._health_at = (now if late else self._health_at) + HEALTH_PERIOD
+            self.publish(HEALTH, self._health(now))
 
     def _guard(self, step: Callable[[], None]) -> None:
         """No input stops a service: what a step raises is counted and logged with its traceback."""
@@ -183,10 +185,11 @@ class Loop:
         config = json.dumps(self.service.settings.effective())
         return ConfigReply(service=self.service.name, config=config, versions=versions())
 
-    def _health(self) -> Health:
+    def _health(self, now: float) -> Health:
         inbox, total = self.inbox, Counter[str]()
-        total.update(inbox.received)
+        total.update(dict(inbox.received))  # a copy: zenoh's threads go on counting
         total.update(self.published)
+        elapsed, self._counted_at = max(now - self._counted_at, 1e-3), now
         rows = [
             TopicHealth(
                 key=key[:200],
@@ -194,7 +197,7 @@ class Loop:
                 published=self.published[key],
                 dropped=inbox.dropped[key],
                 undecodable=self.undecodable[key] + inbox.oversized[key],
-                rate=max(0, total[key] - self._before[key]) / HEALTH_PERIOD,
+                rate=max(0, total[key] - self._before[key]) / elapsed,
             )
             for key in sorted(total)[:200]
         ]
@@ -203,28 +206,43 @@ class Loop:
         return Health(
             stamp_ns=time.time_ns(),
             service=self.service.name,
-            uptime=time.monotonic() - self._began,
+            uptime=now - self._began,
             topics=rows,
             counters=counters,
             note=self.service.note,
         )
 
 
+class _Ending:
+    """Signal handler from the first moment on: a signal that comes before the loop ends it as it begins."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self.loop: Loop | None = None
+
+    def __call__(self, _signal: int, _frame: FrameType | None) -> None:
+        self.asked = True
+        if self.loop is not None:
+            self.loop.stop()
+
+    def run(self, loop: Loop) -> None:
+        self.loop = loop
+        if self.asked:
+            loop.stop()
+        loop.run()
+
+
 def main(settings_class: type[S], make: Callable[[S], Service], argv: list[str] | None = None) -> None:
     """Run a service as a process; ends it with status 0, or 2 and one line where the user can mend something."""
+    ending = _Ending()
+    signal.signal(signal.SIGTERM, ending)
+    signal.signal(signal.SIGINT, ending)
     try:
         settings = load_settings(settings_class, argv)
         set_up_logging(settings.log_level, as_json=settings.log_json)
         service = make(settings)
         with open_bus(settings.link()) as bus:
-            loop = Loop(service, bus, Inbox())
-
-            def stop(_signal: int, _frame: FrameType | None) -> None:
-                loop.stop()
-
-            signal.signal(signal.SIGTERM, stop)
-            signal.signal(signal.SIGINT, stop)
-            loop.run()
+            ending.run(Loop(service, bus, Inbox()))
         service.log.info("ended")
     except UserError as error:
         sys.exit(_fail(settings_class.service, error))

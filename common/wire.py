@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 ENCODING = "application/msgpack"
+FROM_WIRE: dict[str, bool] = {"wire": True}  # validation context of a payload: arrays are binary there, never lists
 
 
 class DecodeError(ValueError):
@@ -39,7 +40,7 @@ class Binary:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Bytes or anything numpy reads goes in, a read-only array comes out, bytes go on the wire."""
-        return core_schema.no_info_plain_validator_function(
+        return core_schema.with_info_plain_validator_function(
             self.validate,
             serialization=core_schema.plain_serializer_function_ser_schema(lambda array: array.tobytes()),
         )
@@ -48,17 +49,17 @@ class Binary:
         """MessagePack's bin type has no JSON twin; the x- keys say how to read it."""
         return {"type": "string", "contentEncoding": "binary", "x-dtype": self.dtype, "x-shape": ["N", *self.row]}
 
-    def validate(self, value: Any) -> npt.NDArray[Any]:
+    def validate(self, value: Any, info: core_schema.ValidationInfo) -> npt.NDArray[Any]:
         """The array, shape (N, *row); raises ValueError where length, type or numbers are wrong."""
         dtype = np.dtype(self.dtype)
         if isinstance(value, bytes):
             if len(value) % (dtype.itemsize * int(np.prod(self.row))):
                 raise ValueError(f"{len(value)} bytes are no whole number of rows {self.row} of {self.dtype}")
             array = np.frombuffer(value, dtype)
-        elif isinstance(value, np.ndarray | list | tuple):
+        elif isinstance(value, np.ndarray | list | tuple) and info.context is not FROM_WIRE:
             array = np.array(value, dtype, order="C")
         else:
-            raise ValueError(f"binary data of {self.dtype} expected, not {type(value).__name__}")  # noqa: TRY004
+            raise ValueError(f"binary data of {self.dtype} expected, not {type(value).__name__}")
         array = array.reshape(-1, *self.row)
         bad = np.isnan(array) if self.values == "ranges" else ~np.isfinite(array)
         if bad.any():
@@ -93,7 +94,7 @@ class Message(BaseModel):
     def decode(cls, payload: bytes) -> Self:
         """The message in ``payload``; raises DecodeError and nothing else, whatever the bytes are."""
         try:
-            return cls.model_validate(msgpack.unpackb(payload))
+            return cls.model_validate(msgpack.unpackb(payload), context=FROM_WIRE)
         except ValidationError as error:
             first = error.errors(include_url=False, include_context=False, include_input=False)[0]
             field = ".".join(map(str, first["loc"])) or "payload"
