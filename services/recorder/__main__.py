@@ -1,0 +1,22 @@
+"""`python -m services.recorder`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from common.service import main
+from services.recorder.settings import RecorderSettings
+
+if TYPE_CHECKING:
+    from common.service import Service
+
+
+def make(settings: RecorderSettings) -> Service:
+    """Imports mcap here, so that --help answers at once."""
+    from services.recorder.service import RecorderService  # noqa: PLC0415
+
+    return RecorderService(settings)
+
+
+if __name__ == "__main__":
+    main(RecorderSettings, make)

@@ -1,0 +1,28 @@
+"""What the recorder can be told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from common.config import ServiceSettings
+
+
+class RecorderSettings(ServiceSettings):
+    """Recorder: every message of the session, bytes as sent, into an MCAP file.
+
+    examples:
+      python -m services.recorder                                    into recordings/
+      python -m services.recorder --directory logs --file run.mcap
+      python -m services.recorder --topics scan,odom --compression none
+    """
+
+    service: ClassVar[str] = "recorder"
+
+    directory: Annotated[Path, Field(description="folder, made where it is missing")] = Path("recordings")
+    file: Annotated[str, Field(pattern=r"^[^/]*$", description="name; none: presage-ROBOT-TIME.mcap, UTC")] = ""
+    topics: Annotated[str, Field(description="comma-separated topic names; empty: all that the table marks")] = ""
+    compression: Annotated[Literal["zstd", "lz4", "none"], Field(description="zstd, lz4 or none")] = "zstd"
+    chunk_size: Annotated[int, Field(ge=1024, le=1 << 30, description="bytes; only whole chunks survive a crash")] = 1 << 18
