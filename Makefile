@@ -1,0 +1,66 @@
+# `make` lists what there is. Needs GNU make, a POSIX shell and Python >= 3.10; everything else goes into .venv.
+
+PYTHON ?=
+WHEEL_INDEX ?=
+ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
+
+.PHONY: help install demo test check bench clean
+.DELETE_ON_ERROR:
+
+help: ## this list
+	@echo 'make TARGET [PYTHON=python3.11] [WHEEL_INDEX=URL] [ARGS="..."]'
+	@sed -n 's/^\([a-z]*\):[^#]*## /  \1	/p' $(firstword $(MAKEFILE_LIST)) | expand -t 12
+	@echo 'PyTorch without gigabytes of CUDA: make install WHEEL_INDEX=https://download.pytorch.org/whl/cpu'
+
+install: $(STAMP) ## make .venv with everything in it; does nothing where nothing changed
+
+# The stamp is written last, so an install that was interrupted is done again.
+$(STAMP): pyproject.toml constraints.txt
+	@rm -f $@
+	@$(find_venv)
+	$(PIP) --upgrade 'pip>=24'
+	$(PIP) $(if $(WHEEL_INDEX),--extra-index-url '$(WHEEL_INDEX)') -c constraints.txt -e '.[dev]'
+	@touch $@
+
+# A name on the path may be a stub that fails (pyenv), and Debian ships Python without venv: each is tried, not believed.
+# PyBullet has wheels for 3.10 and 3.11 alone, so these come first.
+define find_venv
+if $(BIN)/python -m pip --version >/dev/null 2>&1; then exit 0; fi; \
+if test -n '$(PYTHON)'; then names='$(PYTHON)'; else names='python3.11 python3.10 python3 python3.12 python3.13 python'; fi; \
+for name in $$names; do \
+  $$name -c 'import sys; sys.exit(sys.version_info < (3, 10))' >/dev/null 2>&1 || continue; \
+  $$name -c 'import sys; sys.exit(sys.version_info >= (3, 12))' \
+    || echo "make: PyBullet has no wheel for this Python and is compiled: minutes, and it needs a C++ compiler"; \
+  echo "make: $(VENV) from $$name ($$($$name --version 2>&1))"; \
+  rm -rf $(VENV); \
+  if $$name -m venv $(VENV); then exit 0; fi; \
+  rm -rf $(VENV); \
+  echo "make: $$name cannot make a virtual environment; on Debian and Ubuntu: apt-get install $${name##*/}-venv"; \
+done; \
+echo "make: no working Python >= 3.10 among: $$names." >&2; \
+echo "make: install Python 3.11 (Debian: apt-get install python3.11 python3.11-venv) or name one: make install PYTHON=/path/to/python3.11" >&2; \
+exit 1
+endef
+
+demo: install ## localise and drive in the corridor: every service, a recording, a picture
+	$(BIN)/presage demo $(ARGS)
+
+test: install ## all tests, the fast ones first
+	$(BIN)/python -m pytest $(ARGS)
+
+check: install ## style, format and types
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+bench: install ## latency from scan to command beside the raw zenoh round trip
+	$(BIN)/presage bench latency $(ARGS)
+
+clean: ## remove .venv and what tools leave behind; recordings stay
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist
+	find common services presage tests -name __pycache__ -type d -prune -exec rm -rf {} +
