@@ -20,11 +20,11 @@ State = Literal["localising", "tracking", "lost"]
 class Descent:
     """The paper's parameters. Sigma_o = 1 m² on every beam, as there."""
 
-    alpha: float = 5e-4  # m², step size
+    alpha: float = 2e-4  # m², step size; above about 4e-4 the descent oscillates near walls (alpha times curvature > 2)
     beta: float = 0.0  # weight of the goal's attraction in perception; 0 leaves the goal to the controller
-    iterations: int = 1  # gradient steps a scan
+    iterations: int = 10  # gradient steps a scan; the paper makes 1, but its robot stands between two steps
     max_step: float = 0.5  # m, a longer step of one scan is shortened
-    settled_step: float = 0.05  # m, mean step below which the belief counts as settled
+    settled_step: float = 0.03  # m, mean step below which the belief counts as settled
     settled_misfit: float = 2.0  # times the model's own error on test scans
     window: int = 10  # scans over which step and misfit are averaged
 

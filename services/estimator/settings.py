@@ -29,8 +29,8 @@ class EstimatorSettings(ServiceSettings):
     initial_pose: Annotated[
         str, Field(pattern=r"^$|^-?[\d.]+,-?[\d.]+(,-?[\d.]+)?$", description="x,y[,yaw_deg]; none: the map's centre")
     ] = ""
-    alpha: Annotated[float, Field(gt=0, lt=1, description="step size of perception, m²")] = 5e-4
+    alpha: Annotated[float, Field(gt=0, lt=1, description="step size of perception, m²")] = 2e-4
     beta: Annotated[
         float, Field(ge=0, lt=10, description="the goal's attraction in perception (eq. 3); 0: the belief is unbiased")
     ] = 0.0
-    iterations: Annotated[int, Field(ge=1, le=1000, description="gradient steps a scan")] = 1
+    iterations: Annotated[int, Field(ge=1, le=1000, description="gradient steps a scan; the paper: 1")] = 10
