@@ -5,50 +5,102 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import shapely
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle as Disc
 from matplotlib.patches import Polygon as Patch
+from matplotlib.ticker import FuncFormatter
 
 from common import safety
-from common.messages import Prediction, Scan
-from common.robot import Robot
+from common.errors import UserError
+from common.messages import Goal, Prediction, Scan
 from common.se2 import Array, compose
 from common.world import World
-from presage.session import Session, load_session
+from presage.session import Session, load_session, summary_of
 
 # Okabe and Ito: told apart by the colour-blind.
 TRUTH, BELIEF, MEASURED, GOAL = "#000000", "#D55E00", "#0072B2", "#009E73"
-WALL, GRID = "#555555", {"alpha": 0.25, "linewidth": 0.6}
+WALL, FURNITURE, INK = "#8C8C8C", "#C8C8C8", "#555555"
+WALL_THICKNESS = 0.12  # m, as drawn
+SMALLEST = 1e-3  # m, the least error a logarithmic axis shows
 
 
-def draw_session(path: Path, png: Path, title: str | None = None) -> None:
-    """Draw the recording at ``path`` into ``png``; what is missing is said in its panel."""
+def draw_session(path: Path, png: Path, *, title: str | None = None) -> None:
+    """Draw the recording at ``path`` into ``png``; what is missing is said in its panel. UserError if not writable."""
     session = load_session(path)
-    figure = Figure(figsize=(12, 8.2), layout="constrained")
+    figure = figure_of(session, title if title is not None else path.stem)
+    try:
+        figure.savefig(png, dpi=150)
+    except OSError as error:
+        raise UserError(f"{png}: cannot be written ({error.strerror}); choose another place for the figure") from None
+
+
+def figure_of(session: Session, title: str) -> Figure:
+    """The figure, 12 inches wide; its height follows the world's shape."""
+    map_height = 4.0
+    if session.world is not None:
+        x0, y0, x1, y1 = session.world.bounds
+        map_height = float(np.clip(11.2 * (y1 - y0) / (x1 - x0), 2.5, 6.0)) + 0.7
+    figure = Figure(figsize=(12, map_height + 4.4), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(title or f"{session.world.name if session.world else 'session'}: {path.stem}", fontsize=11)
-    grid = figure.add_gridspec(2, 3, height_ratios=(1.0, 0.95))
+    figure.get_layout_engine().set(w_pad=0.08, h_pad=0.08)  # type: ignore[union-attr, call-arg]
+    figure.suptitle(f"{title}\n", fontsize=13, fontweight="bold")
+    figure.text(0.5, 0.985 - 0.36 / (map_height + 4.4), _headline(session), ha="center", va="center", color=INK)
+    grid = figure.add_gridspec(2, 3, height_ratios=(map_height, 3.4))
     _draw_map(figure.add_subplot(grid[0, :]), session)
     _draw_scan(figure.add_subplot(grid[1, 0]), session)
     _draw_free_energy(figure.add_subplot(grid[1, 1]), session)
     _draw_errors(figure.add_subplot(grid[1, 2]), session)
-    figure.savefig(png, dpi=150)
+    return figure
+
+
+def _headline(session: Session) -> str:
+    """The session in one line."""
+    summary = summary_of(session)
+    parts = [f"world {summary.world}" if summary.world else "world unknown"]
+    if session.beliefs:
+        estimator = f" by preset {session.beliefs[-1].estimator}" if session.beliefs[-1].estimator else ""
+        parts.append(
+            f"localised after {summary.localised_after_scans} scans{estimator}"
+            if summary.localised_after_scans is not None
+            else f"not localised{estimator}"
+        )
+    if summary.position_error_m is not None:
+        parts.append(f"position error at the end {summary.position_error_m:.2f} m")
+    if summary.goal_reached is not None:
+        away = f", {summary.goal_distance_m:.2f} m away" if summary.goal_distance_m is not None else ""
+        parts.append(("goal reached" if summary.goal_reached else "goal not reached") + away)
+    return "  ·  ".join(parts if summary.complete else [*parts, "recording incomplete"])
 
 
 def _missing(axes: Axes, what: str) -> None:
-    axes.text(0.5, 0.5, f"no {what} in this recording", ha="center", va="center", transform=axes.transAxes, color=WALL)
+    axes.text(0.5, 0.5, f"no {what} in this recording", ha="center", va="center", transform=axes.transAxes, color=INK)
     axes.set(xticks=[], yticks=[])
+    axes.spines[:].set_color("#DDDDDD")
+
+
+def _dress(axes: Axes, letter: str, title: str) -> None:
+    """What every panel has."""
+    axes.set_title(f"{letter}  {title}", fontsize=10.5, loc="left")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(visible=True, which="major", color="#DDDDDD", linewidth=0.6)
+    axes.set_axisbelow(True)
 
 
 def _draw_world(axes: Axes, world: World) -> None:
-    axes.add_patch(Patch(world.boundary, closed=True, facecolor="white", edgecolor=WALL, linewidth=2.5, zorder=0))
+    outside = shapely.Polygon(world.boundary).buffer(WALL_THICKNESS, join_style="mitre")
+    axes.add_patch(Patch(shapely.get_coordinates(outside.exterior), facecolor=WALL, edgecolor="none", zorder=0.1))
+    axes.add_patch(Patch(world.boundary, closed=True, facecolor="white", edgecolor="none", zorder=0.2))
     for obstacle in world.obstacles:
+        style = {"facecolor": FURNITURE, "edgecolor": WALL, "linewidth": 0.8, "zorder": 1.0}
         if obstacle.circle is not None:
-            axes.add_patch(Disc(obstacle.circle.center, obstacle.circle.radius, facecolor="#BBBBBB", edgecolor=WALL))
+            axes.add_patch(Disc(obstacle.circle.center, obstacle.circle.radius, **style))
         elif (ring := obstacle.ring()) is not None:
-            axes.add_patch(Patch(ring, closed=True, facecolor="#BBBBBB", edgecolor=WALL))
+            axes.add_patch(Patch(ring, closed=True, **style))
+    x0, y0, x1, y1 = world.bounds
+    axes.set(xlim=(x0 - 0.3, x1 + 0.3), ylim=(y0 - 0.3, y1 + 0.3))
 
 
 def _draw_map(axes: Axes, session: Session) -> None:
@@ -58,26 +110,45 @@ def _draw_map(axes: Axes, session: Session) -> None:
         return
     if session.world is not None:
         _draw_world(axes, session.world)
-        x0, y0, x1, y1 = session.world.bounds
-        axes.set(xlim=(x0 - 0.3, x1 + 0.3), ylim=(y0 - 0.3, y1 + 0.3))
     if session.scans and len(true):
         points = _scan_in_map(session.scans[-1], true[-1])
-        axes.plot(*points.T, ".", color=MEASURED, markersize=2.5, label="last scan")
-    if len(believed):
-        axes.plot(believed[:, 0], believed[:, 1], "-", color=BELIEF, linewidth=1.3, label="believed path")
-        axes.plot(*believed[0, :2], "s", color=BELIEF, markersize=6, label="first belief")
-    if len(true):
-        axes.plot(true[:, 0], true[:, 1], "--", color=TRUTH, linewidth=1.5, label="true path")
-        axes.plot(*true[0, :2], "o", color=TRUTH, markersize=6, label="true start")
-        x, y, yaw = true[-1]
-        axes.add_patch(Disc((x, y), Robot().radius, facecolor="none", edgecolor=TRUTH, linewidth=1.2))
-        axes.plot([x, x + Robot().radius * np.cos(yaw)], [y, y + Robot().radius * np.sin(yaw)], color=TRUTH)
+        axes.plot(*points.T, ".", color=MEASURED, markersize=2, label="last scan", zorder=2)
     if goal is not None:
-        axes.plot(goal.pose.x, goal.pose.y, "*", color=GOAL, markersize=14, label="goal", zorder=5)
-        axes.add_patch(Disc((goal.pose.x, goal.pose.y), goal.tolerance, facecolor="none", edgecolor=GOAL))
+        _draw_goal(axes, goal)
+    if len(believed):
+        axes.plot(believed[:, 0], believed[:, 1], "-", color=BELIEF, linewidth=1.5, label="believed path", zorder=4)
+        axes.plot(*believed[0, :2], "s", color=BELIEF, markersize=6, label="first belief", zorder=4)
+        axes.plot(*believed[-1, :2], "x", color=BELIEF, markersize=7, mew=1.8, label="last belief", zorder=6)
+    if len(true):
+        _draw_ties(axes, session)
+        axes.plot(true[:, 0], true[:, 1], "--", color=TRUTH, linewidth=1.5, label="true path", zorder=5)
+        axes.plot(*true[0, :2], "o", color=TRUTH, markersize=6, label="true start", zorder=5)
+        (x, y, yaw), radius = true[-1], session.base.radius
+        axes.add_patch(Disc((x, y), radius, facecolor="#00000014", edgecolor=TRUTH, linewidth=1.2, zorder=5))
+        axes.plot([x, x + radius * np.cos(yaw)], [y, y + radius * np.sin(yaw)], color=TRUTH, linewidth=1.2, zorder=5)
+    _dress(axes, "a", "map")
+    axes.grid(visible=False)
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
-    axes.grid(**GRID)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=7, fontsize=8, frameon=False)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=9, fontsize=8.5, frameon=False)
+
+
+def _draw_goal(axes: Axes, goal: Goal) -> None:
+    where = (goal.pose.x, goal.pose.y)
+    axes.add_patch(Disc(where, goal.tolerance, facecolor=GOAL + "30", edgecolor=GOAL, linewidth=1, zorder=3))
+    axes.plot(*where, "*", color=GOAL, markersize=11, label="goal and tolerance", zorder=6)
+
+
+def _draw_ties(axes: Axes, session: Session) -> None:
+    """Truth to belief of the same moment, once a second: paths that lie on each other may be apart in time."""
+    due, label = -np.inf, "same moment, each second"
+    for belief, truth in zip(session.beliefs, session.true_of, strict=True):
+        if truth is not None and belief.stamp_ns * 1e-9 >= due - 1e-6:
+            due = belief.stamp_ns * 1e-9 + 1.0
+            ends = np.array([belief.pose.array(), truth.pose.array()])
+            axes.plot(ends[:, 0], ends[:, 1], color=INK, linewidth=0.9, alpha=0.6, label=label, zorder=3.5)
+            axes.plot(*ends[1, :2], ".", color=TRUTH, markersize=5, zorder=5)
+            axes.plot(*ends[0, :2], ".", color=BELIEF, markersize=5, zorder=4)
+            label = ""
 
 
 def _scan_in_map(scan: Scan, pose: Array) -> Array:
@@ -93,16 +164,18 @@ def _draw_scan(axes: Axes, session: Session) -> None:
         _missing(axes, "predicted scan")
         return
     scan, prediction = pairs[-1]
-    angles = np.rad2deg(scan.angles())
-    expected = np.array(prediction.ranges, float)
-    axes.plot(angles, np.where(np.isfinite(scan.ranges), scan.ranges, np.nan), color=MEASURED, lw=1.4, label="measured")
-    axes.plot(angles[: len(expected)], expected, color=BELIEF, lw=1.1, label="predicted")
-    if len(prediction.sigma):
-        axes.fill_between(angles, expected - 2 * prediction.sigma, expected + 2 * prediction.sigma, color=BELIEF, alpha=0.2)
+    expected = np.where(np.isfinite(prediction.ranges), prediction.ranges, np.nan).astype(np.float64)
+    measured = np.where(np.isfinite(scan.ranges), scan.ranges, np.nan)
+    angles = np.rad2deg(prediction.angle_min + prediction.angle_increment * np.arange(len(expected)))
+    axes.plot(np.rad2deg(scan.angles()), measured, color=MEASURED, lw=1.4, label="measured")
+    axes.plot(angles, expected, color=BELIEF, lw=1.2, label="predicted")
+    if len(prediction.sigma) == len(expected):
+        low, high = expected - 2 * prediction.sigma, expected + 2 * prediction.sigma
+        axes.fill_between(angles, low, high, color=BELIEF, alpha=0.2, lw=0, label="± 2σ")
+    _dress(axes, "b", f"scan and prediction at {scan.stamp_ns * 1e-9:.1f} s")
     axes.set(xlabel="beam angle (deg)", ylabel="range (m)", ylim=(0, None))
-    axes.set_title(f"scan at {scan.stamp_ns * 1e-9:.1f} s", fontsize=10)
-    axes.grid(**GRID)
-    axes.legend(fontsize=8, frameon=False)
+    axes.set_xticks([t for t in range(-180, 181, 45) if angles.min() - 5 <= t <= angles.max() + 5])
+    axes.legend(fontsize=8.5, frameon=False)
 
 
 def _draw_free_energy(axes: Axes, session: Session) -> None:
@@ -110,22 +183,20 @@ def _draw_free_energy(axes: Axes, session: Session) -> None:
         _missing(axes, "belief")
         return
     time = np.array([b.stamp_ns for b in session.beliefs]) * 1e-9
-    values = {
-        "F": np.array([b.free_energy for b in session.beliefs]),
-        "accuracy": np.array([b.accuracy for b in session.beliefs]),
-        "complexity": np.array([b.complexity for b in session.beliefs]),
-    }
-    if values["complexity"].any():
-        axes.plot(time, values["accuracy"], color=MEASURED, lw=1, label="accuracy")
-        axes.plot(time, values["complexity"], color=GOAL, lw=1, label="complexity")
-    axes.plot(time, values["F"], color=BELIEF, lw=1.3, label="free energy F")
-    low, high = float(values["F"].min()), float(values["F"].max())
-    if low > 0 and high > 20 * low:
+    total, accuracy, complexity = np.array([(b.free_energy, b.accuracy, b.complexity) for b in session.beliefs]).T
+    shown = [total]
+    if complexity.any():
+        shown = [total, accuracy, complexity]
+        axes.plot(time, accuracy, color=MEASURED, lw=1.1, label="accuracy, −ln p(o|x)")
+        axes.plot(time, complexity, color=GOAL, lw=1.1, label="complexity")
+    axes.plot(time, total, color=BELIEF, lw=1.5, label="free energy F")
+    low, high = min(map(np.min, shown)), max(map(np.max, shown))
+    if low > 0 and high > 30 * low:
         axes.set_yscale("log")
-    axes.set(xlabel="time (s)", ylabel="free energy (nats)")
-    axes.set_title("free energy", fontsize=10)
-    axes.grid(**GRID)
-    axes.legend(fontsize=8, frameon=False)
+    _mark_moments(axes, session)
+    _dress(axes, "c", "free energy")
+    axes.set(xlabel="time (s)", ylabel="F (nats)")
+    axes.legend(fontsize=8.5, frameon=False)
 
 
 def _draw_errors(axes: Axes, session: Session) -> None:
@@ -136,15 +207,25 @@ def _draw_errors(axes: Axes, session: Session) -> None:
         _missing(axes, "truth beside beliefs")
         return
     time = np.array([b.stamp_ns for b in session.beliefs]) * 1e-9
-    axes.semilogy(time[known], np.maximum(errors[known], 1e-4), color=BELIEF, lw=1.2, label="position error")
+    axes.semilogy(time[known], np.maximum(errors[known], SMALLEST), color=BELIEF, lw=1.4, label="position error")
     if goal is not None:
-        since = np.array([t.stamp_ns for t in session.truths]) * 1e-9
+        since = np.array([t.stamp_ns for t in session.truths])
         away = np.hypot(*(session.true_path() - goal.pose.array())[:, :2].T)
-        asked = since >= goal.stamp_ns * 1e-9
-        axes.semilogy(since[asked], away[asked], color=GOAL, lw=1.4, label="distance to goal")
-    if (first := next((b for b in session.beliefs if b.state == "tracking"), None)) is not None:
-        axes.axvline(first.stamp_ns * 1e-9, color=WALL, lw=0.8, ls=":", label="localised")
-    axes.set(xlabel="time (s)", ylabel="m")
-    axes.set_title("position error and distance to goal", fontsize=10)
-    axes.grid(which="both", **GRID)
-    axes.legend(fontsize=8, frameon=False)
+        asked = since >= session.goal_times_ns[-1]
+        shown = np.maximum(away[asked], SMALLEST)
+        axes.semilogy(since[asked] * 1e-9, shown, color=GOAL, lw=1.4, label="distance to goal")
+    _mark_moments(axes, session)
+    _dress(axes, "d", "position error and distance to goal")
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.grid(visible=True, which="minor", color="#EEEEEE", linewidth=0.4)
+    axes.set(xlabel="time (s)", ylabel="distance (m)")
+    axes.legend(fontsize=8.5, frameon=False)
+
+
+def _mark_moments(axes: Axes, session: Session) -> None:
+    """When the belief claimed to know the place, and when the goal was reached."""
+    first, reached = session.localised(), session.reached_ns()
+    if first is not None:
+        axes.axvline(session.beliefs[first].stamp_ns * 1e-9, color=INK, lw=0.9, ls=":", label="localised")
+    if reached is not None:
+        axes.axvline(reached * 1e-9, color=GOAL, lw=0.9, ls=":", label="goal reached")

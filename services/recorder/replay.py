@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections import Counter
@@ -17,7 +18,7 @@ LISTENERS_WITHIN = 2.0  # s; a put before a subscriber is known is lost
 
 
 def schedule(messages: Iterable[Raw], rate: float) -> Iterator[tuple[float, Raw]]:
-    """Each message with the seconds after the first at which it is due; ``rate`` 0 is as fast as it goes."""
+    """Each message with the seconds after the first at which it is due; ``rate`` 0 or inf is as fast as it goes."""
     first: int | None = None
     for raw in messages:
         first = raw.logged_ns if first is None else first
@@ -28,8 +29,8 @@ def select(messages: list[Raw], only: set[str] | None) -> list[Raw]:
     """Messages of the topics named, or of all but health, a live service's pulse; UserError for an unknown name."""
     names = {raw.key: topic.name for raw in messages if (topic := topic_of(raw.key)) is not None}
     if only is not None and (unknown := only - set(names.values())):
-        there = ", ".join(sorted(set(names.values()))) or "none"
-        raise UserError(f"the recording has no {', '.join(sorted(unknown))}; it has: {there}")
+        there = ", ".join(sorted(set(names.values()))) or "nothing"
+        raise UserError(f"the recording has no {', '.join(sorted(unknown))}; it has {there}")
     wanted = only if only is not None else set(names.values()) - {HEALTH.name}
     return [raw for raw in messages if names.get(raw.key) in wanted]
 
@@ -45,21 +46,23 @@ def replay(
 ) -> Counter[str]:
     """Publish the recording; counts by key. Waits shortly for somebody to listen. ``on_progress`` gets 0 to 1."""
     stop = stop or threading.Event()
-    chosen = select(read_recording(path).raw, only)
+    recording = read_recording(path)
+    if recording.warning:
+        print(f"warning: {recording.warning}", file=sys.stderr)
+    chosen = select(recording.raw, only)
     counts: Counter[str] = Counter()
     with open_bus(link) as bus:
+        topics = {
+            key: topic for key in dict.fromkeys(raw.key for raw in chosen) if (topic := topic_of(key)) is not None
+        }
         deadline = time.monotonic() + LISTENERS_WITHIN
-        for key in dict.fromkeys(raw.key for raw in chosen):
-            topic = topic_of(key)
-            if topic is not None:
-                bus.wait_matching(topic, max(0.0, deadline - time.monotonic()), key=key)
+        for key, topic in topics.items():
+            bus.wait_matching(topic, max(0.0, deadline - time.monotonic()), key=key)
         began = time.monotonic()
         for number, (due, raw) in enumerate(schedule(chosen, rate)):
             if stop.wait(max(0.0, began + due - time.monotonic())):
                 break
-            topic = topic_of(raw.key)
-            if topic is not None:
-                bus.put(topic, raw.payload, key=raw.key)
-                counts[raw.key] += 1
+            bus.put(topics[raw.key], raw.payload, key=raw.key)
+            counts[raw.key] += 1
             on_progress((number + 1) / len(chosen))
     return counts

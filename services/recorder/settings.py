@@ -13,10 +13,13 @@ from common.config import ServiceSettings
 class RecorderSettings(ServiceSettings):
     """Recorder: every message of the session, bytes as sent, into an MCAP file.
 
-    examples:
+    The file is NAME.mcap.active until it is complete.
+
+    Examples:
       python -m services.recorder                                    into recordings/
       python -m services.recorder --directory logs --file run.mcap
       python -m services.recorder --topics scan,odom --compression none
+
     """
 
     service: ClassVar[str] = "recorder"
@@ -25,4 +28,7 @@ class RecorderSettings(ServiceSettings):
     file: Annotated[str, Field(pattern=r"^[^/]*$", description="name; none: presage-ROBOT-TIME.mcap, UTC")] = ""
     topics: Annotated[str, Field(description="comma-separated topic names; empty: all that the table marks")] = ""
     compression: Annotated[Literal["zstd", "lz4", "none"], Field(description="zstd, lz4 or none")] = "zstd"
-    chunk_size: Annotated[int, Field(ge=1024, le=1 << 30, description="bytes; only whole chunks survive a crash")] = 1 << 18
+    chunk_size: Annotated[int, Field(ge=1024, le=1 << 30, description="bytes; a crash loses at most one chunk")] = (
+        1 << 18
+    )
+    capacity: Annotated[int, Field(ge=1, le=10_000_000, description="messages that may wait to be written")] = 10_000

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
@@ -17,19 +18,22 @@ COMPRESSION = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none":
 
 
 class RecordingWriter:
-    """Writes NAME.mcap.active, which becomes NAME.mcap at `finish`."""
+    """Writes NAME.mcap.active, which becomes NAME.mcap at `finish`; every step raises UserError where it fails."""
 
     def __init__(self, path: Path, compression: str = "zstd", chunk_size: int = 1 << 18) -> None:
         """Open the file; raises UserError where that cannot be."""
         self.path, self.active = path, path.with_name(path.name + ".active")
         self.written: Counter[str] = Counter()  # by key
+        self.failed = False
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            if path.exists() or self.active.exists():
+            if path.exists():
                 raise UserError(f"{path}: there is already a recording of that name; choose another with --file")
-            self._stream = self.active.open("wb")
+            self._stream = self.active.open("xb")
+        except FileExistsError:
+            raise UserError(f"{self.active}: is there already; choose another name with --file, or a folder") from None
         except OSError as error:
             raise UserError(f"{path.parent}: cannot be written to ({error.strerror}); choose another folder") from None
         self._writer = Writer(self._stream, chunk_size=chunk_size, compression=COMPRESSION[compression])
@@ -46,22 +50,24 @@ class RecordingWriter:
     def declare(self, topic: Topic, key: str) -> int:
         """The channel of a key, with the JSON schema derived from its message; registered once."""
         if key not in self._channels:
-            message = topic.message
-            if message.__name__ not in self._schemas:
-                schema = json.dumps(message.json_schema()).encode()
-                self._schemas[message.__name__] = self._writer.register_schema(message.__name__, "jsonschema", schema)
-            meta = {"topic": topic.name, "robot": key.split("/")[1]}
-            schema_id = self._schemas[message.__name__]
-            self._channels[key] = self._writer.register_channel(key, "msgpack", schema_id, meta)
+            name = topic.message.__name__
+            if name not in self._schemas:
+                schema = json.dumps(topic.message.json_schema()).encode()
+                self._schemas[name] = self._writer.register_schema(name, "jsonschema", schema)
+            about = {"topic": topic.name, "robot": key.split("/")[1]}
+            self._channels[key] = self._writer.register_channel(key, "msgpack", self._schemas[name], about)
         return self._channels[key]
 
     def write(self, topic: Topic, key: str, payload: bytes, published_ns: int, received_ns: int) -> None:
-        """One payload, exactly as it came."""
+        """One payload, exactly as it came; times in ns of the wall clock."""
 
         def add() -> None:
-            channel = self.declare(topic, key)
             self._writer.add_message(
-                channel, log_time=received_ns, data=payload, publish_time=published_ns, sequence=self.written[key]
+                self.declare(topic, key),
+                log_time=received_ns,
+                data=payload,
+                publish_time=published_ns,
+                sequence=self.written[key] & 0xFFFFFFFF,
             )
 
         self._guarded(add)
@@ -69,28 +75,35 @@ class RecordingWriter:
 
     def flush(self) -> None:
         """Complete the chunk and hand it to the system: what came before survives this process."""
-
-        def out() -> None:
-            self._writer.flush()
-            self._stream.flush()
-
-        self._guarded(out)
+        self._guarded(self._writer.flush)
 
     def finish(self) -> Path:
-        """Complete the file and give it its name."""
+        """Complete the file and give it its name; after a failure only close it, unfinished."""
 
         def end() -> None:
-            self._writer.finish()
+            self._writer.finish()  # type: ignore[no-untyped-call]
             self._stream.close()
             self.active.rename(self.path)
 
+        if self.failed:
+            self._abandon()
+            return self.active
         self._guarded(end)
         return self.path
 
-    def _guarded(self, step: object) -> None:
+    def _guarded(self, step: Callable[[], None]) -> None:
         try:
-            step()  # type: ignore[operator]
+            step()
         except OSError as error:
+            self.failed = True
+            why = error.strerror or str(error)
             raise UserError(
-                f"{self.active}: recording failed ({error.strerror}); what was flushed before is in the file"
+                f"{self.active}: recording failed ({why}); what was flushed before is in the file: "
+                "make room, or choose another folder with --directory"
             ) from None
+
+    def _abandon(self) -> None:
+        try:
+            self._stream.close()
+        except OSError:
+            self._stream.raw.close()  # what is still in the buffer cannot be written
