@@ -57,6 +57,8 @@ class Inbox:
             self.received[key] += 1
             if size > (MAX_BYTES if isinstance(entry, Sample) else 64 * MAX_BYTES):
                 self.oversized[key] += 1
+                if isinstance(entry, Call):
+                    entry.refuse(f"{size} bytes are too many")
                 return
             self._serial += 1
             slot: object = full_key if newest_only else self._serial
