@@ -15,7 +15,7 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
 help: ## this list
 	@echo 'make TARGET [PYTHON=python3.11] [WHEEL_INDEX=URL] [ARGS="..."]'
 	@sed -n 's/^\([a-z]*\):[^#]*## /  \1	/p' $(firstword $(MAKEFILE_LIST)) | expand -t 12
-	@echo 'PyTorch without gigabytes of CUDA: make install WHEEL_INDEX=https://download.pytorch.org/whl/cpu'
+	@echo 'PyTorch without gigabytes of CUDA: WHEEL_INDEX is the URL of its index of CPU wheels (see pytorch.org)'
 
 install: $(STAMP) ## make .venv with everything in it; does nothing where nothing changed
 

@@ -28,7 +28,7 @@ bench_app = typer.Typer(
     help="Measure: speed and latency, as ratios against a peer in the same run.", no_args_is_help=True
 )
 app.add_typer(bench_app, name="bench")
-console = Console()
+console = Console(width=None if sys.stdout.isatty() else 150)
 
 Robot_ = Annotated[str, typer.Option(envvar="PRESAGE_ROBOT", help="Which robot.")]
 Connect = Annotated[str, typer.Option(envvar="PRESAGE_CONNECT", help="The session's zenoh endpoint(s).")]

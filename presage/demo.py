@@ -155,7 +155,7 @@ def show(summary: SessionSummary, recording: Path, figure: Path, console: Consol
 
 def demo_command(demo: Demo, json_file: Path | None, *, quiet: bool) -> int:
     """Everything; the exit status."""
-    console = Console(stderr=False)
+    console = Console(width=None if sys.stdout.isatty() else 150)
     with Stack("robot", demo.port, quiet=quiet) as stack:
         recording, reached = run_demo(demo, stack, console)
     figure = recording.with_suffix(".png")

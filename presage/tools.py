@@ -95,7 +95,7 @@ def list_topics(robot: str, console: Console) -> None:
     """The table."""
     table = Table(title="topics", title_justify="left")
     for column in ("key", "message", "Hz", "publisher", "receivers keep", "recorded", "about"):
-        table.add_column(column)
+        table.add_column(column, no_wrap=column == "key")
     for topic in TOPICS:
         table.add_row(
             topic.key(robot, "SERVICE"), topic.message.__name__, f"{topic.rate:g}" if topic.rate else "-",
@@ -104,7 +104,7 @@ def list_topics(robot: str, console: Console) -> None:
     console.print(table)
     table = Table(title="queryables", title_justify="left")
     for column in ("key", "request", "reply", "server", "about"):
-        table.add_column(column)
+        table.add_column(column, no_wrap=column == "key")
     for query in QUERIES:
         names = (query.request.__name__, query.reply.__name__)
         table.add_row(query.key(robot, "SERVICE"), *names, query.server, query.about)

@@ -75,6 +75,7 @@ def train(job: Job, link: Link, console: Console) -> Path:
         trainer, seconds = _fit(job, world, scanner, data, checkpoint, bar)
     _write(job, world, scanner, heading, data, trainer, seconds, path)
     checkpoint.finish()
+    _warn_if_nothing_learned(data, trainer, console)
     card = weights.load(path)[1]
     console.print(
         f"{path}: {path.stat().st_size / 1e6:.2f} MB; test error mean {card.test_l1_mean:.3f} m, "
@@ -164,6 +165,16 @@ def _fit(
 
     trainer.run(report)
     return trainer, time.monotonic() - began
+
+
+def _warn_if_nothing_learned(data: dict[str, Data], trainer: Trainer, console: Console) -> None:
+    """A network whose ReLUs have all died predicts one scan for everywhere."""
+    constant = float(np.abs(data["test"].ranges - np.median(data["train"].ranges, axis=0)).mean())
+    if trainer.progress.test_l1[-1] > 0.9 * constant:
+        console.print(
+            f"[bold red]nothing was learned[/]: one and the same scan for every place is as good ({constant:.3f} m). "
+            "Try another --seed, a smaller --learning-rate or more --epochs."
+        )
 
 
 def _write(
