@@ -1,0 +1,236 @@
+"""Motion through physics, safety where the wheels are, odometry, furniture, determinism."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.errors import UserError
+from common.messages import Twist
+from common.robot import Robot
+from common.scanner import SCANNERS
+from common.world import Obstacle, World, load_world
+from services.simulator.odometry import Drift
+from services.simulator.simulation import Setup, Simulation
+
+SCANNER = SCANNERS["tim571"].with_beams(271)
+HALL = World(name="hall", boundary=[(0, 0), (8, 0), (8, 6), (0, 6)])
+
+
+@pytest.fixture
+def make():
+    made = []
+
+    def build(world=HALL, start=(2.0, 3.0, 0.0), **rest) -> Simulation:
+        simulation = Simulation(Setup(world, SCANNER, start=start, **rest))
+        simulation.observe()
+        made.append(simulation)
+        return simulation
+
+    yield build
+    for simulation in made:
+        simulation.close()
+
+
+def drive(simulation, twist, seconds):
+    """Truths while a command is repeated at each scan."""
+    truths = []
+    for _ in range(int(seconds * 15)):
+        assert simulation.command(simulation.stamp_ns, twist)
+        simulation.advance()
+        truths.append(simulation.observe()[1])
+    return truths
+
+
+def speed(truth) -> float:
+    return float(np.hypot(truth.twist.vx, truth.twist.vy))
+
+
+def test_time_is_counted_in_scan_periods(make):
+    simulation = make()
+    stamps = []
+    for _ in range(4):
+        stamps.append(simulation.observe()[2].stamp_ns)
+        simulation.advance()
+    assert stamps == [0, 66_666_667, 133_333_334, 200_000_001]
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.2])
+def test_reaches_the_speed_asked_for_within_the_limits_of_acceleration(make, heading):
+    simulation = make(start=(2.0, 1.0, heading))
+    truths = drive(simulation, Twist(vx=0.6), 2)
+    assert speed(truths[-1]) == pytest.approx(0.6, abs=0.01)
+    assert abs(truths[-1].twist.vy) < 0.01
+    gains = np.diff([0.0] + [speed(t) for t in truths])
+    assert gains.max() <= Robot().acceleration / 15 * 1.05
+    moved = truths[-1].pose.array()[:2] - [2.0, 1.0]
+    assert np.arctan2(moved[1], moved[0]) == pytest.approx(heading, abs=0.01)
+
+
+def test_speed_and_turn_are_clipped(make):
+    simulation = make()
+    assert speed(drive(simulation, Twist(vx=1e300, vy=1e300), 1.6)[-1]) <= 1.01
+    turning = drive(make(), Twist(wz=50.0), 2)
+    assert turning[-1].twist.wz == pytest.approx(Robot().max_turn, abs=0.02)
+
+
+def test_holonomic_goes_sideways_and_differential_does_not(make):
+    assert drive(make(), Twist(vy=0.5), 1)[-1].pose.y > 3.2
+    differential = drive(make(robot=Robot(drive="differential")), Twist(vx=0.3, vy=0.5), 1)[-1]
+    assert differential.pose.y == pytest.approx(3.0, abs=1e-3)
+    assert differential.pose.x > 2.1
+
+
+def test_brakes_when_commands_end(make):
+    simulation = make(start=(1.0, 3.0, 0.0))
+    drive(simulation, Twist(vx=0.8), 1.5)
+    for _ in range(8):  # 0.53 s: the command is still good for 0.5 s of it
+        simulation.advance()
+        truth = simulation.observe()[1]
+    assert speed(truth) < 0.8
+    for _ in range(15):
+        simulation.advance()
+    assert speed(simulation.observe()[1]) < 1e-3
+
+
+def test_commands_too_old_or_from_the_future_are_refused(make):
+    simulation = make()
+    for _ in range(15):
+        simulation.advance()
+    now = simulation.stamp_ns
+    assert not simulation.command(now - 600_000_000, Twist(vx=1.0))
+    assert not simulation.command(now + 1, Twist(vx=1.0))
+    assert simulation.command(now - 400_000_000, Twist(vx=1.0))
+    fresh = make()
+    assert not fresh.command(1, Twist(vx=1.0))
+    fresh.advance()
+    assert speed(fresh.observe()[1]) < 1e-6
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0), (0.7, 0.7), (0.0, 1.0), (0.0, -1.0), (0.7, -0.7)])
+def test_the_obstacle_stop_prevents_contact_at_full_speed(make, direction):
+    """Every way the scanner looks; behind the robot (90 deg) it sees nothing, as on the real base."""
+    simulation = make(start=(3.0, 3.0, 0.0))
+    truths = drive(simulation, Twist(vx=direction[0], vy=direction[1]), 9)
+    assert max(map(speed, truths)) > 0.9
+    assert not any(t.contact for t in truths)
+    assert speed(truths[-1]) < 0.02
+    assert truths[-1].stopped
+    gap = float(HALL.clearance([truths[-1].pose.array()[:2]])[0]) - Robot().radius
+    assert 0.0 < gap < 0.2  # close, but not touching
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_contact_among_furniture_whatever_is_commanded(make, seed):
+    rng, world = np.random.default_rng(seed), load_world("office")
+    simulation = make(world, start=None, seed=seed)
+    contacts = 0
+    for _ in range(12):
+        forward = rng.uniform(-0.7, 0.7)  # mostly where it looks: forward and sideways
+        contacts += sum(t.contact for t in drive(simulation, Twist(vx=abs(forward), vy=rng.uniform(-0.7, 0.7)), 1.0))
+        simulation.command(simulation.stamp_ns, Twist(wz=2.0))
+        for _ in range(7):
+            simulation.advance()
+            contacts += simulation.observe()[1].contact
+    assert contacts == 0
+
+
+def test_moving_away_from_a_wall_is_allowed_from_anywhere(make):
+    simulation = make(start=(7.72, 3.0, 0.0))  # 1 cm from the wall ahead
+    assert drive(simulation, Twist(vx=0.5), 1)[-1].pose.x < 7.73
+    assert drive(simulation, Twist(vx=-0.5), 1)[-1].pose.x < 7.5
+
+
+def test_contacts_are_real_without_the_stop(make):
+    simulation = make(obstacle_stop=False)
+    truths = drive(simulation, Twist(vx=1.0), 8)
+    assert any(t.contact for t in truths)
+    assert truths[-1].pose.x + Robot().radius < 8.02  # it does not go through the wall
+    assert speed(truths[-1]) < 0.05
+
+
+def test_same_seed_same_bytes_other_seed_others(make):
+    def run(seed):
+        simulation, out = make(seed=seed), []
+        for number in range(20):
+            simulation.command(simulation.stamp_ns, Twist(vx=0.5, vy=0.1 * (number % 3), wz=0.4))
+            simulation.advance()
+            out += [message.encode() for message in simulation.observe()]
+        return out
+
+    assert run(3) == run(3)
+    assert run(3) != run(4)
+
+
+def test_odometry_without_drift_is_the_truth_and_with_it_drifts_as_it_says(make):
+    exact = make(start=(2.0, 3.0, 0.7), drift=Drift(0, 0, 0, 0))
+    drive(exact, Twist(vx=0.5, vy=0.2, wz=0.5), 3)
+    odom, truth, _ = exact.observe()
+    here = truth.pose.array() - [2.0, 3.0, 0.7]
+    turn = np.array([[np.cos(0.7), np.sin(0.7)], [-np.sin(0.7), np.cos(0.7)]])
+    assert odom.pose.array() == pytest.approx([*(turn @ here[:2]), here[2]], abs=1e-9)
+    assert not odom.covariance.any()
+
+    normalised = []
+    for seed in range(30):
+        drifting = make(seed=seed, start=(2.0, 3.0, 0.0))
+        drive(drifting, Twist(vx=0.5, wz=0.3), 2)
+        odom, truth, _ = drifting.observe()
+        error = odom.pose.array() - (truth.pose.array() - [2.0, 3.0, 0.0])
+        normalised.append(error @ np.linalg.solve(odom.covariance, error))
+    assert 1.8 < np.mean(normalised) < 4.5  # chi² of 3: 30 runs lie within 2.2 and 4.0 in 95 of 100 cases
+
+
+def test_teleport_is_unseen_by_odometry_and_refused_in_walls(make):
+    simulation = make()
+    before = simulation.observe()[0]
+    simulation.teleport(np.array([6.0, 2.0, 1.0]))
+    odom, truth, _ = simulation.observe()
+    assert odom.pose == before.pose
+    assert truth.pose.array() == pytest.approx([6.0, 2.0, 1.0])
+    for bad, why in (([7.9, 2, 0], "0.10 m from a wall"), ([9, 9, 0], "inside a wall or outside")):
+        with pytest.raises(UserError, match=why):
+            simulation.teleport(np.array(bad, float))
+    assert simulation.observe()[1].pose.array() == pytest.approx([6.0, 2.0, 1.0])
+
+
+def test_furniture_comes_moves_and_goes(make):
+    simulation = make()
+    box = Obstacle.model_validate({"box": {"center": (5, 3), "size": (1, 1)}})
+    further = Obstacle.model_validate({"circle": {"center": (6, 3), "radius": 0.5}})
+
+    def ahead():
+        return float(simulation.sample(np.array([[2.0, 3.0, 0.0]]), None, None)[0][135])
+
+    assert ahead() == pytest.approx(5.8, abs=1e-3)
+    simulation.change("add", "box", box)
+    assert ahead() == pytest.approx(2.3, abs=1e-3)
+    assert [o.name for o in simulation.world.obstacles] == ["box"]
+    simulation.change("move", "box", further)
+    assert ahead() == pytest.approx(3.3, abs=1e-3)
+    simulation.change("remove", "box", None)
+    assert ahead() == pytest.approx(5.8, abs=1e-3)
+    assert simulation.world.obstacles == []
+
+
+@pytest.mark.parametrize(
+    ("action", "name", "center", "why"),
+    [
+        ("add", "here", (2, 3), "on the robot"),
+        ("add", "out", (20, 3), "outside the world"),
+        ("add", "boundary", (5, 3), "name of its own"),
+        ("move", "nothing", (5, 3), "no obstacle 'nothing'"),
+        ("remove", "nothing", (5, 3), "no obstacle 'nothing'"),
+    ],
+)
+def test_furniture_that_cannot_be_is_refused(make, action, name, center, why):
+    shape = Obstacle.model_validate({"circle": {"center": center, "radius": 0.3}})
+    simulation = make()
+    with pytest.raises(UserError, match=why):
+        simulation.change(action, name, shape)
+    assert simulation.world.obstacles == []
+
+
+def test_a_start_in_a_wall_is_one_clear_line():
+    with pytest.raises(UserError, match=r"start \(0\.10, 3\.00\) is 0\.10 m from a wall of 'hall'"):
+        Simulation(Setup(HALL, SCANNER, start=(0.1, 3.0, 0.0)))
