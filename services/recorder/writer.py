@@ -29,11 +29,10 @@ class RecordingWriter:
         self._channels: dict[str, int] = {}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            if path.exists():
-                raise UserError(f"{path}: there is already a recording of that name; choose another with --file")
+            for taken in (path, self.active):
+                if taken.exists():
+                    raise UserError(f"{taken}: is there already; choose another name with --file, or another folder")
             self._stream = self.active.open("xb")
-        except FileExistsError:
-            raise UserError(f"{self.active}: is there already; choose another name with --file, or a folder") from None
         except OSError as error:
             raise UserError(f"{path.parent}: cannot be written to ({error.strerror}); choose another folder") from None
         self._writer = Writer(self._stream, chunk_size=chunk_size, compression=COMPRESSION[compression])

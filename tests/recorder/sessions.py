@@ -1,0 +1,119 @@
+"""A made-up session whose numbers can be worked out by hand, written with the project's own writer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from common import se2
+from common.messages import (
+    Belief,
+    Goal,
+    Health,
+    Pose,
+    Prediction,
+    Scan,
+    Stamped,
+    Status,
+    TopicHealth,
+    Truth,
+    Twist,
+    WorldReply,
+)
+from common.robot import Robot
+from common.scanner import SCANNERS
+from common.topics import BELIEF, GOAL, HEALTH, PREDICTION, SCAN, STATUS, TRUTH, Topic
+from common.world import Box, Circle, Obstacle, Start, World
+from services.recorder.service import write_world
+from services.recorder.writer import RecordingWriter
+
+WORLD = World(
+    name="hall",
+    boundary=[(0, 0), (10, 0), (10, 5), (0, 5)],
+    obstacles=[
+        Obstacle(box=Box(center=(3, 4), size=(1, 0.5), yaw_deg=20)),
+        Obstacle(circle=Circle(center=(6, 4), radius=0.5)),
+        Obstacle(polygon=[(8, 4), (9, 4), (8.5, 4.8)]),
+    ],
+    start=Start(x=1, y=1),
+)
+SCANNER = SCANNERS["tim571"].with_beams(91)
+PERIOD_NS = 100_000_000
+BEGAN_NS = 1_700_000_000_000_000_000
+SCANS = 100
+LOCALISED = 20  # index of the first belief in state tracking
+MOVED = 30  # index of the scan after which the goal comes and the robot leaves
+SPEED = 0.1  # m a scan
+GOAL_MESSAGE = Goal(stamp_ns=0, pose=Pose(x=8, y=1), tolerance=0.15)  # as `presage goal` sends it, without a stamp
+
+
+def true_x(i: int) -> float:
+    """m; stands at 1 until `MOVED`, then drives along y = 1."""
+    return 1.0 + SPEED * max(0, i - MOVED)
+
+
+def error(i: int) -> float:
+    """m; falls from 2 by 0.1 a scan until localised, then 0.05 standing, 0.2 on the way."""
+    return 2.0 - 0.1 * i if i < LOCALISED else 0.05 if i <= MOVED else 0.2
+
+
+def events() -> list[tuple[Topic, str, Stamped, int]]:
+    """Topic, publishing service, message and reception time."""
+    rng = np.random.default_rng(1)
+    found: list[tuple[Topic, str, Stamped, int]] = []
+    for i in range(SCANS):
+        stamp, at = i * PERIOD_NS, BEGAN_NS + i * PERIOD_NS
+        pose = np.array([true_x(i), 1.0, 0.0])
+        mount = np.array(SCANNER.mount)
+        exact = WORLD.ray_distances(se2.compose(pose, mount)[None], SCANNER.angles())[0]
+        noisy = exact + rng.normal(0, SCANNER.sigma, exact.shape)
+        seen = np.array([true_x(i) + error(i), 1.0, 0.0])
+        expected = WORLD.ray_distances(se2.compose(seen, mount)[None], SCANNER.angles())[0]
+        geometry = {"angle_min": SCANNER.angle_min, "angle_increment": SCANNER.angle_increment}
+        truth = Truth(stamp_ns=stamp, pose=Pose.of(pose), twist=Twist(), contact=i in {40, 41, 42})
+        scan = Scan(
+            stamp_ns=stamp,
+            **geometry,
+            range_min=0.05,
+            range_max=25.0,
+            ranges=noisy,
+            mount=Pose.of(mount),
+            scan_time=0.1,
+        )
+        accuracy = float(np.square(noisy - expected).sum() / 2 / 0.1**2)
+        belief = Belief(
+            stamp_ns=stamp, state="localising" if i < LOCALISED else "tracking", pose=Pose.of(seen),
+            xi=np.zeros(3, np.float32), free_energy=accuracy + 10, accuracy=accuracy, complexity=10.0,
+            estimator="paper",
+        )  # fmt: skip
+        prediction = Prediction(
+            stamp_ns=stamp, **geometry, ranges=expected, sigma=np.full(len(expected), 0.1, np.float32)
+        )
+        found += [(TRUTH, "simulator", truth, at), (SCAN, "simulator", scan, at + 1_000_000)]
+        if i == MOVED:
+            found.append((GOAL, "demo", GOAL_MESSAGE, at + 2_000_000))
+        found += [(BELIEF, "estimator", belief, at + 5_000_000), (PREDICTION, "estimator", prediction, at + 5_000_000)]
+        if i >= MOVED:
+            away = abs(8.0 - seen[0])
+            state = "reached" if away <= GOAL_MESSAGE.tolerance else "navigating"
+            status = Status(stamp_ns=stamp, state=state, goal=GOAL_MESSAGE.pose, distance=away)
+            found.append((STATUS, "controller", status, at + 6_000_000))
+    for service, dropped in (("estimator", 3), ("controller", 4)):
+        for count in (1, dropped):  # counters grow; the last counts
+            rows = [TopicHealth(key=SCAN.key("robot"), received=100, dropped=count)]
+            health = Health(stamp_ns=1, service=service, uptime=1.0, topics=rows)
+            found.append((HEALTH, service, health, BEGAN_NS + SCANS * PERIOD_NS))
+    return found
+
+
+def write(path: Path, *leave_out: Topic, world: bool = True) -> Path:
+    """The session as a recording, without some topics."""
+    writer = RecordingWriter(path)
+    writer.metadata("presage", {"robot": "robot"})
+    if world:
+        write_world(writer, WorldReply(world=WORLD, scanner=SCANNER, robot=Robot(radius=0.3)))
+    for topic, service, message, at in events():
+        if topic not in leave_out:
+            writer.write(topic, topic.key("robot", service), message.encode(), at, at)
+    return writer.finish()
