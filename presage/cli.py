@@ -163,10 +163,9 @@ def record(
 
     Examples: `presage record`; `presage record --out logs --topics scan,odom`.
     """
+    from common.service import main as serve  # noqa: PLC0415
     from services.recorder.service import RecorderService  # noqa: PLC0415
     from services.recorder.settings import RecorderSettings  # noqa: PLC0415
-
-    from common.service import main as serve  # noqa: PLC0415
 
     args = ["--directory", str(out), "--robot", robot, "--connect", connect]
     serve(RecorderSettings, RecorderService, args + (["--topics", topics] if topics else []))

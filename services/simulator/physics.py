@@ -130,4 +130,3 @@ class Physics:
             )
             found[part] = [hit[2] if hit[0] >= 0 else np.inf for hit in hits]
         return (found * reach).reshape(len(lasers), len(angles))
-

@@ -187,6 +187,8 @@ class SimulatorService(Service):
     def _sample(self, request: SampleRequest) -> SampleReply:
         scanner = self.setup.scanner.with_beams(request.beams)
         if len(request.poses) * scanner.beams > MAX_SAMPLE:
-            raise UserError(f"{len(request.poses)} poses x {scanner.beams} beams are more than {MAX_SAMPLE}: ask in parts")
+            raise UserError(
+                f"{len(request.poses)} poses x {scanner.beams} beams are more than {MAX_SAMPLE}: ask in parts"
+            )
         ranges = self.simulation.sample(request.poses, request.beams, request.seed if request.noise else None)
         return SampleReply(scanner=scanner, ranges=np.asarray(ranges, np.float32).ravel())

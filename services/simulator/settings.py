@@ -15,11 +15,12 @@ from common.scanner import SCANNERS, Scanner
 class SimulatorSettings(ServiceSettings):
     """Simulator: a mobile base with a laser scanner in a world, in pybullet.
 
-    examples:
+    Examples:
       python -m services.simulator                                   the corridor, in real time
       python -m services.simulator --world maze --drive differential
       python -m services.simulator --world my.yaml --start 2,1,90    x m, y m, yaw deg
       python -m services.simulator --beams 622 --pace lockstep --seed 7
+
     """
 
     service: ClassVar[str] = "simulator"
@@ -35,7 +36,9 @@ class SimulatorSettings(ServiceSettings):
     seed: Annotated[int, Field(ge=0, description="of all noise")] = 0
     pace: Annotated[
         Literal["realtime", "fast", "lockstep"],
-        Field(description="realtime; fast: as fast as it goes; lockstep: each scan waits for the command that answers it"),
+        Field(
+            description="realtime; fast: as fast as it goes; lockstep: each scan waits for the command that answers it"
+        ),
     ] = "realtime"
     lockstep_deadline: Annotated[float, Field(gt=0, description="s until a scan nobody answered is sent again")] = 5.0
     wait_for: Annotated[str, Field(description="lockstep: services that must be alive before the first scan")] = (
@@ -54,7 +57,7 @@ class SimulatorSettings(ServiceSettings):
         return scanner if self.noise is None else scanner.model_copy(update={"sigma": self.noise})
 
     def start_pose(self) -> tuple[float, float, float] | None:
-        """x m, y m, yaw rad, or None."""
+        """X m, y m, yaw rad, or None."""
         if not self.start:
             return None
         x, y, *yaw = (float(part) for part in self.start.split(","))

@@ -140,7 +140,9 @@ class Simulation:
         inside = self.world.clearance(poses[:, :2]) <= 0
         if inside.any():
             x, y, _ = poses[int(np.argmax(inside))]
-            raise UserError(f"{inside.sum()} of {len(poses)} poses are inside a wall or outside, such as ({x:.2f}, {y:.2f})")
+            raise UserError(
+                f"{inside.sum()} of {len(poses)} poses are inside a wall or outside, such as ({x:.2f}, {y:.2f})"
+            )
         rows = [self._see(poses[i : i + BLOCK], scanner) for i in range(0, len(poses), BLOCK)]
         ranges = np.concatenate(rows) if rows else np.zeros((0, scanner.beams))
         if noise_seed is not None:

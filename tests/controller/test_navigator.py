@@ -110,9 +110,7 @@ def test_stands_until_it_knows_where_it_is(state):
 
 
 def test_an_obstacle_the_scan_shows_blocks_without_contact():
-    crossed = World(
-        name="crossed", boundary=ROOM.boundary, obstacles=[{"box": {"center": (5, 2), "size": (0.2, 3.9)}}]
-    )
+    crossed = World(name="crossed", boundary=ROOM.boundary, obstacles=[{"box": {"center": (5, 2), "size": (0.2, 3.9)}}])
     navigator = Navigator(world=ROOM)  # its map does not know the box
     navigator.hear_goal(goal(8.5, 2))
     log = drive(navigator, [1.5, 2, 0], 15, crossed)
@@ -135,5 +133,7 @@ def test_without_a_belief_it_stands_and_keeps_the_goal():
 
 
 def test_the_controller_needs_no_torch():
-    code = "import sys, services.controller.service; assert 'torch' not in sys.modules and 'pybullet' not in sys.modules"
+    code = (
+        "import sys, services.controller.service; assert 'torch' not in sys.modules and 'pybullet' not in sys.modules"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)

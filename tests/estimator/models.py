@@ -13,7 +13,10 @@ from services.estimator.training import Data
 ROOM = World(
     name="room",
     boundary=[(0, 0), (6, 0), (6, 4), (0, 4)],
-    obstacles=[{"box": {"center": (2, 3), "size": (0.6, 0.4), "yaw_deg": 20}}, {"circle": {"center": (4.5, 3), "radius": 0.4}}],
+    obstacles=[
+        {"box": {"center": (2, 3), "size": (0.6, 0.4), "yaw_deg": 20}},
+        {"circle": {"center": (4.5, 3), "radius": 0.4}},
+    ],
 )
 SCANNER = SCANNERS["tim571"].with_beams(64)
 HEADING = np.pi / 2

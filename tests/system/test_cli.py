@@ -1,0 +1,101 @@
+"""The command line: bad input is one clear line with what to do, status not 0, no traceback."""
+
+from __future__ import annotations
+
+import socket
+
+import pytest
+
+from common.bus import wait_until
+
+NOWHERE = ("--connect", "tcp/127.0.0.1:9")  # the discard port: nobody is there
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (("up", "--world", "nowhere"), "give a file or one of corridor, maze, office"),
+        (("demo", "--world", "{tmp}/no.yaml"), "give a file or one of"),
+        (("demo", "--goal", "6.8", "3.95"), "from a wall of 'corridor'"),
+        (("up", "--world", "maze"), "presage train --world maze"),
+        (("goal", "1", "1", *NOWHERE), "start a session with `presage up`"),
+        (("goal",), "X Y in m"),
+        (("teleport", "1", "1", *NOWHERE), "start a session"),
+        (("echo", "nothing"), "no topic 'nothing': choose one of scan"),
+        (("hz", *NOWHERE), "start a session"),
+        (("replay", "{tmp}/no.mcap"), "no.mcap"),
+        (("plot", "{tmp}/foreign.mcap"), "foreign.mcap"),
+        (("train", "--preset", "better"), "no preset 'better'"),
+        (("train", "--scanner", "sonar", "--out", "{tmp}/m"), "no scanner 'sonar': choose one of tim571"),
+        (("record", "--topics", "smell", "--out", "{tmp}/r"), "smell"),
+    ],
+)
+def test_bad_input_is_one_line(process, tmp_path, args, says):
+    (tmp_path / "foreign.mcap").write_bytes(b"no recording at all, but long enough to be looked at twice")
+    running = process("presage.__main__", *[a.format(tmp=tmp_path) for a in args])
+    assert running.wait(90) not in {0, None}
+    assert "Traceback" not in running.output, running.output
+    complaints = [line for line in running.output.splitlines() if says in line]
+    assert complaints, running.output
+
+
+def test_a_port_in_use_is_said(process):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        running = process("presage.__main__", "up", "--port", str(taken.getsockname()[1]))
+        assert running.wait(60) == 2
+    assert "cannot be used" in running.output
+    assert "--port" in running.output
+    assert "Traceback" not in running.output
+
+
+def test_help_has_examples_for_every_command(process):
+    commands = [
+        "up",
+        "demo",
+        "goal",
+        "teleport",
+        "localise",
+        "record",
+        "replay",
+        "plot",
+        "train",
+        "topics",
+        "hz",
+        "echo",
+        "doctor",
+    ]
+    started = {name: process("presage.__main__", name, "--help") for name in commands}
+    for name, running in started.items():
+        assert running.wait(60) == 0
+        assert "Example" in running.output, name
+        assert f"presage {name}" in running.output, name
+
+
+def test_tools_on_a_running_session(process, bus, link):
+    process("simulator")
+    process("estimator")
+    process("controller")
+    assert wait_until(lambda: {"simulator", "estimator", "controller"} <= bus.alive(), 60)
+
+    def run(*args):
+        running = process("presage.__main__", *args)
+        return running.wait(60), running.output
+
+    assert run("echo", "belief", "-n", "2")[1].count('"estimator": "paper"') == 2
+    status, text = run("hz", "scan", "--seconds", "2")
+    assert status == 0
+    assert "presage/" in text
+    assert run("teleport", "3.5", "1.5")[0] == 0
+    status, text = run("teleport", "0.1", "0.1")
+    assert status == 2
+    assert "from a wall of 'corridor'" in text
+    status, text = run("goal", "0.1", "0.1")
+    assert status == 2
+    assert "the robot needs 0.27 m around it" in text
+    assert run("localise", "3.5", "1.5")[0] == 0
+    assert run("goal", "4", "1.5", "--wait")[0] == 0
+    assert run("goal", "--cancel")[0] == 0
+    assert "simulator of" in run("doctor")[1]
+    assert link.robot in run("topics", "--robot", link.robot)[1]

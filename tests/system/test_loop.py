@@ -1,0 +1,135 @@
+"""The whole loop as processes over zenoh: it repeats itself in lockstep, and a replay gives the same beliefs."""
+
+from __future__ import annotations
+
+import json
+import signal
+
+import psutil
+import pytest
+
+from common.bus import wait_until
+from common.inbox import Inbox, Sample
+from common.messages import Belief, Goal, Health, Pose, Scan
+from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, PREDICTION, SCAN, STATUS, TRUTH
+from services.recorder.reader import read_recording
+
+SCANS = 90
+REPEATED = (SCAN, ODOM, TRUTH, BELIEF, PREDICTION, STATUS, CMD_VEL)
+
+
+def next_of(inbox, kind, condition, timeout=60.0):
+    """The first message of a kind that meets a condition."""
+    found = []
+
+    def look():
+        while isinstance(sample := inbox.get(0), Sample):
+            message = sample.topic.message.decode(sample.payload)
+            if isinstance(message, kind) and condition(message):
+                found.append(message)
+                return True
+        return False
+
+    assert wait_until(look, timeout), f"no {kind.__name__} as wanted within {timeout:g} s"
+    return found[0]
+
+
+def run_in_lockstep(process, bus, folder, name):
+    """Localise and drive for SCANS scans, recorded; payloads by topic."""
+    inbox = Inbox()
+    for topic in (SCAN, HEALTH):
+        bus.subscribe(topic, inbox, keep_all=True)
+    driver = f"driver-{name}"  # the simulator waits for it, and so the goal is there before the first scan
+    started = [
+        process("recorder", "--directory", str(folder), "--file", f"{name}.mcap"),
+        process("controller", "--belief-timeout", "60"),
+        process("estimator", "--initial-pose", "3.2,1.4"),
+        process(
+            "simulator", "--beams", "622", "--pace", "lockstep", "--seed", "3",
+            "--wait-for", f"estimator,controller,recorder,{driver}",
+        ),
+    ]  # fmt: skip
+    assert wait_until(lambda: {"recorder", "controller", "estimator", "simulator"} <= bus.alive(), 60)
+    bus.put(GOAL, Goal(stamp_ns=0, pose=Pose(x=15.5, y=1.5)).encode())
+    goal_key = GOAL.key(bus.robot)
+    next_of(
+        inbox, Health, lambda h: h.service == "controller" and any(t.key == goal_key and t.received for t in h.topics)
+    )
+    bus.declare_alive(driver)
+    next_of(inbox, Scan, lambda scan: scan.seq >= SCANS)
+    for running in reversed(started):
+        assert running.stop()[0] == 0, running.output
+    raw = read_recording(folder / f"{name}.mcap").raw
+    return {topic.name: [r.payload for r in raw if r.key == topic.key(bus.robot)][:SCANS] for topic in REPEATED}
+
+
+def test_in_lockstep_a_seed_gives_the_same_bytes_twice(process, bus, tmp_path):
+    first = run_in_lockstep(process, bus, tmp_path, "first")
+    second = run_in_lockstep(process, bus, tmp_path, "second")
+    for topic in REPEATED:
+        assert len(first[topic.name]) == SCANS, topic.name
+        assert first[topic.name] == second[topic.name], topic.name
+    moved = [TRUTH.message.decode(p).pose.x for p in first["truth"]]
+    assert moved[-1] - moved[0] > 1.0  # there was something to repeat
+
+
+def test_recorded_scans_give_the_recorded_beliefs(process, bus, tmp_path):
+    recorded = run_in_lockstep(process, bus, tmp_path, "run")
+    inbox = Inbox()
+    bus.subscribe(BELIEF, inbox, keep_all=True)
+    process("estimator", "--initial-pose", "3.2,1.4")
+    assert wait_until(lambda: "estimator" in bus.alive(), 60)
+    assert bus.wait_matching(SCAN, 10)
+    for scan, belief in zip(recorded["scan"], recorded["belief"], strict=True):
+        bus.put(SCAN, scan)
+        stamp = Scan.decode(scan).stamp_ns
+        again = next_of(inbox, Belief, lambda b, s=stamp: b.stamp_ns == s)
+        assert again == Belief.decode(belief)
+
+
+def test_demo_localises_navigates_records_and_draws(process, tmp_path):
+    demo = process(
+        "presage.__main__",
+        "demo",
+        "--pace",
+        "lockstep",
+        "--out",
+        str(tmp_path / "out"),
+        "--json",
+        str(tmp_path / "d.json"),
+    )
+    assert demo.wait(170) == 0, demo.output
+    numbers = json.loads((tmp_path / "d.json").read_text())
+    assert numbers["goal_reached"]
+    assert numbers["straight_line_m"] >= 12
+    assert numbers["localised_after_scans"] > 5  # it began at the map's centre, not at the truth
+    assert numbers["localised_error_m"] < 0.5
+    assert numbers["goal_distance_m"] < 0.2 + 0.3
+    assert numbers["contacts"] == 0
+    assert numbers["dropped"] == 0
+    assert numbers["scans"] > 100
+    names = sorted(p.suffix for p in (tmp_path / "out").iterdir())
+    assert names == [".mcap", ".png"]
+    for word in ("distance to goal", "localisation error", "scans", "dropped", "recording", "figure", "goal reached"):
+        assert word in demo.output
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_no_process_outlives_presage_up(process, free_port, number):
+    up = process("presage.__main__", "up", "--port", str(free_port()))
+    up.wait_for("all alive", 90)
+    children = psutil.Process(up.child.pid).children(recursive=True)
+    assert len(children) == 4
+    up.send(number)
+    assert up.wait(20) == (-9 if number == signal.SIGKILL else 130)
+    assert wait_until(lambda: not any(child.is_running() and child.status() != "zombie" for child in children), 10)
+
+
+def test_up_names_a_service_that_ends_and_keeps_the_others(process, free_port):
+    up = process("presage.__main__", "up", "--port", str(free_port()))
+    up.wait_for("all alive", 90)
+    estimator = next(c for c in psutil.Process(up.child.pid).children() if "services.estimator" in c.cmdline())
+    estimator.kill()
+    up.wait_for("estimator ended with status -9", 20)
+    assert "python -m services.estimator" in up.output
+    assert len([c for c in psutil.Process(up.child.pid).children() if c.status() != "zombie"]) == 3
