@@ -1,4 +1,4 @@
-"""Velocity limits of a robot, and braking before what its scan shows. Pure; where the wheels are, and in the controller."""
+"""Velocity limits of a robot, and braking before what its scan shows; where the wheels are, and in the controller."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ def scan_points(scan: Scan) -> Array:
     hit = np.isfinite(ranges)
     angles, ranges = scan.angles()[hit], ranges[hit]
     mount = scan.mount.array()
-    return mount[:2] + se2.rotate(float(mount[2]), np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=-1))
+    in_laser = np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=-1)
+    return mount[:2] + se2.rotate(float(mount[2]), in_laser)
 
 
 def clip_twist(twist: Array, robot: Robot) -> Array:
