@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle as Disc
 from matplotlib.patches import Polygon as Patch
 from matplotlib.ticker import FuncFormatter
+from matplotlib.transforms import ScaledTranslation
 
 from common import safety
 from common.errors import UserError
@@ -129,7 +130,8 @@ def _draw_map(axes: Axes, session: Session) -> None:
     _dress(axes, "a", "map")
     axes.grid(visible=False)
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=9, fontsize=8.5, frameon=False)
+    below = axes.transAxes + ScaledTranslation(0, -0.45, axes.figure.dpi_scale_trans)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=below, ncols=9, fontsize=8.5, frameon=False)
 
 
 def _draw_goal(axes: Axes, goal: Goal) -> None:
@@ -185,11 +187,11 @@ def _draw_free_energy(axes: Axes, session: Session) -> None:
     time = np.array([b.stamp_ns for b in session.beliefs]) * 1e-9
     total, accuracy, complexity = np.array([(b.free_energy, b.accuracy, b.complexity) for b in session.beliefs]).T
     shown = [total]
+    axes.plot(time, total, color=BELIEF, lw=2.2 if complexity.any() else 1.5, label="free energy F")
     if complexity.any():
         shown = [total, accuracy, complexity]
         axes.plot(time, accuracy, color=MEASURED, lw=1.1, label="accuracy, −ln p(o|x)")
         axes.plot(time, complexity, color=GOAL, lw=1.1, label="complexity")
-    axes.plot(time, total, color=BELIEF, lw=1.5, label="free energy F")
     low, high = min(map(np.min, shown)), max(map(np.max, shown))
     if low > 0 and high > 30 * low:
         axes.set_yscale("log")

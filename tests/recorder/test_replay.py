@@ -99,6 +99,16 @@ def test_the_same_bytes_come_back_in_their_order(tmp_path, link, listening, rate
         assert [payload for k, payload in got if k == key] == [payload for _, k, payload, _ in entries if k == key]
 
 
+def test_it_waits_for_who_comes_a_little_late(tmp_path, link, bus, monkeypatch):
+    monkeypatch.setattr(shell, "LISTENERS_WITHIN", 20.0)
+    inbox = Inbox()
+    late = threading.Timer(1.0, lambda: bus.subscribe(SCAN, inbox, keep_all=True))
+    late.start()
+    replay(write(tmp_path / "run.mcap", [(SCAN, SCAN.key(link.robot), b"s", 0)]), link, rate=0)
+    late.join()
+    assert wait_until(lambda: len(inbox) == 1, 10)
+
+
 def test_only_what_was_chosen_is_sent(tmp_path, link, listening):
     entries = [(SCAN, SCAN.key(link.robot), b"s", 0), (ODOM, ODOM.key(link.robot), b"o", 1)]
     assert replay(write(tmp_path / "run.mcap", entries), link, only={"odom"}, rate=0) == {ODOM.key(link.robot): 1}
