@@ -157,7 +157,7 @@ class Bus:
 @contextmanager
 def open_bus(link: Link) -> Iterator[Bus]:
     """A session for the block; raises UserError where the endpoints cannot be used."""
-    zenoh.init_log_from_env_or("error")
+    zenoh.init_log_from_env_or("error,zenoh::api::session=off")  # it calls late data an error while a session closes
     try:
         session = zenoh.open(_config(link))
     except zenoh.ZError as error:

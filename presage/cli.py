@@ -309,6 +309,24 @@ def bench_latency(
     raise typer.Exit(run(scans, rate, beams, json_file, console))
 
 
+@bench_app.command("localisation")
+def bench_localisation(
+    world: World_ = "corridor",
+    beams: Annotated[int, typer.Option(help="Beams of a scan.")] = 622,
+    trials: Annotated[int, typer.Option(min=1)] = 100,
+    scans: Annotated[int, typer.Option(min=1, help="Fresh scans of each trial.")] = 25,
+    seed: Annotated[int, typer.Option(min=0)] = 1,
+    json_file: Json = None,
+) -> None:
+    """How often preset paper finds a standing robot from the map's centre.
+
+    Example: `presage bench localisation --trials 20`.
+    """
+    from presage.bench_localisation import bench_localisation as run  # noqa: PLC0415
+
+    raise typer.Exit(run(world, beams, trials, scans, seed, json_file, console))
+
+
 def main() -> None:
     """Entry point: one line for what a user can mend, status 2; 130 after Ctrl-C."""
     os.environ.setdefault("PYTHONWARNINGS", "default")

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-from services.recorder.replay import replay
 
 from common.bus import Link
 from common.errors import UserError
+from services.recorder.replay import replay
 
 
 def run_replay(file: Path, link: Link, only: str, rate: float, console: Console) -> None:
