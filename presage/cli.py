@@ -217,6 +217,7 @@ def train(
     batch: Annotated[int, typer.Option(min=1)] = 500,
     learning_rate: Annotated[float, typer.Option(min=1e-6)] = 3e-3,
     seed: Annotated[int, typer.Option(min=0)] = 0,
+    robot: Robot_ = "robot",
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
     """Learn to predict a scanner in a world. The same command takes an interrupted run up again.
@@ -231,7 +232,7 @@ def train(
     if preset != "paper":
         raise UserError(f"no preset {preset!r}: choose paper")
     recipe = Recipe(epochs=epochs, batch=batch, learning_rate=learning_rate, seed=seed)
-    learn(Job(world, preset, scanner, beams, out, samples, recipe), _link(connect, "robot"), console)
+    learn(Job(world, preset, scanner, beams, out, samples, recipe), _link(connect, robot), console)
 
 
 @app.command()

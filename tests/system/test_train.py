@@ -1,0 +1,78 @@
+"""`presage train`: samples from the scanner on the bus, or from a simulator of its own; resumed; used by the estimator."""
+
+from __future__ import annotations
+
+import signal
+
+from common.bus import wait_until
+from common.inbox import Inbox, Sample
+from common.messages import Belief
+from common.topics import BELIEF
+
+WORLD = """
+name: closet
+boundary: [[0, 0], [5, 0], [5, 3], [0, 3]]
+obstacles:
+  - circle: {center: [4, 2], radius: 0.3}
+start: {x: 1.5, y: 1.5, yaw_deg: 90}
+"""
+SMALL = ("--beams", "61", "--samples", "300", "--batch", "50")
+
+
+def train(process, tmp_path, *args):
+    return process(
+        "presage.__main__", "train", "--world", str(tmp_path / "w.yaml"), "--out", str(tmp_path / "m"), *SMALL, *args
+    )
+
+
+def test_a_world_of_one_s_own_from_nothing_to_beliefs(process, bus, tmp_path):
+    (tmp_path / "w.yaml").write_text(WORLD)
+    estimator = ("estimator", "--world", str(tmp_path / "w.yaml"), "--models", str(tmp_path / "m"))
+    without = process(*estimator)
+    assert without.wait(60) == 2
+    assert f"presage train --world {tmp_path / 'w.yaml'}" in without.output
+
+    training = train(process, tmp_path, "--epochs", "3")
+    assert training.wait(120) == 0, training.output
+    assert sorted(p.name for p in (tmp_path / "m").iterdir()) == [
+        "closet-paper-61.json", "closet-paper-61.png", "closet-paper-61.safetensors",
+    ]  # fmt: skip
+
+    inbox = Inbox()
+    bus.subscribe(BELIEF, inbox)
+    process(*estimator)
+    process("simulator", "--world", str(tmp_path / "w.yaml"), "--beams", "61")
+    assert wait_until(lambda: len(inbox) > 0, 60)
+    sample = inbox.get(0)
+    assert isinstance(sample, Sample)
+    assert Belief.decode(sample.payload).estimator == "paper"
+
+
+def test_the_scanner_on_the_bus_is_asked(process, bus, tmp_path):
+    (tmp_path / "w.yaml").write_text(WORLD)
+    process("simulator", "--world", str(tmp_path / "w.yaml"))
+    assert wait_until(lambda: "simulator" in bus.alive(), 60)
+    training = train(process, tmp_path, "--epochs", "1", "--robot", bus.robot)
+    assert training.wait(120) == 0, training.output
+    assert "samples come from the running scanner tim571 in closet" in training.output
+
+
+def test_an_interrupted_training_is_taken_up_and_ends_in_the_same_weights(process, tmp_path):
+    (tmp_path / "w.yaml").write_text(WORLD)
+    whole = train(process, tmp_path, "--epochs", "40")
+    assert whole.wait(150) == 0, whole.output
+    weights = tmp_path / "m" / "closet-paper-61.safetensors"
+    first = weights.read_bytes()
+    weights.unlink()
+
+    cut = train(process, tmp_path, "--epochs", "40")
+    state = tmp_path / "m" / ".closet-paper-61.unfinished" / "state.safetensors"
+    assert wait_until(lambda: state.exists() or not cut.running, 60)
+    cut.send(signal.SIGINT)
+    assert cut.wait(30) == 130, cut.output
+    assert not weights.exists()
+
+    again = train(process, tmp_path, "--epochs", "40")
+    assert again.wait(150) == 0, again.output
+    assert "of an interrupted run" in again.output
+    assert weights.read_bytes() == first
