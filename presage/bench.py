@@ -8,6 +8,7 @@ import platform
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from rich.progress import track
 from rich.table import Table
 
 from common import se2
-from common.bus import Bus, open_bus
+from common.bus import Bus, Link, open_bus
 from common.errors import UserError
 from common.inbox import Inbox, Sample
 from common.messages import CmdVel, Pose, Scan
@@ -35,8 +36,6 @@ WARM_UP = 30  # scans not counted
 
 def echo_main() -> None:
     """Child process: every payload that comes goes back, in zenoh's own callback thread's order."""
-    from common.bus import Link  # noqa: PLC0415
-
     inbox = Inbox()
     with open_bus(Link(robot=ECHO_ROBOT, connect=(os.environ["PRESAGE_CONNECT"],))) as bus:
         bus.subscribe(ODOM, inbox, keep_all=True)
@@ -50,7 +49,7 @@ def echo_main() -> None:
 
 def latency(scans: int, rate: float, beams: int, console: Console) -> dict[str, Any]:
     """Milliseconds: scan to command (through estimator and controller), and the same payload there and back."""
-    world, scanner, start = load_world("corridor"), SCANNERS["tim571"].with_beams(beams), None
+    world, scanner = load_world("corridor"), SCANNERS["tim571"].with_beams(beams)
     start = world.start_pose(Robot().radius)
     clean = world.ray_distances(se2.compose(start[None], scanner.mount), scanner.angles())[0]
     rng = np.random.default_rng(0)
@@ -63,19 +62,13 @@ def latency(scans: int, rate: float, beams: int, console: Console) -> dict[str, 
             [sys.executable, "-c", "from presage.bench import echo_main; echo_main()"], env=environment
         )
         try:
-            with open_bus(stack.link()) as bus, open_bus(_echo_link(stack)) as raw:
+            with open_bus(stack.link()) as bus, open_bus(replace(stack.link(), robot=ECHO_ROBOT)) as raw:
                 stack.wait_alive(bus)
                 _wait_echo(raw, echo)
                 return _measure(bus, raw, scanner, clean, rng, scans, rate, console)
         finally:
             echo.terminate()
             echo.wait()
-
-
-def _echo_link(stack: Stack) -> Any:
-    from dataclasses import replace  # noqa: PLC0415
-
-    return replace(stack.link(), robot=ECHO_ROBOT)
 
 
 def _wait_echo(raw: Bus, echo: subprocess.Popen[bytes]) -> None:

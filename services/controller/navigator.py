@@ -33,6 +33,8 @@ class Navigator:
         self.goal: Goal | None = None
         self.state: Literal["idle", "navigating", "reached", "blocked", "lost"] = "idle"
         self.reason = ""
+        self._refused = False  # the goal lies in a wall
+        self._waiting = False  # for a belief that knows where it is
         self._action = np.zeros(2)
         self._velocity = np.zeros(3)
         self._standing_since: int | None = None
@@ -46,11 +48,11 @@ class Navigator:
     def hear_goal(self, goal: Goal) -> None:
         """A new preference, or none; a goal inside a wall is refused."""
         self._action, self._standing_since = np.zeros(2), None
-        self.goal, self.state, self.reason = goal, "navigating", ""
+        self.goal, self.state, self.reason, self._refused = goal, "navigating", "", False
         if goal.cancel:
             self.goal, self.state, self.reason = None, "idle", "cancelled"
         elif (refusal := self._refusal(goal)) is not None:
-            self.state, self.reason = "blocked", refusal
+            self.state, self.reason, self._refused = "blocked", refusal, True
 
     def _refusal(self, goal: Goal) -> str | None:
         if self.world is None:
@@ -81,11 +83,12 @@ class Navigator:
     def _wanted(self, belief: Belief, pose: Array, distance: float | None) -> Array:
         """The command free energy asks for, before any limit; (3,) in base_link."""
         stand = np.zeros(3)
-        if self.goal is None or distance is None or self.state == "reached" or self.reason.startswith("goal refused"):
+        if self.goal is None or distance is None or self.state == "reached" or self._refused:
             self._action = np.zeros(2)
             return stand
         if belief.state in {"lost", "localising", "ambiguous"}:
             self._action = np.zeros(2)
+            self._waiting = True
             self.state = "lost" if belief.state == "lost" else "navigating"
             self.reason = f"standing until localised: the belief is {belief.state}"
             return stand
@@ -93,8 +96,8 @@ class Navigator:
             self.state, self.reason = "reached", f"within {self.goal.tolerance:g} m of the goal"
             self._action = np.zeros(2)
             return stand
-        if self.state == "lost" or self.reason.startswith("standing"):
-            self.state, self.reason = "navigating", ""
+        if self._waiting:
+            self._waiting, self.state, self.reason = False, "navigating", ""
         observed = observed_position(pose, belief.xi.astype(np.float64), belief.curvature)
         preferred = preferred_position(observed, self.goal.pose.array(), self.preference.reach)
         self._action = next_action(self._action, observed, preferred, float(pose[2]), self.preference)
@@ -102,7 +105,7 @@ class Navigator:
 
     def _watch_progress(self, stamp_ns: int, *, held_back: bool) -> None:
         """Navigating, held back by what the scan shows, and standing for a while: blocked."""
-        if self.state not in {"navigating", "blocked"} or self.reason.startswith(("goal refused", "standing")):
+        if self.state not in {"navigating", "blocked"} or self._refused or self._waiting:
             self._standing_since = None
             return
         if np.hypot(*self._velocity[:2]) > CREEP or not held_back:
@@ -127,8 +130,7 @@ class Navigator:
     def without_belief(self, stamp_ns: int, why: str) -> tuple[CmdVel, Status]:
         """Stand: nothing is known about now. The goal is kept."""
         self._action, self._velocity = np.zeros(2), np.zeros(3)
-        if self.state in {"navigating", "blocked"} and not self.reason.startswith("goal refused"):
-            self.state = "lost"
-        status = self.status(stamp_ns, None).model_copy(update={"reason": why})
-        self.reason = "standing until localised" if self.state == "lost" else self.reason
+        if self.state in {"navigating", "blocked"} and not self._refused:
+            self.state, self.reason, self._waiting = "lost", why, True
+        status = self.status(stamp_ns, None).model_copy(update={"reason": why})  # idle, too, says so
         return CmdVel(stamp_ns=stamp_ns, twist=Twist()), status
