@@ -1,0 +1,174 @@
+"""Over 10 000 payloads that are not what they should be, on every key of a running system: it does not care."""
+
+from __future__ import annotations
+
+import msgpack
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from common.bus import Link, open_bus, wait_until
+from common.errors import UserError
+from common.inbox import Inbox, Sample
+from common.messages import ConfigReply, Health, Request, Scan, Truth
+from common.topics import CONFIG, HEALTH, MAX_BYTES, QUERIES, SCAN, TOPICS, TRUTH
+from common.wire import DecodeError
+from services.recorder.reader import read_recording
+from tests.common.samples import message_of
+from tests.conftest import Processes
+
+SERVICES = ("simulator", "estimator", "controller", "recorder")
+EXAMPLES = 560  # a key; 18 keys
+HEARD = {"simulator": ["cmd_vel"], "estimator": ["scan", "goal"], "controller": ["scan", "belief", "goal"]}
+
+JUNK = st.one_of(
+    st.none(),
+    st.sampled_from(
+        [float("nan"), float("inf"), float("-inf"), -1, 2**63, 2**64 - 1, "", "x" * 300, True, b"", b"\x00" * 7]
+    ),
+    st.binary(max_size=40),
+    st.lists(st.floats(), max_size=4),
+    st.dictionaries(st.text(max_size=5), st.floats(), max_size=3),
+)
+
+
+def decodes(cls, payload) -> bool:
+    try:
+        cls.decode(payload)
+    except DecodeError:
+        return False
+    return True
+
+
+def hostile(cls):
+    """Bytes that are no message of the class: junk, and valid messages with something broken."""
+    whole = message_of(cls).map(lambda message: message.encode())
+    fields = whole.map(msgpack.unpackb).filter(bool)
+    replaced = st.tuples(fields, st.randoms(use_true_random=False), JUNK).map(
+        lambda parts: msgpack.packb({**parts[0], parts[1].choice(sorted(parts[0])): parts[2]})
+    )
+    without = fields.map(lambda values: msgpack.packb(dict(list(values.items())[1:])))
+    cut = st.tuples(whole, st.floats(0, 0.99)).map(lambda parts: parts[0][: int(len(parts[0]) * parts[1])])
+    flipped = st.tuples(whole, st.integers(0, 2**30), st.integers(1, 255)).map(
+        lambda p: bytes(b ^ (p[2] if i == p[1] % len(p[0]) else 0) for i, b in enumerate(p[0]))
+    )
+    nested = st.integers(1, 3000).map(lambda depth: b"\x91" * depth)
+    claimed = st.sampled_from(
+        [b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\xdb\x7f\xff\xff\xff"]
+    )
+    kinds = [st.binary(max_size=200), nested, claimed, cut, flipped]
+    kinds += [replaced, without] if cls.model_fields else []
+    return st.one_of(kinds).filter(lambda payload: not decodes(cls, payload))
+
+
+@pytest.fixture(scope="module")
+def system(tmp_path_factory, router):
+    """The four services, a session beside them, and the folder of the recording."""
+    link = Link(robot="hostile", connect=(f"tcp/127.0.0.1:{router}",))
+    folder = tmp_path_factory.mktemp("hostile")
+    processes = Processes(folder)
+    talk = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": link.robot}
+    try:
+        with open_bus(link) as bus:
+            running = {
+                name: processes.start(name, *(("--directory", str(folder)) if name == "recorder" else ()), env=talk)
+                for name in SERVICES
+            }
+            assert wait_until(lambda: set(SERVICES) <= bus.alive(), 60)
+            yield bus, running, folder
+    finally:
+        processes.close()
+
+
+def latest(bus, topic, kind, condition=lambda _: True):
+    """A message that arrives from now on."""
+    inbox, found = Inbox(), []
+    bus.subscribe(topic, inbox, keep_all=True)
+
+    def look():
+        while isinstance(sample := inbox.get(0), Sample):
+            if decodes(kind, sample.payload) and condition(message := kind.decode(sample.payload)):
+                found.append(message)
+        return bool(found)
+
+    assert wait_until(look, 30), f"no {kind.__name__}"
+    return found[-1]
+
+
+@pytest.fixture(scope="module")
+def before(system):
+    """Where the robot stands before anything hostile is said."""
+    return latest(system[0], TRUTH, Truth)
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
+def test_hostile_payloads_on_every_topic(system, before, topic):
+    bus, running, _ = system
+
+    @settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck))
+    @given(hostile(topic.message))
+    def send(payload):
+        bus.put(topic, payload, service="intruder")
+
+    send()
+    for oversized in (b"\x00" * (MAX_BYTES + 1), b"\xc1" * (4 * MAX_BYTES)):
+        bus.put(topic, oversized, service="intruder")
+    assert before.seq >= 0
+    assert all(process.running for process in running.values())
+
+
+@pytest.mark.parametrize("query", QUERIES, ids=lambda query: query.name)
+def test_hostile_requests_are_refused_with_a_reason(system, before, query):
+    bus, running, _ = system
+    service = "estimator" if query is CONFIG else "*"
+
+    @settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck))
+    @given(hostile(query.request))
+    def ask(payload):
+        answers = list(bus._session.get(query.key(bus.robot, service), payload=payload, timeout=30))
+        assert len(answers) == 1
+        assert answers[0].err is not None
+        assert query.request.__name__ in answers[0].err.payload.to_string()
+
+    ask()
+    assert before.seq >= 0
+    assert all(process.running for process in running.values())
+
+
+def test_after_all_that_everything_runs_and_the_robot_has_not_moved(system, before):
+    bus, running, _ = system
+    after = latest(bus, TRUTH, Truth, lambda truth: truth.stamp_ns > before.stamp_ns + 10**9)
+    assert after.pose.array() == pytest.approx(before.pose.array(), abs=1e-3)
+    first = latest(bus, SCAN, Scan)
+    assert latest(bus, SCAN, Scan, lambda scan: scan.seq > first.seq + 5)
+    for name in SERVICES:
+        assert running[name].running
+        assert bus.ask(CONFIG, Request(), ConfigReply, service=name).service == name
+        assert "Traceback" not in running[name].output, running[name].output[-3000:]
+
+
+def test_it_was_counted_and_logged_but_not_each_time(system, before):
+    bus, running, _ = system
+    for name, topics in HEARD.items():
+        health = latest(bus, HEALTH, Health, lambda h, n=name: h.service == n)
+        rows = {row.key: row for row in health.topics}
+        for topic in topics:
+            row = rows[f"presage/hostile/{topic}"]
+            assert row.received >= EXAMPLES
+            assert row.undecodable > 0
+        assert health.counters["failed"] == 0
+        assert "payload dropped" in running[name].output
+        assert running[name].output.count("payload dropped") < EXAMPLES  # once a second and key at most
+    assert before.seq >= 0
+
+
+def test_the_recorder_has_it_all(system):
+    bus, running, folder = system
+    assert running["recorder"].stop()[0] == 0
+    (file,) = folder.glob("*.mcap")
+    counts = read_recording(file).counts()
+    for topic in TOPICS:
+        key = topic.key(bus.robot, "intruder")
+        assert counts[key] >= EXAMPLES, topic.name
+    with pytest.raises(UserError, match="nobody answers"):
+        bus.ask(CONFIG, Request(), ConfigReply, timeout=1, service="recorder")
