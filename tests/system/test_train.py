@@ -1,4 +1,4 @@
-"""`presage train`: samples from the scanner on the bus, or from a simulator of its own; resumed; used by the estimator."""
+"""`presage train`: samples from the scanner on the bus, or a simulator of its own; resumed; used by the estimator."""
 
 from __future__ import annotations
 
