@@ -19,6 +19,8 @@ from common.topics import Query, Topic, alive_key, topic_of
 from common.wire import ENCODING, DecodeError, Message
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+# Both call it an error when something arrives while a session opens or closes.
+LOG_FILTER = "error,zenoh::api::session=off,zenoh::net::protocol::gossip=off"
 R = TypeVar("R", bound=Reply)
 
 
@@ -119,15 +121,17 @@ class Bus:
     def ask(self, query: Query, request: Request, reply: type[R], timeout: float = 5.0, service: str = "*") -> R:
         """The first answer; raises UserError where nobody answers, the answer is an error, or makes no sense."""
         key = query.key(self.robot, service)
-        answers = self._session.get(key, payload=request.encode(), encoding=ENCODING, timeout=timeout)
-        for answer in answers:
-            if answer.ok is not None:
-                try:
-                    return reply.decode(answer.ok.payload.to_bytes())
-                except DecodeError as error:
-                    raise UserError(f"{key}: the answer makes no sense: {error}") from None
-            if answer.err is not None and (why := answer.err.payload.to_string()) != "Timeout":
-                raise UserError(f"{key}: refused: {why}")
+        deadline = time.monotonic() + timeout
+        while (left := deadline - time.monotonic()) > 0:
+            answers = list(self._session.get(key, payload=request.encode(), encoding=ENCODING, timeout=left))
+            for answer in answers:
+                if answer.ok is not None:
+                    return _decode_reply(key, reply, answer.ok.payload.to_bytes())
+                if answer.err is not None and (why := answer.err.payload.to_string()) != "Timeout":
+                    raise UserError(f"{key}: refused: {why}")
+            if answers:
+                break
+            time.sleep(0.02)  # a session that has just opened does not know yet who is there: nothing was asked
         who = service if service != "*" else query.server
         raise UserError(f"nobody answers {key} within {timeout:g} s: is the {who} running? `presage doctor` looks")
 
@@ -154,10 +158,17 @@ class Bus:
         return bool(list(self._session.info.routers_zid()) or list(self._session.info.peers_zid()))
 
 
+def _decode_reply(key: str, reply: type[R], payload: bytes) -> R:
+    try:
+        return reply.decode(payload)
+    except DecodeError as error:
+        raise UserError(f"{key}: the answer makes no sense: {error}") from None
+
+
 @contextmanager
 def open_bus(link: Link) -> Iterator[Bus]:
     """A session for the block; raises UserError where the endpoints cannot be used."""
-    zenoh.init_log_from_env_or("error,zenoh::api::session=off")  # it calls late data an error while a session closes
+    zenoh.init_log_from_env_or(LOG_FILTER)
     try:
         session = zenoh.open(_config(link))
     except zenoh.ZError as error:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from rich.console import Console
 from rich.progress import track
 
@@ -16,6 +15,7 @@ from common import se2
 from common.robot import Robot
 from common.versions import commit, versions
 from services.estimator import weights
+from services.estimator.decoder import use_one_core
 from services.estimator.perception import PaperEstimator
 from services.estimator.training import usable_ranges
 
@@ -24,7 +24,7 @@ FOUND = 1.0  # m
 
 def localisation(world: str, beams: int, trials: int, scans: int, seed: int, console: Console) -> dict[str, Any]:
     """Errors in m after ``scans`` fresh noisy scans each, at places uniform over free space, exact rays plus noise."""
-    torch.set_num_threads(1)
+    use_one_core()
     model, card = weights.load(weights.find(weights.FOLDER, world, "paper", beams))
     rng, scanner = np.random.default_rng(seed), card.scanner
     places = card.world.sample_free(trials, rng, Robot().radius)

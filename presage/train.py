@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -190,8 +189,7 @@ def _write(
     """Errors are measured on the weights as they will be read, in half precision."""
     model_state = {name: tensor.half().float() for name, tensor in trainer.decoder.state_dict().items()}
     trainer.decoder.load_state_dict(model_state)
-    with torch.no_grad():
-        predicted = PaperModel(trainer.decoder, trainer.norm).ranges(data["test"].poses)
+    predicted = PaperModel(trainer.decoder, trainer.norm).ranges(data["test"].poses)
     error = np.abs(predicted - data["test"].ranges)
     recipe = job.recipe
     card = weights.ModelCard(

@@ -121,3 +121,8 @@ class PaperModel:
         with torch.no_grad():
             parts = [self.decoder(part) for part in torch.split(self.norm.position(poses, self.dtype), 1000)]
         return torch.cat(parts).double().numpy() * self.norm.range_scale
+
+
+def use_one_core() -> None:
+    """For inference: a scan is too small to share, and the bytes are the same on any number of cores."""
+    torch.set_num_threads(1)

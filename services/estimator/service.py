@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
-import torch
 
 from common.errors import UserError
 from common.messages import Belief, Goal, LocaliseRequest, Pose, Prediction, Reply, Request, Scan, Stamped
@@ -13,6 +12,7 @@ from common.service import Service
 from common.topics import BELIEF, GOAL, LOCALISE, PREDICTION, SCAN, Query, Topic
 from common.world import load_world
 from services.estimator import weights
+from services.estimator.decoder import use_one_core
 from services.estimator.perception import Descent, PaperEstimator
 from services.estimator.settings import EstimatorSettings
 from services.estimator.training import usable_ranges
@@ -40,7 +40,7 @@ class EstimatorService(Service):
 
     def open(self) -> None:
         """Fail now, not at the first scan, where a world has no weights at all."""
-        torch.set_num_threads(1)  # a scan is too small to share; also the same bytes on any number of cores
+        use_one_core()
         self.world_name = load_world(self.options.world).name
         known = weights.available(self.folder, self.world_name, self.options.preset)
         if not known:

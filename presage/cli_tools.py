@@ -1,0 +1,130 @@
+"""Commands for a running session: goal, teleport, localise, topics, hz, echo, doctor."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from common.bus import DEFAULT_ENDPOINT
+from common.errors import UserError
+from presage.options import Connect, RobotName, console, link_of
+
+app = typer.Typer()
+
+
+@app.command()
+def goal(
+    x: Annotated[float | None, typer.Argument(help="m, map")] = None,
+    y: Annotated[float | None, typer.Argument(help="m, map")] = None,
+    tolerance: Annotated[float, typer.Option(min=0.01, help="Reached within this, m.")] = 0.2,
+    wait: Annotated[bool, typer.Option("--wait", help="Until it is reached or blocked.")] = False,
+    cancel: Annotated[bool, typer.Option("--cancel", help="Forget the goal and stand.")] = False,
+    robot: RobotName = "robot",
+    connect: Connect = DEFAULT_ENDPOINT,
+) -> None:
+    """Send the robot somewhere.
+
+    Examples: `presage goal 15 1.5 --wait`; `presage goal --cancel`.
+    """
+    from common.messages import Goal, Pose  # noqa: PLC0415
+    from presage.tools import give_goal  # noqa: PLC0415
+
+    if not cancel and (x is None or y is None):
+        raise UserError("a goal is two numbers, X Y in m (or --cancel)")
+    wish = Goal(stamp_ns=0, pose=Pose(x=x or 0.0, y=y or 0.0), tolerance=tolerance, cancel=cancel)
+    raise typer.Exit(give_goal(link_of(connect, robot), wish, console, wait=wait))
+
+
+@app.command()
+def teleport(
+    x: Annotated[float, typer.Argument(help="m, map")],
+    y: Annotated[float, typer.Argument(help="m, map")],
+    yaw: Annotated[float, typer.Argument(help="deg, counter-clockwise from x")] = 90.0,
+    robot: RobotName = "robot",
+    connect: Connect = DEFAULT_ENDPOINT,
+) -> None:
+    """Carry the simulated robot off, unseen by its odometry.
+
+    Example: `presage teleport 9 1.5`. The paper's preset knows one heading alone: 90 deg in corridor.
+    """
+    from common.messages import Pose  # noqa: PLC0415
+    from presage.tools import teleport as carry  # noqa: PLC0415
+
+    carry(link_of(connect, robot), Pose(x=x, y=y, yaw=float(np.deg2rad(yaw))), console)
+
+
+@app.command()
+def localise(
+    x: Annotated[float | None, typer.Argument(help="m, map; none: from the map's centre")] = None,
+    y: Annotated[float | None, typer.Argument(help="m, map")] = None,
+    robot: RobotName = "robot",
+    connect: Connect = DEFAULT_ENDPOINT,
+) -> None:
+    """Let the estimator begin anew, from a position or from nothing.
+
+    Examples: `presage localise`; `presage localise 3 1.5`.
+    """
+    from presage.tools import localise as restart  # noqa: PLC0415
+
+    restart(link_of(connect, robot), x, y, console)
+
+
+@app.command()
+def topics(robot: RobotName = "robot") -> None:
+    """The table of topics and queryables.
+
+    Example: `presage topics`.
+    """
+    from presage.tools import list_topics  # noqa: PLC0415
+
+    list_topics(robot, console)
+
+
+@app.command()
+def hz(
+    topic: Annotated[str | None, typer.Argument(help="A topic; none: all.")] = None,
+    seconds: Annotated[float, typer.Option(min=0.1)] = 3.0,
+    robot: RobotName = "robot",
+    connect: Connect = DEFAULT_ENDPOINT,
+) -> None:
+    """Measure rates on the bus.
+
+    Examples: `presage hz`; `presage hz scan --seconds 10`.
+    """
+    from presage.tools import show_rates  # noqa: PLC0415
+
+    raise typer.Exit(show_rates(link_of(connect, robot), topic, seconds, console))
+
+
+@app.command()
+def echo(
+    topic: str,
+    count: Annotated[int, typer.Option("-n", "--count", min=0, help="End after so many; 0: Ctrl-C.")] = 0,
+    full: Annotated[bool, typer.Option("--full", help="Long arrays whole.")] = False,
+    robot: RobotName = "robot",
+    connect: Connect = DEFAULT_ENDPOINT,
+) -> None:
+    """Print a topic's messages, one JSON line each.
+
+    Examples: `presage echo belief -n 1`; `presage echo scan --full -n 1 | jq .ranges`.
+    """
+    from presage.tools import echo as show  # noqa: PLC0415
+
+    raise typer.Exit(show(link_of(connect, robot), topic, count, console, full=full))
+
+
+@app.command()
+def doctor(
+    seconds: Annotated[float, typer.Option(min=0.5, help="How long to listen.")] = 3.0,
+    robot: RobotName = "robot",
+    connect: Connect = DEFAULT_ENDPOINT,
+) -> None:
+    """Find what is wrong with the installation or the running session.
+
+    Example: `presage doctor`.
+    """
+    from presage.doctor import examine  # noqa: PLC0415
+
+    raise typer.Exit(examine(link_of(connect, robot), seconds, console))

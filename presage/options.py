@@ -1,0 +1,28 @@
+"""What the commands share: options by their meaning, the console, the session's link."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from common.bus import Link
+from common.config import split_endpoints
+
+# Nobody's terminal is 80 columns wide when it is a pipe.
+console = Console(width=None if sys.stdout.isatty() else 150)
+
+RobotName = Annotated[str, typer.Option(envvar="PRESAGE_ROBOT", help="Which robot.")]
+Connect = Annotated[str, typer.Option(envvar="PRESAGE_CONNECT", help="The session's zenoh endpoint(s).")]
+WorldName = Annotated[str, typer.Option(envvar="PRESAGE_WORLD", help="A shipped world or a world file.")]
+Port = Annotated[int, typer.Option(min=0, max=65535, help="The router's port on 127.0.0.1; 0: any free one.")]
+Json = Annotated[Path | None, typer.Option("--json", help="Write the numbers there.")]
+
+
+def link_of(connect: str, robot: str) -> Link:
+    """The session these options name."""
+    return replace(Link(), robot=robot, connect=split_endpoints(connect))
