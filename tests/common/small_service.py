@@ -1,0 +1,72 @@
+"""A service as small as can be, run as a process by test_service."""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated, ClassVar
+
+from pydantic import Field
+
+from common.config import ServiceSettings
+from common.errors import UserError
+from common.messages import CmdVel, Goal, Pose, Reply, Scan
+from common.service import Service, main
+from common.topics import CMD_VEL, GOAL, SCAN, TELEPORT
+
+
+class SmallSettings(ServiceSettings):
+    """A small service."""
+
+    service: ClassVar[str] = "small"
+    fail: Annotated[str, Field(description="where to fail")] = ""
+
+
+class Small(Service):
+    """Answers each scan with a command; what it must fail at stands in the data."""
+
+    name = "small"
+    inputs = (SCAN, GOAL)
+    queries = (TELEPORT,)
+
+    def __init__(self, settings):
+        super().__init__(settings)
+        self.fail = settings.fail
+        self.ticks = 0
+
+    def open(self):
+        if self.fail == "open":
+            raise UserError("no weights in that folder; train some")
+        if self.fail == "slowly":
+            self.log.info("opening")
+            time.sleep(1.0)
+
+    def on_message(self, topic, message):
+        if isinstance(message, Scan):
+            self.counters["scans"] += 1
+            self.publish(CMD_VEL, CmdVel(stamp_ns=message.stamp_ns, twist={"vx": 0.5}))
+        elif isinstance(message, Goal) and message.pose.x < 0:
+            raise ValueError("a bug in on_message")
+        elif isinstance(message, Goal) and message.pose.x > 100:
+            raise UserError("the map ends before that")
+        elif isinstance(message, Goal):
+            time.sleep(message.pose.x)
+
+    def on_request(self, query, request):
+        if request.pose.x < 0:
+            raise UserError("inside a wall")
+        if request.pose.x > 100:
+            raise ValueError("a bug in on_request")
+        return Reply(reason=f"at {request.pose.x:g}")
+
+    def due(self):
+        return None if self.fail != "timer" else 0.05
+
+    def on_timer(self):
+        raise ValueError("never due")
+
+    def close(self):
+        self.log.info("closed", origin=Pose(x=0.0, y=0.0).array().tolist())
+
+
+if __name__ == "__main__":
+    main(SmallSettings, Small)
