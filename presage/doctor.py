@@ -65,6 +65,8 @@ def running(link: Link, seconds: float) -> Iterator[Finding]:
             )
             return
         yield Finding(True, f"session at {where}")
+        # A session that has just opened hears of the others one by one.
+        wait_until(lambda: set(NEEDED) <= bus.alive(timeout=0.5), 2.0)
         alive = bus.alive()
     for service in NEEDED:
         there = service in alive

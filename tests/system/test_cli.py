@@ -97,5 +97,10 @@ def test_tools_on_a_running_session(process, bus, link):
     assert run("localise", "3.5", "1.5")[0] == 0
     assert run("goal", "4", "1.5", "--wait")[0] == 0
     assert run("goal", "--cancel")[0] == 0
-    assert "simulator of" in run("doctor")[1]
+    status, text = run("doctor")
+    assert status == 1  # no recorder runs
+    for there in ("simulator", "estimator", "controller"):
+        assert f"{there} of '{link.robot}': alive" in text
+    assert f"recorder of '{link.robot}': not there" in text
+    assert "python -m services.recorder" in text
     assert link.robot in run("topics", "--robot", link.robot)[1]
