@@ -30,7 +30,8 @@ $(STAMP): pyproject.toml constraints.txt
 # A name on the path may be a stub that fails (pyenv), and Debian ships Python without venv: each is tried, not believed.
 # PyBullet has wheels for 3.10 and 3.11 alone, so these come first.
 define find_venv
-if $(BIN)/python -m pip --version >/dev/null 2>&1; then exit 0; fi; \
+if $(BIN)/python -m pip --version >/dev/null 2>&1 \
+  && { test -z '$(PYTHON)' || test "$$($(BIN)/python --version)" = "$$('$(PYTHON)' --version 2>&1)"; }; then exit 0; fi; \
 if test -n '$(PYTHON)'; then names='$(PYTHON)'; else names='python3.11 python3.10 python3 python3.12 python3.13 python'; fi; \
 for name in $$names; do \
   $$name -c 'import sys; sys.exit(sys.version_info < (3, 10))' >/dev/null 2>&1 || continue; \
