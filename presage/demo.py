@@ -104,7 +104,8 @@ def _localise(watch: Watch, stack: Stack, console: Console) -> bool:
                 if belief.stamp_ns > LOCALISE_WITHIN * 1e9:
                     break
     console.print(
-        f"[bold]not localised within {LOCALISE_WITHIN:g} s: the paper's descent has stopped in a wrong place[/]"
+        f"[bold]not localised within {LOCALISE_WITHIN:g} s[/]: the paper's descent has stopped in a wrong place. "
+        "How often it does: presage bench localisation"
     )
     return False
 
