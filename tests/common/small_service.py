@@ -11,7 +11,7 @@ from common.config import ServiceSettings
 from common.errors import UserError
 from common.messages import CmdVel, Goal, Pose, Reply, Scan
 from common.service import Service, main
-from common.topics import CMD_VEL, GOAL, SCAN, TELEPORT
+from common.topics import CMD_VEL, GOAL, HEALTH, SCAN, TELEPORT
 
 
 class SmallSettings(ServiceSettings):
@@ -19,24 +19,27 @@ class SmallSettings(ServiceSettings):
 
     service: ClassVar[str] = "small"
     fail: Annotated[str, Field(description="where to fail")] = ""
+    slow: Annotated[str, Field(description="where to take its time")] = ""
 
 
 class Small(Service):
     """Answers each scan with a command; what it must fail at stands in the data."""
 
     name = "small"
-    inputs = (SCAN, GOAL)
+    inputs = (SCAN, GOAL, HEALTH)
     queries = (TELEPORT,)
 
     def __init__(self, settings):
         super().__init__(settings)
         self.fail = settings.fail
-        self.ticks = 0
+        if settings.slow == "making":
+            self.log.info("in the making")
+            time.sleep(1.0)
 
     def open(self):
         if self.fail == "open":
             raise UserError("no weights in that folder; train some")
-        if self.fail == "slowly":
+        if self.settings.slow == "opening":
             self.log.info("opening")
             time.sleep(1.0)
 
