@@ -39,9 +39,10 @@ class Beside:
 
         def look() -> bool:
             while (sample := self.health.get(0)) is not None:
-                self.latest = Health.decode(sample.payload)
-                if fits(self.latest):
-                    return True
+                if sample.key == HEALTH.key(self.bus.robot, "small"):
+                    self.latest = Health.decode(sample.payload)
+                    if fits(self.latest):
+                        return True
             return False
 
         return wait_until(look, PATIENCE)
