@@ -11,6 +11,8 @@ from common.config import ServiceSettings
 from common.errors import UserError
 from common.scanner import SCANNERS, Scanner
 
+NUMBER = r"-?(\d{1,9}\.?\d*|\.\d+)"
+
 
 class SimulatorSettings(ServiceSettings):
     """Simulator: a mobile base with a laser scanner in a world, in pybullet.
@@ -31,7 +33,7 @@ class SimulatorSettings(ServiceSettings):
     noise: Annotated[float | None, Field(ge=0, le=1, description="instead of the scanner's own sigma, m")] = None
     drive: Annotated[Literal["holonomic", "differential"], Field(description="holonomic or differential")] = "holonomic"
     start: Annotated[
-        str, Field(pattern=r"^$|^-?[\d.]+,-?[\d.]+(,-?[\d.]+)?$", description="x,y[,yaw_deg]; none: the world's own")
+        str, Field(pattern=rf"^$|^{NUMBER},{NUMBER}(,{NUMBER})?$", description="x,y[,yaw_deg]; none: the world's own")
     ] = ""
     seed: Annotated[int, Field(ge=0, description="of all noise")] = 0
     pace: Annotated[

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -96,10 +97,11 @@ class Simulation:
             return np.zeros(3)
         if not self.setup.obstacle_stop:
             return self._command[1]
-        # The wheels may still turn another way than commanded: brake for that way too.
-        _, moving_blocked = safety.limit_velocity(self._velocity, self._points, self.setup.robot)
-        wanted, self._stopped = safety.limit_velocity(self._command[1], self._points, self.setup.robot)
-        return np.zeros(3) if moving_blocked and not self._stopped else wanted
+        # Each period ends in a velocity from which braking is clear: that way out is taken where no other is left.
+        wanted, self._stopped = safety.limit_velocity(
+            self._command[1], self._points, self.setup.robot, self._velocity, self.period_ns * 1e-9
+        )
+        return wanted
 
     def observe(self) -> tuple[Odom, Truth, Scan]:
         """What is measured now; draws the scanner's noise."""
@@ -114,7 +116,13 @@ class Simulation:
         truth = Truth(
             stamp_ns=self.stamp_ns, pose=Pose.of(pose), twist=moving, contact=self._contact, stopped=self._stopped
         )
-        scan = Scan(
+        scan = self._scan(ranges)
+        self._points = safety.scan_points(scan)
+        return odom, truth, scan
+
+    def _scan(self, ranges: Array) -> Scan:
+        scanner = self.setup.scanner
+        return Scan(
             stamp_ns=self.stamp_ns,
             angle_min=scanner.angle_min,
             angle_increment=scanner.angle_increment,
@@ -124,8 +132,6 @@ class Simulation:
             mount=Pose.of(scanner.mount),
             scan_time=1 / scanner.rate,
         )
-        self._points = safety.scan_points(scan)
-        return odom, truth, scan
 
     def _see(self, poses: Array, scanner: Scanner | None = None) -> Array:
         """(N, B) m without noise or limits from base_link poses (N, 3)."""
@@ -137,12 +143,15 @@ class Simulation:
     def sample(self, poses: Array, beams: int | None, noise_seed: int | None) -> Array:
         """(N, B) m seen from poses (N, 3), with noise of a seed or none; the robot and its noise do not notice."""
         scanner = self.setup.scanner.with_beams(beams)
-        inside = self.world.clearance(poses[:, :2]) <= 0
-        if inside.any():
-            x, y, _ = poses[int(np.argmax(inside))]
-            raise UserError(
-                f"{inside.sum()} of {len(poses)} poses are inside a wall or outside, such as ({x:.2f}, {y:.2f})"
-            )
+        lasers = se2.compose(poses, np.array(scanner.mount))
+        for what, where in (("", poses), (" with the laser", lasers)):
+            inside = self.world.clearance(where[:, :2]) <= 0
+            if inside.any():
+                x, y, _ = poses[int(np.argmax(inside))]
+                raise UserError(
+                    f"{inside.sum()} of {len(poses)} poses are{what} inside a wall or outside,"
+                    f" such as ({x:.2f}, {y:.2f})"
+                )
         rows = [self._see(poses[i : i + BLOCK], scanner) for i in range(0, len(poses), BLOCK)]
         ranges = np.concatenate(rows) if rows else np.zeros((0, scanner.beams))
         if noise_seed is not None:
@@ -163,6 +172,8 @@ class Simulation:
             raise UserError(why)
         self.physics.place(pose)
         self._velocity, self._command = np.zeros(3), None
+        # What stands around the new place, for a command that comes before the next scan; no noise is drawn.
+        self._points = safety.scan_points(self._scan(self.setup.scanner.limit(self._see(pose[None])[0])))
 
     def change(self, action: str, name: str, obstacle: Obstacle | None) -> None:
         """Add, move or remove furniture; raises UserError with the reason where it cannot be."""
@@ -177,14 +188,16 @@ class Simulation:
                 raise UserError(f"{action} needs the obstacle's shape")
             self._check_place(obstacle)
         kept = [o for o in self.world.obstacles if o.name != name]
+        if action != "remove" and obstacle is not None:
+            obstacle = obstacle.model_copy(update={"name": name})
+            kept.append(obstacle)
+        # Built anew, for a copy would keep the old world's cached geometry; first, for it may refuse.
+        world = World(name=self.world.name, boundary=self.world.boundary, obstacles=kept, start=self.world.start)
         if action != "add":
             self.physics.remove(name)
         if action != "remove" and obstacle is not None:
-            obstacle = obstacle.model_copy(update={"name": name})
             self.physics.add(name, obstacle)
-            kept.append(obstacle)
-        # Built anew, for a copy would keep the old world's cached geometry.
-        self.world = World(name=self.world.name, boundary=self.world.boundary, obstacles=kept, start=self.world.start)
+        self.world = world
 
     def _check_place(self, obstacle: Obstacle) -> None:
         shape = obstacle.shape()
@@ -196,10 +209,13 @@ class Simulation:
 
 def _named(world: World) -> World:
     """Every obstacle with a name, so that it can be moved."""
-    taken = {o.name for o in world.obstacles if o.name}
-    if len(taken) < sum(bool(o.name) for o in world.obstacles):
-        raise UserError(f"world {world.name!r}: two obstacles have the same name")
-    named = [
-        o if o.name else o.model_copy(update={"name": f"obstacle-{number}"}) for number, o in enumerate(world.obstacles)
-    ]
+    taken = [o.name for o in world.obstacles if o.name]
+    if twice := sorted({name for name in taken if taken.count(name) > 1}):
+        raise UserError(f"world {world.name!r}: two obstacles are named {twice[0]!r}; give each a name of its own")
+    if "boundary" in taken:
+        raise UserError(
+            f"world {world.name!r}: an obstacle is named 'boundary', as the walls are; give it another name"
+        )
+    free = (name for number in itertools.count() if (name := f"obstacle-{number}") not in taken)
+    named = [o if o.name else o.model_copy(update={"name": next(free)}) for o in world.obstacles]
     return World(name=world.name, boundary=world.boundary, obstacles=named, start=world.start)
