@@ -1,0 +1,6 @@
+"""A particle filter of AMCL's design, for comparison on the same topics."""
+
+from services.estimator.particle_filter.filter import ParticleFilter
+from services.estimator.particle_filter.settings import Settings
+
+__all__ = ["ParticleFilter", "Settings"]

@@ -1,0 +1,96 @@
+"""Beam model: what a range finder measures given the distance to the wall (Thrun, Burgard, Fox 2005, section 6.3)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from common.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from common.se2 import Array
+    from common.world import World
+
+HEADINGS = 360  # of the table; between them ranges are interpolated
+MAX_CELLS = 20_000_000
+_erf = np.vectorize(math.erf, otypes=[float])
+
+
+@dataclass(frozen=True)
+class BeamModel:
+    """Mixture of hit, short, max and random measurements; weights sum to 1 by construction."""
+
+    z_hit: float
+    z_short: float
+    z_max: float
+    z_rand: float
+    sigma_hit: float  # m
+    lambda_short: float  # 1/m
+
+    def log_density(self, ranges: Array, expected: Array, range_max: float) -> Array:
+        """(N, B) ln p of ranges (B,) m where ``expected`` (N, B) m; no return (+inf) is a mass, not a density.
+
+        Hit and short are normalised over what can be measured, [0, range_max] and [0, expected], as in the book; a
+        beam expected to meet nothing is a maximum reading instead of a hit, and cannot be short.
+        """
+        total = self.z_hit + self.z_short + self.z_max + self.z_rand
+        far = expected >= range_max
+        mean = np.minimum(expected, range_max)
+        missed = ~np.isfinite(ranges) | (ranges >= range_max)
+        z = np.where(missed, 0.0, np.maximum(ranges, 0.0))
+        root = math.sqrt(2) * self.sigma_hit
+        # The part of the Gaussian that lies in [0, range_max]; nearly always 1, so erf is asked for few.
+        edge = (mean < 5 * self.sigma_hit) | (mean > range_max - 5 * self.sigma_hit)
+        inside = np.ones_like(mean)
+        inside[edge] = 0.5 * (_erf((range_max - mean[edge]) / root) + _erf(mean[edge] / root))
+        hit = np.exp(-(((z - mean) / root) ** 2)) / (root * math.sqrt(math.pi) * inside)
+        lam = self.lambda_short
+        short = np.where(z <= mean, lam * np.exp(-lam * z) / -np.expm1(-lam * np.maximum(mean, 1e-6)), 0.0)
+        random = self.z_rand / range_max
+        measured = np.where(far, random, self.z_hit * hit + self.z_short * short + random)
+        nothing = np.where(far, self.z_hit + self.z_short + self.z_max, self.z_max)
+        return np.log(np.maximum(np.where(missed, nothing, measured) / total, 1e-300))
+
+
+class RangeTable:
+    """Ranges to the walls from cells of a grid, all around; a cell is cast when a particle first comes there."""
+
+    def __init__(self, world: World, resolution: float = 0.05) -> None:
+        """``resolution`` m of a cell; UserError for too many cells."""
+        x0, y0, x1, y1 = world.bounds
+        self.world, self.resolution, self.origin = world, resolution, np.array([x0, y0])
+        nx, ny = int(np.ceil((x1 - x0) / resolution)), int(np.ceil((y1 - y0) / resolution))
+        if nx * ny > MAX_CELLS:
+            raise UserError(f"world {world.name!r}: {nx} x {ny} cells of {resolution} m are too many for a table")
+        self._limit = np.array([nx - 1, ny - 1])
+        self._row = np.full(nx * ny, -1, np.int32)
+        self._ranges: npt.NDArray[np.float32] = np.zeros((0, HEADINGS), np.float32)
+        self._angles = 2 * np.pi / HEADINGS * np.arange(HEADINGS)
+
+    def ranges(self, poses: Array, angles: Array) -> Array:
+        """(N, B) m, about, from scanner poses (N, 3) in map along ``angles`` (B,): as from the cell's middle."""
+        ij = np.clip(np.floor((poses[:, :2] - self.origin) / self.resolution).astype(int), 0, self._limit)
+        cells = ij[:, 0] * (self._limit[1] + 1) + ij[:, 1]
+        self._cast(np.unique(cells[self._row[cells] < 0]))
+        at = ((poses[:, 2:3] + angles) % (2 * np.pi)) * (HEADINGS / (2 * np.pi))
+        low = np.floor(at).astype(int)
+        rows, part = self._row[cells][:, None], at - low
+        a, b = self._ranges[rows, low % HEADINGS], self._ranges[rows, (low + 1) % HEADINGS]
+        # Across a silhouette the nearer heading is asked: between near and far there is nothing.
+        with np.errstate(invalid="ignore"):
+            smooth = np.abs(a - b) < 0.1 * np.minimum(a, b)
+            return np.asarray(np.where(smooth, a + part * (b - a), np.where(part < 0.5, a, b)), float)
+
+    def _cast(self, cells: npt.NDArray[np.int_]) -> None:
+        if len(cells) == 0:
+            return
+        ij = np.stack(np.divmod(cells, self._limit[1] + 1), axis=-1)
+        middles = np.column_stack([self.origin + (ij + 0.5) * self.resolution, np.zeros(len(cells))])
+        self._row[cells] = len(self._ranges) + np.arange(len(cells), dtype=np.int32)
+        found = self.world.ray_distances(middles, self._angles).astype(np.float32)
+        self._ranges = np.concatenate([self._ranges, found])

@@ -1,0 +1,68 @@
+"""Clusters of particles as AMCL forms them: occupied bins that touch (nav2's pf_kdtree_cluster)."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from common import se2
+from services.estimator.interface import Hypothesis
+from services.estimator.particle_filter.resampling import HEADING_BINS, OFFSET, bins
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from common.se2 import Array
+
+NEGLIGIBLE = 1e-3  # this part of the weight, carried by the lightest particles, joins no cluster
+MOST = 8  # clusters reported
+# Half of the 26 neighbours in x, y, heading, (13, 3, 1): each pair once.
+NEIGHBOURS = np.array([n for n in product((-1, 0, 1), repeat=3) if n > (0, 0, 0)])[..., None]
+
+
+def labels(poses: Array) -> npt.NDArray[np.int64]:
+    """(N,) cluster of each pose (N, 3): bins that touch, corners and headings across pi included."""
+    occupied, of_pose = np.unique(bins(poses), return_inverse=True)
+    xy, yaw = np.divmod(occupied, HEADING_BINS)
+    beside = (xy + NEIGHBOURS[:, 0] * 2 * OFFSET + NEIGHBOURS[:, 1]) * HEADING_BINS
+    beside = beside + (yaw + NEIGHBOURS[:, 2]) % HEADING_BINS
+    at = np.minimum(np.searchsorted(occupied, beside), len(occupied) - 1)
+    offset, a = np.nonzero(occupied[at] == beside)
+    b = at[offset, a]
+    # Every bin takes the least label around it, and the label's own label, until none changes.
+    label = np.arange(len(occupied))
+    while True:
+        before = label.copy()
+        np.minimum.at(label, a, before[b])
+        np.minimum.at(label, b, before[a])
+        label = label[label]
+        if np.array_equal(label, before):
+            return np.asarray(label[of_pose], np.int64)
+
+
+def moments(poses: Array, weights: Array) -> tuple[Array, Array]:
+    """Mean (3,) and covariance (3, 3) of poses (N, 3) under weights (N,); headings by their mean direction."""
+    w = weights / weights.sum()
+    yaw = np.arctan2(w @ np.sin(poses[:, 2]), w @ np.cos(poses[:, 2]))
+    mean = np.array([w @ poses[:, 0], w @ poses[:, 1], yaw])
+    off = poses - mean
+    off[:, 2] = se2.wrap(off[:, 2])
+    return mean, np.asarray((off * w[:, None]).T @ off)
+
+
+def hypotheses(poses: Array, weights: Array) -> tuple[Hypothesis, ...]:
+    """The heaviest clusters of weighted poses, at most 8, heaviest first; their weights sum to 1."""
+    order = np.argsort(weights, kind="stable")
+    kept = order[np.searchsorted(np.cumsum(weights[order]), NEGLIGIBLE * weights.sum()) :]
+    poses, weights = poses[kept], weights[kept]
+    names, of_pose = np.unique(labels(poses), return_inverse=True)
+    mass = np.bincount(of_pose, weights, len(names))
+    heaviest = np.argsort(-mass, kind="stable")[:MOST]
+    total = float(mass[heaviest].sum())
+    found = []
+    for name in heaviest:
+        mean, covariance = moments(poses[of_pose == name], weights[of_pose == name])
+        found.append(Hypothesis(mean, covariance, float(mass[name]) / total))
+    return tuple(found)

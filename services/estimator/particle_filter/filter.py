@@ -1,0 +1,182 @@
+"""Particle filter of AMCL's design behind the estimator's interface: predict, weigh, cluster, resample."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from common import se2
+from services.estimator.interface import Observation, Posterior, State
+from services.estimator.particle_filter import motion, resampling
+from services.estimator.particle_filter.clusters import hypotheses
+from services.estimator.particle_filter.recovery import Recovery
+from services.estimator.particle_filter.sensor import Sensor
+from services.estimator.particle_filter.settings import Settings
+
+if TYPE_CHECKING:
+    from common.se2 import Array
+    from common.world import World
+    from services.estimator.interface import Hypothesis
+
+NOMINAL_DT = 1 / 15  # s, between scans where no stamps tell; the jitter's unit
+LONGEST_DT = 1.0  # s, a random walk over a longer gap would be everywhere: that is recovery's business
+INITIAL_COVARIANCE = np.diag([0.25, 0.25, (np.pi / 12) ** 2])  # nav2's initial_cov
+COMMAND_NOISE = 0.5  # of the recent speed: the base lags behind its command
+COMMAND_MEMORY = 0.5  # s, for which a past command may still be acted upon
+TIGHT = 0.3  # m, position standard deviation of a cluster that is one place
+SURE = 0.95  # of the weight
+PLACES = 20_000  # sampled over free space in advance: to find them scan by scan takes longer than to filter
+LOST = 0.5  # short- over long-term fit below which the pose is not believed
+FOUND = 0.8  # the same, above which it is again
+
+
+class ParticleFilter:
+    """Monte Carlo localisation with KLD-adaptive particles and augmented recovery; deterministic by seed."""
+
+    name = "particle-filter"
+
+    def __init__(
+        self,
+        world: World,
+        settings: Settings | None = None,
+        mount: tuple[float, float, float] = (0, 0, 0),
+        seed: int = 0,
+    ) -> None:
+        """Spread over free space of ``world``; ``mount`` (3,) is laser in base_link, m, m, rad.
+
+        Raises UserError where the world is too large for the settings' resolution.
+        """
+        self.world, self.settings = world, settings or Settings()
+        self.mount = np.array(mount, float)
+        self.sensor = Sensor(world, self.settings)
+        self._rng = np.random.default_rng(seed)
+        self._places = np.zeros((0, 2))
+        self.restart()
+
+    def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:
+        """Begin anew: Gaussian about ``pose`` (3,) with ``covariance`` (3, 3), nav2's by default, or uniform."""
+        s = self.settings
+        if pose is None:
+            self._places = self.world.sample_free(max(s.max_particles, PLACES), self._rng)
+            self.particles = self._anywhere(s.max_particles, self._places[: s.max_particles])
+        else:
+            count = min(s.max_particles, max(s.min_particles, 2000))
+            spread = INITIAL_COVARIANCE if covariance is None else np.asarray(covariance, float)
+            self.particles = self._rng.multivariate_normal(np.asarray(pose, float), spread, count, method="eigh")
+        self.weights = np.full(len(self.particles), 1 / len(self.particles))
+        self._recovery = Recovery(s.recovery_alpha_slow, s.recovery_alpha_fast)
+        self._health = Recovery(0.01, 0.3)
+        self._state: State = "localising"
+        self._scans = 0
+        self._sigma = self.sensor.widest
+        self._last: Observation | None = None
+        self._speed = np.zeros(2)  # m/s, rad/s recently commanded
+
+    def update(self, observation: Observation) -> Posterior:
+        """The posterior after one more scan."""
+        self._predict(observation)
+        self._anneal()
+        log_weights, fit = self.sensor.weigh(se2.compose(self.particles, self.mount), observation, self._sigma)
+        log_weights = log_weights + np.log(self.weights)
+        weights = np.exp(log_weights - log_weights.max())
+        self.weights = weights / weights.sum()
+        self._recovery.add(fit)
+        self._health.add(fit)
+        found = hypotheses(self.particles, self.weights)
+        self._state = self._judge(found)
+        posterior = self._posterior(observation, found)
+        self._scans += 1
+        if self._scans % self.settings.resample_interval == 0:
+            self._resample()
+        self._last = observation
+        return posterior
+
+    def _anywhere(self, count: int, places: Array | None = None) -> Array:
+        """(count, 3) poses uniform over free space, at ``places`` (count, 2) or at ones sampled in advance."""
+        if places is None:
+            places = self._places[self._rng.integers(len(self._places), size=count)]
+        return np.column_stack([places, self._rng.uniform(-np.pi, np.pi, count)])
+
+    def _predict(self, now: Observation) -> None:
+        """Move the particles by odometry, else by the last command, else at random."""
+        last, s = self._last, self.settings
+        if last is None:
+            return
+        dt = NOMINAL_DT
+        if now.stamp is not None and last.stamp is not None and now.stamp >= last.stamp:
+            dt = min(now.stamp - last.stamp, LONGEST_DT)
+        alphas = (s.alpha1, s.alpha2, s.alpha3, s.alpha4, s.alpha5)
+        model = motion.omni if s.robot_model_type == "omni" else motion.differential
+        position, heading = s.floor_position, s.floor_heading
+        moved = self.particles
+        if now.odom is not None and last.odom is not None:
+            moved = model(moved, se2.between(last.odom, now.odom), alphas, self._rng)
+        elif now.command is not None:
+            speed = np.array([np.hypot(now.command[0], now.command[1]), abs(now.command[2])])
+            self._speed = np.maximum(speed, self._speed * np.exp(-dt / COMMAND_MEMORY))
+            moved = se2.compose(moved, motion.arc(now.command, dt))
+            position, heading = np.hypot((position, heading), COMMAND_NOISE * dt * self._speed)
+        else:
+            position, heading = np.array([s.jitter_position, s.jitter_heading]) * dt / NOMINAL_DT
+        self.particles = motion.jitter(moved, position, heading, self._rng)
+        self.particles[:, 2] = se2.wrap(self.particles[:, 2])
+
+    def _anneal(self) -> None:
+        """Sigma of a hit follows the spread of the particles down, and up at once where a fit was lost."""
+        off = self.particles[:, :2] - np.median(self.particles[:, :2], axis=0)
+        spread = float(np.median(np.hypot(off[:, 0], off[:, 1])))
+        self._sigma = self.sensor.sigma(spread, self._sigma)
+
+    def _judge(self, found: tuple[Hypothesis, ...]) -> State:
+        ratio = self._health.ratio
+        if self._state in ("tracking", "lost") and ratio < (FOUND if self._state == "lost" else LOST):
+            return "lost"
+        tight = [np.sqrt(np.trace(h.covariance[:2, :2])) < TIGHT for h in found]
+        if found[0].weight > SURE and tight[0] and self._sigma < 1.5 * self.settings.sigma_hit:
+            if self._state != "tracking":
+                self._health.converged()
+                self._recovery.converged()
+            return "tracking"
+        if found[0].weight <= SURE and sum(h.weight for h, t in zip(found, tight, strict=True) if t) > SURE:
+            return "ambiguous"
+        return "localising"
+
+    def _posterior(self, observation: Observation, found: tuple[Hypothesis, ...]) -> Posterior:
+        pose = found[0].pose
+        accuracy, xi, curvature = self.sensor.explain(pose, self.mount, observation)
+        return Posterior(
+            state=self._state,
+            hypotheses=found,
+            accuracy=accuracy,
+            complexity=0.0,  # particles have no density to compare with the prior's
+            xi=xi,
+            curvature=curvature,
+            predicted=self.world.ray_distances(se2.compose(pose, self.mount), observation.angles)[0],
+        )
+
+    def _resample(self) -> None:
+        """As many particles as the belief needs, a share of them anywhere when scans have stopped to fit."""
+        s, rng = self.settings, self._rng
+        share = self._recovery.random_share
+        at = resampling.bins(self.particles)
+        trial = self._most_needed(len(np.unique(at)), share)
+        drawn = at[rng.permutation(resampling.low_variance(self.weights, trial, rng))]
+        strangers = self._anywhere(int(rng.binomial(trial, share))) if share > 0 else np.zeros((0, 3))
+        if len(strangers):
+            drawn[rng.permutation(trial)[: len(strangers)]] = resampling.bins(strangers)
+        count = resampling.adaptive_count(drawn, s.pf_err, s.pf_z, s.min_particles, s.max_particles)
+        strangers = strangers[: int(rng.binomial(count, share))]
+        chosen = resampling.low_variance(self.weights, count - len(strangers), rng)
+        self.particles = np.concatenate([self.particles[chosen], strangers])
+        self.weights = np.full(count, 1 / count)
+
+    def _most_needed(self, occupied: int, share: float) -> int:
+        """Particles that suffice in any case: no draw meets more bins than are occupied, and one a stranger."""
+        s, count = self.settings, self.settings.min_particles
+        while count < s.max_particles:
+            needed = resampling.kld_bound(occupied + np.ceil(1.5 * share * count), s.pf_err, s.pf_z)
+            if needed <= count:
+                break
+            count = int(needed)
+        return min(count, s.max_particles)

@@ -1,0 +1,44 @@
+"""Noticing that scans no longer fit: augmented Monte Carlo localisation (Thrun, Burgard, Fox 2005, table 8.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass
+class Recovery:
+    """Short- and long-term average of how well the particles explain the scans.
+
+    AMCL averages the likelihoods themselves. A product over 60 beams jumps by e^20 from one good scan to the next, so
+    what is averaged here for products is the geometric mean over the beams, relative to a perfect fit.
+    """
+
+    alpha_slow: float
+    alpha_fast: float
+    slow: float = 0.0
+    fast: float = 0.0
+
+    def add(self, fit: float) -> None:
+        """Take in how well one scan fitted, > 0."""
+        if self.slow == 0.0:
+            self.slow = self.fast = fit
+        self.slow += self.alpha_slow * (fit - self.slow)
+        self.fast += self.alpha_fast * (fit - self.fast)
+
+    def converged(self) -> None:
+        """The long-term average forgets the search, whose poor fits would hide a later kidnapping."""
+        self.slow = max(self.slow, self.fast)
+
+    def reset(self) -> None:
+        """Nothing has been seen yet."""
+        self.slow = self.fast = 0.0
+
+    @property
+    def ratio(self) -> float:
+        """Short- over long-term average; 1 before the first scan."""
+        return self.fast / self.slow if self.slow > 0 else 1.0
+
+    @property
+    def random_share(self) -> float:
+        """Share of particles to draw at random over free space."""
+        return max(0.0, 1.0 - self.ratio)
