@@ -27,7 +27,8 @@ COMMAND_MEMORY = 0.5  # s, for which a past command may still be acted upon
 TIGHT = 0.3  # m, position standard deviation of a cluster that is one place
 SURE = 0.95  # of the weight
 PLACES = 20_000  # sampled over free space in advance: to find them scan by scan takes longer than to filter
-LOST = 0.5  # short- over long-term fit below which the pose is not believed
+LOST = 0.6  # short- over long-term fit below which the pose is not believed
+SEARCHES = 3  # that end in one place and no good fit, before the poor fit is taken for the world's doing
 FOUND = 0.8  # the same, above which it is again
 
 
@@ -66,8 +67,9 @@ class ParticleFilter:
             self.particles = self._rng.multivariate_normal(np.asarray(pose, float), spread, count, method="eigh")
         self.weights = np.full(len(self.particles), 1 / len(self.particles))
         self._recovery = Recovery(s.recovery_alpha_slow, s.recovery_alpha_fast)
-        self._health = Recovery(0.01, 0.3)
+        self._health = Recovery(0.01, 0.5)
         self._state: State = "localising"
+        self._was_found, self._searches = False, 0
         self._scans = 0
         self._sigma = self.sensor.widest
         self._last: Observation | None = None
@@ -77,15 +79,11 @@ class ParticleFilter:
         """The posterior after one more scan."""
         self._predict(observation)
         self._anneal()
-        log_weights, fit = self.sensor.weigh(se2.compose(self.particles, self.mount), observation, self._sigma)
-        log_weights = log_weights + np.log(self.weights)
-        weights = np.exp(log_weights - log_weights.max())
-        self.weights = weights / weights.sum()
-        self._recovery.add(fit)
-        self._health.add(fit)
-        found = hypotheses(self.particles, self.weights)
-        self._state = self._judge(found)
-        posterior = self._posterior(observation, found)
+        log_weights = self.sensor.weigh(se2.compose(self.particles, self.mount), observation, self._sigma)
+        log_weights += np.log(np.maximum(self.weights, 1e-300))
+        searching = self._sigma > self.settings.sigma_hit
+        self.weights = resampling.tempered(log_weights, self.settings.search_share if searching else 0.0)
+        posterior = self._posterior(observation, hypotheses(self.particles, self.weights))
         self._scans += 1
         if self._scans % self.settings.resample_interval == 0:
             self._resample()
@@ -108,7 +106,10 @@ class ParticleFilter:
             dt = min(now.stamp - last.stamp, LONGEST_DT)
         alphas = (s.alpha1, s.alpha2, s.alpha3, s.alpha4, s.alpha5)
         model = motion.omni if s.robot_model_type == "omni" else motion.differential
-        position, heading = s.floor_position, s.floor_heading
+        walk = np.array([s.jitter_position, s.jitter_heading]) * dt / NOMINAL_DT
+        # While searching a particle stands for its surroundings: it must be able to come nearer.
+        search = (self._sigma - s.sigma_hit) / max(self.sensor.widest - s.sigma_hit, 1e-9)
+        position, heading = np.maximum((s.floor_position, s.floor_heading), search * walk)
         moved = self.particles
         if now.odom is not None and last.odom is not None:
             moved = model(moved, se2.between(last.odom, now.odom), alphas, self._rng)
@@ -118,23 +119,32 @@ class ParticleFilter:
             moved = se2.compose(moved, motion.arc(now.command, dt))
             position, heading = np.hypot((position, heading), COMMAND_NOISE * dt * self._speed)
         else:
-            position, heading = np.array([s.jitter_position, s.jitter_heading]) * dt / NOMINAL_DT
+            position, heading = walk
         self.particles = motion.jitter(moved, position, heading, self._rng)
         self.particles[:, 2] = se2.wrap(self.particles[:, 2])
 
     def _anneal(self) -> None:
-        """Sigma of a hit follows the spread of the particles down, and up at once where a fit was lost."""
+        """Sigma of a hit follows the spread of the particles; a search that found nothing begins again."""
+        if self._state == "lost" and self._sigma <= self.settings.sigma_hit and self._health.ratio < LOST:
+            self._sigma = self.sensor.widest
+            self._searches += 1
+            return
         off = self.particles[:, :2] - np.median(self.particles[:, :2], axis=0)
         spread = float(np.median(np.hypot(off[:, 0], off[:, 1])))
         self._sigma = self.sensor.sigma(spread, self._sigma)
 
     def _judge(self, found: tuple[Hypothesis, ...]) -> State:
-        ratio = self._health.ratio
-        if self._state in ("tracking", "lost") and ratio < (FOUND if self._state == "lost" else LOST):
-            return "lost"
         tight = [np.sqrt(np.trace(h.covariance[:2, :2])) < TIGHT for h in found]
-        if found[0].weight > SURE and tight[0] and self._sigma < 1.5 * self.settings.sigma_hit:
+        settled = found[0].weight > SURE and tight[0] and self._sigma < 1.5 * self.settings.sigma_hit
+        if self._was_found and self._health.ratio < (FOUND if self._state == "lost" else LOST):
+            if self._searches <= SEARCHES or not settled or self.settings.recovery_alpha_fast == 0:
+                return "lost"
+            self._health.accept()
+            self._recovery.accept()
+        self._searches = 0
+        if settled:
             if self._state != "tracking":
+                self._was_found = True
                 self._health.converged()
                 self._recovery.converged()
             return "tracking"
@@ -145,6 +155,10 @@ class ParticleFilter:
     def _posterior(self, observation: Observation, found: tuple[Hypothesis, ...]) -> Posterior:
         pose = found[0].pose
         accuracy, xi, curvature = self.sensor.explain(pose, self.mount, observation)
+        fit = self.sensor.fit(accuracy, observation)
+        self._recovery.add(fit)
+        self._health.add(fit)
+        self._state = self._judge(found)
         return Posterior(
             state=self._state,
             hypotheses=found,

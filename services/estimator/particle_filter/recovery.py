@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+# Most particles stay where the belief is: people that block half the beams must not cost a pose that is right.
+MOST_RANDOM = 0.4
+
 
 @dataclass
 class Recovery:
     """Short- and long-term average of how well the particles explain the scans.
 
-    AMCL averages the likelihoods themselves. A product over 60 beams jumps by e^20 from one good scan to the next, so
-    what is averaged here for products is the geometric mean over the beams, relative to a perfect fit.
+    AMCL averages the particles' likelihoods. A product over many beams jumps by e^20 from one good scan to the next,
+    and changes with sigma; what is averaged here is the fit at the estimate, see `Sensor.fit`.
     """
 
     alpha_slow: float
@@ -29,9 +32,9 @@ class Recovery:
         """The long-term average forgets the search, whose poor fits would hide a later kidnapping."""
         self.slow = max(self.slow, self.fast)
 
-    def reset(self) -> None:
-        """Nothing has been seen yet."""
-        self.slow = self.fast = 0.0
+    def accept(self) -> None:
+        """Scans fit as well as they will: it is the world that changed."""
+        self.slow = self.fast
 
     @property
     def ratio(self) -> float:
@@ -41,4 +44,4 @@ class Recovery:
     @property
     def random_share(self) -> float:
         """Share of particles to draw at random over free space."""
-        return max(0.0, 1.0 - self.ratio)
+        return min(MOST_RANDOM, max(0.0, 1.0 - self.ratio))

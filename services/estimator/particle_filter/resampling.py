@@ -17,6 +17,27 @@ HEADING_BINS = 36
 OFFSET = 1 << 20  # so many bins either side of the origin: 500 km
 
 
+def tempered(log_weights: Array, share: float) -> Array:
+    """(N,) weights exp(beta log_weights), normalised: beta = 1, or so small that ``share`` of them count.
+
+    What counts is the effective sample size 1 / sum of squares (Del Moral, Doucet, Jasra 2012). While particles are
+    sparse, the right place may have none near enough to beat a lucky one in a place that looks alike.
+    """
+    log = log_weights - log_weights.max()
+
+    def weigh(beta: float) -> Array:
+        weights = np.exp(beta * log)
+        return np.asarray(weights / weights.sum())
+
+    low, high = 0.0, 1.0
+    if share <= 0 or 1 / np.sum(weigh(1.0) ** 2) >= share * len(log):
+        return weigh(1.0)
+    for _ in range(12):
+        middle = (low + high) / 2
+        low, high = (middle, high) if 1 / np.sum(weigh(middle) ** 2) >= share * len(log) else (low, middle)
+    return weigh(low)
+
+
 def low_variance(weights: Array, count: int, rng: np.random.Generator) -> Indices:
     """(count,) indices, each i about count * weights[i] times, never off by one or more; weights (N,) sum to 1."""
     comb = (rng.random() + np.arange(count)) / count
@@ -51,4 +72,6 @@ def adaptive_count(drawn_bins: Indices, err: float, z: float, least: int, most: 
     first[np.unique(drawn_bins, return_index=True)[1]] = True
     enough = np.arange(1, len(first) + 1) >= kld_bound(np.cumsum(first), err, z)
     enough[: least - 1] = False  # the first draws meet few bins, that does not make them enough
-    return int(np.clip(int(np.argmax(enough)) + 1 if enough.any() else most, least, most))
+    # Where all of them do not suffice, what their bins ask for.
+    needed = np.argmax(enough) + 1 if enough.any() else kld_bound(first.sum(), err, z)
+    return int(np.clip(needed, least, most))

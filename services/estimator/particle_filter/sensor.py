@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from services.estimator.particle_filter.settings import Settings
 
 SIGMA_PER_SPREAD = 1.5  # a hit is as blurred as the particles are sparse
-SLOWEST = 0.7  # sigma shrinks by no more than this a scan: one scan must not decide a search
+SLOWEST = 0.85  # sigma shrinks by no more than this a scan: one scan must not decide a search
+# Beams' worth of likelihood in a fit. All of them and it jumps at every scan; 1 and a place that only looks alike fits.
+SHARPNESS = 2.0
 STEP = np.array([0.01, 0.01, 0.002])  # m, m, rad of the numeric gradient
 
 
@@ -39,23 +41,18 @@ class Sensor:
         wanted = float(np.clip(SIGMA_PER_SPREAD * spread, self.settings.sigma_hit, self.widest))
         return max(wanted, SLOWEST * before) if before > self.settings.sigma_hit else wanted
 
-    def weigh(self, poses: Array, observation: Observation, sigma: float) -> tuple[Array, float]:
-        """(N,) log weights of scanner poses (N, 3) in map, and how well they explain the scan on average, in (0, 1]."""
+    def weigh(self, poses: Array, observation: Observation, sigma: float) -> Array:
+        """(N,) log weights of scanner poses (N, 3) in map; ``sigma`` m of a hit, but the beam model keeps its own."""
         used, ranges, angles = self._beams(observation, self.settings.max_beams)
         kind = self.settings.laser_model_type
-        if len(ranges) == 0:
-            return np.zeros(len(poses)), 1.0
         if kind == "beam" and self._table is not None:
             expected = self._table.ranges(poses, observation.angles[used])
-            log = self._beam.log_density(observation.ranges[used], expected, observation.range_max).sum(axis=1)
-            return log, self._geometric(log, len(used), np.log(self.settings.z_hit / (np.sqrt(2 * np.pi) * sigma)))
+            log = self._beam.log_density(observation.ranges[used], expected, observation.range_max)
+            return np.asarray(log.sum(axis=1))
         ends = self.field.ends(poses, ranges, angles)
         if kind == "likelihood_field":
-            log = self.field.log_cubes(ends, sigma, observation.range_max)
-            return log, float(np.mean(np.expm1(log)) / len(ranges))
-        log = self.field.log_product(ends, sigma, observation.range_max)
-        best = float(np.log(self.field.densities(np.zeros(1), sigma, observation.range_max)[0]))
-        return log, self._geometric(log, len(ranges), best)
+            return self.field.log_cubes(ends, sigma, observation.range_max)
+        return self.field.log_product(ends, sigma, observation.range_max)
 
     def explain(self, pose: Array, mount: Array, observation: Observation) -> tuple[float, Array, Array]:
         """At base_link ``pose`` (3,): -ln p(o | pose) in nats over all beams, xi (3,) and curvature (3, 3) of it.
@@ -83,8 +80,8 @@ class Sensor:
         ended = np.isfinite(ranges) & (ranges < observation.range_max)
         return used, ranges[ended], observation.angles[used][ended]
 
-    @staticmethod
-    def _geometric(log: Array, beams: int, best: float) -> float:
-        """Mean likelihood per beam relative to ``best``, a beam's in nats; the sum runs over particles (N,) of logs."""
-        mean = log.max() + np.log(np.mean(np.exp(log - log.max())))
-        return float(np.exp(min(0.0, mean / beams - best)))
+    def fit(self, accuracy: float, observation: Observation) -> float:
+        """How well ``accuracy`` nats explain the scan, in (0, 1]: its mean per beam against an exact beam's."""
+        beams = len(self._beams(observation, None)[1])
+        exact = np.log(self.field.densities(np.zeros(1), self.settings.sigma_hit, observation.range_max)[0])
+        return float(np.exp(SHARPNESS * min(0.0, -accuracy / max(beams, 1) - exact)))

@@ -43,6 +43,7 @@ class Settings:
     resample_interval: int = 1  # scans
     resolution: float = 0.05  # m, cells of the likelihood field and of the beam model's table
     sigma_search: float = 0.0  # m, replaces sigma_hit while the particles are spread; 0: never
+    search_share: float = 0.0  # of the particles keep weight while sigma is wide, by tempering; 0: none need to
     jitter_position: float = 0.05  # m in 1/15 s, random walk where neither odometry nor command is known
     jitter_heading: float = 0.05  # rad in 1/15 s
     floor_position: float = 0.0  # m a scan, added to every motion: copies of one particle part again
@@ -78,8 +79,9 @@ class Settings:
             z_rand=0.05,
             sigma_hit=0.1,
             sigma_search=0.5,
+            search_share=0.05,
             max_particles=20_000,
-            recovery_alpha_slow=0.01,
+            recovery_alpha_slow=0.02,
             recovery_alpha_fast=0.3,
             floor_position=0.002,
             floor_heading=0.001,

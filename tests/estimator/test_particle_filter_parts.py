@@ -1,0 +1,230 @@
+"""The particle filter's parts against what the book says of them: densities, motion, resampling, clusters."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common import se2
+from common.errors import UserError
+from common.world import World
+from services.estimator.particle_filter import Settings, motion, resampling
+from services.estimator.particle_filter.beam_model import BeamModel, RangeTable
+from services.estimator.particle_filter.clusters import hypotheses, labels, moments
+from services.estimator.particle_filter.likelihood_field import DistanceField, LikelihoodField
+from services.estimator.particle_filter.recovery import Recovery
+from tests.estimator.models import ROOM
+
+HALL = World(name="hall", boundary=[(0, 0), (10, 0), (10, 10), (0, 10)])
+ALPHAS = (0.04, 0.02, 0.03, 0.05, 0.01)
+
+
+def test_the_distance_field_is_exact_at_nodes_and_close_between():
+    field, rng = DistanceField(ROOM, 0.05), np.random.default_rng(0)
+    points = rng.uniform((-1, -1), (7, 5), (4000, 2))
+    exact = np.clip(ROOM.clearance(points), -2, 2)
+    found = field(points[:, 0], points[:, 1])
+    assert np.abs(found - exact).max() < 0.03  # a medial axis or a corner within a cell
+    assert np.median(np.abs(found - exact)) < 1e-4
+    x, y = (field.origin[k] + 0.05 * rng.integers(5, field.shape[k] - 5, 500) for k in (0, 1))
+    nodes = np.clip(ROOM.clearance(np.column_stack([x, y])), -2, 2)
+    assert np.abs(field(x, y) - nodes).max() < 2e-4  # single precision finds the node to 1e-6 of a cell
+
+
+def test_surfaces_are_where_they_are_seen_and_far_away_is_saturated():
+    """No pull into the walls: the distance vanishes on the boundary of free space, to a tenth of a millimetre."""
+    field = DistanceField(HALL, 0.07)
+    along = np.linspace(0.5, 9.5, 50)
+    assert np.abs(field(np.zeros(50), along)).max() < 1e-4
+    assert np.abs(field(along, np.full(50, 10.0))).max() < 1e-4
+    assert np.all(field(np.array([-500.0, 5.0, 1e4]), np.array([5.0, 900.0, -1e4])) == -2.0)
+    assert field(np.array([5.0]), np.array([5.0]))[0] == 2.0
+
+
+def test_a_world_too_large_for_the_field_is_refused():
+    huge = World(name="huge", boundary=[(0, 0), (9000, 0), (9000, 9000), (0, 9000)])
+    with pytest.raises(UserError, match="coarser resolution"):
+        DistanceField(huge)
+    with pytest.raises(UserError, match="too many"):
+        RangeTable(huge)
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.1, 0.5])
+def test_likelihood_field_of_a_beam_is_a_density(sigma):
+    """A beam that meets a wall squarely, over every range it may report; the wall is the only surface about."""
+    field = LikelihoodField(DistanceField(HALL, 0.05), 0.95, 0.05)
+    z, pose = np.linspace(0, 25, 25001), np.array([[5.0, 5.0, 0.0]])
+    ends = np.concatenate([field.ends(pose, np.array([r]), np.zeros(1))[0] for r in z[::10]])
+    density = field.densities(ends, sigma, 25.0)
+    # Beyond max_dist the Gaussian's tail is held at its value there: 4 sigma for the widest.
+    assert np.sum(density) * 0.01 == pytest.approx(1.0, abs=6e-3)
+
+
+def test_a_product_of_many_beams_does_not_underflow():
+    field = LikelihoodField(DistanceField(ROOM), 0.95, 0.05)
+    far = np.full((2, 811), 1.5)
+    log = field.log_product(far, 0.1, 25.0)
+    assert np.allclose(log, 811 * np.log(0.05 / 25), rtol=1e-5)  # e^-5040
+    assert np.all(np.isfinite(field.log_cubes(far, 0.1, 25.0)))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(0.05, 30), st.floats(0.02, 1), st.floats(0.05, 3))
+def test_the_beam_model_is_a_density(expected, sigma, rate):
+    model, z = BeamModel(0.5, 0.1, 0.05, 0.5, sigma, rate), np.linspace(0, 10, 40001)
+    middles = (z[1:] + z[:-1]) / 2
+    p = np.exp(model.log_density(middles, np.array([[expected]]), 10.0))[0]
+    nothing = np.exp(model.log_density(np.array([np.inf]), np.array([[expected]]), 10.0))[0, 0]
+    assert p.sum() * (z[1] - z[0]) + nothing == pytest.approx(1.0, abs=2e-3)
+
+
+def test_the_beam_model_knows_people_from_holes():
+    model, seen = BeamModel(0.7, 0.2, 0.05, 0.05, 0.1, 1.0), np.array([[5.0]])
+    near, hit, beyond = (model.log_density(np.array([r]), seen, 25.0)[0, 0] for r in (2.0, 5.0, 8.0))
+    assert hit > near > beyond
+
+
+def test_the_range_table_agrees_with_exact_rays():
+    table, rng = RangeTable(ROOM, 0.02), np.random.default_rng(1)
+    poses = np.column_stack([ROOM.sample_free(50, rng, 0.3), rng.uniform(-np.pi, np.pi, 50)])
+    angles = np.linspace(-2, 2, 30)
+    error = np.abs(table.ranges(poses, angles) - ROOM.ray_distances(poses, angles))
+    assert np.median(error) < 0.01
+    assert np.quantile(error, 0.95) < 0.05
+
+
+def test_omni_moments_are_the_analytic_ones():
+    rng, step, n = np.random.default_rng(2), np.array([0.3, 0.4, 0.2]), 200_000
+    moved = motion.omni(np.tile([1.0, 2.0, 0.7], (n, 1)), step, ALPHAS, rng)
+    mean = se2.compose(np.array([1.0, 2.0, 0.7]), step)
+    a1, a2, a3, a4, a5 = ALPHAS
+    p2, t2 = 0.25, 0.04
+    along, across, turn = a3 * p2 + a1 * t2, a1 * t2 + a5 * p2, a4 * t2 + a2 * p2
+    bearing = 0.7 + np.arctan2(0.4, 0.3)
+    axes = np.array([[np.cos(bearing), np.sin(bearing)], [np.sin(bearing), -np.cos(bearing)]]).T
+    assert np.allclose(moved.mean(axis=0), mean, atol=4 * np.sqrt(along / n))
+    assert np.allclose(np.cov(moved[:, :2].T), axes @ np.diag([along, across]) @ axes.T, atol=2e-4)
+    assert np.var(moved[:, 2]) == pytest.approx(turn, rel=0.02)
+
+
+@pytest.mark.parametrize("sign", [1, -1], ids=["forward", "backward"])
+@pytest.mark.parametrize("path", [0.5, 0.004], ids=["far", "short"])
+def test_differential_moments_are_the_analytic_ones(sign, path):
+    """Along a straight line, either way: path variance alpha3 p², turn variance 2 alpha2 p², no false turn by pi."""
+    rng, n = np.random.default_rng(3), 200_000
+    moved = motion.differential(np.zeros((n, 3)), np.array([sign * path, 0.0, 0.0]), ALPHAS, rng)
+    shrunk = np.exp(-0.5 * ALPHAS[1] * path**2)  # E cos of the first turn
+    deviation = path * np.sqrt(ALPHAS[2])
+    assert moved[:, 0].mean() == pytest.approx(sign * path * shrunk, abs=4 * deviation / np.sqrt(n))
+    assert np.std(moved[:, 0]) == pytest.approx(deviation, rel=0.02)
+    assert np.var(se2.wrap(moved[:, 2])) == pytest.approx(2 * ALPHAS[1] * path**2, rel=0.02)
+
+
+def test_differential_turns_in_place():
+    moved = motion.differential(np.zeros((100_000, 3)), np.array([0, 0, 0.3]), ALPHAS, np.random.default_rng(4))
+    assert moved[:, 2].mean() == pytest.approx(0.3, abs=1e-3)
+    assert np.var(moved[:, 2]) == pytest.approx(ALPHAS[0] * 0.09, rel=0.02)
+    assert np.hypot(moved[:, 0], moved[:, 1]).max() < 0.5
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.floats(-1, 1), st.floats(-1, 1), st.floats(-2, 2), st.floats(0, 1))
+def test_a_command_is_an_arc(vx, vy, w, dt):
+    fine, pose = np.array([vx, vy, w]) * dt / 500, np.zeros(3)
+    for _ in range(500 if abs(w) > 1e-9 else 1):
+        pose = pose + np.array([*se2.rotate(pose[2] + fine[2] / 2, fine[:2]), fine[2]])
+    if abs(w) <= 1e-9:
+        pose = np.array([vx, vy, w]) * dt
+    assert np.allclose(motion.arc(np.array([vx, vy, w]), dt), pose, atol=3e-6)
+
+
+def test_low_variance_resampling_is_unbiased_and_never_off_by_one():
+    rng, weights = np.random.default_rng(5), np.array([0.05, 0.0, 0.33, 0.12, 0.5])
+    draws = np.stack([np.bincount(resampling.low_variance(weights, 17, rng), minlength=5) for _ in range(20_000)])
+    assert np.allclose(draws.mean(axis=0), 17 * weights, atol=0.02)
+    assert np.all(np.abs(draws - 17 * weights) < 1)
+    assert draws.sum(axis=1).tolist() == [17] * 20_000
+
+
+def test_kld_bound_by_hand():
+    """For k = 2: 1 / (2 * 0.05) = 10 times (1 - 2/9 + sqrt(2/9) * 0.99)^3 = (7/9 + 0.466690...)^3 = 1.92721."""
+    assert float(resampling.kld_bound(2, 0.05, 0.99)) == 20
+    # k = 101: 1000 (1 - 1/450 + 0.0471405 * 0.99)^3 = 1000 * 1.0444469^3 = 1139.34
+    assert float(resampling.kld_bound(101, 0.05, 0.99)) == 1140
+    assert float(resampling.kld_bound(1, 0.05, 0.99)) == 1
+    # The chi-square it approximates: 2 n err is its quantile at k - 1 degrees of freedom; 124.342 at 0.95 and 100.
+    assert float(resampling.kld_bound(101, 0.05, 1.6449)) == pytest.approx(1243.42, abs=1.5)
+
+
+def test_the_number_of_particles_follows_the_bins_met():
+    one, many = np.zeros(20_000, np.int64), np.arange(20_000)
+    assert resampling.adaptive_count(one, 0.05, 0.99, 500, 20_000) == 500
+    assert resampling.adaptive_count(many, 0.05, 0.99, 500, 20_000) == 20_000
+    hundred = np.arange(20_000) % 101
+    assert resampling.adaptive_count(hundred, 0.05, 0.99, 500, 20_000) == 1140
+    assert resampling.adaptive_count(one[:100], 0.05, 0.99, 500, 20_000) == 500
+
+
+def test_bins_touch_across_pi_and_do_not_across_a_gap():
+    poses = np.array([[0.1, 0.1, np.pi - 0.05], [0.1, 0.1, -np.pi + 0.05], [-0.1, -0.4, -3.0], [2.0, 0.1, 3.1]])
+    found = labels(poses)
+    assert found[0] == found[1] == found[2] != found[3]
+    chain = np.column_stack([np.arange(40) * 0.5 + 0.25, np.full(40, 0.25), np.zeros(40)])
+    assert len(np.unique(labels(chain[np.random.default_rng(6).permutation(40)]))) == 1
+    turned = np.column_stack([np.zeros(3), np.zeros(3), np.radians([5, 25, 45])])
+    assert len(np.unique(labels(turned))) == 3
+
+
+def test_hypotheses_are_clusters_by_weight():
+    rng = np.random.default_rng(7)
+    centres = [(1.0, 1.0, 3.1), (4.0, 1.0, 0.0), (1.0, 5.0, 1.0)]
+    poses = np.concatenate([np.array(c) + 0.05 * rng.standard_normal((300, 3)) for c in centres])
+    weights = np.repeat([0.2, 0.7, 0.1], 300) / 300
+    found = hypotheses(poses, weights)
+    assert [h.weight for h in found] == pytest.approx([0.7, 0.2, 0.1], abs=2e-3)
+    for h, centre in zip(found, (centres[1], centres[0], centres[2]), strict=True):
+        assert np.allclose(se2.between(np.array(centre), h.pose), 0, atol=0.015)
+        assert np.allclose(h.covariance, 0.0025 * np.eye(3), atol=6e-4)
+
+
+def test_moments_average_headings_on_the_circle():
+    mean, covariance = moments(np.array([[0, 0, np.pi - 0.1], [2.0, 0, -np.pi + 0.1]]), np.array([0.5, 0.5]))
+    assert abs(mean[2]) == pytest.approx(np.pi)
+    assert covariance[2, 2] == pytest.approx(0.01)
+    assert covariance[0, 0] == pytest.approx(1.0)
+
+
+def test_recovery_draws_strangers_only_when_fits_fall():
+    recovery = Recovery(0.01, 0.3)
+    for _ in range(20):
+        recovery.add(0.9)
+    assert recovery.random_share == 0.0
+    recovery.add(0.1)
+    assert recovery.random_share == pytest.approx(1 - (0.9 - 0.24) / (0.9 - 0.008), abs=1e-6)
+    recovery.add(0.95)
+    recovery.add(0.95)
+    assert recovery.random_share < 0.12
+
+
+def test_settings_are_amcls_and_refuse_nonsense():
+    s = Settings()
+    assert (s.min_particles, s.max_particles, s.max_beams, s.sigma_hit, s.pf_err) == (500, 2000, 60, 0.2, 0.05)
+    assert (s.recovery_alpha_slow, s.recovery_alpha_fast, s.resample_interval) == (0.0, 0.0, 1)
+    tuned = Settings.tuned()
+    assert (tuned.max_particles, tuned.laser_model_type, tuned.sigma_hit) == (20_000, "likelihood_field_prob", 0.1)
+    for wrong in ({"sigma_hit": 0.0}, {"alpha1": -1.0}, {"max_beams": 0}, {"z_rand": 0.0}, {"min_particles": 9000}):
+        with pytest.raises(UserError, match="particle filter"):
+            dataclasses.replace(s, **wrong)
+
+
+def test_surfaces_hidden_inside_obstacles_count_for_nothing():
+    """Two boxes that overlap: the edge of one inside the other is no surface."""
+    boxes = [{"box": {"center": (c, 5), "size": (2, 2)}} for c in (4.5, 5.5)]
+    world = World(name="pair", boundary=HALL.boundary, obstacles=boxes)
+    assert DistanceField(world)(np.array([5.5]), np.array([5.0]))[0] == pytest.approx(-1.0, abs=1e-3)
+    assert shapely.area(world.free_space) == pytest.approx(94)
