@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from common.errors import UserError, first_fault
 
 if TYPE_CHECKING:
     from common.se2 import Array
@@ -40,8 +42,13 @@ class Scanner(BaseModel):
         return self.angle_min + self.angle_increment * np.arange(self.beams, dtype=np.float64)
 
     def with_beams(self, beams: int | None) -> Scanner:
-        """The same scanner with another number of beams over the same field of view."""
-        return self if beams is None else Scanner.model_validate({**self.model_dump(), "beams": beams})
+        """The same scanner with another number over the same field of view; raises UserError for an impossible one."""
+        if beams is None:
+            return self
+        try:
+            return Scanner.model_validate({**self.model_dump(), "beams": beams})
+        except ValidationError as error:
+            raise UserError(f"{self.name} with {beams} beams: {first_fault(error)}") from None
 
     def limit(self, ranges: Array) -> Array:
         """Ranges beyond the scanner's limits as it reports them (REP-117): +inf too far, -inf too close."""

@@ -24,6 +24,9 @@ Length = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e5)]
 Point = tuple[Number, Number]
 Ring = Annotated[list[Point], Field(min_length=3, max_length=10_000)]
 
+# What safe_load raises: a date like 2020-13-45 is a ValueError, 20 000 opening brackets end the recursion.
+NOT_YAML = (yaml.YAMLError, ValueError, RecursionError)
+
 CIRCLE_SEGMENTS = 64  # a quarter circle in free space: 0.04 mm off at a radius of 0.5 m
 
 
@@ -214,11 +217,11 @@ def load_world(name: str) -> World:
         raise UserError(f"no world {name!r}: give a file or one of {', '.join(known_worlds())}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"world {path}: cannot be read ({error})") from None
-    except yaml.YAMLError as error:
-        raise UserError(f"world {path}: no YAML ({' '.join(str(error).split())})") from None
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         raise UserError(f"world {path}: {'.'.join(map(str, first['loc'])) or 'file'}: {first['msg']}") from None
+    except NOT_YAML as error:
+        raise UserError(f"world {path}: no YAML ({' '.join(str(error).split())})") from None
 
 
 def save_world(world: World) -> str:

@@ -18,7 +18,7 @@ from common.messages import Stamped
 from common.robot import Robot
 from common.topics import Topic, topic_of
 from common.wire import DecodeError
-from common.world import World
+from common.world import NOT_YAML, World
 from services.recorder.writer import PROFILE
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -85,7 +85,7 @@ class Recording:
         text = self.attachments.get("world.yaml")
         try:
             return World.model_validate(yaml.safe_load(text)) if text is not None else None
-        except (yaml.YAMLError, UnicodeDecodeError, ValidationError):
+        except NOT_YAML:  # a ValidationError is a ValueError too
             return None
 
     def robot(self) -> Robot:

@@ -102,6 +102,8 @@ def test_a_wrong_argument_is_one_line_that_names_it(argv, words, tmp_path, monke
         ("thing: {colour: red}\n", ["colour", "settings.yaml"]),
         ("size: 1000\n", ["size", "settings.yaml"]),
         ("\xff\xfe", ["settings.yaml"]),
+        ("label: 2020-13-45\n", ["settings.yaml: no YAML", "month"]),
+        ("[" * 20_000, ["settings.yaml: no YAML"]),
     ],
 )
 def test_a_wrong_file_is_one_line_that_names_it(file, text, words):

@@ -119,6 +119,8 @@ def test_what_is_saved_loads(tmp_path):
         ("{name: x, boundary: [[0, 0], [1, 0], [1, 1]], walls: 3}", "walls"),
         ("{name: ../x, boundary: [[0, 0], [1, 0], [1, 1]]}", "name"),
         ("3", "file"),
+        ("{name: x, since: 2020-13-45}", "month"),
+        ("[" * 20_000, "recursion"),
     ],
 )
 def test_a_bad_file_is_one_line_that_says_where(tmp_path, text, why):
