@@ -172,7 +172,8 @@ def test_xi_is_minus_the_gradient_of_accuracy():
     found = make(9)
     observation = observe(truth, rng)
     pose = truth + np.array([0.03, -0.02, 0.01])
-    _, xi, curvature = found.sensor.explain(pose, found.mount, observation)
+    _, xi, curvature, fit = found.sensor.explain(pose, found.mount, observation)
+    assert 0.8 < fit < 1
     for axis, h in enumerate((0.01, 0.01, 0.002)):
         step = h * np.eye(3)[axis]
         high, low = (found.sensor.explain(pose + s * step, found.mount, observation)[0] for s in (1, -1))

@@ -27,9 +27,9 @@ COMMAND_MEMORY = 0.5  # s, for which a past command may still be acted upon
 TIGHT = 0.3  # m, position standard deviation of a cluster that is one place
 SURE = 0.95  # of the weight
 PLACES = 20_000  # sampled over free space in advance: to find them scan by scan takes longer than to filter
-LOST = 0.6  # short- over long-term fit below which the pose is not believed
+LOST = 0.65  # short- over long-term fit below which the pose is not believed
 SEARCHES = 3  # that end in one place and no good fit, before the poor fit is taken for the world's doing
-FOUND = 0.8  # the same, above which it is again
+FOUND = 0.85  # the same, above which it is again
 
 
 class ParticleFilter:
@@ -154,18 +154,17 @@ class ParticleFilter:
 
     def _posterior(self, observation: Observation, found: tuple[Hypothesis, ...]) -> Posterior:
         pose = found[0].pose
-        accuracy, xi, curvature = self.sensor.explain(pose, self.mount, observation)
-        fit = self.sensor.fit(accuracy, observation)
-        self._recovery.add(fit)
-        self._health.add(fit)
+        explanation = self.sensor.explain(pose, self.mount, observation)
+        self._recovery.add(explanation.fit)
+        self._health.add(explanation.fit)
         self._state = self._judge(found)
         return Posterior(
             state=self._state,
             hypotheses=found,
-            accuracy=accuracy,
+            accuracy=explanation.accuracy,
             complexity=0.0,  # particles have no density to compare with the prior's
-            xi=xi,
-            curvature=curvature,
+            xi=explanation.xi,
+            curvature=explanation.curvature,
             predicted=self.world.ray_distances(se2.compose(pose, self.mount), observation.angles)[0],
         )
 

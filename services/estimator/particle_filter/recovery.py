@@ -13,7 +13,7 @@ class Recovery:
     """Short- and long-term average of how well the particles explain the scans.
 
     AMCL averages the particles' likelihoods. A product over many beams jumps by e^20 from one good scan to the next,
-    and changes with sigma; what is averaged here is the fit at the estimate, see `Sensor.fit`.
+    and changes with sigma; what is averaged here is the fit of a beam at the estimate, see `Explanation.fit`.
     """
 
     alpha_slow: float

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -20,9 +20,16 @@ if TYPE_CHECKING:
 
 SIGMA_PER_SPREAD = 1.5  # a hit is as blurred as the particles are sparse
 SLOWEST = 0.85  # sigma shrinks by no more than this a scan: one scan must not decide a search
-# Beams' worth of likelihood in a fit. All of them and it jumps at every scan; 1 and a place that only looks alike fits.
-SHARPNESS = 2.0
 STEP = np.array([0.01, 0.01, 0.002])  # m, m, rad of the numeric gradient
+
+
+class Explanation(NamedTuple):
+    """What a pose makes of a scan."""
+
+    accuracy: float  # nats, -ln p(o | pose)
+    xi: Array  # (3,) minus its gradient
+    curvature: Array  # (3, 3) Gauss-Newton Hessian
+    fit: float  # mean likelihood of a beam over that of an exact one, in (0, 1]: about the share that is explained
 
 
 class Sensor:
@@ -54,10 +61,10 @@ class Sensor:
             return self.field.log_cubes(ends, sigma, observation.range_max)
         return self.field.log_product(ends, sigma, observation.range_max)
 
-    def explain(self, pose: Array, mount: Array, observation: Observation) -> tuple[float, Array, Array]:
-        """At base_link ``pose`` (3,): -ln p(o | pose) in nats over all beams, xi (3,) and curvature (3, 3) of it.
+    def explain(self, pose: Array, mount: Array, observation: Observation) -> Explanation:
+        """The scan, all its beams, seen from base_link ``pose`` (3,) in map by the product likelihood field.
 
-        The product likelihood field with the tracking sigma; derivatives of the distances by central differences.
+        Sigma is that of tracking; derivatives of the distances are central differences.
         """
         _, ranges, angles = self._beams(observation, None)
         sigma = self.settings.sigma_hit
@@ -65,10 +72,16 @@ class Sensor:
         poses = se2.compose(np.concatenate([pose[None], pose + offsets, pose - offsets]), mount)
         ends = self.field.ends(poses, ranges, angles).astype(float)
         d, slope = ends[0], (ends[1:4] - ends[4:]) / (2 * STEP[:, None])
-        p = self.field.densities(d, sigma, observation.range_max).astype(float)
+        p = self.field.densities(np.append(d, 0.0), sigma, observation.range_max).astype(float)
+        p, exact = p[:-1], p[-1]
         # Beams that the surface explains pull; the others are z_rand's.
         pull = (1 - self.field.z_rand / observation.range_max / p) / sigma**2
-        return float(-np.log(p).sum()), -slope @ (pull * d), (slope * pull) @ slope.T
+        return Explanation(
+            accuracy=float(-np.log(p).sum()),
+            xi=-slope @ (pull * d),
+            curvature=(slope * pull) @ slope.T,
+            fit=float(p.mean() / exact) if len(p) else 1.0,
+        )
 
     def _beams(self, observation: Observation, most: int | None) -> tuple[npt.NDArray[np.int_], Array, Array]:
         """Indices of at most ``most`` beams, evenly spaced, and ranges and angles of those that ended somewhere."""
@@ -79,9 +92,3 @@ class Sensor:
         ranges = observation.ranges[used]
         ended = np.isfinite(ranges) & (ranges < observation.range_max)
         return used, ranges[ended], observation.angles[used][ended]
-
-    def fit(self, accuracy: float, observation: Observation) -> float:
-        """How well ``accuracy`` nats explain the scan, in (0, 1]: its mean per beam against an exact beam's."""
-        beams = len(self._beams(observation, None)[1])
-        exact = np.log(self.field.densities(np.zeros(1), self.settings.sigma_hit, observation.range_max)[0])
-        return float(np.exp(SHARPNESS * min(0.0, -accuracy / max(beams, 1) - exact)))
