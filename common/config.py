@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import inspect
+import re
 import sys
 from contextvars import ContextVar
 from pathlib import Path
@@ -30,6 +31,8 @@ from common.errors import UserError
 
 _file_values: ContextVar[dict[str, Any]] = ContextVar("_file_values")
 S = TypeVar("S", bound="ServiceSettings")
+NUMBER = r"-?(\d{1,9}\.?\d*|\.\d+)"
+POSE_TEXT = rf"^$|^{NUMBER},{NUMBER}(,{NUMBER})?$"  # x,y[,yaw_deg], or nothing
 
 
 class ServiceSettings(BaseSettings):
@@ -97,9 +100,20 @@ def split_endpoints(text: str) -> tuple[str, ...]:
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
+def with_values_joined(argv: list[str]) -> list[str]:
+    """``--start -3,1`` as ``--start=-3,1``: argparse takes a value that begins with a minus for an option."""
+    joined: list[str] = []
+    for word in argv:
+        if re.match(r"-[.\d]", word) and joined and re.fullmatch(r"--[a-z][a-z-]*", joined[-1]):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined
+
+
 def load_settings(cls: type[S], argv: list[str] | None = None) -> S:
     """Settings of a service from all sources; raises UserError in one line. ``--print-config`` prints and ends."""
-    argv = sys.argv[1:] if argv is None else argv
+    argv = with_values_joined(sys.argv[1:] if argv is None else argv)
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--config", type=Path)
     path = early.parse_known_args(argv)[0].config
@@ -116,8 +130,11 @@ def load_settings(cls: type[S], argv: list[str] | None = None) -> S:
         first = error.errors(include_url=False)[0]
         name = ".".join(map(str, first["loc"])) or "settings"
         variable = f"PRESAGE_{cls.service.upper()}_{name.upper()}" if name in cls.private else f"PRESAGE_{name.upper()}"
+        wrong = first["msg"]
+        if first["type"] == "string_pattern_mismatch" and name in cls.model_fields:
+            wrong = f"{first['input']!r} is not as it should be: {cls.model_fields[name].description}"
         raise UserError(
-            f"{name}: {first['msg']} (--{name.replace('_', '-')}, {variable}{f' or {path}' if path else ''})"
+            f"{name}: {wrong} (--{name.replace('_', '-')}, {variable}{f' or {path}' if path else ''})"
         ) from None
     except SettingsError as error:
         raise UserError(" ".join(str(error).split())) from None

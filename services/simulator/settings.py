@@ -7,11 +7,9 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from common.config import ServiceSettings
+from common.config import POSE_TEXT, ServiceSettings
 from common.errors import UserError
 from common.scanner import SCANNERS, Scanner
-
-NUMBER = r"-?(\d{1,9}\.?\d*|\.\d+)"
 
 
 class SimulatorSettings(ServiceSettings):
@@ -32,9 +30,7 @@ class SimulatorSettings(ServiceSettings):
     beams: Annotated[int | None, Field(ge=2, le=100_000, description="instead of the scanner's own number")] = None
     noise: Annotated[float | None, Field(ge=0, le=1, description="instead of the scanner's own sigma, m")] = None
     drive: Annotated[Literal["holonomic", "differential"], Field(description="holonomic or differential")] = "holonomic"
-    start: Annotated[
-        str, Field(pattern=rf"^$|^{NUMBER},{NUMBER}(,{NUMBER})?$", description="x,y[,yaw_deg]; none: the world's own")
-    ] = ""
+    start: Annotated[str, Field(pattern=POSE_TEXT, description="x,y[,yaw_deg]; none: the world's own")] = ""
     seed: Annotated[int, Field(ge=0, description="of all noise")] = 0
     pace: Annotated[
         Literal["realtime", "fast", "lockstep"],

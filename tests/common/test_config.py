@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, ClassVar
 
+import numpy as np
 import pytest
 import yaml
 from pydantic import Field
 
 from common.bus import DEFAULT_ENDPOINT, Link
-from common.config import ServiceSettings, load_settings, split_endpoints
+from common.config import POSE_TEXT, ServiceSettings, load_settings, split_endpoints
 from common.errors import UserError
 from common.router import RouterSettings
 
@@ -65,6 +67,23 @@ def test_one_file_does_not_reach_into_the_next_call(file):
     assert load_settings(Settings, []).size == 1
 
 
+@pytest.mark.parametrize("given", [["--label", "-3,1.5"], ["--label=-3,1.5"]])
+def test_a_value_may_begin_with_a_minus(given):
+    assert load_settings(Settings, [*given, "--size", "3"]).label == "-3,1.5"
+    assert load_settings(Settings, ["--ratio", "-.5", *given]).ratio == -0.5
+
+
+@pytest.mark.parametrize("text", ["3,1.5", "-3,1.5,-90", ".5,-2.", ""])
+def test_poses_are_numbers_with_commas(text):
+    assert re.match(POSE_TEXT, text)
+    assert all(np.isfinite(float(part)) for part in text.split(",") if part)
+
+
+@pytest.mark.parametrize("text", ["1.2.3,1", "1", ".,1", "nan,1", "1,2,3,4", "1,,2", "-,1", "1e3,1"])
+def test_what_is_no_pose_is_refused(text):
+    assert not re.match(POSE_TEXT, text)
+
+
 def test_empty_is_a_value_on_the_command_line_and_none_in_the_environment(monkeypatch):
     assert load_settings(Settings, ["--label", "", "--connect="]).label == ""
     assert load_settings(Settings, ["--connect", ""]).link().connect == ()
@@ -80,7 +99,7 @@ def test_empty_is_a_value_on_the_command_line_and_none_in_the_environment(monkey
         (["--size", "101"], ["size", "less than or equal to 100", "--size", "PRESAGE_SIZE"]),
         (["--size", "many"], ["size", "integer", "--size"]),
         (["--robot", "a/b"], ["robot", "--robot", "PRESAGE_ROBOT"]),
-        (["--robot", "*"], ["robot"]),
+        (["--robot", "*"], ["robot: '*' is not as it should be: name in the keys"]),
         (["--log-level", "loud"], ["--log-level", "PRESAGE_LOG_LEVEL"]),
         (["--config", "nowhere.yaml"], ["nowhere.yaml", "cannot be read"]),
     ],
