@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from common.config import ServiceSettings
+from common.config import POSE_TEXT, ServiceSettings
 
 
 class EstimatorSettings(ServiceSettings):
@@ -26,9 +26,7 @@ class EstimatorSettings(ServiceSettings):
     world: Annotated[str, Field(description="shipped world or world file the model was trained for")] = "corridor"
     preset: Annotated[Literal["paper"], Field(description="paper: the decoder and descent of the paper")] = "paper"
     models: Annotated[Path | None, Field(description="folder of weights; none: the shipped ones")] = None
-    initial_pose: Annotated[
-        str, Field(pattern=r"^$|^-?[\d.]+,-?[\d.]+(,-?[\d.]+)?$", description="x,y[,yaw_deg]; none: the map's centre")
-    ] = ""
+    initial_pose: Annotated[str, Field(pattern=POSE_TEXT, description="x,y[,yaw_deg]; none: the map's centre")] = ""
     alpha: Annotated[float, Field(gt=0, lt=1, description="step size of perception, m²")] = 2e-4
     beta: Annotated[
         float, Field(ge=0, lt=10, description="the goal's attraction in perception (eq. 3); 0: the belief is unbiased")
