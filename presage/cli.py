@@ -134,31 +134,39 @@ def plot(
 @app.command()
 def train(
     world: WorldName = "corridor",
-    preset: Annotated[str, typer.Option(help="paper.")] = "paper",
+    preset: Annotated[str, typer.Option(help="precise or paper.")] = "precise",
     scanner: Annotated[str, typer.Option(help="A known scanner.")] = "tim571",
-    out: Annotated[Path, typer.Option(help="Folder for weights, card and curve.")] = Path("models"),
+    out: Annotated[Path | None, typer.Option(help="Folder for weights and card; none: where services look.")] = None,
     beams: Annotated[int | None, typer.Option(min=2, help="Instead of the scanner's own number.")] = None,
-    samples: Annotated[int, typer.Option(min=10)] = 13_000,
-    epochs: Annotated[int, typer.Option(min=1)] = 60,
-    batch: Annotated[int, typer.Option(min=1)] = 500,
-    learning_rate: Annotated[float, typer.Option(min=1e-6)] = 3e-3,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    samples: Annotated[int | None, typer.Option(min=10, help="none: 5000, paper 13000.")] = None,
+    resolution: Annotated[float, typer.Option(min=0.005, max=1.0, help="precise: m between nodes.")] = 0.04,
+    epochs: Annotated[int, typer.Option(min=1, help="paper.")] = 60,
+    batch: Annotated[int, typer.Option(min=1, help="paper.")] = 500,
+    learning_rate: Annotated[float, typer.Option(min=1e-6, help="paper.")] = 3e-3,
+    seed: Annotated[int, typer.Option(min=0, max=2**31)] = 0,
     robot: RobotName = "robot",
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
-    """Learn to predict a scanner in a world. The same command takes an interrupted run up again.
+    """Learn to predict a scanner in a world.
 
-    Samples come from the scanner on the bus where it is in this world, else from a simulator of its own.
-    Examples: `presage train --world corridor --beams 622`; `presage train --world my.yaml --out trained --epochs 20`.
+    Samples come from the scanner on the bus where it is in this world, else from a simulator of its own. An interrupted
+    run of preset paper is taken up again by the same command.
+    Examples: `presage train --world my.yaml`; `presage train --world corridor --preset paper --beams 622 --out mine`.
     """
-    from presage.train import Job  # noqa: PLC0415
-    from presage.train import train as learn  # noqa: PLC0415
-    from services.estimator.training import Recipe  # noqa: PLC0415
+    from presage import train as paper  # noqa: PLC0415
+    from presage import train_precise as precise  # noqa: PLC0415
+    from services.estimator.precise.learning import Recipe  # noqa: PLC0415
+    from services.estimator.precise.weights import FOLDER  # noqa: PLC0415
 
-    if preset != "paper":
-        raise UserError(f"no preset {preset!r}: choose paper")
-    recipe = Recipe(epochs=epochs, batch=batch, learning_rate=learning_rate, seed=seed)
-    learn(Job(world, preset, scanner, beams, out, samples, recipe), link_of(connect, robot), console)
+    link, folder = link_of(connect, robot), out or FOLDER
+    if preset == "precise":
+        recipe = Recipe(resolution=resolution, seed=seed)
+        precise.train_precise(precise.Job(world, scanner, beams, folder, samples or 5000, recipe), link, console)
+    elif preset == "paper":
+        descent = paper.Recipe(epochs=epochs, batch=batch, learning_rate=learning_rate, seed=seed)
+        paper.train(paper.Job(world, preset, scanner, beams, folder, samples or 13_000, descent), link, console)
+    else:
+        raise UserError(f"no preset {preset!r}: choose precise or paper")
 
 
 app.add_typer(cli_tools.app)

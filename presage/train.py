@@ -20,6 +20,7 @@ from common.errors import UserError
 from common.messages import Request, SampleReply, SampleRequest, WorldReply
 from common.robot import Robot
 from common.scanner import SCANNERS, Scanner
+from common.se2 import Array
 from common.topics import SAMPLE, WORLD
 from common.versions import commit, versions
 from common.world import World, load_world
@@ -27,6 +28,7 @@ from presage.stack import Stack
 from services.estimator import training, weights
 from services.estimator.checkpoint import Checkpoint
 from services.estimator.decoder import Normalisation, PaperModel, Shape
+from services.estimator.precise.weights import same_walls
 from services.estimator.training import Data, Recipe, Trainer, usable_ranges
 
 TEST_SAMPLES = 1000
@@ -66,9 +68,10 @@ def train(job: Job, link: Link, console: Console) -> Path:
             poses = np.column_stack([world.sample_free(count, rng, Robot().radius), np.full(count, heading)])
             kept = checkpoint.samples(name)
             if kept is None:
-                with scanner_on_bus(link, job, world, scanner, console) as bus:
+                with scanner_on_bus(link, job.world, job.scanner, job.beams, world, scanner, console) as bus:
                     noise_seed = job.recipe.seed if name == "train" else None  # test against what is, not noise
-                    kept = collect(bus, poses, scanner, noise_seed, bar, f"{name} samples")
+                    ranges = collect(bus, poses, scanner, noise_seed, bar, f"{name} samples")
+                kept = Data(poses, usable_ranges(ranges, scanner.range_max))
                 checkpoint.keep_samples(name, kept)
             data[name] = kept
         trainer, seconds = _fit(job, world, scanner, data, checkpoint, bar)
@@ -84,7 +87,9 @@ def train(job: Job, link: Link, console: Console) -> Path:
 
 
 @contextmanager
-def scanner_on_bus(link: Link, job: Job, world: World, scanner: Scanner, console: Console) -> Iterator[Bus]:
+def scanner_on_bus(
+    link: Link, world_name: str, scanner_name: str, beams: int | None, world: World, scanner: Scanner, console: Console
+) -> Iterator[Bus]:
     """A bus on which this scanner in this world answers `sample`: the one that is there, or a simulator of our own."""
     with open_bus(link) as bus:
         if wait_until(bus.linked, 1.0) and _answers(bus, world, scanner, console):
@@ -92,14 +97,11 @@ def scanner_on_bus(link: Link, job: Job, world: World, scanner: Scanner, console
             return
     with Stack("training", quiet=True) as stack:
         stack.start_router()
-        stack.start("simulator", "--world", job.world, "--scanner", job.scanner, *_beams(job), "--pace", "realtime")
+        asked = ["--beams", str(beams)] if beams is not None else []
+        stack.start("simulator", "--world", world_name, "--scanner", scanner_name, *asked, "--pace", "realtime")
         with open_bus(stack.link()) as bus:
             stack.wait_alive(bus)
             yield bus
-
-
-def _beams(job: Job) -> list[str]:
-    return ["--beams", str(job.beams)] if job.beams is not None else []
 
 
 def _answers(bus: Bus, world: World, scanner: Scanner, console: Console) -> bool:
@@ -108,7 +110,7 @@ def _answers(bus: Bus, world: World, scanner: Scanner, console: Console) -> bool
         here = bus.ask(WORLD, Request(), WorldReply, timeout=1.0)
     except UserError:
         return False
-    if here.world is not None and here.world.name == world.name and here.scanner is not None:
+    if here.world is not None and same_walls(here.world, world) and here.scanner is not None:
         same = {"name", "fov", "mount", "range_max"}
         if here.scanner.model_dump(include=same) == scanner.model_dump(include=same):
             console.print(f"samples come from the running scanner {here.scanner.name} in {world.name}")
@@ -119,13 +121,13 @@ def _answers(bus: Bus, world: World, scanner: Scanner, console: Console) -> bool
 
 def collect(
     bus: Bus,
-    poses: np.ndarray[tuple[int, ...], np.dtype[np.float64]],
+    poses: Array,
     scanner: Scanner,
     seed: int | None,
     bar: Progress,
     title: str,
-) -> Data:
-    """Scans from ``poses`` (N, 3), in blocks; with noise of ``seed``, or none."""
+) -> Array:
+    """Ranges (N, B) m from ``poses`` (N, 3), in blocks; with noise of ``seed``, or none. +inf no return, -inf close."""
     task = bar.add_task(title, total=len(poses))
     rows = []
     for number, start in enumerate(range(0, len(poses), BLOCK)):
@@ -138,9 +140,9 @@ def collect(
             raise UserError(f"the scanner refuses to be sampled: {reply.reason or 'it does not describe itself'}")
         if len(reply.ranges) != len(block) * scanner.beams:
             raise UserError(f"the scanner answered {len(reply.ranges)} ranges for {len(block)} x {scanner.beams}")
-        rows.append(usable_ranges(reply.ranges.reshape(len(block), -1).astype(np.float64), scanner.range_max))
+        rows.append(reply.ranges.reshape(len(block), -1).astype(np.float64))
         bar.advance(task, len(block))
-    return Data(poses, np.concatenate(rows))
+    return np.concatenate(rows)
 
 
 def _fit(

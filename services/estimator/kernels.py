@@ -1,0 +1,182 @@
+"""Inner loops, compiled by numba: one beam at a time reads as the method does and is thirty times faster than arrays.
+
+Compiled once a machine (numba keeps the result beside this file, or in NUMBA_CACHE_DIR), loaded afterwards.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+MIN_STEP = 0.25  # cells; a shorter stride would creep along walls, a longer one jump over corners
+MAX_STEPS = 2000
+FACING = 0.02  # least |n . u|: a beam within about a degree of the surface has no usable derivative
+
+jit = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@jit
+def lookup(phi, x, y):  # type: ignore[no-untyped-def]
+    """Bilinear phi (m) at grid coordinates (cells), its derivatives by x and y (m a cell), and whether it lies inside."""
+    ny, nx = phi.shape
+    if not (0 <= x < nx - 1 and 0 <= y < ny - 1):
+        return 0.0, 0.0, 0.0, False
+    j, i = int(x), int(y)
+    u, v = x - j, y - i
+    a = phi[i, j]
+    b, c = phi[i, j + 1] - a, phi[i + 1, j] - a
+    d = phi[i + 1, j + 1] - a - b - c
+    return a + b * u + (c + d * u) * v, b + d * v, c + d * u, True
+
+
+@jit
+def trace_one(phi, h, x, y, ux, uy):  # type: ignore[no-untyped-def]
+    """Sphere tracing in grid coordinates: length of the beam and nearest pass by another surface (m), inf for none."""
+    t, step, before, falling, dip = 0.0, 0.0, 0.0, False, np.inf
+    for _ in range(MAX_STEPS):
+        value, _, _, inside = lookup(phi, x + t * ux, y + t * uy)
+        if not inside:
+            return np.inf, dip
+        value /= h
+        if value <= 0.0:
+            if step == 0.0:
+                return 0.0, dip
+            t -= step * -value / (before - value)  # regula falsi with the last point outside
+            value, gx, gy, _ = lookup(phi, x + t * ux, y + t * uy)
+            slope = gx * ux + gy * uy
+            if slope < -FACING * h:  # one Newton step onto the surface
+                t -= min(max(value / slope, -1.0), 1.0)
+            return max(t, 0.0) * h, dip
+        if falling and value > before:
+            dip = min(dip, before * h)
+        falling, before = value < before, value
+        step = max(0.98 * value, MIN_STEP)
+        t += step
+    return np.inf, dip
+
+
+@jit
+def trace(phi, ox, oy, h, lasers, angles, ranges, jacobian, dip, edge, facing):  # type: ignore[no-untyped-def]
+    """Beams ``angles`` (B,) of lasers (N, 3): fills ranges (N, B), jacobian (N, B, 3), and (N, B) dip, edge, facing.
+
+    dr = -(n . dp + r n . u' dyaw) / (n . u). Edge: how deep, relative to a plane, one cell behind the surface lies.
+    """
+    for k in range(lasers.shape[0]):
+        x, y = (lasers[k, 0] - ox) / h, (lasers[k, 1] - oy) / h
+        for b in range(angles.shape[0]):
+            ux, uy = math.cos(lasers[k, 2] + angles[b]), math.sin(lasers[k, 2] + angles[b])
+            r, passed = trace_one(phi, h, x, y, ux, uy)
+            ranges[k, b], dip[k, b] = r, passed
+            jacobian[k, b, :] = 0.0
+            edge[k, b], facing[k, b] = 0.0, 0.0
+            if r == np.inf:
+                continue
+            hx, hy = x + r / h * ux, y + r / h * uy
+            _, gx, gy, _ = lookup(phi, hx, hy)
+            length = max(math.hypot(gx, gy), 1e-9)
+            nx, ny = gx / length, gy / length
+            cosine = -min(nx * ux + ny * uy, -FACING)
+            jacobian[k, b, 0], jacobian[k, b, 1] = nx / cosine, ny / cosine
+            jacobian[k, b, 2] = r * (ny * ux - nx * uy) / cosine
+            behind, _, _, _ = lookup(phi, hx + ux, hy + uy)
+            edge[k, b], facing[k, b] = -behind / (h * cosine), cosine
+
+
+@jit
+def cast(segments, circles, lasers, angles, ranges, jacobian):  # type: ignore[no-untyped-def]
+    """Exact rays of lasers (N, 3) against segments (S, 4) and circles (C, 3): fills ranges (N, B), jacobian (N, B, 3)."""
+    for k in range(lasers.shape[0]):
+        px, py = lasers[k, 0], lasers[k, 1]
+        for b in range(angles.shape[0]):
+            ux, uy = math.cos(lasers[k, 2] + angles[b]), math.sin(lasers[k, 2] + angles[b])
+            best, nx, ny = np.inf, 0.0, 0.0
+            for s in range(segments.shape[0]):
+                ax, ay = segments[s, 0] - px, segments[s, 1] - py
+                ex, ey = segments[s, 2] - segments[s, 0], segments[s, 3] - segments[s, 1]
+                det = ux * ey - uy * ex
+                if det == 0.0:
+                    continue
+                r, along = (ax * ey - ay * ex) / det, (ax * uy - ay * ux) / det
+                if 0.0 <= r < best and 0.0 <= along <= 1.0:
+                    length = math.hypot(ex, ey)
+                    best, nx, ny = r, -ey / length, ex / length
+            for s in range(circles.shape[0]):
+                cx, cy, radius = circles[s, 0] - px, circles[s, 1] - py, circles[s, 2]
+                middle = cx * ux + cy * uy
+                under = middle * middle - (cx * cx + cy * cy - radius * radius)
+                if under < 0.0:
+                    continue
+                r = middle - math.sqrt(under)
+                if 0.0 <= r < best:
+                    best, nx, ny = r, (r * ux - cx) / radius, (r * uy - cy) / radius
+            ranges[k, b] = best
+            jacobian[k, b, :] = 0.0
+            if best == np.inf:
+                continue
+            dot = nx * ux + ny * uy
+            if dot > 0.0:
+                nx, ny, dot = -nx, -ny, -dot
+            cosine = -min(dot, -FACING)
+            jacobian[k, b, 0], jacobian[k, b, 1] = nx / cosine, ny / cosine
+            jacobian[k, b, 2] = best * (ny * ux - nx * uy) / cosine
+
+
+@jit
+def accumulate(measured, expected, jacobian, scale, sigma, widen, outlier, range_max, unseen, total, gradient, matrices):  # type: ignore[no-untyped-def]
+    """Sums over beams of -ln p(o | pose) and its derivatives; see `services.estimator.precise.likelihood`.
+
+    Fills total (N, 3) energy, explained, used; gradient (N, 3); matrices (N, 3, 3, 3): curvature, and its parts from the
+    scanner's noise and from the model's error.
+    """
+    flat = outlier / range_max
+    for k in range(expected.shape[0]):
+        for b in range(measured.shape[0]):
+            o, g = measured[b], expected[k, b]
+            if o == -np.inf or o != o:
+                continue
+            total[k, 2] += 1.0
+            if o == np.inf:
+                seen = g < range_max
+                total[k, 0] -= math.log(unseen if seen else 1.0 - unseen)
+                total[k, 1] += 0.0 if seen else 1.0
+                continue
+            if g == np.inf:
+                total[k, 0] -= math.log(flat)
+                continue
+            noise, model = sigma * sigma, scale[k, b] * scale[k, b]
+            variance = noise + model + widen * widen
+            e = o - g
+            core = (1.0 - outlier) * math.exp(-0.5 * e * e / variance) / math.sqrt(2 * math.pi * variance)
+            density = core + flat
+            inlier = core / density
+            total[k, 0] -= math.log(density)
+            total[k, 1] += inlier
+            weight = inlier / variance
+            for i in range(3):
+                gradient[k, i] += weight * e * jacobian[k, b, i]
+                for j in range(3):
+                    outer = jacobian[k, b, i] * jacobian[k, b, j] * weight
+                    matrices[k, 0, i, j] += outer
+                    matrices[k, 1, i, j] += outer * noise / variance
+                    matrices[k, 2, i, j] += outer * model / variance
+
+
+@jit
+def rank(panoramas, bins, measured, tolerance, range_max, costs):  # type: ignore[no-untyped-def]
+    """Misfit of every place and heading: fills costs (S, H) with the mean over beams of e² / (e² + tolerance²)."""
+    size, headings = panoramas.shape[1], costs.shape[1]
+    for s in range(panoramas.shape[0]):
+        for h in range(headings):
+            shift = h * size // headings
+            total, used = 0.0, 0
+            for b in range(bins.shape[0]):
+                o = measured[b]
+                if o == -np.inf or o != o:
+                    continue
+                g = panoramas[s, (bins[b] + shift) % size]
+                e = min(o, range_max) - min(g, range_max)
+                total += e * e / (e * e + tolerance * tolerance)
+                used += 1
+            costs[s, h] = total / max(used, 1)

@@ -1,0 +1,55 @@
+"""How well a field predicts scans it has not learned from, and how its errors hang together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from common import se2
+from services.estimator.precise.gauss_newton import View, difference, polish
+from services.estimator.precise.likelihood import Likelihood
+
+if TYPE_CHECKING:
+    from common.se2 import Array
+    from services.estimator.precise.field import FieldModel
+
+TRIMMED = 0.99  # share of poses that the correlation is taken from: one silhouette must not decide it
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Figures of the model card."""
+
+    range_error_median: float  # m
+    range_error_mean: float  # m
+    share_above_5_cm: float
+    position_error_rms: float  # m, of the pose found from scans without noise
+    correlation: float  # of the model's errors: (3, 3) covariance found, over that of independent beams
+
+
+def evaluate(
+    model: FieldModel, poses: Array, mount: Array, angles: Array, ranges: Array, range_max: float, sigma: float
+) -> Quality:
+    """From scans (N, B) m without noise at base_link poses (N, 3); ``sigma`` m is the noise of the scanner in use."""
+    expected = model.expect(se2.compose(poses, mount), angles)
+    both = np.isfinite(ranges) & np.isfinite(expected.ranges)
+    error = np.abs(ranges[both] - expected.ranges[both])
+    offsets, misfits = [], []
+    for pose, scan in zip(poses, ranges, strict=True):
+        view = View(model, Likelihood(sigma), mount, angles, scan, range_max)
+        found, evidence = polish(view, pose[None])
+        off = difference(found, pose[None])[0]
+        alone = np.linalg.inv(evidence.curvature[0] + 1e-6 * np.eye(3))
+        covariance = alone @ evidence.of_model[0] @ alone
+        offsets.append(float(np.hypot(off[0], off[1])))
+        misfits.append(float(off @ np.linalg.pinv(covariance, hermitian=True) @ off) / 3)
+    typical = np.sort(misfits)[: max(1, int(TRIMMED * len(misfits)))]
+    return Quality(
+        float(np.median(error)),
+        float(error.mean()),
+        float((error > 0.05).mean()),
+        float(np.sqrt(np.mean(np.square(offsets)))),
+        float(max(1.0, np.mean(typical))),
+    )

@@ -1,0 +1,132 @@
+"""Natural-gradient descent on the free energy, many poses at once: Gauss-Newton steps with Levenberg's damping.
+
+The step is (H + P^-1 + lambda D)^-1 (xi + P^-1 (prior - x)), H the Gauss-Newton Hessian of accuracy (the Fisher
+information of the density), D its diagonal. A step that does not lower F is taken back and lambda raised.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from common import se2
+from services.estimator.precise.likelihood import Evidence
+
+if TYPE_CHECKING:
+    from common.se2 import Array
+    from services.estimator.generative import GenerativeModel
+    from services.estimator.precise.likelihood import Likelihood
+
+MAX_STEP = np.array([0.5, 0.5, 0.3])  # m, m, rad: beyond it the linearisation is not trusted
+CONVERGED = np.array([1e-4, 1e-4, 2e-5])  # m, m, rad: a tenth of what a scan can tell
+DAMPING = np.diag([1.0, 1.0, 1.0]) * 1e-6  # 1/m², 1/rad²: directions of which nothing is known stay put
+
+
+@dataclass(frozen=True)
+class View:
+    """One scan as the descent sees it."""
+
+    model: GenerativeModel
+    likelihood: Likelihood
+    mount: Array  # (3,) laser in base_link
+    angles: Array  # (B,) rad in laser
+    ranges: Array  # (B,) m
+    range_max: float  # m
+
+    def thinned(self, beams: int) -> View:
+        """Every k-th beam, so that about ``beams`` are left."""
+        k = max(1, len(self.angles) // beams)
+        return View(self.model, self.likelihood, self.mount, self.angles[::k], self.ranges[::k], self.range_max)
+
+    def evidence(self, poses: Array, widen: float = 0.0) -> Evidence:
+        """What the scan says about base_link poses (N, 3), derivatives by these."""
+        lasers = se2.compose(poses, self.mount)
+        found = self.likelihood.evaluate(
+            self.ranges, self.range_max, self.model.expect(lasers, self.angles), widen
+        )
+        # A turn of base_link moves the laser sideways: J_base = J_laser T.
+        T = np.tile(np.eye(3), (len(poses), 1, 1))
+        T[:, 0, 2], T[:, 1, 2] = poses[:, 1] - lasers[:, 1], lasers[:, 0] - poses[:, 0]
+        Tt = T.transpose(0, 2, 1)
+        return Evidence(
+            found.accuracy,
+            found.explained,
+            (Tt @ found.xi[..., None])[..., 0],
+            *(Tt @ matrix @ T for matrix in (found.curvature, found.of_noise, found.of_model)),
+        )
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A Gaussian over the pose for each of N hypotheses."""
+
+    mean: Array  # (N, 3)
+    information: Array  # (N, 3, 3)
+
+    def energy(self, poses: Array) -> Array:
+        """(N,) nats, the quadratic part."""
+        off = difference(poses, self.mean)
+        return np.asarray(0.5 * np.einsum("ni,nij,nj->n", off, self.information, off))
+
+
+def difference(a: Array, b: Array) -> Array:
+    """(N, 3) a - b, the angle wrapped."""
+    off = a - b
+    off[:, 2] = se2.wrap(off[:, 2])
+    return np.asarray(off)
+
+
+def descend(
+    view: View, poses: Array, prior: Prior | None = None, widen: float = 0.0, iterations: int = 10
+) -> tuple[Array, Evidence]:
+    """Poses (N, 3) after the descent from ``poses``, and the evidence there."""
+    best = np.array(poses, float)
+    evidence = view.evidence(best, widen)
+    energy = evidence.accuracy + (prior.energy(best) if prior else 0.0)
+    damping, live = np.full(len(best), 1e-3), np.ones(len(best), bool)
+    for _ in range(iterations):
+        step = _steps(best, evidence, prior, damping)
+        live &= (np.abs(step) > CONVERGED).any(axis=1)
+        if not live.any():
+            break
+        trial = best[live] + step[live]
+        trial[:, 2] = se2.wrap(trial[:, 2])
+        tried = view.evidence(trial, widen)
+        part = Prior(prior.mean[live], prior.information[live]) if prior else None
+        new = tried.accuracy + (part.energy(trial) if part else 0.0)
+        better = new < energy[live]
+        rows = np.flatnonzero(live)[better]
+        best[rows], energy[rows] = trial[better], new[better]
+        for name in ("accuracy", "explained", "xi", "curvature", "of_noise", "of_model"):
+            getattr(evidence, name)[rows] = getattr(tried, name)[better]
+        damping[live] = np.where(better, damping[live] * 0.1, damping[live] * 30)
+        live &= damping < 1e4
+    return best, evidence
+
+
+def _steps(poses: Array, evidence: Evidence, prior: Prior | None, damping: Array) -> Array:
+    H, slope = evidence.curvature + DAMPING, evidence.xi
+    if prior:
+        H = H + prior.information
+        slope = slope + np.einsum("nij,nj->ni", prior.information, difference(prior.mean, poses))
+    H = H + damping[:, None, None] * H * np.eye(3)
+    step = np.linalg.solve(H, slope[..., None])[..., 0]
+    return np.asarray(step / np.maximum((np.abs(step) / MAX_STEP).max(axis=1, keepdims=True), 1.0))
+
+
+def polish(view: View, poses: Array, prior: Prior | None = None, iterations: int = 4) -> tuple[Array, Evidence]:
+    """The last millimetres, full steps: beams that jump between surfaces ripple F there, and would stop a line search.
+
+    Each step minimises F with the beams' weights held (iteratively reweighted least squares).
+    """
+    poses = np.array(poses, float)
+    for _ in range(iterations):
+        evidence = view.evidence(poses)
+        step = _steps(poses, evidence, prior, np.zeros(len(poses)))
+        poses = poses + step
+        poses[:, 2] = se2.wrap(poses[:, 2])
+        if (np.abs(step) < CONVERGED).all():
+            break
+    return poses, view.evidence(poses)

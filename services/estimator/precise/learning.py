@@ -1,0 +1,180 @@
+"""Learning the distance field from posed scans: surfaces where beams end, then descent on the prediction error.
+
+1. Points where beams end are pooled in cells; their covariance gives a surface element (mean, normal) for each cell.
+2. phi near surfaces is the weighted distance to the elements around (implicit moving least squares, Kolluri 2008);
+   elsewhere the distance to the nearest surface.
+3. Sweeps of prediction: phi moves, where beams end, along the gradient of the squared prediction error (diagonal
+   Gauss-Newton steps), as perception moves the belief.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+
+from common.se2 import Array, compose
+from services.estimator.precise.field import CLASSES, DistanceField, Floats
+
+POOL = 1  # cells to each side that share their points to find a normal
+REACH = 2.0  # cells around a surface element that it shapes
+LEVEL_POINTS = 3  # points a cell needs to count as surface
+EM_STEPS, OUTLIER, FLAT = 15, 0.1, 25.0  # FLAT: m over which the flat part of the density extends
+CLIP = 0.1  # m, a larger error is another surface's
+GRAZING = 0.15  # least |n . u| of a beam that shapes the field
+RARE, RARE_SCALE = 20, 0.05  # a class seen seldom: as if it had been seen so often, with this error (m), besides
+LEAST_SCALE = 1e-3  # m
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What learning depends on, besides the samples."""
+
+    resolution: float = 0.04  # m
+    sweeps: int = 10
+    beams_a_sweep: int = 2_000_000
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Beams:
+    """Single beams of posed scans: starts (R, 2) m in map, directions (R,) rad in map, ranges (R,) m."""
+
+    starts: Array
+    directions: Array
+    ranges: Array
+
+    @classmethod
+    def of(cls, poses: Array, mount: Array, angles: Array, ranges: Array) -> Beams:
+        """Every beam that returned, of scans ranges (N, B) from base_link poses (N, 3)."""
+        lasers = compose(poses, mount)
+        returned = np.isfinite(ranges) & (ranges > 0)
+        row, column = np.nonzero(returned)
+        return cls(lasers[row, :2], lasers[row, 2] + angles[column], ranges[returned])
+
+    def ends(self) -> Array:
+        """(R, 2) m in map."""
+        return np.asarray(self.starts + self.ranges[:, None] * self.unit())
+
+    def unit(self) -> Array:
+        """(R, 2) unit directions."""
+        return np.stack([np.cos(self.directions), np.sin(self.directions)], -1)
+
+    def part(self, which: np.ndarray) -> Beams:
+        """Some of them."""
+        return Beams(self.starts[which], self.directions[which], self.ranges[which])
+
+
+def learn_field(
+    beams: Beams, recipe: Recipe, report: Callable[[str, float], None] = lambda _title, _done: None
+) -> DistanceField:
+    """The field that predicts the beams; ``report`` hears of stages and the share done."""
+    report("surfaces", 0.0)
+    field = _surfaces(beams, recipe.resolution)
+    rng = np.random.default_rng(recipe.seed)
+    phi = field.phi.copy()
+    for sweep in range(recipe.sweeps):
+        report("prediction errors", sweep / recipe.sweeps)
+        some = rng.integers(0, len(beams.ranges), min(recipe.beams_a_sweep, len(beams.ranges)))
+        rate = 1 / (1 + sweep / 2)  # falls, so that the noise of the last sweeps averages out
+        phi = _descend(DistanceField(phi, field.origin, field.resolution), beams.part(some), rate)
+    return DistanceField(phi, field.origin, field.resolution)
+
+
+def _surfaces(beams: Beams, h: float) -> DistanceField:
+    ends, unit = beams.ends(), beams.unit()
+    low = np.minimum(ends.min(0), beams.starts.min(0)) - 4 * h
+    shape = np.ceil((np.maximum(ends.max(0), beams.starts.max(0)) + 4 * h - low) / h).astype(int)[::-1] + 1
+    cell = np.floor((ends - low) / h).astype(int)
+    index = cell[:, 1] * shape[1] + cell[:, 0]
+
+    def pooled(values: Array | None) -> Array:
+        grid = np.bincount(index, values, int(shape.prod())).reshape(shape)
+        padded = np.pad(grid, POOL)
+        side = 2 * POOL + 1
+        return sum(  # type: ignore[return-value]
+            padded[i : i + shape[0], j : j + shape[1]] for i in range(side) for j in range(side)
+        )
+
+    own = np.bincount(index, minlength=int(shape.prod())).reshape(shape)
+    local = ends - low  # smaller numbers, better sums
+    count = np.maximum(pooled(None), 1)
+    mx, my = pooled(local[:, 0]) / count, pooled(local[:, 1]) / count
+    xx, yy = pooled(local[:, 0] ** 2) / count - mx**2, pooled(local[:, 1] ** 2) / count - my**2
+    xy = pooled(local[:, 0] * local[:, 1]) / count - mx * my
+    dx, dy = pooled(unit[:, 0]), pooled(unit[:, 1])
+    surface = own >= LEVEL_POINTS
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the long axis
+    nx, ny = -np.sin(angle), np.cos(angle)
+    flip = np.where(nx * dx + ny * dy > 0, -1.0, 1.0)  # against the beams: towards free space
+    nx, ny = nx * flip, ny * flip
+    return DistanceField(_distances(surface, mx, my, nx, ny, own, h), (float(low[0]), float(low[1])), h)
+
+
+def _distances(
+    surface: np.ndarray, mx: Array, my: Array, nx: Array, ny: Array, own: Array, h: float
+) -> Floats:
+    """Phi at the nodes from surface elements: near them by their planes, elsewhere by the nearest."""
+    rows, columns = np.nonzero(surface)
+    ex, ey, ax, ay = (a[surface] for a in (mx, my, nx, ny))
+    total, weight = np.zeros(surface.shape), np.zeros(surface.shape)
+    span = int(np.ceil(REACH)) + 1
+    for di in range(-span, span + 1):
+        for dj in range(-span, span + 1):
+            i, j = rows + di, columns + dj
+            inside = (i >= 0) & (j >= 0) & (i < surface.shape[0]) & (j < surface.shape[1])
+            vx, vy = j * h - ex, i * h - ey
+            square = (vx**2 + vy**2) / h**2
+            w = np.where(inside & (square < REACH**2), np.exp(-1.5 * square) * np.sqrt(own[surface]), 0.0)
+            np.add.at(total, (i[inside], j[inside]), (w * (ax * vx + ay * vy))[inside])
+            np.add.at(weight, (i[inside], j[inside]), w[inside])
+    near = weight > 0
+    tree = shapely.STRtree(shapely.points(np.stack([ex, ey], -1)))
+    ii, jj = np.nonzero(~near)
+    nearest = tree.nearest(shapely.points(np.stack([jj * h, ii * h], -1)))
+    phi = np.divide(total, weight, out=np.zeros_like(total), where=near)
+    phi[~near] = np.hypot(jj * h - ex[nearest], ii * h - ey[nearest])
+    return phi.astype(np.float32)
+
+
+def _descend(field: DistanceField, beams: Beams, rate: float) -> Floats:
+    """One sweep: dr = dphi / |n . u|, so an error e = o - r asks for e |n . u| where the beam ends, by 1 / |n . u|²."""
+    traced = field.trace(np.column_stack([beams.starts, beams.directions]), np.zeros(1))
+    ranges, facing = traced.ranges[:, 0], traced.facing[:, 0]
+    error = beams.ranges - ranges
+    good = np.isfinite(ranges) & (np.abs(error) < CLIP) & (facing > GRAZING)
+    facing = facing[good]
+    where = (beams.starts[good] + ranges[good, None] * beams.unit()[good] - field.origin) / field.resolution
+    node = np.minimum(np.maximum(where.astype(int), 0), np.array(field.phi.shape)[::-1] - 2)
+    u, v = (where - node).T
+    ny, nx = field.phi.shape
+    up, norm = np.zeros(ny * nx), np.zeros(ny * nx)
+    for di, dj, w in ((0, 0, (1 - u) * (1 - v)), (0, 1, u * (1 - v)), (1, 0, (1 - u) * v), (1, 1, u * v)):
+        index = (node[:, 1] + di) * nx + node[:, 0] + dj
+        up += np.bincount(index, w * error[good] / facing, ny * nx)
+        norm += np.bincount(index, w / facing**2, ny * nx)
+    step = np.divide(up, norm + 1.0, out=np.zeros_like(up))
+    return np.asarray(field.phi + rate * step.reshape(ny, nx), np.float32)
+
+
+def learn_scales(field: DistanceField, poses: Array, mount: Array, angles: Array, ranges: Array, sigma: float) -> Array:
+    """The model's own error (m) in each class of beams, from scans (N, B) it has not learned from: learned precision.
+
+    Expectation maximisation of the density of `services.estimator.precise.likelihood`, whose flat part takes what misses.
+    """
+    traced = field.trace(compose(poses, mount), angles)
+    both = np.isfinite(ranges) & np.isfinite(traced.ranges)
+    square, kind = (ranges[both] - traced.ranges[both]) ** 2, traced.classes()[both]
+    size = int(np.prod(CLASSES))
+    variance = np.full(size, RARE_SCALE**2)
+    for _ in range(EM_STEPS):
+        s2 = variance[kind] + sigma**2
+        core = (1 - OUTLIER) * np.exp(-0.5 * square / s2) / np.sqrt(2 * np.pi * s2)
+        inlier = core / (core + OUTLIER / FLAT)
+        count, total = np.bincount(kind, inlier, size), np.bincount(kind, inlier * square, size)
+        variance = np.maximum(
+            (total + RARE * (RARE_SCALE**2 + sigma**2)) / (count + RARE) - sigma**2, LEAST_SCALE**2
+        )
+    return np.asarray(np.sqrt(variance))

@@ -1,0 +1,60 @@
+"""The density of a beam, and free energy's accuracy: a sum of -ln p over beams, no gain, no 1/N.
+
+    p(o | g) = (1 - epsilon) N(o; g, sigma² + m²) + epsilon / range_max
+
+sigma is the scanner's noise, m the model's stated error, epsilon the share of beams that something unknown ends (people,
+moved furniture): a proper density with tails that no outlier moves (Thrun, Burgard & Fox 2005, section 6.3, without its
+gains). A beam without return has the probability `unseen` where a surface is expected, 1 - unseen where none is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from services.estimator import kernels
+
+if TYPE_CHECKING:
+    from common.se2 import Array
+    from services.estimator.generative import Expected
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the beams say about N poses; derivatives by the laser's pose."""
+
+    accuracy: Array  # (N,) nats, -ln p(o | pose)
+    explained: Array  # (N,) expected share of used beams that the model explains
+    xi: Array  # (N, 3) minus the gradient of accuracy: 1/m, 1/m, 1/rad
+    curvature: Array  # (N, 3, 3) Gauss-Newton Hessian
+    of_noise: Array  # (N, 3, 3) covariance of xi from the scanner's noise
+    of_model: Array  # (N, 3, 3) covariance of xi from the model's error, were beams independent
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Parameters of the density."""
+
+    sigma: float = 0.02  # m
+    outlier: float = 0.1  # epsilon
+    unseen: float = 0.05
+
+    def evaluate(self, measured: Array, range_max: float, expected: Expected, widen: float = 0.0) -> Evidence:
+        """For ranges (B,) m (+inf no return, -inf too close: not used); ``widen`` m is added to every deviation."""
+        count = len(expected.ranges)
+        total, gradient = np.zeros((count, 3)), np.zeros((count, 3))
+        matrices = np.zeros((count, 3, 3, 3))
+        kernels.accumulate(
+            measured, expected.ranges, expected.jacobian, expected.scale,
+            self.sigma, widen, self.outlier, range_max, self.unseen, total, gradient, matrices,
+        )  # fmt: skip
+        explained = total[:, 1] / np.maximum(total[:, 2], 1)
+        return Evidence(total[:, 0], explained, gradient, matrices[:, 0], matrices[:, 1], matrices[:, 2])
+
+    def density(self, measured: Array, expected: float, scale: float, range_max: float) -> Array:
+        """p(o | g) in 1/m at measured (K,) m."""
+        variance = self.sigma**2 + scale**2
+        core = np.exp(-0.5 * (measured - expected) ** 2 / variance) / np.sqrt(2 * np.pi * variance)
+        return np.asarray((1 - self.outlier) * core + self.outlier / range_max)

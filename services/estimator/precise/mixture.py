@@ -1,0 +1,100 @@
+"""The hypotheses between which scans have not decided: made, moved, merged, weighed, dropped."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from common import se2
+
+if TYPE_CHECKING:
+    from common.se2 import Array
+    from services.estimator.precise.gauss_newton import Prior
+    from services.estimator.precise.likelihood import Evidence
+    from services.estimator.precise.motion import Fused
+
+SAME_PLACE, SAME_YAW = 0.1, 0.1  # m, rad: nearer modes are one
+MEMORY = 0.8  # of the evidence of earlier scans; a model's error repeats, so evidence must not add up for ever
+NEGLIGIBLE = 1e-4  # weight below which a hypothesis is refuted
+
+
+@dataclass(frozen=True)
+class Mode:
+    """One hypothesis and what the last scan says about it."""
+
+    pose: Array  # (3,) base_link in map
+    noise: Array  # (3, 3) covariance that scanner noise and motion leave: fusion makes it smaller
+    error: Array  # (3, 3) covariance that the model's error leaves, for independent beams: fusion does not
+    explained: float  # share of beams
+    accuracy: float  # nats, of the last scan
+    complexity: float  # nats
+    energy: float  # nats, F averaged over the last scans: what weights come from
+    xi: Array  # (3,)
+    curvature: Array  # (3, 3)
+    velocity: Array | None = None  # (3,) in base_link; None: not known yet
+    weight: float = 1.0
+
+    def covariance(self, correlation: float) -> Array:
+        """(3, 3) of x, y, yaw in map."""
+        return np.asarray(self.noise + correlation * self.error)
+
+
+def found(pose: Array, evidence: Evidence, k: int, prior: Prior | None) -> Mode:
+    """A mode of the search; of nothing known in a direction, a metre and a radian remain."""
+    information = prior.information[k] if prior else np.eye(3)
+    inverse = np.linalg.inv(evidence.curvature[k] + information)
+    noise = inverse @ (evidence.of_noise[k] + information) @ inverse
+    error = inverse @ evidence.of_model[k] @ inverse
+    accuracy = float(evidence.accuracy[k])
+    complexity = float(prior.energy(prior.mean * 0 + pose)[k]) if prior else 0.0
+    complexity += 0.5 * float(np.linalg.slogdet(evidence.curvature[k] + information)[1])
+    return Mode(
+        pose, noise, error, float(evidence.explained[k]), accuracy, complexity, accuracy + complexity,
+        evidence.xi[k], evidence.curvature[k],
+    )  # fmt: skip
+
+
+def moved(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: float) -> Mode:
+    """The mode after a scan: noise shrinks by the scan's information, the model's error is this scan's own."""
+    inverse = np.linalg.inv(fused.information)
+    information = fused.information - evidence.curvature[k]
+    noise = inverse @ (evidence.of_noise[k] + information) @ inverse
+    alone = np.linalg.inv(evidence.curvature[k] + np.eye(3))
+    accuracy = float(evidence.accuracy[k])
+    velocity = se2.between(mode.pose, fused.mean) / period
+    energy = MEMORY * mode.energy + (1 - MEMORY) * (accuracy + fused.complexity)
+    return Mode(
+        fused.mean, noise, alone @ evidence.of_model[k] @ alone, float(evidence.explained[k]), accuracy,
+        fused.complexity, energy, evidence.xi[k], evidence.curvature[k], velocity,
+    )  # fmt: skip
+
+
+def distinct(poses: Array, energy: Array, count: int) -> list[int]:
+    """Indices of the ``count`` least energies, no two at the same place."""
+    kept: list[int] = []
+    for k in np.argsort(energy, kind="stable"):
+        off = np.abs(poses[kept] - poses[k])
+        off[:, 2] = np.abs(se2.wrap(poses[kept, 2] - poses[k, 2]))
+        if not ((off[:, :2] < SAME_PLACE).all(axis=1) & (off[:, 2] < SAME_YAW)).any():
+            kept.append(int(k))
+        if len(kept) == count:
+            break
+    return kept
+
+
+def weigh(modes: list[Mode], evidence_error: float, count: int) -> list[Mode]:
+    """Merged, weighed by energy, best first, refuted ones dropped.
+
+    F between places is only known up to the model's error, a few beams at about 9 nats: ``evidence_error`` nats.
+    """
+    kept = distinct(np.array([mode.pose for mode in modes]), np.array([mode.energy for mode in modes]), count)
+    ordered = [modes[k] for k in kept]
+    weights = np.exp(-(np.array([mode.energy for mode in ordered]) - ordered[0].energy) / evidence_error)
+    weights /= weights.sum()
+    return [
+        replace(mode, weight=float(weight / weights[weights > NEGLIGIBLE].sum()))
+        for mode, weight in zip(ordered, weights, strict=True)
+        if weight > NEGLIGIBLE
+    ]

@@ -1,0 +1,116 @@
+"""The temporal prior: how the robot may have moved since the last scan, and which of these motions the scan speaks for.
+
+With odometry: dead reckoning with its noise. Without: the robot stands, or goes on as it did (or as it was commanded),
+with what it can accelerate. Always, with small probability: any motion the robot is capable of. Which holds is decided by
+evidence, so that a standing robot's scans are fused and a moving one's belief does not trail.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from common import se2
+
+if TYPE_CHECKING:
+    from common.se2 import Array
+
+
+@dataclass(frozen=True)
+class MotionNoise:
+    """Standard deviations; of each axis of base_link."""
+
+    period: float = 1 / 15  # s between scans, where stamps do not say
+    acceleration: float = 1.0  # m/s²
+    turn_acceleration: float = 3.0  # rad/s²
+    speed: float = 1.0  # m/s
+    turn: float = 2.0  # rad/s
+    odom_per_metre: float = 0.05  # m a metre travelled
+    odom_turn_per_metre: float = 0.05  # rad a metre
+    odom_per_radian: float = 0.05  # rad a radian turned
+    command_share: float = 0.2  # of the commanded velocity
+    standing: float = 1e-4  # m and rad a scan: what a robot that stands may still move
+    surprise: float = 0.02  # probability of any other motion
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One way the robot may have moved: a Gaussian over where it is now."""
+
+    name: str
+    mean: Array  # (3,)
+    covariance: Array  # (3, 3) in map
+    probability: float
+
+
+def candidates(
+    noise: MotionNoise,
+    pose: Array,
+    covariance: Array,
+    period: float,
+    odom: Array | None = None,
+    command: Array | None = None,
+    velocity: Array | None = None,
+) -> list[Candidate]:
+    """Priors for now from the last posterior (3,), (3, 3); the last one is the widest.
+
+    ``odom`` (3,): motion since then in base_link; ``command`` and ``velocity`` (3,): m/s, m/s, rad/s in base_link.
+    """
+    reach = np.array([noise.speed, noise.speed, noise.turn]) * period
+    rest = 1 - noise.surprise
+    found = []
+    if odom is not None:
+        moved, turned = float(np.hypot(odom[0], odom[1])), abs(float(odom[2]))
+        across = noise.odom_per_metre * moved + noise.standing
+        around = noise.odom_turn_per_metre * moved + noise.odom_per_radian * turned + noise.standing
+        found.append(_moved("odometry", pose, covariance, odom, np.array([across, across, around]), rest))
+    else:
+        found.append(_moved("standing", pose, covariance, np.zeros(3), np.full(3, noise.standing), rest / 2))
+        change = np.array([noise.acceleration, noise.acceleration, noise.turn_acceleration]) * period**2
+        if command is not None:
+            change = change + noise.command_share * np.abs(command) * period
+            found.append(_moved("commanded", pose, covariance, command * period, change, rest / 2))
+        elif velocity is not None:
+            found.append(_moved("going on", pose, covariance, velocity * period, change, rest / 2))
+    centre = odom if odom is not None else np.zeros(3)
+    found.append(_moved("any motion", pose, covariance, centre, reach + np.abs(centre), noise.surprise))
+    return found
+
+
+def _moved(name: str, pose: Array, covariance: Array, step: Array, deviation: Array, probability: float) -> Candidate:
+    by_pose, by_step = se2.compose_jacobians(pose, step)
+    spread = by_pose @ covariance @ by_pose.T + (by_step * deviation**2) @ by_step.T
+    return Candidate(name, se2.compose(pose, step), spread, probability)
+
+
+@dataclass(frozen=True)
+class Fused:
+    """A candidate updated by a scan."""
+
+    candidate: Candidate
+    mean: Array  # (3,)
+    information: Array  # (3, 3) H + P^-1
+    complexity: float  # nats, KL of the posterior from the prior
+    surprise: float  # nats, -ln of prior probability times evidence, less the scan's constant
+
+
+def fuse(candidate: Candidate, mode: Array, slope: Array, curvature: Array) -> Fused:
+    """Laplace: the scan's -ln p is a parabola with ``slope`` (3,) (minus its gradient) and ``curvature`` at ``mode``."""
+    information = np.linalg.inv(candidate.covariance)
+    total = curvature + information
+    off = mode - candidate.mean
+    off[2] = se2.wrap(off[2])
+    # Minus the gradient of the parabola at the candidate's mean.
+    pull = slope + curvature @ off
+    step = np.linalg.solve(total, pull)
+    sound = curvature + 1e-9 * np.trace(curvature) * np.eye(3) + 1e-9 * np.eye(3)
+    misfit = float(pull @ np.linalg.solve(sound, pull) - pull @ step)
+    logdet = float(np.linalg.slogdet(total)[1] - np.linalg.slogdet(information)[1])
+    evidence = 0.5 * misfit + 0.5 * logdet - np.log(candidate.probability)
+    posterior = np.linalg.inv(total)
+    kl = 0.5 * (float(np.trace(information @ posterior)) - 3 + float(step @ information @ step) + logdet)
+    mean = candidate.mean + step
+    mean[2] = se2.wrap(mean[2])
+    return Fused(candidate, mean, total, kl, float(evidence))
