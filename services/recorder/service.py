@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
 import time
+from contextlib import nullcontext, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import ClassVar
@@ -18,9 +20,10 @@ from common.versions import versions
 from common.world import save_world
 from services.recorder.describing import Describer
 from services.recorder.settings import RecorderSettings
-from services.recorder.writer import RecordingWriter
+from services.recorder.writer import NameTakenError, RecordingWriter
 
 FLUSH_PERIOD = 1.0  # s
+LINK_WITHIN = 3.0  # s; a recorder may come before the others, but should not wait for nobody in silence
 
 
 class RecorderService(Service):
@@ -38,13 +41,13 @@ class RecorderService(Service):
         self.writer: RecordingWriter | None = None
         self.describer: Describer | None = None
         self._flush_at = 0.0
+        self._warn_at: float | None = None  # of nobody there; None: no more
 
     def open(self) -> None:
         """What is known of the session first, so that even a torn file explains itself."""
         options = self.options
         self.loop.inbox.capacity = options.capacity
-        writer = RecordingWriter(file_path(options), options.compression, options.chunk_size)
-        self.writer = writer
+        writer = self.writer = open_writer(options)
         session = {"robot": options.robot, "command": " ".join(sys.argv), **versions()}
         writer.metadata("presage", session)
         writer.metadata("config:recorder", {"config": json.dumps(options.effective())})
@@ -53,6 +56,7 @@ class RecorderService(Service):
                 writer.declare(topic, topic.key(options.robot))
         writer.flush()
         self._flush_at = time.monotonic() + FLUSH_PERIOD
+        self._warn_at = time.monotonic() + LINK_WITHIN if options.link().connect else None
         self.describer = Describer(self.loop.bus, self.name, self.log)
         self.log.info("recording", file=str(writer.path))
 
@@ -71,6 +75,7 @@ class RecorderService(Service):
         """Once a second: what services said of themselves, then to disk."""
         self._flush_at = time.monotonic() + FLUSH_PERIOD
         self._write_answers()
+        self._look_for_others()
         if self.writer is not None:
             self.writer.flush()
 
@@ -96,6 +101,19 @@ class RecorderService(Service):
         written, dropped = sum(writer.written.values()), sum(inbox.dropped.values())
         self.log.info("recorded", file=str(path), messages=written, dropped=dropped)
 
+    def _look_for_others(self) -> None:
+        """Say once that nobody is there, and when somebody comes after that."""
+        if self._warn_at is None or time.monotonic() < self._warn_at:
+            return
+        linked = self.loop.bus.linked()
+        if not linked and not self.note:
+            self.note = f"nothing answers at {', '.join(self.options.link().connect)}"
+            self.log.warning(self.note, advice="start a session with `presage up`, or say where it is with --connect")
+        elif linked:
+            if self.note:
+                self.log.info("there it is")
+            self._warn_at, self.note = None, ""
+
     def _write_answers(self) -> None:
         if self.writer is None or self.describer is None:
             return
@@ -104,6 +122,16 @@ class RecorderService(Service):
                 write_world(self.writer, answer)
             else:
                 self.writer.metadata(f"config:{service}", {"config": answer.config, **answer.versions})
+
+
+def open_writer(options: RecorderSettings) -> RecordingWriter:
+    """Under the name asked for; a name of our own making gets a number where another recorder was first."""
+    first = file_path(options)
+    for number in itertools.count(1):
+        path = first if number == 1 else first.with_stem(f"{first.stem}-{number}")
+        with suppress(NameTakenError) if not options.file else nullcontext():
+            return RecordingWriter(path, options.compression, options.chunk_size)
+    raise AssertionError
 
 
 def file_path(options: RecorderSettings) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable
+from io import BufferedWriter
 from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
@@ -17,11 +18,15 @@ LIBRARY = "presage recorder"
 COMPRESSION = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 
 
+class NameTakenError(UserError):
+    """A recording of that name is there, or being written."""
+
+
 class RecordingWriter:
     """Writes NAME.mcap.active, which becomes NAME.mcap at `finish`; every step raises UserError where it fails."""
 
     def __init__(self, path: Path, compression: str = "zstd", chunk_size: int = 1 << 18) -> None:
-        """Open the file; raises UserError where that cannot be."""
+        """Open the file; raises UserError where that cannot be, `NameTakenError` where the name is another's."""
         self.path, self.active = path, path.with_name(path.name + ".active")
         self.written: Counter[str] = Counter()  # by key
         self.failed = False
@@ -29,10 +34,7 @@ class RecordingWriter:
         self._channels: dict[str, int] = {}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            for taken in (path, self.active):
-                if taken.exists():
-                    raise UserError(f"{taken}: is there already; choose another name with --file, or another folder")
-            self._stream = self.active.open("xb")
+            self._stream = _claim(path, self.active)
         except OSError as error:
             raise UserError(f"{path.parent}: cannot be written to ({error.strerror}); choose another folder") from None
         self._writer = Writer(self._stream, chunk_size=chunk_size, compression=COMPRESSION[compression])
@@ -106,3 +108,17 @@ class RecordingWriter:
             self._stream.close()
         except OSError:
             self._stream.raw.close()  # what is still in the buffer cannot be written
+
+
+def _claim(path: Path, active: Path) -> BufferedWriter:
+    """The unfinished file, open; whoever makes it owns the name, so two recorders never write one recording."""
+    taken = "is there already; choose another name with --file, or another folder"
+    try:
+        stream = active.open("xb")
+    except FileExistsError:
+        raise NameTakenError(f"{active}: {taken}") from None
+    if path.exists():
+        stream.close()
+        active.unlink()
+        raise NameTakenError(f"{path}: {taken}")
+    return stream

@@ -11,11 +11,11 @@ import pytest
 
 from common.bus import wait_until
 from common.inbox import Inbox
-from common.messages import ConfigReply, Request, WorldReply
+from common.messages import Health, WorldReply
 from common.robot import Robot
 from common.scanner import SCANNERS
 from common.service import Loop, Service
-from common.topics import CONFIG, HEALTH, ODOM, SCAN, TOPICS, WORLD
+from common.topics import HEALTH, ODOM, SCAN, TOPICS, WORLD
 from services.recorder.reader import read_recording
 from services.recorder.settings import RecorderSettings
 from tests.recorder import sessions as made
@@ -52,7 +52,7 @@ def publish(bus, count, seed=1):
 def test_every_payload_is_in_the_file_bit_exactly(recorder, bus, tmp_path):
     running = recorder()
     sent = publish(bus, 3000)
-    settle(bus)
+    settle(bus, 3000)
     status, took = running.stop(signal.SIGTERM)
     assert status == 0, running.output
     assert took < 5
@@ -89,9 +89,18 @@ def test_kill_9_leaves_what_came_more_than_a_flush_before(recorder, bus, tmp_pat
     assert recording.metadata["presage"]["robot"] == bus.robot
 
 
-def settle(bus):
-    """An answer of the recorder's comes after what was put before the question: one link, one queue."""
-    bus.ask(CONFIG, Request(), ConfigReply, timeout=20, service="recorder")
+def settle(bus, count):
+    """Until the recorder says that so many messages have come; an answer of its own may overtake what was put."""
+    pulses, own = Inbox(), HEALTH.key(bus.robot, "recorder")
+    bus.subscribe(HEALTH, pulses, keep_all=True)
+
+    def heard():
+        entry = pulses.get(0)
+        if entry is None or entry.key != own:
+            return False
+        return sum(row.received for row in Health.decode(entry.payload).topics if row.key != own) >= count
+
+    assert wait_until(heard, 20)
 
 
 class Pretender(Service):
@@ -137,10 +146,21 @@ def test_only_the_topics_asked_for(recorder, bus, tmp_path):
     assert bus.wait_matching(ODOM, 10)
     bus.put(SCAN, b"no")
     bus.put(ODOM, b"yes")
-    settle(bus)
+    settle(bus, 1)
     assert running.stop(signal.SIGINT)[0] == 0
     recording = read_recording(tmp_path / "logs" / "some.mcap")
     assert [(r.key, r.payload) for r in recording.raw] == [(ODOM.key(bus.robot), b"yes")]
+
+
+def test_it_does_not_wait_in_silence_for_nobody(processes, tmp_path, free_port):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    running = processes.start("recorder", "--directory", str(tmp_path), env={"PRESAGE_CONNECT": endpoint})
+    running.wait_for(f"nothing answers at {endpoint}")
+    running.wait_for("start a session with `presage up`")
+    processes.start("common.router", "--listen", endpoint)
+    running.wait_for("there it is")
+    assert running.output.count("nothing answers") == 1
+    assert running.stop()[0] == 0
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,9 @@ from common.messages import Pose, Truth, Twist
 from common.topics import HEALTH, ODOM, SCAN, TOPICS, TRUTH
 from common.world import load_world
 from services.recorder.reader import MAGIC, read_recording
-from services.recorder.service import RecorderService, chosen_topics
-from services.recorder.writer import RecordingWriter
+from services.recorder.service import RecorderService, chosen_topics, open_writer
+from services.recorder.settings import RecorderSettings
+from services.recorder.writer import NameTakenError, RecordingWriter
 from tests.recorder import sessions as made
 
 KEYS = [(SCAN, "presage/r/scan"), (ODOM, "presage/other/odom"), (HEALTH, "presage/r/health/me")]
@@ -229,6 +230,31 @@ def test_what_is_no_recording_is_named(tmp_path, make, said):
         read_recording(tmp_path / "x.mcap")
     assert str(tmp_path / "x.mcap") in str(told.value)
     assert "\n" not in str(told.value)
+
+
+def test_two_recordings_never_share_a_name(tmp_path):
+    def name(recording):
+        return recording.path.name.rsplit("-r-", 1)[-1][len("20260101-000000") :]
+
+    options = RecorderSettings(directory=tmp_path, robot="r")
+    writers = [open_writer(options) for _ in range(3)]
+    stamp = writers[0].path.stem
+    while writers[-1].path.stem != f"{stamp}-3":  # unless the second turned between two of them
+        stamp = (first := open_writer(options)).path.stem
+        writers += [first, *(open_writer(options) for _ in range(2))]
+    assert [name(w) for w in writers[-3:]] == [".mcap", "-2.mcap", "-3.mcap"]
+    assert len({w.finish() for w in writers}) == len(writers)
+
+
+def test_a_name_asked_for_is_never_another(tmp_path):
+    options = RecorderSettings(directory=tmp_path, file="run")
+    writer = open_writer(options)
+    with pytest.raises(NameTakenError, match=r"run\.mcap\.active: is there already"):
+        open_writer(options)
+    whole = writer.finish().read_bytes()
+    with pytest.raises(NameTakenError, match=r"run\.mcap: is there already"):
+        open_writer(options)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [whole]
 
 
 def test_topics_are_chosen_by_name():
