@@ -91,6 +91,20 @@ class Truth(Stamped):
     frame_id: Name = "map"
 
 
+class Hypothesis(Message):
+    """One Gaussian of a belief's mixture."""
+
+    pose: Pose  # base_link in map
+    covariance: Matrix3 | None = None  # (3, 3) of x, y, yaw in map; None: this estimator has none
+    weight: Annotated[float, Field(ge=0, le=1)]  # of the mixture, sums to 1
+
+    @model_validator(mode="after")
+    def _shape(self) -> Hypothesis:
+        if self.covariance is not None and self.covariance.shape != (3, 3):
+            raise ValueError(f"covariance has {self.covariance.shape}, not (3, 3)")
+        return self
+
+
 class Belief(Stamped):
     """The estimator's posterior about the pose, one for each scan, with that scan's stamp."""
 
@@ -103,6 +117,8 @@ class Belief(Stamped):
     free_energy: Finite  # nats, accuracy + complexity
     accuracy: Finite  # nats, -ln p(o | pose)
     complexity: Finite = 0.0  # nats, how far the posterior is from the prior
+    hypotheses: Annotated[list[Hypothesis], Field(max_length=64)] = []  # noqa: RUF012
+    # best first: the first is the pose above
     estimator: Name = ""
     frame_id: Name = "map"
 

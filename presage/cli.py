@@ -157,13 +157,14 @@ def train(
     from presage import train_precise as precise  # noqa: PLC0415
     from services.estimator.precise.learning import Recipe  # noqa: PLC0415
     from services.estimator.precise.weights import FOLDER  # noqa: PLC0415
+    from services.estimator.training import Recipe as PaperRecipe  # noqa: PLC0415
 
     link, folder = link_of(connect, robot), out or FOLDER
     if preset == "precise":
         recipe = Recipe(resolution=resolution, seed=seed)
         precise.train_precise(precise.Job(world, scanner, beams, folder, samples or 5000, recipe), link, console)
     elif preset == "paper":
-        descent = paper.Recipe(epochs=epochs, batch=batch, learning_rate=learning_rate, seed=seed)
+        descent = PaperRecipe(epochs=epochs, batch=batch, learning_rate=learning_rate, seed=seed)
         paper.train(paper.Job(world, preset, scanner, beams, folder, samples or 13_000, descent), link, console)
     else:
         raise UserError(f"no preset {preset!r}: choose precise or paper")

@@ -1,4 +1,4 @@
-"""What every estimator takes and gives: one scan in, one posterior out. The shell and `presage localize` know no more."""
+"""What every estimator takes and gives: one scan in, one posterior out."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ class Observation:
     stamp: float | None = None  # s, of the measurement; None: no clock, scans count
     odom: Array | None = None  # (3,) base_link in odom at the stamp
     command: Array | None = None  # (3,) m/s, m/s, rad/s in base_link: the last velocity command
+    goal: Array | None = None  # (3,) base_link in map that is preferred; only the paper's equation 3 has a use for it
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Hypothesis:
     """One Gaussian of a mixture."""
 
     pose: Array  # (3,) base_link in map
-    covariance: Array  # (3, 3) of x, y, yaw in map
+    covariance: Array | None  # (3, 3) of x, y, yaw in map; None: this estimator has none
     weight: float  # of the mixture, sums to 1
 
 
@@ -53,8 +54,8 @@ class Posterior:
         return self.hypotheses[0].pose
 
     @property
-    def covariance(self) -> Array:
-        """(3, 3) of the best hypothesis."""
+    def covariance(self) -> Array | None:
+        """(3, 3) of the best hypothesis; None where the estimator has none."""
         return self.hypotheses[0].covariance
 
     @property

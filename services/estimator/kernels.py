@@ -18,8 +18,8 @@ jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @jit
-def lookup(phi, x, y):  # type: ignore[no-untyped-def]
-    """Bilinear phi (m) at grid coordinates (cells), its derivatives by x and y (m a cell), and whether it lies inside."""
+def lookup(phi, x, y):
+    """Bilinear phi (m) at grid coordinates (cells), its derivatives by x and y (m a cell), whether it is inside."""
     ny, nx = phi.shape
     if not (0 <= x < nx - 1 and 0 <= y < ny - 1):
         return 0.0, 0.0, 0.0, False
@@ -32,7 +32,7 @@ def lookup(phi, x, y):  # type: ignore[no-untyped-def]
 
 
 @jit
-def trace_one(phi, h, x, y, ux, uy):  # type: ignore[no-untyped-def]
+def trace_one(phi, h, x, y, ux, uy):
     """Sphere tracing in grid coordinates: length of the beam and nearest pass by another surface (m), inf for none."""
     t, step, before, falling, dip = 0.0, 0.0, 0.0, False, np.inf
     for _ in range(MAX_STEPS):
@@ -58,7 +58,7 @@ def trace_one(phi, h, x, y, ux, uy):  # type: ignore[no-untyped-def]
 
 
 @jit
-def trace(phi, ox, oy, h, lasers, angles, ranges, jacobian, dip, edge, facing):  # type: ignore[no-untyped-def]
+def trace(phi, ox, oy, h, lasers, angles, ranges, jacobian, dip, edge, facing):
     """Beams ``angles`` (B,) of lasers (N, 3): fills ranges (N, B), jacobian (N, B, 3), and (N, B) dip, edge, facing.
 
     dr = -(n . dp + r n . u' dyaw) / (n . u). Edge: how deep, relative to a plane, one cell behind the surface lies.
@@ -85,8 +85,8 @@ def trace(phi, ox, oy, h, lasers, angles, ranges, jacobian, dip, edge, facing): 
 
 
 @jit
-def cast(segments, circles, lasers, angles, ranges, jacobian):  # type: ignore[no-untyped-def]
-    """Exact rays of lasers (N, 3) against segments (S, 4) and circles (C, 3): fills ranges (N, B), jacobian (N, B, 3)."""
+def cast(segments, circles, lasers, angles, ranges, jacobian):
+    """Exact rays of lasers (N, 3) against segments (S, 4), circles (C, 3): fills ranges (N, B), jacobian (N, B, 3)."""
     for k in range(lasers.shape[0]):
         px, py = lasers[k, 0], lasers[k, 1]
         for b in range(angles.shape[0]):
@@ -124,17 +124,19 @@ def cast(segments, circles, lasers, angles, ranges, jacobian):  # type: ignore[n
 
 
 @jit
-def accumulate(measured, expected, jacobian, scale, sigma, widen, outlier, range_max, unseen, total, gradient, matrices):  # type: ignore[no-untyped-def]
+def accumulate(
+    measured, expected, jacobian, scale, sigma, widen, outlier, range_max, unseen, total, gradient, matrices
+):
     """Sums over beams of -ln p(o | pose) and its derivatives; see `services.estimator.precise.likelihood`.
 
-    Fills total (N, 3) energy, explained, used; gradient (N, 3); matrices (N, 3, 3, 3): curvature, and its parts from the
-    scanner's noise and from the model's error.
+    Fills total (N, 3) energy, explained, used; gradient (N, 3); matrices (N, 3, 3, 3): curvature, and its parts from
+    the scanner's noise and from the model's error.
     """
     flat = outlier / range_max
     for k in range(expected.shape[0]):
         for b in range(measured.shape[0]):
             o, g = measured[b], expected[k, b]
-            if o == -np.inf or o != o:
+            if o == -np.inf or np.isnan(o):
                 continue
             total[k, 2] += 1.0
             if o == np.inf:
@@ -164,7 +166,7 @@ def accumulate(measured, expected, jacobian, scale, sigma, widen, outlier, range
 
 
 @jit
-def rank(panoramas, bins, measured, tolerance, range_max, costs):  # type: ignore[no-untyped-def]
+def rank(panoramas, bins, measured, tolerance, range_max, costs):
     """Misfit of every place and heading: fills costs (S, H) with the mean over beams of e² / (e² + tolerance²)."""
     size, headings = panoramas.shape[1], costs.shape[1]
     for s in range(panoramas.shape[0]):
@@ -173,7 +175,7 @@ def rank(panoramas, bins, measured, tolerance, range_max, costs):  # type: ignor
             total, used = 0.0, 0
             for b in range(bins.shape[0]):
                 o = measured[b]
-                if o == -np.inf or o != o:
+                if o == -np.inf or np.isnan(o):
                     continue
                 g = panoramas[s, (bins[b] + shift) % size]
                 e = min(o, range_max) - min(g, range_max)

@@ -11,24 +11,41 @@ from common.config import POSE_TEXT, ServiceSettings
 
 
 class EstimatorSettings(ServiceSettings):
-    """Free-energy estimator: from each scan a belief about the pose, and the scan it expected.
+    """Estimator: from each scan a belief about the pose, and the scan it expected.
 
     Examples:
-      python -m services.estimator                                    the paper's preset in the corridor
+      python -m services.estimator                                    preset precise in the corridor
+      python -m services.estimator --estimator particle-filter        another one, on the same topics
+      python -m services.estimator --world office --model exact       rays cast in the world itself, nothing learned
       python -m services.estimator --world my.yaml --models trained   your world, your weights
       python -m services.estimator --initial-pose 3,1.5,90            start from a known pose (m, m, deg)
-      PRESAGE_ALPHA=0.001 python -m services.estimator --print-config
+      PRESAGE_ESTIMATOR=paper python -m services.estimator --print-config
 
     """
 
     service: ClassVar[str] = "estimator"
 
     world: Annotated[str, Field(description="shipped world or world file the model was trained for")] = "corridor"
-    preset: Annotated[Literal["paper"], Field(description="paper: the decoder and descent of the paper")] = "paper"
+    estimator: Annotated[
+        Literal["precise", "paper", "particle-filter", "amcl-defaults"],
+        Field(description="precise; paper: Burghardt & Lanillos 2021; particle-filter: AMCL's design, tuned or not"),
+    ] = "precise"
+    model: Annotated[str, Field(description="of precise: learned, exact, or a file of weights")] = "learned"
     models: Annotated[Path | None, Field(description="folder of weights; none: the shipped ones")] = None
-    initial_pose: Annotated[str, Field(pattern=POSE_TEXT, description="x,y[,yaw_deg]; none: the map's centre")] = ""
-    alpha: Annotated[float, Field(gt=0, lt=1, description="step size of perception, m²")] = 2e-4
+    prior: Annotated[
+        Literal["motion", "odometry", "command"],
+        Field(
+            description="what tells of motion between scans; motion: the last scans alone; "
+            "command: runs are not repeatable to the byte, for it races with the scan"
+        ),
+    ] = "motion"
+    sigma: Annotated[float, Field(gt=0, lt=10, description="m, the scanner's noise")] = 0.02
+    seed: Annotated[int, Field(ge=0, le=2**31, description="of particles")] = 0
+    initial_pose: Annotated[
+        str, Field(pattern=POSE_TEXT, description="x,y[,yaw_deg]; none: nothing is known (paper: the map's centre)")
+    ] = ""
+    alpha: Annotated[float, Field(gt=0, lt=1, description="paper: step size of perception, m²")] = 2e-4
     beta: Annotated[
-        float, Field(ge=0, lt=10, description="the goal's attraction in perception (eq. 3); 0: the belief is unbiased")
+        float, Field(ge=0, lt=10, description="paper: the goal's attraction in perception (eq. 3); 0: unbiased belief")
     ] = 0.0
-    iterations: Annotated[int, Field(ge=1, le=1000, description="gradient steps a scan; the paper: 1")] = 10
+    iterations: Annotated[int, Field(ge=1, le=1000, description="paper: gradient steps a scan; the paper: 1")] = 10

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from common.messages import Belief, Robot, Scanner, World
+from common.messages import Belief, Hypothesis, Robot, Scanner, World
 from common.topics import QUERIES, TOPICS
 from common.wire import Binary, Message
 from common.world import Box, Circle, Obstacle
@@ -40,11 +40,12 @@ FIXED: dict[type, st.SearchStrategy] = {
 def message_of(cls: type[Message]) -> st.SearchStrategy:
     """Valid messages of a class."""
     rows = {name: _field(field) for name, field in cls.model_fields.items()}
-    if cls is Belief:
+    if cls in (Belief, Hypothesis):
         three = st.builds(np.array, st.lists(st.floats(-1e6, 1e6, width=64), min_size=9, max_size=9))
         matrix = st.none() | three.map(lambda m: m.reshape(3, 3))
-        xi = st.lists(st.floats(-1e6, 1e6, width=32), min_size=3, max_size=3)
-        rows |= {"xi": xi, "covariance": matrix, "curvature": matrix}
+        rows["covariance"] = matrix
+    if cls is Belief:
+        rows |= {"xi": st.lists(st.floats(-1e6, 1e6, width=32), min_size=3, max_size=3), "curvature": matrix}
     return st.builds(cls, **rows)
 
 

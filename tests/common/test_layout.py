@@ -17,6 +17,8 @@ SHELL = {"__main__.py", "service.py", "settings.py"}
 # Files that are about files or threads themselves; no more may join unnoticed.
 ALSO_SHELL = {
     "services/estimator/checkpoint.py", "services/estimator/weights.py",
+    "services/estimator/precise/weights.py",
+    "services/estimator/building.py",  # opens what the names name
     "services/recorder/reader.py", "services/recorder/replay.py", "services/recorder/writer.py",
     "services/recorder/describing.py",  # a thread that asks
     "services/simulator/physics.py",  # pybullet reads the robot's URDF from a file

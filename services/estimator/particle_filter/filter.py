@@ -134,7 +134,7 @@ class ParticleFilter:
         self._sigma = self.sensor.sigma(spread, self._sigma)
 
     def _judge(self, found: tuple[Hypothesis, ...]) -> State:
-        tight = [np.sqrt(np.trace(h.covariance[:2, :2])) < TIGHT for h in found]
+        tight = [h.covariance is not None and np.sqrt(np.trace(h.covariance[:2, :2])) < TIGHT for h in found]
         settled = found[0].weight > SURE and tight[0] and self._sigma < 1.5 * self.settings.sigma_hit
         if self._was_found and self._health.ratio < (FOUND if self._state == "lost" else LOST):
             if self._searches <= SEARCHES or not settled or self.settings.recovery_alpha_fast == 0:

@@ -1,4 +1,4 @@
-"""Preset `precise`: natural-gradient descent on F from many places at once, a mixture of hypotheses, fusion over time."""
+"""Preset `precise`: natural-gradient descent on F from many places at once, a mixture, fusion over time."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common import se2
+from services.estimator.interface import Hypothesis, Observation, Posterior, State
 from services.estimator.precise import mixture
 from services.estimator.precise.gauss_newton import Prior, View, descend, polish
-from services.estimator.interface import Hypothesis, Observation, Posterior, State
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.mixture import Mode
 from services.estimator.precise.motion import MotionNoise, candidates, fuse
@@ -94,9 +94,7 @@ class PreciseEstimator:
         if observation.odom is not None and self._odom is not None:
             odom = se2.between(self._odom, observation.odom)
         options = [
-            candidates(
-                self.settings.motion, mode.pose, mode.noise, period, odom, observation.command, mode.velocity
-            )
+            candidates(self.settings.motion, mode.pose, mode.noise, period, odom, observation.command, mode.velocity)
             for mode in self.modes
         ]
         starts = np.array([each[-2].mean for each in options])
@@ -152,7 +150,9 @@ class PreciseEstimator:
         starts = self._rng.multivariate_normal(pose, covariance, self.settings.seeds)
         starts[0] = pose
         information = np.linalg.inv(covariance)
-        return self._refine(view, starts, Prior(np.tile(pose, (len(starts), 1)), np.tile(information, (len(starts), 1, 1))))
+        return self._refine(
+            view, starts, Prior(np.tile(pose, (len(starts), 1)), np.tile(information, (len(starts), 1, 1)))
+        )
 
     def _refine(self, view: View, starts: Array, prior: Prior | None) -> list[Mode]:
         """Descend from all starts with few beams and wide deviations, then from the best with all and none."""

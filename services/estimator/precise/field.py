@@ -7,7 +7,8 @@ range's derivative is that of the implicit function: dr = -(n . dp + r n . u' dy
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import dataclasses
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -71,7 +72,9 @@ class FieldModel:
     """A distance field with learned precision."""
 
     field: DistanceField
-    scales: Array = field(default_factory=lambda: np.full(int(np.prod(CLASSES)), 1e-3))  # m, error of each class
+    scales: Array = dataclasses.field(
+        default_factory=lambda: np.full(int(np.prod(CLASSES)), 1e-3)
+    )  # m, error of each class
 
     def expect(self, lasers: Array, angles: Array) -> Expected:
         """See GenerativeModel."""

@@ -43,9 +43,7 @@ class View:
     def evidence(self, poses: Array, widen: float = 0.0) -> Evidence:
         """What the scan says about base_link poses (N, 3), derivatives by these."""
         lasers = se2.compose(poses, self.mount)
-        found = self.likelihood.evaluate(
-            self.ranges, self.range_max, self.model.expect(lasers, self.angles), widen
-        )
+        found = self.likelihood.evaluate(self.ranges, self.range_max, self.model.expect(lasers, self.angles), widen)
         # A turn of base_link moves the laser sideways: J_base = J_laser T.
         T = np.tile(np.eye(3), (len(poses), 1, 1))
         T[:, 0, 2], T[:, 1, 2] = poses[:, 1] - lasers[:, 1], lasers[:, 0] - poses[:, 0]

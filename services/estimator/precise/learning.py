@@ -113,9 +113,7 @@ def _surfaces(beams: Beams, h: float) -> DistanceField:
     return DistanceField(_distances(surface, mx, my, nx, ny, own, h), (float(low[0]), float(low[1])), h)
 
 
-def _distances(
-    surface: np.ndarray, mx: Array, my: Array, nx: Array, ny: Array, own: Array, h: float
-) -> Floats:
+def _distances(surface: np.ndarray, mx: Array, my: Array, nx: Array, ny: Array, own: Array, h: float) -> Floats:
     """Phi at the nodes from surface elements: near them by their planes, elsewhere by the nearest."""
     rows, columns = np.nonzero(surface)
     ex, ey, ax, ay = (a[surface] for a in (mx, my, nx, ny))
@@ -131,7 +129,7 @@ def _distances(
             np.add.at(total, (i[inside], j[inside]), (w * (ax * vx + ay * vy))[inside])
             np.add.at(weight, (i[inside], j[inside]), w[inside])
     near = weight > 0
-    tree = shapely.STRtree(shapely.points(np.stack([ex, ey], -1)))
+    tree = shapely.STRtree([shapely.Point(x, y) for x, y in zip(ex, ey, strict=True)])
     ii, jj = np.nonzero(~near)
     nearest = tree.nearest(shapely.points(np.stack([jj * h, ii * h], -1)))
     phi = np.divide(total, weight, out=np.zeros_like(total), where=near)
@@ -162,7 +160,7 @@ def _descend(field: DistanceField, beams: Beams, rate: float) -> Floats:
 def learn_scales(field: DistanceField, poses: Array, mount: Array, angles: Array, ranges: Array, sigma: float) -> Array:
     """The model's own error (m) in each class of beams, from scans (N, B) it has not learned from: learned precision.
 
-    Expectation maximisation of the density of `services.estimator.precise.likelihood`, whose flat part takes what misses.
+    Expectation maximisation of the likelihood's density, whose flat part takes what misses.
     """
     traced = field.trace(compose(poses, mount), angles)
     both = np.isfinite(ranges) & np.isfinite(traced.ranges)
@@ -174,7 +172,5 @@ def learn_scales(field: DistanceField, poses: Array, mount: Array, angles: Array
         core = (1 - OUTLIER) * np.exp(-0.5 * square / s2) / np.sqrt(2 * np.pi * s2)
         inlier = core / (core + OUTLIER / FLAT)
         count, total = np.bincount(kind, inlier, size), np.bincount(kind, inlier * square, size)
-        variance = np.maximum(
-            (total + RARE * (RARE_SCALE**2 + sigma**2)) / (count + RARE) - sigma**2, LEAST_SCALE**2
-        )
+        variance = np.maximum((total + RARE * (RARE_SCALE**2 + sigma**2)) / (count + RARE) - sigma**2, LEAST_SCALE**2)
     return np.asarray(np.sqrt(variance))

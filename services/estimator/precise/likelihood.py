@@ -2,9 +2,9 @@
 
     p(o | g) = (1 - epsilon) N(o; g, sigma² + m²) + epsilon / range_max
 
-sigma is the scanner's noise, m the model's stated error, epsilon the share of beams that something unknown ends (people,
-moved furniture): a proper density with tails that no outlier moves (Thrun, Burgard & Fox 2005, section 6.3, without its
-gains). A beam without return has the probability `unseen` where a surface is expected, 1 - unseen where none is.
+sigma is the scanner's noise, m the model's stated error, epsilon the share of beams that something unknown ends
+(people, moved furniture): a proper density with tails that no outlier moves (Thrun, Burgard & Fox 2005, section 6.3,
+without its gains). A beam without return has the probability `unseen` where a surface is expected, else 1 - unseen.
 """
 
 from __future__ import annotations

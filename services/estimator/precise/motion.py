@@ -1,8 +1,8 @@
 """The temporal prior: how the robot may have moved since the last scan, and which of these motions the scan speaks for.
 
 With odometry: dead reckoning with its noise. Without: the robot stands, or goes on as it did (or as it was commanded),
-with what it can accelerate. Always, with small probability: any motion the robot is capable of. Which holds is decided by
-evidence, so that a standing robot's scans are fused and a moving one's belief does not trail.
+with what it can accelerate. Always, with small probability: any motion the robot is capable of. Which holds is decided
+by evidence, so that a standing robot's scans are fused and a moving one's belief does not trail.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Fused:
 
 
 def fuse(candidate: Candidate, mode: Array, slope: Array, curvature: Array) -> Fused:
-    """Laplace: the scan's -ln p is a parabola with ``slope`` (3,) (minus its gradient) and ``curvature`` at ``mode``."""
+    """Laplace: the scan's -ln p is a parabola, ``slope`` (3,) minus its gradient at ``mode``, ``curvature`` its own."""
     information = np.linalg.inv(candidate.covariance)
     total = curvature + information
     off = mode - candidate.mean

@@ -12,8 +12,8 @@ from services.estimator import kernels
 
 if TYPE_CHECKING:
     from common.se2 import Array
-    from services.estimator.precise.gauss_newton import View
     from services.estimator.generative import GenerativeModel
+    from services.estimator.precise.gauss_newton import View
 
 BINS = 360  # of a cached panorama
 TOLERANCE = 0.35  # m, misfit of a beam that still speaks for a place about as far from the truth
@@ -30,7 +30,7 @@ class Seeds:
     def at(cls, model: GenerativeModel, places: Array) -> Seeds:
         """Ask the model for every place (S, 2)."""
         lasers = np.column_stack([places, np.zeros(len(places))])
-        directions = np.arange(BINS) * (2 * np.pi / BINS)
+        directions = np.linspace(0.0, 2 * np.pi, BINS, endpoint=False)
         parts = [model.expect(part, directions).ranges for part in np.array_split(lasers, max(1, len(lasers) // 500))]
         return cls(np.asarray(places, float), np.concatenate(parts).astype(np.float32))
 
@@ -40,7 +40,12 @@ class Seeds:
         bins = np.round(thin.angles / (2 * np.pi / BINS)).astype(np.int64)
         costs = np.empty((len(self.places), headings), np.float32)
         kernels.rank(
-            self.panoramas, bins, thin.ranges.astype(np.float32), np.float32(TOLERANCE), np.float32(view.range_max), costs
+            self.panoramas,
+            bins,
+            thin.ranges.astype(np.float32),
+            np.float32(TOLERANCE),
+            np.float32(view.range_max),
+            costs,
         )
         place, heading = _least(costs, count)
         lasers = np.column_stack([self.places[place], se2.wrap(heading * (2 * np.pi / headings))])

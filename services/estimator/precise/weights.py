@@ -54,7 +54,7 @@ def path_of(folder: Path, world: str) -> Path:
 def save(path: Path, model: FieldModel, places: Array, card: FieldCard) -> None:
     """The field in half precision (fine near zero, where it matters); whole files or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    tensors = {
+    tensors: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]] = {
         "phi": model.field.phi.astype(np.float16),
         "scales": model.scales.astype(np.float32),
         "places": np.asarray(places, np.float32),
@@ -96,12 +96,10 @@ def train_command(world: str, folder: Path = FOLDER) -> str:
 
 
 def find(folder: Path, world: World, asked: str) -> Path:
-    """The field of a world; raises UserError with the command that makes it (``asked``: how the user named the world)."""
+    """The field of a world the user named ``asked``; raises UserError with the command that makes it."""
     path = path_of(folder, world.name)
     if not path.exists():
-        raise UserError(
-            f"no field of world {world.name!r} in {folder}; make it with: {train_command(asked, folder)}"
-        )
+        raise UserError(f"no field of world {world.name!r} in {folder}; make it with: {train_command(asked, folder)}")
     _, _, card = load(path)
     if not same_walls(card.world, world):
         raise UserError(

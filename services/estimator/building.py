@@ -1,0 +1,157 @@
+"""Which estimator, over which model: from names to something that takes scans. The one place where files are opened."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import shapely
+
+from common.errors import UserError
+from common.scanner import SCANNERS
+from common.se2 import Array
+from common.world import World, load_world
+from services.estimator.generative import GenerativeModel, RayCaster
+from services.estimator.interface import Estimator
+from services.estimator.particle_filter.filter import ParticleFilter
+from services.estimator.particle_filter.settings import Settings as ParticleSettings
+from services.estimator.perception import Descent
+from services.estimator.precise import weights
+from services.estimator.precise.estimator import PreciseEstimator, Settings
+from services.estimator.precise.gauss_newton import View, polish
+from services.estimator.precise.likelihood import Likelihood
+from services.estimator.precise.seeding import Seeds, thin_places
+
+Name = Literal["precise", "paper", "particle-filter", "amcl-defaults"]
+SPACING = 0.3  # m between the places a search begins at
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a user chooses."""
+
+    world: str = "corridor"
+    estimator: Name = "precise"
+    model: str = "learned"  # of precise: learned, exact, or a file of weights
+    models: Path | None = None  # folder of weights; none: the shipped ones
+    sigma: float = 0.02  # m, the scanner's noise
+    seed: int = 0
+    initial_pose: Array | None = None  # (3,); none: nothing is known (paper: the map's centre)
+    descent: Descent = Descent()  # noqa: RUF009 - frozen; of paper
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Of the scans to come."""
+
+    angles: Array  # (B,) rad in laser
+    mount: Array  # (3,) laser in base_link
+    range_max: float  # m
+
+    def same(self, other: Geometry) -> bool:
+        """Whether an estimator made for one takes the other."""
+        return len(self.angles) == len(other.angles) and bool(
+            np.allclose(self.angles, other.angles, atol=1e-4) and np.allclose(self.mount, other.mount, atol=1e-4)
+        )
+
+
+Factory = Callable[[Geometry], Estimator]
+
+
+def prepare(choice: Choice) -> Factory:
+    """Load what is needed, so that errors come now; the factory makes the estimator for the first scan's geometry."""
+    if choice.estimator not in get_args(Name):
+        raise UserError(f"no estimator {choice.estimator!r}: choose one of {', '.join(get_args(Name))}")
+    world = load_world(choice.world)
+    if choice.estimator == "paper":
+        return _paper(choice, world)
+    if choice.estimator == "precise":
+        return _precise(choice, world)
+    tuned = choice.estimator == "particle-filter"
+
+    def make(geometry: Geometry) -> Estimator:
+        settings = ParticleSettings.tuned() if tuned else ParticleSettings()
+        settings = replace(settings, robot_model_type="omni")  # covers a differential base as well
+        made = ParticleFilter(world, settings, (*map(float, geometry.mount),), choice.seed)  # type: ignore[arg-type]
+        if choice.initial_pose is not None:
+            made.restart(choice.initial_pose)
+        return made
+
+    return make
+
+
+def _precise(choice: Choice, world: World) -> Factory:
+    model, places, correlation = generative_model(choice, world)
+    seeds = Seeds.at(model, places)
+    likelihood = Likelihood(choice.sigma)
+    _compile(model, seeds, likelihood)
+
+    def make(geometry: Geometry) -> Estimator:
+        made = PreciseEstimator(
+            model, seeds, geometry.mount, likelihood, Settings(correlation=correlation),
+            np.random.default_rng(choice.seed),
+        )  # fmt: skip
+        if choice.initial_pose is not None:
+            made.restart(choice.initial_pose)
+        return made
+
+    return make
+
+
+def generative_model(choice: Choice, world: World) -> tuple[GenerativeModel, Array, float]:
+    """The model of that name, places (S, 2) m a laser may be at, and how its errors hang together."""
+    if choice.model == "exact":
+        places = world.sample_free(max(4000, int(60 * shapely.area(world.free_space))), np.random.default_rng(0), 0.05)
+        return RayCaster(world), thin_places(places, SPACING), 1.0
+    if choice.model == "learned":
+        path = weights.find(choice.models or weights.FOLDER, world, choice.world)
+    elif (path := Path(choice.model)).suffix != ".safetensors":
+        raise UserError(f"no model {choice.model!r}: give learned, exact, or a file of weights (.safetensors)")
+    model, places, card = weights.load(path)
+    return model, places, card.correlation
+
+
+def _compile(model: GenerativeModel, seeds: Seeds, likelihood: Likelihood) -> None:
+    """Once through every compiled loop, so that no scan waits for it."""
+    angles = np.linspace(-1, 1, 16)
+    view = View(model, likelihood, np.zeros(3), angles, np.ones(16), 25.0)
+    polish(view, seeds.rank(view, 2), iterations=1)
+
+
+def _paper(choice: Choice, world: World) -> Factory:
+    # Torch takes a second to import; the other estimators do without.
+    from services.estimator import weights as paper_weights  # noqa: PLC0415
+    from services.estimator.decoder import use_one_core  # noqa: PLC0415
+    from services.estimator.paper_perception import PaperPerception, check_geometry  # noqa: PLC0415
+
+    use_one_core()
+    folder = choice.models or paper_weights.FOLDER
+    known = paper_weights.available(folder, world.name, "paper")
+    remedy = paper_weights.train_command(choice.world, "paper")
+    if not known:
+        raise UserError(f"no weights of preset paper for world {world.name!r} in {folder}; make them with: {remedy}")
+    for path in known.values():  # a broken file is found now, and torch is warm for the first scan
+        model, card = paper_weights.load(path)
+        if not weights.same_walls(card.world, world):
+            raise UserError(
+                f"{path} was trained in another world of the same name {world.name!r}: its walls differ. Give your "
+                f"world a name of its own and train for it: {remedy}"
+            )
+        model.predict(np.array([*card.world.center(), card.heading]))
+
+    def make(geometry: Geometry) -> Estimator:
+        found = paper_weights.find(folder, world.name, "paper", len(geometry.angles))
+        model, card = paper_weights.load(found)
+        check_geometry(card.scanner, geometry.angles, geometry.mount, remedy)
+        return PaperPerception(model, card, choice.descent, choice.initial_pose)
+
+    return make
+
+
+def default_geometry(beams: int | None = None) -> Geometry:
+    """Of the shipped scanner."""
+    scanner = SCANNERS["tim571"].with_beams(beams)
+    return Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max)

@@ -1,0 +1,89 @@
+"""Preset `paper` behind the common interfaces: as an estimator, and its decoder as a generative model for others."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from common import se2
+from common.errors import UserError
+from services.estimator.generative import Expected
+from services.estimator.interface import Hypothesis, Observation, Posterior
+from services.estimator.perception import Descent, PaperEstimator
+from services.estimator.training import usable_ranges
+
+if TYPE_CHECKING:
+    from common.scanner import Scanner
+    from common.se2 import Array
+    from services.estimator.decoder import PaperModel
+    from services.estimator.weights import ModelCard
+
+ANGLE_TOLERANCE = 1e-4  # rad and m, between a scan's beams or mounting and the model's
+
+
+def check_geometry(scanner: Scanner, angles: Array, mount: Array | None, remedy: str) -> None:
+    """Raises UserError where a scan's beams or mounting are not those a decoder was trained for."""
+    same = len(angles) == scanner.beams and np.abs(angles - scanner.angles()).max() < ANGLE_TOLERANCE
+    if not same or (mount is not None and np.abs(mount - np.array(scanner.mount)).max() > ANGLE_TOLERANCE):
+        raise UserError(
+            f"the scan's beams or mounting are not those of {scanner.name} that the weights were trained for; "
+            f"train for this scanner: {remedy}"
+        )
+
+
+class PaperPerception:
+    """The paper's estimator; the heading is the one of its training, there is no covariance."""
+
+    name = "paper"
+
+    def __init__(self, model: PaperModel, card: ModelCard, descent: Descent, pose: Array | None = None) -> None:
+        """``pose`` (3,) to begin with; none: the map's centre."""
+        self.card = card
+        self._first = pose
+        self.estimator = PaperEstimator(model, card.test_l1_mean, card.world.bounds, self._initial(pose), descent)
+
+    def _initial(self, pose: Array | None) -> Array:
+        x, y = self.card.world.center() if pose is None else pose[:2]
+        return np.array([x, y, self.card.heading])
+
+    def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:  # noqa: ARG002
+        """Begin anew at ``pose``, or where it began first; the heading and a covariance are not used."""
+        self.estimator.restart(self._initial(self._first if pose is None else pose))
+
+    def update(self, observation: Observation) -> Posterior:
+        """Descend on one scan."""
+        ranges = usable_ranges(observation.ranges, observation.range_max)
+        estimate = self.estimator.update(ranges, observation.goal)
+        found = estimate.gradient
+        return Posterior(
+            estimate.state,
+            (Hypothesis(estimate.pose, None, 1.0),),
+            found.accuracy,
+            found.attraction,
+            found.xi,
+            found.curvature,
+            estimate.predicted,
+        )
+
+
+class PaperScans:
+    """The paper's decoder as a generative model: one heading, the beams of its training, no derivative by yaw."""
+
+    def __init__(self, model: PaperModel, card: ModelCard) -> None:
+        """The stated precision is the decoder's mean error on test scans, for every beam."""
+        self.model, self.card = model, card
+
+    def expect(self, lasers: Array, angles: Array) -> Expected:
+        """See GenerativeModel; raises UserError for other beams than those of the training."""
+        scanner = self.card.scanner
+        own = scanner.angles()
+        index = np.abs(own[None, :] - se2.wrap(angles)[:, None]).argmin(axis=1)
+        if np.abs(own[index] - angles).max() > scanner.angle_increment:
+            raise UserError("the paper's decoder predicts the beams of its training alone")
+        poses = se2.compose(np.asarray(lasers, float).reshape(-1, 3), se2.inverse(np.array(scanner.mount)))
+        poses[:, 2] = self.card.heading
+        rows = [self.model.predict(pose) for pose in poses]
+        ranges = np.array([row[0][index] for row in rows])
+        jacobian = np.array([row[1][index] for row in rows])
+        return Expected(ranges, np.full(ranges.shape, self.card.test_l1_mean), jacobian)
