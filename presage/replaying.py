@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 
 from rich.console import Console
@@ -10,6 +9,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from common.bus import Link
 from common.errors import UserError
+from presage.watch import session
 from services.recorder.replay import replay
 
 
@@ -24,7 +24,7 @@ def run_replay(file: Path, link: Link, only: str, rate: float, console: Console)
             only=names,
             rate=rate,
             on_progress=lambda done: bar.update(task, completed=done),
-            stop=threading.Event(),
+            opening=session,
         )
     if not counts:
         raise UserError(f"{file}: nothing to replay")

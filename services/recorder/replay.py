@@ -7,9 +7,10 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 
-from common.bus import Link, open_bus
+from common.bus import Bus, Link, open_bus
 from common.errors import UserError
 from common.topics import HEALTH, topic_of
 from services.recorder.reader import Raw, read_recording
@@ -43,21 +44,30 @@ def replay(
     rate: float = 1.0,
     on_progress: Callable[[float], None] = lambda _: None,
     stop: threading.Event | None = None,
+    opening: Callable[[Link], AbstractContextManager[Bus]] = open_bus,
 ) -> Counter[str]:
-    """Publish the recording; counts by key. Waits shortly for somebody to listen. ``on_progress`` gets 0 to 1."""
+    """Publish the recording; counts by key. Waits shortly for somebody to listen, and warns of keys nobody wants.
+
+    ``on_progress`` gets 0 to 1; ``opening`` makes the session, and may insist that somebody is there.
+    """
     stop = stop or threading.Event()
     recording = read_recording(path)
     if recording.warning:
         print(f"warning: {recording.warning}", file=sys.stderr)
     chosen = select(recording.raw, only)
     counts: Counter[str] = Counter()
-    with open_bus(link) as bus:
+    with opening(link) as bus:
         topics = {
             key: topic for key in dict.fromkeys(raw.key for raw in chosen) if (topic := topic_of(key)) is not None
         }
+        for key, topic in topics.items():  # all before the first wait: each asks who listens
+            bus.publisher(topic, key=key)
         deadline = time.monotonic() + LISTENERS_WITHIN
-        for key, topic in topics.items():
-            bus.wait_matching(topic, max(0.0, deadline - time.monotonic()), key=key)
+        unheard = [
+            k for k, t in topics.items() if not bus.wait_matching(t, max(0.0, deadline - time.monotonic()), key=k)
+        ]
+        if unheard:
+            print(f"warning: nobody listens to {', '.join(unheard)}", file=sys.stderr)
         began = time.monotonic()
         for number, (due, raw) in enumerate(schedule(chosen, rate)):
             if stop.wait(max(0.0, began + due - time.monotonic())):

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.bus import open_bus, wait_until
+from common.bus import wait_until
 from common.errors import UserError
 from common.inbox import Inbox, Sample
 from common.topics import HEALTH, ODOM, SCAN, TOPICS
@@ -133,8 +133,12 @@ def test_an_unfinished_recording_is_replayed_with_a_warning(tmp_path, link, list
     writer.finish()
 
 
-def test_nobody_listens_and_it_ends_all_the_same(tmp_path, link, monkeypatch):
-    monkeypatch.setattr(shell, "LISTENERS_WITHIN", 0.2)
-    path = write(tmp_path / "run.mcap", [(SCAN, SCAN.key(link.robot), b"s", 1)])
-    with open_bus(link):
-        assert replay(path, link) == {SCAN.key(link.robot): 1}
+def test_a_key_nobody_listens_to_is_named_and_it_ends_all_the_same(tmp_path, link, bus, capsys, monkeypatch):
+    monkeypatch.setattr(shell, "LISTENERS_WITHIN", 2.0)
+    inbox = Inbox()
+    bus.subscribe(ODOM, inbox, keep_all=True)
+    scan, odom = SCAN.key(link.robot), ODOM.key(link.robot)
+    path = write(tmp_path / "run.mcap", [(SCAN, scan, b"s", 1), (ODOM, odom, b"o", 2)])
+    assert replay(path, link) == {scan: 1, odom: 1}
+    assert f"warning: nobody listens to {scan}\n" in capsys.readouterr().err
+    assert wait_until(lambda: len(inbox) == 1, 10)
