@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
-import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -27,6 +25,7 @@ from common.scanner import SCANNERS
 from common.topics import CMD_VEL, ODOM, SCAN, TRUTH
 from common.versions import commit, versions
 from common.world import load_world
+from presage.output import check_file, write_json
 from presage.stack import Stack
 
 # The echo process speaks on keys of a robot of its own: payload out on `odom`, back on `truth`, any bytes.
@@ -57,25 +56,19 @@ def latency(scans: int, rate: float, beams: int, console: Console) -> dict[str, 
         stack.start_router()
         stack.start("controller")
         stack.start("estimator", "--initial-pose", f"{start[0]},{start[1]}")
-        environment = {**os.environ, "PRESAGE_CONNECT": stack.endpoint}
-        echo = subprocess.Popen(
-            [sys.executable, "-c", "from presage.bench import echo_main; echo_main()"], env=environment
-        )
-        try:
-            with open_bus(stack.link()) as bus, open_bus(replace(stack.link(), robot=ECHO_ROBOT)) as raw:
-                stack.wait_alive(bus)
-                _wait_echo(raw, echo)
-                return _measure(bus, raw, scanner, clean, rng, scans, rate, console)
-        finally:
-            echo.terminate()
-            echo.wait()
+        with open_bus(stack.link()) as bus, open_bus(replace(stack.link(), robot=ECHO_ROBOT)) as raw:
+            stack.wait_alive(bus)
+            stack.start_code("echo", "from presage.bench import echo_main; echo_main()")
+            _wait_echo(raw, stack)
+            return _measure(bus, raw, scanner, clean, rng, scans, rate, console)
 
 
-def _wait_echo(raw: Bus, echo: subprocess.Popen[bytes]) -> None:
+def _wait_echo(raw: Bus, stack: Stack) -> None:
     deadline = time.monotonic() + 30
     while "echo" not in raw.alive(timeout=0.5):
-        if echo.poll() is not None or time.monotonic() > deadline:
-            raise UserError("the echo process did not start")
+        stack.check()
+        if time.monotonic() > deadline:
+            raise UserError("the echo process did not start within 30 s")
 
 
 def _measure(
@@ -127,6 +120,7 @@ def _await(inbox: Inbox, wanted: Any) -> bool:
 
 def bench_latency(scans: int, rate: float, beams: int, json_file: Path | None, console: Console) -> int:
     """Print, and write as JSON where asked."""
+    check_file(json_file, "--json")
     result = latency(scans, rate, beams, console)
     table = Table(
         title=f"{beams} beams ({result['payload_bytes']} bytes) at {rate:g} Hz, {scans} scans", title_justify="left"
@@ -141,6 +135,5 @@ def bench_latency(scans: int, rate: float, beams: int, json_file: Path | None, c
     console.print(table)
     if result["unanswered"]:
         console.print(f"[bold]{result['unanswered']} payloads were not answered within 2 s[/]")
-    if json_file is not None:
-        json_file.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    write_json(json_file, result)
     return 1 if result["unanswered"] else 0

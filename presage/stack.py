@@ -69,6 +69,10 @@ class Stack:
         """A service, connected to this session's router."""
         self._spawn(service, ["-m", f"services.{service}", *args])
 
+    def start_code(self, name: str, code: str) -> None:
+        """A child of our own making that is no service, connected to this session's router."""
+        self._spawn(name, ["-c", code])
+
     def wait_alive(self, bus: Bus, timeout: float = 60.0) -> None:
         """Until every started service has its liveliness token; raises UserError naming who is missing or ended."""
         wanted = set(self.processes) - {"router"}
@@ -172,12 +176,13 @@ def _die_with(parent: int) -> None:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """SIGTERM and SIGHUP end the block as Ctrl-C does, so that what it started is ended too."""
+    """SIGTERM and SIGHUP, where nohup does not ignore them, end the block as Ctrl-C does: what it started is ended."""
 
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    before = {s: signal.signal(s, interrupt) for s in (signal.SIGTERM, signal.SIGHUP)}
+    heard = [s for s in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(s) != signal.SIG_IGN]
+    before = {s: signal.signal(s, interrupt) for s in heard}
     try:
         yield
     finally:
