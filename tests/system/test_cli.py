@@ -7,6 +7,7 @@ import socket
 import pytest
 
 from common.bus import wait_until
+from tests.recorder import sessions as made
 
 NOWHERE = ("--connect", "tcp/127.0.0.1:9")  # the discard port: nobody is there
 
@@ -24,6 +25,7 @@ NOWHERE = ("--connect", "tcp/127.0.0.1:9")  # the discard port: nobody is there
         (("echo", "nothing"), "no topic 'nothing': choose one of scan"),
         (("hz", *NOWHERE), "start a session"),
         (("replay", "{tmp}/no.mcap"), "no.mcap"),
+        (("replay", "{tmp}/run.mcap", *NOWHERE), "start a session"),
         (("plot", "{tmp}/foreign.mcap"), "foreign.mcap"),
         (("train", "--preset", "better"), "no preset 'better'"),
         (("train", "--scanner", "sonar", "--out", "{tmp}/m"), "no scanner 'sonar': choose one of tim571"),
@@ -32,6 +34,7 @@ NOWHERE = ("--connect", "tcp/127.0.0.1:9")  # the discard port: nobody is there
 )
 def test_bad_input_is_one_line(process, tmp_path, args, says):
     (tmp_path / "foreign.mcap").write_bytes(b"no recording at all, but long enough to be looked at twice")
+    made.write(tmp_path / "run.mcap")
     running = process("presage.__main__", *[a.format(tmp=tmp_path) for a in args])
     assert running.wait(90) not in {0, None}
     assert "Traceback" not in running.output, running.output
@@ -83,7 +86,7 @@ def test_tools_on_a_running_session(process, bus, link):
         running = process("presage.__main__", *args)
         return running.wait(60), running.output
 
-    assert run("echo", "belief", "-n", "2")[1].count('"estimator": "paper"') == 2
+    assert run("echo", "belief", "-n", "2")[1].count('"estimator": "') == 2
     status, text = run("hz", "scan", "--seconds", "2")
     assert status == 0
     assert "presage/" in text
@@ -98,7 +101,9 @@ def test_tools_on_a_running_session(process, bus, link):
     assert run("goal", "4", "1.5", "--wait")[0] == 0
     assert run("goal", "--cancel")[0] == 0
     status, text = run("doctor")
-    assert status == 1  # no recorder runs
+    faults = [line for line in text.splitlines() if line.startswith("no ")]
+    assert all(" Hz" in line for line in faults), text  # a machine under load may be slow
+    assert status == (1 if faults else 0)
     for there in ("simulator", "estimator", "controller"):
         assert f"{there} of '{link.robot}': alive" in text
     assert f"recorder of '{link.robot}': not there" in text
