@@ -19,8 +19,13 @@ COPY services services
 COPY presage presage
 COPY worlds worlds
 COPY models models
+ENV NUMBA_CACHE_DIR=/var/cache/numba
+# The compiled loops are kept in the image; on another processor they are compiled again.
 RUN pip install --no-deps . && rm -rf /app/* \
- && useradd --create-home presage && mkdir /recordings && chown presage /recordings
+ && useradd --create-home presage && mkdir /recordings && chown presage /recordings \
+ && mkdir -m 1777 $NUMBA_CACHE_DIR && cd / \
+ && python -c 'from services.estimator.building import *; [prepare(Choice(model=m)) for m in ("learned", "exact")]' \
+ && chmod -R a+rwX $NUMBA_CACHE_DIR
 
 USER presage
 WORKDIR /home/presage

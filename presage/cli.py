@@ -12,7 +12,19 @@ import typer
 from common.bus import DEFAULT_ENDPOINT
 from common.errors import UserError
 from presage import cli_bench, cli_tools
-from presage.options import Connect, Json, Port, RobotName, WorldName, console, link_of
+from presage.options import (
+    Connect,
+    EstimatorName,
+    Json,
+    ModelName,
+    Port,
+    PriorName,
+    RobotName,
+    WorldName,
+    console,
+    err_console,
+    link_of,
+)
 from presage.stack import ignoring_interrupts, interruptible
 
 app = typer.Typer(
@@ -28,18 +40,19 @@ app = typer.Typer(
 def up(
     world: WorldName = "corridor",
     beams: Annotated[int, typer.Option(help="Beams of the scanner; 622 are the paper's.")] = 811,
-    drive: Annotated[
-        str, typer.Option(help="holonomic or differential (hand driving only, with preset paper).")
-    ] = "holonomic",
+    drive: Annotated[str, typer.Option(help="holonomic or differential (hand driving only, for now).")] = "holonomic",
     pace: Annotated[str, typer.Option(help="realtime, fast or lockstep.")] = "realtime",
     seed: Annotated[int, typer.Option(min=0)] = 0,
     record: Annotated[Path | None, typer.Option(help="Record into this folder.")] = None,
     robot: RobotName = "robot",
     port: Port = 7447,
+    estimator: EstimatorName = "precise",
+    model: ModelName = "learned",
+    prior: PriorName = "motion",
 ) -> None:
     """Start router, simulator, estimator and controller here, until Ctrl-C.
 
-    Examples: `presage up`, then elsewhere `presage goal 15 1.5 --wait`;
+    Examples: `presage up`, then elsewhere `presage goal 15 1.5 --wait`; `presage up --estimator particle-filter`;
     `presage up --record recordings --seed 7`; `presage up --world my.yaml --port 7500`.
     """
     from presage.up import run_up  # noqa: PLC0415
@@ -54,6 +67,7 @@ def up(
         robot=robot,
         port=port,
         console=console,
+        estimator=("--estimator", estimator, "--model", model, "--prior", prior),
     )
 
 
@@ -68,14 +82,17 @@ def demo(
     port: Port = 0,
     json_file: Json = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Without the services' own lines.")] = False,
+    estimator: EstimatorName = "precise",
+    model: ModelName = "learned",
 ) -> None:
-    """The whole loop: localise from the map's centre, drive to a goal, record, draw, summarise.
+    """The whole loop: localise from nothing, drive to a goal, record, draw, summarise.
 
     Examples: `presage demo`; `presage demo --goal 12 2 --seed 3 --json run.json`; `presage demo --pace lockstep`.
     """
     from presage.demo import Demo, demo_command  # noqa: PLC0415
 
-    raise typer.Exit(demo_command(Demo(world, goal, out, beams, seed, pace, port or None), json_file, quiet=quiet))
+    how = ("--estimator", estimator, "--model", model)
+    raise typer.Exit(demo_command(Demo(world, goal, out, beams, seed, pace, port or None, how), json_file, quiet=quiet))
 
 
 @app.command()
@@ -129,6 +146,39 @@ def plot(
     from presage.demo import plot_command  # noqa: PLC0415
 
     plot_command(file, out or file.with_suffix(".png"), json_file, console)
+
+
+@app.command()
+def localize(
+    file: Annotated[Path, typer.Argument(help=".npz (ranges, angles, range_max) or a recording (.mcap).")],
+    world: Annotated[str, typer.Option(help="A shipped world or a world file; none: the recording's.")] = "",
+    estimator: EstimatorName = "precise",
+    model: ModelName = "learned",
+    models: Annotated[Path | None, typer.Option(help="Folder of weights; none: the shipped ones.")] = None,
+    out: Annotated[Path | None, typer.Option(help="NAME.csv or NAME.json; none: CSV to standard output.")] = None,
+    frame: Annotated[
+        str, typer.Option(help="base_link or laser: whose pose; of an .npz also its own poses'.")
+    ] = "base_link",
+    mount: Annotated[str, typer.Option(help="Of an .npz's laser in base_link: x,y,yaw_deg (m, m, deg).")] = "0.2,0,0",
+    mode: Annotated[str, typer.Option(help="global: nothing is known; track: from initial_pose.")] = "global",
+    fresh: Annotated[bool, typer.Option("--fresh", help="Each scan on its own.")] = False,
+    odometry: Annotated[bool, typer.Option(help="Use the file's odometry, where there is any.")] = True,
+    initial_pose: Annotated[str, typer.Option(help="x,y,yaw_deg; for mode track.")] = "",
+    sigma: Annotated[float, typer.Option(min=1e-4, max=10, help="The scanner's noise, m.")] = 0.02,
+    seed: Annotated[int, typer.Option(min=0, max=2**31)] = 0,
+) -> None:
+    """Run an estimator over a file of scans, as fast as it goes; one row a scan.
+
+    Columns: stamp (s), x, y (m), yaw (rad), covariance (cov_xx ... cov_yawyaw), free_energy (nats), state, update_ms.
+    Examples: `presage localize scans.npz --world office --out poses.csv`;
+    `presage localize run.mcap --estimator particle-filter --out poses.json`;
+    `presage localize scans.npz --world office --fresh --frame laser`.
+    """
+    from presage.localize import Job, choice_of  # noqa: PLC0415
+    from presage.localize import localize as run  # noqa: PLC0415
+
+    choice = choice_of(file, world, estimator, model, models, sigma, seed, initial_pose)
+    run(Job.of(file, choice, mode, frame, mount, fresh=fresh, odometry=odometry, out=out), err_console)
 
 
 @app.command()

@@ -16,11 +16,21 @@ from common.config import split_endpoints
 # Nobody's terminal is 80 columns wide when it is a pipe.
 console = Console(width=None if sys.stdout.isatty() else 150)
 
+# Where standard output is the result.
+err_console = Console(stderr=True, width=None if sys.stderr.isatty() else 150)
+
 RobotName = Annotated[str, typer.Option(envvar="PRESAGE_ROBOT", help="Which robot.")]
 Connect = Annotated[str, typer.Option(envvar="PRESAGE_CONNECT", help="The session's zenoh endpoint(s).")]
 WorldName = Annotated[str, typer.Option(envvar="PRESAGE_WORLD", help="A shipped world or a world file.")]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="The router's port on 127.0.0.1; 0: any free one.")]
 Json = Annotated[Path | None, typer.Option("--json", help="Write the numbers there.")]
+
+
+EstimatorName = Annotated[
+    str, typer.Option(envvar="PRESAGE_ESTIMATOR", help="precise, paper, particle-filter or amcl-defaults.")
+]
+ModelName = Annotated[str, typer.Option(help="Of precise: learned, exact (the world itself), or a file of weights.")]
+PriorName = Annotated[str, typer.Option(help="Of motion between scans: motion (scans alone), odometry, command.")]
 
 
 def link_of(connect: str, robot: str) -> Link:

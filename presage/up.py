@@ -23,6 +23,7 @@ def run_up(
     robot: str,
     port: int,
     console: Console,
+    estimator: tuple[str, ...] = (),
 ) -> None:
     """Start, wait until all are alive, say what can be done, and watch; a service that ends is named, not restarted."""
     load_world(world)  # one clear line now rather than three from the children
@@ -31,14 +32,14 @@ def run_up(
         lockstep = pace == "lockstep"
         if record is not None:
             stack.start("recorder", "--directory", str(record))
-        stack.start("estimator", "--world", world)
+        stack.start("estimator", "--world", world, *estimator)
         if drive == "holonomic":
             stack.start("controller", "--world", world, *(["--belief-timeout", "20"] if lockstep else []))
         else:
-            console.print("the paper's preset does not turn: no controller is started for a differential drive")
+            console.print("the controller does not turn yet: none is started for a differential drive")
         waits = ",".join(sorted(set(stack.processes) - {"router"}))
         simulator = ["--world", world, "--beams", str(beams), "--drive", drive, "--pace", pace, "--seed", str(seed)]
-        stack.start("simulator", *simulator, *(["--wait-for", waits] if lockstep else []))
+        stack.start("simulator", *simulator, *(["--wait-for", waits] if pace != "realtime" else []))
         with open_bus(stack.link()) as bus:
             stack.wait_alive(bus)
         where = "" if port == 7447 else f" --connect {stack.endpoint}"

@@ -34,13 +34,15 @@ class EstimatorService(Service):
     """Perception as a process."""
 
     name: ClassVar[str] = "estimator"
-    inputs: ClassVar[tuple[Topic, ...]] = (SCAN, GOAL, ODOM, CMD_VEL)
+    inputs: ClassVar[tuple[Topic, ...]] = (SCAN, GOAL)
     queries: ClassVar[tuple[Query, ...]] = (LOCALISE,)
 
     def __init__(self, settings: EstimatorSettings) -> None:
         """Models are loaded in `open`; the estimator is made for the beams of the first scan."""
         super().__init__(settings)
         self.options = settings
+        more = {"odometry": (ODOM,), "command": (CMD_VEL,)}.get(settings.prior, ())
+        self.inputs = (SCAN, GOAL, *more)  # type: ignore[misc]
         self.factory: Factory | None = None
         self.geometry: Geometry | None = None
         self.estimator: Estimator | None = None

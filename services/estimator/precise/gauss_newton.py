@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 MAX_STEP = np.array([0.5, 0.5, 0.3])  # m, m, rad: beyond it the linearisation is not trusted
 CONVERGED = np.array([1e-4, 1e-4, 2e-5])  # m, m, rad: a tenth of what a scan can tell
+SETTLED = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: nearer, F is a parabola and the rest is algebra
 DAMPING = np.diag([1.0, 1.0, 1.0]) * 1e-6  # 1/m², 1/rad²: directions of which nothing is known stay put
 
 
@@ -38,7 +39,9 @@ class View:
     def thinned(self, beams: int) -> View:
         """Every k-th beam, so that about ``beams`` are left."""
         k = max(1, len(self.angles) // beams)
-        return View(self.model, self.likelihood, self.mount, self.angles[::k], self.ranges[::k], self.range_max)
+        # Contiguous: of a strided array numba would compile every loop once more.
+        angles, ranges = np.ascontiguousarray(self.angles[::k]), np.ascontiguousarray(self.ranges[::k])
+        return View(self.model, self.likelihood, self.mount, angles, ranges, self.range_max)
 
     def evidence(self, poses: Array, widen: float = 0.0) -> Evidence:
         """What the scan says about base_link poses (N, 3), derivatives by these."""
@@ -114,17 +117,19 @@ def _steps(poses: Array, evidence: Evidence, prior: Prior | None, damping: Array
     return np.asarray(step / np.maximum((np.abs(step) / MAX_STEP).max(axis=1, keepdims=True), 1.0))
 
 
-def polish(view: View, poses: Array, prior: Prior | None = None, iterations: int = 4) -> tuple[Array, Evidence]:
+def polish(view: View, poses: Array, prior: Prior | None = None, iterations: int = 5) -> tuple[Array, Evidence]:
     """The last millimetres, full steps: beams that jump between surfaces ripple F there, and would stop a line search.
 
-    Each step minimises F with the beams' weights held (iteratively reweighted least squares).
+    Each step minimises F with the beams' weights held (iteratively reweighted least squares). Returns the last poses
+    that were evaluated, at most ``SETTLED`` from the minimum, and the evidence there.
     """
     poses = np.array(poses, float)
-    for _ in range(iterations):
-        evidence = view.evidence(poses)
+    evidence = view.evidence(poses)
+    for _ in range(iterations - 1):
         step = _steps(poses, evidence, prior, np.zeros(len(poses)))
+        if (np.abs(step) < SETTLED).all():
+            break
         poses = poses + step
         poses[:, 2] = se2.wrap(poses[:, 2])
-        if (np.abs(step) < CONVERGED).all():
-            break
-    return poses, view.evidence(poses)
+        evidence = view.evidence(poses)
+    return poses, evidence

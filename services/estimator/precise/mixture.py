@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common import se2
+from services.estimator.precise.gauss_newton import Prior, difference
 
 if TYPE_CHECKING:
     from common.se2 import Array
-    from services.estimator.precise.gauss_newton import Prior
     from services.estimator.precise.likelihood import Evidence
     from services.estimator.precise.motion import Fused
 
@@ -45,6 +45,9 @@ def found(pose: Array, evidence: Evidence, k: int, prior: Prior | None) -> Mode:
     """A mode of the search; of nothing known in a direction, a metre and a radian remain."""
     information = prior.information[k] if prior else np.eye(3)
     inverse = np.linalg.inv(evidence.curvature[k] + information)
+    slope = evidence.xi[k] + (prior.information[k] @ difference(prior.mean[k : k + 1], pose[None])[0] if prior else 0)
+    pose = pose + inverse @ slope
+    pose[2] = se2.wrap(pose[2])
     noise = inverse @ (evidence.of_noise[k] + information) @ inverse
     error = inverse @ evidence.of_model[k] @ inverse
     accuracy = float(evidence.accuracy[k])

@@ -1,0 +1,176 @@
+"""`presage localize`: any estimator over a file of scans, without the bus."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from common import se2
+from common.config import POSE_TEXT
+from common.errors import UserError
+from common.se2 import Array
+from common.versions import commit, versions
+from presage.output import check_file
+from presage.scan_files import Scans, read_scans
+from services.estimator.building import Choice, Name, prepare
+from services.estimator.interface import Posterior
+from services.recorder.reader import read_recording
+
+COLUMNS = (
+    "stamp", "x", "y", "yaw", "cov_xx", "cov_xy", "cov_xyaw", "cov_yy", "cov_yyaw", "cov_yawyaw",
+    "free_energy", "state", "update_ms",
+)  # fmt: skip
+UPPER = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to localise, how, and where the result goes."""
+
+    file: Path
+    choice: Choice
+    mode: Literal["global", "track"] = "global"
+    fresh: bool = False
+    odometry: bool = True
+    frame: Literal["base_link", "laser"] = "base_link"
+    mount: tuple[float, float, float] = (0.2, 0.0, 0.0)
+    out: Path | None = None
+
+    @classmethod
+    def of(
+        cls, file: Path, choice: Choice, mode: str, frame: str, mount: str, *, fresh: bool, odometry: bool,
+        out: Path | None,
+    ) -> Job:  # fmt: skip
+        """From the command line's words; raises UserError on one that is not known."""
+        if mode not in ("global", "track"):
+            raise UserError(f"no mode {mode!r}: choose global or track")
+        if frame not in ("base_link", "laser"):
+            raise UserError(f"no frame {frame!r}: choose base_link or laser")
+        if out is not None and out.suffix not in (".csv", ".json"):
+            raise UserError(f"{out}: the result is written as .csv or .json")
+        x, y, yaw = map(float, pose_of(mount, "--mount"))
+        return cls(file, choice, mode, fresh, odometry, frame, (x, y, yaw), out)  # type: ignore[arg-type]
+
+
+def pose_of(text: str, option: str) -> Array:
+    """(3,) m, m, rad from x,y[,yaw_deg]."""
+    if not re.fullmatch(POSE_TEXT, text) or not text:
+        raise UserError(f"{option} {text!r}: give x,y,yaw_deg, such as 3,1.5,90")
+    numbers = [float(part) for part in text.split(",")]
+    return np.array([*numbers[:2], np.deg2rad(numbers[2]) if len(numbers) > 2 else 0.0])
+
+
+def choice_of(
+    file: Path, world: str, estimator: str, model: str, models: Path | None, sigma: float, seed: int, initial_pose: str
+) -> Choice:
+    """From the command line's words; the world is the recording's where none is named."""
+    if estimator not in get_args(Name):
+        raise UserError(f"no estimator {estimator!r}: choose one of {', '.join(get_args(Name))}")
+    if not world:
+        if file.suffix == ".npz":
+            raise UserError("an .npz does not say which world it is of: name it with --world")
+        recorded = read_recording(file).world()
+        if recorded is None:
+            raise UserError(f"{file}: no world was recorded: name it with --world")
+        world = recorded.name
+    pose = pose_of(initial_pose, "--initial-pose") if initial_pose else None
+    return Choice(world, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
+
+
+def localize(job: Job, console: Console) -> list[dict[str, Any]]:
+    """A row for each scan; raises UserError in one line."""
+    check_file(job.out, "--out")
+    laser = job.frame == "laser"
+    scans = read_scans(job.file, np.zeros(3) if laser else np.array(job.mount))
+    start = _start(job, scans)
+    estimator = prepare(job.choice)(scans.geometry)
+    rows = []
+    numbers = track(range(len(scans.ranges)), "localising", console=console, transient=True)
+    if start is not None:
+        estimator.restart(start)
+    for k in numbers:
+        if job.fresh and k:
+            estimator.restart(start)
+        observation = scans.observation(k, odometry=job.odometry)
+        began = time.perf_counter()
+        posterior = estimator.update(observation)
+        rows.append(_row(scans, k, posterior, (time.perf_counter() - began) * 1e3, laser=laser))
+    _write(job, rows)
+    _summarise(scans, rows, console, laser=laser)
+    return rows
+
+
+def _start(job: Job, scans: Scans) -> Array | None:
+    """Mode track: the pose given on the command line, in the file, or the truth of a recording."""
+    if job.mode == "global":
+        return None
+    if job.choice.initial_pose is not None:
+        return job.choice.initial_pose
+    if scans.initial_pose is not None:
+        return scans.initial_pose
+    if scans.truth is not None and np.isfinite(scans.truth[0]).all():
+        return np.asarray(scans.truth[0])
+    raise UserError(f"{job.file}: mode track needs where to begin: initial_pose in the file, or --initial-pose x,y,deg")
+
+
+def _row(scans: Scans, k: int, posterior: Posterior, update_ms: float, *, laser: bool) -> dict[str, Any]:
+    pose, covariance = posterior.pose, posterior.covariance
+    mount = scans.geometry.mount
+    if laser and mount.any():  # a recording: inference is about base_link
+        by_pose, _ = se2.compose_jacobians(pose, mount)
+        pose = se2.compose(pose, mount)
+        covariance = None if covariance is None else by_pose @ covariance @ by_pose.T
+    values = [None if covariance is None else float(covariance[i, j]) for i, j in UPPER]
+    stamp = None if scans.stamps is None else float(scans.stamps[k])
+    numbers = [stamp, *map(float, pose), *values, posterior.free_energy, posterior.state, round(update_ms, 3)]
+    return dict(zip(COLUMNS, numbers, strict=True))
+
+
+def _write(job: Job, rows: list[dict[str, Any]]) -> None:
+    if job.out is not None and job.out.suffix == ".json":
+        meta = {
+            "file": str(job.file), "world": job.choice.world, "estimator": job.choice.estimator,
+            "model": job.choice.model, "frame": job.frame, "mode": job.mode, "fresh": job.fresh,
+            "seed": job.choice.seed, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:],
+        }  # fmt: skip
+        job.out.write_text(json.dumps({**meta, "rows": rows}, indent=1) + "\n", encoding="utf-8")
+        return
+    stream = sys.stdout if job.out is None else job.out.open("w", newline="", encoding="utf-8")
+    try:
+        writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    finally:
+        if job.out is not None:
+            stream.close()
+
+
+def _summarise(scans: Scans, rows: list[dict[str, Any]], console: Console, *, laser: bool) -> None:
+    """A line or two for a human, beside the table."""
+    states: dict[str, int] = {}
+    for row in rows:
+        states[row["state"]] = states.get(row["state"], 0) + 1
+    console.print(
+        f"{len(rows)} scans: " + ", ".join(f"{count} {state}" for state, count in states.items())
+        + f"; update {np.median([row['update_ms'] for row in rows]):.2f} ms median"
+    )  # fmt: skip
+    if scans.truth is None:
+        return
+    truth = se2.compose(scans.truth, scans.geometry.mount) if laser else scans.truth
+    error = np.hypot(*(np.array([[row["x"], row["y"]] for row in rows]) - truth[:, :2]).T)
+    error = error[np.isfinite(error)]
+    if len(error):
+        console.print(
+            f"against the recorded truth: {np.median(error) * 1e3:.1f} mm median, "
+            f"{np.sqrt(np.mean(error**2)) * 1e3:.1f} mm RMS, {error.max() * 1e3:.1f} mm at most"
+        )
