@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import json
+import secrets
 import sys
+import time
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
@@ -13,18 +15,23 @@ from rich.table import Table
 
 from common.bus import Bus, open_bus
 from common.errors import UserError
-from common.messages import Belief, Goal, Pose, Status, Truth
+from common.messages import Belief, Goal, Health, Pose, Status, Truth
 from common.robot import Robot
-from common.topics import BELIEF, GOAL, STATUS, TRUTH
+from common.topics import BELIEF, GOAL, HEALTH, STATUS, TRUTH
 from common.versions import commit
 from common.world import World, load_world
 from presage.figure import draw_session
+from presage.output import check_file, make_folder, write_json
 from presage.session import SessionSummary, summarise
 from presage.stack import Stack
 from presage.watch import Watch
 
-LOCALISE_WITHIN = 30.0  # s of wall time; 50 iterations take 3.3 s
-ARRIVE_WITHIN = 90.0  # s; 12.5 m take about 15
+# By the messages' stamps, whatever the pace:
+LOCALISE_WITHIN = 30.0  # s from the first belief; the paper's descent takes 3.3 s
+ARRIVE_WITHIN = 90.0  # s from the goal; 12.5 m take about 15
+# By the wall's clock:
+FIRST_WITHIN = 30.0  # s until there is a belief at all
+GIVE_UP = 120.0  # s for localising, and again for the way
 
 
 @dataclass(frozen=True)
@@ -38,24 +45,26 @@ class Demo:
     seed: int = 0
     pace: str = "realtime"
     port: int | None = None  # None: any free one
+    estimator: tuple[str, ...] = ()  # arguments
 
 
 def run_demo(demo: Demo, stack: Stack, console: Console) -> tuple[Path, bool]:
-    """The recording, and whether the goal was reached; the figure lies beside it."""
-    world = load_world(demo.world)
-    goal = _goal(demo, world)
-    demo.out.mkdir(parents=True, exist_ok=True)
-    before = set(demo.out.glob("*.mcap"))
+    """The recording, and whether the goal was reached; raises UserError where it cannot be or nothing is believed."""
+    goal = _goal(demo, load_world(demo.world))
+    make_folder(demo.out, "--out")
+    # A name of its own: others may record into the same folder in the same second.
+    began = datetime.now(timezone.utc).strftime("%Y%m%d-%H%M%S")
+    recording = demo.out / f"presage-{stack.robot}-{began}-{secrets.token_hex(3)}.mcap"
     stack.start_router()
     with open_bus(stack.link()) as bus:
-        watch = Watch(bus, TRUTH, BELIEF, STATUS)
-        stack.start("recorder", "--directory", str(demo.out))
+        watch = Watch(bus, TRUTH, BELIEF, STATUS, HEALTH)
+        stack.start("recorder", "--directory", str(demo.out), "--file", recording.name)
         stack.start(
             "controller", "--world", demo.world, *(["--belief-timeout", "20"] if demo.pace == "lockstep" else [])
         )
-        stack.start("estimator", "--world", demo.world)
+        stack.start("estimator", "--world", demo.world, *demo.estimator)
         simulator = ["--world", demo.world, "--beams", str(demo.beams), "--seed", str(demo.seed), "--pace", demo.pace]
-        if demo.pace == "lockstep":
+        if demo.pace != "realtime":  # time must not have run off before the others see it
             simulator += ["--wait-for", "estimator,controller,recorder"]
         stack.start("simulator", *simulator)
         with console.status("starting simulator, estimator, controller, recorder"):
@@ -65,15 +74,16 @@ def run_demo(demo: Demo, stack: Stack, console: Console) -> tuple[Path, bool]:
         for name in ("controller", "estimator", "simulator"):
             stack.stop(name)
         status = stack.stop("recorder")
-    files = set(demo.out.glob("*.mcap")) - before
-    if status != 0 or len(files) != 1:
-        raise UserError(f"the recorder ended with status {status} and left {len(files)} new files in {demo.out}")
-    return files.pop(), reached
+    if status != 0 or not recording.exists():
+        raise UserError(f"the recorder ended with status {status}; what it has written is {recording}.active")
+    return recording, reached
 
 
 def _goal(demo: Demo, world: World) -> tuple[float, float]:
     """The goal asked for, or a free place at the far end of the paper's corridor, at least 12 m away."""
     robot, start = Robot(), world.start_pose(Robot().radius)
+    if demo.goal is not None and not np.isfinite(demo.goal).all():
+        raise UserError(f"goal {demo.goal}: two finite numbers are needed, in m, as in --goal 12 2")
     if demo.goal is None:
         _, y0, _, y1 = world.bounds
         free = world.sample_free(2000, np.random.default_rng(demo.seed), robot.radius + 0.3)
@@ -88,60 +98,74 @@ def _goal(demo: Demo, world: World) -> tuple[float, float]:
 
 
 def _localise(watch: Watch, stack: Stack, console: Console) -> bool:
-    """Stand until the belief has settled, from the map's centre and one scan after another."""
-    with console.status("localising from the map's centre, by the laser alone") as status:
-        for _ in range(int(LOCALISE_WITHIN * 100)):
+    """Stand until the belief has settled, one scan after another; raises UserError where there is none at all."""
+    began, first, belief, pulse = time.monotonic(), None, None, None
+    with console.status("localising, by the laser alone") as status:
+        while (waited := time.monotonic() - began) < GIVE_UP:
+            stack.check()
             message = watch.next(0.5)
-            if message is None:
-                stack.check()
-            belief, truth = watch.latest.get("belief"), watch.latest.get("truth")
-            if isinstance(belief, Belief) and isinstance(truth, Truth):
-                error = float(np.hypot(*(belief.pose.array() - truth.pose.array())[:2]))
-                status.update(f"localising: scan {belief.seq}, F = {belief.free_energy:.0f} nats, error {error:.2f} m")
+            if isinstance(message, Health) and message.service == "estimator":
+                pulse = message
+            if first is None:
+                _check_estimator(pulse, waited)
+            if isinstance(message, Belief):
+                belief, first = message, message.stamp_ns if first is None else first
+                truth = watch.latest.get("truth")
+                off = f"{_apart(belief, truth):.3f} m from the truth" if isinstance(truth, Truth) else "truth unknown"
+                status.update(f"localising: scan {belief.seq}, F = {belief.free_energy:.0f} nats, {off}")
                 if belief.state == "tracking":
-                    console.print(f"localised after {belief.seq + 1} scans, {error:.3f} m from the truth")
+                    console.print(f"localised after {belief.seq + 1} scans, {off}")
                     return True
-                if belief.stamp_ns > LOCALISE_WITHIN * 1e9:
+                if belief.stamp_ns - first > LOCALISE_WITHIN * 1e9:
                     break
     console.print(
-        f"[bold]not localised within {LOCALISE_WITHIN:g} s[/]: the paper's descent has stopped in a wrong place. "
-        "How often it does: presage bench localisation"
+        f"[bold]not localised within {LOCALISE_WITHIN:g} s[/]: the belief is {belief.state if belief else 'unknown'}. "
+        "How often that happens: presage bench localisation"
     )
     return False
 
 
-def _navigate(bus: Bus, watch: Watch, stack: Stack, goal: tuple[float, float], console: Console) -> bool:
+def _apart(belief: Belief, truth: Truth) -> float:
+    return float(np.hypot(*(belief.pose.array() - truth.pose.array())[:2]))
+
+
+def _check_estimator(pulse: Health | None, waited: float) -> None:
+    """Raises UserError with the estimator's own reason where it can use no scan, or says nothing for long."""
+    note = (pulse.note if pulse is not None else "") or "nothing"
+    if pulse is not None and pulse.counters.get("unfit_scans"):
+        raise UserError(f"no belief comes: the estimator says: {note}")
+    if waited > FIRST_WITHIN:
+        raise UserError(f"no belief came within {FIRST_WITHIN:g} s; the estimator says: {note}. See its lines above")
+
+
+def _navigate(bus: Bus, watch: Watch, stack: Stack, place: tuple[float, float], console: Console) -> bool:
     """Give the goal and watch until it is reached."""
-    belief = watch.latest["belief"]
     if not bus.wait_matching(GOAL, 5.0):
         raise UserError("nobody listens for goals: is the controller running?")
-    bus.put(GOAL, Goal(stamp_ns=belief.stamp_ns, pose=Pose(x=goal[0], y=goal[1])).encode())
-    began = belief.stamp_ns
+    stamp, began = watch.latest["belief"].stamp_ns, time.monotonic()
+    goal = Goal(stamp_ns=stamp, seq=1, pose=Pose(x=place[0], y=place[1]))  # the first: a status without one says 0
+    bus.put(GOAL, goal.encode())
     with console.status("navigating") as status:
-        while (message := watch.next(5.0)) is not None:
+        while True:
             stack.check()
-            if not isinstance(message, Status) or message.goal is None:
-                continue
-            if message.distance is not None:
-                status.update(
-                    f"navigating to ({goal[0]:g}, {goal[1]:g}): {message.distance:.2f} m to go {message.reason}"
-                )
-            if message.state == "reached":
+            said = watch.until(Status, lambda s: s.goal_seq == goal.seq, 5.0)
+            if said is None:
+                console.print("[bold]the controller has said nothing about the goal for 5 s[/]")
+                return False
+            if said.distance is not None:
+                where = f"({place[0]:g}, {place[1]:g})"
+                status.update(f"navigating to {where}: {said.distance:.2f} m to go {said.reason}")
+            if said.state == "reached":
                 break
-            if (
-                message.state in {"blocked", "lost"}
-                and message.stamp_ns - began > 5e9
-                and "standing" not in message.reason
-            ):
-                console.print(f"[bold]{message.state}: {message.reason}[/]")
+            passed = (said.stamp_ns - stamp) * 1e-9
+            if said.state in {"blocked", "lost"} and passed > 5 and "standing" not in said.reason:
+                console.print(f"[bold]{said.state}: {said.reason}[/]")
                 return False
-            if message.stamp_ns - began > ARRIVE_WITHIN * 1e9:
-                console.print(f"[bold]not there after {ARRIVE_WITHIN:g} s[/]")
+            if passed > ARRIVE_WITHIN or time.monotonic() - began > GIVE_UP:
+                console.print(f"[bold]not there after {passed:.0f} s[/]: {said.state} {said.reason}")
                 return False
-    stack.check()
     # The last scans of the standing robot belong to the picture.
-    arrived = watch.until(Truth, lambda truth: bool(np.hypot(truth.twist.vx, truth.twist.vy) < 0.01), 5.0)
-    return message is not None and arrived is not None
+    return watch.until(Truth, lambda truth: bool(np.hypot(truth.twist.vx, truth.twist.vy) < 0.01), 5.0) is not None
 
 
 def show(summary: SessionSummary, recording: Path, figure: Path, console: Console) -> None:
@@ -157,6 +181,7 @@ def show(summary: SessionSummary, recording: Path, figure: Path, console: Consol
 def demo_command(demo: Demo, json_file: Path | None, *, quiet: bool) -> int:
     """Everything; the exit status."""
     console = Console(width=None if sys.stdout.isatty() else 150)
+    check_file(json_file, "--json")
     with Stack("robot", demo.port, quiet=quiet) as stack:
         recording, reached = run_demo(demo, stack, console)
     figure = recording.with_suffix(".png")
@@ -164,18 +189,16 @@ def demo_command(demo: Demo, json_file: Path | None, *, quiet: bool) -> int:
         summary = summarise(recording)
         draw_session(recording, figure)
     show(summary, recording, figure, console)
-    if json_file is not None:
-        data = {**summary.as_dict(), "seed": demo.seed, "commit": commit(), "arguments": sys.argv[1:]}
-        json_file.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    write_json(json_file, {**summary.as_dict(), "seed": demo.seed, "commit": commit(), "arguments": sys.argv[1:]})
     console.print("[bold green]goal reached[/]" if reached else "[bold red]goal not reached[/]")
     return 0 if reached else 1
 
 
 def plot_command(recording: Path, figure: Path, json_file: Path | None, console: Console) -> None:
     """Summary and figure of any recording."""
+    check_file(figure, "--out")
+    check_file(json_file, "--json")
     summary = summarise(recording)
     draw_session(recording, figure)
     show(summary, recording, figure, console)
-    if json_file is not None:
-        data = {**summary.as_dict(), "commit": commit(), "arguments": sys.argv[1:]}
-        json_file.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    write_json(json_file, {**summary.as_dict(), "commit": commit(), "arguments": sys.argv[1:]})

@@ -62,7 +62,7 @@ class SimulatorService(Service):
         self._sent: tuple[Stamped, Stamped, Stamped] | None = None  # the observation of now, once published
         self._next = 0.0  # wall time of the next step, or in lockstep of the next complaint
         self._alive: set[str] = set()
-        self._wait_for = {name for name in settings.wait_for.split(",") if name} if self.lockstep else set()
+        self._wait_for = settings.waited_for()
 
     @property
     def lockstep(self) -> bool:

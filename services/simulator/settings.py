@@ -39,9 +39,10 @@ class SimulatorSettings(ServiceSettings):
         ),
     ] = "realtime"
     lockstep_deadline: Annotated[float, Field(gt=0, description="s until a scan nobody answered is sent again")] = 5.0
-    wait_for: Annotated[str, Field(description="lockstep: services that must be alive before the first scan")] = (
-        "estimator,controller"
-    )
+    wait_for: Annotated[
+        str | None,
+        Field(description="services waited for before the first scan; lockstep: estimator,controller unless told"),
+    ] = None
     turn_by_turn: Annotated[float, Field(ge=0, description="odometry alpha 1, rad²/rad")] = 1e-3
     turn_by_path: Annotated[float, Field(ge=0, description="odometry alpha 2, rad²/m")] = 5e-4
     path_by_path: Annotated[float, Field(ge=0, description="odometry alpha 3, m²/m")] = 1e-3
@@ -53,6 +54,11 @@ class SimulatorSettings(ServiceSettings):
             raise UserError(f"no scanner {self.scanner!r}: choose one of {', '.join(SCANNERS)}")
         scanner = SCANNERS[self.scanner].with_beams(self.beams)
         return scanner if self.noise is None else scanner.model_copy(update={"sigma": self.noise})
+
+    def waited_for(self) -> set[str]:
+        """Services without which time does not begin."""
+        text = self.wait_for if self.wait_for is not None else "estimator,controller" * (self.pace == "lockstep")
+        return {name.strip() for name in text.split(",") if name.strip()}
 
     def start_pose(self) -> tuple[float, float, float] | None:
         """X m, y m, yaw rad, or None."""
