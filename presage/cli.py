@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from pydantic import ValidationError
 
 from common.bus import DEFAULT_ENDPOINT
-from common.errors import UserError
+from common.errors import UserError, first_fault
 from presage import cli_bench, cli_tools
 from presage.options import (
     Connect,
@@ -20,6 +21,7 @@ from presage.options import (
     Port,
     PriorName,
     RobotName,
+    Seed,
     WorldName,
     console,
     err_console,
@@ -42,7 +44,7 @@ def up(
     beams: Annotated[int, typer.Option(help="Beams of the scanner; 622 are the paper's.")] = 811,
     drive: Annotated[str, typer.Option(help="holonomic or differential (hand driving only, for now).")] = "holonomic",
     pace: Annotated[str, typer.Option(help="realtime, fast or lockstep.")] = "realtime",
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Seed = 0,
     record: Annotated[Path | None, typer.Option(help="Record into this folder.")] = None,
     robot: RobotName = "robot",
     port: Port = 7447,
@@ -77,7 +79,7 @@ def demo(
     goal: Annotated[tuple[float, float] | None, typer.Option(help="x y in m.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for recording and figure.")] = Path("recordings"),
     beams: Annotated[int, typer.Option(help="Beams of the scanner.")] = 622,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Seed = 0,
     pace: Annotated[str, typer.Option(help="realtime, fast or lockstep.")] = "realtime",
     port: Port = 0,
     json_file: Json = None,
@@ -165,7 +167,7 @@ def localize(
     odometry: Annotated[bool, typer.Option(help="Use the file's odometry, where there is any.")] = True,
     initial_pose: Annotated[str, typer.Option(help="x,y,yaw_deg; for mode track.")] = "",
     sigma: Annotated[float, typer.Option(min=1e-4, max=10, help="The scanner's noise, m.")] = 0.02,
-    seed: Annotated[int, typer.Option(min=0, max=2**31)] = 0,
+    seed: Seed = 0,
 ) -> None:
     """Run an estimator over a file of scans, as fast as it goes; one row a scan.
 
@@ -193,7 +195,7 @@ def train(
     epochs: Annotated[int, typer.Option(min=1, help="paper.")] = 60,
     batch: Annotated[int, typer.Option(min=1, help="paper.")] = 500,
     learning_rate: Annotated[float, typer.Option(min=1e-6, help="paper.")] = 3e-3,
-    seed: Annotated[int, typer.Option(min=0, max=2**31)] = 0,
+    seed: Seed = 0,
     robot: RobotName = "robot",
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
@@ -230,10 +232,19 @@ def main() -> None:
     try:
         with interruptible():
             app()
-    except UserError as error:
-        print(f"presage: {error}", file=sys.stderr)
+    except (UserError, ValidationError, OSError) as error:
+        print(f"presage: {_in_one_line(error)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         with ignoring_interrupts():
             print("interrupted", file=sys.stderr)
         sys.exit(130)
+
+
+def _in_one_line(error: UserError | ValidationError | OSError) -> str:
+    """What is wrong, where, and what to do."""
+    if isinstance(error, ValidationError):
+        return f"{first_fault(error)} ({error.title}): see --help for what is meant"
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}; choose another place"
+    return " ".join(str(error).split()) or type(error).__name__

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import time
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -11,10 +12,17 @@ from common.bus import DEFAULT_ENDPOINT
 from common.errors import UserError
 from presage.options import Connect, RobotName, console, link_of
 
+if TYPE_CHECKING:
+    from common.messages import Pose
+
 app = typer.Typer()
 
 
-@app.command()
+# A coordinate may be negative; a misspelt option still is no number.
+NUMBERS = {"ignore_unknown_options": True}
+
+
+@app.command(context_settings=NUMBERS)
 def goal(
     x: Annotated[float | None, typer.Argument(help="m, map")] = None,
     y: Annotated[float | None, typer.Argument(help="m, map")] = None,
@@ -28,16 +36,19 @@ def goal(
 
     Examples: `presage goal 15 1.5 --wait`; `presage goal --cancel`.
     """
-    from common.messages import Goal, Pose  # noqa: PLC0415
+    from common.messages import Goal  # noqa: PLC0415
     from presage.tools import give_goal  # noqa: PLC0415
 
     if not cancel and (x is None or y is None):
         raise UserError("a goal is two numbers, X Y in m (or --cancel)")
-    wish = Goal(stamp_ns=0, pose=Pose(x=x or 0.0, y=y or 0.0), tolerance=tolerance, cancel=cancel)
+    if not np.isfinite(tolerance):
+        raise UserError(f"--tolerance {tolerance}: a finite number is needed, in m")
+    # The time numbers it: the controller's status says which goal it is about, whoever gave the others.
+    wish = Goal(stamp_ns=0, seq=time.time_ns(), pose=_pose(x or 0.0, y or 0.0), tolerance=tolerance, cancel=cancel)
     raise typer.Exit(give_goal(link_of(connect, robot), wish, console, wait=wait))
 
 
-@app.command()
+@app.command(context_settings=NUMBERS)
 def teleport(
     x: Annotated[float, typer.Argument(help="m, map")],
     y: Annotated[float, typer.Argument(help="m, map")],
@@ -49,13 +60,12 @@ def teleport(
 
     Example: `presage teleport 9 1.5`. The paper's preset knows one heading alone: 90 deg in corridor.
     """
-    from common.messages import Pose  # noqa: PLC0415
     from presage.tools import teleport as carry  # noqa: PLC0415
 
-    carry(link_of(connect, robot), Pose(x=x, y=y, yaw=float(np.deg2rad(yaw))), console)
+    carry(link_of(connect, robot), _pose(x, y, yaw), console)
 
 
-@app.command()
+@app.command(context_settings=NUMBERS)
 def localise(
     x: Annotated[float | None, typer.Argument(help="m, map; none: from the map's centre")] = None,
     y: Annotated[float | None, typer.Argument(help="m, map")] = None,
@@ -68,7 +78,20 @@ def localise(
     """
     from presage.tools import localise as restart  # noqa: PLC0415
 
-    restart(link_of(connect, robot), x, y, console)
+    if (x is None) != (y is None):
+        raise UserError("a position is two numbers, X Y in m")
+    pose = _pose(x, y) if x is not None and y is not None else None
+    restart(link_of(connect, robot), pose, console)
+
+
+def _pose(x: float, y: float, yaw: float = 0.0) -> Pose:
+    """From m and deg; raises UserError where a number is none."""
+    from common.messages import Pose  # noqa: PLC0415
+
+    if not np.isfinite([x, y, yaw]).all():
+        given = f"{x:g} {y:g}" + (f" {yaw:g}" if yaw else "")
+        raise UserError(f"{given}: a place is finite numbers, X Y in m (and for teleport YAW in deg)")
+    return Pose(x=x, y=y, yaw=float(np.deg2rad(yaw)))
 
 
 @app.command()

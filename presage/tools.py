@@ -45,7 +45,7 @@ def give_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
             done = watch.until(Status, lambda s: s.state == "idle", 3.0)
             console.print("cancelled; the robot stands" if done else "sent, but not confirmed")
             return 0 if done else 1
-        if (status := watch.until(Status, lambda s: s.goal == goal.pose, 3.0)) is None:
+        if (status := watch.until(Status, lambda s: s.goal_seq == goal.seq, 3.0)) is None:
             raise UserError("the controller did not take the goal within 3 s")
         if status.state == "blocked":
             raise UserError(status.reason)
@@ -72,7 +72,7 @@ def _check_goal(bus: Bus, pose: Pose) -> None:
 def _follow(watch: Watch, goal: Goal, console: Console) -> int:
     with console.status("navigating") as line:
         while (status := watch.until(Status, lambda _: True, 3.0)) is not None:
-            if status.goal != goal.pose:
+            if status.goal_seq != goal.seq:
                 raise UserError("another goal took its place" if status.goal else "the goal was cancelled")
             away = f"{status.distance:.2f} m to go" if status.distance is not None else ""
             line.update(f"{status.state} {away} {status.reason}")
@@ -186,13 +186,10 @@ def echo(link: Link, name: str, count: int, console: Console, *, full: bool) -> 
     return 0
 
 
-def localise(link: Link, x: float | None, y: float | None, console: Console) -> None:
+def localise(link: Link, pose: Pose | None, console: Console) -> None:
     """Restart the estimator's belief; raises UserError with the reason where it is refused."""
-    if (x is None) != (y is None):
-        raise UserError("a position is two numbers, X Y in m")
-    pose = Pose(x=x, y=y) if x is not None and y is not None else None
     with session(link) as bus:
         reply = bus.ask(LOCALISE, LocaliseRequest(pose=pose), Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
-    console.print("localising anew " + (f"from ({x:g}, {y:g})" if pose else "from its initial pose"))
+    console.print("localising anew " + (f"from ({pose.x:g}, {pose.y:g})" if pose else "from its initial pose"))

@@ -18,9 +18,29 @@ NOWHERE = ("--connect", "tcp/127.0.0.1:9")  # the discard port: nobody is there
         (("up", "--world", "nowhere"), "give a file or one of corridor, maze, office"),
         (("demo", "--world", "{tmp}/no.yaml"), "give a file or one of"),
         (("demo", "--goal", "6.8", "3.95"), "from a wall of 'corridor'"),
-        (("up", "--world", "maze"), "presage train --world maze"),
+        (("up", "--world", "maze", "--estimator", "paper", "--port", "0"), "presage train --world maze"),
         (("goal", "1", "1", *NOWHERE), "start a session with `presage up`"),
         (("goal",), "X Y in m"),
+        (("goal", "-1", "2", *NOWHERE), "start a session"),
+        (("goal", "nan", "1"), "nan 1: a place is finite numbers"),
+        (("goal", "1", "1", "--tolerance", "inf"), "--tolerance inf"),
+        (("goal", "1", "2", "--wiat"), "--wiat"),
+        (("teleport", "inf", "1"), "inf 1 90: a place is finite numbers"),
+        (("teleport", "-1", "-1.5", "-90", *NOWHERE), "start a session"),
+        (("localise", "nan", "1"), "a place is finite numbers"),
+        (("localise", "-1", "-.5", *NOWHERE), "start a session"),
+        (("localise", "1"), "a position is two numbers"),
+        (("demo", "--goal", "nan", "1"), "two finite numbers"),
+        (("demo", "--out", "/dev/null/x"), "/dev/null/x: cannot be written to"),
+        (("demo", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
+        (("demo", "--seed", "99999999999999999999"), "--seed"),
+        (("demo", "--beams", "1000000", "--out", "{tmp}/d"), "beams: Input should be less than"),
+        (("demo", "--world", "{tmp}/bad.yaml"), "bad.yaml: no YAML"),
+        (("plot", "{tmp}/run.mcap", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
+        (("plot", "{tmp}/run.mcap", "--out", "/proc/no.png"), "/proc/no.png: cannot be written to"),
+        (("bench", "latency", "--beams", "1"), "tim571 with 1 beams"),
+        (("train", "--preset", "paper", "--out", "/dev/null/m"), "/dev/null/m"),
+        (("record", "--out", "/dev/null"), "/dev/null: cannot be written to"),
         (("teleport", "1", "1", *NOWHERE), "start a session"),
         (("echo", "nothing"), "no topic 'nothing': choose one of scan"),
         (("hz", *NOWHERE), "start a session"),
@@ -34,6 +54,7 @@ NOWHERE = ("--connect", "tcp/127.0.0.1:9")  # the discard port: nobody is there
 )
 def test_bad_input_is_one_line(process, tmp_path, args, says):
     (tmp_path / "foreign.mcap").write_bytes(b"no recording at all, but long enough to be looked at twice")
+    (tmp_path / "bad.yaml").write_text("since: 2020-13-45")
     made.write(tmp_path / "run.mcap")
     running = process("presage.__main__", *[a.format(tmp=tmp_path) for a in args])
     assert running.wait(90) not in {0, None}
