@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
 
-.PHONY: help install demo test check bench clean
+.PHONY: help install demo test check bench clean FORCE
 .DELETE_ON_ERROR:
 
 help: ## this list
@@ -26,6 +26,13 @@ $(STAMP): pyproject.toml constraints.txt
 	$(PIP) --upgrade 'pip>=24'
 	$(PIP) $(if $(WHEEL_INDEX),--extra-index-url '$(WHEEL_INDEX)') -c constraints.txt -e '.[dev]'
 	@touch $@
+
+# A Python that is asked for is taken, though the files are older than the stamp.
+ifneq ($(PYTHON),)
+ifneq ($(shell $(BIN)/python --version 2>&1),$(shell '$(PYTHON)' --version 2>&1))
+$(STAMP): FORCE
+endif
+endif
 
 # A name on the path may be a stub that fails (pyenv), and Debian ships Python without venv: each is tried, not believed.
 # PyBullet has wheels for 3.10 and 3.11 alone, so these come first.

@@ -1,0 +1,56 @@
+"""`make install` does what is asked for, and nothing where nothing changed; looked at with --dry-run."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def python(path, version):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!/bin/sh\necho Python {version}\n")
+    path.chmod(0o755)
+    return path
+
+
+@pytest.fixture
+def install(tmp_path):
+    """Calls say what `make install` would do in a checkout that is installed with Python 3.11.9."""
+    for number, name in enumerate(("Makefile", "pyproject.toml", "constraints.txt", ".venv/.installed")):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, (number, number))
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    python(tmp_path / ".venv/bin/python", "3.11.9")
+
+    def run(*args):
+        command = ["make", "--dry-run", "install", *args]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60).stdout
+
+    return run
+
+
+pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="no make here")
+
+
+def test_nothing_is_done_where_nothing_changed(install, tmp_path):
+    assert "pip install" not in install()
+    same = python(tmp_path / "bin/python3.11", "3.11.9")
+    assert "pip install" not in install(f"PYTHON={same}")
+
+
+def test_another_python_that_is_asked_for_is_taken(install, tmp_path):
+    other = python(tmp_path / "bin/python3.10", "3.10.14")
+    assert f"names='{other}'" in install(f"PYTHON={other}")
+    assert "pip install" in install("PYTHON=/nowhere/python")
+
+
+def test_changed_requirements_are_installed(install, tmp_path):
+    os.utime(tmp_path / "pyproject.toml")
+    assert "pip install" in install()
