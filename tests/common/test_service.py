@@ -226,4 +226,4 @@ def test_two_robots_share_a_network(bus, process, link):
     beside.bus.put(SCAN, scan(1))
     assert wait_until(lambda: len(beside.commands) == 1, PATIENCE)
     assert beside.until(lambda h: h.counters.get("scans") == 1)
-    assert beside.bus.alive() == {"small"}
+    assert wait_until(lambda: beside.bus.alive() == {"small"}, PATIENCE)  # one look may come too early

@@ -137,7 +137,11 @@ def test_lockstep_says_who_is_missing_and_goes_on_when_it_comes(process, bus):
         ("simulator", ("--world", "nowhere"), "one of corridor, maze, office"),
         ("estimator", ("--world", "nowhere"), "one of corridor, maze, office"),
         ("controller", ("--world", "nowhere"), "one of corridor, maze, office"),
-        ("estimator", ("--world", "maze"), "presage train --world maze --preset paper --scanner tim571"),
+        (
+            "estimator",
+            ("--world", "maze", "--estimator", "paper"),
+            "presage train --world maze --preset paper",
+        ),
         ("simulator", ("--scanner", "sonar"), "no scanner 'sonar': choose one of tim571"),
         ("simulator", ("--start", "0.1,0.1"), "the robot needs 0.27 m around it"),
         ("simulator", ("--beams", "one"), "beams"),
