@@ -27,6 +27,7 @@ from presage.options import (
     err_console,
     link_of,
 )
+from presage.output import make_folder
 from presage.stack import ignoring_interrupts, interruptible
 
 app = typer.Typer(
@@ -212,6 +213,7 @@ def train(
     from services.estimator.training import Recipe as PaperRecipe  # noqa: PLC0415
 
     link, folder = link_of(connect, robot), out or FOLDER
+    make_folder(folder, "--out")
     if preset == "precise":
         recipe = Recipe(resolution=resolution, seed=seed)
         precise.train_precise(precise.Job(world, scanner, beams, folder, samples or 5000, recipe), link, console)

@@ -39,7 +39,7 @@ NOWHERE = ("--connect", "tcp/127.0.0.1:9")  # the discard port: nobody is there
         (("plot", "{tmp}/run.mcap", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
         (("plot", "{tmp}/run.mcap", "--out", "/proc/no.png"), "/proc/no.png: cannot be written to"),
         (("bench", "latency", "--beams", "1"), "tim571 with 1 beams"),
-        (("train", "--preset", "paper", "--out", "/dev/null/m"), "/dev/null/m"),
+        (("train", "--out", "/dev/null/m"), "/dev/null/m: cannot be written to"),
         (("record", "--out", "/dev/null"), "/dev/null: cannot be written to"),
         (("teleport", "1", "1", *NOWHERE), "start a session"),
         (("echo", "nothing"), "no topic 'nothing': choose one of scan"),
