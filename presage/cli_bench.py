@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -43,3 +44,44 @@ def bench_localisation(
     from presage.bench_localisation import bench_localisation as run  # noqa: PLC0415
 
     raise typer.Exit(run(world, beams, trials, scans, seed, json_file, console))
+
+
+@app.command("accuracy")
+def bench_accuracy(
+    worlds: Annotated[str, typer.Option(help="Comma-separated.")] = "office",
+    beams: Annotated[str, typer.Option(help="Comma-separated.")] = "622",
+    estimators: Annotated[
+        str, typer.Option(help="Of precise, precise-exact, particle-filter, amcl-defaults.")
+    ] = "precise,precise-exact,particle-filter",
+    trials: Annotated[int, typer.Option(min=2, help="Places of each task.")] = 100,
+    minutes: Annotated[float, typer.Option(min=0.05, help="Of each path that is tracked, at 15 Hz.")] = 2.0,
+    seed: Annotated[int, typer.Option(min=0, max=2**31)] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Processes side by side.")] = 2,
+    json_file: Json = None,
+    figure: Annotated[Path | None, typer.Option(help="PNG, SVG or PDF.")] = None,
+) -> None:
+    """Estimators and the Cramér-Rao bound side by side: from nothing, tracking, kidnapped, blocked, two rooms alike.
+
+    Examples: `presage bench accuracy --trials 20 --minutes 0.5`;
+    `presage bench accuracy --worlds office,corridor,maze --beams 622,811 --json accuracy.json --figure accuracy.png`.
+    """
+    from presage.accuracy.report import bench_accuracy as run  # noqa: PLC0415
+
+    code = run(worlds, beams, estimators, trials, minutes, seed, workers, json_file, figure, console)
+    raise typer.Exit(code)
+
+
+@app.command("speed")
+def bench_speed(
+    world: WorldName = "office",
+    beams: Annotated[str, typer.Option(help="Comma-separated.")] = "622,811",
+    seed: Annotated[int, typer.Option(min=0, max=2**31)] = 1,
+    json_file: Json = None,
+) -> None:
+    """Milliseconds an update and memory of every estimator, one core, one process each.
+
+    Example: `presage bench speed --beams 622 --json speed.json`.
+    """
+    from presage.accuracy.speed import bench_speed as run  # noqa: PLC0415
+
+    raise typer.Exit(run(world, beams, seed, json_file, console))

@@ -12,6 +12,7 @@ import numpy as np
 
 MIN_STEP = 0.25  # cells; a shorter stride would creep along walls, a longer one jump over corners
 MAX_STEPS = 2000
+SHORT = 0.6  # of the misfit of a beam too long is that of one too short: much may shorten beams, little lengthens
 FACING = 0.02  # least |n . u|: a beam within about a degree of the surface has no usable derivative
 
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -125,14 +126,14 @@ def cast(segments, circles, lasers, angles, ranges, jacobian):
 
 @jit
 def accumulate(
-    measured, expected, jacobian, scale, sigma, widen, outlier, range_max, unseen, total, gradient, matrices
+    measured, expected, jacobian, scale, sigma, widen, short, random, range_max, unseen, total, gradient, matrices
 ):
     """Sums over beams of -ln p(o | pose) and its derivatives; see `services.estimator.precise.likelihood`.
 
     Fills total (N, 3) energy, explained, used; gradient (N, 3); matrices (N, 3, 3, 3): curvature, and its parts from
     the scanner's noise and from the model's error.
     """
-    flat = outlier / range_max
+    flat = random / range_max
     for k in range(expected.shape[0]):
         for b in range(measured.shape[0]):
             o, g = measured[b], expected[k, b]
@@ -145,13 +146,13 @@ def accumulate(
                 total[k, 1] += 0.0 if seen else 1.0
                 continue
             if g == np.inf:
-                total[k, 0] -= math.log(flat)
+                total[k, 0] -= math.log(flat + short / range_max)
                 continue
             noise, model = sigma * sigma, scale[k, b] * scale[k, b]
             variance = noise + model + widen * widen
             e = o - g
-            core = (1.0 - outlier) * math.exp(-0.5 * e * e / variance) / math.sqrt(2 * math.pi * variance)
-            density = core + flat
+            core = (1.0 - short - random) * math.exp(-0.5 * e * e / variance) / math.sqrt(2 * math.pi * variance)
+            density = core + flat + (short / max(g, 1e-3) if o < g else 0.0)
             inlier = core / density
             total[k, 0] -= math.log(density)
             total[k, 1] += inlier
@@ -179,6 +180,7 @@ def rank(panoramas, bins, measured, tolerance, range_max, costs):
                     continue
                 g = panoramas[s, (bins[b] + shift) % size]
                 e = min(o, range_max) - min(g, range_max)
-                total += e * e / (e * e + tolerance * tolerance)
+                misfit = e * e / (e * e + tolerance * tolerance)
+                total += misfit if e > 0.0 else SHORT * misfit
                 used += 1
             costs[s, h] = total / max(used, 1)

@@ -28,7 +28,7 @@ class Settings:
     """What can be set; defaults hold for every shipped world."""
 
     seeds: int = 48  # poses descended in the first round of a search
-    more_seeds: int = 384  # in the second, where the first explains too little
+    more_seeds: int = 240  # in the second, where the first explains too little
     beams: int = 150  # of the descent from seeds; the last steps take all
     satisfied: float = 0.9  # share of beams explained that ends a search
     believable: float = 0.45  # least share of beams that a belief must explain
@@ -164,7 +164,7 @@ class PreciseEstimator:
         poses, evidence = descend(view, poses[keep], part, NARROW, 4)
         poses, evidence = polish(view, poses, part)
         keep = mixture.distinct(poses, evidence.accuracy, self.settings.hypotheses)
-        modes = [mixture.found(poses[k], evidence, k, part) for k in keep]
+        modes = [mixture.found(poses[k], evidence, k, part, self.seeds.volume) for k in keep]
         return mixture.weigh(modes, self.settings.evidence_error, self.settings.hypotheses)
 
     def _period(self, stamp: float | None) -> float:

@@ -1,10 +1,11 @@
 """The density of a beam, and free energy's accuracy: a sum of -ln p over beams, no gain, no 1/N.
 
-    p(o | g) = (1 - epsilon) N(o; g, sigma² + m²) + epsilon / range_max
+    p(o | g) = (1 - short - random) N(o; g, sigma² + m²) + short [o < g] / g + random / range_max
 
-sigma is the scanner's noise, m the model's stated error, epsilon the share of beams that something unknown ends
-(people, moved furniture): a proper density with tails that no outlier moves (Thrun, Burgard & Fox 2005, section 6.3,
-without its gains). A beam without return has the probability `unseen` where a surface is expected, else 1 - unseen.
+sigma is the scanner's noise, m the model's stated error, `short` the share of beams that something unknown ends
+(people, moved furniture), `random` that of all else (something was taken away): a proper density with tails that no
+outlier moves (Thrun, Burgard & Fox 2005, section 6.3, without its gains). A beam without return has the probability
+`unseen` where a surface is expected, 1 - unseen where none is.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ class Likelihood:
     """Parameters of the density."""
 
     sigma: float = 0.02  # m
-    outlier: float = 0.1  # epsilon
+    short: float = 0.25
+    random: float = 0.005
     unseen: float = 0.05
 
     def evaluate(self, measured: Array, range_max: float, expected: Expected, widen: float = 0.0) -> Evidence:
@@ -48,7 +50,7 @@ class Likelihood:
         matrices = np.zeros((count, 3, 3, 3))
         kernels.accumulate(
             measured, expected.ranges, expected.jacobian, expected.scale,
-            self.sigma, widen, self.outlier, range_max, self.unseen, total, gradient, matrices,
+            self.sigma, widen, self.short, self.random, range_max, self.unseen, total, gradient, matrices,
         )  # fmt: skip
         explained = total[:, 1] / np.maximum(total[:, 2], 1)
         return Evidence(total[:, 0], explained, gradient, matrices[:, 0], matrices[:, 1], matrices[:, 2])
@@ -57,4 +59,5 @@ class Likelihood:
         """p(o | g) in 1/m at measured (K,) m."""
         variance = self.sigma**2 + scale**2
         core = np.exp(-0.5 * (measured - expected) ** 2 / variance) / np.sqrt(2 * np.pi * variance)
-        return np.asarray((1 - self.outlier) * core + self.outlier / range_max)
+        flat = self.short / expected * (measured < expected) + self.random / range_max
+        return np.asarray((1 - self.short - self.random) * core + flat)

@@ -41,8 +41,11 @@ class Mode:
         return np.asarray(self.noise + correlation * self.error)
 
 
-def found(pose: Array, evidence: Evidence, k: int, prior: Prior | None) -> Mode:
-    """A mode of the search; of nothing known in a direction, a metre and a radian remain."""
+def found(pose: Array, evidence: Evidence, k: int, prior: Prior | None, volume: float) -> Mode:
+    """A mode of the search; of nothing known in a direction, a metre and a radian remain.
+
+    Without a prior every pose was as likely, in ``volume`` m² rad: complexity is the KL divergence from that.
+    """
     information = prior.information[k] if prior else np.eye(3)
     inverse = np.linalg.inv(evidence.curvature[k] + information)
     slope = evidence.xi[k] + (prior.information[k] @ difference(prior.mean[k : k + 1], pose[None])[0] if prior else 0)
@@ -51,8 +54,13 @@ def found(pose: Array, evidence: Evidence, k: int, prior: Prior | None) -> Mode:
     noise = inverse @ (evidence.of_noise[k] + information) @ inverse
     error = inverse @ evidence.of_model[k] @ inverse
     accuracy = float(evidence.accuracy[k])
-    complexity = float(prior.energy(prior.mean * 0 + pose)[k]) if prior else 0.0
-    complexity += 0.5 * float(np.linalg.slogdet(evidence.curvature[k] + information)[1])
+    logdet = float(np.linalg.slogdet(evidence.curvature[k] + information)[1])
+    if prior:
+        off = difference(pose[None], prior.mean[k : k + 1])[0]
+        complexity = 0.5 * float(np.trace(information @ inverse) - 3 + off @ information @ off + logdet)
+        complexity -= 0.5 * float(np.linalg.slogdet(information)[1])
+    else:
+        complexity = float(np.log(volume)) + 0.5 * (logdet - 3 * np.log(2 * np.pi * np.e))
     return Mode(
         pose, noise, error, float(evidence.explained[k]), accuracy, complexity, accuracy + complexity,
         evidence.xi[k], evidence.curvature[k],

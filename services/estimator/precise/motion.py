@@ -20,16 +20,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MotionNoise:
-    """Standard deviations; of each axis of base_link."""
+    """Of each axis of base_link; standard deviations where not said otherwise."""
 
     period: float = 1 / 15  # s between scans, where stamps do not say
     acceleration: float = 1.0  # m/s²
     turn_acceleration: float = 3.0  # rad/s²
     speed: float = 1.0  # m/s
     turn: float = 2.0  # rad/s
-    odom_per_metre: float = 0.05  # m a metre travelled
-    odom_turn_per_metre: float = 0.05  # rad a metre
-    odom_per_radian: float = 0.05  # rad a radian turned
+    turn_by_turn: float = 1e-3  # odometry's variance, rad² a radian turned (Thrun et al. 2005, table 5.6)
+    turn_by_path: float = 5e-4  # rad² a metre travelled
+    path_by_path: float = 1e-3  # m² a metre
+    path_by_turn: float = 1e-4  # m² a radian
     command_share: float = 0.2  # of the commanded velocity
     standing: float = 1e-4  # m and rad a scan: what a robot that stands may still move
     surprise: float = 0.02  # probability of any other motion
@@ -63,8 +64,8 @@ def candidates(
     found = []
     if odom is not None:
         moved, turned = float(np.hypot(odom[0], odom[1])), abs(float(odom[2]))
-        across = noise.odom_per_metre * moved + noise.standing
-        around = noise.odom_turn_per_metre * moved + noise.odom_per_radian * turned + noise.standing
+        across = np.sqrt(noise.path_by_path * moved + noise.path_by_turn * turned) + noise.standing
+        around = np.sqrt(noise.turn_by_turn * turned + noise.turn_by_path * moved) + noise.standing
         found.append(_moved("odometry", pose, covariance, odom, np.array([across, across, around]), rest))
     else:
         found.append(_moved("standing", pose, covariance, np.zeros(3), np.full(3, noise.standing), rest / 2))

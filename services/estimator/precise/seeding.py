@@ -25,6 +25,7 @@ class Seeds:
 
     places: Array  # (S, 2) m in map, of the laser
     panoramas: np.ndarray[tuple[int, ...], np.dtype[np.float32]]  # (S, BINS) m in direction 2 pi k / BINS of map
+    spacing: float = 0.3  # m between places
 
     @classmethod
     def at(cls, model: GenerativeModel, places: Array) -> Seeds:
@@ -33,6 +34,11 @@ class Seeds:
         directions = np.linspace(0.0, 2 * np.pi, BINS, endpoint=False)
         parts = [model.expect(part, directions).ranges for part in np.array_split(lasers, max(1, len(lasers) // 500))]
         return cls(np.asarray(places, float), np.concatenate(parts).astype(np.float32))
+
+    @property
+    def volume(self) -> float:
+        """M² rad that places and headings stand for."""
+        return max(1, len(self.places)) * self.spacing**2 * 2 * np.pi
 
     def rank(self, view: View, count: int, headings: int = 120, beams: int = 72) -> Array:
         """(count, 3) base_link poses that fit the scan best, best first; a place gives at most two headings."""

@@ -1,0 +1,1 @@
+"""`presage bench accuracy` and `bench speed`: estimators and the bound, side by side."""

@@ -1,0 +1,51 @@
+"""The Cramér-Rao bound of a scan, and of scans along a path: what no unbiased estimator can beat (Censi 2007)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from common import se2
+from common.se2 import Array
+from presage.accuracy.scenes import Scene
+from services.estimator.generative import RayCaster
+from services.simulator.odometry import Drift
+
+TINY = 1e-9  # 1/m², so that a direction of which a scan says nothing has a bound, a very large one
+
+
+def information(scene: Scene, poses: Array) -> Array:
+    """(N, 3, 3) Fisher information of one scan about base_link: sum of J'J / sigma² over beams, from exact rays."""
+    mount = np.array(scene.scanner.mount)
+    lasers = se2.compose(poses, mount)
+    expected = RayCaster(scene.world).expect(lasers, scene.scanner.angles())
+    J = np.where(np.isfinite(expected.ranges)[..., None], expected.jacobian, 0)
+    J[..., 2] += J[..., 0] * (poses[:, 1] - lasers[:, 1])[:, None] + J[..., 1] * (lasers[:, 0] - poses[:, 0])[:, None]
+    return np.asarray(np.einsum("nbi,nbj->nij", J, J) / scene.scanner.sigma**2 + TINY * np.eye(3))
+
+
+def position(covariance: Array) -> Array:
+    """(N,) m, root of the expected squared distance, of covariances (N, 3, 3)."""
+    return np.sqrt(covariance[..., 0, 0] + covariance[..., 1, 1])
+
+
+def single(scene: Scene, poses: Array, scans: int = 1) -> Array:
+    """(N, 3, 3) bound on the covariance from so many scans of a robot that stands."""
+    return np.asarray(np.linalg.inv(information(scene, poses) * scans), np.float64)
+
+
+def recursive(scene: Scene, path: Array, drift: Drift) -> Array:
+    """(N, 3, 3) bound along a path (N, 3) with odometry of that drift: the information filter at the true poses."""
+    found, carried = [], np.zeros((3, 3))
+    for k, own in enumerate(information(scene, path)):
+        total = own + carried
+        covariance = np.linalg.inv(total)
+        found.append(covariance)
+        if k + 1 < len(path):
+            step = se2.between(path[k], path[k + 1])
+            length, turn = float(np.hypot(step[0], step[1])), abs(float(step[2]))
+            along = drift.path_by_path * length + drift.path_by_turn * turn
+            around = drift.turn_by_turn * turn + drift.turn_by_path * length
+            by_pose, by_step = se2.compose_jacobians(path[k], step)
+            spread = (by_step * np.array([along, along, around])) @ by_step.T
+            carried = np.linalg.inv(by_pose @ covariance @ by_pose.T + spread + 1e-14 * np.eye(3))
+    return np.array(found)

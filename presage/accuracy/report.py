@@ -1,0 +1,112 @@
+"""`presage bench accuracy`: table, JSON and figure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
+
+from common.errors import UserError
+from common.world import load_world
+from presage.accuracy.running import CHOICES, Job, about, run_all
+from presage.output import check_file, write_json
+
+# Colours and marks that the colour-blind can tell apart (Okabe & Ito).
+MARKS = {
+    "precise": ("#0072B2", "o"), "precise-exact": ("#56B4E9", "s"), "particle-filter": ("#D55E00", "^"),
+    "amcl-defaults": ("#CC79A7", "v"),
+}  # fmt: skip
+
+
+def bench_accuracy(
+    worlds: str, beams: str, estimators: str, trials: int, minutes: float, seed: int, workers: int,
+    json_file: Path | None, figure: Path | None, console: Console,
+) -> int:  # fmt: skip
+    """Measure, print, and write where asked."""
+    chosen = estimators.split(",")
+    unknown = [name for name in chosen if name not in CHOICES]
+    if unknown:
+        raise UserError(f"no estimator {unknown[0]!r}: choose from {', '.join(CHOICES)}")
+    try:
+        counts = [int(part) for part in beams.split(",")]
+    except ValueError:
+        raise UserError(f"--beams {beams!r}: give numbers, such as 622,811") from None
+    names = worlds.split(",")
+    for name in names:
+        load_world(name)
+    check_file(json_file, "--json")
+    check_file(figure, "--figure")
+    jobs = [
+        Job(estimator, world, count, trials, minutes * 60, seed)
+        for world in names for count in counts for estimator in chosen
+    ]  # fmt: skip
+    rows = run_all(jobs, workers, console)
+    for world, count in dict.fromkeys((row["world"], row["beams"]) for row in rows):
+        console.print(_table([r for r in rows if (r["world"], r["beams"]) == (world, count)], world, count))
+    write_json(json_file, {"rows": rows, "trials": trials, "minutes": minutes, **about(seed)})
+    if figure is not None:
+        _draw(rows, figure)
+    return 0
+
+
+def _number(value: float | None, scale: float = 1.0, digits: int = 2) -> str:
+    return "" if value is None else f"{value * scale:.{digits}f}"
+
+
+def _table(rows: list[dict[str, Any]], world: str, beams: int) -> Table:
+    table = Table(title=f"{world}, {beams} beams, sigma 0.02 m; errors of what was found", title_justify="left")
+    heads = "task|estimator|found|wrong|median mm|RMS mm|95 % mm|yaw deg|bound mm|RMS/bound|NEES|band|update ms"
+    for column in heads.split("|"):
+        table.add_column(column, justify="left" if column in ("task", "estimator") else "right")
+    for row in sorted(rows, key=lambda r: [q["task"] for q in rows].index(r["task"])):
+        band = row["nees_band"]
+        table.add_row(
+            row["task"], row["estimator"], f"{row['found']}/{row['of']}", str(row["tracking_but_wrong"]),
+            _number(row["position_error_median_m"], 1e3), _number(row["position_error_rms_m"], 1e3),
+            _number(row["position_error_p95_m"], 1e3), _number(row["heading_error_median_deg"], 1, 3),
+            _number(row["bound_rms_m"], 1e3), _number(row["rms_over_bound"]), _number(row["nees_mean"]),
+            "" if band is None else f"{band[0]:.2f}-{band[1]:.2f}", _number(row["update_ms_median"], 1, 1),
+        )  # fmt: skip
+    return table
+
+
+def _draw(rows: list[dict[str, Any]], file: Path) -> None:
+    """Root mean square position error of each task; the bound as a bar beside."""
+    first = (rows[0]["world"], rows[0]["beams"])
+    rows = [r for r in rows if (r["world"], r["beams"]) == first and r["position_error_rms_m"] is not None]
+    tasks = list(dict.fromkeys(row["task"] for row in rows))
+    figure = Figure(figsize=(9, 0.55 * len(tasks) + 1.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for name in dict.fromkeys(row["estimator"] for row in rows):
+        own = [row for row in rows if row["estimator"] == name]
+        colour, mark = MARKS[name]
+        axes.scatter(
+            [row["position_error_rms_m"] * 1e3 for row in own], [tasks.index(row["task"]) for row in own],
+            color=colour, marker=mark, s=50, label=name, zorder=3,
+        )  # fmt: skip
+        for row in own:
+            if row["found"] < row["of"]:
+                axes.annotate(
+                    f"{row['found']}/{row['of']}", (row["position_error_rms_m"] * 1e3, tasks.index(row["task"])),
+                    textcoords="offset points", xytext=(0, 7), ha="center", fontsize=7, color=colour,
+                )  # fmt: skip
+    bounds = [row for row in rows if row["bound_rms_m"] is not None]
+    axes.scatter(
+        [row["bound_rms_m"] * 1e3 for row in bounds], [tasks.index(row["task"]) for row in bounds],
+        color="black", marker="|", s=300, label="Cramér-Rao bound", zorder=4,
+    )  # fmt: skip
+    axes.set_yticks(np.arange(len(tasks)), tasks)
+    axes.invert_yaxis()
+    axes.set(
+        xscale="log", xlabel="position error, RMS (mm)",
+        title=f"{first[0]}, {first[1]} beams, sigma 20 mm; numbers: found of all, where not all",
+    )  # fmt: skip
+    axes.grid(alpha=0.3, which="both", axis="x")
+    axes.legend(loc="lower right")
+    figure.savefig(file, dpi=150)

@@ -1,0 +1,151 @@
+"""Every estimator through every task, in processes of their own, and the rows that come of it."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from common import se2
+from common.scanner import SCANNERS
+from common.se2 import Array
+from common.versions import commit, versions
+from common.world import World, load_world
+from presage.accuracy import tasks
+from presage.accuracy.scenes import TWINS, Scene
+from services.estimator.building import SPACING, Choice, Geometry, Name, prepare
+from services.estimator.generative import RayCaster
+from services.estimator.interface import Estimator
+from services.estimator.particle_filter.filter import ParticleFilter
+from services.estimator.particle_filter.settings import Settings as ParticleSettings
+from services.estimator.precise.estimator import PreciseEstimator
+from services.estimator.precise.field import FieldModel
+from services.estimator.precise.learning import Beams, Recipe, learn_field, learn_scales
+from services.estimator.precise.seeding import Seeds, thin_places
+
+# As users name them; exact is precise over the world itself.
+CHOICES: dict[str, tuple[Name, str]] = {
+    "precise": ("precise", "learned"),
+    "precise-exact": ("precise", "exact"),
+    "particle-filter": ("particle-filter", "learned"),
+    "amcl-defaults": ("amcl-defaults", "learned"),
+}
+ONE_CORE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+DEGREES_OF_FREEDOM = 3
+
+
+@dataclass(frozen=True)
+class Job:
+    """One estimator in one world with one scanner."""
+
+    estimator: str
+    world: str
+    beams: int
+    trials: int
+    seconds: float
+    seed: int
+
+
+def run_all(jobs: list[Job], workers: int, console: Console) -> list[dict[str, Any]]:
+    """Rows of all jobs, in order; with progress."""
+    for name in ONE_CORE:
+        os.environ[name] = "1"
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        done = track(pool.map(run, jobs), "measuring", total=len(jobs), console=console, transient=True)
+        return [row for rows in done for row in rows]
+
+
+def run(job: Job) -> list[dict[str, Any]]:
+    """The rows of one job."""
+    world = load_world(job.world)
+    geometry = _geometry(job.beams)
+    name, model = CHOICES[job.estimator]
+    estimator = prepare(Choice(job.world, name, model, seed=job.seed))(geometry)
+    outcomes: dict[str, tasks.Outcome] = {}
+    for number, task in enumerate((tasks.standing, tasks.blocked, tasks.kidnapped)):
+        outcomes |= task(estimator, Scene.of(world, job.beams, job.seed * 100 + number), job.trials, _quiet)
+    for number, odometry in enumerate((False, True)):
+        scene = Scene.of(world, job.beams, job.seed * 100 + 10 + number)
+        outcomes |= tasks.tracking(estimator, scene, job.seconds, _quiet, odometry=odometry)
+    rows = [_row(job, job.world, task, outcome) for task, outcome in outcomes.items()]
+    alike = tasks.twins(
+        _among_twins(job, geometry), Scene.of(TWINS, job.beams, job.seed * 100 + 20), job.trials, _quiet
+    )
+    return rows + [_row(job, TWINS.name, task, outcome) for task, outcome in alike.items()]
+
+
+def _quiet(poses: Iterable[Array]) -> Iterator[Array]:
+    return iter(poses)
+
+
+def _geometry(beams: int) -> Geometry:
+    scanner = SCANNERS["tim571"].with_beams(beams)
+    return Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max)
+
+
+def _among_twins(job: Job, geometry: Geometry) -> Estimator:
+    """The estimator in the world of two rooms alike; a field is learned for it here, from 2000 scans."""
+    name, model = CHOICES[job.estimator]
+    mount = (float(geometry.mount[0]), float(geometry.mount[1]), float(geometry.mount[2]))
+    if name == "amcl-defaults":
+        return ParticleFilter(TWINS, ParticleSettings(robot_model_type="omni"), mount, job.seed)
+    if name == "particle-filter":
+        return ParticleFilter(TWINS, ParticleSettings.tuned(), mount, job.seed)
+    rng = np.random.default_rng(job.seed)
+    places = thin_places(TWINS.sample_free(6000, rng, 0.05), SPACING)
+    if model == "exact":
+        return PreciseEstimator(RayCaster(TWINS), Seeds.at(RayCaster(TWINS), places), geometry.mount)
+    learned = quick_field(TWINS, geometry, rng)
+    return PreciseEstimator(learned, Seeds.at(learned, places), geometry.mount)
+
+
+def quick_field(world: World, geometry: Geometry, rng: np.random.Generator, samples: int = 2000) -> FieldModel:
+    """A field learned from exact rays with the shipped scanner's noise, and no simulator."""
+    poses = np.column_stack([world.sample_free(samples, rng, 0.27), rng.uniform(-np.pi, np.pi, samples)])
+    clean = world.ray_distances(se2.compose(poses, geometry.mount), geometry.angles)
+    split = samples // 10
+    noisy = clean[split:] + SCANNERS["tim571"].sigma * rng.standard_normal(clean[split:].shape)
+    field = learn_field(Beams.of(poses[split:], geometry.mount, geometry.angles, noisy), Recipe(sweeps=6))
+    return FieldModel(field, learn_scales(field, poses[:split], geometry.mount, geometry.angles, clean[:split], 0.0))
+
+
+def _row(job: Job, world: str, task: str, outcome: tasks.Outcome) -> dict[str, Any]:
+    """Plain names, units in them; None where nothing can be said."""
+    errors = np.array(outcome.errors).reshape(-1, 3)
+    position = np.hypot(errors[:, 0], errors[:, 1])
+    count, misfits = len(position), np.array(outcome.misfits)
+    rms = float(np.sqrt(np.mean(position**2))) if count else None
+    limit = float(np.sqrt(np.mean(np.square(outcome.bounds)))) if outcome.bounds else None
+    half = 1.96 * np.sqrt(2 * DEGREES_OF_FREEDOM / max(len(misfits), 1))
+    return {
+        "world": world,
+        "beams": job.beams,
+        "estimator": job.estimator,
+        "task": task,
+        "of": outcome.of,
+        "found": outcome.found,
+        "tracking_but_wrong": outcome.wrong,
+        "position_error_median_m": float(np.median(position)) if count else None,
+        "position_error_rms_m": rms,
+        "position_error_p95_m": float(np.quantile(position, 0.95)) if count else None,
+        "position_error_max_m": float(position.max()) if count else None,
+        "heading_error_median_deg": float(np.rad2deg(np.median(np.abs(errors[:, 2])))) if count else None,
+        "bound_rms_m": limit,
+        "rms_over_bound": rms / limit if rms is not None and limit else None,
+        "nees_mean": float(misfits.mean()) if len(misfits) else None,
+        "nees_band": [DEGREES_OF_FREEDOM - half, DEGREES_OF_FREEDOM + half] if len(misfits) else None,
+        "update_ms_median": float(np.median(outcome.update_ms)) if outcome.update_ms else None,
+    }
+
+
+def about(seed: int) -> dict[str, Any]:
+    """What a result needs to be repeated."""
+    return {"seed": seed, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:]}
