@@ -85,3 +85,20 @@ def bench_speed(
     from presage.accuracy.speed import bench_speed as run  # noqa: PLC0415
 
     raise typer.Exit(run(world, beams, seed, json_file, console))
+
+
+@app.command("decoders")
+def bench_decoders(
+    world: WorldName = "office",
+    samples: Annotated[int, typer.Option(min=100, help="Scans to learn from.")] = 5000,
+    seconds: Annotated[float, typer.Option(min=1, help="Training of each network.")] = 120.0,
+    seed: Annotated[int, typer.Option(min=0, max=2**31)] = 0,
+    json_file: Json = None,
+) -> None:
+    """Generative models that were tried, learned from the same scans: error, size, training time.
+
+    Example: `presage bench decoders --seconds 20 --json decoders.json`.
+    """
+    from presage.accuracy.decoders import bench_decoders as run  # noqa: PLC0415
+
+    raise typer.Exit(run(world, samples, seconds, seed, json_file, console))

@@ -76,14 +76,14 @@ def choice_of(
     """From the command line's words; the world is the recording's where none is named."""
     if estimator not in get_args(Name):
         raise UserError(f"no estimator {estimator!r}: choose one of {', '.join(get_args(Name))}")
+    pose = pose_of(initial_pose, "--initial-pose") if initial_pose else None
     if not world:
         if file.suffix == ".npz":
             raise UserError("an .npz does not say which world it is of: name it with --world")
         recorded = read_recording(file).world()
         if recorded is None:
             raise UserError(f"{file}: no world was recorded: name it with --world")
-        world = recorded.name
-    pose = pose_of(initial_pose, "--initial-pose") if initial_pose else None
+        return Choice(recorded, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
     return Choice(world, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
 
 
@@ -139,7 +139,7 @@ def _row(scans: Scans, k: int, posterior: Posterior, update_ms: float, *, laser:
 def _write(job: Job, rows: list[dict[str, Any]]) -> None:
     if job.out is not None and job.out.suffix == ".json":
         meta = {
-            "file": str(job.file), "world": job.choice.world, "estimator": job.choice.estimator,
+            "file": str(job.file), "world": job.choice.asked, "estimator": job.choice.estimator,
             "model": job.choice.model, "frame": job.frame, "mode": job.mode, "fresh": job.fresh,
             "seed": job.choice.seed, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:],
         }  # fmt: skip

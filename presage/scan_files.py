@@ -49,7 +49,7 @@ def read_scans(path: Path, mount: Array) -> Scans:
 
 def _read_npz(path: Path, mount: Array) -> Scans:
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             data = {name: np.asarray(file[name], np.float64) for name in file.files if name in NAMES}
     except FileNotFoundError:
         raise UserError(f"{path}: no such file") from None

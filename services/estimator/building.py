@@ -33,7 +33,7 @@ SPACING = 0.3  # m between the places a search begins at
 class Choice:
     """What a user chooses."""
 
-    world: str = "corridor"
+    world: str | World = "corridor"  # a shipped one, a file, or the world itself
     estimator: Name = "precise"
     model: str = "learned"  # of precise: learned, exact, or a file of weights
     models: Path | None = None  # folder of weights; none: the shipped ones
@@ -41,6 +41,11 @@ class Choice:
     seed: int = 0
     initial_pose: Array | None = None  # (3,); none: nothing is known (paper: the map's centre)
     descent: Descent = Descent()  # noqa: RUF009 - frozen; of paper
+
+    @property
+    def asked(self) -> str:
+        """The world as the user names it."""
+        return self.world.name if isinstance(self.world, World) else self.world
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,7 @@ def prepare(choice: Choice) -> Factory:
     """Load what is needed, so that errors come now; the factory makes the estimator for the first scan's geometry."""
     if choice.estimator not in get_args(Name):
         raise UserError(f"no estimator {choice.estimator!r}: choose one of {', '.join(get_args(Name))}")
-    world = load_world(choice.world)
+    world = choice.world if isinstance(choice.world, World) else load_world(choice.world)
     if choice.estimator == "paper":
         return _paper(choice, world)
     if choice.estimator == "precise":
@@ -107,7 +112,7 @@ def generative_model(choice: Choice, world: World) -> tuple[GenerativeModel, Arr
         places = world.sample_free(max(4000, int(60 * shapely.area(world.free_space))), np.random.default_rng(0), 0.05)
         return RayCaster(world), thin_places(places, SPACING), 1.0
     if choice.model == "learned":
-        path = weights.find(choice.models or weights.FOLDER, world, choice.world)
+        path = weights.find(choice.models or weights.FOLDER, world, choice.asked)
     elif (path := Path(choice.model)).suffix != ".safetensors":
         raise UserError(f"no model {choice.model!r}: give learned, exact, or a file of weights (.safetensors)")
     model, places, card = weights.load(path)
@@ -130,7 +135,7 @@ def _paper(choice: Choice, world: World) -> Factory:
     use_one_core()
     folder = choice.models or paper_weights.FOLDER
     known = paper_weights.available(folder, world.name, "paper")
-    remedy = paper_weights.train_command(choice.world, "paper")
+    remedy = paper_weights.train_command(choice.asked, "paper")
     if not known:
         raise UserError(f"no weights of preset paper for world {world.name!r} in {folder}; make them with: {remedy}")
     for path in known.values():  # a broken file is found now, and torch is warm for the first scan

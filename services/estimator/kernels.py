@@ -152,13 +152,15 @@ def accumulate(
             variance = noise + model + widen * widen
             e = o - g
             core = (1.0 - short - random) * math.exp(-0.5 * e * e / variance) / math.sqrt(2 * math.pi * variance)
-            density = core + flat + (short / max(g, 1e-3) if o < g else 0.0)
+            early = short / max(g, 1e-3) if o < g else 0.0
+            density = core + flat + early
             inlier = core / density
             total[k, 0] -= math.log(density)
             total[k, 1] += inlier
             weight = inlier / variance
+            slope = weight * e - early / (max(g, 1e-3) * density)  # d ln p / dg
             for i in range(3):
-                gradient[k, i] += weight * e * jacobian[k, b, i]
+                gradient[k, i] += slope * jacobian[k, b, i]
                 for j in range(3):
                     outer = jacobian[k, b, i] * jacobian[k, b, j] * weight
                     matrices[k, 0, i, j] += outer

@@ -1,0 +1,160 @@
+"""Preset precise as a whole: finds, tracks, fuses, doubts, notices; on exact rays, and on the shipped fields."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common import se2
+from common.world import World, load_world
+from presage.accuracy import bound, tasks
+from presage.accuracy.scenes import TWINS, Scene
+from services.estimator.building import Choice, Geometry, prepare
+from services.estimator.generative import RayCaster
+from services.estimator.interface import Observation
+from services.estimator.precise.estimator import PreciseEstimator
+from services.estimator.precise.seeding import Seeds, thin_places
+from tests.estimator.models import ROOM
+
+BEAMS = 271
+
+
+def estimator(world: World, beams: int = BEAMS) -> tuple[PreciseEstimator, Scene]:
+    scene = Scene.of(world, beams, 3)
+    model = RayCaster(world)
+    places = thin_places(world.sample_free(4000, np.random.default_rng(0), 0.05), 0.3)
+    return PreciseEstimator(model, Seeds.at(model, places), np.array(scene.scanner.mount)), scene
+
+
+def feed(made, scene, pose, count, first=0):
+    clean = scene.clean(pose[None])[0]
+    return [made.update(scene.observe(clean, (first + k) / 15)) for k in range(count)]
+
+
+def off(posterior, pose):
+    error = posterior.pose - pose
+    error[2] = se2.wrap(error[2])
+    return error
+
+
+def test_one_scan_finds_the_place_and_twenty_are_worth_more():
+    made, scene = estimator(ROOM)
+    outcome = tasks.standing(made, scene, 40, iter)
+    one, many = outcome["from nothing, 1 scan"], outcome["standing, 20 scans"]
+    assert one.found == one.of == 40
+    rms = [np.sqrt(np.mean(np.square(np.array(o.errors)[:, :2]).sum(1))) for o in (one, many)]
+    limit = [np.sqrt(np.mean(np.square(o.bounds))) for o in (one, many)]
+    assert 0.7 * limit[0] < rms[0] < 1.4 * limit[0]  # below the bound would be an error of the test
+    assert rms[1] < 1.6 * limit[1]
+
+
+def test_the_stated_covariance_is_consistent():
+    """NEES of 300 scans: mean of chi squared with 3 degrees of freedom, 99.9 % band."""
+    made, scene = estimator(ROOM)
+    outcome = tasks.Outcome()
+    for pose in scene.poses(300):
+        made.restart(pose, np.diag([1.0, 1.0, 1.0]))
+        outcome.add(feed(made, scene, pose, 1)[0], pose, None)
+    assert len(outcome.misfits) >= 298
+    assert np.mean(outcome.misfits) == pytest.approx(3, abs=3.3 * np.sqrt(6 / 300))
+
+
+@pytest.mark.parametrize("odometry", [False, True])
+def test_it_tracks_and_is_never_lost(odometry):
+    made, scene = estimator(ROOM)
+    (outcome,) = tasks.tracking(made, scene, 20.0, iter, odometry=odometry).values()
+    assert outcome.found == outcome.of == 300
+    rms = np.sqrt(np.mean(np.square(np.array(outcome.errors)[:, :2]).sum(1)))
+    assert rms < 1.3 * np.sqrt(np.mean(np.square(outcome.bounds)))
+
+
+def test_carried_off_it_is_found_again_by_the_next_scan():
+    made, scene = estimator(load_world("maze"))  # no two places alike, as there are in the empty room
+    outcome = tasks.kidnapped(made, scene, 15, iter)
+    assert outcome["kidnapped, 1 scan"].found == 15
+    assert outcome["kidnapped, 3 scans"].wrong == 0
+
+
+def test_people_in_the_way():
+    made, scene = estimator(ROOM)
+    outcome = tasks.blocked(made, scene, 20, iter)["30 % blocked, 1 scan"]
+    assert outcome.found >= 18
+    assert np.median(np.hypot(*np.array(outcome.errors)[:, :2].T)) < 0.01
+
+
+def test_two_rooms_alike_are_both_kept_until_a_scan_tells():
+    made, scene = estimator(TWINS)
+    outcome = tasks.twins(made, scene, 6, iter)
+    assert outcome["two rooms alike: both kept"].found == 6
+    assert outcome["two rooms alike: right after"].found == 6
+
+
+def test_in_a_corridor_without_features_the_covariance_says_so():
+    """Two walls 60 m long, a scanner that sees 25 m: nothing is known along them, much across."""
+    hall = World(name="hall", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)])
+    made, scene = estimator(hall, 90)
+    pose = np.array([30.0, 0.9, 0.1])
+    made.restart(pose, np.diag([0.04, 0.04, 0.01]))
+    for k, posterior in enumerate(feed(made, scene, pose, 10)):
+        along, across = np.sqrt(np.diag(posterior.covariance)[:2])
+        assert along > 0.15, k
+        assert across < 0.01, k
+    limit = np.linalg.inv(bound.information(scene, pose[None])[0])
+    assert limit[0, 0] > 100 * limit[1, 1]
+
+
+def test_begun_near_a_pose_it_stays_near():
+    made, scene = estimator(TWINS)
+    pose = np.array([7.5, 2.6, 0.4])
+    made.restart(pose + np.array([0.2, -0.1, 0.1]))
+    posterior = feed(made, scene, pose, 1)[0]
+    assert posterior.state == "tracking"
+    assert np.abs(off(posterior, pose)).max() < 0.02
+
+
+def test_scans_that_nothing_explains():
+    made, scene = estimator(ROOM)
+    rng, angles = np.random.default_rng(0), scene.scanner.angles()
+    garbage = [Observation(rng.uniform(0.1, 20, BEAMS), angles, 25.0, k / 15) for k in range(3)]
+    assert [made.update(o).state for o in garbage] == ["localising"] * 3
+    pose = np.array([3.0, 1.5, 1.0])
+    assert feed(made, scene, pose, 3, 3)[-1].state == "tracking"
+    posterior = [made.update(o) for o in garbage][-1]
+    assert posterior.state == "lost"
+    assert feed(made, scene, pose, 2, 9)[-1].state == "tracking"
+
+
+@pytest.mark.parametrize("value", [np.inf, -np.inf])
+def test_scans_without_a_single_range_do_no_harm(value):
+    made, scene = estimator(ROOM)
+    pose = np.array([3.0, 1.5, 1.0])
+    empty = Observation(np.full(BEAMS, value), scene.scanner.angles(), 25.0, 0.0)
+    for posterior in (made.update(empty), *feed(made, scene, pose, 2, 1), made.update(empty)):
+        assert np.isfinite(posterior.pose).all()
+        assert np.isfinite(posterior.covariance).all()
+        assert np.isfinite(posterior.free_energy)
+    assert np.abs(off(feed(made, scene, pose, 3, 5)[-1], pose)).max() < 0.02
+
+
+def test_the_same_scans_give_the_same_beliefs():
+    def run():
+        made, scene = estimator(ROOM)
+        return np.array([p.pose for p in feed(made, scene, np.array([3.0, 1.5, 1.0]), 5)])
+
+    assert np.array_equal(run(), run())
+
+
+@pytest.mark.parametrize("world", ["corridor", "maze", "office"])
+def test_shipped_fields_find_the_robot_anywhere(world):
+    """Poses, seeds and noise that nothing was tuned on: 20 of 20, a few millimetres."""
+    scene = Scene.of(load_world(world), 622, 4242)
+    scanner = scene.scanner
+    made = prepare(Choice(world))(Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max))
+    errors = []
+    for pose in scene.poses(20):
+        made.restart()
+        errors.append(off(feed(made, scene, pose, 1)[0], pose))
+    position = np.hypot(*np.array(errors)[:, :2].T)
+    assert position.max() < 0.02
+    assert np.median(position) < 0.003
+    assert np.rad2deg(np.median(np.abs(np.array(errors)[:, 2]))) < 0.06

@@ -1,0 +1,163 @@
+"""The likelihood is a density, its gradient is the gradient, the descent descends, fusion is Bayes' rule."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common import se2
+from services.estimator.generative import Expected, RayCaster
+from services.estimator.precise.gauss_newton import Prior, View, descend, polish
+from services.estimator.precise.likelihood import Likelihood
+from services.estimator.precise.mixture import Mode, distinct, weigh
+from services.estimator.precise.motion import Candidate, MotionNoise, candidates, fuse
+from services.estimator.precise.seeding import Seeds, thin_places
+from tests.estimator.models import ROOM
+
+MOUNT = np.array([0.2, 0.05, 0.3])
+ANGLES = np.deg2rad(np.linspace(-135, 135, 200))
+TRUTH = np.array([3.1, 1.4, 0.7])
+
+
+def scan(pose, rng, sigma=0.02):
+    clean = ROOM.ray_distances(se2.compose(pose, MOUNT)[None], ANGLES)[0]
+    return clean + sigma * rng.standard_normal(len(clean))
+
+
+def view(ranges, likelihood=None):
+    return View(RayCaster(ROOM), likelihood or Likelihood(), MOUNT, ANGLES, ranges, 25.0)
+
+
+@pytest.mark.parametrize(("expected", "scale"), [(5.0, 1e-3), (5.0, 0.3), (12.0, 0.05)])
+def test_the_likelihood_is_a_density(expected, scale):
+    o = np.linspace(0, 25.0, 2_000_001)
+    density = Likelihood().density(o, expected, scale, 25.0)
+    assert density.sum() * (o[1] - o[0]) == pytest.approx(1, rel=1e-4)
+
+
+def test_accuracy_is_the_sum_of_minus_log_densities():
+    likelihood, rng = Likelihood(), np.random.default_rng(0)
+    g, m = rng.uniform(1, 9, 50), rng.uniform(1e-3, 0.1, 50)
+    o = np.clip(g + rng.normal(0, 0.5, 50) * (rng.random(50) < 0.5), 0.1, 24)
+    found = likelihood.evaluate(o, 25.0, Expected(g[None], m[None], np.zeros((1, 50, 3))))
+    by_hand = -sum(np.log(likelihood.density(np.array([a]), b, c, 25.0)[0]) for a, b, c in zip(o, g, m, strict=True))
+    assert found.accuracy[0] == pytest.approx(by_hand)
+
+
+def test_no_return_is_evidence_and_too_close_is_not():
+    likelihood = Likelihood()
+    expected = Expected(np.array([[3.0, np.inf, 3.0]]), np.full((1, 3), 1e-3), np.ones((1, 3, 3)))
+
+    def accuracy(*o):
+        return likelihood.evaluate(np.array(o), 25.0, expected).accuracy[0]
+
+    assert accuracy(np.inf, np.inf, -np.inf) == pytest.approx(-np.log(0.05) - np.log(0.95))
+    assert accuracy(-np.inf, -np.inf, -np.inf) == 0
+    assert accuracy(3.0, -np.inf, -np.inf) < accuracy(np.inf, -np.inf, -np.inf)
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=30, deadline=None)
+def test_xi_is_minus_the_gradient_of_accuracy_by_base_link(seed):
+    rng = np.random.default_rng(seed)
+    pose = TRUTH + rng.normal(0, [0.01, 0.01, 0.005])
+    # Wide deviations: no beam may jump between surfaces within the step.
+    seen = view(scan(TRUTH, rng), Likelihood(sigma=0.5))
+    found = seen.evidence(pose[None]).xi[0]
+    step = 1e-6
+    for axis in range(3):
+        offset = step * np.eye(3)[axis]
+        low, high = seen.evidence(np.array([pose - offset, pose + offset])).accuracy
+        assert found[axis] == pytest.approx(-(high - low) / (2 * step), rel=2e-2, abs=2.0)
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=20, deadline=None)
+def test_the_descent_lowers_f_and_finds_the_truth(seed):
+    rng = np.random.default_rng(seed)
+    seen = view(scan(TRUTH, rng))
+    starts = TRUTH + rng.normal(0, [0.1, 0.1, 0.05], (8, 3))
+    before = seen.evidence(starts, 0.1).accuracy
+    poses, after = descend(seen, starts, None, 0.1)
+    assert (after.accuracy <= before).all()
+    poses, evidence = polish(seen, poses)
+    best = int(evidence.accuracy.argmin())
+    assert np.hypot(*(poses[best] - TRUTH)[:2]) < 0.02
+    assert evidence.explained[best] > 0.9
+
+
+def test_a_prior_holds_where_the_scan_says_nothing():
+    nothing = view(np.full(len(ANGLES), -np.inf))
+    prior = Prior(TRUTH[None], np.diag([100.0, 100.0, 400.0])[None])
+    poses, _ = descend(nothing, TRUTH[None] + 0.2, prior)
+    assert np.abs(poses[0] - TRUTH).max() < 1e-3
+
+
+@given(st.integers(0, 10_000))
+def test_fusing_is_bayes_rule_for_gaussians(seed):
+    rng = np.random.default_rng(seed)
+    a, b = rng.normal(0, 0.1, (2, 3, 3))
+    P, H = a @ a.T + 0.01 * np.eye(3), np.linalg.inv(b @ b.T + 0.01 * np.eye(3))
+    prior, seen = rng.normal(0, 0.2, (2, 3))
+    mode = seen + rng.normal(0, 0.05, 3)  # any point will do to expand a parabola
+    found = fuse(Candidate("x", prior, P, 0.5), mode, H @ (seen - mode), H)
+    information = np.linalg.inv(P) + H
+    assert found.mean == pytest.approx(np.linalg.solve(information, np.linalg.inv(P) @ prior + H @ seen), abs=1e-6)
+    assert found.information == pytest.approx(information, rel=1e-6)
+    # Evidence: the scan's mean is N(prior, P + H^-1) distributed.
+    S = P + np.linalg.inv(H)
+    off = seen - prior
+    by_hand = 0.5 * off @ np.linalg.solve(S, off) + 0.5 * np.linalg.slogdet(S @ H)[1] - np.log(0.5)
+    assert found.surprise == pytest.approx(by_hand, rel=1e-4, abs=1e-4)
+    assert found.complexity >= -1e-6
+
+
+def test_motion_priors():
+    noise, P = MotionNoise(), 1e-6 * np.eye(3)
+    standing, going, wide = candidates(noise, TRUTH, P, 0.1, velocity=np.array([1.0, 0, 0]))
+    assert standing.mean == pytest.approx(TRUTH)
+    assert going.mean == pytest.approx(se2.compose(TRUTH, [0.1, 0, 0]))
+    assert [np.trace(c.covariance[:2, :2]) for c in (standing, going, wide)] == sorted(
+        np.trace(c.covariance[:2, :2]) for c in (standing, going, wide)
+    )
+    odom, _ = candidates(noise, TRUTH, P, 0.1, odom=np.array([0.1, 0, 0.2]), velocity=np.ones(3))
+    assert odom.mean == pytest.approx(se2.compose(TRUTH, [0.1, 0, 0.2]))
+    commanded = candidates(noise, TRUTH, P, 0.1, command=np.array([0.5, 0, 0]), velocity=np.ones(3))[1]
+    assert commanded.name == "commanded"
+    assert commanded.mean == pytest.approx(se2.compose(TRUTH, [0.05, 0, 0]))
+    assert sum(c.probability for c in (standing, going, wide)) == pytest.approx(1)
+
+
+def mode(x, energy):
+    return Mode(np.array([x, 0.0, 0.0]), np.eye(3), np.zeros((3, 3)), 1.0, energy, 0.0, energy, np.zeros(3), np.eye(3))
+
+
+def test_modes_are_merged_weighed_and_dropped():
+    found = weigh([mode(5.0, 20.0), mode(0.0, 0.0), mode(0.01, 3.0), mode(9.0, 5000.0)], 20.0, 8)
+    assert [m.pose[0] for m in found] == [0.0, 5.0]
+    assert found[0].weight / found[1].weight == pytest.approx(np.e)
+    assert sum(m.weight for m in found) == pytest.approx(1)
+
+
+def test_headings_a_turn_apart_are_one():
+    poses = np.array([[0, 0, np.pi - 0.01], [0, 0, -np.pi + 0.01], [0, 0, 0.0]])
+    assert distinct(poses, np.array([1.0, 0.0, 2.0]), 8) == [1, 2]
+
+
+def test_ranking_puts_the_truth_among_the_first():
+    rng = np.random.default_rng(3)
+    seeds = Seeds.at(RayCaster(ROOM), thin_places(ROOM.sample_free(2000, rng, 0.05), 0.3))
+    for _ in range(10):
+        pose = np.array([*ROOM.sample_free(1, rng, 0.27)[0], rng.uniform(-np.pi, np.pi)])
+        ranked = seeds.rank(view(scan(pose, rng)), 30)
+        near = np.hypot(*(ranked - pose)[:, :2].T) < 0.4
+        assert (near & (np.abs(se2.wrap(ranked[:, 2] - pose[2])) < 0.2)).any()
+
+
+def test_one_place_a_square():
+    points = np.random.default_rng(0).uniform(0, 3, (5000, 2))
+    thin = thin_places(points, 0.5)
+    assert len(thin) == 36
+    assert len({(int(x / 0.5), int(y / 0.5)) for x, y in thin}) == 36

@@ -1,0 +1,86 @@
+"""Generative models: ranges against exact rays, derivatives against finite differences."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.world import World
+from services.estimator.generative import RayCaster
+from services.estimator.precise.field import DistanceField, FieldModel
+from tests.estimator.models import ROOM
+
+ANGLES = np.deg2rad(np.linspace(-135, 135, 61))
+BOX = World(name="box", boundary=[(0, 0), (6, 0), (6, 4), (0, 4)])
+
+
+def analytic(resolution: float = 0.05) -> DistanceField:
+    """The exact distance to the walls of an empty 6 m x 4 m room, negative outside, and a disc of 0.4 m in it."""
+    x, y = np.meshgrid(np.arange(-0.5, 6.5, resolution), np.arange(-0.5, 4.5, resolution))
+    walls = np.minimum(np.minimum(x, 6 - x), np.minimum(y, 4 - y))
+    disc = np.hypot(x - 4.5, y - 3) - 0.4
+    return DistanceField(np.minimum(walls, disc).astype(np.float32), (-0.5, -0.5), resolution)
+
+
+ANALYTIC_WORLD = World(name="disc", boundary=BOX.boundary, obstacles=[{"circle": {"center": (4.5, 3), "radius": 0.4}}])
+
+
+def poses_in(world: World, count: int, seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.column_stack([world.sample_free(count, rng, 0.1), rng.uniform(-np.pi, np.pi, count)])
+
+
+@pytest.mark.parametrize("world", [ROOM, BOX, ANALYTIC_WORLD])
+def test_the_ray_caster_is_exact(world):
+    poses = poses_in(world, 50, 0)
+    assert RayCaster(world).expect(poses, ANGLES).ranges == pytest.approx(world.ray_distances(poses, ANGLES), abs=1e-9)
+
+
+def test_a_field_predicts_what_exact_rays_do():
+    poses = poses_in(ANALYTIC_WORLD, 100, 1)
+    found = analytic().trace(poses, ANGLES)
+    error = np.abs(found.ranges - ANALYTIC_WORLD.ray_distances(poses, ANGLES))
+    # A curve of 0.4 m between nodes 0.05 m apart bulges by 0.05² / (8 * 0.4) = 0.8 mm.
+    assert np.quantile(error, 0.98) < 2e-3
+    unsure = (found.dip < 0.03) | (found.edge < 0.75) | (found.facing < 0.3)
+    assert error[~unsure].max() < 5e-3
+    assert error[unsure].max() > 0.1  # where it errs, the classes know
+
+
+def _differences(model, pose, angles, step):
+    rows = []
+    for axis in range(3):
+        offset = step * np.eye(3)[axis]
+        ranges = model.expect(np.array([pose + offset, pose - offset]), angles).ranges
+        rows.append((ranges[0] - ranges[1]) / (2 * step))
+    return np.array(rows).T
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=40, deadline=None)
+def test_derivatives_are_those_of_the_ranges(seed):
+    pose = poses_in(ANALYTIC_WORLD, 1, seed)[0]
+    for model, step, tolerance in (
+        (RayCaster(ANALYTIC_WORLD), 1e-6, 1e-4),
+        (FieldModel(analytic(0.02)), 2e-4, 0.05),
+    ):
+        found = model.expect(pose[None], ANGLES).jacobian[0]
+        numeric = _differences(model, pose, ANGLES, step)
+        # A beam that jumps between surfaces, or grazes one, has no derivative to compare with.
+        smooth = (np.abs(numeric).max(axis=1) < 8) & (np.abs(found).max(axis=1) < 8)
+        error = np.abs(found - numeric)[smooth] / (1 + np.abs(numeric[smooth]))
+        assert smooth.mean() > 0.4
+        assert np.quantile(error, 0.9) < tolerance
+
+
+def test_outside_the_grid_nothing_is_met():
+    open_field = DistanceField(np.full((20, 20), 1.0, np.float32), (0.0, 0.0), 0.1)
+    found = open_field.trace(np.array([[1.0, 1.0, 0.0], [9.0, 9.0, 0.0]]), ANGLES)
+    assert np.isinf(found.ranges).all()
+    assert not found.jacobian.any()
+
+
+def test_inside_a_surface_the_range_is_zero():
+    assert analytic().trace(np.array([[4.5, 3.0, 0.0]]), ANGLES).ranges.max() == 0

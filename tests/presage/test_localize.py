@@ -1,0 +1,162 @@
+"""`presage localize` over files made here: npz in every form, a recording, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from common import se2
+from common.errors import UserError
+from common.scanner import SCANNERS
+from common.world import load_world
+from presage.localize import COLUMNS, Job, choice_of, localize
+from presage.scan_files import clean, read_scans
+from tests.recorder.sessions import write
+
+SCANNER = SCANNERS["tim571"].with_beams(200)
+WORLD = load_world("corridor")
+PATH = np.column_stack([np.linspace(4, 4.6, 10), np.full(10, 1.5), np.linspace(1, 1.2, 10)])
+CONSOLE = Console(quiet=True)
+
+
+def npz(folder: Path, mount=SCANNER.mount, **changes) -> Path:
+    rng = np.random.default_rng(0)
+    lasers = se2.compose(PATH, np.array(mount))
+    ranges = WORLD.ray_distances(lasers, SCANNER.angles()) + 0.02 * rng.standard_normal((10, 200))
+    values = {
+        "ranges": ranges, "angles": SCANNER.angles(), "range_max": 25.0, "stamps": np.arange(10) / 15,
+        "odom": PATH - PATH[0], "initial_pose": PATH[0],
+    }  # fmt: skip
+    values = {name: value for name, value in {**values, **changes}.items() if value is not None}
+    file = folder / "scans.npz"
+    np.savez(file, **values)
+    return file
+
+
+def job(file, mode="global", frame="base_link", estimator="precise", model="learned", world="corridor", **more):
+    out = more.pop("out", None)
+    choice = choice_of(file, world, estimator, model, None, 0.02, 0, more.pop("initial_pose", ""))
+    given = {"fresh": False, "odometry": True, "out": out, **more}
+    return Job.of(file, choice, mode, frame, "0.2,0,0", **given)
+
+
+def errors(rows, path=PATH):
+    return np.hypot(*(np.array([[r["x"], r["y"]] for r in rows]) - path[:, :2]).T)
+
+
+@pytest.mark.parametrize("fresh", [False, True])
+@pytest.mark.parametrize("model", ["learned", "exact"])
+def test_a_csv_with_a_row_for_each_scan(tmp_path, fresh, model):
+    out = tmp_path / "poses.csv"
+    localize(job(npz(tmp_path), fresh=fresh, model=model, out=out), CONSOLE)
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == COLUMNS
+    assert len(rows) == 10
+    numbers = [{k: float(v) for k, v in row.items() if k != "state"} for row in rows]
+    assert errors(numbers).max() < 0.02
+    assert {row["state"] for row in rows} == {"tracking"}
+    assert all(row["cov_xx"] > 0 and row["update_ms"] > 0 for row in numbers)
+
+
+def test_json_says_what_was_run(tmp_path):
+    out = tmp_path / "poses.json"
+    localize(job(npz(tmp_path), out=out), CONSOLE)
+    data = json.loads(out.read_text())
+    assert {"world", "estimator", "model", "frame", "seed", "commit", "rows"} <= set(data)
+    assert len(data["rows"]) == 10
+
+
+def test_the_laser_frame_is_that_of_the_files_poses_too(tmp_path):
+    file = npz(tmp_path, mount=(0, 0, 0))  # PATH is the laser's
+    assert errors(localize(job(file, frame="laser"), CONSOLE)).max() < 0.02
+    assert errors(localize(job(file, frame="base_link"), CONSOLE)).min() > 0.15
+
+
+def test_only_what_is_needed(tmp_path):
+    file = npz(tmp_path, stamps=None, odom=None, initial_pose=None)
+    assert errors(localize(job(file), CONSOLE)).max() < 0.02
+    with pytest.raises(UserError, match="mode track needs where to begin"):
+        localize(job(file, mode="track"), CONSOLE)
+    assert errors(localize(job(file, mode="track", initial_pose="4,1.5,57"), CONSOLE)).max() < 0.02
+
+
+@pytest.mark.parametrize("estimator", ["particle-filter", "amcl-defaults"])
+def test_the_particle_filter_over_the_same_file(tmp_path, estimator):
+    rows = localize(job(npz(tmp_path), mode="track", estimator=estimator), CONSOLE)
+    assert errors(rows).max() < 0.5
+
+
+def test_the_standard_output_is_csv_alone(tmp_path, capsys):
+    localize(job(npz(tmp_path)), Console(stderr=True))
+    out = capsys.readouterr().out.splitlines()
+    assert out[0] == ",".join(COLUMNS)
+    assert len(out) == 11
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"ranges": None}, "lacks ranges"),
+        ({"angles": np.zeros(3)}, "angles has the shape"),
+        ({"odom": np.zeros((3, 3))}, "odom has the shape"),
+        ({"stamps": -np.arange(10.0)}, "not sorted"),
+        ({"range_max": -1.0}, "range_max"),
+        ({"initial_pose": np.full(3, np.nan)}, "not finite"),
+        ({"ranges": np.zeros((2, 3, 4))}, "not \\(N, B\\)"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_said(tmp_path, changes, why):
+    with pytest.raises(UserError, match=why) as error:
+        localize(job(npz(tmp_path, **changes)), CONSOLE)
+    assert "scans.npz" in str(error.value)
+
+
+def test_files_that_are_none(tmp_path):
+    garbage = tmp_path / "x.npz"
+    garbage.write_bytes(b"PK\x03\x04 not really")
+    for file, why in (
+        (garbage, "not an .npz"),
+        (tmp_path / "no.npz", "no such file"),
+        (tmp_path / "x.txt", "read from"),
+    ):
+        with pytest.raises(UserError, match=why):
+            read_scans(file, np.zeros(3))
+    pickled = tmp_path / "p.npz"
+    np.savez(pickled, ranges=np.array([{}], dtype=object), angles=np.zeros(3), range_max=1.0)
+    with pytest.raises(UserError, match="plain arrays"):
+        read_scans(pickled, np.zeros(3))
+
+
+def test_ranges_as_rep_117_has_them():
+    assert clean(np.array([[1.0, 25.0, np.inf, 0.0, np.nan, -np.inf]]), 25.0).tolist() == [
+        [1.0, np.inf, np.inf, -np.inf, -np.inf, -np.inf]
+    ]
+
+
+def test_words_that_are_not_known(tmp_path):
+    file = npz(tmp_path)
+    for wrong, why in (
+        ({"mode": "best"}, "no mode"), ({"frame": "map"}, "no frame"), ({"estimator": "kalman"}, "no estimator"),
+        ({"world": ""}, "--world"), ({"model": "best"}, "no model"), ({"initial_pose": "1"}, "initial-pose"),
+        ({"out": tmp_path / "x.txt"}, "csv or .json"), ({"out": tmp_path / "no" / "x.csv"}, "cannot be written"),
+    ):  # fmt: skip
+        with pytest.raises(UserError, match=why):
+            localize(job(file, **wrong), CONSOLE)
+
+
+def test_a_recording_says_its_world_and_its_truth(tmp_path):
+    file = tmp_path / "run.mcap"
+    write(file)
+    scans = read_scans(file, np.zeros(3))
+    assert scans.truth is not None
+    assert len(scans.stamps) == len(scans.ranges) == len(scans.truth)
+    rows = localize(job(file, world="", model="exact"), CONSOLE)
+    assert errors(rows, scans.truth).max() < 0.03
+    with pytest.raises(UserError, match="presage train --world hall"):  # no field was learned of that world
+        localize(job(file, world=""), CONSOLE)
