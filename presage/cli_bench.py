@@ -53,6 +53,9 @@ def bench_accuracy(
     estimators: Annotated[
         str, typer.Option(help="Of precise, precise-exact, particle-filter, amcl-defaults.")
     ] = "precise,precise-exact,particle-filter",
+    tasks: Annotated[
+        str, typer.Option(help="Of standing, blocked, kidnapped, tracking, odometry, twins; empty: all.")
+    ] = "",
     trials: Annotated[int, typer.Option(min=2, help="Places of each task.")] = 100,
     minutes: Annotated[float, typer.Option(min=0.05, help="Of each path that is tracked, at 15 Hz.")] = 2.0,
     seed: Annotated[int, typer.Option(min=0, max=2**31)] = 1,
@@ -63,11 +66,12 @@ def bench_accuracy(
     """Estimators and the Cramér-Rao bound side by side: from nothing, tracking, kidnapped, blocked, two rooms alike.
 
     Examples: `presage bench accuracy --trials 20 --minutes 0.5`;
+    `presage bench accuracy --tasks standing --trials 1000 --estimators precise`;
     `presage bench accuracy --worlds office,corridor,maze --beams 622,811 --json accuracy.json --figure accuracy.png`.
     """
     from presage.accuracy.report import bench_accuracy as run  # noqa: PLC0415
 
-    code = run(worlds, beams, estimators, trials, minutes, seed, workers, json_file, figure, console)
+    code = run(worlds, beams, estimators, tasks, trials, minutes, seed, workers, json_file, figure, console)
     raise typer.Exit(code)
 
 
@@ -91,14 +95,14 @@ def bench_speed(
 def bench_decoders(
     world: WorldName = "office",
     samples: Annotated[int, typer.Option(min=100, help="Scans to learn from.")] = 5000,
-    seconds: Annotated[float, typer.Option(min=1, help="Training of each network.")] = 120.0,
+    steps: Annotated[int, typer.Option(min=1, help="Of each network's training, 256 scans each.")] = 3000,
     seed: Annotated[int, typer.Option(min=0, max=2**31)] = 0,
     json_file: Json = None,
 ) -> None:
     """Generative models that were tried, learned from the same scans: error, size, training time.
 
-    Example: `presage bench decoders --seconds 20 --json decoders.json`.
+    Example: `presage bench decoders --steps 300 --json decoders.json`.
     """
     from presage.accuracy.decoders import bench_decoders as run  # noqa: PLC0415
 
-    raise typer.Exit(run(world, samples, seconds, seed, json_file, console))
+    raise typer.Exit(run(world, samples, steps, seed, json_file, console))

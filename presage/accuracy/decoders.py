@@ -57,27 +57,25 @@ def field(resolution: float, share: float = 1.0, sweeps: int = 10) -> Learn:
     return learn
 
 
-def panorama(seconds: float, **shape: Any) -> Learn:
-    """A network, trained for so long."""
+def panorama(steps: int, **shape: Any) -> Learn:
+    """A network, trained for so many steps of 256 scans."""
 
     def learn(scans: Scans) -> tuple[GenerativeModel, int]:
-        model = train_panorama(Shape(**shape), scans.poses, scans.angles, scans.ranges, seconds, 0)
+        model = train_panorama(Shape(**shape), scans.poses, scans.angles, scans.ranges, steps, 0)
         return model, sum(x.numel() for x in model.network.parameters())
 
     return learn
 
 
-def bench_decoders(
-    world: str, samples: int, seconds: float, seed: int, json_file: Path | None, console: Console
-) -> int:
+def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: Path | None, console: Console) -> int:
     """Learn each, measure, print, and write where asked."""
     check_file(json_file, "--json")
     tried: dict[str, Learn] = {
-        "panorama, Fourier features, SiLU, L1": panorama(seconds, loss="l1"),
-        "panorama, Fourier features, SiLU, learned precision": panorama(seconds),
-        "panorama, Fourier features, ReLU, learned precision": panorama(seconds, activation="relu"),
-        "panorama, 3 x 1024, learned precision": panorama(seconds, width=1024, layers=3),
-        "panorama, grids of 2 to 0.25 m, learned precision": panorama(seconds, inputs="grid"),
+        "panorama, Fourier features, SiLU, L1": panorama(steps, loss="l1"),
+        "panorama, Fourier features, SiLU, learned precision": panorama(steps),
+        "panorama, Fourier features, ReLU, learned precision": panorama(steps, activation="relu"),
+        "panorama, 3 x 1024, learned precision": panorama(steps, width=1024, layers=3),
+        "panorama, grids of 2 to 0.25 m, learned precision": panorama(steps, inputs="grid"),
         "distance field, 0.08 m": field(0.08),
         "distance field, 0.04 m, surfaces alone (no sweeps)": field(0.04, sweeps=0),
         "distance field, 0.04 m, a tenth of the scans": field(0.04, share=0.1),
@@ -112,5 +110,5 @@ def bench_decoders(
     console.print(
         "position: error of the pose found from scans without noise, begun at the truth: what the model leaves"
     )
-    write_json(json_file, {"rows": rows, "samples": samples, "network_seconds": seconds, **about(seed)})
+    write_json(json_file, {"rows": rows, "samples": samples, "network_steps": steps, **about(seed)})
     return 0

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from common.errors import UserError
 from common.world import load_world
-from presage.accuracy.running import CHOICES, Job, about, run_all
+from presage.accuracy.running import CHOICES, TASKS, Job, about, run_all
 from presage.output import check_file, write_json
 
 # Colours and marks that the colour-blind can tell apart (Okabe & Ito).
@@ -24,7 +24,7 @@ MARKS = {
 
 
 def bench_accuracy(
-    worlds: str, beams: str, estimators: str, trials: int, minutes: float, seed: int, workers: int,
+    worlds: str, beams: str, estimators: str, tasks: str, trials: int, minutes: float, seed: int, workers: int,
     json_file: Path | None, figure: Path | None, console: Console,
 ) -> int:  # fmt: skip
     """Measure, print, and write where asked."""
@@ -36,13 +36,16 @@ def bench_accuracy(
         counts = [int(part) for part in beams.split(",")]
     except ValueError:
         raise UserError(f"--beams {beams!r}: give numbers, such as 622,811") from None
+    wanted = tuple(tasks.split(",")) if tasks else TASKS
+    if missing := [name for name in wanted if name not in TASKS]:
+        raise UserError(f"no task {missing[0]!r}: choose from {', '.join(TASKS)}")
     names = worlds.split(",")
     for name in names:
         load_world(name)
     check_file(json_file, "--json")
     check_file(figure, "--figure")
     jobs = [
-        Job(estimator, world, count, trials, minutes * 60, seed)
+        Job(estimator, world, count, trials, minutes * 60, seed, wanted)
         for world in names for count in counts for estimator in chosen
     ]  # fmt: skip
     rows = run_all(jobs, workers, console)

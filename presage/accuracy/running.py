@@ -40,6 +40,7 @@ CHOICES: dict[str, tuple[Name, str]] = {
 }
 ONE_CORE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 DEGREES_OF_FREEDOM = 3
+TASKS = ("standing", "blocked", "kidnapped", "tracking", "odometry", "twins")
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,7 @@ class Job:
     trials: int
     seconds: float
     seed: int
+    tasks: tuple[str, ...] = TASKS
 
 
 def run_all(jobs: list[Job], workers: int, console: Console) -> list[dict[str, Any]]:
@@ -71,14 +73,17 @@ def run(job: Job) -> list[dict[str, Any]]:
     estimator = prepare(Choice(job.world, name, model, seed=job.seed))(geometry)
     outcomes: dict[str, tasks.Outcome] = {}
     for number, task in enumerate((tasks.standing, tasks.blocked, tasks.kidnapped)):
-        outcomes |= task(estimator, Scene.of(world, job.beams, job.seed * 100 + number), job.trials, _quiet)
-    for number, odometry in enumerate((False, True)):
-        scene = Scene.of(world, job.beams, job.seed * 100 + 10 + number)
-        outcomes |= tasks.tracking(estimator, scene, job.seconds, _quiet, odometry=odometry)
+        if task.__name__ in job.tasks:
+            outcomes |= task(estimator, Scene.of(world, job.beams, job.seed * 100 + number), job.trials, _quiet)
+    for number, name_of_task in enumerate(("tracking", "odometry")):
+        if name_of_task in job.tasks:
+            scene = Scene.of(world, job.beams, job.seed * 100 + 10 + number)
+            outcomes |= tasks.tracking(estimator, scene, job.seconds, _quiet, odometry=name_of_task == "odometry")
     rows = [_row(job, job.world, task, outcome) for task, outcome in outcomes.items()]
-    alike = tasks.twins(
-        _among_twins(job, geometry), Scene.of(TWINS, job.beams, job.seed * 100 + 20), job.trials, _quiet
-    )
+    if "twins" not in job.tasks:
+        return rows
+    scene = Scene.of(TWINS, job.beams, job.seed * 100 + 20)
+    alike = tasks.twins(_among_twins(job, geometry), scene, job.trials, _quiet)
     return rows + [_row(job, TWINS.name, task, outcome) for task, outcome in alike.items()]
 
 

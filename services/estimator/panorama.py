@@ -7,7 +7,6 @@ by the Laplace negative log-likelihood |o - mu| exp(-b) + b. `presage bench deco
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -135,10 +134,8 @@ class PanoramaModel:
         return Expected(np.maximum(between(mean), 0.0), between(scale), jacobian)
 
 
-def train_panorama(
-    shape: Shape, lasers: Array, angles: Array, ranges: Array, seconds: float, seed: int
-) -> PanoramaModel:
-    """From scans (N, B) m at laser poses (N, 3), for about ``seconds``; a cosine takes the rate to zero."""
+def train_panorama(shape: Shape, lasers: Array, angles: Array, ranges: Array, steps: int, seed: int) -> PanoramaModel:
+    """From scans (N, B) m at laser poses (N, 3), in ``steps`` of 256 scans; a cosine takes the rate to zero."""
     torch.manual_seed(seed)
     low, high = lasers[:, :2].min(0), lasers[:, :2].max(0)
     center, size = (low + high) / 2, (float(high[0] - low[0]), float(high[1] - low[1]))
@@ -150,11 +147,10 @@ def train_panorama(
     rest = [x for name, x in network.named_parameters() if "grids" not in name]
     optimiser = torch.optim.Adam([{"params": rest, "lr": 1e-3}] + [{"params": grids, "lr": 1e-2}] * bool(grids))
     first = [group["lr"] for group in optimiser.param_groups]
-    began = time.monotonic()
-    while (done := (time.monotonic() - began) / seconds) < 1:
+    for step in range(steps):
         batch = torch.randint(len(p), (BATCH,))
         for group, rate in zip(optimiser.param_groups, first, strict=True):
-            group["lr"] = rate * 0.5 * (1 + math.cos(math.pi * done))
+            group["lr"] = rate * 0.5 * (1 + math.cos(math.pi * step / steps))
         mean, log_scale = network(p[batch])
         error = (mean - target[batch]).abs()
         loss = error * torch.exp(-log_scale) + log_scale if shape.loss == "laplace" else error + 0 * log_scale
