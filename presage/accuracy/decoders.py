@@ -17,13 +17,18 @@ from common.world import load_world
 from presage.accuracy.running import about
 from presage.accuracy.scenes import Scene
 from presage.output import check_file, write_json
+from services.estimator import decoder, training
+from services.estimator.decoder import Normalisation
 from services.estimator.generative import GenerativeModel
 from services.estimator.panorama import Shape, train_panorama
+from services.estimator.paper_perception import PaperScans
 from services.estimator.precise.evaluation import evaluate
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning import Beams, Recipe, learn_field, learn_scales
 
 COLUMNS = ("learning s", "numbers", "range median mm", "mean mm", "> 5 cm %", "position median mm", "RMS mm")
+PAPER = "the paper's decoder, L1, one heading"
+HEADING = np.pi / 2  # rad, the one heading
 TEST, CALIBRATION = 200, 300  # scans
 Learn = Callable[["Scans"], tuple[GenerativeModel, int]]  # model, numbers it stores
 
@@ -31,17 +36,19 @@ Learn = Callable[["Scans"], tuple[GenerativeModel, int]]  # model, numbers it st
 class Scans:
     """Noisy scans to learn from, clean ones to calibrate and to test with; the laser in the middle of base_link."""
 
-    def __init__(self, world: str, samples: int, seed: int) -> None:
-        scene = Scene(load_world(world), SCANNERS["tim571"].model_copy(update={"mount": (0.0, 0.0, 0.0)}), _rng(seed))
+    def __init__(self, world: str, samples: int, seed: int, heading: float | None = None) -> None:
+        """At any heading, or at one."""
+        self.world, self.seed = load_world(world), seed
+        self.scanner = SCANNERS["tim571"].model_copy(update={"mount": (0.0, 0.0, 0.0)})
+        scene = Scene(self.world, self.scanner, np.random.default_rng(seed))
         self.angles, self.sigma = scene.scanner.angles(), scene.scanner.sigma
         self.poses, self.calibration, self.test = (scene.poses(n) for n in (samples, CALIBRATION, TEST))
+        if heading is not None:
+            for poses in (self.poses, self.calibration, self.test):
+                poses[:, 2] = heading
         clean = scene.clean(self.poses)
         self.ranges = clean + self.sigma * scene.rng.standard_normal(clean.shape)
         self.calibration_ranges, self.test_ranges = scene.clean(self.calibration), scene.clean(self.test)
-
-
-def _rng(seed: int) -> np.random.Generator:
-    return np.random.default_rng(seed)
 
 
 def field(resolution: float, share: float = 1.0, sweeps: int = 10) -> Learn:
@@ -67,10 +74,28 @@ def panorama(steps: int, **shape: Any) -> Learn:
     return learn
 
 
+def paper(epochs: int) -> Learn:
+    """The paper's decoder, at one heading."""
+
+    def learn(scans: Scans) -> tuple[GenerativeModel, int]:
+        x0, y0, x1, y1 = scans.world.bounds
+        norm = Normalisation(((x0 + x1) / 2, (y0 + y1) / 2), ((x1 - x0) / 2, (y1 - y0) / 2), float(scans.ranges.max()))
+        recipe = training.Recipe(epochs=epochs, learning_rate=3e-3)
+        data = training.Data(scans.poses, scans.ranges)
+        held_out = training.Data(scans.calibration, scans.calibration_ranges)
+        trainer = training.Trainer(decoder.Shape(len(scans.angles), 128, 8), norm, recipe, data, held_out)
+        model = trainer.run()
+        size = sum(x.numel() for x in trainer.decoder.parameters())
+        return PaperScans(model, scans.scanner, HEADING, trainer.progress.test_l1[-1]), size
+
+    return learn
+
+
 def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: Path | None, console: Console) -> int:
     """Learn each, measure, print, and write where asked."""
     check_file(json_file, "--json")
     tried: dict[str, Learn] = {
+        PAPER: paper(max(1, steps // 50)),
         "panorama, Fourier features, SiLU, L1": panorama(steps, loss="l1"),
         "panorama, Fourier features, SiLU, learned precision": panorama(steps),
         "panorama, Fourier features, ReLU, learned precision": panorama(steps, activation="relu"),
@@ -82,9 +107,10 @@ def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: P
         "distance field, 0.04 m": field(0.04),
         "distance field, 0.02 m": field(0.02),
     }
-    scans = Scans(world, samples, seed)
+    any_heading, one_heading = Scans(world, samples, seed), Scans(world, samples, seed, HEADING)
     rows: list[dict[str, Any]] = []
     for name, learn in track(list(tried.items()), "learning", console=console, transient=True):
+        scans = one_heading if name == PAPER else any_heading
         began = time.monotonic()
         model, size = learn(scans)
         took = time.monotonic() - began

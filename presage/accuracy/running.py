@@ -60,6 +60,8 @@ def run_all(jobs: list[Job], workers: int, console: Console) -> list[dict[str, A
     """Rows of all jobs, in order; with progress."""
     for name in ONE_CORE:
         os.environ[name] = "1"
+    if workers == 1:
+        return [row for job in track(jobs, "measuring", console=console, transient=True) for row in run(job)]
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         done = track(pool.map(run, jobs), "measuring", total=len(jobs), console=console, transient=True)
         return [row for rows in done for row in rows]

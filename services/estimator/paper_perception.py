@@ -70,20 +70,20 @@ class PaperPerception:
 class PaperScans:
     """The paper's decoder as a generative model: one heading, the beams of its training, no derivative by yaw."""
 
-    def __init__(self, model: PaperModel, card: ModelCard) -> None:
-        """The stated precision is the decoder's mean error on test scans, for every beam."""
-        self.model, self.card = model, card
+    def __init__(self, model: PaperModel, scanner: Scanner, heading: float, scale: float) -> None:
+        """``scale`` m is the stated error of every beam: this decoder has one precision for all."""
+        self.model, self.scanner, self.heading, self.scale = model, scanner, heading, scale
 
     def expect(self, lasers: Array, angles: Array) -> Expected:
         """See GenerativeModel; raises UserError for other beams than those of the training."""
-        scanner = self.card.scanner
+        scanner = self.scanner
         own = scanner.angles()
         index = np.abs(own[None, :] - se2.wrap(angles)[:, None]).argmin(axis=1)
         if np.abs(own[index] - angles).max() > scanner.angle_increment:
             raise UserError("the paper's decoder predicts the beams of its training alone")
         poses = se2.compose(np.asarray(lasers, float).reshape(-1, 3), se2.inverse(np.array(scanner.mount)))
-        poses[:, 2] = self.card.heading
+        poses[:, 2] = self.heading
         rows = [self.model.predict(pose) for pose in poses]
         ranges = np.array([row[0][index] for row in rows])
         jacobian = np.array([row[1][index] for row in rows])
-        return Expected(ranges, np.full(ranges.shape, self.card.test_l1_mean), jacobian)
+        return Expected(ranges, np.full(ranges.shape, self.scale), jacobian)

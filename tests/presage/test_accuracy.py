@@ -1,0 +1,105 @@
+"""The benches' own parts: paths a robot can drive, a bound that is one, rows that say what was measured."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from common import se2
+from common.errors import UserError
+from common.robot import Robot
+from common.world import load_world
+from presage.accuracy import bound
+from presage.accuracy.report import bench_accuracy
+from presage.accuracy.scenes import TWINS, Scene, alike, twin_path
+from services.simulator.odometry import Drift
+
+CONSOLE = Console(quiet=True)
+
+
+@pytest.mark.parametrize("world", ["office", "maze"])
+def test_a_path_is_one_a_robot_can_drive(world):
+    scene = Scene.of(load_world(world), 60, 0)
+    path = scene.path(60)
+    assert len(path) == 900
+    step = np.diff(path, axis=0)
+    speed = np.hypot(step[:, 0], step[:, 1]) * scene.scanner.rate
+    assert speed.max() < 1.0 + 1e-6
+    assert speed.mean() > 0.2
+    assert np.abs(se2.wrap(step[:, 2])).max() * scene.scanner.rate < 1.0 + 1e-6
+    assert scene.world.clearance(path[:, :2]).min() > Robot().radius - 1e-6
+
+
+def test_the_bound_is_that_of_the_exact_rays_by_finite_differences():
+    scene = Scene.of(load_world("maze"), 200, 0)
+    pose, step = scene.poses(1)[0], 1e-5
+    columns = []
+    for axis in range(3):
+        offset = step * np.eye(3)[axis]
+        ahead, back = scene.clean(np.array([pose + offset, pose - offset]))
+        columns.append((ahead - back) / (2 * step))
+    J = np.array(columns).T
+    J = J[np.abs(J).max(axis=1) < 50]  # a beam that jumps within the step has no derivative
+    by_hand = J.T @ J / scene.scanner.sigma**2
+    assert bound.information(scene, pose[None])[0] == pytest.approx(by_hand, rel=0.05, abs=0.02 * by_hand.max())
+
+
+def test_odometry_only_tightens_the_bound_and_standing_adds_up():
+    scene = Scene.of(load_world("maze"), 200, 0)
+    path = scene.path(3)
+    alone, along = bound.single(scene, path), bound.recursive(scene, path, Drift())
+    assert (bound.position(along) <= bound.position(alone) + 1e-12).all()
+    still = np.tile(path[:1], (20, 1))
+    last = bound.recursive(scene, still, Drift(0, 0, 0, 0))[-1]
+    assert last == pytest.approx(bound.single(scene, path[:1], 20)[0], rel=1e-3)
+
+
+def test_blocked_is_at_least_the_share_asked_for_and_only_shorter():
+    scene = Scene.of(load_world("office"), 622, 0)
+    for clean in scene.clean(scene.poses(10)):
+        blocked = scene.blocked(clean, 0.3)
+        assert (blocked <= clean).all()
+        assert (blocked < clean).mean() >= 0.3
+
+
+def test_twins_are_twins_until_the_corridor():
+    scene = Scene.of(TWINS, 200, 1)
+    path, same = twin_path(scene)
+    assert 5 <= same < len(path)
+    left = path - np.array([6.1, 0, 0]) if path[0, 0] > 6 else path
+    assert alike(scene, left)[:same].all()
+    assert not alike(scene, left)[-1]
+    assert TWINS.clearance(path[:, :2]).min() > Robot().radius
+
+
+def test_rows_say_what_was_measured(tmp_path):
+    file, figure = tmp_path / "a.json", tmp_path / "a.png"
+    code = bench_accuracy("maze", "200", "precise-exact", "standing,odometry", 3, 0.1, 5, 1, file, figure, CONSOLE)
+    assert code == 0
+    data = json.loads(file.read_text())
+    rows = {row["task"]: row for row in data["rows"]}
+    assert set(rows) == {"from nothing, 1 scan", "standing, 20 scans", "tracking, odometry"}
+    assert rows["tracking, odometry"]["of"] == 90
+    assert 0 < rows["tracking, odometry"]["position_error_rms_m"] < 0.02
+    assert rows["standing, 20 scans"]["bound_rms_m"] == pytest.approx(
+        rows["from nothing, 1 scan"]["bound_rms_m"] / np.sqrt(20)
+    )
+    assert {"seed", "commit", "arguments"} <= set(data)
+    assert figure.stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("nowhere", "622", "precise", ""), "no world"),
+        (("office", "many", "precise", ""), "--beams"),
+        (("office", "622", "best", ""), "no estimator"),
+        (("office", "622", "precise", "running"), "no task"),
+    ],
+)
+def test_words_that_are_not_known(words, why):
+    with pytest.raises(UserError, match=why):
+        bench_accuracy(*words, 2, 0.1, 0, 1, None, None, CONSOLE)
