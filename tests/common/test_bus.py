@@ -186,7 +186,8 @@ def test_life_and_death_are_seen(bus, link):
         assert wait_until(lambda: bus.alive() == {"estimator"}, PATIENCE)
         late = []
         bus.watch_alive(lambda service, there: late.append((service, there)))  # one that comes late hears it too
-        assert wait_until(lambda: late == [("estimator", True)], PATIENCE)
+        # What was there before and what comes may both be told: once or twice, but nothing else.
+        assert wait_until(lambda: set(late) == {("estimator", True)}, PATIENCE)
     assert wait_until(lambda: changes[-1] == ("estimator", False), PATIENCE)
     assert bus.alive() == set()
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 
+import pytest
+
 from common.bus import wait_until
 from common.inbox import Inbox, Sample
 from common.messages import Belief
@@ -16,7 +18,8 @@ obstacles:
   - circle: {center: [4, 2], radius: 0.3}
 start: {x: 1.5, y: 1.5, yaw_deg: 90}
 """
-SMALL = ("--beams", "61", "--samples", "300", "--batch", "50")
+SMALL = ("--beams", "61", "--samples", "300")
+PAPER = ("--preset", "paper", "--batch", "50", "--epochs")
 
 
 def train(process, tmp_path, *args):
@@ -25,17 +28,21 @@ def train(process, tmp_path, *args):
     )
 
 
-def test_a_world_of_one_s_own_from_nothing_to_beliefs(process, bus, tmp_path):
+@pytest.mark.parametrize(
+    ("preset", "stem", "more"), [("precise", "closet-precise", ()), ("paper", "closet-paper-61", (*PAPER, "3"))]
+)
+def test_a_world_of_one_s_own_from_nothing_to_beliefs(process, bus, tmp_path, preset, stem, more):
     (tmp_path / "w.yaml").write_text(WORLD)
-    estimator = ("estimator", "--world", str(tmp_path / "w.yaml"), "--models", str(tmp_path / "m"))
+    folder = str(tmp_path / "m")
+    estimator = ("estimator", "--world", str(tmp_path / "w.yaml"), "--models", folder, "--estimator", preset)
     without = process(*estimator)
     assert without.wait(60) == 2
     assert f"presage train --world {tmp_path / 'w.yaml'}" in without.output
 
-    training = train(process, tmp_path, "--epochs", "3")
+    training = train(process, tmp_path, *more)
     assert training.wait(120) == 0, training.output
     assert sorted(p.name for p in (tmp_path / "m").iterdir()) == [
-        "closet-paper-61.json", "closet-paper-61.png", "closet-paper-61.safetensors",
+        f"{stem}.json", f"{stem}.png", f"{stem}.safetensors",
     ]  # fmt: skip
 
     inbox = Inbox()
@@ -45,34 +52,34 @@ def test_a_world_of_one_s_own_from_nothing_to_beliefs(process, bus, tmp_path):
     assert wait_until(lambda: len(inbox) > 0, 60)
     sample = inbox.get(0)
     assert isinstance(sample, Sample)
-    assert Belief.decode(sample.payload).estimator == "paper"
+    assert Belief.decode(sample.payload).estimator == preset
 
 
 def test_the_scanner_on_the_bus_is_asked(process, bus, tmp_path):
     (tmp_path / "w.yaml").write_text(WORLD)
     process("simulator", "--world", str(tmp_path / "w.yaml"))
     assert wait_until(lambda: "simulator" in bus.alive(), 60)
-    training = train(process, tmp_path, "--epochs", "1", "--robot", bus.robot)
+    training = train(process, tmp_path, *PAPER, "1", "--robot", bus.robot)
     assert training.wait(120) == 0, training.output
     assert "samples come from the running scanner tim571 in closet" in training.output
 
 
 def test_an_interrupted_training_is_taken_up_and_ends_in_the_same_weights(process, tmp_path):
     (tmp_path / "w.yaml").write_text(WORLD)
-    whole = train(process, tmp_path, "--epochs", "40")
+    whole = train(process, tmp_path, *PAPER, "40")
     assert whole.wait(150) == 0, whole.output
     weights = tmp_path / "m" / "closet-paper-61.safetensors"
     first = weights.read_bytes()
     weights.unlink()
 
-    cut = train(process, tmp_path, "--epochs", "40")
+    cut = train(process, tmp_path, *PAPER, "40")
     state = tmp_path / "m" / ".closet-paper-61.unfinished" / "state.safetensors"
     assert wait_until(lambda: state.exists() or not cut.running, 60)
     cut.send(signal.SIGINT)
     assert cut.wait(30) == 130, cut.output
     assert not weights.exists()
 
-    again = train(process, tmp_path, "--epochs", "40")
+    again = train(process, tmp_path, *PAPER, "40")
     assert again.wait(150) == 0, again.output
     assert "of an interrupted run" in again.output
     assert weights.read_bytes() == first
