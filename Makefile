@@ -59,7 +59,7 @@ demo: install ## localise and drive in the corridor: every service, a recording,
 	$(BIN)/presage demo $(ARGS)
 
 test: install ## all tests, the fast ones first
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 check: install ## style, format and types
 	$(BIN)/ruff check

@@ -62,6 +62,7 @@ def bench_accuracy(
     workers: Annotated[int, typer.Option(min=1, help="Processes side by side.")] = 2,
     json_file: Json = None,
     figure: Annotated[Path | None, typer.Option(help="PNG, SVG or PDF.")] = None,
+    markdown: Annotated[bool, typer.Option("--markdown", help="A short table as in README.")] = False,
 ) -> None:
     """Estimators and the Cramér-Rao bound side by side: from nothing, tracking, kidnapped, blocked, two rooms alike.
 
@@ -71,7 +72,9 @@ def bench_accuracy(
     """
     from presage.accuracy.report import bench_accuracy as run  # noqa: PLC0415
 
-    code = run(worlds, beams, estimators, tasks, trials, minutes, seed, workers, json_file, figure, console)
+    code = run(
+        worlds, beams, estimators, tasks, trials, minutes, seed, workers, json_file, figure, console, markdown=markdown
+    )
     raise typer.Exit(code)
 
 

@@ -25,7 +25,7 @@ MARKS = {
 
 def bench_accuracy(
     worlds: str, beams: str, estimators: str, tasks: str, trials: int, minutes: float, seed: int, workers: int,
-    json_file: Path | None, figure: Path | None, console: Console,
+    json_file: Path | None, figure: Path | None, console: Console, *, markdown: bool = False,
 ) -> int:  # fmt: skip
     """Measure, print, and write where asked."""
     chosen = estimators.split(",")
@@ -50,7 +50,11 @@ def bench_accuracy(
     ]  # fmt: skip
     rows = run_all(jobs, workers, console)
     for world, count in dict.fromkeys((row["world"], row["beams"]) for row in rows):
-        console.print(_table([r for r in rows if (r["world"], r["beams"]) == (world, count)], world, count))
+        own = [row for row in rows if (row["world"], row["beams"]) == (world, count)]
+        if markdown:
+            print(_markdown(own, world, count))
+        else:
+            console.print(_table(own, world, count))
     write_json(json_file, {"rows": rows, "trials": trials, "minutes": minutes, **about(seed)})
     if figure is not None:
         _draw(rows, figure)
@@ -76,6 +80,27 @@ def _table(rows: list[dict[str, Any]], world: str, beams: int) -> Table:
             "" if band is None else f"{band[0]:.2f}-{band[1]:.2f}", _number(row["update_ms_median"], 1, 1),
         )  # fmt: skip
     return table
+
+
+def _markdown(rows: list[dict[str, Any]], world: str, beams: int) -> str:
+    """A line for each task: median and root mean square in mm, found of all; the bound; NEES and its band."""
+    names = list(dict.fromkeys(row["estimator"] for row in rows))
+    lines = [f"| {world}, {beams} beams | " + " | ".join(names) + " | bound |", "|---" * (len(names) + 2) + "|"]
+    for task in dict.fromkeys(row["task"] for row in rows):
+        own = {row["estimator"]: row for row in rows if row["task"] == task}
+        limit = next((row["bound_rms_m"] for row in own.values() if row["bound_rms_m"] is not None), None)
+        cells = [_cell(own[name]) if name in own else "" for name in names]
+        lines.append(f"| {task} | " + " | ".join(cells) + f" | {_number(limit, 1e3)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(row: dict[str, Any]) -> str:
+    share = f"{row['found']}/{row['of']}"
+    if row["position_error_median_m"] is None:
+        return share
+    error = f"{_number(row['position_error_median_m'], 1e3)} / {_number(row['position_error_rms_m'], 1e3)} mm"
+    nees = f", NEES {row['nees_mean']:.2f}" if row["nees_mean"] is not None else ""
+    return f"{error}, {share}{nees}"
 
 
 def _draw(rows: list[dict[str, Any]], file: Path) -> None:
