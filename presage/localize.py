@@ -7,7 +7,7 @@ import json
 import re
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -93,7 +93,7 @@ def localize(job: Job, console: Console) -> list[dict[str, Any]]:
     laser = job.frame == "laser"
     scans = read_scans(job.file, np.zeros(3) if laser else np.array(job.mount))
     start = _start(job, scans)
-    estimator = prepare(job.choice)(scans.geometry)
+    estimator = prepare(replace(job.choice, initial_pose=None))(scans.geometry)
     rows = []
     numbers = track(range(len(scans.ranges)), "localising", console=console, transient=True)
     if start is not None:

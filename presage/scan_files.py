@@ -48,21 +48,15 @@ def read_scans(path: Path, mount: Array) -> Scans:
 
 
 def _read_npz(path: Path, mount: Array) -> Scans:
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            data = {name: np.asarray(file[name], np.float64) for name in file.files if name in NAMES}
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file") from None
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
-        raise UserError(f"{path}: not an .npz of plain arrays ({' '.join(str(error).split())[:120]})") from None
+    data = _arrays(path)
     missing = [name for name in ("ranges", "angles", "range_max") if name not in data]
     if missing:
         raise UserError(f"{path}: lacks {', '.join(missing)}; needed are ranges (N, B), angles (B,) and range_max")
     ranges = np.atleast_2d(data["ranges"])
     count, beams = ranges.shape[0], ranges.shape[-1]
     shapes = {"angles": (beams,), "stamps": (count,), "odom": (count, 3), "initial_pose": (3,)}
-    if ranges.ndim != 2 or beams < 3:
-        raise UserError(f"{path}: ranges has the shape {data['ranges'].shape}, not (N, B) with B of at least 3")
+    if ranges.ndim != 2 or beams < 3 or not count:
+        raise UserError(f"{path}: ranges has the shape {data['ranges'].shape}, not (N, B) of 3 beams or more")
     for name, shape in shapes.items():
         if name in data and data[name].shape != shape:
             raise UserError(f"{path}: {name} has the shape {data[name].shape}; for these ranges it must be {shape}")
@@ -76,6 +70,21 @@ def _read_npz(path: Path, mount: Array) -> Scans:
         Geometry(data["angles"], mount, range_max), clean(ranges, range_max),
         data.get("stamps"), data.get("odom"), data.get("initial_pose"),
     )  # fmt: skip
+
+
+def _arrays(path: Path) -> dict[str, Array]:
+    """The arrays we know, as numbers."""
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            kept = {name: file[name] for name in file.files if name in NAMES}
+            if wrong := [name for name, array in kept.items() if array.dtype.kind not in "fiu"]:
+                raise UserError(f"{path}: {wrong[0]} holds {kept[wrong[0]].dtype}, not real numbers")
+            data = {name: np.asarray(array, np.float64) for name, array in kept.items()}
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
+        raise UserError(f"{path}: not an .npz of plain arrays ({' '.join(str(error).split())[:120]})") from None
+    return data
 
 
 def clean(ranges: Array, range_max: float) -> Array:

@@ -24,11 +24,10 @@ from presage.train import collect, scanner_on_bus
 from services.estimator.precise import weights
 from services.estimator.precise.evaluation import Quality, evaluate
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.learning import Beams, Recipe, learn_field, learn_scales
-from services.estimator.precise.seeding import thin_places
+from services.estimator.precise.learning import Beams, Recipe, learn_field, learn_ripple, learn_scales, reachable
+from services.estimator.precise.seeding import SPACING, thin_places
 
 TEST_SAMPLES = 500
-SPACING = 0.3  # m between the places a search begins at
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,8 @@ def train_precise(job: Job, link: Link, console: Console) -> Path:
         began = time.monotonic()
         model, quality = _learn(job, scanner, poses, {"train": train, "test": test}, bar)
     seconds = time.monotonic() - began
-    places = thin_places(se2.compose(poses["train"], np.array(scanner.mount))[:, :2], SPACING)
+    visited = se2.compose(poses["train"], np.array(scanner.mount))[:, :2]
+    places = thin_places(np.concatenate([visited, reachable(model.field, visited)]), SPACING)
     card = _card(job, world, scanner, model, quality, seconds)
     weights.save(path, model, places, card)
     _draw(weights.load(path)[0], card, path.with_suffix(".png"))
@@ -105,7 +105,8 @@ def _learn(
     report("precision", 1.0)
     half = TEST_SAMPLES // 2  # precision from one half of the test scans, figures from the other
     scales = learn_scales(field, poses["test"][:half], mount, angles, scans["test"][:half], 0.0)
-    model = FieldModel(field, scales)
+    ripple = learn_ripple(field, se2.compose(poses["test"][:half], mount), angles)
+    model = FieldModel(field, scales, ripple)
     quality = evaluate(
         model, poses["test"][half:], mount, angles, scans["test"][half:], scanner.range_max, scanner.sigma
     )
@@ -118,7 +119,7 @@ def _card(
 ) -> weights.FieldCard:
     return weights.FieldCard(
         world=world, scanner=scanner, samples=job.samples, seed=job.recipe.seed, resolution=job.recipe.resolution,
-        origin=model.field.origin, sweeps=job.recipe.sweeps, correlation=round(quality.correlation, 3),
+        origin=model.field.origin, sweeps=job.recipe.sweeps, ripple=model.ripple, inflation=round(quality.inflation, 3),
         test_samples=TEST_SAMPLES // 2, test_range_error_median_m=quality.range_error_median,
         test_range_error_mean_m=quality.range_error_mean, test_share_above_5_cm=quality.share_above_5_cm,
         test_position_error_rms_m=quality.position_error_rms, learning_s=round(seconds, 1), commit=commit(),

@@ -21,15 +21,15 @@ from common.versions import commit, versions
 from common.world import World, load_world
 from presage.accuracy import tasks
 from presage.accuracy.scenes import TWINS, Scene
-from services.estimator.building import SPACING, Choice, Geometry, Name, prepare
+from services.estimator.building import Choice, Geometry, Name, prepare
 from services.estimator.generative import RayCaster
 from services.estimator.interface import Estimator
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.learning import Beams, Recipe, learn_field, learn_scales
-from services.estimator.precise.seeding import Seeds, thin_places
+from services.estimator.precise.learning import Beams, Recipe, learn_field, learn_ripple, learn_scales
+from services.estimator.precise.seeding import SPACING, Seeds, thin_places
 
 # As users name them; exact is precise over the world itself.
 CHOICES: dict[str, tuple[Name, str]] = {
@@ -103,7 +103,7 @@ def _among_twins(job: Job, geometry: Geometry) -> Estimator:
     name, model = CHOICES[job.estimator]
     mount = (float(geometry.mount[0]), float(geometry.mount[1]), float(geometry.mount[2]))
     if name == "amcl-defaults":
-        return ParticleFilter(TWINS, ParticleSettings(robot_model_type="omni"), mount, job.seed)
+        return ParticleFilter(TWINS, ParticleSettings(), mount, job.seed)
     if name == "particle-filter":
         return ParticleFilter(TWINS, ParticleSettings.tuned(), mount, job.seed)
     rng = np.random.default_rng(job.seed)
@@ -121,7 +121,9 @@ def quick_field(world: World, geometry: Geometry, rng: np.random.Generator, samp
     split = samples // 10
     noisy = clean[split:] + SCANNERS["tim571"].sigma * rng.standard_normal(clean[split:].shape)
     field = learn_field(Beams.of(poses[split:], geometry.mount, geometry.angles, noisy), Recipe(sweeps=6))
-    return FieldModel(field, learn_scales(field, poses[:split], geometry.mount, geometry.angles, clean[:split], 0.0))
+    scales = learn_scales(field, poses[:split], geometry.mount, geometry.angles, clean[:split], 0.0)
+    ripple = learn_ripple(field, se2.compose(poses[:split], geometry.mount), geometry.angles)
+    return FieldModel(field, scales, ripple)
 
 
 def _row(job: Job, world: str, task: str, outcome: tasks.Outcome) -> dict[str, Any]:

@@ -23,10 +23,9 @@ from services.estimator.precise import weights
 from services.estimator.precise.estimator import PreciseEstimator, Settings
 from services.estimator.precise.gauss_newton import View, polish
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.seeding import Seeds, thin_places
+from services.estimator.precise.seeding import SPACING, Seeds, thin_places
 
 Name = Literal["precise", "paper", "particle-filter", "amcl-defaults"]
-SPACING = 0.3  # m between the places a search begins at
 
 
 @dataclass(frozen=True)
@@ -79,8 +78,10 @@ def prepare(choice: Choice) -> Factory:
 
     def make(geometry: Geometry) -> Estimator:
         settings = ParticleSettings.tuned() if tuned else ParticleSettings()
-        settings = replace(settings, robot_model_type="omni")  # covers a differential base as well
+        if tuned:
+            settings = replace(settings, robot_model_type="omni")  # covers a differential base as well
         made = ParticleFilter(world, settings, (*map(float, geometry.mount),), choice.seed)  # type: ignore[arg-type]
+        made.name = choice.estimator
         if choice.initial_pose is not None:
             made.restart(choice.initial_pose)
         return made
@@ -89,14 +90,14 @@ def prepare(choice: Choice) -> Factory:
 
 
 def _precise(choice: Choice, world: World) -> Factory:
-    model, places, correlation = generative_model(choice, world)
+    model, places, inflation = generative_model(choice, world)
     seeds = Seeds.at(model, places)
     likelihood = Likelihood(choice.sigma)
     _compile(model, seeds, likelihood)
 
     def make(geometry: Geometry) -> Estimator:
         made = PreciseEstimator(
-            model, seeds, geometry.mount, likelihood, Settings(correlation=correlation),
+            model, seeds, geometry.mount, likelihood, Settings(inflation=inflation),
             np.random.default_rng(choice.seed),
         )  # fmt: skip
         if choice.initial_pose is not None:
@@ -107,7 +108,7 @@ def _precise(choice: Choice, world: World) -> Factory:
 
 
 def generative_model(choice: Choice, world: World) -> tuple[GenerativeModel, Array, float]:
-    """The model of that name, places (S, 2) m a laser may be at, and how its errors hang together."""
+    """The model of that name, places (S, 2) m a laser may be at, and the covariance's inflation."""
     if choice.model == "exact":
         places = world.sample_free(max(4000, int(60 * shapely.area(world.free_space))), np.random.default_rng(0), 0.05)
         return RayCaster(world), thin_places(places, SPACING), 1.0
@@ -116,7 +117,7 @@ def generative_model(choice: Choice, world: World) -> tuple[GenerativeModel, Arr
     elif (path := Path(choice.model)).suffix != ".safetensors":
         raise UserError(f"no model {choice.model!r}: give learned, exact, or a file of weights (.safetensors)")
     model, places, card = weights.load(path)
-    return model, places, card.correlation
+    return model, places, card.inflation
 
 
 def _compile(model: GenerativeModel, seeds: Seeds, likelihood: Likelihood) -> None:

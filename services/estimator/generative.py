@@ -28,6 +28,11 @@ class Expected:
 class GenerativeModel(Protocol):
     """From poses of the laser to the scans expected there."""
 
+    @property
+    def ripple(self) -> float:
+        """Standard deviation, rad, by which surfaces that are flat are predicted to be tilted: false information."""
+        ...
+
     def expect(self, lasers: Array, angles: Array) -> Expected:
         """Scans from laser poses (N, 3) in map along beams at angles (B,) rad in laser."""
         ...
@@ -38,6 +43,7 @@ class RayCaster:
     """The world itself: the limit of any learning."""
 
     world: World
+    ripple: float = 0.0
 
     def expect(self, lasers: Array, angles: Array) -> Expected:
         """See GenerativeModel."""

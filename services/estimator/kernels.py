@@ -141,12 +141,11 @@ def accumulate(
                 continue
             total[k, 2] += 1.0
             if o == np.inf:
-                seen = g < range_max
-                total[k, 0] -= math.log(unseen if seen else 1.0 - unseen)
-                total[k, 1] += 0.0 if seen else 1.0
+                total[k, 0] -= math.log(unseen if g < range_max else 1.0 - unseen)
+                total[k, 1] += 0.0 if g < range_max else 1.0
                 continue
-            if g == np.inf:
-                total[k, 0] -= math.log(flat + short / range_max)
+            if g >= range_max:
+                total[k, 0] -= math.log(unseen / range_max)
                 continue
             noise, model = sigma * sigma, scale[k, b] * scale[k, b]
             variance = noise + model + widen * widen
@@ -155,7 +154,7 @@ def accumulate(
             early = short / max(g, 1e-3) if o < g else 0.0
             density = core + flat + early
             inlier = core / density
-            total[k, 0] -= math.log(density)
+            total[k, 0] -= math.log(density * (1.0 - unseen))
             total[k, 1] += inlier
             weight = inlier / variance
             slope = weight * e - early / (max(g, 1e-3) * density)  # d ln p / dg

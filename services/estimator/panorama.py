@@ -108,6 +108,7 @@ class PanoramaModel:
     half: float  # m, of the longer side
     range_scale: float  # m
     bins: int
+    ripple: float = 0.0  # not known
 
     def expect(self, lasers: Array, angles: Array) -> Expected:
         """See GenerativeModel; between directions by linear interpolation."""

@@ -70,6 +70,8 @@ class PaperPerception:
 class PaperScans:
     """The paper's decoder as a generative model: one heading, the beams of its training, no derivative by yaw."""
 
+    ripple = 0.0  # not known
+
     def __init__(self, model: PaperModel, scanner: Scanner, heading: float, scale: float) -> None:
         """``scale`` m is the stated error of every beam: this decoder has one precision for all."""
         self.model, self.scanner, self.heading, self.scale = model, scanner, heading, scale

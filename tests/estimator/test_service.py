@@ -97,7 +97,7 @@ def test_the_particle_filter_answers_on_the_same_topics(estimator):
     for stamp in range(5):
         service.on_message(SCAN, a_scan(stamp, TRUTH))
     belief = service.sent[-1]
-    assert belief.estimator == "particle-filter"
+    assert belief.estimator == estimator
     assert np.hypot(belief.pose.x - 5, belief.pose.y - 1.5) < 0.3
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,13 +13,14 @@ from services.estimator.precise import mixture
 from services.estimator.precise.gauss_newton import Prior, View, descend, polish
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.mixture import Mode
-from services.estimator.precise.motion import MotionNoise, candidates, fuse
+from services.estimator.precise.motion import Candidate, MotionNoise, candidates, fuse
 
 if TYPE_CHECKING:
     from common.se2 import Array
     from services.estimator.generative import GenerativeModel
     from services.estimator.precise.seeding import Seeds
 
+FIRST_WAIT, LONGEST_WAIT = 5, 150  # scans between searches while the scan fits badly
 WIDEST, WIDE, NARROW = 0.3, 0.1, 0.03  # m, added to every beam's deviation on the way down from a seed
 
 
@@ -36,7 +37,11 @@ class Settings:
     evidence_error: float = 20.0  # nats by which a model's error may set two places apart
     ambiguous: float = 0.05  # weight of a second hypothesis from which the belief is ambiguous
     hypotheses: int = 8
-    correlation: float = 1.0  # of the model's error: beams that err alike
+    inflation: float = 1.0  # of the covariance, for errors of the model that hang together
+    sure: float = 0.75  # share of beams from which one scan is enough to say tracking
+    patience: int = 30  # scans that a place must persist with less
+    rise: float = 150.0  # nats by which accuracy must worsen at once to call for a search
+    vague: float = 0.5  # m, standard deviation of a position that is not known
     motion: MotionNoise = field(default_factory=MotionNoise)
 
 
@@ -70,8 +75,8 @@ class PreciseEstimator:
         self._was_tracking = False
         self._stamp: float | None = None
         self._odom: Array | None = None
-        self._usual = 1.0  # share of beams explained lately
-        self._searched_at = 1.0  # share explained when a search found nothing better; 1: none was made
+        self._usual, self._energy = 1.0, 0.0  # share of beams explained, and accuracy, lately
+        self._since, self._wait = 0, FIRST_WAIT  # scans that fitted badly, and after how many to search
 
     def update(self, observation: Observation) -> Posterior:
         """One more scan."""
@@ -85,6 +90,7 @@ class PreciseEstimator:
         self._stamp, self._odom = observation.stamp, observation.odom
         best = self.modes[0]
         self._usual += 0.1 * (best.explained - self._usual)
+        self._energy += 0.1 * (best.accuracy - self._energy)
         return self._posterior(view, best)
 
     def _track(self, view: View, observation: Observation) -> None:
@@ -111,18 +117,32 @@ class PreciseEstimator:
                 poses, evidence = retried
         modes = []
         for k, (mode, each) in enumerate(zip(self.modes, options, strict=True)):
+            keep, blind = mixture.seen(evidence.curvature[k], self.model.ripple)
+            mixture.project(evidence, k, keep)
+            if blind is not None and odom is None:
+                each = [self._unseen(option, blind, mode.blind, period) for option in each]  # noqa: PLW2901
             parts = [fuse(option, poses[k], evidence.xi[k], evidence.curvature[k]) for option in each]
             fused = min(parts, key=lambda part: part.surprise)
-            modes.append(mixture.moved(mode, fused, evidence, k, period))
+            modes.append(mixture.moved(mode, fused, evidence, k, period, blind=blind is not None))
         self.modes = mixture.weigh(modes, self.settings.evidence_error, self.settings.hypotheses)
 
+    def _unseen(self, option: Candidate, blind: Array, scans: int, period: float) -> Candidate:
+        """Along a direction no scan sees, the robot may have gone at full speed: the deviation grows with time."""
+        covariance = option.covariance.copy()
+        covariance[:2, :2] += np.outer(blind, blind) * (self.settings.motion.speed * period) ** 2 * (2 * scans + 1)
+        return replace(option, covariance=covariance)
+
     def _suspicious(self) -> bool:
-        """The best hypothesis explains less than it used to, or than a belief must; and a search may help."""
-        share = self.modes[0].explained
-        if share >= self._usual - self.settings.drop and share >= self.settings.believable:
-            self._searched_at = 1.0
+        """The scan fits worse at once, or has fitted badly for long, or not as a belief must."""
+        best, settings = self.modes[0], self.settings
+        fell = best.explained < self._usual - settings.drop or best.accuracy > self._energy + settings.rise
+        if fell or best.explained < settings.believable:
+            return True
+        if best.explained >= settings.satisfied:
+            self._since, self._wait = 0, FIRST_WAIT
             return False
-        return share < self._searched_at - self.settings.drop or share < self.settings.believable
+        self._since += 1
+        return self._since >= self._wait
 
     def _relocalise(self, view: View) -> None:
         """Search from nothing; keep what is tracked where nothing better is found."""
@@ -133,10 +153,10 @@ class PreciseEstimator:
         if self.modes:
             margin = 3 * self.settings.evidence_error
             if found[0].energy > self.modes[0].energy - margin:
-                self._searched_at = self.modes[0].explained
-                return
+                found = self.modes  # nothing better: this is how it looks here now; search again later
+                self._since, self._wait = 0, min(2 * self._wait, LONGEST_WAIT)
         self.modes = found
-        self._usual, self._searched_at = found[0].explained, 1.0
+        self._usual, self._energy = found[0].explained, found[0].accuracy
 
     def _search(self, view: View) -> list[Mode]:
         modes: list[Mode] = []
@@ -164,7 +184,10 @@ class PreciseEstimator:
         poses, evidence = descend(view, poses[keep], part, NARROW, 4)
         poses, evidence = polish(view, poses, part)
         keep = mixture.distinct(poses, evidence.accuracy, self.settings.hypotheses)
-        modes = [mixture.found(poses[k], evidence, k, part, self.seeds.volume) for k in keep]
+        modes = [
+            mixture.found(poses[k], evidence, k, part, self.seeds.volume, self.seeds.spread, self.model.ripple)
+            for k in keep
+        ]
         return mixture.weigh(modes, self.settings.evidence_error, self.settings.hypotheses)
 
     def _period(self, stamp: float | None) -> float:
@@ -174,11 +197,14 @@ class PreciseEstimator:
 
     def _posterior(self, view: View, best: Mode) -> Posterior:
         expected = self.model.expect(se2.compose(best.pose, self.mount)[None], view.angles)
+        state = self._state(best)
+        unknown = self.seeds.spread * (best.explained < self.settings.believable)
         hypotheses = tuple(
-            Hypothesis(mode.pose, mode.covariance(self.settings.correlation), mode.weight) for mode in self.modes
+            Hypothesis(mode.pose, mode.covariance(self.settings.inflation) + unknown, mode.weight)
+            for mode in self.modes
         )
         return Posterior(
-            self._state(best),
+            state,
             hypotheses,
             best.accuracy,
             best.complexity,
@@ -189,9 +215,13 @@ class PreciseEstimator:
         )
 
     def _state(self, best: Mode) -> State:
-        if best.explained < self.settings.believable:
+        settings = self.settings
+        if best.explained < settings.believable:
             return "lost" if self._was_tracking else "localising"
-        if len(self.modes) > 1 and self.modes[1].weight > self.settings.ambiguous:
+        if len(self.modes) > 1 and self.modes[1].weight > settings.ambiguous:
             return "ambiguous"
+        vague = np.linalg.eigvalsh(best.covariance(settings.inflation)[:2, :2])[-1] > settings.vague**2
+        if vague or (best.explained < settings.sure and best.age < settings.patience):
+            return "localising"
         self._was_tracking = True
         return "tracking"

@@ -76,6 +76,8 @@ class FieldModel:
         default_factory=lambda: np.full(int(np.prod(CLASSES)), 1e-3)
     )  # m, error of each class
 
+    ripple: float = 0.0  # rad, see GenerativeModel
+
     def expect(self, lasers: Array, angles: Array) -> Expected:
         """See GenerativeModel."""
         traced = self.field.trace(lasers, angles)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from common.se2 import Array, compose
+from common.se2 import Array, compose, wrap
 from services.estimator.precise.field import CLASSES, DistanceField, Floats
 
 POOL = 1  # cells to each side that share their points to find a normal
@@ -26,6 +26,7 @@ CLIP = 0.1  # m, a larger error is another surface's
 GRAZING = 0.15  # least |n . u| of a beam that shapes the field
 RARE, RARE_SCALE = 20, 0.05  # a class seen seldom: as if it had been seen so often, with this error (m), besides
 LEAST_SCALE = 1e-3  # m
+CORNER = 0.3  # rad
 
 
 @dataclass(frozen=True)
@@ -135,6 +136,42 @@ def _distances(surface: np.ndarray, mx: Array, my: Array, nx: Array, ny: Array, 
     phi = np.divide(total, weight, out=np.zeros_like(total), where=near)
     phi[~near] = np.hypot(jj * h - ex[nearest], ii * h - ey[nearest])
     return phi.astype(np.float32)
+
+
+def reachable(field: DistanceField, visited: Array, clearance: float = 0.1) -> Array:
+    """(K, 2) m in map: nodes at least ``clearance`` m from surfaces that hang together with visited places (N, 2)."""
+    free = field.phi > clearance
+    grown = np.zeros_like(free)
+    node = np.round((visited - field.origin) / field.resolution).astype(int)
+    grown[node[:, 1], node[:, 0]] = True
+    grown &= free
+    while True:
+        wider = grown.copy()
+        wider[1:] |= grown[:-1]
+        wider[:-1] |= grown[1:]
+        wider[:, 1:] |= grown[:, :-1]
+        wider[:, :-1] |= grown[:, 1:]
+        wider &= free
+        if (wider == grown).all():
+            break
+        grown = wider
+    i, j = np.nonzero(grown)
+    return np.asarray(np.array(field.origin) + field.resolution * np.column_stack([j, i]))
+
+
+def learn_ripple(field: DistanceField, lasers: Array, angles: Array, apart: int = 10) -> float:
+    """Rad by which normals of flat surfaces err: of a beam's against the mean of those ``apart`` beams to its sides.
+
+    Beyond 0.3 rad it is a corner, not a ripple.
+    """
+    normal = field.trace(lasers, angles).jacobian[..., :2]
+    yaw = np.arctan2(normal[..., 1], normal[..., 0])
+    left, right = (
+        wrap(yaw[:, shift : yaw.shape[1] - 2 * apart + shift] - yaw[:, apart:-apart]) for shift in (0, 2 * apart)
+    )
+    flat = (np.abs(left) < CORNER) & (np.abs(right) < CORNER)
+    # The mean of two errors less one's own: 1.5 times the variance of one.
+    return float(np.sqrt(np.mean(((left + right)[flat] / 2) ** 2) / 1.5)) if flat.any() else 0.0
 
 
 def _descend(field: DistanceField, beams: Beams, rate: float) -> Floats:

@@ -1,11 +1,11 @@
 """The density of a beam, and free energy's accuracy: a sum of -ln p over beams, no gain, no 1/N.
 
-    p(o | g) = (1 - short - random) N(o; g, sigma² + m²) + short [o < g] / g + random / range_max
+    p(o | g) = (1 - unseen) ((1 - short - random) N(o; g, sigma² + m²) + short [o < g] / g + random / range_max)
 
 sigma is the scanner's noise, m the model's stated error, `short` the share of beams that something unknown ends
 (people, moved furniture), `random` that of all else (something was taken away): a proper density with tails that no
 outlier moves (Thrun, Burgard & Fox 2005, section 6.3, without its gains). A beam without return has the probability
-`unseen` where a surface is expected, 1 - unseen where none is.
+`unseen` where a surface is expected; where none is, 1 - unseen, and any range is as likely as any other.
 """
 
 from __future__ import annotations
@@ -56,8 +56,10 @@ class Likelihood:
         return Evidence(total[:, 0], explained, gradient, matrices[:, 0], matrices[:, 1], matrices[:, 2])
 
     def density(self, measured: Array, expected: float, scale: float, range_max: float) -> Array:
-        """p(o | g) in 1/m at measured (K,) m."""
+        """p(o | g) in 1/m at measured (K,) m; with the probability of no return it sums to one."""
+        if expected >= range_max:
+            return np.full(len(measured), self.unseen / range_max)
         variance = self.sigma**2 + scale**2
         core = np.exp(-0.5 * (measured - expected) ** 2 / variance) / np.sqrt(2 * np.pi * variance)
         flat = self.short / expected * (measured < expected) + self.random / range_max
-        return np.asarray((1 - self.short - self.random) * core + flat)
+        return np.asarray((1 - self.unseen) * ((1 - self.short - self.random) * core + flat))

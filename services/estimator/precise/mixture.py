@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 SAME_PLACE, SAME_YAW = 0.1, 0.1  # m, rad: nearer modes are one
 MEMORY = 0.8  # of the evidence of earlier scans; a model's error repeats, so evidence must not add up for ever
+BLIND, RIPPLES = 1e-4, 7.0  # information along, as a share of that across, that counts as none; of the ripple's
 NEGLIGIBLE = 1e-4  # weight below which a hypothesis is refuted
 
 
@@ -35,18 +36,46 @@ class Mode:
     curvature: Array  # (3, 3)
     velocity: Array | None = None  # (3,) in base_link; None: not known yet
     weight: float = 1.0
+    blind: int = 0  # scans in a row that say nothing along some direction
+    age: int = 0  # scans since it was found
 
-    def covariance(self, correlation: float) -> Array:
+    def covariance(self, inflation: float) -> Array:
         """(3, 3) of x, y, yaw in map."""
-        return np.asarray(self.noise + correlation * self.error)
+        return np.asarray(inflation * (self.noise + self.error))
 
 
-def found(pose: Array, evidence: Evidence, k: int, prior: Prior | None, volume: float) -> Mode:
-    """A mode of the search; of nothing known in a direction, a metre and a radian remain.
+def seen(curvature: Array, ripple: float) -> tuple[Array, Array | None]:
+    """What a scan tells of the position: (3, 3) projection onto it, and the direction (2,) it tells nothing of.
+
+    Along a corridor without features a learned field still has ripples: walls tilted by ``ripple`` rad, which add about
+    ripple² of the curvature across. Not clearly more than that is taken for none. (Schur: the heading is not known.)
+    """
+    S = curvature[:2, :2] - np.outer(curvature[:2, 2], curvature[2, :2]) / max(float(curvature[2, 2]), 1e-12)
+    values, vectors = np.linalg.eigh(S)
+    if values[0] >= (BLIND + RIPPLES * ripple**2) * values[1] and values[1] > 0:
+        return np.eye(3), None
+    keep, blind = np.eye(3), vectors[:, 0]
+    keep[:2, :2] -= np.outer(blind, blind)
+    return keep, blind
+
+
+def project(evidence: Evidence, k: int, keep: Array) -> None:
+    """Leave of the k-th evidence what `seen` keeps."""
+    evidence.xi[k] = keep @ evidence.xi[k]
+    for matrix in (evidence.curvature, evidence.of_noise, evidence.of_model):
+        matrix[k] = keep @ matrix[k] @ keep
+
+
+def found(
+    pose: Array, evidence: Evidence, k: int, prior: Prior | None, volume: float, spread: Array, ripple: float
+) -> Mode:
+    """A mode of the search; of a direction that nothing is known of, ``spread`` (3, 3) remains.
 
     Without a prior every pose was as likely, in ``volume`` m² rad: complexity is the KL divergence from that.
     """
-    information = prior.information[k] if prior else np.eye(3)
+    keep, _ = seen(evidence.curvature[k], ripple)
+    project(evidence, k, keep)
+    information = prior.information[k] if prior else np.linalg.inv(spread)
     inverse = np.linalg.inv(evidence.curvature[k] + information)
     slope = evidence.xi[k] + (prior.information[k] @ difference(prior.mean[k : k + 1], pose[None])[0] if prior else 0)
     pose = pose + inverse @ slope
@@ -67,18 +96,20 @@ def found(pose: Array, evidence: Evidence, k: int, prior: Prior | None, volume: 
     )  # fmt: skip
 
 
-def moved(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: float) -> Mode:
+def moved(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: float, *, blind: bool) -> Mode:
     """The mode after a scan: noise shrinks by the scan's information, the model's error is this scan's own."""
     inverse = np.linalg.inv(fused.information)
     information = fused.information - evidence.curvature[k]
     noise = inverse @ (evidence.of_noise[k] + information) @ inverse
     alone = np.linalg.inv(evidence.curvature[k] + np.eye(3))
     accuracy = float(evidence.accuracy[k])
-    velocity = se2.between(mode.pose, fused.mean) / period
+    # Of a motion that is half unseen nothing is carried on.
+    velocity = None if blind or mode.blind else se2.between(mode.pose, fused.mean) / period
     energy = MEMORY * mode.energy + (1 - MEMORY) * (accuracy + fused.complexity)
     return Mode(
         fused.mean, noise, alone @ evidence.of_model[k] @ alone, float(evidence.explained[k]), accuracy,
         fused.complexity, energy, evidence.xi[k], evidence.curvature[k], velocity,
+        blind=mode.blind + 1 if blind else 0, age=mode.age + 1,
     )  # fmt: skip
 
 

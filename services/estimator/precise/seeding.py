@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from services.estimator.precise.gauss_newton import View
 
 BINS = 360  # of a cached panorama
+SPACING = 0.3  # m between the places a search begins at
 TOLERANCE = 0.35  # m, misfit of a beam that still speaks for a place about as far from the truth
 
 
@@ -25,7 +26,6 @@ class Seeds:
 
     places: Array  # (S, 2) m in map, of the laser
     panoramas: np.ndarray[tuple[int, ...], np.dtype[np.float32]]  # (S, BINS) m in direction 2 pi k / BINS of map
-    spacing: float = 0.3  # m between places
 
     @classmethod
     def at(cls, model: GenerativeModel, places: Array) -> Seeds:
@@ -38,7 +38,13 @@ class Seeds:
     @property
     def volume(self) -> float:
         """M² rad that places and headings stand for."""
-        return max(1, len(self.places)) * self.spacing**2 * 2 * np.pi
+        return max(1, len(self.places)) * SPACING**2 * 2 * np.pi
+
+    @property
+    def spread(self) -> Array:
+        """(3, 3) covariance of a pose of which nothing is known."""
+        extent = np.ptp(self.places, axis=0) if len(self.places) else np.ones(2)
+        return np.diag([*np.maximum(extent, SPACING) ** 2 / 12, np.pi**2 / 3])
 
     def rank(self, view: View, count: int, headings: int = 120, beams: int = 72) -> Array:
         """(count, 3) base_link poses that fit the scan best, best first; a place gives at most two headings."""

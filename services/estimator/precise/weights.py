@@ -34,7 +34,8 @@ class FieldCard(BaseModel):
     resolution: float  # m
     origin: tuple[float, float]  # m
     sweeps: int
-    correlation: float  # beams that err alike: the model's covariance over that of independent beams
+    ripple: float  # rad, by which flat surfaces are tilted
+    inflation: float  # of the covariance, for errors of the model that hang together
     test_samples: int
     test_range_error_median_m: float
     test_range_error_mean_m: float
@@ -86,7 +87,7 @@ def load(path: Path) -> tuple[FieldModel, Array, FieldCard]:
     if not all(np.isfinite(a).all() for a in (phi, scales, places)):
         raise UserError(f"weights {path}: not all numbers are finite")
     field = DistanceField(phi.astype(np.float32), card.origin, card.resolution)
-    return FieldModel(field, scales.astype(np.float64)), places.astype(np.float64), card
+    return FieldModel(field, scales.astype(np.float64), card.ripple), places.astype(np.float64), card
 
 
 def train_command(world: str, folder: Path = FOLDER) -> str:

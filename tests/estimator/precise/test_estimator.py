@@ -8,6 +8,7 @@ import pytest
 from common import se2
 from common.world import World, load_world
 from presage.accuracy import bound, tasks
+from presage.accuracy.running import quick_field
 from presage.accuracy.scenes import TWINS, Scene
 from services.estimator.building import Choice, Geometry, prepare
 from services.estimator.generative import RayCaster
@@ -101,6 +102,26 @@ def test_in_a_corridor_without_features_the_covariance_says_so():
         assert across < 0.01, k
     limit = np.linalg.inv(bound.information(scene, pose[None])[0])
     assert limit[0, 0] > 100 * limit[1, 1]
+
+
+@pytest.mark.parametrize("learned", [False, True])
+def test_driving_along_such_a_corridor_it_does_not_pretend_to_know_how_far(learned):
+    """Neither odometry nor features: the error along the walls is within what is stated, and it grows."""
+    hall = World(name="hall", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)])
+    made, scene = estimator(hall, 360)
+    if learned:
+        geometry = Geometry(scene.scanner.angles(), np.array(scene.scanner.mount), 25.0)
+        made.model = quick_field(hall, geometry, np.random.default_rng(0), 3000)
+    pose = np.array([27.0, 0.9, 0.1])
+    made.restart(pose, np.diag([1e-4, 1e-4, 1e-4]))
+    for k in range(75):
+        posterior = feed(made, scene, pose + np.array([0.8 / 15 * k, 0, 0]), 1, k)[0]
+    error = off(posterior, pose + np.array([0.8 / 15 * 74, 0, 0]))
+    stated = np.sqrt(np.diag(posterior.covariance))
+    assert abs(error[0]) < 3 * stated[0]
+    assert stated[0] > 1
+    assert abs(error[1]) < 0.02
+    assert posterior.state != "tracking"
 
 
 def test_begun_near_a_pose_it_stays_near():

@@ -30,11 +30,17 @@ def view(ranges, likelihood=None):
     return View(RayCaster(ROOM), likelihood or Likelihood(), MOUNT, ANGLES, ranges, 25.0)
 
 
-@pytest.mark.parametrize(("expected", "scale"), [(5.0, 1e-3), (5.0, 0.3), (12.0, 0.05)])
+@pytest.mark.parametrize(("expected", "scale"), [(5.0, 1e-3), (5.0, 0.3), (12.0, 0.05), (np.inf, 0.1)])
 def test_the_likelihood_is_a_density(expected, scale):
     o = np.linspace(0, 25.0, 2_000_001)
     density = Likelihood().density(o, expected, scale, 25.0)
-    assert density.sum() * (o[1] - o[0]) == pytest.approx(1, rel=1e-4)
+    no_return = np.exp(-accuracy_of_no_return(expected, scale))
+    assert density.sum() * (o[1] - o[0]) + no_return == pytest.approx(1, rel=1e-4)
+
+
+def accuracy_of_no_return(expected, scale):
+    one = Expected(np.array([[expected]]), np.array([[scale]]), np.zeros((1, 1, 3)))
+    return Likelihood().evaluate(np.array([np.inf]), 25.0, one).accuracy[0]
 
 
 def test_accuracy_is_the_sum_of_minus_log_densities():
