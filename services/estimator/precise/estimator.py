@@ -117,7 +117,8 @@ class PreciseEstimator:
                 poses, evidence = retried
         modes = []
         for k, (mode, each) in enumerate(zip(self.modes, options, strict=True)):
-            keep, blind = mixture.seen(evidence.curvature[k], self.model.ripple)
+            # Once blind, a ripple a little larger than the others must not be taken for a feature.
+            keep, blind = mixture.seen(evidence.curvature[k], self.model.ripple * (3 if mode.blind else 1))
             mixture.project(evidence, k, keep)
             if blind is not None and odom is None:
                 each = [self._unseen(option, blind, mode.blind, period) for option in each]  # noqa: PLW2901
