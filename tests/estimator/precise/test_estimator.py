@@ -118,7 +118,7 @@ def test_driving_along_such_a_corridor_it_does_not_pretend_to_know_how_far(learn
         posterior = feed(made, scene, pose + np.array([0.8 / 15 * k, 0, 0]), 1, k)[0]
     error = off(posterior, pose + np.array([0.8 / 15 * 74, 0, 0]))
     stated = np.sqrt(np.diag(posterior.covariance))
-    # What a learned wall's ripples pretend to tell is told from features, but not to the last (docs/precise.md, limits).
+    # A learned wall's ripples are told from features, but not to the last (docs/precise.md, limits).
     assert abs(error[0]) < (5 if learned else 3) * stated[0]
     assert stated[0] > (0.5 if learned else 1)
     assert abs(error[1]) < 0.02
