@@ -13,7 +13,8 @@ import numpy as np
 MIN_STEP = 0.25  # cells; a shorter stride would creep along walls, a longer one jump over corners
 MAX_STEPS = 2000
 SHORT = 0.6  # of the misfit of a beam too long is that of one too short: much may shorten beams, little lengthens
-FACING = 0.02  # least |n . u|: a beam within about a degree of the surface has no usable derivative
+FACING = 0.02  # least |n . u| that is divided by
+GRAZING = 0.05  # |n . u| below which (three degrees from the surface, or an edge) no derivative is claimed
 
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -79,8 +80,9 @@ def trace(phi, ox, oy, h, lasers, angles, ranges, jacobian, dip, edge, facing):
             length = max(math.hypot(gx, gy), 1e-9)
             nx, ny = gx / length, gy / length
             cosine = -min(nx * ux + ny * uy, -FACING)
-            jacobian[k, b, 0], jacobian[k, b, 1] = nx / cosine, ny / cosine
-            jacobian[k, b, 2] = r * (ny * ux - nx * uy) / cosine
+            if cosine > GRAZING:
+                jacobian[k, b, 0], jacobian[k, b, 1] = nx / cosine, ny / cosine
+                jacobian[k, b, 2] = r * (ny * ux - nx * uy) / cosine
             behind, _, _, _ = lookup(phi, hx + ux, hy + uy)
             edge[k, b], facing[k, b] = -behind / (h * cosine), cosine
 

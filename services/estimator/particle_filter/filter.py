@@ -43,13 +43,15 @@ class ParticleFilter:
         settings: Settings | None = None,
         mount: tuple[float, float, float] = (0, 0, 0),
         seed: int = 0,
+        heading: float | None = None,
     ) -> None:
         """Spread over free space of ``world``; ``mount`` (3,) is laser in base_link, m, m, rad.
 
+        ``heading`` rad: known and frozen, as the paper's robot has it; none: estimated.
         Raises UserError where the world is too large for the settings' resolution.
         """
         self.world, self.settings = world, settings or Settings()
-        self.mount = np.array(mount, float)
+        self.mount, self.heading = np.array(mount, float), heading
         self.sensor = Sensor(world, self.settings)
         self._rng = np.random.default_rng(seed)
         self._places = np.zeros((0, 2))
@@ -65,6 +67,7 @@ class ParticleFilter:
             count = min(s.max_particles, max(s.min_particles, 2000))
             spread = INITIAL_COVARIANCE if covariance is None else np.asarray(covariance, float)
             self.particles = self._rng.multivariate_normal(np.asarray(pose, float), spread, count, method="eigh")
+        self._freeze_heading()
         self.weights = np.full(len(self.particles), 1 / len(self.particles))
         self._recovery = Recovery(s.recovery_alpha_slow, s.recovery_alpha_fast)
         self._health = Recovery(0.01, 0.5)
@@ -122,6 +125,11 @@ class ParticleFilter:
             position, heading = walk
         self.particles = motion.jitter(moved, position, heading, self._rng)
         self.particles[:, 2] = se2.wrap(self.particles[:, 2])
+        self._freeze_heading()
+
+    def _freeze_heading(self) -> None:
+        if self.heading is not None:
+            self.particles[:, 2] = self.heading
 
     def _anneal(self) -> None:
         """Sigma of a hit follows the spread of the particles; a search that found nothing begins again."""
@@ -183,6 +191,7 @@ class ParticleFilter:
         chosen = resampling.low_variance(self.weights, count - len(strangers), rng)
         self.particles = np.concatenate([self.particles[chosen], strangers])
         self.weights = np.full(count, 1 / count)
+        self._freeze_heading()
 
     def _most_needed(self, occupied: int, share: float) -> int:
         """Particles that suffice in any case: no draw meets more bins than are occupied, and one a stranger."""

@@ -1,0 +1,81 @@
+"""Who takes part: estimators by the names of the figures, all over the same scans."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.errors import UserError
+from common.se2 import Array
+from common.world import load_world
+from presage.accuracy.scenes import Scene
+from services.estimator.building import Choice, Factory, Geometry, prepare
+from services.estimator.interface import Estimator
+from services.estimator.particle_filter.filter import ParticleFilter
+from services.estimator.particle_filter.settings import Settings as ParticleSettings
+from services.estimator.perception import Descent
+
+NAMES = (
+    "paper", "precise", "particle-filter", "particle-filter, heading known", "amcl-defaults", "precise, odometry",
+    "particle-filter, odometry",
+)  # fmt: skip
+# One gradient step a scan, as the paper's algorithm 1. The step size is the best of `presage experiment alpha`.
+PAPER = Descent(alpha=2e-4, iterations=1)
+
+
+@dataclass(frozen=True)
+class Field:
+    """Where they meet: a world, a number of beams, the one heading the paper's decoder knows."""
+
+    world: str = "corridor"
+    beams: int = 622
+
+    def scene(self, *seed: int) -> Scene:
+        """With the shipped scanner; its noise and places are drawn from these seeds."""
+        scene = Scene.of(load_world(self.world), self.beams, 0)
+        scene.rng = np.random.default_rng(seed)
+        return scene
+
+    @property
+    def heading(self) -> float:
+        """Rad."""
+        return float(load_world(self.world).start_pose(0.0)[2])
+
+
+def chosen(names: str) -> tuple[str, ...]:
+    """From a comma-separated text; "particle-filter odometry" may stand for "particle-filter, odometry"."""
+    by_name = {name.replace(",", ""): name for name in NAMES}
+    asked = [" ".join(part.split()) for part in names.split(",")]
+    if unknown := [name for name in asked if name not in by_name]:
+        raise UserError(f"no estimator {unknown[0]!r}: choose from {', '.join(by_name)}")
+    return tuple(by_name[name] for name in asked)
+
+
+def uses_odometry(name: str) -> bool:
+    """Whether this one is told of motion."""
+    return name.endswith("odometry")
+
+
+def enter(name: str, field: Field, scene: Scene, seed: int, descent: Descent = PAPER) -> Estimator:
+    """A new estimator that knows nothing but the world; the paper's begins at the map's centre, as there."""
+    scanner, kind = scene.scanner, name.split(",", maxsplit=1)[0]
+    geometry = Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max)
+    if kind == "paper":
+        return _factory(field.world, "paper", descent)(geometry)
+    if kind == "precise":
+        return _factory(field.world, "precise", descent)(geometry)
+    settings = ParticleSettings() if kind == "amcl-defaults" else ParticleSettings.tuned()
+    heading = field.heading if name.endswith("heading known") else None
+    return ParticleFilter(scene.world, settings, scanner.mount, seed, heading)
+
+
+@functools.lru_cache(maxsize=8)
+def _factory(world: str, name: str, descent: Descent) -> Factory:
+    return prepare(Choice(world, name, descent=descent))  # type: ignore[arg-type]
+
+
+def errors(poses: Array, truth: Array) -> Array:
+    """(N,) m between poses (N, 3) and true ones."""
+    return np.asarray(np.hypot(*(poses - truth)[:, :2].T))

@@ -1,0 +1,54 @@
+"""The figures' common habits: colours that the colour-blind tell apart, bands, log axes with plain numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+from common.se2 import Array
+
+# Okabe and Ito; the same in every figure. Green is the paper's for the distance to the goal.
+COLOURS = {
+    "paper": "#E69F00", "precise": "#0072B2", "particle-filter": "#D55E00", "amcl-defaults": "#CC79A7",
+    "particle-filter, heading known": "#000000", "precise, odometry": "#56B4E9",
+    "particle-filter, odometry": "#999999",
+}  # fmt: skip
+MEASURED, PREDICTED, GOAL, BOUND = "#0072B2", "#D55E00", "#009E73", "#444444"
+SMALLEST = 1e-4  # m, the least a logarithmic axis shows
+
+
+def figure_of(columns: int = 1, rows: int = 1, *, width: float = 7.0, height: float = 4.2) -> tuple[Figure, list[Axes]]:
+    """An empty figure of so many panels, each ``width`` x ``height`` inches; the panels, row by row."""
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    return figure, [dress(each) for each in axes.ravel()]
+
+
+def dress(axes: Axes) -> Axes:
+    """Light grid, no box."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(visible=True, which="major", color="#DDDDDD", linewidth=0.6)
+    axes.set_axisbelow(True)
+    return axes
+
+
+def band(axes: Axes, x: Sequence[float] | Array, rows: Sequence[Sequence[float]] | Array, name: str) -> None:
+    """Mean over trials (N, K) with a band of one standard deviation; on a log axis it ends where it would be <= 0."""
+    values = np.asarray(rows, float)
+    mean, std = values.mean(axis=0), values.std(axis=0)
+    colour = COLOURS.get(name, GOAL)
+    axes.plot(x, mean, color=colour, linewidth=1.6, label=name)
+    axes.fill_between(x, np.maximum(mean - std, SMALLEST), mean + std, color=colour, alpha=0.18, linewidth=0)
+
+
+def log_metres(axes: Axes, axis: str = "y") -> None:
+    """A logarithmic axis that says 0.01, not 10^-2."""
+    axes.set(**{f"{axis}scale": "log"})
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    (axes.yaxis if axis == "y" else axes.xaxis).set_major_formatter(plain)
