@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from common.bus import DEFAULT_ENDPOINT
 from common.errors import UserError, first_fault
-from presage import cli_bench, cli_tools
+from presage import cli_bench, cli_experiment, cli_tools
 from presage.options import (
     Connect,
     EstimatorName,
@@ -226,6 +226,7 @@ def train(
 
 app.add_typer(cli_tools.app)
 app.add_typer(cli_bench.app, name="bench")
+app.add_typer(cli_experiment.app, name="experiment")
 
 
 def main() -> None:

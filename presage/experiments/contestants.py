@@ -18,11 +18,11 @@ from services.estimator.particle_filter.settings import Settings as ParticleSett
 from services.estimator.perception import Descent
 
 NAMES = (
-    "paper", "precise", "particle-filter", "particle-filter, heading known", "amcl-defaults", "precise, odometry",
+    "paper", "paper, 10 steps a scan", "precise", "particle-filter", "particle-filter, heading known", "amcl-defaults", "precise, odometry",
     "particle-filter, odometry",
 )  # fmt: skip
 # One gradient step a scan, as the paper's algorithm 1. The step size is the best of `presage experiment alpha`.
-PAPER = Descent(alpha=2e-4, iterations=1)
+PAPER = Descent(alpha=5e-4, iterations=1)
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,20 @@ class Field:
         scene.rng = np.random.default_rng(seed)
         return scene
 
+    def in_front(self, pose: Array) -> bool:
+        """Whether a place lies below every object of the world, as far as y goes: the corridor's free middle."""
+        lowest = min((obstacle.shape().bounds[1] for obstacle in load_world(self.world).obstacles), default=np.inf)
+        return bool(pose[1] < lowest)
+
     @property
     def heading(self) -> float:
         """Rad."""
         return float(load_world(self.world).start_pose(0.0)[2])
+
+
+def descent_of(alpha: float | None, steps: int | None) -> Descent:
+    """The paper's parameters; where one is None, those of `PAPER`."""
+    return Descent(alpha=PAPER.alpha if alpha is None else alpha, iterations=steps or PAPER.iterations)
 
 
 def chosen(names: str) -> tuple[str, ...]:
@@ -63,7 +73,8 @@ def enter(name: str, field: Field, scene: Scene, seed: int, descent: Descent = P
     scanner, kind = scene.scanner, name.split(",", maxsplit=1)[0]
     geometry = Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max)
     if kind == "paper":
-        return _factory(field.world, "paper", descent)(geometry)
+        # The service's default where several are asked for: the robot does not stand between two steps.
+        return _factory(field.world, "paper", Descent() if "steps" in name else descent)(geometry)
     if kind == "precise":
         return _factory(field.world, "precise", descent)(geometry)
     settings = ParticleSettings() if kind == "amcl-defaults" else ParticleSettings.tuned()

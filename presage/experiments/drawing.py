@@ -14,7 +14,7 @@ from common.se2 import Array
 
 # Okabe and Ito; the same in every figure. Green is the paper's for the distance to the goal.
 COLOURS = {
-    "paper": "#E69F00", "precise": "#0072B2", "particle-filter": "#D55E00", "amcl-defaults": "#CC79A7",
+    "paper": "#E69F00", "paper, 10 steps a scan": "#F0E442", "precise": "#0072B2", "particle-filter": "#D55E00", "amcl-defaults": "#CC79A7",
     "particle-filter, heading known": "#000000", "precise, odometry": "#56B4E9",
     "particle-filter, odometry": "#999999",
 }  # fmt: skip

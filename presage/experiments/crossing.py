@@ -1,0 +1,149 @@
+"""E2, the paper's second experiment: crossing the map by small teleports at one heading; error over time.
+
+The robot is carried 5 cm between two scans (0.75 m/s at 15 Hz) from one end of the corridor to the other, at a distance
+from the objects' wall that differs from trial to trial. Everybody knows the start. Nobody has odometry but those whose
+name says so: they are told of each teleport by dead reckoning that drifts as the simulator's does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from common.errors import UserError
+from common.robot import Robot
+from common.se2 import Array
+from presage.accuracy import bound
+from presage.accuracy.scenes import Scene
+from presage.experiments import drawing, results
+from presage.experiments.contestants import PAPER, Field, enter, uses_odometry
+from presage.experiments.trials import run_trials
+from services.estimator.perception import Descent
+from services.simulator.odometry import Drift, Odometer
+
+NUMBER = 2  # of the experiment, in its seeds
+ESTIMATORS = (
+    "paper", "paper, 10 steps a scan", "precise", "particle-filter", "particle-filter, heading known", "amcl-defaults", "precise, odometry",
+    "particle-filter, odometry",
+)  # fmt: skip
+START = np.diag([0.01, 0.01, 0.01])  # covariance of what is known of the start: 10 cm, 6 degrees
+LOST = 0.5  # m
+MARGIN = 0.1  # m, between the robot and anything
+
+
+@dataclass(frozen=True)
+class Job:
+    """One crossing, the same scans to everybody."""
+
+    index: int
+    seed: int
+    step: float = 0.05  # m, of each teleport
+    estimators: tuple[str, ...] = ESTIMATORS
+    field: Field = Field()  # noqa: RUF009 - frozen
+    descent: Descent = PAPER
+
+
+def path_of(scene: Scene, heading: float, step: float) -> Array:
+    """(N, 3) poses straight across the world along x, in steps of so many m, on a free line drawn at random."""
+    x0, y0, x1, y1 = scene.world.bounds
+    away = Robot().radius + MARGIN
+    room = shapely.buffer(scene.world.free_space, -away)
+    for y in scene.rng.uniform(y0 + away, y1 - away, 1000):
+        if shapely.covers(room, shapely.LineString([(x0 + away + 1e-6, y), (x1 - away - 1e-6, y)])):
+            x = np.arange(x0 + away + 1e-6, x1 - away, step)
+            return np.column_stack([x, np.full(len(x), y), np.full(len(x), heading)])
+    raise UserError(f"world {scene.world.name!r} has no free straight line from one side to the other: take another")
+
+
+def trial(job: Job) -> dict[str, Any]:
+    """Errors in m at each scan, by estimator."""
+    scene = job.field.scene(job.seed, NUMBER, job.index)
+    path = path_of(scene, job.field.heading, job.step)
+    odometer, scans = Odometer(Drift(), np.random.default_rng((job.seed, NUMBER, job.index, 1))), []
+    for k, clean in enumerate(scene.clean(path)):
+        if k:
+            odometer.move(path[k - 1], path[k])
+        scans.append(scene.observe(clean, k / scene.scanner.rate, odometer.pose.copy()))
+    found: dict[str, Any] = {"y": float(path[0, 1]), "error_m": {}, "lost": {}}
+    found["bound_m"] = np.round(bound.position(bound.single(scene, path)), 6).tolist()
+    for name in job.estimators:
+        estimator = enter(name, job.field, scene, job.seed * 100_003 + job.index, job.descent)
+        estimator.restart(path[0], START)
+        told = scans if uses_odometry(name) else [replace(scan, odom=None) for scan in scans]
+        poses = np.array([estimator.update(scan).pose for scan in told])
+        error = np.hypot(*(poses - path)[:, :2].T)
+        found["error_m"][name] = np.round(error, 6).tolist()
+        found["lost"][name] = bool((error > LOST).any())
+    return found
+
+
+def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
+    """Numbers of one estimator over all crossings."""
+    error = np.concatenate([each["error_m"][name] for each in trials])
+    return {
+        "crossings": len(trials),
+        "error_mean_m": float(error.mean()),
+        "error_std_m": float(error.std()),
+        "error_median_m": float(np.median(error)),
+        "error_rms_m": float(np.sqrt(np.mean(error**2))),
+        "error_max_m": float(error.max()),
+        "crossings_ever_0.5_m_off": int(np.sum([each["lost"][name] for each in trials])),
+    }
+
+
+def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
+    """All crossings; writes e2.json, .csv, .pdf and .png into ``out``."""
+    jobs = [replace(job, index=index) for index in range(trials)]
+    rows = run_trials("e2", trial, jobs, out, workers, console)
+    scans = len(rows[0]["bound_m"])
+    scanner = job.field.scene(job.seed).scanner
+    curves: dict[str, list[Any]] = {"time s": [round(k / scanner.rate, 6) for k in range(scans)]}
+    for name in job.estimators:
+        mean, std = results.spread([row["error_m"][name] for row in rows])
+        curves[f"{name} mean m"], curves[f"{name} std m"] = mean, std
+    curves["bound m"] = np.sqrt(np.mean(np.square([row["bound_m"] for row in rows]), axis=0)).tolist()
+    result = results.Result(
+        "e2", "E2: crossing the map by small teleports", job.seed, asdict(job) | {"trials": trials},
+        {name: summarise(rows, name) for name in job.estimators}, curves, rows,
+    )  # fmt: skip
+    result.write(out, draw(rows, job.estimators, result.curves))
+    return result
+
+
+def draw(rows: Sequence[dict[str, Any]], names: Sequence[str], curves: dict[str, list[Any]]) -> Figure:
+    """Error over time; without odometry, and with it."""
+    figure, panels = drawing.figure_of(2)
+    told = [name for name in names if uses_odometry(name)]
+    groups = [name for name in names if name not in told], told
+    for axes, group, title in zip(panels, groups, ("laser alone", "with odometry that drifts"), strict=True):
+        for name in group:
+            drawing.band(axes, curves["time s"], [row["error_m"][name] for row in rows], name)
+        axes.plot(curves["time s"], curves["bound m"], "--", color=drawing.BOUND, label="bound of one scan")
+        drawing.log_metres(axes)
+        axes.set(xlabel="time (s)", ylabel="position error (m)", title=title)
+        axes.legend(fontsize=8.5, frameon=False, ncols=2)
+    low, high = zip(*(axes.get_ylim() for axes in panels), strict=True)
+    for axes in panels:
+        axes.set(ylim=(min(low), max(high) * 3))
+    return figure
+
+
+def table(summary: dict[str, dict[str, Any]]) -> str:
+    """As docs/experiments.md has it."""
+    heads = ("estimator", "error, mean ± std (m)", "median (m)", "RMS (m)", "max (m)", "ever 0.5 m off")
+    rows = [
+        [
+            name, results.mean_std(row, "error", 4),
+            *(results.number(row[f"error_{kind}_m"], 4) for kind in ("median", "rms", "max")),
+            f"{row['crossings_ever_0.5_m_off']} of {row['crossings']}",
+        ]
+        for name, row in summary.items()
+    ]  # fmt: skip
+    return results.markdown(heads, rows)
