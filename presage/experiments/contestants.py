@@ -18,7 +18,8 @@ from services.estimator.particle_filter.settings import Settings as ParticleSett
 from services.estimator.perception import Descent
 
 NAMES = (
-    "paper", "paper, 10 steps a scan", "precise", "particle-filter", "particle-filter, heading known", "amcl-defaults", "precise, odometry",
+    "paper", "paper, 10 steps a scan", "precise", "particle-filter", "particle-filter, heading known",
+    "amcl-defaults", "precise, odometry",
     "particle-filter, odometry",
 )  # fmt: skip
 # One gradient step a scan, as the paper's algorithm 1. The step size is the best of `presage experiment alpha`.

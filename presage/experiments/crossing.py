@@ -30,7 +30,8 @@ from services.simulator.odometry import Drift, Odometer
 
 NUMBER = 2  # of the experiment, in its seeds
 ESTIMATORS = (
-    "paper", "paper, 10 steps a scan", "precise", "particle-filter", "particle-filter, heading known", "amcl-defaults", "precise, odometry",
+    "paper", "paper, 10 steps a scan", "precise", "particle-filter", "particle-filter, heading known",
+    "amcl-defaults", "precise, odometry",
     "particle-filter, odometry",
 )  # fmt: skip
 START = np.diag([0.01, 0.01, 0.01])  # covariance of what is known of the start: 10 cm, 6 degrees
@@ -128,10 +129,10 @@ def draw(rows: Sequence[dict[str, Any]], names: Sequence[str], curves: dict[str,
         axes.plot(curves["time s"], curves["bound m"], "--", color=drawing.BOUND, label="bound of one scan")
         drawing.log_metres(axes)
         axes.set(xlabel="time (s)", ylabel="position error (m)", title=title)
-        axes.legend(fontsize=8.5, frameon=False, ncols=2)
     low, high = zip(*(axes.get_ylim() for axes in panels), strict=True)
     for axes in panels:
-        axes.set(ylim=(min(low), max(high) * 3))
+        axes.set(ylim=(max(min(low), drawing.SMALLEST), max(high)))
+    drawing.legend_below(figure, *panels)
     return figure
 
 

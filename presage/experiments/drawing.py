@@ -14,7 +14,8 @@ from common.se2 import Array
 
 # Okabe and Ito; the same in every figure. Green is the paper's for the distance to the goal.
 COLOURS = {
-    "paper": "#E69F00", "paper, 10 steps a scan": "#F0E442", "precise": "#0072B2", "particle-filter": "#D55E00", "amcl-defaults": "#CC79A7",
+    "paper": "#E69F00", "paper, 10 steps a scan": "#F0E442", "precise": "#0072B2", "particle-filter": "#D55E00",
+    "amcl-defaults": "#CC79A7",
     "particle-filter, heading known": "#000000", "precise, odometry": "#56B4E9",
     "particle-filter, odometry": "#999999",
 }  # fmt: skip
@@ -45,6 +46,14 @@ def band(axes: Axes, x: Sequence[float] | Array, rows: Sequence[Sequence[float]]
     colour = COLOURS.get(name, GOAL)
     axes.plot(x, mean, color=colour, linewidth=1.6, label=name)
     axes.fill_between(x, np.maximum(mean - std, SMALLEST), mean + std, color=colour, alpha=0.18, linewidth=0)
+
+
+def legend_below(figure: Figure, *panels: Axes) -> None:
+    """One legend for all panels, where it hides nothing."""
+    named = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(
+        named.values(), named.keys(), loc="outside lower center", ncols=min(len(named), 5), fontsize=9, frameon=False
+    )
 
 
 def log_metres(axes: Axes, axis: str = "y") -> None:

@@ -128,7 +128,7 @@ def draw(rows: Sequence[dict[str, Any]], names: Sequence[str], curves: dict[str,
     panels[0].set(ylim=(0, None), title="mean ± standard deviation, as the paper draws it")
     drawing.log_metres(panels[1])
     panels[1].set(title="the same, logarithmic")
-    panels[1].legend(fontsize=8.5, frameon=False, loc="upper right", bbox_to_anchor=(1, 0.8))
+    drawing.legend_below(figure, *panels)
     return figure
 
 
