@@ -91,7 +91,7 @@ def e2(
 
 @app.command("alpha")
 def alpha_sweep(
-    trials: Trials = 100,
+    trials: Trials = 50,
     alphas: Annotated[str, typer.Option(help="Comma-separated, m²; empty: 1e-4 to 2.4e-3.")] = "",
     seed: ExperimentSeed = 1,
     out: Out = OUT,
@@ -116,4 +116,4 @@ def alpha_sweep(
 def _say(name: str, table: str, out: Path) -> None:
     """The table, and where everything lies."""
     print(f"\n{table}\n")
-    console.print(f"{out / name}.json, .csv, .pdf, .png")
+    console.print(f"{out / name}.json, .csv, .trials.jsonl, .pdf, .png")

@@ -111,7 +111,7 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
         curves[f"{name} mean m"], curves[f"{name} std m"] = mean, std
     curves["bound m"] = np.sqrt(np.mean(np.square([row["bound_m"] for row in rows]), axis=0)).tolist()
     result = results.Result(
-        "e2", "E2: crossing the map by small teleports", job.seed, asdict(job) | {"trials": trials},
+        "e2", "E2: crossing the map by small teleports", job.seed, asdict(job) | {"trials": trials, "bound_rms_m": float(np.sqrt(np.mean(np.square(curves["bound m"]))))},
         {name: summarise(rows, name) for name in job.estimators}, curves, rows,
     )  # fmt: skip
     result.write(out, draw(rows, job.estimators, result.curves))

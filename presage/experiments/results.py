@@ -1,4 +1,4 @@
-"""What an experiment leaves: NAME.json with everything, NAME.csv with its curves, NAME.pdf and NAME.png."""
+"""What an experiment leaves: NAME.json, .csv (its curves), .trials.jsonl (every trial), .pdf and .png."""
 
 from __future__ import annotations
 
@@ -35,8 +35,12 @@ class Result:
         """Into the folder ``out``; the files."""
         about = {"command": " ".join(["presage", *sys.argv[1:]]), "commit": commit(), "versions": versions()}
         path = out / f"{self.name}.json"
-        path.write_text(json.dumps({**vars(self), **about}, indent=1) + "\n", encoding="utf-8")
+        own = {name: value for name, value in vars(self).items() if name not in ("trials", "curves")}
+        path.write_text(json.dumps({**own, **about}, indent=1) + "\n", encoding="utf-8")
         files = [path]
+        if self.trials:
+            files.append(out / f"{self.name}.trials.jsonl")
+            files[-1].write_text("".join(json.dumps(each) + "\n" for each in self.trials), encoding="utf-8")
         if self.curves:
             files.append(out / f"{self.name}.csv")
             with files[-1].open("w", newline="", encoding="utf-8") as file:
