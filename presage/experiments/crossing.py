@@ -109,9 +109,11 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
     for name in job.estimators:
         mean, std = results.spread([row["error_m"][name] for row in rows])
         curves[f"{name} mean m"], curves[f"{name} std m"] = mean, std
-    curves["bound m"] = np.sqrt(np.mean(np.square([row["bound_m"] for row in rows]), axis=0)).tolist()
+    limits = np.square([row["bound_m"] for row in rows])
+    curves["bound m"] = np.sqrt(limits.mean(axis=0)).tolist()
+    parameters = asdict(job) | {"trials": trials, "bound_rms_m": float(np.sqrt(limits.mean()))}
     result = results.Result(
-        "e2", "E2: crossing the map by small teleports", job.seed, asdict(job) | {"trials": trials, "bound_rms_m": float(np.sqrt(np.mean(np.square(curves["bound m"]))))},
+        "e2", "E2: crossing the map by small teleports", job.seed, parameters,
         {name: summarise(rows, name) for name in job.estimators}, curves, rows,
     )  # fmt: skip
     result.write(out, draw(rows, job.estimators, result.curves))

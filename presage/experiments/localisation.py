@@ -103,8 +103,9 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
         mean, std = results.spread([row["error_m"][name] for row in rows])
         curves[f"{name} mean m"], curves[f"{name} std m"] = mean, std
     curves["bound m"] = _bound(rows, job.iterations)
+    parameters = asdict(job) | {"trials": trials, "bound_end_m": curves["bound m"][-1]}
     result = results.Result(
-        "e1", "E1: a standing robot localised", job.seed, asdict(job) | {"trials": trials, "bound_end_m": curves["bound m"][-1]},
+        "e1", "E1: a standing robot localised", job.seed, parameters,
         {name: summarise(rows, name) for name in job.estimators}, curves, rows,
     )  # fmt: skip
     result.write(out, draw(rows, job.estimators, result.curves))
