@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import FrameType, TracebackType
@@ -39,10 +39,13 @@ class Process:
 class Stack:
     """Child processes of one session; a context manager that leaves none behind."""
 
-    def __init__(self, robot: str, port: int | None = None, *, quiet: bool = False) -> None:
-        """``port`` on loopback for the router, or a free one."""
+    def __init__(
+        self, robot: str, port: int | None = None, *, quiet: bool = False, environment: Mapping[str, str] | None = None
+    ) -> None:
+        """``port`` on loopback for the router, or a free one; ``environment`` of the children, or ours."""
         self.port = port if port is not None else free_port()
         self.robot, self.quiet = robot, quiet
+        self.environment = os.environ if environment is None else environment
         self.processes: dict[str, Process] = {}
 
     @property
@@ -97,7 +100,7 @@ class Stack:
 
     def _spawn(self, name: str, args: list[str]) -> None:
         environment = {
-            **os.environ,
+            **self.environment,
             "PRESAGE_CONNECT": self.endpoint,
             "PRESAGE_ROBOT": self.robot,
             "PYTHONUNBUFFERED": "1",

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import shapely
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
 from matplotlib.ticker import FuncFormatter
 
 from common.se2 import Array
+from common.world import World
 
 # Okabe and Ito; the same in every figure. Green is the paper's for the distance to the goal.
 COLOURS = {
@@ -25,10 +28,16 @@ SMALLEST = 1e-4  # m, the least a logarithmic axis shows
 
 def figure_of(columns: int = 1, rows: int = 1, *, width: float = 7.0, height: float = 4.2) -> tuple[Figure, list[Axes]]:
     """An empty figure of so many panels, each ``width`` x ``height`` inches; the panels, row by row."""
-    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank(width * columns, height * rows)
     axes = figure.subplots(rows, columns, squeeze=False)
     return figure, [dress(each) for each in axes.ravel()]
+
+
+def blank(width: float, height: float) -> Figure:
+    """No panel yet; inches."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
 
 
 def dress(axes: Axes) -> Axes:
@@ -39,13 +48,30 @@ def dress(axes: Axes) -> Axes:
     return axes
 
 
-def band(axes: Axes, x: Sequence[float] | Array, rows: Sequence[Sequence[float]] | Array, name: str) -> None:
+def band(
+    axes: Axes, x: Sequence[float] | Array, rows: Sequence[Sequence[float]] | Array, name: str, colour: str = ""
+) -> None:
     """Mean over trials (N, K) with a band of one standard deviation; on a log axis it ends where it would be <= 0."""
     values = np.asarray(rows, float)
     mean, std = values.mean(axis=0), values.std(axis=0)
-    colour = COLOURS.get(name, GOAL)
+    colour = colour or COLOURS.get(name, GOAL)
     axes.plot(x, mean, color=colour, linewidth=1.6, label=name)
     axes.fill_between(x, np.maximum(mean - std, SMALLEST), mean + std, color=colour, alpha=0.18, linewidth=0)
+
+
+def held(rows: Sequence[Sequence[float]], length: int) -> Array:
+    """(N, ``length``) of rows that end earlier: they hold their last value."""
+    return np.array([[*row, *[row[-1]] * (length - len(row))] for row in rows])
+
+
+def world_map(axes: Axes, world: World) -> None:
+    """Walls and furniture, m."""
+    axes.add_patch(Polygon(np.array(world.boundary), fill=False, edgecolor="black", linewidth=1.2))
+    for obstacle in world.obstacles:
+        outline = shapely.get_coordinates(obstacle.shape())
+        axes.add_patch(Polygon(outline, facecolor="#BBBBBB", edgecolor="black", linewidth=0.6))
+    x0, y0, x1, y1 = world.bounds
+    axes.set(xlim=(x0 - 0.2, x1 + 0.2), ylim=(y0 - 0.2, y1 + 0.2), aspect="equal", xlabel="x (m)", ylabel="y (m)")
 
 
 def legend_below(figure: Figure, *panels: Axes) -> None:

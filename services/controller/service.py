@@ -35,14 +35,18 @@ class ControllerService(Service):
         robot = Robot(drive=options.drive, max_speed=options.max_speed, acceleration=options.acceleration)
         world = load_world(options.world) if options.world else None
         self.navigator = Navigator(robot, Preference(gamma=options.gamma, reach=options.reach), world)
+        # Declared before anybody asks: the first message on a key just declared may be lost.
+        for topic in (STATUS, CMD_VEL):
+            self.loop.bus.publisher(topic, self.name)
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
-        """A belief is answered by a command of the same stamp."""
+        """A belief is answered by a command of the same stamp; a goal by a status, at once."""
         if isinstance(message, Scan):
             self.navigator.hear_scan(message)
         elif isinstance(message, Goal):
             self.navigator.hear_goal(message)
             self.log.info("goal", x=message.pose.x, y=message.pose.y, cancel=message.cancel)
+            self.publish(STATUS, self.navigator.status(self._last[0] if self._last else 0, None))
         elif isinstance(message, Belief):
             self._belief_at = time.monotonic()
             if self._last is None or self._last[0] != message.stamp_ns:  # one sent again is answered again
