@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from common.errors import UserError
 from presage.options import console
 from presage.output import make_folder
+
+if TYPE_CHECKING:
+    from presage.experiments.results import Result
 
 app = typer.Typer(
     help="The experiments of Burghardt & Lanillos 2021, for presets paper and precise and the particle filter.",
@@ -58,7 +61,7 @@ def e1(
     if estimators:
         job = replace(job, estimators=chosen(estimators))
     result = localisation.run(job, trials, out, workers, console)
-    _say(result.name, localisation.table(result.summary), out)
+    _say(result, localisation.table(result.summary), out)
 
 
 @app.command("e2")
@@ -86,7 +89,35 @@ def e2(
     if estimators:
         job = replace(job, estimators=chosen(estimators))
     result = crossing.run(job, trials, out, workers, console)
-    _say(result.name, crossing.table(result.summary), out)
+    _say(result, crossing.table(result.summary), out)
+
+
+@app.command("e3")
+def e3(
+    trials: Trials = 50,
+    apart: Annotated[float, typer.Option(min=1.0, max=1000.0, help="m, between start and goal at least.")] = 12.0,
+    estimators: Estimators = "",
+    alpha: Alpha = None,
+    steps: Steps = None,
+    world: World = "corridor",
+    beams: Beams = 622,
+    seed: ExperimentSeed = 1,
+    out: Out = OUT,
+    workers: Workers = CORES,
+) -> None:
+    """E3: navigation from a known start to a goal, through the real processes in lockstep over zenoh.
+
+    Examples: `presage experiment e3 --trials 2`; `presage experiment e3 --estimators precise --apart 5 --out near`.
+    """
+    from presage.experiments import navigation  # noqa: PLC0415
+    from presage.experiments.contestants import Field, chosen, descent_of  # noqa: PLC0415
+
+    make_folder(out, "--out")
+    job = navigation.Job(0, seed, apart, field=Field(world, beams), descent=descent_of(alpha, steps))
+    if estimators:
+        job = replace(job, estimators=chosen(estimators))
+    result = navigation.run(job, trials, out, workers, console)
+    _say(result, navigation.table(result.summary), out)
 
 
 @app.command("alpha")
@@ -109,11 +140,122 @@ def alpha_sweep(
     except ValueError:
         raise UserError(f"--alphas {alphas!r}: give numbers, such as 2e-4,4e-4") from None
     result = step_size.run(localisation.Job(0, seed, 50), trials, out, workers, console, wanted)
-    _say(result.name, step_size.table(result.summary), out)
-    console.print(*result.notes, sep="\n")
+    _say(result, step_size.table(result.summary), out)
 
 
-def _say(name: str, table: str, out: Path) -> None:
+@app.command("steps")
+def step_sizes(trials: Trials = 10, seed: ExperimentSeed = 1, out: Out = OUT, workers: Workers = CORES) -> None:
+    """The step sizes β and γ on E3 in one process, and the paper's own loop of teleports: where 12.5 iterations lie.
+
+    Example: `presage experiment steps --trials 2`.
+    """
+    from presage.experiments import stepping  # noqa: PLC0415
+
+    make_folder(out, "--out")
+    result = stepping.run(stepping.Job(seed=seed), trials, out, workers, console)
+    _say(result, stepping.table(result.summary), out)
+
+
+@app.command("samples")
+def samples_needed(
+    sizes: Annotated[str, typer.Option(help="Comma-separated; empty: 500 to 13000.")] = "",
+    places: Annotated[int, typer.Option(min=1, help="To find, after learning.")] = 50,
+    seed: ExperimentSeed = 1,
+    out: Out = OUT,
+    workers: Workers = CORES,
+) -> None:
+    """Fewer samples: error of what is predicted, and of the places found with it.
+
+    Examples: `presage experiment samples --sizes 500,2000 --places 10`.
+    """
+    from presage.experiments import samples  # noqa: PLC0415
+
+    make_folder(out, "--out")
+    try:
+        wanted = tuple(int(part) for part in sizes.split(",")) if sizes else samples.SIZES
+    except ValueError:
+        raise UserError(f"--sizes {sizes!r}: give whole numbers, such as 500,2000") from None
+    result = samples.run(samples.Job(seed, places=places), out, workers, console, wanted)
+    _say(result, samples.table(result.summary), out)
+
+
+@app.command("aliasing")
+def similar_objects(
+    places: Annotated[int, typer.Option(min=1, help="In each world.")] = 50,
+    seed: ExperimentSeed = 1,
+    out: Out = OUT,
+    workers: Workers = CORES,
+) -> None:
+    """Similar objects, and two rooms alike: who is found, who is sure and wrong, who keeps both.
+
+    Example: `presage experiment aliasing --places 5`.
+    """
+    from presage.experiments import aliasing  # noqa: PLC0415
+
+    make_folder(out, "--out")
+    result = aliasing.run(aliasing.Job(seed, places=places), out, workers, console)
+    _say(result, aliasing.table(result.summary), out)
+
+
+@app.command("prediction")
+def predicted(
+    scans: Annotated[int, typer.Option(min=2, help="Whose beams are counted.")] = 500,
+    seed: ExperimentSeed = 1,
+    out: Out = OUT,
+) -> None:
+    """Predicted against measured scan on a test sample, with the stated precision (the paper's figure 2c).
+
+    Example: `presage experiment prediction --seed 7 --out other`.
+    """
+    from presage.experiments import prediction  # noqa: PLC0415
+
+    make_folder(out, "--out")
+    result = prediction.run(prediction.Job(seed, scans), out, 1, console)
+    _say(result, prediction.table(result.summary), out)
+
+
+def _say(result: Result, table: str, out: Path) -> None:
     """The table, and where everything lies."""
     print(f"\n{table}\n")
-    console.print(f"{out / name}.json, .csv, .trials.jsonl, .pdf, .png")
+    if result.notes:
+        console.print(*result.notes, sep="\n")
+    console.print(f"{out / result.name}.json, .csv, .trials.jsonl, .pdf, .png")
+
+
+@app.command("all")
+def all_experiments(
+    trials: Annotated[int, typer.Option(min=0, help="At most so many of each, for a look; 0: each its own.")] = 0,
+    seed: ExperimentSeed = 1,
+    out: Out = OUT,
+    workers: Workers = CORES,
+) -> None:
+    """Every experiment, one after another; after Ctrl-C the same command goes on where it was.
+
+    Examples: `presage experiment all`; `presage experiment all --trials 3 --out look`.
+    """
+    from presage.experiments.suite import run_all  # noqa: PLC0415
+
+    make_folder(out, "--out")
+    run_all(trials, seed, out, workers, console)
+
+
+@app.command("tables")
+def tables(
+    out: Annotated[Path, typer.Option(help="Folder with the results.")] = OUT,
+    page: Annotated[Path | None, typer.Option(help="Markdown file whose marked tables are filled anew.")] = None,
+) -> None:
+    """The tables of results that are there, as Markdown; or a page filled with them.
+
+    Examples: `presage experiment tables`;
+    `presage experiment tables --page docs/experiments.md --out docs/experiments`.
+    """
+    from presage.experiments.page import MODULES, filled, table_of  # noqa: PLC0415
+
+    if page is not None:
+        page.write_text(filled(page.read_text(encoding="utf-8"), out), encoding="utf-8")
+        return
+    found = [name for name in MODULES if (out / f"{name}.json").exists()]
+    if not found:
+        raise UserError(f"{out}: no results there; make them with: presage experiment all")
+    for name in found:
+        print(f"\n{name}\n\n{table_of(name, out)}")

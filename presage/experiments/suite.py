@@ -1,0 +1,74 @@
+"""`presage experiment all`: one after another, and which of them are done."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+
+from common.versions import commit
+from presage.experiments import (
+    aliasing,
+    crossing,
+    localisation,
+    navigation,
+    page,
+    prediction,
+    results,
+    samples,
+    step_size,
+    stepping,
+)
+
+Run = Callable[[], results.Result]
+
+
+def run_all(trials: int, seed: int, out: Path, workers: int, console: Console) -> None:
+    """Run what is not done yet by the same command at the same commit; ``trials`` 0: each experiment's own number."""
+
+    def few(own: int) -> int:
+        return min(own, trials) if trials else own
+
+    runs: dict[str, Run] = {
+        "e1": lambda: localisation.run(localisation.Job(0, seed, 50), few(100), out, workers, console),
+        "e2": lambda: crossing.run(crossing.Job(0, seed), few(20), out, workers, console),
+        "e3": lambda: navigation.run(navigation.Job(0, seed), few(50), out, workers, console),
+        "alpha": lambda: step_size.run(localisation.Job(0, seed, 50), few(50), out, workers, console),
+        "steps": lambda: stepping.run(stepping.Job(seed=seed), few(10), out, workers, console),
+        "samples": lambda: samples.run(samples.Job(seed, places=few(50)), out, workers, console),
+        "aliasing": lambda: aliasing.run(aliasing.Job(seed, places=few(50)), out, workers, console),
+        "prediction": lambda: prediction.run(prediction.Job(seed), out, 1, console),
+    }
+    done = Done(out / ".all.unfinished.json", [trials, seed])
+    began = time.monotonic()
+    for number, (name, run) in enumerate(runs.items(), 1):
+        if name in done.names:
+            console.print(f"{name}: done before")
+            continue
+        console.rule(f"{number} of {len(runs)}: {name}", align="left")
+        result = run()
+        print(f"\n{page.table_of(name, out)}\n")
+        console.print(*result.notes, sep="\n")
+        done.add(name)
+    done.path.unlink(missing_ok=True)
+    console.print(f"all of it lies in {out}/; {(time.monotonic() - began) / 60:.1f} minutes")
+
+
+class Done:
+    """Names of the experiments that an interrupted run has finished; those of another command or commit count not."""
+
+    def __init__(self, path: Path, parameters: list[int]) -> None:
+        """Read what is there."""
+        self.path, self.key = path, [commit(), *parameters]
+        self.names: list[str] = []
+        if path.exists():
+            kept = json.loads(path.read_text(encoding="utf-8"))
+            self.names = kept["done"] if kept["key"] == self.key else []
+
+    def add(self, name: str) -> None:
+        """One more."""
+        self.names.append(name)
+        self.path.write_text(json.dumps({"key": self.key, "done": self.names}) + "\n", encoding="utf-8")
