@@ -17,7 +17,7 @@ APART = 12.0  # m, between start and goal at least
 # m between robot and anything along the line. The obstacle stop (common/safety.py) looks 1 cm beside the robot and
 # keeps 5 cm before it; the rest is seven times the scanner's noise, so that on this line it never acts.
 CLEARANCE = 0.15
-TRIES = 100_000
+TRIES = 20_000
 
 
 @dataclass(frozen=True)

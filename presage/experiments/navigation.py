@@ -176,9 +176,14 @@ def draw(rows: Sequence[dict[str, Any]], job: Job) -> Figure:
             drawing.band(axes, range(values.shape[1]), values, name, colour)
     left.axhline(CLOSE, linestyle="--", color=drawing.BOUND, linewidth=1)
     left.annotate(f"{CLOSE:g} m: there", (1, CLOSE), (4, 4), textcoords="offset points", fontsize=9)
-    left.set(xlabel="iteration (one scan, 1/15 s)", ylabel="distance to the goal (m)", xlim=(0, None), ylim=(0, None))
-    right.set(xlabel="iteration", ylabel="position error of the belief (m)", xlim=(0, None))
+    left.set(xlabel="iteration (one scan, 1/15 s)", ylabel="distance to the goal (m)", ylim=(0, None))
+    right.set(xlabel="iteration", ylabel="position error of the belief (m)")
     drawing.log_metres(right)
+    # As far as somebody arrives; those that never do stand still beyond.
+    every = [each for row in rows for each in row["estimators"].values()]
+    last = max((each["iterations"] for each in every if each["reached"]), default=job.limit)
+    for axes in (left, right):
+        axes.set_xlim(0, last + 10)
     drawing.world_map(below, load_world(job.field.world))
     name = "precise" if "precise" in job.estimators else job.estimators[-1]
     for row in rows:

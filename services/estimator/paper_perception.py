@@ -41,7 +41,9 @@ class PaperPerception:
         """``pose`` (3,) to begin with; none: the map's centre."""
         self.card = card
         self._first = pose
-        self.estimator = PaperEstimator(model, card.test_l1_mean, card.world.bounds, self._initial(pose), descent)
+        self.estimator = PaperEstimator(
+            model, card.test_l1_mean, card.world.bounds, self._initial(pose), descent, known=pose is not None
+        )
 
     def _initial(self, pose: Array | None) -> Array:
         x, y = self.card.world.center() if pose is None else pose[:2]
@@ -49,7 +51,7 @@ class PaperPerception:
 
     def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:  # noqa: ARG002
         """Begin anew at ``pose``, or where it began first; the heading and a covariance are not used."""
-        self.estimator.restart(self._initial(self._first if pose is None else pose))
+        self.estimator.restart(self._initial(self._first if pose is None else pose), known=pose is not None)
 
     def update(self, observation: Observation) -> Posterior:
         """Descend on one scan."""

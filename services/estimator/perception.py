@@ -48,16 +48,17 @@ class PaperEstimator:
     bounds: tuple[float, float, float, float]  # m, the belief stays within x0, y0, x1, y1
     pose: Array  # (3,) initial belief
     settings: Descent = field(default_factory=Descent)
+    known: bool = False  # the initial belief is where the robot is, so it tracks from the first scan on
 
     def __post_init__(self) -> None:
         """Nothing is known of the first steps."""
         self._steps: list[float] = []
         self._misfits: list[float] = []
-        self._was_tracking = False
+        self._was_tracking = self.known
 
-    def restart(self, pose: Array) -> None:
-        """Believe ``pose`` (3,) and localise anew."""
-        self.pose = np.array(pose, float)
+    def restart(self, pose: Array, *, known: bool = False) -> None:
+        """Believe ``pose`` (3,): told that it is there, or to localise from there."""
+        self.pose, self.known = np.array(pose, float), known
         self.__post_init__()
 
     def update(self, ranges: Array, goal: Array | None = None) -> Estimate:

@@ -74,6 +74,15 @@ def test_restart_forgets():
     assert found.update(scan((3.0, 1.5), rng)).state == "localising"
 
 
+def test_told_where_it_is_it_tracks_at_once_unless_the_scan_says_otherwise():
+    rng = np.random.default_rng(5)
+    found = estimator((1.0, 1.0), alpha=2e-3, iterations=1)
+    found.restart(np.array([3.0, 1.5, HEADING]), known=True)
+    assert found.update(scan((3.0, 1.5), rng)).state == "tracking"
+    found.restart(np.array([1.0, 1.0, HEADING]), known=True)
+    assert found.update(scan((5.0, 3.0), rng)).state == "lost"
+
+
 @pytest.mark.parametrize("beams", [622, 811])
 def test_shipped_weights_localise_in_the_corridor(beams):
     """From the map's centre, 25 scans: most beliefs end within 1 m, the median within 0.25 m."""
