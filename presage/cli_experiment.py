@@ -152,7 +152,7 @@ def step_sizes(trials: Trials = 10, seed: ExperimentSeed = 1, out: Out = OUT, wo
     from presage.experiments import stepping  # noqa: PLC0415
 
     make_folder(out, "--out")
-    result = stepping.run(stepping.Job(seed=seed), trials, out, workers, console)
+    result = stepping.run(stepping.Job(0, seed), trials, out, workers, console)
     _say(result, stepping.table(result.summary), out)
 
 

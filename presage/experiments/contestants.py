@@ -6,6 +6,7 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 
 from common.errors import UserError
 from common.se2 import Array
@@ -41,7 +42,7 @@ class Field:
 
     def in_front(self, pose: Array) -> bool:
         """Whether a place lies below every object of the world, as far as y goes: the corridor's free middle."""
-        lowest = min((obstacle.shape().bounds[1] for obstacle in load_world(self.world).obstacles), default=np.inf)
+        lowest = min((shapely.bounds(obstacle.shape())[1] for obstacle in load_world(self.world).obstacles), default=np.inf)
         return bool(pose[1] < lowest)
 
     @property

@@ -37,7 +37,7 @@ def run_all(trials: int, seed: int, out: Path, workers: int, console: Console) -
         "e2": lambda: crossing.run(crossing.Job(0, seed), few(20), out, workers, console),
         "e3": lambda: navigation.run(navigation.Job(0, seed), few(50), out, workers, console),
         "alpha": lambda: step_size.run(localisation.Job(0, seed, 50), few(50), out, workers, console),
-        "steps": lambda: stepping.run(stepping.Job(seed=seed), few(10), out, workers, console),
+        "steps": lambda: stepping.run(stepping.Job(0, seed), few(10), out, workers, console),
         "samples": lambda: samples.run(samples.Job(seed, places=few(50)), out, workers, console),
         "aliasing": lambda: aliasing.run(aliasing.Job(seed, places=few(50)), out, workers, console),
         "prediction": lambda: prediction.run(prediction.Job(seed), out, 1, console),
