@@ -42,8 +42,8 @@ class Field:
 
     def in_front(self, pose: Array) -> bool:
         """Whether a place lies below every object of the world, as far as y goes: the corridor's free middle."""
-        lowest = min((shapely.bounds(obstacle.shape())[1] for obstacle in load_world(self.world).obstacles), default=np.inf)
-        return bool(pose[1] < lowest)
+        objects = [obstacle.shape() for obstacle in load_world(self.world).obstacles]
+        return not objects or bool(pose[1] < shapely.bounds(objects)[:, 1].min())
 
     @property
     def heading(self) -> float:
