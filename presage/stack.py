@@ -115,7 +115,7 @@ class Stack:
             text=True,
             errors="replace",
             start_new_session=True,  # Ctrl-C is ours to pass on, in order
-            preexec_fn=lambda: _die_with(parent),  # noqa: PLW1509 - one call, before any thread of the child
+            preexec_fn=lambda: die_with(parent),  # noqa: PLW1509 - one call, before any thread of the child
         )
         process = Process(name, child, threading.Thread(target=lambda: self._pass_on(process), daemon=True))
         process.reader.start()
@@ -167,7 +167,7 @@ def _end(process: Process) -> int:
     return child.returncode
 
 
-def _die_with(parent: int) -> None:
+def die_with(parent: int) -> None:
     """Linux: end this process when its parent ends, even by SIGKILL."""
     pr_set_pdeathsig = 1
     libc = ctypes.CDLL(None, use_errno=True)

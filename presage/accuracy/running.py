@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -21,6 +18,7 @@ from common.versions import commit, versions
 from common.world import World, load_world
 from presage.accuracy import tasks
 from presage.accuracy.scenes import TWINS, Scene
+from presage.workers import pool
 from services.estimator.building import Choice, Geometry, Name, prepare
 from services.estimator.generative import RayCaster
 from services.estimator.interface import Estimator
@@ -38,7 +36,6 @@ CHOICES: dict[str, tuple[Name, str]] = {
     "particle-filter": ("particle-filter", "learned"),
     "amcl-defaults": ("amcl-defaults", "learned"),
 }
-ONE_CORE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 DEGREES_OF_FREEDOM = 3
 TASKS = ("standing", "blocked", "kidnapped", "tracking", "odometry", "twins")
 
@@ -58,12 +55,10 @@ class Job:
 
 def run_all(jobs: list[Job], workers: int, console: Console) -> list[dict[str, Any]]:
     """Rows of all jobs, in order; with progress."""
-    for name in ONE_CORE:
-        os.environ[name] = "1"
     if workers == 1:
         return [row for job in track(jobs, "measuring", console=console, transient=True) for row in run(job)]
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        done = track(pool.map(run, jobs), "measuring", total=len(jobs), console=console, transient=True)
+    with pool(workers) as executor:
+        done = track(executor.map(run, jobs), "measuring", total=len(jobs), console=console, transient=True)
         return [row for rows in done for row in rows]
 
 

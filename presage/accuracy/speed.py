@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import resource
 import time
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +13,10 @@ from rich.progress import track
 from rich.table import Table
 
 from common.world import load_world
-from presage.accuracy.running import CHOICES, ONE_CORE, about
+from presage.accuracy.running import CHOICES, about
 from presage.accuracy.scenes import Scene
 from presage.output import check_file, write_json
+from presage.workers import pool
 from services.estimator.building import Choice, Geometry, prepare
 
 LIMITS = {"tracking": 5.0, "from nothing": 500.0}  # ms, what is asked of preset precise
@@ -30,11 +28,9 @@ def bench_speed(world: str, beams: str, seed: int, json_file: Path | None, conso
     check_file(json_file, "--json")
     load_world(world)
     jobs = [(name, world, int(count), seed) for count in beams.split(",") for name in CHOICES]
-    for name in ONE_CORE:
-        os.environ[name] = "1"
     rows = []
     for job in track(jobs, "measuring", console=console, transient=True):
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
+        with pool(1) as alone:
             rows.append(alone.submit(measure, *job).result())
     table = Table(title=f"{world}, one core", title_justify="left")
     for column in ["estimator", "beams", "tracking ms", "p95", "from nothing ms", "p95", "ready s", "memory MB"]:

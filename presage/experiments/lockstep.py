@@ -21,9 +21,9 @@ from common.messages import Belief, Goal, Pose, Stamped, Status, Truth
 from common.se2 import Array
 from common.topics import BELIEF, GOAL, STATUS, TRUTH
 from presage.experiments.journeys import CLOSE, Journey
-from presage.experiments.trials import ONE_CORE
 from presage.stack import Stack
 from presage.watch import Watch
+from presage.workers import ONE_CORE
 
 OURS = "experiment"  # our liveliness token: the simulator waits for it, so the goal is there before the first scan
 PATIENCE = 120.0  # s of wall time without a message

@@ -174,7 +174,7 @@ def draw(rows: Sequence[dict[str, Any]], job: Job) -> Figure:
         for axes, quantity in ((left, "distance_m"), (right, "error_m")):
             values = _rows(rows, name, quantity, job.estimators)
             drawing.band(axes, range(values.shape[1]), values, name, colour)
-            if name == "precise":  # wide, for another that drives as fast may lie upon it
+            if name == "precise" and axes is left:  # wide, for another that drives as fast may lie upon it
                 axes.lines[-1].set(linewidth=3.2, zorder=1.5)
     left.axhline(CLOSE, linestyle="--", color=drawing.BOUND, linewidth=1)
     left.annotate(f"{CLOSE:g} m: there", (1, CLOSE), (4, 4), textcoords="offset points", fontsize=9)

@@ -58,7 +58,8 @@ def _navigation(summary: Summary, names: tuple[str, ...]) -> list[list[str]]:
     # The running service makes ten gradient steps a scan.
     own = [summary[name if name in summary else f"{name}, 10 steps a scan"] for name in names]
     return [
-        ["E3: reached; trials with a contact", "–", *(f"{r['reached']} of {r['trials']}; {r['trials_with_contact']}" for r in own), ""],
+        ["E3: reached", "–", *(f"{r['reached']} of {r['trials']}" for r in own), ""],
+        ["E3: trials with a contact", "–", *(str(r["trials_with_contact"]) for r in own), ""],
         ["E3: iterations, mean", "12.5 (of about 1 m each)"] + [number(r["iterations_mean"], 1) for r in own] + [""],
         ["E3: time over the least possible, median", "–"]
         + [number(r["time_over_least_median"], 3) for r in own] + ["1"],

@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from rich.console import Console
 
 from common.messages import Belief, Goal, Pose
@@ -233,6 +234,7 @@ def _logarithmic(axes: Axes, *names: str) -> None:
     """Where there is anything: an empty axis has no logarithm."""
     for name in names if axes.collections else ():
         drawing.log_metres(axes, name)
+        (axes.yaxis if name == "y" else axes.xaxis).set_minor_formatter(NullFormatter())
 
 
 def _line(

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import signal
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,9 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from common.errors import UserError
 from common.versions import commit
-
-ONE_CORE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-ENDS_WITHIN = 10.0  # s
+from presage.workers import pool
 
 Job = TypeVar("Job")  # a frozen dataclass of plain values: it is sent to a process, and it names its result
 Result = dict[str, Any]  # plain values
@@ -64,34 +59,13 @@ def _side_by_side(
     trial: Callable[[Job], Result], jobs: Sequence[Job], left: list[int], workers: int,
     keep: Callable[[int, Result], None],
 ) -> None:  # fmt: skip
-    for variable in ONE_CORE:
-        os.environ.setdefault(variable, "1")
-    pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_leave_interrupts_to_parent)
     try:
-        futures = {pool.submit(trial, jobs[index]): index for index in left}
-        for future in as_completed(futures):
-            keep(futures[future], future.result())
+        with pool(workers) as executor:
+            futures = {executor.submit(trial, jobs[index]): index for index in left}
+            for future in as_completed(futures):
+                keep(futures[future], future.result())
     except BrokenProcessPool:
         raise UserError("a worker process was ended from outside (out of memory?); the same command goes on") from None
-    except BaseException:
-        children = list(pool._processes.values())  # noqa: SLF001 - there is no public way to end a running trial
-        pool.shutdown(wait=False, cancel_futures=True)
-        for child in children:
-            child.terminate()
-        for child in children:
-            child.join(ENDS_WITHIN)
-        raise
-    pool.shutdown()
-
-
-def _leave_interrupts_to_parent() -> None:
-    """Ctrl-C reaches the whole group; the parent ends us with SIGTERM, upon which what a trial started is ended."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _end)
-
-
-def _end(_signal: int, _frame: object) -> None:
-    raise SystemExit(1)
 
 
 class Store:

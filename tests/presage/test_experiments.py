@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import shapely
 from rich.console import Console
@@ -186,6 +187,22 @@ def test_command_writes_all_files_and_repeats_itself(process, tmp_path):
         assert {"seed", "commit", "versions", "parameters"} <= set(told)
         summaries.append((told["summary"], (tmp_path / folder / "e1.csv").read_bytes()))
     assert summaries[0] == summaries[1]
+
+
+def test_a_killed_run_leaves_no_workers(process, tmp_path):
+    run = process(
+        "presage.__main__", "experiment", "e1", "--trials", "40", "--estimators", "particle-filter", "--out",
+        str(tmp_path), "--workers", "2",
+    )  # fmt: skip
+    store = tmp_path / ".e1.unfinished.jsonl"
+    assert wait_until(lambda: store.exists() and len(store.read_text().splitlines()) > 1, 90), run.output
+    workers = psutil.Process(run.child.pid).children(recursive=True)
+    assert len(workers) >= 2
+    run.kill()
+    _, alive = psutil.wait_procs(workers, 20)
+    for left in alive:
+        left.kill()
+    assert not alive
 
 
 def test_ctrl_c_ends_it_and_the_same_command_goes_on(process, tmp_path):
