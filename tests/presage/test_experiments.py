@@ -172,6 +172,13 @@ def test_a_page_is_filled_from_results_and_missing_ones_are_named(tmp_path):
         page.filled(text.replace("e2", "e1"), tmp_path)
 
 
+def test_the_page_has_the_numbers_of_the_results_beside_it():
+    docs = Path(__file__).resolve().parents[2] / "docs"
+    text = (docs / "experiments.md").read_text(encoding="utf-8")
+    assert page.filled(text, docs / "experiments") == text
+    assert "<!-- table e1 -->" in text
+
+
 def test_command_writes_all_files_and_repeats_itself(process, tmp_path):
     summaries = []
     for folder, workers in (("a", "1"), ("b", "2")):
