@@ -32,6 +32,7 @@ World = Annotated[str, typer.Option(help="World that the paper's decoder and a f
 Beams = Annotated[int, typer.Option(min=2, help="Beams of the scanner.")]
 
 OUT = Path("experiments")
+FEWEST = 50  # samples that anything can be learned from
 CORES = os.cpu_count() or 1
 
 
@@ -50,7 +51,7 @@ def e1(
 ) -> None:
     """E1: where is a standing robot? Error against iterations.
 
-    Examples: `presage experiment e1 --trials 5`; `presage experiment e1 --alpha 2e-4 --out slow`;
+    Examples: `presage experiment e1 --trials 5`; `presage experiment e1 --alpha 5e-4 --out slow`;
     `presage experiment e1 --estimators "paper,precise" --iterations 200`.
     """
     from presage.experiments import localisation  # noqa: PLC0415
@@ -123,14 +124,14 @@ def e3(
 @app.command("alpha")
 def alpha_sweep(
     trials: Trials = 50,
-    alphas: Annotated[str, typer.Option(help="Comma-separated, m²; empty: 1e-4 to 2.4e-3.")] = "",
+    alphas: Annotated[str, typer.Option(help="Comma-separated, m²; empty: 2e-4 to 2e-2.")] = "",
     seed: ExperimentSeed = 1,
     out: Out = OUT,
     workers: Workers = CORES,
 ) -> None:
     """The paper's step size α, swept on E1.
 
-    Examples: `presage experiment alpha --trials 10`; `presage experiment alpha --alphas 2e-4,4e-4,8e-4`.
+    Examples: `presage experiment alpha --trials 10`; `presage experiment alpha --alphas 5e-4,1e-3,2e-3`.
     """
     from presage.experiments import localisation, step_size  # noqa: PLC0415
 
@@ -139,6 +140,8 @@ def alpha_sweep(
         wanted = tuple(float(part) for part in alphas.split(",")) if alphas else step_size.ALPHAS
     except ValueError:
         raise UserError(f"--alphas {alphas!r}: give numbers, such as 2e-4,4e-4") from None
+    if not all(1e-8 <= value <= 1 for value in wanted):
+        raise UserError(f"--alphas {alphas!r}: each must lie between 1e-8 and 1 m²")
     result = step_size.run(localisation.Job(0, seed, 50), trials, out, workers, console, wanted)
     _say(result, step_size.table(result.summary), out)
 
@@ -175,6 +178,8 @@ def samples_needed(
         wanted = tuple(int(part) for part in sizes.split(",")) if sizes else samples.SIZES
     except ValueError:
         raise UserError(f"--sizes {sizes!r}: give whole numbers, such as 500,2000") from None
+    if min(wanted) < FEWEST:
+        raise UserError(f"--sizes {sizes!r}: each must be at least {FEWEST} samples")
     result = samples.run(samples.Job(seed, places=places), out, workers, console, wanted)
     _say(result, samples.table(result.summary), out)
 

@@ -24,7 +24,7 @@ NAMES = (
     "particle-filter, odometry",
 )  # fmt: skip
 # One gradient step a scan, as the paper's algorithm 1. The step size is the best of `presage experiment alpha`.
-PAPER = Descent(alpha=5e-4, iterations=1)
+PAPER = Descent(iterations=1)
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,13 @@ class Result:
         """Into the folder ``out``; the files."""
         about = {"command": " ".join(["presage", *sys.argv[1:]]), "commit": commit(), "versions": versions()}
         path = out / f"{self.name}.json"
+        if figure is not None:  # first: a result without its figure would look complete
+            for suffix in (".pdf", ".png"):
+                # Without its date a figure's bytes depend on its data alone.
+                metadata = {"CreationDate": None} if suffix == ".pdf" else None
+                figure.savefig(out / (self.name + suffix), dpi=150, metadata=metadata)
         own = {name: value for name, value in vars(self).items() if name not in ("trials", "curves")}
-        path.write_text(json.dumps({**own, **about}, indent=1) + "\n", encoding="utf-8")
+        path.write_text(json.dumps({**own, **about}, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         files = [path]
         if self.trials:
             files.append(out / f"{self.name}.trials.jsonl")
@@ -48,10 +53,7 @@ class Result:
                 writer.writerow(self.curves)
                 writer.writerows(zip(*self.curves.values(), strict=True))
         if figure is not None:
-            for suffix in (".pdf", ".png"):
-                files.append(out / (self.name + suffix))
-                # Without its date a figure's bytes depend on its data alone.
-                figure.savefig(files[-1], dpi=150, metadata={"CreationDate": None} if suffix == ".pdf" else None)
+            files += [out / (self.name + suffix) for suffix in (".pdf", ".png")]
         return files
 
 

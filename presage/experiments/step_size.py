@@ -14,7 +14,7 @@ from presage.experiments import drawing, localisation, results
 from presage.experiments.trials import run_trials
 from services.estimator.perception import Descent
 
-ALPHAS = (1e-4, 2e-4, 3e-4, 4e-4, 5e-4, 6e-4, 8e-4, 1.2e-3, 2.4e-3)  # m²
+ALPHAS = (2e-4, 5e-4, 1e-3, 2e-3, 3e-3, 4e-3, 6e-3, 1e-2, 2e-2)  # m²
 STEPS = (1, 10)  # gradient steps a scan: the paper's, and the service's default
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from rich.console import Console
@@ -45,7 +47,7 @@ def run_all(trials: int, seed: int, out: Path, workers: int, console: Console) -
     done = Done(out / ".all.unfinished.json", [trials, seed])
     began = time.monotonic()
     for number, (name, run) in enumerate(runs.items(), 1):
-        if name in done.names:
+        if done.has(name):
             console.print(f"{name}: done before")
             continue
         console.rule(f"{number} of {len(runs)}: {name}", align="left")
@@ -63,12 +65,22 @@ class Done:
     def __init__(self, path: Path, parameters: list[int]) -> None:
         """Read what is there."""
         self.path, self.key = path, [commit(), *parameters]
-        self.names: list[str] = []
-        if path.exists():
+        self._done: dict[str, str] = {}  # by name, the digest of its result
+        with suppress(OSError, ValueError, KeyError, TypeError):  # a damaged file is as good as none
             kept = json.loads(path.read_text(encoding="utf-8"))
-            self.names = kept["done"] if kept["key"] == self.key else []
+            self._done = dict(kept["done"]) if kept["key"] == self.key else {}
+
+    def has(self, name: str) -> bool:
+        """Whether it is done, and its result still is the one that was written."""
+        return name in self._done and self._digest(name) == self._done[name]
 
     def add(self, name: str) -> None:
         """One more."""
-        self.names.append(name)
-        self.path.write_text(json.dumps({"key": self.key, "done": self.names}) + "\n", encoding="utf-8")
+        self._done[name] = self._digest(name)
+        fresh = self.path.with_suffix(".new")
+        fresh.write_text(json.dumps({"key": self.key, "done": self._done}) + "\n", encoding="utf-8")
+        fresh.replace(self.path)
+
+    def _digest(self, name: str) -> str:
+        result = self.path.parent / f"{name}.json"
+        return hashlib.sha256(result.read_bytes()).hexdigest() if result.exists() else ""

@@ -46,11 +46,15 @@ def run_trials(
             bar.advance(task)
 
         left = [index for index in range(len(jobs)) if index not in done]
-        if workers == 1 or len(left) <= 1:
-            for index in left:
-                keep(index, trial(jobs[index]))
-        else:
-            _side_by_side(trial, jobs, left, min(workers, len(left)), keep)
+        try:
+            if workers == 1 or len(left) <= 1:
+                for index in left:
+                    keep(index, trial(jobs[index]))
+            else:
+                _side_by_side(trial, jobs, left, min(workers, len(left)), keep)
+        except KeyboardInterrupt:
+            console.print(f"{name}: {len(done)} of {len(jobs)} trials are kept; the same command goes on there")
+            raise
     store.path.unlink(missing_ok=True)
     return [done[index] for index in range(len(jobs))]
 

@@ -42,8 +42,9 @@ class PaperPerception:
         self.card = card
         self._first = pose
         self.estimator = PaperEstimator(
-            model, card.test_l1_mean, card.world.bounds, self._initial(pose), descent, known=pose is not None
-        )
+            model, card.test_l1_mean, card.world.bounds, self._initial(pose), descent,
+            np.array(model.norm.half_size), known=pose is not None,
+        )  # fmt: skip
 
     def _initial(self, pose: Array | None) -> Array:
         x, y = self.card.world.center() if pose is None else pose[:2]

@@ -44,7 +44,9 @@ class EstimatorSettings(ServiceSettings):
     initial_pose: Annotated[
         str, Field(pattern=POSE_TEXT, description="x,y[,yaw_deg]; none: nothing is known (paper: the map's centre)")
     ] = ""
-    alpha: Annotated[float, Field(gt=0, lt=1, description="paper: step size of perception, m²")] = 2e-4
+    alpha: Annotated[
+        float, Field(gt=0, lt=1, description="paper: step size of perception along the longest axis, m²")
+    ] = 2e-3
     beta: Annotated[
         float, Field(ge=0, lt=10, description="paper: the goal's attraction in perception (eq. 3); 0: unbiased belief")
     ] = 0.0

@@ -161,6 +161,7 @@ def test_the_beam_model_tracks_too():
         z_short=0.05,
         z_max=0.05,
         z_rand=0.05,
+        min_particles=200,
         max_particles=500,
     )
     off, _ = follow(make(8, settings), drive(30), np.random.default_rng(8), lambda i: {})

@@ -82,7 +82,10 @@ class ParticleFilter:
         """The posterior after one more scan."""
         self._predict(observation)
         self._anneal()
-        log_weights = self.sensor.weigh(se2.compose(self.particles, self.mount), observation, self._sigma)
+        sigma = self._sigma
+        if self.settings.sigma_odometry and observation.odom is not None and sigma <= 1.01 * self.settings.sigma_hit:
+            sigma = self.settings.sigma_odometry  # the particles lie close enough
+        log_weights = self.sensor.weigh(se2.compose(self.particles, self.mount), observation, sigma)
         log_weights += np.log(np.maximum(self.weights, 1e-300))
         searching = self._sigma > self.settings.sigma_hit
         self.weights = resampling.tempered(log_weights, self.settings.search_share if searching else 0.0)
@@ -122,7 +125,10 @@ class ParticleFilter:
             moved = se2.compose(moved, motion.arc(now.command, dt))
             position, heading = np.hypot((position, heading), COMMAND_NOISE * dt * self._speed)
         else:
-            position, heading = walk
+            walks = self._rng.random(len(moved)) < s.walk_share
+            position, heading = (
+                np.where(walks, far, near) for far, near in zip(walk, (position, heading), strict=True)
+            )
         self.particles = motion.jitter(moved, position, heading, self._rng)
         self.particles[:, 2] = se2.wrap(self.particles[:, 2])
         self._freeze_heading()

@@ -70,6 +70,7 @@ def arc(command: Array, dt: float) -> Array:
     return np.array([dt * (vx * straight - vy * bent), dt * (vx * bent + vy * straight), turn])
 
 
-def jitter(poses: Array, position: float, heading: float, rng: np.random.Generator) -> Array:
-    """Poses (N, 3) each moved by Gaussian noise of standard deviation ``position`` m in x and y, ``heading`` rad."""
-    return np.asarray(poses + np.array([position, position, heading]) * rng.standard_normal((len(poses), 3)))
+def jitter(poses: Array, position: Array | float, heading: Array | float, rng: np.random.Generator) -> Array:
+    """Poses (N, 3) moved by Gaussian noise: deviation ``position`` m in x and y, ``heading`` rad; one, or (N,)."""
+    spread = np.broadcast_arrays(position, position, heading)
+    return np.asarray(poses + np.stack(spread, axis=-1) * rng.standard_normal((len(poses), 3)))

@@ -43,9 +43,11 @@ class Settings:
     resample_interval: int = 1  # scans
     resolution: float = 0.05  # m, cells of the likelihood field and of the beam model's table
     sigma_search: float = 0.0  # m, replaces sigma_hit while the particles are spread; 0: never
+    sigma_odometry: float = 0.0  # m, replaces sigma_hit once found while odometry tells of motion; 0: never
     search_share: float = 0.0  # of the particles keep weight while sigma is wide, by tempering; 0: none need to
     jitter_position: float = 0.05  # m in 1/15 s, random walk where neither odometry nor command is known
     jitter_heading: float = 0.05  # rad in 1/15 s
+    walk_share: float = 1.0  # of the particles take that walk, the others stay: a robot that stands is found exactly
     floor_position: float = 0.0  # m a scan, added to every motion: copies of one particle part again
     floor_heading: float = 0.0  # rad a scan
 
@@ -77,12 +79,16 @@ class Settings:
             laser_model_type="likelihood_field_prob",
             z_hit=0.95,
             z_rand=0.05,
+            max_beams=180,
             sigma_hit=0.1,
+            sigma_odometry=0.05,
             sigma_search=0.5,
             search_share=0.05,
+            min_particles=2000,
             max_particles=20_000,
+            walk_share=0.95,
             recovery_alpha_slow=0.02,
             recovery_alpha_fast=0.3,
-            floor_position=0.002,
-            floor_heading=0.001,
+            floor_position=0.001,
+            floor_heading=0.0005,
         )
