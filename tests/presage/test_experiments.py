@@ -19,6 +19,7 @@ from common.errors import UserError
 from presage.accuracy.scenes import Scene
 from presage.experiments import crossing, localisation, page, results, step_size
 from presage.experiments.contestants import PAPER, Field, chosen
+from presage.experiments.suite import Done
 from presage.experiments.trials import Store, run_trials
 
 QUIET = Console(quiet=True)
@@ -227,3 +228,29 @@ def test_ctrl_c_ends_it_and_the_same_command_goes_on(process, tmp_path):
     assert int(found[1]) == done
     run.send(signal.SIGINT)
     assert run.wait(30) == 130, run.output
+
+
+def test_all_goes_on_only_where_the_results_still_are_what_it_wrote(tmp_path):
+    path = tmp_path / ".all.unfinished.json"
+    (tmp_path / "e1.json").write_text("{}")
+    (tmp_path / "e2.json").write_text("{}")
+    done = Done(path, [0, 1])
+    done.add("e1")
+    done.add("e2")
+    (tmp_path / "e2.json").write_text('{"other": 1}')
+    again = Done(path, [0, 1])
+    assert again.has("e1")
+    assert not again.has("e2")
+    assert not again.has("e3")
+    (tmp_path / "e1.json").unlink()
+    assert not Done(path, [0, 1]).has("e1")
+    assert not Done(path, [5, 1]).has("e1")
+    path.write_text("x")
+    assert not Done(path, [0, 1]).has("e1")
+
+
+@pytest.mark.parametrize("args", [("alpha", "--alphas", "nan"), ("samples", "--sizes", "0"), ("e1", "--trials", "0")])
+def test_wrong_arguments_are_refused_before_anything_runs(process, tmp_path, args):
+    run = process("presage.__main__", "experiment", *args, "--out", str(tmp_path / "out"))
+    assert run.wait(60) == 2, run.output
+    assert "Traceback" not in run.output
