@@ -34,9 +34,7 @@ def localisation(world: str, beams: int, trials: int, scans: int, seed: int, con
         laser = se2.compose(pose, np.array(scanner.mount))
         clean = card.world.ray_distances(laser, scanner.angles())[0]
         start = np.array([*card.world.center(), card.heading])
-        estimator = PaperEstimator(
-            model, card.test_l1_mean, card.world.bounds, start, half_size=np.array(card.half_size)
-        )
+        estimator = PaperEstimator(model, card.test_l1_mean, card.world.bounds, start, metric=model.norm.metric)
         for _ in range(scans):
             noisy = usable_ranges(clean + scanner.sigma * rng.standard_normal(beams), scanner.range_max)
             estimate = estimator.update(noisy)

@@ -14,6 +14,9 @@ from presage.options import console
 from presage.output import make_folder
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import ModuleType
+
     from presage.experiments.results import Result
 
 app = typer.Typer(
@@ -57,12 +60,9 @@ def e1(
     from presage.experiments import localisation  # noqa: PLC0415
     from presage.experiments.contestants import Field, chosen, descent_of  # noqa: PLC0415
 
-    make_folder(out, "--out")
     job = localisation.Job(0, seed, iterations, field=Field(world, beams), descent=descent_of(alpha, steps))
-    if estimators:
-        job = replace(job, estimators=chosen(estimators))
-    result = localisation.run(job, trials, out, workers, console)
-    _say(result, localisation.table(result.summary), out)
+    job = replace(job, estimators=chosen(estimators)) if estimators else job
+    _show(localisation, lambda: localisation.run(job, trials, out, workers, console), out)
 
 
 @app.command("e2")
@@ -85,12 +85,9 @@ def e2(
     from presage.experiments import crossing  # noqa: PLC0415
     from presage.experiments.contestants import Field, chosen, descent_of  # noqa: PLC0415
 
-    make_folder(out, "--out")
     job = crossing.Job(0, seed, step, field=Field(world, beams), descent=descent_of(alpha, steps))
-    if estimators:
-        job = replace(job, estimators=chosen(estimators))
-    result = crossing.run(job, trials, out, workers, console)
-    _say(result, crossing.table(result.summary), out)
+    job = replace(job, estimators=chosen(estimators)) if estimators else job
+    _show(crossing, lambda: crossing.run(job, trials, out, workers, console), out)
 
 
 @app.command("e3")
@@ -113,12 +110,9 @@ def e3(
     from presage.experiments import navigation  # noqa: PLC0415
     from presage.experiments.contestants import Field, chosen, descent_of  # noqa: PLC0415
 
-    make_folder(out, "--out")
     job = navigation.Job(0, seed, apart, field=Field(world, beams), descent=descent_of(alpha, steps))
-    if estimators:
-        job = replace(job, estimators=chosen(estimators))
-    result = navigation.run(job, trials, out, workers, console)
-    _say(result, navigation.table(result.summary), out)
+    job = replace(job, estimators=chosen(estimators)) if estimators else job
+    _show(navigation, lambda: navigation.run(job, trials, out, workers, console), out)
 
 
 @app.command("alpha")
@@ -135,15 +129,13 @@ def alpha_sweep(
     """
     from presage.experiments import localisation, step_size  # noqa: PLC0415
 
-    make_folder(out, "--out")
     try:
         wanted = tuple(float(part) for part in alphas.split(",")) if alphas else step_size.ALPHAS
     except ValueError:
         raise UserError(f"--alphas {alphas!r}: give numbers, such as 2e-4,4e-4") from None
     if not all(1e-8 <= value <= 1 for value in wanted):
         raise UserError(f"--alphas {alphas!r}: each must lie between 1e-8 and 1 m²")
-    result = step_size.run(localisation.Job(0, seed, 50), trials, out, workers, console, wanted)
-    _say(result, step_size.table(result.summary), out)
+    _show(step_size, lambda: step_size.run(localisation.Job(0, seed, 50), trials, out, workers, console, wanted), out)
 
 
 @app.command("steps")
@@ -154,9 +146,7 @@ def step_sizes(trials: Trials = 10, seed: ExperimentSeed = 1, out: Out = OUT, wo
     """
     from presage.experiments import stepping  # noqa: PLC0415
 
-    make_folder(out, "--out")
-    result = stepping.run(stepping.Job(0, seed), trials, out, workers, console)
-    _say(result, stepping.table(result.summary), out)
+    _show(stepping, lambda: stepping.run(stepping.Job(0, seed), trials, out, workers, console), out)
 
 
 @app.command("samples")
@@ -173,15 +163,13 @@ def samples_needed(
     """
     from presage.experiments import samples  # noqa: PLC0415
 
-    make_folder(out, "--out")
     try:
         wanted = tuple(int(part) for part in sizes.split(",")) if sizes else samples.SIZES
     except ValueError:
         raise UserError(f"--sizes {sizes!r}: give whole numbers, such as 500,2000") from None
     if min(wanted) < FEWEST:
         raise UserError(f"--sizes {sizes!r}: each must be at least {FEWEST} samples")
-    result = samples.run(samples.Job(seed, places=places), out, workers, console, wanted)
-    _say(result, samples.table(result.summary), out)
+    _show(samples, lambda: samples.run(samples.Job(seed, places=places), out, workers, console, wanted), out)
 
 
 @app.command("aliasing")
@@ -197,9 +185,7 @@ def similar_objects(
     """
     from presage.experiments import aliasing  # noqa: PLC0415
 
-    make_folder(out, "--out")
-    result = aliasing.run(aliasing.Job(seed, places=places), out, workers, console)
-    _say(result, aliasing.table(result.summary), out)
+    _show(aliasing, lambda: aliasing.run(aliasing.Job(seed, places=places), out, workers, console), out)
 
 
 @app.command("prediction")
@@ -214,14 +200,14 @@ def predicted(
     """
     from presage.experiments import prediction  # noqa: PLC0415
 
+    _show(prediction, lambda: prediction.run(prediction.Job(seed, scans), out, 1, console), out)
+
+
+def _show(experiment: ModuleType, run: Callable[[], Result], out: Path) -> None:
+    """Run it; its table, its notes, and where everything lies."""
     make_folder(out, "--out")
-    result = prediction.run(prediction.Job(seed, scans), out, 1, console)
-    _say(result, prediction.table(result.summary), out)
-
-
-def _say(result: Result, table: str, out: Path) -> None:
-    """The table, and where everything lies."""
-    print(f"\n{table}\n")
+    result = run()
+    print(f"\n{experiment.table(result.summary)}\n")
     if result.notes:
         console.print(*result.notes, sep="\n")
     console.print(f"{out / result.name}.json, .csv, .trials.jsonl, .pdf, .png")

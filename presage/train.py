@@ -148,10 +148,7 @@ def collect(
 def _fit(
     job: Job, world: World, scanner: Scanner, data: dict[str, Data], checkpoint: Checkpoint, bar: Progress
 ) -> tuple[Trainer, float]:
-    x0, y0, x1, y1 = world.bounds
-    norm = Normalisation(
-        ((x0 + x1) / 2, (y0 + y1) / 2), ((x1 - x0) / 2, (y1 - y0) / 2), float(data["train"].ranges.max())
-    )
+    norm = Normalisation.of(world.bounds, float(data["train"].ranges.max()))
     shape = Shape(scanner.beams, job.shape_hidden, job.shape_channels)
     trainer = Trainer(shape, norm, job.recipe, data["train"], data["test"])
     if checkpoint.restore(trainer):

@@ -78,8 +78,7 @@ def paper(epochs: int) -> Learn:
     """The paper's decoder, at one heading."""
 
     def learn(scans: Scans) -> tuple[GenerativeModel, int]:
-        x0, y0, x1, y1 = scans.world.bounds
-        norm = Normalisation(((x0 + x1) / 2, (y0 + y1) / 2), ((x1 - x0) / 2, (y1 - y0) / 2), float(scans.ranges.max()))
+        norm = Normalisation.of(scans.world.bounds, float(scans.ranges.max()))
         recipe = training.Recipe(epochs=epochs, learning_rate=3e-3)
         data = training.Data(scans.poses, scans.ranges)
         held_out = training.Data(scans.calibration, scans.calibration_ranges)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -28,7 +29,7 @@ class Scene:
     rng: np.random.Generator
 
     @classmethod
-    def of(cls, world: World, beams: int, seed: int) -> Scene:
+    def of(cls, world: World, beams: int, seed: int | Sequence[int]) -> Scene:
         """With the shipped scanner."""
         return cls(world, SCANNERS["tim571"].with_beams(beams), np.random.default_rng(seed))
 

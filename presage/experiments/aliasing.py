@@ -13,9 +13,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Polygon
 from rich.console import Console
 
 from common.se2 import Array
@@ -70,9 +68,7 @@ def world_of(name: str) -> World:
 
 def scene_of(job: Job, *seed: int) -> Scene:
     """The job's world; places and scans are the same for every estimator."""
-    scene = Scene.of(world_of(job.world), job.beams, 0)
-    scene.rng = np.random.default_rng((job.seed, NUMBER, list(TITLES).index(job.world), *seed))
-    return scene
+    return Scene.of(world_of(job.world), job.beams, (job.seed, NUMBER, list(TITLES).index(job.world), *seed))
 
 
 def stands(scene: Scene, count: int) -> Array:
@@ -176,8 +172,7 @@ def run(job: Job, out: Path, workers: int, console: Console, worlds: Sequence[st
 def draw(rows: Sequence[dict[str, Any]], summary: dict[str, dict[str, Any]]) -> Figure:
     """A row a world: its map, with what the paper's estimator believed; shares of places as bars."""
     worlds = list(dict.fromkeys(row["world"] for row in rows))
-    figure = Figure(figsize=(14, 3.5 * len(worlds)), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = drawing.blank(14, 3.5 * len(worlds))
     panels = figure.subplots(len(worlds), 2, squeeze=False, width_ratios=(1.15, 1))
     for name, (left, right) in zip(worlds, panels, strict=True):
         own = {row["estimator"]: row for row in rows if row["world"] == name}
@@ -191,13 +186,7 @@ def draw(rows: Sequence[dict[str, Any]], summary: dict[str, dict[str, Any]]) -> 
 
 def _map(axes: Axes, world: World, places: Sequence[dict[str, Any]]) -> None:
     """Walls, furniture, true places, and lines to where the belief ended where that is somewhere else."""
-    axes.add_patch(Polygon(world.boundary, fill=False, edgecolor="#222222", linewidth=2))
-    for obstacle in world.obstacles:
-        ring = obstacle.ring()
-        if ring is not None:
-            axes.add_patch(Polygon(ring, color="#888888"))
-        elif obstacle.circle is not None:
-            axes.add_patch(Circle(obstacle.circle.center, obstacle.circle.radius, color="#888888"))
+    drawing.world_map(axes, world)
     true, believed = (np.array([place[key] for place in places])[:, :2] for key in ("pose", "believed"))
     off = np.hypot(*(believed - true).T) > FOUND
     for a, b in zip(true[off], believed[off], strict=True):
@@ -205,8 +194,7 @@ def _map(axes: Axes, world: World, places: Sequence[dict[str, Any]]) -> None:
     axes.plot(*true.T, ".", color="#222222", markersize=5, label="true place")
     axes.plot(*believed[off].T, "x", color=drawing.COLOURS["paper"], markersize=6, label="paper's belief, > 0.5 m off")
     x0, y0, x1, y1 = world.bounds
-    axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", xticks=np.arange(x0, x1 + 1, 3), yticks=[y0, y1])
-    axes.margins(0.02)
+    axes.set(xticks=np.arange(x0, x1 + 1, 3), yticks=[y0, y1])
     axes.spines[:].set_visible(False)
 
 

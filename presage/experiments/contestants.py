@@ -9,7 +9,6 @@ import numpy as np
 import shapely
 
 from common.errors import UserError
-from common.se2 import Array
 from common.world import load_world
 from presage.accuracy.scenes import Scene
 from services.estimator.building import Choice, Factory, Geometry, prepare
@@ -18,8 +17,9 @@ from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
 from services.estimator.perception import Descent
 
+STEPS = "10 steps a scan"  # of the paper's estimator as the service has it: its robot does not stand between two
 NAMES = (
-    "paper", "paper, 10 steps a scan", "precise", "particle-filter", "particle-filter, heading known",
+    "paper", f"paper, {STEPS}", "precise", "particle-filter", "particle-filter, heading known",
     "amcl-defaults", "precise, odometry",
     "particle-filter, odometry",
 )  # fmt: skip
@@ -36,14 +36,12 @@ class Field:
 
     def scene(self, *seed: int) -> Scene:
         """With the shipped scanner; its noise and places are drawn from these seeds."""
-        scene = Scene.of(load_world(self.world), self.beams, 0)
-        scene.rng = np.random.default_rng(seed)
-        return scene
+        return Scene.of(load_world(self.world), self.beams, seed)
 
-    def in_front(self, pose: Array) -> bool:
-        """Whether a place lies below every object of the world, as far as y goes: the corridor's free middle."""
+    def front(self) -> float:
+        """M, the least y of any object of the world: below it lies the corridor's free middle. None: infinity."""
         objects = [obstacle.shape() for obstacle in load_world(self.world).obstacles]
-        return not objects or bool(pose[1] < shapely.bounds(objects)[:, 1].min())
+        return float(shapely.bounds(objects)[:, 1].min()) if objects else np.inf
 
     @property
     def heading(self) -> float:
@@ -75,8 +73,7 @@ def enter(name: str, field: Field, scene: Scene, seed: int, descent: Descent = P
     scanner, kind = scene.scanner, name.split(",", maxsplit=1)[0]
     geometry = Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max)
     if kind == "paper":
-        # The service's default where several are asked for: the robot does not stand between two steps.
-        return _factory(field.world, "paper", Descent() if "steps" in name else descent)(geometry)
+        return _factory(field.world, "paper", Descent() if name.endswith(STEPS) else descent)(geometry)
     if kind == "precise":
         return _factory(field.world, "precise", descent)(geometry)
     settings = ParticleSettings() if kind == "amcl-defaults" else ParticleSettings.tuned()
@@ -87,8 +84,3 @@ def enter(name: str, field: Field, scene: Scene, seed: int, descent: Descent = P
 @functools.lru_cache(maxsize=8)
 def _factory(world: str, name: str, descent: Descent) -> Factory:
     return prepare(Choice(world, name, descent=descent))  # type: ignore[arg-type]
-
-
-def errors(poses: Array, truth: Array) -> Array:
-    """(N,) m between poses (N, 3) and true ones."""
-    return np.asarray(np.hypot(*(poses - truth)[:, :2].T))

@@ -23,14 +23,14 @@ from common.se2 import Array
 from presage.accuracy import bound
 from presage.accuracy.scenes import Scene
 from presage.experiments import drawing, results
-from presage.experiments.contestants import PAPER, Field, enter, uses_odometry
+from presage.experiments.contestants import PAPER, STEPS, Field, enter, uses_odometry
 from presage.experiments.trials import run_trials
 from services.estimator.perception import Descent
 from services.simulator.odometry import Drift, Odometer
 
 NUMBER = 2  # of the experiment, in its seeds
 ESTIMATORS = (
-    "paper", "paper, 10 steps a scan", "precise", "particle-filter", "particle-filter, heading known",
+    "paper", f"paper, {STEPS}", "precise", "particle-filter", "particle-filter, heading known",
     "amcl-defaults", "precise, odometry",
     "particle-filter, odometry",
 )  # fmt: skip
@@ -106,9 +106,7 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
     scans = len(rows[0]["bound_m"])
     scanner = job.field.scene(job.seed).scanner
     curves: dict[str, list[Any]] = {"time s": [round(k / scanner.rate, 6) for k in range(scans)]}
-    for name in job.estimators:
-        mean, std = results.spread([row["error_m"][name] for row in rows])
-        curves[f"{name} mean m"], curves[f"{name} std m"] = mean, std
+    curves |= results.curves_of(rows, job.estimators)
     limits = np.square([row["bound_m"] for row in rows])
     curves["bound m"] = np.sqrt(limits.mean(axis=0)).tolist()
     parameters = asdict(job) | {"trials": trials, "bound_rms_m": float(np.sqrt(limits.mean()))}

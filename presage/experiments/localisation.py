@@ -8,7 +8,7 @@ begins at the map's centre, the particle filter's particles anywhere in free spa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +18,14 @@ from rich.console import Console
 
 from presage.accuracy import bound
 from presage.experiments import drawing, results
-from presage.experiments.contestants import PAPER, Field, enter
+from presage.experiments.contestants import PAPER, STEPS, Field, enter
 from presage.experiments.trials import run_trials
 from services.estimator.perception import Descent
 
 NUMBER = 1  # of the experiment, in its seeds
 ESTIMATORS = (
     "paper",
-    "paper, 10 steps a scan",
+    f"paper, {STEPS}",
     "precise",
     "particle-filter",
     "particle-filter, heading known",
@@ -56,7 +56,8 @@ def trial(job: Job) -> dict[str, Any]:
     scans = [scene.observe(clean, k / scene.scanner.rate) for k in range(job.iterations)]
     one_scan = float(bound.position(bound.single(scene, pose[None]))[0])
     found: dict[str, Any] = {
-        "pose": pose.tolist(), "in_front": job.field.in_front(pose), "bound_m": one_scan, "error_m": {}, "claim": {},
+        "pose": pose.tolist(), "in_front": bool(pose[1] < job.field.front()), "bound_m": one_scan,
+        "error_m": {}, "claim": {},
     }  # fmt: skip
     for name in job.estimators:
         estimator = enter(name, job.field, scene, job.seed * 100_003 + job.index, job.descent)
@@ -96,12 +97,10 @@ def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
 
 def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
     """All trials; writes e1.json, .csv, .pdf and .png into ``out``."""
-    jobs = [Job(**{**vars(job), "index": index}) for index in range(trials)]
+    jobs = [replace(job, index=index) for index in range(trials)]
     rows = run_trials("e1", trial, jobs, out, workers, console)
     curves: dict[str, list[Any]] = {"iteration": list(range(1, job.iterations + 1))}
-    for name in job.estimators:
-        mean, std = results.spread([row["error_m"][name] for row in rows])
-        curves[f"{name} mean m"], curves[f"{name} std m"] = mean, std
+    curves |= results.curves_of(rows, job.estimators)
     curves["bound m"] = _bound(rows, job.iterations)
     parameters = asdict(job) | {"trials": trials, "bound_end_m": curves["bound m"][-1]}
     result = results.Result(

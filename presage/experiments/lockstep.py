@@ -1,8 +1,7 @@
 """One journey through the real processes: router, simulator, estimator, controller, in lockstep over zenoh.
 
 All but the router are started anew for every journey: so the numbers depend on the errand alone, not on what ran
-before. In lockstep
-each scan waits for the command that answers it, so they do not depend on the machine's speed either.
+before. In lockstep each scan waits for the command that answers it, so the machine's speed does not count either.
 """
 
 from __future__ import annotations

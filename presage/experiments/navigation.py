@@ -21,7 +21,7 @@ from common.robot import Robot
 from common.se2 import Array
 from common.world import load_world
 from presage.experiments import drawing, results
-from presage.experiments.contestants import PAPER, Field, uses_odometry
+from presage.experiments.contestants import PAPER, STEPS, Field, uses_odometry
 from presage.experiments.journeys import APART, CLEARANCE, CLOSE, Journey, draw_journey, least_time, path_ratio
 from presage.experiments.lockstep import Errand, Track, session
 from presage.experiments.lockstep import run as run_errand
@@ -30,8 +30,7 @@ from presage.stack import Stack
 from services.estimator.perception import Descent
 
 NUMBER = 3  # of the experiment, in its seeds
-ESTIMATORS = ("paper, 10 steps a scan", "precise", "particle-filter")
-STEPS = "10 steps a scan"  # the service's default: its robot does not stand between two steps
+ESTIMATORS = (f"paper, {STEPS}", "precise", "particle-filter")
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from typing import Any
 
 from common.errors import UserError
 from presage.experiments import results
+from presage.experiments.contestants import STEPS
 from presage.experiments.results import mean_std, number
 
 # Experiments in the order of the page, and the modules that run them.
@@ -56,7 +57,7 @@ def overview(folder: Path) -> str:
 
 def _navigation(summary: Summary, names: tuple[str, ...]) -> list[list[str]]:
     # The running service makes ten gradient steps a scan.
-    own = [summary[name if name in summary else f"{name}, 10 steps a scan"] for name in names]
+    own = [summary[name if name in summary else f"{name}, {STEPS}"] for name in names]
     return [
         ["E3: reached", "–", *(f"{r['reached']} of {r['trials']}" for r in own), ""],
         ["E3: trials with a contact", "–", *(str(r["trials_with_contact"]) for r in own), ""],

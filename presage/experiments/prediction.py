@@ -14,13 +14,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.console import Console
 
 from common import se2
 from common.se2 import Array
-from common.world import World, load_world
 from presage.accuracy.scenes import ROBOT, Scene
 from presage.experiments import drawing, results
 from presage.experiments.contestants import Field
@@ -53,9 +51,8 @@ class Job:
 def trial(job: Job) -> dict[str, Any]:
     """The sample as measured and as each expects it; shares of beams within the stated deviation's multiples."""
     use_one_core()
-    world = load_world(job.field.world)
     sample, test = (job.field.scene(job.seed, NUMBER, part) for part in (SAMPLE, TEST))
-    pose = in_front(world, sample, job.field.heading)
+    pose = in_front(job.field, sample)
     noisy = sample.observe(sample.clean(pose[None])[0], 0.0).ranges
     found: dict[str, Any] = {
         "pose": pose.tolist(), "angle_rad": sample.scanner.angles().tolist(), "measured_m": noisy.tolist(), "models": {}
@@ -88,13 +85,11 @@ def _shares(error: Array, sigma: Array) -> dict[str, float]:
     return {f"{k:g}": float((error <= k * sigma).mean()) for k in FACTORS} if error.size else {}
 
 
-def in_front(world: World, scene: Scene, heading: float) -> Array:
+def in_front(field: Field, scene: Scene) -> Array:
     """(3,) at random between the bare wall and the objects; anywhere where there are none."""
-    tops = [ring[:, 1].min() for o in world.obstacles if (ring := o.ring()) is not None]
-    tops += [o.circle.center[1] - o.circle.radius for o in world.obstacles if o.circle is not None]
-    places = world.sample_free(1000, scene.rng, ROBOT.radius)
-    front = places[places[:, 1] < min(tops, default=np.inf) - FEET]
-    return np.array([*(front if len(front) else places)[0], heading])
+    places = scene.world.sample_free(1000, scene.rng, ROBOT.radius)
+    front = places[places[:, 1] < field.front() - FEET]
+    return np.array([*(front if len(front) else places)[0], field.heading])
 
 
 def _expected(name: str, field: Field, scene: Scene, poses: Array) -> tuple[Array, Array]:
@@ -135,8 +130,7 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
 def draw(result: results.Result) -> Figure:
     """The scan by both models, residuals below, calibration beside."""
     row = result.trials[0]
-    figure = Figure(figsize=(16, 6.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = drawing.blank(16, 6.2)
     grid = figure.add_gridspec(2, 3, height_ratios=(1.9, 1), width_ratios=(1, 1, 0.8))
     tops = [drawing.dress(figure.add_subplot(grid[0, k])) for k in range(2)]
     bottoms = [drawing.dress(figure.add_subplot(grid[1, k], sharex=tops[k])) for k in range(2)]

@@ -73,6 +73,14 @@ def spread(rows: Sequence[Sequence[float]] | Array) -> tuple[list[float], list[f
     return values.mean(axis=0).tolist(), values.std(axis=0).tolist()
 
 
+def curves_of(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> dict[str, list[Any]]:
+    """Columns: mean and deviation over trials of each estimator's error_m, at each moment."""
+    curves: dict[str, list[Any]] = {}
+    for name in names:
+        curves[f"{name} mean m"], curves[f"{name} std m"] = spread([row["error_m"][name] for row in rows])
+    return curves
+
+
 def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table."""
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]

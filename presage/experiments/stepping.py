@@ -37,7 +37,6 @@ from services.estimator.interface import Observation
 from services.estimator.paper_perception import PaperPerception
 from services.estimator.perception import Descent
 from services.estimator.training import usable_ranges
-from services.simulator.simulation import Setup, Simulation
 
 NUMBER = 5  # of the experiment, in its seeds; the journeys are E3's
 PAPERS = 12.5  # iterations, the paper's mean over 50 trials
@@ -121,6 +120,8 @@ def _displaced(job: Job, world: World, journey: Journey) -> dict[str, Any]:
 
 def _driven(job: Job, world: World, journey: Journey) -> dict[str, Any]:
     """As E3, but in one process and with these step sizes."""
+    from services.simulator.simulation import Setup, Simulation  # noqa: PLC0415 - pybullet, for this alone
+
     scanner, steps = job.field.scene(0).scanner, job.setting.steps
     pose, goal = (*journey.start, job.field.heading), np.array([*journey.goal, job.field.heading])
     model, card = _model(job.field)

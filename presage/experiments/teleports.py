@@ -68,9 +68,7 @@ def travel(
     room = shapely.buffer(world.free_space, -Robot().radius)
     shapely.prepare(room)
     goal, robot = np.array(journey.goal), np.array(journey.start)
-    belief, action, metric = robot.copy(), np.zeros(2), np.ones(2)
-    if steps.normalised:
-        metric = (np.array(model.norm.half_size) / max(model.norm.half_size)) ** 2
+    belief, action, metric = robot.copy(), np.zeros(2), model.norm.metric if steps.normalised else np.ones(2)
     x0, y0, x1, y1 = world.bounds
     g_goal = model.predict(np.array([*goal, yaw]))[0]
     distances, errors, stopped = [float(np.hypot(*(robot - goal)))], [0.0], 0

@@ -77,8 +77,7 @@ def train_paper(scene: Scene, heading: float, samples: int, steps: int, seed: in
     judge = _usable(posed(scene, JUDGED, heading, noise=False), scene)
     watch = Data(judge.poses[:WATCHED], judge.ranges[:WATCHED])
     recipe = training.Recipe(max(1, -(-steps // -(-samples // BATCH))), BATCH, RATE, seed)
-    x0, y0, x1, y1 = scene.world.bounds
-    norm = Normalisation(((x0 + x1) / 2, (y0 + y1) / 2), ((x1 - x0) / 2, (y1 - y0) / 2), float(train.ranges.max()))
+    norm = Normalisation.of(scene.world.bounds, float(train.ranges.max()))
     began = time.process_time()
     trainer = training.Trainer(Shape(scene.scanner.beams, HIDDEN, CHANNELS), norm, recipe, train, watch)
     model = trainer.run()

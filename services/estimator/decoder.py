@@ -78,6 +78,17 @@ class Normalisation:
     half_size: tuple[float, float]  # m
     range_scale: float  # m, a normalised range of 1
 
+    @classmethod
+    def of(cls, bounds: tuple[float, float, float, float], range_scale: float) -> Normalisation:
+        """The map's bounds x0, y0, x1, y1 (m) become a square from -1 to 1."""
+        x0, y0, x1, y1 = bounds
+        return cls(((x0 + x1) / 2, (y0 + y1) / 2), ((x1 - x0) / 2, (y1 - y0) / 2), range_scale)
+
+    @property
+    def metric(self) -> Array:
+        """(2,) length in m, by axis, of a gradient step in normalised coordinates, relative to the longest axis'."""
+        return np.asarray((np.array(self.half_size) / max(self.half_size)) ** 2)
+
     def position(self, poses: Array, dtype: torch.dtype = torch.float32) -> torch.Tensor:
         """(N, 2) in [-1, 1] from poses (N, 3) in map."""
         return torch.as_tensor((poses[:, :2] - np.array(self.center)) / np.array(self.half_size), dtype=dtype)

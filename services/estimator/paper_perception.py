@@ -43,7 +43,7 @@ class PaperPerception:
         self._first = pose
         self.estimator = PaperEstimator(
             model, card.test_l1_mean, card.world.bounds, self._initial(pose), descent,
-            np.array(model.norm.half_size), known=pose is not None,
+            model.norm.metric, known=pose is not None,
         )  # fmt: skip
 
     def _initial(self, pose: Array | None) -> Array:

@@ -21,7 +21,6 @@ class Descent:
     """The paper's parameters. Sigma_o = 1 m² on every beam, as there."""
 
     alpha: float = 2e-3  # m², step size along the map's longest axis; twice that and the belief swings near walls
-    normalised: bool = True  # descend in the network's own coordinates, in which the map is a square; False: in metres
     beta: float = 0.0  # weight of the goal's attraction in perception; 0 leaves the goal to the controller
     iterations: int = 10  # gradient steps a scan; the paper makes 1, but its robot stands between two steps
     max_step: float = 0.5  # m, a longer step of one scan is shortened
@@ -49,7 +48,7 @@ class PaperEstimator:
     bounds: tuple[float, float, float, float]  # m, the belief stays within x0, y0, x1, y1
     pose: Array  # (3,) initial belief
     settings: Descent = field(default_factory=Descent)
-    half_size: Array = field(default_factory=lambda: np.ones(2))  # (2,) m, of the map, as the network is normalised
+    metric: Array = field(default_factory=lambda: np.ones(2))  # (2,) of alpha by axis, see Normalisation.metric
     known: bool = False  # the initial belief is where the robot is, so it tracks from the first scan on
 
     def __post_init__(self) -> None:
@@ -66,7 +65,8 @@ class PaperEstimator:
     def update(self, ranges: Array, goal: Array | None = None) -> Estimate:
         """Descend F for a scan of usable ranges (B,) m; ``goal`` (3,) attracts the belief where beta > 0."""
         precision = np.ones(len(ranges))
-        before, metric = self.pose, np.append(self._metric(), 1.0)
+        before = self.pose
+        metric = np.append(self.metric, 1.0)
         g_goal = self.model.predict(goal)[0] if goal is not None and self.settings.beta > 0 else None
         for _ in range(self.settings.iterations):
             g, dg = self.model.predict(self.pose)
@@ -77,10 +77,6 @@ class PaperEstimator:
         final = gradient(ranges, g, dg, precision, g_goal, self.settings.beta)
         state = self._judge(float(np.hypot(*(self.pose - before)[:2])), float(np.mean(np.abs(ranges - g))))
         return Estimate(self.pose.copy(), g, final, state)
-
-    def _metric(self) -> Array:
-        """(2,) of alpha: a step of u = x / h in u is h² times as long in x."""
-        return np.asarray((self.half_size / max(self.half_size)) ** 2) if self.settings.normalised else np.ones(2)
 
     def _inside(self, pose: Array) -> Array:
         x0, y0, x1, y1 = self.bounds

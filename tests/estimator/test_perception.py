@@ -94,7 +94,7 @@ def test_shipped_weights_localise_in_the_corridor(beams):
         pose = np.array([*truth, card.heading])
         exact = world.ray_distances(se2.compose(pose, card.scanner.mount)[None], card.scanner.angles())[0]
         start = np.array([*world.center(), card.heading])
-        found = PaperEstimator(model, card.test_l1_mean, world.bounds, start, half_size=np.array(card.half_size))
+        found = PaperEstimator(model, card.test_l1_mean, world.bounds, start, metric=model.norm.metric)
         for _ in range(25):
             found.update(exact + 0.02 * rng.standard_normal(beams))
         errors.append(np.hypot(*(found.pose - pose)[:2]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import psutil
@@ -22,6 +21,7 @@ from presage.experiments import navigation, stepping, teleports
 from presage.experiments.contestants import Field
 from presage.experiments.journeys import CLEARANCE, CLOSE, Journey, draw_journey, least_time, path_ratio
 from presage.experiments.lockstep import Track, _is_next
+from services.estimator.decoder import Normalisation
 
 QUIET = Console(quiet=True)
 ROBOT = Robot()
@@ -143,7 +143,7 @@ class Linear:
     """A world in which a scan is the position itself, many times over: everything can be worked out by hand."""
 
     beams = 50
-    norm = SimpleNamespace(half_size=(9.0, 9.0))
+    norm = Normalisation((0.0, 0.0), (9.0, 9.0), 1.0)
 
     def predict(self, pose):
         jacobian = np.zeros((2 * self.beams, 3))
