@@ -67,7 +67,7 @@ def e1(
 
 @app.command("e2")
 def e2(
-    trials: Trials = 20,
+    trials: Trials = 12,
     step: Annotated[float, typer.Option(min=1e-3, max=1.0, help="m, of each teleport.")] = 0.05,
     estimators: Estimators = "",
     alpha: Alpha = None,
@@ -94,6 +94,9 @@ def e2(
 def e3(
     trials: Trials = 50,
     apart: Annotated[float, typer.Option(min=1.0, max=1000.0, help="m, between start and goal at least.")] = 12.0,
+    free: Annotated[
+        bool, typer.Option("--free/--any", help="Free straight line from start to goal, or any pair of places.")
+    ] = True,
     estimators: Estimators = "",
     alpha: Alpha = None,
     steps: Steps = None,
@@ -105,12 +108,13 @@ def e3(
 ) -> None:
     """E3: navigation from a known start to a goal, through the real processes in lockstep over zenoh.
 
-    Examples: `presage experiment e3 --trials 2`; `presage experiment e3 --estimators precise --apart 5 --out near`.
+    Examples: `presage experiment e3 --trials 2`; `presage experiment e3 --estimators precise --apart 5 --out near`;
+    `presage experiment e3 --any --trials 20 --estimators precise --out any`.
     """
     from presage.experiments import navigation  # noqa: PLC0415
     from presage.experiments.contestants import Field, chosen, descent_of  # noqa: PLC0415
 
-    job = navigation.Job(0, seed, apart, field=Field(world, beams), descent=descent_of(alpha, steps))
+    job = navigation.Job(0, seed, apart, free=free, field=Field(world, beams), descent=descent_of(alpha, steps))
     job = replace(job, estimators=chosen(estimators)) if estimators else job
     _show(navigation, lambda: navigation.run(job, trials, out, workers, console), out)
 

@@ -33,9 +33,26 @@ def single(scene: Scene, poses: Array, scans: int = 1) -> Array:
     return np.asarray(np.linalg.inv(information(scene, poses) * scans), np.float64)
 
 
-def recursive(scene: Scene, path: Array, drift: Drift) -> Array:
-    """(N, 3, 3) bound along a path (N, 3) with odometry of that drift: the information filter at the true poses."""
-    found, carried = [], np.zeros((3, 3))
+def heading_known(covariance: Array) -> Array:
+    """(..., 3, 3) bounds as they are for those who know the heading: nothing is lost on estimating it."""
+    found = np.zeros_like(covariance)
+    found[..., :2, :2] = np.linalg.inv(np.linalg.inv(covariance)[..., :2, :2])
+    return found
+
+
+def median(covariance: Array) -> float:
+    """M, the median distance of Gaussian errors with these covariances (N, 3, 3), all of them equally often."""
+    spread = np.linalg.cholesky(covariance[:, :2, :2])
+    draws = np.random.default_rng(0).standard_normal((2000, 2))
+    return float(np.median(np.linalg.norm(np.einsum("nij,kj->nki", spread, draws), axis=-1)))
+
+
+def recursive(scene: Scene, path: Array, drift: Drift, start: Array | None = None) -> Array:
+    """(N, 3, 3) bound along a path (N, 3) with odometry of that drift: the information filter at the true poses.
+
+    ``start`` (3, 3) is the covariance of what is known before the first scan; None: nothing is.
+    """
+    found, carried = [], np.zeros((3, 3)) if start is None else np.linalg.inv(start)
     for k, own in enumerate(information(scene, path)):
         total = own + carried
         covariance = np.linalg.inv(total)

@@ -20,8 +20,7 @@ from services.estimator.perception import Descent
 STEPS = "10 steps a scan"  # of the paper's estimator as the service has it: its robot does not stand between two
 NAMES = (
     "paper", f"paper, {STEPS}", "precise", "particle-filter", "particle-filter, heading known",
-    "amcl-defaults", "precise, odometry",
-    "particle-filter, odometry",
+    "amcl-defaults", "precise, odometry", "particle-filter, odometry", "amcl-defaults, odometry",
 )  # fmt: skip
 # One gradient step a scan, as the paper's algorithm 1. The step size is the best of `presage experiment alpha`.
 PAPER = Descent(iterations=1)
@@ -63,6 +62,11 @@ def chosen(names: str) -> tuple[str, ...]:
     return tuple(by_name[name] for name in asked)
 
 
+def knows_heading(name: str) -> bool:
+    """Whether this one is given the robot's heading."""
+    return name.startswith("paper") or name.endswith("heading known")
+
+
 def uses_odometry(name: str) -> bool:
     """Whether this one is told of motion."""
     return name.endswith("odometry")
@@ -76,11 +80,15 @@ def enter(name: str, field: Field, scene: Scene, seed: int, descent: Descent = P
         return _factory(field.world, "paper", Descent() if name.endswith(STEPS) else descent)(geometry)
     if kind == "precise":
         return _factory(field.world, "precise", descent)(geometry)
-    settings = ParticleSettings() if kind == "amcl-defaults" else ParticleSettings.tuned()
+    # The default motion model, differential, cannot follow a base that moves sideways: nobody would leave it.
+    settings = ParticleSettings(robot_model_type="omni") if kind == "amcl-defaults" else ParticleSettings.tuned()
     heading = field.heading if name.endswith("heading known") else None
     return ParticleFilter(scene.world, settings, scanner.mount, seed, heading)
 
 
 @functools.lru_cache(maxsize=8)
 def _factory(world: str, name: str, descent: Descent) -> Factory:
-    return prepare(Choice(world, name, descent=descent))  # type: ignore[arg-type]
+    try:
+        return prepare(Choice(world, name, descent=descent))  # type: ignore[arg-type]
+    except UserError as error:
+        raise UserError(f"{error}; or leave {name} out: --estimators names who takes part") from None

@@ -17,11 +17,11 @@ from common.world import World
 
 # Okabe and Ito; the same in every figure. Green is the paper's for the distance to the goal.
 COLOURS = {
-    "paper": "#E69F00", "paper, 10 steps a scan": "#F0E442", "precise": "#0072B2", "particle-filter": "#D55E00",
-    "amcl-defaults": "#CC79A7",
-    "particle-filter, heading known": "#000000", "precise, odometry": "#56B4E9",
-    "particle-filter, odometry": "#999999",
+    "paper": "#E69F00", "paper, 10 steps a scan": "#E69F00", "precise": "#0072B2", "particle-filter": "#D55E00",
+    "amcl-defaults": "#CC79A7", "particle-filter, heading known": "#000000", "precise, odometry": "#56B4E9",
+    "particle-filter, odometry": "#999999", "amcl-defaults, odometry": "#CC79A7",
 }  # fmt: skip
+DASHED = ("paper, 10 steps a scan",)  # those that share a colour with another
 MEASURED, PREDICTED, GOAL, BOUND = "#0072B2", "#D55E00", "#009E73", "#444444"
 SMALLEST = 1e-4  # m, the least a logarithmic axis shows
 
@@ -54,9 +54,27 @@ def band(
     """Mean over trials (N, K) with a band of one standard deviation; on a log axis it ends where it would be <= 0."""
     values = np.asarray(rows, float)
     mean, std = values.mean(axis=0), values.std(axis=0)
+    _band(axes, x, mean, (np.maximum(mean - std, SMALLEST), mean + std), name, colour)
+
+
+def quartiles(axes: Axes, x: Sequence[float] | Array, rows: Sequence[Sequence[float]] | Array, name: str) -> None:
+    """Median over trials (N, K) with a band from the first to the third quartile: for a logarithmic axis."""
+    low, middle, high = np.quantile(np.asarray(rows, float), (0.25, 0.5, 0.75), axis=0)
+    _band(axes, x, middle, (low, high), name)
+
+
+def line(axes: Axes, x: Sequence[float], y: Sequence[float], name: str, colour: str = "") -> None:
+    """As this estimator's always is."""
     colour = colour or COLOURS.get(name, GOAL)
-    axes.plot(x, mean, color=colour, linewidth=1.6, label=name)
-    axes.fill_between(x, np.maximum(mean - std, SMALLEST), mean + std, color=colour, alpha=0.18, linewidth=0)
+    axes.plot(x, y, "--" if name in DASHED else "-", color=colour, linewidth=1.6, label=name)
+
+
+def _band(
+    axes: Axes, x: Sequence[float] | Array, middle: Array, edges: tuple[Array, Array], name: str, colour: str = ""
+) -> None:
+    colour = colour or COLOURS.get(name, GOAL)
+    line(axes, x, middle, name, colour)  # type: ignore[arg-type]
+    axes.fill_between(x, *edges, color=colour, alpha=0.18, linewidth=0)
 
 
 def held(rows: Sequence[Sequence[float]], length: int) -> Array:

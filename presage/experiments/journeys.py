@@ -35,11 +35,13 @@ class Journey:
         return float(np.hypot(self.goal[0] - self.start[0], self.goal[1] - self.start[1]))
 
 
-def draw_journey(world: World, rng: np.random.Generator, robot: Robot, apart: float = APART) -> Journey:
+def draw_journey(
+    world: World, rng: np.random.Generator, robot: Robot, apart: float = APART, *, free: bool = True
+) -> Journey:
     """Uniform over pairs of places where the robot fits, of those ``apart`` m or more with a free line between.
 
-    Places are rounded to whole millimetres, so that they pass through a command line unchanged. Raises UserError where
-    there seems to be no such pair.
+    With ``free`` False the line between need not be. Places are rounded to whole millimetres, so that they pass through
+    a command line unchanged. Raises UserError where there seems to be no such pair.
     """
     room = shapely.buffer(world.free_space, -(robot.radius + CLEARANCE))
     shapely.prepare(room)
@@ -49,7 +51,7 @@ def draw_journey(world: World, rng: np.random.Generator, robot: Robot, apart: fl
         for start, goal in places.reshape(-1, 2, 2):
             if np.hypot(*(goal - start)) < apart:
                 too_near += 1
-            elif not shapely.covers(room, shapely.LineString(np.array([start, goal]))):
+            elif free and not shapely.covers(room, shapely.LineString(np.array([start, goal]))):
                 obstructed += 1
             else:
                 ends = [(float(x), float(y)) for x, y in (start, goal)]

@@ -16,9 +16,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from common.se2 import Array
 from presage.accuracy import bound
 from presage.experiments import drawing, results
-from presage.experiments.contestants import PAPER, STEPS, Field, enter
+from presage.experiments.contestants import PAPER, STEPS, Field, enter, knows_heading
 from presage.experiments.trials import run_trials
 from services.estimator.perception import Descent
 
@@ -54,9 +55,9 @@ def trial(job: Job) -> dict[str, Any]:
     pose[2] = job.field.heading
     clean = scene.clean(pose[None])[0]
     scans = [scene.observe(clean, k / scene.scanner.rate) for k in range(job.iterations)]
-    one_scan = float(bound.position(bound.single(scene, pose[None]))[0])
+    one_scan = bound.single(scene, pose[None])
     found: dict[str, Any] = {
-        "pose": pose.tolist(), "in_front": bool(pose[1] < job.field.front()), "bound_m": one_scan,
+        "pose": pose.tolist(), "in_front": bool(pose[1] < job.field.front()), "bound": one_scan[0].tolist(),
         "error_m": {}, "claim": {},
     }  # fmt: skip
     for name in job.estimators:
@@ -70,6 +71,7 @@ def trial(job: Job) -> dict[str, Any]:
 def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
     """Numbers of one estimator over all trials."""
     errors = np.array([each["error_m"][name] for each in trials])
+    limit = bounds(trials, knows_heading(name)) / errors.shape[1]
     last, claims = errors[:, -1], [each["claim"][name] == "tracking" for each in trials]
     front = np.array([each["in_front"] for each in trials], bool)
     # Iterations until it is close and stays so; those that never are have none.
@@ -81,6 +83,9 @@ def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
         "final_error_std_m": float(last.std()),
         "final_error_median_m": float(np.median(last)),
         "final_error_max_m": float(last.max()),
+        "final_error_rms_m": float(np.sqrt(np.mean(last**2))),
+        "final_rms_over_bound": float(np.sqrt(np.mean(last**2) / np.mean(bound.position(limit) ** 2))),
+        "final_median_over_bound": float(np.median(last)) / bound.median(limit),
         "found_within_0.5_m": int((last < FOUND).sum()),
         "found_within_0.2_m": int((last < CLOSE).sum()),
         "first_scan_error_median_m": float(np.median(errors[:, 0])),
@@ -101,8 +106,14 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
     rows = run_trials("e1", trial, jobs, out, workers, console)
     curves: dict[str, list[Any]] = {"iteration": list(range(1, job.iterations + 1))}
     curves |= results.curves_of(rows, job.estimators)
-    curves["bound m"] = _bound(rows, job.iterations)
-    parameters = asdict(job) | {"trials": trials, "bound_end_m": curves["bound m"][-1]}
+    for name in job.estimators:
+        curves[f"{name} median m"] = np.median([row["error_m"][name] for row in rows], axis=0).tolist()
+    for text, known in (("", False), (", heading known", True)):
+        one = bounds(rows, known)
+        rms, median = float(np.sqrt(np.mean(bound.position(one) ** 2))), bound.median(one)
+        for what, value in (("RMS", rms), ("median", median)):
+            curves[f"bound{text} {what} m"] = [value / float(np.sqrt(k)) for k in range(1, job.iterations + 1)]
+    parameters = asdict(job) | {"trials": trials, "bound_end_m": curves["bound RMS m"][-1]}
     result = results.Result(
         "e1", "E1: a standing robot localised", job.seed, parameters,
         {name: summarise(rows, name) for name in job.estimators}, curves, rows,
@@ -111,23 +122,25 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
     return result
 
 
-def _bound(rows: Sequence[dict[str, Any]], iterations: int) -> list[float]:
-    """Root mean square over places of the Cramér-Rao bound of so many scans, m; heading unknown."""
-    one = float(np.sqrt(np.mean(np.square([row["bound_m"] for row in rows]))))
-    return [one / float(np.sqrt(k)) for k in range(1, iterations + 1)]
+def bounds(rows: Sequence[dict[str, Any]], heading_known: bool) -> Array:
+    """(N, 3, 3) Cramér-Rao bound of one scan at each trial's place; of k scans it is so many times smaller."""
+    found = np.array([row["bound"] for row in rows])
+    return bound.heading_known(found) if heading_known else found
 
 
 def draw(rows: Sequence[dict[str, Any]], names: Sequence[str], curves: dict[str, list[Any]]) -> Figure:
     """Error against iteration, as in the paper's figure 3; beside it on a logarithmic axis, where all can be seen."""
     figure, panels = drawing.figure_of(2)
-    for axes in panels:
+    for axes, put in zip(panels, (drawing.band, drawing.quartiles), strict=True):
         for name in names:
-            drawing.band(axes, curves["iteration"], [row["error_m"][name] for row in rows], name)
+            put(axes, curves["iteration"], [row["error_m"][name] for row in rows], name)
         axes.set(xlabel="iteration (one scan)", ylabel="position error (m)", xlim=(1, curves["iteration"][-1]))
-    panels[1].plot(curves["iteration"], curves["bound m"], "--", color=drawing.BOUND, label="Cramér-Rao bound")
+    for text, style in (("", "--"), (", heading known", ":")):
+        limit = curves[f"bound{text} median m"]
+        panels[1].plot(curves["iteration"], limit, style, color=drawing.BOUND, label=f"Cramér-Rao bound{text}")
     panels[0].set(ylim=(0, None), title="mean ± standard deviation, as the paper draws it")
     drawing.log_metres(panels[1])
-    panels[1].set(title="the same, logarithmic")
+    panels[1].set(title="median and quartiles; bound: median at best")
     drawing.legend_below(figure, *panels)
     return figure
 
@@ -135,12 +148,15 @@ def draw(rows: Sequence[dict[str, Any]], names: Sequence[str], curves: dict[str,
 def table(summary: dict[str, dict[str, Any]]) -> str:
     """As docs/experiments.md has it."""
     heads = (
-        "estimator", "error at the end, mean ± std (m)", "median (m)", "within 0.5 m", "in front of the objects",
-        "error there (m)", "iterations to 0.2 m", "claims to know; wrongly",
+        "estimator", "error at the end, mean ± std (m)", "median (mm)", "over the bound's", "RMS (mm)",
+        "over the bound's", "within 0.5 m", "in front of the objects", "error there (m)", "iterations to 0.2 m",
+        "claims to know; wrongly",
     )  # fmt: skip
     rows = [
         [
-            name, results.mean_std(row, "final_error", 4), results.number(row["final_error_median_m"], 4),
+            name, results.mean_std(row, "final_error", 4),
+            results.millimetres(row["final_error_median_m"]), results.ratio(row["final_median_over_bound"]),
+            results.millimetres(row["final_error_rms_m"]), results.ratio(row["final_rms_over_bound"]),
             f"{row['found_within_0.5_m']} of {row['trials']}",
             f"{row['in_front_within_0.5_m']} of {row['places_in_front']}", results.mean_std(row, "in_front_error", 4),
             results.number(row["iterations_to_0.2_m_median"], 0),

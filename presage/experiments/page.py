@@ -18,18 +18,20 @@ MODULES = {
     "e1": "localisation", "e2": "crossing", "e3": "navigation", "alpha": "step_size", "steps": "stepping",
     "samples": "samples", "aliasing": "aliasing", "prediction": "prediction",
 }  # fmt: skip
-MARKED = re.compile(r"(<!-- table (?P<name>\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+MARKED = re.compile(r"(<!-- table (?P<name>[\w/]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 Summary = dict[str, dict[str, Any]]
 
 
 def table_of(name: str, folder: Path) -> str:
-    """The table of one result in ``folder``, or `overview` of several."""
+    """The table and the notes of one result in ``folder``, or `overview` of several; e1, converged/e1."""
     if name == "overview":
         return overview(folder)
-    if name not in MODULES:
-        raise UserError(f"no experiment {name!r}: choose from {', '.join(MODULES)}")
-    table: Callable[[Summary], str] = import_module(f"presage.experiments.{MODULES[name]}").table
-    return table(results.read(folder / f"{name}.json")["summary"])
+    kind = name.rsplit("/", maxsplit=1)[-1]
+    if kind not in MODULES:
+        raise UserError(f"no experiment {kind!r}: choose from {', '.join(MODULES)}")
+    table: Callable[[Summary], str] = import_module(f"presage.experiments.{MODULES[kind]}").table
+    result = results.read(folder / f"{name}.json")
+    return "\n\n".join([table(result["summary"]), *(f"{note[0].upper()}{note[1:]}" for note in result["notes"])])
 
 
 def filled(page: str, folder: Path) -> str:
@@ -45,11 +47,16 @@ def overview(folder: Path) -> str:
     one, two = (e1["summary"], e2["summary"])
     rows = [
         ["E1: error after 50 iterations (m)", "a figure; weights re-measured: 0.17 to 0.37 median"]
-        + [mean_std(one[name], "final_error", 4) for name in names] + [number(e1["parameters"]["bound_end_m"], 4)],
+        + [mean_std(one[name], "final_error", 4) for name in names] + [""],
+        ["E1: the same, RMS (mm)", "–"]
+        + [results.millimetres(one[name]["final_error_rms_m"]) for name in names]
+        + [results.millimetres(e1["parameters"]["bound_end_m"])],
         ["E1: places within 0.5 m", "–"]
         + [f"{one[name]['found_within_0.5_m']} of {one[name]['trials']}" for name in names] + [""],
-        ["E2: error on the way (m)", "a figure"]
-        + [mean_std(two[name], "error", 4) for name in names] + [number(e2["parameters"]["bound_rms_m"], 4)],
+        ["E2: error on the way (m)", "a figure", *(mean_std(two[name], "error", 4) for name in names), ""],
+        ["E2: the same, RMS (mm)", "–"]
+        + [results.millimetres(two[name]["error_rms_m"]) for name in names]
+        + [results.millimetres(e2["parameters"]["bound, one scan, rms_m"])],
         *_navigation(e3["summary"], names),
     ]  # fmt: skip
     return results.markdown(heads, rows)

@@ -92,6 +92,19 @@ def number(value: float | None, digits: int = 3) -> str:
     return "–" if value is None or not np.isfinite(value) else f"{value:.{digits}f}"
 
 
+def millimetres(metres: float | None) -> str:
+    """For a table: one thousandth as precise as it is large, 0.35, 12.3, 1757."""
+    if metres is None or not np.isfinite(metres):
+        return "–"
+    value = 1000 * metres
+    return f"{value:.{2 if value < 10 else 1 if value < 100 else 0}f}"
+
+
+def ratio(value: float) -> str:
+    """For a table: 1.1, 23, 5494."""
+    return f"{value:.{1 if value < 10 else 0}f}"
+
+
 def mean_std(summary: Mapping[str, Any], quantity: str, digits: int = 3) -> str:
     """As ± of what the summary holds as QUANTITY_mean_m and QUANTITY_std_m."""
     mean, std = summary.get(f"{quantity}_mean_m"), summary.get(f"{quantity}_std_m")

@@ -71,7 +71,7 @@ def trial(job: Job) -> dict[str, Any]:
         "no_prediction_share": float(np.isnan(ranges).mean()),
         "position_error_m": [round(_located(make(), judge, pose, scans), 6) for pose in poses],
         "same_scan_everywhere_m": float(np.abs(held_out.ranges - np.median(held_out.ranges, axis=0)).mean()),
-        "bound_median_m": _median_at_the_bound(bound.single(judge, poses)),
+        "bound_median_m": bound.median(bound.single(judge, poses)),
     }  # fmt: skip
 
 
@@ -81,13 +81,6 @@ def _located(estimator: Estimator, scene: Scene, pose: Array, scans: int) -> flo
     for k in range(scans):
         posterior = estimator.update(scene.observe(clean, k / scene.scanner.rate))
     return float(np.hypot(*(posterior.pose - pose)[:2]))
-
-
-def _median_at_the_bound(covariance: Array) -> float:
-    """M, the median distance of errors with the least covariances (N, 3, 3) that one scan allows."""
-    spread = np.linalg.cholesky(covariance[:, :2, :2])
-    draws = np.random.default_rng(0).standard_normal((2000, 2))
-    return float(np.median(np.linalg.norm(np.einsum("nij,kj->nki", spread, draws), axis=-1)))
 
 
 def summarise(row: dict[str, Any]) -> dict[str, Any]:

@@ -34,10 +34,20 @@ def run_all(trials: int, seed: int, out: Path, workers: int, console: Console) -
     def few(own: int) -> int:
         return min(own, trials) if trials else own
 
+    def folder(name: str) -> Path:
+        made = out / name
+        made.mkdir(exist_ok=True)
+        return made
+
+    # The paper's estimator with all the time it wants, and journeys whose straight line need not be free.
+    slow = localisation.Job(0, seed, 200, ("paper",))
+    any_pair = navigation.Job(0, seed, limit=450, free=False, estimators=("precise",))
     runs: dict[str, Run] = {
         "e1": lambda: localisation.run(localisation.Job(0, seed, 50), few(100), out, workers, console),
-        "e2": lambda: crossing.run(crossing.Job(0, seed), few(20), out, workers, console),
+        "converged/e1": lambda: localisation.run(slow, few(100), folder("converged"), workers, console),
+        "e2": lambda: crossing.run(crossing.Job(0, seed), few(12), out, workers, console),
         "e3": lambda: navigation.run(navigation.Job(0, seed), few(50), out, workers, console),
+        "any/e3": lambda: navigation.run(any_pair, few(20), folder("any"), workers, console),
         "alpha": lambda: step_size.run(localisation.Job(0, seed, 50), few(50), out, workers, console),
         "steps": lambda: stepping.run(stepping.Job(0, seed), few(10), out, workers, console),
         "samples": lambda: samples.run(samples.Job(seed, places=few(50)), out, workers, console),
@@ -51,9 +61,8 @@ def run_all(trials: int, seed: int, out: Path, workers: int, console: Console) -
             console.print(f"{name}: done before")
             continue
         console.rule(f"{number} of {len(runs)}: {name}", align="left")
-        result = run()
+        run()
         print(f"\n{page.table_of(name, out)}\n")
-        console.print(*result.notes, sep="\n")
         done.add(name)
     done.path.unlink(missing_ok=True)
     console.print(f"all of it lies in {out}/; {(time.monotonic() - began) / 60:.1f} minutes")

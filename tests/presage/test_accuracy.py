@@ -57,6 +57,22 @@ def test_odometry_only_tightens_the_bound_and_standing_adds_up():
     assert last == pytest.approx(bound.single(scene, path[:1], 20)[0], rel=1e-3)
 
 
+def test_what_is_known_before_tightens_the_bound_and_nothing_beats_a_known_heading():
+    scene = Scene.of(load_world("maze"), 200, 0)
+    path = scene.path(2)
+    one = bound.single(scene, path)
+    start = np.diag([1e-3, 1e-3, 1e-3]) ** 2
+    first = bound.recursive(scene, path, Drift(), start)[0]
+    assert np.linalg.inv(first) == pytest.approx(np.linalg.inv(one[0]) + np.linalg.inv(start), rel=1e-6)
+    known = bound.heading_known(one)
+    assert (bound.position(known) <= bound.position(one)).all()
+    assert known[0, :2, :2] == pytest.approx(np.linalg.inv(bound.information(scene, path[:1])[0, :2, :2]), rel=1e-6)
+
+
+def test_the_median_of_errors_at_the_bound():
+    assert bound.median(np.tile(np.diag([1.0, 1.0, 1.0]), (3, 1, 1))) == pytest.approx(np.sqrt(np.log(4)), rel=0.03)
+
+
 def test_blocked_is_at_least_the_share_asked_for_and_only_shorter():
     scene = Scene.of(load_world("office"), 622, 0)
     for clean in scene.clean(scene.poses(10)):

@@ -108,7 +108,8 @@ def test_precise_finds_in_one_scan_what_the_papers_descent_approaches():
 
 def test_summary_counts_and_places():
     def row(errors, claim, *, front):
-        return {"error_m": {"x": errors}, "claim": {"x": claim}, "in_front": front}
+        limit = np.diag([3e-2, 4e-2, 0.1]) ** 2  # 5 cm
+        return {"error_m": {"x": errors}, "claim": {"x": claim}, "in_front": front, "bound": limit.tolist()}
 
     rows = [row([3, 0.1, 0.1], "tracking", front=True), row([0.1, 0.3, 0.1], "tracking", front=True),
             row([4, 4, 4], "tracking", front=False), row([4, 4, 0.3], "localising", front=False)]  # fmt: skip
@@ -118,7 +119,9 @@ def test_summary_counts_and_places():
     assert found["claimed_tracking"] == 3
     assert found["claimed_tracking_but_wrong"] == 1
     assert found["in_front_within_0.5_m"] == found["places_in_front"] == 2
-    assert localisation.summarise(rows[:2], "x")["iterations_to_0.2_m_median"] == 2.5  # after 2, and after 3
+    two = localisation.summarise(rows[:2], "x")
+    assert two["iterations_to_0.2_m_median"] == 2.5  # after 2, and after 3
+    assert two["final_rms_over_bound"] == pytest.approx(0.1 / (0.05 / np.sqrt(3)))
 
 
 def test_the_crossing_is_free_and_straight():
@@ -162,11 +165,14 @@ def test_names_are_those_of_the_tables():
 
 def test_a_page_is_filled_from_results_and_missing_ones_are_named(tmp_path):
     result = results.Result("e2", "t", 0, {}, {"precise": crossing.summarise(
-        [{"error_m": {"precise": [0.001, 0.003]}, "lost": {"precise": False}}], "precise")})  # fmt: skip
+        [{"error_m": {"precise": [0.001, 0.003]}, "lost": {"precise": False}, "bound_m": {"one scan": [0.001, 0.001]}}],
+        "precise")}, notes=["a remark"])  # fmt: skip
     result.write(tmp_path, None)
     text = "before\n<!-- table e2 -->\nold\n<!-- end -->\nafter\n"
     filled = page.filled(text, tmp_path)
     assert "0.0020 ± 0.0010" in filled
+    assert "| 2.24 | 2.2 | one scan |" in filled
+    assert "\n\nA remark\n" in filled
     assert "old" not in filled
     assert page.filled(filled, tmp_path) == filled
     with pytest.raises(UserError, match="presage experiment e1"):
