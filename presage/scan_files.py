@@ -95,8 +95,6 @@ def clean(ranges: Array, range_max: float) -> Array:
 
 def _read_recording(path: Path) -> Scans:
     recording = read_recording(path)
-    if recording.warning:
-        print(recording.warning)
     scans: list[Scan] = []
     odoms: dict[int, Array] = {}
     truths: dict[int, Array] = {}
@@ -107,6 +105,8 @@ def _read_recording(path: Path) -> Scans:
             odoms[message.stamp_ns] = message.pose.array()
         elif isinstance(message, Truth):
             truths[message.stamp_ns] = message.pose.array()
+    if recording.warning:  # damage is found on the way
+        print(recording.warning)
     if not scans:
         raise UserError(f"{path}: no scan in it")
     first = scans[0]

@@ -83,11 +83,9 @@ def session_of(recording: Recording) -> Session:
         world=recording.world(),
         robot=recording.metadata.get("presage", {}).get("robot", "unknown"),
         base=recording.robot(),
-        warning=recording.warning,
         counts=dict(recording.counts()),
+        duration_s=(recording.end_ns - recording.start_ns) * 1e-9,
     )
-    if recording.raw:
-        session.duration_s = (recording.raw[-1].logged_ns - recording.raw[0].logged_ns) * 1e-9
     kept: dict[type[Stamped], list[Any]] = {
         Scan: session.scans, Truth: session.truths, Belief: session.beliefs, Prediction: session.predictions,
     }  # fmt: skip
@@ -110,6 +108,7 @@ def session_of(recording: Recording) -> Session:
     session.true_of = [
         _nearest(truths.get(b.stamp_ns, []), raw) for b, raw in zip(session.beliefs, belief_raws, strict=True)
     ]
+    session.warning = recording.warning  # damage is found on the way
     session.undecodable = sum(recording.undecodable.values())
     return session
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 
 import yaml
+from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Header, Metadata
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
@@ -36,20 +39,25 @@ class Raw:
 
 @dataclass
 class Recording:
-    """A recording, all of it in memory, in the order it was received; `problem` says what cut it short, if anything."""
+    """A recording on disk; payloads are read when asked for. `problem` says what cut it short, if anything.
+
+    Damage inside a finished file is found where it is read: ask for `problem` after the messages.
+    """
 
     path: Path
-    raw: list[Raw] = field(default_factory=list)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # of each name the last
     attachments: dict[str, bytes] = field(default_factory=dict)  # of each name the last
-    problem: str = "its end is missing"
+    problem: str = ""
     undecodable: Counter[str] = field(default_factory=Counter)  # by key, of the last pass of `messages`
     profile: str = ""
-    _keys: dict[int, str] = field(default_factory=dict)  # by channel
+    start_ns: int = 0  # reception of the first message, wall clock
+    end_ns: int = 0  # and of the last
+    _counts: Counter[str] = field(default_factory=Counter)  # by key
+    _finished: bool = False  # there is an index
 
     @property
     def complete(self) -> bool:
-        """Whether the file was finished and is whole."""
+        """Whether the file was finished and, as far as it was read, is whole."""
         return not self.problem
 
     @property
@@ -62,23 +70,50 @@ class Recording:
             if self.path.suffix == ".active"
             else "it is cut short or damaged"
         )
-        return f"{self.path}: incomplete ({self.problem}): {why}; the {len(self.raw)} messages before that are used"
+        readable = "what comes" if self._finished else f"the {sum(self._counts.values())} messages"
+        return (
+            f"{self.path}: incomplete ({self.problem}): {why}; {readable} before that can be used, and "
+            "`presage recover` makes a whole file of what is readable"
+        )
+
+    def payloads(
+        self, keys: Collection[str] | None = None, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Raw]:
+        """Those of some keys (None: all), from ``start_ns`` to before ``end_ns`` of the wall clock, as received.
+
+        A chunk at a time is in memory. Ends at the first damage, and `problem` then says what it is.
+        """
+        try:
+            with self.path.open("rb") as stream:
+                for channel, message in (self._indexed if self._finished else self._torn)(
+                    stream, keys, start_ns, end_ns
+                ):
+                    yield Raw(channel.topic, message.data, message.publish_time, message.log_time)
+        except OSError as error:
+            raise _unreadable(self.path, error) from None
+
+    @property
+    def raw(self) -> list[Raw]:
+        """All of it at once, for short recordings."""
+        return list(self.payloads())
 
     def messages(self, *topics: Topic) -> Iterator[tuple[Topic, Stamped, Raw]]:
         """Decoded messages of the topics (none: all) beside their bytes; the undecodable are counted and left out."""
         self.undecodable.clear()
-        for raw in self.raw:
-            topic = topic_of(raw.key)
-            if topic is None or (topics and topic not in topics):
-                continue
+        rows = {key: topic for key in self._counts if (topic := topic_of(key)) and (not topics or topic in topics)}
+        for raw in self.payloads(rows.keys()):
             try:
-                yield topic, topic.message.decode(raw.payload), raw
+                yield rows[raw.key], rows[raw.key].message.decode(raw.payload), raw
             except DecodeError:
                 self.undecodable[raw.key] += 1
 
     def counts(self) -> Counter[str]:
         """Messages by key."""
-        return Counter(raw.key for raw in self.raw)
+        return Counter(self._counts)
+
+    def topics(self) -> dict[str, Topic]:
+        """The rows of the table that are in it, by key."""
+        return {key: topic for key in sorted(self._counts) if (topic := topic_of(key)) is not None}
 
     def world(self) -> World | None:
         """The world the session ran in, where it was recorded."""
@@ -95,39 +130,110 @@ class Recording:
         except ValidationError:
             return Robot()
 
+    def _indexed(
+        self, stream: BinaryIO, keys: Collection[str] | None, start_ns: int | None, end_ns: int | None
+    ) -> Iterator[tuple[Channel, McapMessage]]:
+        reader = SeekingReader(stream, validate_crcs=True)
+        try:
+            for _, channel, message in reader.iter_messages(keys, starting_at=start_ns, ending_before=end_ns):
+                yield channel, message
+        except OSError:
+            raise
+        except Exception as error:  # noqa: BLE001 - a damaged chunk raises kinds of each decompressor
+            self.problem = f"damaged: {error}"
+
+    def _torn(
+        self, stream: BinaryIO, keys: Collection[str] | None, start_ns: int | None, end_ns: int | None
+    ) -> Iterator[tuple[Channel, McapMessage]]:
+        channels: dict[int, Channel] = {}
+        for record in _records(self, stream):
+            if isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, McapMessage):
+                channel, at = channels.get(record.channel_id), record.log_time
+                if channel is None or (keys is not None and channel.topic not in keys):
+                    continue
+                if (start_ns is None or at >= start_ns) and (end_ns is None or at < end_ns):
+                    yield channel, record
+
 
 def read_recording(path: Path) -> Recording:
-    """All of a file; raises UserError where it is missing or no recording. A torn file gives its complete chunks."""
+    """Open a file; raises UserError where it is missing or no recording. A torn file gives its complete chunks."""
     recording = Recording(path)
     try:
         with path.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 raise UserError(f"{path}: not an MCAP file; `presage record` and `presage demo` make recordings")
-            stream.seek(0)
-            reader = StreamReader(stream, validate_crcs=True, record_size_limit=path.stat().st_size)
-            try:
-                for record in reader.records:
-                    _take(recording, record)
-                recording.problem = ""
-            except Exception as error:  # noqa: BLE001 - a torn or damaged chunk raises kinds of each decompressor
-                recording.problem = "its end is missing" if "End" in type(error).__name__ else f"damaged: {error}"
+            if not _read_summary(recording, stream):
+                _read_through(recording, stream)
     except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); recordings are named NAME.mcap") from None
-    if recording.profile not in {"", PROFILE} and not any(topic_of(key) for key in recording._keys.values()):  # noqa: SLF001
+        raise _unreadable(path, error) from None
+    if recording.profile not in {"", PROFILE} and not recording.topics():
         raise UserError(f"{path}: an MCAP file, but no recording of presage (its profile is {recording.profile!r})")
-    recording.raw.sort(key=lambda raw: raw.logged_ns)  # stable: equal times keep the file's order
     return recording
 
 
-def _take(recording: Recording, record: object) -> None:
-    if isinstance(record, Header):
-        recording.profile = record.profile
-    elif isinstance(record, Channel):
-        recording._keys[record.id] = record.topic  # noqa: SLF001 - the recording's own half
-    elif isinstance(record, Metadata):
-        recording.metadata[record.name] = dict(record.metadata)
-    elif isinstance(record, Attachment):
-        recording.attachments[record.name] = record.data
-    elif isinstance(record, McapMessage):
-        key = recording._keys[record.channel_id]  # noqa: SLF001
-        recording.raw.append(Raw(key, record.data, record.publish_time, record.log_time))
+def _read_summary(recording: Recording, stream: BinaryIO) -> bool:
+    """From the index of a finished file; False where there is none that can be trusted."""
+    stream.seek(0)
+    try:
+        reader = SeekingReader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        if summary is None or summary.statistics is None:
+            return False
+        recording.profile = reader.get_header().profile
+        for metadata in reader.iter_metadata():
+            recording.metadata[metadata.name] = dict(metadata.metadata)
+        for attachment in reader.iter_attachments():
+            recording.attachments[attachment.name] = attachment.data
+        for number, count in summary.statistics.channel_message_counts.items():
+            recording._counts[summary.channels[number].topic] += count  # noqa: SLF001 - the recording's own half
+        recording.start_ns, recording.end_ns = (
+            summary.statistics.message_start_time,
+            summary.statistics.message_end_time,
+        )
+    except OSError as error:
+        if error.errno == errno.EINVAL:  # it is shorter than an end
+            return False
+        raise
+    except Exception:  # noqa: BLE001 - whatever a torn or damaged end makes of it
+        recording.metadata, recording.attachments, recording._counts = {}, {}, Counter()  # noqa: SLF001
+        return False
+    recording._finished = True  # noqa: SLF001
+    return True
+
+
+def _read_through(recording: Recording, stream: BinaryIO) -> None:
+    """From the beginning, as far as it goes."""
+    stream.seek(0)
+    keys: dict[int, str] = {}
+    for record in _records(recording, stream):
+        if isinstance(record, Header):
+            recording.profile = record.profile
+        elif isinstance(record, Channel):
+            keys[record.id] = record.topic
+        elif isinstance(record, Metadata):
+            recording.metadata[record.name] = dict(record.metadata)
+        elif isinstance(record, Attachment):
+            recording.attachments[record.name] = record.data
+        elif isinstance(record, McapMessage) and record.channel_id in keys:
+            if not recording._counts:  # noqa: SLF001
+                recording.start_ns = record.log_time
+            recording._counts[keys[record.channel_id]] += 1  # noqa: SLF001
+            recording.end_ns = max(recording.end_ns, record.log_time)
+
+
+def _records(recording: Recording, stream: BinaryIO) -> Iterator[object]:
+    """Until the end or the first damage, which is noted; a record longer than the file is damage."""
+    stream.seek(0)
+    size = recording.path.stat().st_size
+    try:
+        yield from StreamReader(stream, validate_crcs=True, record_size_limit=size).records
+    except OSError:
+        raise
+    except Exception as error:  # noqa: BLE001 - a torn or damaged chunk raises kinds of each decompressor
+        recording.problem = "its end is missing" if "End" in type(error).__name__ else f"damaged: {error}"
+
+
+def _unreadable(path: Path, error: OSError) -> UserError:
+    return UserError(f"{path}: cannot be read ({error.strerror}); recordings are named NAME.mcap")

@@ -199,9 +199,9 @@ def test_a_damaged_chunk_is_noticed(tmp_path):
     data[data.find(truth(12345)) + 20] ^= 1
     (tmp_path / "bad.mcap").write_bytes(data)
     recording = read_recording(tmp_path / "bad.mcap")
+    assert recording.raw == []
     assert not recording.complete
     assert "damaged" in recording.warning
-    assert recording.raw == []
 
 
 def foreign(path):
