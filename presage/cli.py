@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from common.bus import DEFAULT_ENDPOINT
 from common.errors import UserError, first_fault
-from presage import cli_bench, cli_experiment, cli_tools
+from presage import cli_bench, cli_experiment, cli_inspect, cli_recording, cli_replay, cli_tools
 from presage.options import (
     Connect,
     EstimatorName,
@@ -99,59 +99,6 @@ def demo(
 
 
 @app.command()
-def record(
-    out: Annotated[Path, typer.Option(help="Folder.")] = Path("recordings"),
-    topics: Annotated[str, typer.Option(help="Comma-separated topic names; empty: all.")] = "",
-    robot: RobotName = "robot",
-    connect: Connect = DEFAULT_ENDPOINT,
-) -> None:
-    """Record a running session to an MCAP file, until Ctrl-C.
-
-    Examples: `presage record`; `presage record --out logs --topics scan,odom`.
-    """
-    from common.service import main as serve  # noqa: PLC0415
-    from services.recorder.service import RecorderService  # noqa: PLC0415
-    from services.recorder.settings import RecorderSettings  # noqa: PLC0415
-
-    args = ["--directory", str(out), "--robot", robot, "--connect", connect]
-    serve(RecorderSettings, RecorderService, args + (["--topics", topics] if topics else []))
-
-
-@app.command()
-def replay(
-    file: Path,
-    only: Annotated[str, typer.Option(help="Comma-separated topic names; empty: all but health.")] = "",
-    rate: Annotated[
-        float, typer.Option(min=0.0, help="1 is the original timing, 2 twice as fast, 0 as fast as it goes.")
-    ] = 1.0,
-    connect: Connect = DEFAULT_ENDPOINT,
-) -> None:
-    """Put a recording's bytes back on their keys.
-
-    Examples: `presage replay run.mcap --only scan,odom` (with `python -m services.estimator` beside it);
-    `presage replay run.mcap --rate 4`.
-    """
-    from presage.replaying import run_replay  # noqa: PLC0415
-
-    run_replay(file, link_of(connect, "replay"), only, rate, console)
-
-
-@app.command()
-def plot(
-    file: Path,
-    out: Annotated[Path | None, typer.Option(help="PNG; none: beside the recording.")] = None,
-    json_file: Json = None,
-) -> None:
-    """Draw a recording and print its summary.
-
-    Example: `presage plot recordings/run.mcap --out run.png`.
-    """
-    from presage.demo import plot_command  # noqa: PLC0415
-
-    plot_command(file, out or file.with_suffix(".png"), json_file, console)
-
-
-@app.command()
 def localize(
     file: Annotated[Path, typer.Argument(help=".npz (ranges, angles, range_max) or a recording (.mcap).")],
     world: Annotated[str, typer.Option(help="A shipped world or a world file; none: the recording's.")] = "",
@@ -224,6 +171,9 @@ def train(
         raise UserError(f"no preset {preset!r}: choose precise or paper")
 
 
+app.add_typer(cli_recording.app)
+app.add_typer(cli_replay.app)
+app.add_typer(cli_inspect.app)
 app.add_typer(cli_tools.app)
 app.add_typer(cli_bench.app, name="bench")
 app.add_typer(cli_experiment.app, name="experiment")
