@@ -18,7 +18,7 @@ Written by `python -m common.describe > docs/messages.md` from `common/topics.py
 
 Keys are `{ROOT}/<robot>/<topic>`. A payload is one MessagePack map with the field names below; a field with a
 default may be left out, an unknown one is ignored. *Binary* fields are MessagePack `bin`: little-endian numbers of the
-type shown (`<f4` is float32, `<f8` float64), row after row. Payloads above {MAX_BYTES >> 20} MiB
+type shown (`<f4` is float32, `<f8` float64, `u1` a byte), row after row. Payloads above {MAX_BYTES >> 20} MiB
 ({64 * MAX_BYTES >> 20} MiB for requests) are not read. zenoh's encoding is `application/msgpack` with the message's
 name as schema. While a service runs, the liveliness token `{alive_key("<robot>", "<service>")}` stands.
 

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from common.robot import Robot
 from common.scanner import Scanner
-from common.wire import Count, Finite, Floats, Matrix3, Message, Name, NotNegative, Poses, Positive, Ranges, Text
+from common.wire import Bytes, Count, Finite, Floats, Matrix3, Message, Name, NotNegative, Poses, Positive, Ranges, Text
 from common.world import Obstacle, World
 
 
@@ -175,6 +175,8 @@ class TopicHealth(Message):
     published: Count = 0
     dropped: Count = 0  # older than the newest, by the topic's queue policy, or a full queue
     undecodable: Count = 0
+    written: Count = 0  # into the recording; 0 in all but the recorder
+    missing: Count = 0  # by the publisher's sequence numbers, sent and never received; counted by the recorder
     rate: NotNegative = 0.0  # Hz over the last second
 
 
@@ -249,9 +251,44 @@ class WorldReply(Reply):
     robot: Robot | None = None
 
 
+class PlayerRequest(Request):
+    """Steer a running replay."""
+
+    action: Literal["pause", "resume", "step", "seek", "rate", "status"]  # step: to the end of the next scan, paused
+    value: Finite = 0.0  # seek: s from the recording's beginning; rate: times the original timing, 0 flat out
+
+
+class PlayerReply(Reply):
+    """Where a replay stands after the request."""
+
+    paused: bool = False
+    position_s: NotNegative = 0.0  # s from the recording's beginning
+    duration_s: NotNegative = 0.0  # s, of the recording
+    rate: NotNegative = 1.0  # times the original timing; 0: as fast as it goes
+    loop: bool = False  # begins anew at its end
+
+
 class ConfigReply(Reply):
     """Effective configuration and versions of a service."""
 
     service: Name = ""
     config: Text = ""  # JSON
     versions: dict[str, str] = {}  # noqa: RUF012
+
+
+class ModelRequest(Request):
+    """Ask the estimator what it was made of."""
+
+    weights: bool = False  # with the weights themselves
+
+
+class ModelReply(Reply):
+    """What makes the estimator the very same again: its map, and the weights it loaded with their card."""
+
+    estimator: Name = ""
+    world: World | None = None  # the estimator's map
+    card: Text = ""  # JSON, the model card; empty: nothing was learned
+    file: Name = ""  # of the weights, NAME.safetensors, the card's is NAME.json; empty: nothing was learned
+    size: Count = 0  # bytes of the weights
+    sha256: Name = ""  # of the weights, hexadecimal
+    weights: Bytes = np.zeros(0, np.uint8)  # the weights, where they were asked for

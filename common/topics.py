@@ -65,9 +65,11 @@ OBSTACLE = Query("obstacle", m.ObstacleRequest, m.Reply, "simulator", about="add
 SAMPLE = Query("sample", m.SampleRequest, m.SampleReply, "simulator", about="the scans seen from a batch of poses")
 WORLD = Query("world", m.Request, m.WorldReply, "simulator", about="world, scanner and robot as data")
 LOCALISE = Query("localise", m.LocaliseRequest, m.Reply, "estimator", about="begin localisation anew")
+PLAYER = Query("player", m.PlayerRequest, m.PlayerReply, "replay", about="pause, step, seek a replay")
+MODEL = Query("model", m.ModelRequest, m.ModelReply, "estimator", about="the model in use: card, map, weights")
 CONFIG = Query("config", m.Request, m.ConfigReply, "every service", per_service=True, about="effective configuration")
 
-QUERIES: tuple[Query, ...] = (TELEPORT, RESET, PAUSE, RESUME, OBSTACLE, SAMPLE, WORLD, LOCALISE, CONFIG)
+QUERIES: tuple[Query, ...] = (TELEPORT, RESET, PAUSE, RESUME, OBSTACLE, SAMPLE, WORLD, LOCALISE, PLAYER, MODEL, CONFIG)
 
 
 def alive_key(robot: str, service: str = "*") -> str:

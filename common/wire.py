@@ -34,7 +34,7 @@ class Binary:
     -inf too close, never NaN).
     """
 
-    dtype: Literal["<f4", "<f8"]
+    dtype: Literal["<f4", "<f8", "u1"]
     row: tuple[int, ...] = ()
     values: Literal["finite", "ranges"] = "finite"
 
@@ -77,6 +77,7 @@ Name = Annotated[str, Field(max_length=200)]
 
 Ranges = Annotated[npt.NDArray[np.float32], Binary("<f4", values="ranges")]
 Floats = Annotated[npt.NDArray[np.float32], Binary("<f4")]
+Bytes = Annotated[npt.NDArray[np.uint8], Binary("u1")]
 Poses = Annotated[npt.NDArray[np.float64], Binary("<f8", (3,))]
 Matrix3 = Annotated[npt.NDArray[np.float64], Binary("<f8", (3,))]
 

@@ -112,7 +112,9 @@ def _limits(metadata: tuple) -> dict[str, typing.Any]:
 @functools.cache
 def _array(binary: Binary) -> st.SearchStrategy:
     width = 32 if binary.dtype == "<f4" else 64
-    number = st.floats(allow_nan=False, allow_infinity=binary.values == "ranges", width=width)
+    number: st.SearchStrategy = st.integers(0, 255)
+    if binary.dtype != "u1":
+        number = st.floats(allow_nan=False, allow_infinity=binary.values == "ranges", width=width)
     columns = int(np.prod(binary.row))
     rows = st.integers(0, 20 // columns)
     flat = rows.flatmap(lambda n: st.lists(number, min_size=n * columns, max_size=n * columns))

@@ -75,7 +75,7 @@ def test_a_schema_knows_every_field_and_how_to_read_its_arrays(cls):
     for part in schema.get("properties", {}).values():
         for option in allowed(part, schema):
             if option.get("contentEncoding") == "binary":
-                assert option["x-dtype"] in ("<f4", "<f8")
+                assert option["x-dtype"] in ("<f4", "<f8", "u1")
                 assert option["x-shape"][0] == "N"
 
 
