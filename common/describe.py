@@ -67,15 +67,12 @@ def _fields(model: type[BaseModel]) -> list[str]:
     lines = [f"### {model.__name__}\n", f"{about}\n"]
     if not model.model_fields:
         return [*lines, "No fields.\n"]
-    comments: dict[str, str] = {}
-    for ancestor in reversed(model.__mro__):
-        if issubclass(ancestor, BaseModel) and ancestor is not BaseModel:
-            comments |= _comments(ancestor)
+    said = comments(model)
     schema = model.model_json_schema(mode="serialization")
     rows = []
     for name, field in model.model_fields.items():
         default = "required" if field.is_required() else _plain(field.default)
-        rows.append(f"| `{name}` | {_kind(schema['properties'][name])} | {default} | {comments.get(name, '')} |")
+        rows.append(f"| `{name}` | {_kind(schema['properties'][name])} | {default} | {said.get(name, '')} |")
     return [*lines, "| field | type | default | meaning |", "|---|---|---|---|", *rows, ""]
 
 
@@ -103,6 +100,15 @@ def _plain(value: object) -> str:
     if hasattr(value, "tolist"):
         value = value.tolist()
     return "nil" if value is None else f"`{json.dumps(value)}`"
+
+
+def comments(model: type[BaseModel]) -> dict[str, str]:
+    """What each field means, with its unit, as the source says it; inherited fields too."""
+    found: dict[str, str] = {}
+    for ancestor in reversed(model.__mro__):
+        if issubclass(ancestor, BaseModel) and ancestor is not BaseModel:
+            found |= _comments(ancestor)
+    return found
 
 
 def _comments(model: type[BaseModel]) -> dict[str, str]:
