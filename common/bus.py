@@ -139,9 +139,9 @@ class Bus:
         """Say that the service is there, until the session ends. Declare it last: order is kept."""
         self._declared.append(self._session.liveliness().declare_token(alive_key(self.robot, service)))
 
-    def alive(self, timeout: float = 1.0) -> set[str]:
-        """Services of this robot that are there now."""
-        replies = self._session.liveliness().get(alive_key(self.robot), timeout=timeout)
+    def alive(self, timeout: float = 1.0, robot: str | None = None) -> set[str]:
+        """Services of this robot, or another, that are there now."""
+        replies = self._session.liveliness().get(alive_key(robot or self.robot), timeout=timeout)
         return {str(r.ok.key_expr).rsplit("/", 1)[-1] for r in replies if r.ok is not None}
 
     def watch_alive(self, changed: Callable[[str, bool], None]) -> None:

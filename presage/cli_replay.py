@@ -1,4 +1,4 @@
-"""Commands that bring a recording back to life: replay."""
+"""Commands that bring a recording back to life: replay, rerun."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from common.bus import DEFAULT_ENDPOINT
-from presage.options import Connect, console, link_of
+from common.errors import UserError
+from presage.options import Connect, Json, console, link_of
 
 app = typer.Typer()
 
@@ -17,16 +18,49 @@ app = typer.Typer()
 def replay(
     file: Path,
     only: Annotated[str, typer.Option(help="Comma-separated topic names; empty: all but health.")] = "",
+    leave_out: Annotated[str, typer.Option("--except", help="Comma-separated topic names to leave out.")] = "",
     rate: Annotated[
-        float, typer.Option(min=0.0, help="1 is the original timing, 2 twice as fast, 0 as fast as it goes.")
-    ] = 1.0,
+        float | None, typer.Option(min=0.0, help="1 is the original timing, 2 twice as fast, 0 as fast as it goes.")
+    ] = None,
+    start: Annotated[float | None, typer.Option(min=0.0, help="s from the recording's beginning.")] = None,
+    end: Annotated[float | None, typer.Option(help="s from its beginning; negative: from its end.")] = None,
+    loop: Annotated[bool, typer.Option("--loop", help="Begin anew at the end, until Ctrl-C.")] = False,
+    robot: Annotated[str, typer.Option(help="Another robot's name in the keys; empty: the recorded one.")] = "",
+    force: Annotated[bool, typer.Option("--force", help="Beside a live publisher of the same keys too.")] = False,
+    with_services: Annotated[
+        str, typer.Option("--with", help="estimator[,controller]: start them here, as recorded, and compare.")
+    ] = "",
+    every_scan: Annotated[
+        bool, typer.Option("--every-scan", help="--with: also scans that the live estimator did not answer.")
+    ] = False,
+    json_file: Json = None,
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
-    """Put a recording's bytes back on their keys.
+    """Put a recording's bytes back on their keys, with their own stamps; or replay it to services started for it.
+
+    While it runs, in a terminal: space pauses, `.` steps one scan, left and right (h, l) go 5 s, up and down change the
+    rate, q quits. The queryable presage/ROBOT/player does the same over the bus.
+
+    `--with estimator` needs nothing but the file: a router and the services named run here as they were configured,
+    over the recorded world and model, hear what they heard, and what they say is compared with the recording. Each scan
+    waits for the belief of the last (unless `--rate` is given). Where the session ran in lockstep both must be equal
+    bit for bit; the status is 1 where they are not.
 
     Examples: `presage replay run.mcap --only scan,odom` (with `python -m services.estimator` beside it);
-    `presage replay run.mcap --rate 4`.
+    `presage replay run.mcap --rate 4 --start 10 --end -5 --loop`; `presage replay run.mcap --except belief,prediction`;
+    `presage replay run.mcap --robot ghost` (beside a live robot); `presage replay run.mcap --with estimator`.
     """
-    from presage.replaying import run_replay  # noqa: PLC0415
+    from presage.replaying import choice_of, run_replay  # noqa: PLC0415
 
-    run_replay(file, link_of(connect, "replay"), only, rate, console)
+    choice = choice_of(only, leave_out, rate, start, end, robot, loop=loop, force=force)
+    if not with_services:
+        if json_file is not None or every_scan:
+            raise UserError("--json and --every-scan go with --with: a plain replay compares nothing")
+        run_replay(file, link_of(connect, "robot"), choice, console)
+        return
+    if only or leave_out or robot or force or loop or start is not None or end is not None:
+        raise UserError("--with replays the whole of what those services heard: it takes no other choice than --rate")
+    from presage.replays.again import Again, again_command  # noqa: PLC0415
+
+    how = Again(file, with_services, rate, every_scan=every_scan)
+    raise typer.Exit(again_command(how, json_file, console))

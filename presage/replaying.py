@@ -1,31 +1,64 @@
-"""`presage replay`: a recording's bytes back on their keys, with progress."""
+"""`presage replay`: a recording's bytes back on their keys, with progress and a keyboard."""
 
 from __future__ import annotations
 
+import re
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn
 
 from common.bus import Link
 from common.errors import UserError
+from common.messages import PlayerReply
+from presage.replays.keyboard import HELP, keyboard
 from presage.watch import session
-from services.recorder.replay import replay
+from services.recorder.replay import Choice, Remote, names_of, replay
+
+PERIOD = 0.1  # s between two looks of the bar
+ROBOT = r"[A-Za-z0-9_.-]{1,64}"
 
 
-def run_replay(file: Path, link: Link, only: str, rate: float, console: Console) -> None:
-    """Replay until the end or Ctrl-C."""
-    names = {part.strip() for part in only.split(",") if part.strip()} or None
-    with Progress(TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), console=console) as bar:
-        task = bar.add_task(file.name, total=1.0)
-        counts = replay(
-            file,
-            link,
-            only=names,
-            rate=rate,
-            on_progress=lambda done: bar.update(task, completed=done),
-            opening=session,
-        )
-    if not counts:
-        raise UserError(f"{file}: nothing to replay")
-    console.print("replayed " + ", ".join(f"{key} {count}" for key, count in sorted(counts.items())))
+def run_replay(file: Path, link: Link, choice: Choice, console: Console) -> None:
+    """Replay until the end, q or Ctrl-C."""
+
+    @contextmanager
+    def steering(remote: Remote) -> Iterator[None]:
+        with keyboard(remote) as there:
+            if there:
+                console.print(HELP, style="dim", highlight=False)
+            with bar:
+                yield
+
+    bar = Progress(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[said]}"), console=console)
+    task, shown = bar.add_task(file.name, total=1.0, said=""), 0.0
+
+    def show(state: PlayerReply) -> None:
+        nonlocal shown
+        if (now := time.monotonic()) - shown >= PERIOD or state.paused:
+            shown = now
+            bar.update(task, completed=state.position_s, total=max(state.duration_s, 1e-9), said=words(state))
+
+    counts = replay(file, link, choice, on_progress=show, opening=session, steering=steering)
+    console.print("replayed " + (", ".join(f"{key} {count}" for key, count in sorted(counts.items())) or "nothing"))
+
+
+def words(state: PlayerReply) -> str:
+    """Where it stands, for a line."""
+    rate = f" x {state.rate:g}" if state.rate != 1 else ""
+    how = " paused" if state.paused else rate + (" looping" if state.loop else "")
+    return f"{state.position_s:.1f} of {state.duration_s:.1f} s{how}"
+
+
+def choice_of(
+    only: str, leave_out: str, rate: float | None, start: float | None, end: float | None, robot: str, *,
+    loop: bool, force: bool,
+) -> Choice:  # fmt: skip
+    """From the command line's words; raises UserError on a robot no key can hold."""
+    if robot and not re.fullmatch(ROBOT, robot):
+        raise UserError(f"--robot {robot!r}: letters, digits and _ . - only, 64 at most")
+    names, without = names_of(only), names_of(leave_out)
+    return Choice(names or None, without, 1.0 if rate is None else rate, start, end, loop, robot, force)

@@ -1,59 +1,26 @@
-"""When which bytes are due, and that they come back over real zenoh as they were."""
+"""Bytes that come back over real zenoh as they were, steered while they do, and not beside a live publisher."""
 
 from __future__ import annotations
 
+import json
 import threading
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from common.bus import wait_until
+from common.bus import open_bus, wait_until
 from common.errors import UserError
 from common.inbox import Inbox, Sample
-from common.topics import HEALTH, ODOM, SCAN, TOPICS
+from common.messages import ConfigReply, PlayerReply, PlayerRequest, Request
+from common.topics import BELIEF, CONFIG, GOAL, HEALTH, ODOM, PLAYER, SCAN, TOPICS
+from services.recorder import player as core
 from services.recorder import replay as shell
-from services.recorder.reader import Raw
-from services.recorder.replay import replay, schedule, select
+from services.recorder.replay import Choice, replay
 from services.recorder.writer import RecordingWriter
 
-
-def raw(key="presage/r/scan", logged=0, payload=b""):
-    return Raw(key, payload, 0, logged)
-
-
-def test_the_schedule_keeps_the_original_distances():
-    messages = [raw(logged=at) for at in (5_000_000_000, 5_500_000_000, 7_000_000_000)]
-    assert [due for due, _ in schedule(messages, 1.0)] == pytest.approx([0.0, 0.5, 2.0])
-    assert [due for due, _ in schedule(messages, 4.0)] == pytest.approx([0.0, 0.125, 0.5])
-    assert [message for _, message in schedule(messages, 4.0)] == messages
-
-
-@pytest.mark.parametrize("rate", [0.0, -1.0, float("inf")])
-def test_no_rate_is_as_fast_as_it_goes(rate):
-    assert [due for due, _ in schedule([raw(logged=0), raw(logged=10**12)], rate)] == [0.0, 0.0]
-
-
-def test_nothing_has_no_schedule():
-    assert list(schedule([], 1.0)) == []
-
-
-@given(times=st.lists(st.integers(0, 2**62)).map(sorted), rate=st.floats(0.01, 100))
-def test_nothing_is_due_before_what_came_before_it(times, rate):
-    dues = [due for due, _ in schedule([raw(logged=at) for at in times], rate)]
-    assert dues == sorted(dues)
-    assert dues[:1] in ([], [0.0])
-
-
-def test_topics_are_selected_by_name_and_health_only_when_asked_for():
-    scan, odom, health = raw("presage/r/scan"), raw("presage/r/odom"), raw("presage/r/health/estimator")
-    foreign = raw("other/key")
-    everything = [scan, health, odom, foreign]
-    assert select(everything, None) == [scan, odom]
-    assert select(everything, {"odom"}) == [odom]
-    assert select(everything, {"odom", "health"}) == [health, odom]
-    with pytest.raises(UserError, match="no belief; it has health, odom, scan"):
-        select(everything, {"belief", "scan"})
+SECOND = 10**9
+FAST = Choice(rate=0)
 
 
 def write(path, entries):
@@ -70,6 +37,51 @@ def listening(bus, link):
     for topic in TOPICS:
         bus.subscribe(topic, inbox, keep_all=True)
     return inbox
+
+
+@pytest.fixture
+def scans(tmp_path, link):
+    """A recording of a hundred seconds, a scan each, then its odometry; a payload is its number."""
+    scan, odom = SCAN.key(link.robot), ODOM.key(link.robot)
+    entries = []
+    for n in range(100):
+        entries += [(SCAN, scan, bytes([n]), n * SECOND), (ODOM, odom, bytes([n]), n * SECOND + SECOND // 2)]
+    return write(tmp_path / "run.mcap", entries)
+
+
+@pytest.fixture
+def running(scans, link):
+    """Calls start a replay in a thread of its own; all are ended after the test. The remote and the counts."""
+    stop, threads, failed = threading.Event(), [], []
+
+    def start(choice, path=scans):
+        there, remotes, counts = threading.Event(), [], {}
+
+        @contextmanager
+        def steering(remote):
+            remotes.append(remote)
+            there.set()
+            yield
+
+        def work():
+            try:
+                counts.update(replay(path, link, choice, stop=stop, steering=steering))
+            except BaseException as error:
+                failed.append(error)
+                there.set()
+                raise
+
+        threads.append(threading.Thread(target=work))
+        threads[-1].start()
+        assert there.wait(20)
+        assert not failed, failed
+        return remotes[0], threads[-1], counts
+
+    yield start
+    stop.set()
+    for thread in threads:
+        thread.join(20)
+        assert not thread.is_alive()
 
 
 def drain(inbox):
@@ -89,9 +101,9 @@ def test_the_same_bytes_come_back_in_their_order(tmp_path, link, listening, rate
     health = (HEALTH, HEALTH.key(link.robot, "estimator"), b"pulse", 0)
     path = write(tmp_path / "run.mcap", [health, *entries])
     progress = []
-    counts = replay(path, link, rate=rate, on_progress=progress.append)
+    counts = replay(path, link, Choice(rate=rate), on_progress=lambda state: progress.append(state.position_s))
     assert counts == {scan: 333, odom: 167}
-    assert progress[-1] == 1.0
+    assert progress[-1] == pytest.approx(4.99)
     assert progress == sorted(progress)
     assert wait_until(lambda: len(listening) == 500, 10)
     got = drain(listening)
@@ -104,20 +116,38 @@ def test_it_waits_for_who_comes_a_little_late(tmp_path, link, bus, monkeypatch):
     inbox = Inbox()
     late = threading.Timer(1.0, lambda: bus.subscribe(SCAN, inbox, keep_all=True))
     late.start()
-    replay(write(tmp_path / "run.mcap", [(SCAN, SCAN.key(link.robot), b"s", 0)]), link, rate=0)
+    replay(write(tmp_path / "run.mcap", [(SCAN, SCAN.key(link.robot), b"s", 0)]), link, FAST)
     late.join()
     assert wait_until(lambda: len(inbox) == 1, 10)
 
 
-def test_only_what_was_chosen_is_sent(tmp_path, link, listening):
-    entries = [(SCAN, SCAN.key(link.robot), b"s", 0), (ODOM, ODOM.key(link.robot), b"o", 1)]
-    assert replay(write(tmp_path / "run.mcap", entries), link, only={"odom"}, rate=0) == {ODOM.key(link.robot): 1}
+def test_only_what_was_chosen_is_sent(scans, link, listening):
+    only = Choice(rate=0, only=frozenset({"odom"}), start=10.0, end=-88.9)
+    assert replay(scans, link, only) == {ODOM.key(link.robot): 1}
     assert wait_until(lambda: len(listening) == 1, 10)
-    assert drain(listening) == [(ODOM.key(link.robot), b"o")]
+    assert drain(listening) == [(ODOM.key(link.robot), bytes([10]))]
+
+
+def test_what_is_left_out_is_not_sent(scans, link, listening):
+    choice = Choice(rate=0, leave_out=frozenset({"odom", "belief"}), start=98.0)
+    assert replay(scans, link, choice) == {SCAN.key(link.robot): 2}
+
+
+def test_another_robot_gets_the_bytes(scans, link, bus):
+    inbox = Inbox()
+    bus.subscribe(SCAN, inbox, keep_all=True, robot=f"{link.robot}-ghost")
+    assert replay(scans, link, Choice(rate=0, robot=f"{link.robot}-ghost", start=99.0, only=frozenset({"scan"})))
+    assert wait_until(lambda: len(inbox) == 1, 10)
+    assert drain(inbox) == [(SCAN.key(f"{link.robot}-ghost"), bytes([99]))]
+
+
+def test_nothing_to_replay_is_said(scans, link):
+    with pytest.raises(UserError, match=r"run.mcap: nothing to replay"):
+        replay(scans, link, Choice(leave_out=frozenset({"scan", "odom"})))
 
 
 def test_it_ends_when_it_is_told_to(tmp_path, link, listening):
-    entries = [(SCAN, SCAN.key(link.robot), b"s", at) for at in (0, 3600 * 10**9)]
+    entries = [(SCAN, SCAN.key(link.robot), b"s", at) for at in (0, 3600 * SECOND)]
     stop = threading.Event()
     path = write(tmp_path / "hour.mcap", entries)
     assert replay(path, link, on_progress=lambda _: stop.set(), stop=stop) == {SCAN.key(link.robot): 1}
@@ -128,7 +158,7 @@ def test_an_unfinished_recording_is_replayed_with_a_warning(tmp_path, link, list
     writer = RecordingWriter(tmp_path / "run.mcap")
     writer.write(SCAN, SCAN.key(link.robot), b"s", 1, 1)
     writer.flush()
-    assert replay(writer.active, link, rate=0) == {SCAN.key(link.robot): 1}
+    assert replay(writer.active, link, FAST) == {SCAN.key(link.robot): 1}
     assert "run.mcap.active: incomplete" in capsys.readouterr().err
     writer.finish()
 
@@ -142,3 +172,89 @@ def test_a_key_nobody_listens_to_is_named_and_it_ends_all_the_same(tmp_path, lin
     assert replay(path, link) == {scan: 1, odom: 1}
     assert f"warning: nobody listens to {scan}\n" in capsys.readouterr().err
     assert wait_until(lambda: len(inbox) == 1, 10)
+
+
+def test_it_is_steered_over_the_bus(running, listening, bus, link):
+    def ask(action, value=0.0):
+        return bus.ask(PLAYER, PlayerRequest(action=action, value=value), PlayerReply, timeout=10)
+
+    scan, odom = SCAN.key(link.robot), ODOM.key(link.robot)
+    _, thread, counts = running(Choice(rate=1e-6))  # so slow that only what is asked for happens
+    assert wait_until(lambda: len(listening) == 1, 10)  # the first is due at once
+    assert ask("pause").paused
+    assert ask("status").duration_s == pytest.approx(99.5)
+    for _ in range(2):  # a scan, and what came before it
+        ask("step")
+    assert wait_until(lambda: len(listening) == 5, 10)
+    assert sorted(drain(listening)) == [(odom, bytes([n])) for n in range(2)] + [(scan, bytes([n])) for n in range(3)]
+    assert ask("seek", 50.0).position_s == 50.0
+    ask("step")
+    assert wait_until(lambda: len(listening) == 1, 10)
+    assert drain(listening) == [(SCAN.key(link.robot), bytes([50]))]
+    ask("seek", 10.0)  # backwards
+    ask("step")
+    assert wait_until(lambda: len(listening) == 1, 10)
+    assert drain(listening) == [(SCAN.key(link.robot), bytes([10]))]
+    assert not ask("rate", -1.0).ok
+    assert ask("seek", 95.0).paused
+    assert ask("rate", 0.0).rate == 0.0
+    ask("resume")
+    thread.join(20)
+    assert not thread.is_alive()
+    assert wait_until(lambda: len(listening) == 10, 10)
+    assert sorted(payload[0] for _, payload in drain(listening)) == sorted([*range(95, 100)] * 2)
+    assert sum(counts.values()) == 17
+
+
+def test_it_says_what_it_is(running, bus, scans):
+    running(Choice(rate=1e-6))
+    assert wait_until(lambda: "replay" in bus.alive(), 10)
+    reply = bus.ask(CONFIG, Request(), ConfigReply, timeout=10, service="replay")
+    assert json.loads(reply.config)["file"] == str(scans)
+
+
+def test_a_loop_begins_anew(running, listening, link, monkeypatch):
+    monkeypatch.setattr(core, "GAP", 0.01)
+    remote, thread, counts = running(Choice(rate=0, start=98.0, loop=True, only=frozenset({"scan"})))
+    assert wait_until(lambda: len(listening) >= 20, 10)
+    remote.quit()
+    thread.join(10)
+    assert not thread.is_alive()
+    assert counts[SCAN.key(link.robot)] >= 20
+    assert [payload[0] for _, payload in drain(listening)][:6] == [98, 99] * 3
+
+
+@pytest.fixture
+def alive(link):
+    """Calls make a service of this robot seem alive, in a session of its own."""
+    sessions = []  # held: zenoh undeclares what nobody holds
+    with ExitStack() as stack:
+
+        def declare(service):
+            sessions.append(stack.enter_context(open_bus(link)))
+            sessions[-1].declare_alive(service)
+
+        yield declare
+
+
+def believed(path, link):
+    entries = [(t, t.key(link.robot), b"x", n) for n, t in enumerate((SCAN, BELIEF, GOAL))]
+    return write(path / "b.mcap", entries)
+
+
+def test_it_does_not_publish_beside_a_live_publisher_unless_told(tmp_path, link, bus, alive):
+    path = believed(tmp_path, link)
+    alive("estimator")
+    assert wait_until(lambda: "estimator" in bus.alive(), 20)
+    with pytest.raises(UserError, match=f"the estimator of '{link.robot}' is alive and publishes .*/belief;.*--except"):
+        replay(path, link, FAST)
+    assert sum(replay(path, link, replace(FAST, leave_out=frozenset({"belief"}))).values()) == 2
+    assert sum(replay(path, link, replace(FAST, force=True)).values()) == 3
+    assert sum(replay(path, link, replace(FAST, robot=f"{link.robot}-ghost")).values()) == 3
+
+
+def test_a_second_replay_of_the_same_keys_is_refused(running, link, scans, bus):
+    running(Choice(rate=1e-6))
+    assert wait_until(lambda: "replay" in bus.alive(), 20)
+    with pytest.raises(UserError, match="the replay of"):
+        replay(scans, link, FAST)
