@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from common.topics import MAX_BYTES, Query, Topic
 
 MAX_KEYS = 1000  # counted by name; a sender that invents keys must not fill memory
+OTHERS = "others"  # what the rest is counted under
 
 
 @dataclass(frozen=True)
@@ -76,9 +77,9 @@ class Inbox:
             self._changed.notify()
 
     def counted_as(self, key: str) -> str:
-        """The name a key is counted under: its own, or ``others`` when there are too many."""
+        """The name a key is counted under: its own, or `OTHERS` when there are too many."""
         if key not in self._counted and len(self._counted) >= MAX_KEYS:
-            return "others"
+            return OTHERS
         self._counted.add(key)
         return key
 

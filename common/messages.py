@@ -288,7 +288,7 @@ class ModelReply(Reply):
     estimator: Name = ""
     world: World | None = None  # the estimator's map
     card: Text = ""  # JSON, the model card; empty: nothing was learned
-    file: Name = ""  # of the weights, NAME.safetensors, the card's is NAME.json; empty: nothing was learned
+    file: Text = ""  # of the weights, NAME.safetensors, the card's is NAME.json; empty: nothing was learned
     size: Count = 0  # bytes of the weights
     sha256: Name = ""  # of the weights, hexadecimal
     weights: Bytes = np.zeros(0, np.uint8)  # the weights, where they were asked for

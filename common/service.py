@@ -63,6 +63,10 @@ class Service(ABC):
             return
         self.on_message(sample.topic, message)
 
+    def counted(self, key: str) -> dict[str, int]:  # noqa: ARG002
+        """More fields of this key's row in health."""
+        return {}
+
     def on_message(self, topic: Topic, message: Stamped) -> None:
         """A valid message came."""
 
@@ -198,6 +202,7 @@ class Loop:
                 dropped=inbox.dropped[key],
                 undecodable=self.undecodable[key] + inbox.oversized[key],
                 rate=max(0, total[key] - self._before[key]) / elapsed,
+                **self.service.counted(key),
             )
             for key in sorted(total)[:200]
         ]

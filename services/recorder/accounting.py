@@ -15,7 +15,7 @@ FAR = 64  # a number so much below the last is a publisher that began anew, not 
 
 @dataclass
 class Sequence:
-    """A publisher's numbers on one key, as they came: 0, 1, 2 …"""
+    """A publisher's numbers on one key, as they came: 0, 1, 2 and so on."""
 
     gaps: int = 0  # places where at least one number was left out
     missing: int = 0  # numbers left out

@@ -13,12 +13,13 @@ from common.config import ServiceSettings
 class RecorderSettings(ServiceSettings):
     """Recorder: every message of the session, bytes as sent, into an MCAP file.
 
-    The file is NAME.mcap.active until it is complete.
+    The file is NAME.mcap.active until it is complete; `presage recover` completes one whose recorder was killed.
 
     Examples:
       python -m services.recorder                                    into recordings/
       python -m services.recorder --directory logs --file run.mcap
       python -m services.recorder --topics scan,odom --compression none
+      python -m services.recorder --split-minutes 10                 run-001.mcap, run-002.mcap, each whole by itself
 
     """
 
@@ -31,4 +32,8 @@ class RecorderSettings(ServiceSettings):
     chunk_size: Annotated[int, Field(ge=1024, le=1 << 30, description="bytes; a crash loses at most one chunk")] = (
         1 << 18
     )
-    capacity: Annotated[int, Field(ge=1, le=10_000_000, description="messages that may wait to be written")] = 10_000
+    flush: Annotated[float, Field(ge=0.05, le=60, description="s; a kill loses at most what came since")] = 0.5
+    capacity: Annotated[int, Field(ge=1, le=10_000_000, description="messages that may wait to be written")] = 20_000
+    split_size: Annotated[float, Field(ge=0, description="MB of one part; 0: one file")] = 0.0
+    split_minutes: Annotated[float, Field(ge=0, description="of one part; 0: one file")] = 0.0
+    weights: Annotated[bool, Field(description="store the estimator's weights, up to 16 MiB")] = True

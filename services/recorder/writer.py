@@ -1,10 +1,13 @@
-"""An MCAP file of a session: payloads as sent, schemas derived, unfinished files known by their name."""
+"""One MCAP file of a session: payloads as sent, schemas derived, unfinished files known by their name and locked."""
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from io import BufferedWriter
 from pathlib import Path
 
@@ -15,6 +18,7 @@ from common.topics import Topic
 
 PROFILE = "presage"
 LIBRARY = "presage recorder"
+UNFINISHED = ".active"  # behind the name of a file that is not complete
 COMPRESSION = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 
 
@@ -27,18 +31,23 @@ class RecordingWriter:
 
     def __init__(self, path: Path, compression: str = "zstd", chunk_size: int = 1 << 18) -> None:
         """Open the file; raises UserError where that cannot be, `NameTakenError` where the name is another's."""
-        self.path, self.active = path, path.with_name(path.name + ".active")
+        self.path, self.active = path, path.with_name(path.name + UNFINISHED)
         self.written: Counter[str] = Counter()  # by key
         self.failed = False
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._stream = _claim(path, self.active)
+            self._stream = claim(path, self.active)
         except OSError as error:
             raise UserError(f"{path.parent}: cannot be written to ({error.strerror}); choose another folder") from None
         self._writer = Writer(self._stream, chunk_size=chunk_size, compression=COMPRESSION[compression])
         self._guarded(lambda: self._writer.start(PROFILE, LIBRARY))
+
+    @property
+    def size(self) -> int:
+        """Bytes that lie in the file so far; what is not flushed is not counted."""
+        return self._stream.tell()
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
         """A named map of text."""
@@ -77,14 +86,22 @@ class RecordingWriter:
     def flush(self) -> None:
         """Complete the chunk and hand it to the system: what came before survives this process."""
         self._guarded(self._writer.flush)
+        if not is_there(self.active, self._stream):
+            self.failed = True
+            raise UserError(
+                f"{self.active}: was removed or moved away while it was written: what it held is gone with it; "
+                "start recording anew"
+            )
 
     def finish(self) -> Path:
         """Complete the file and give it its name; after a failure only close it, unfinished."""
 
         def end() -> None:
             self._writer.finish()  # type: ignore[no-untyped-call]
+            self._stream.flush()
+            os.fsync(self._stream.fileno())
+            self.active.rename(self.path)  # while it is locked: nobody else has taken it
             self._stream.close()
-            self.active.rename(self.path)
 
         if self.failed:
             self._abandon()
@@ -99,8 +116,8 @@ class RecordingWriter:
             self.failed = True
             why = error.strerror or str(error)
             raise UserError(
-                f"{self.active}: recording failed ({why}); what was flushed before is in the file: "
-                "make room, or choose another folder with --directory"
+                f"{self.active}: recording failed ({why}); what was flushed before is in the file, and "
+                f"`presage recover {self.active}` makes a whole one of it: make room, or choose another folder"
             ) from None
 
     def _abandon(self) -> None:
@@ -110,11 +127,34 @@ class RecordingWriter:
             self._stream.raw.close()  # what is still in the buffer cannot be written
 
 
-def _claim(path: Path, active: Path) -> BufferedWriter:
+def is_there(path: Path, stream: BufferedWriter) -> bool:
+    """Whether the file that is open still has that name."""
+    try:
+        named, opened = path.stat(), os.fstat(stream.fileno())
+    except OSError:
+        return False
+    return (named.st_dev, named.st_ino) == (opened.st_dev, opened.st_ino)
+
+
+def is_being_written(path: Path) -> bool:
+    """Whether a live process holds this unfinished file; the lock ends with the process, however it ends."""
+    try:
+        with path.open("rb") as stream:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # gone, or a file system without locks
+        return False
+    return False
+
+
+def claim(path: Path, active: Path) -> BufferedWriter:
     """The unfinished file, open; whoever makes it owns the name, so two recorders never write one recording."""
     taken = "is there already; choose another name with --file, or another folder"
     try:
         stream = active.open("xb")
+        with suppress(OSError):  # some network file systems have no locks
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except FileExistsError:
         raise NameTakenError(f"{active}: {taken}") from None
     if path.exists():

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import random
 import signal
 import threading
+import time
 
 import pytest
 
 from common.bus import wait_until
-from common.inbox import Inbox
-from common.messages import Health, WorldReply
+from common.inbox import MAX_KEYS, Inbox
+from common.messages import Health, Odom, Pose, Twist, WorldReply
 from common.robot import Robot
 from common.scanner import SCANNERS
 from common.service import Loop, Service
 from common.topics import HEALTH, ODOM, SCAN, TOPICS, WORLD
+from services.recorder.accounting import from_metadata
 from services.recorder.reader import read_recording
+from services.recorder.recover import recover
 from services.recorder.settings import RecorderSettings
 from tests.recorder import sessions as made
 
@@ -64,8 +68,11 @@ def test_every_payload_is_in_the_file_bit_exactly(recorder, bus, tmp_path):
         key = topic.key(bus.robot, "me")
         assert [r.payload for r in recording.raw if r.key == key] == [payload for k, payload in sent if k == key]
     assert all(0 < r.published_ns <= r.logged_ns + 1_000_000_000 for r in recording.raw)
-    assert recording.metadata["dropped"] == {}
-    assert int(recording.metadata["written"][SCAN.key(bus.robot)]) == recording.counts()[SCAN.key(bus.robot)]
+    counters = from_metadata(recording.metadata["counters"])
+    count = counters[SCAN.key(bus.robot)]
+    assert (count.received, count.written, count.dropped) == (334, 334, 0)
+    assert all(c.received == c.written and c.dropped == c.missing == 0 for c in counters.values())
+    assert {key: c.written for key, c in counters.items()} == recording.counts()
     assert str(path) in running.output
 
 
@@ -178,3 +185,133 @@ def test_bad_input_is_one_line(process, args, said):
     lines = [line for line in running.output.splitlines() if "[" not in line[:12]]
     assert lines[-1].startswith(said), running.output
     assert "Traceback" not in running.output
+
+
+LIMITED = """
+import resource, runpy, sys
+resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))  # a disk that is full after so much
+sys.argv = ["recorder", *sys.argv[1:]]
+runpy.run_module("services.recorder", run_name="__main__")
+"""
+
+
+def test_a_full_disk_ends_it_with_one_line_and_what_was_written_is_recovered(process, bus, tmp_path):
+    (tmp_path / "limited.py").write_text(LIMITED)
+    running = process(tmp_path / "limited.py", "--directory", str(tmp_path / "logs"), "--compression", "none")
+    running.wait_for("ready")
+    sent = publish(bus, 200)
+    assert running.wait() == 2, running.output
+    told = [line for line in running.output.splitlines() if line.startswith("recorder: ")]
+    assert len(told) == 1
+    assert "recording failed (File too large)" in told[0]
+    assert "presage recover" in told[0]
+    assert "Traceback" not in running.output
+    found = recover(only_file(tmp_path / "logs", ".mcap.active"))
+    got = [(raw.key, raw.payload) for raw in read_recording(found.path).payloads() if raw.key.count("/") == 2]
+    assert got == [entry for entry in sent if entry[0].count("/") == 2][: len(got)]
+
+
+def test_a_file_removed_underneath_is_noticed(recorder, bus, tmp_path):
+    running = recorder()
+    only_file(tmp_path / "logs", ".mcap.active").unlink()
+    assert running.wait() == 2
+    assert "was removed or moved away while it was written" in running.output
+    assert "Traceback" not in running.output
+
+
+def test_a_recorder_tells_how_to_mend_what_another_left_and_they_do_not_meet(recorder, bus, tmp_path):
+    killed = recorder("--file", "first")
+    publish(bus, 30)
+    settle(bus, 30)
+    alive = recorder("--file", "second")
+    killed.kill()
+    third = recorder("--file", "third")
+    left = tmp_path / "logs" / "first.mcap.active"
+    third.wait_for(f"presage recover {left}")
+    assert "second.mcap.active" not in third.output
+    assert alive.stop()[0] == third.stop()[0] == 0
+    assert recover(left).messages.total() > 0
+
+
+def test_kill_9_loses_at_most_the_last_second(recorder, bus, tmp_path):
+    """Everything the recorder had received a second before it was killed is in the file."""
+    running = recorder()
+    assert bus.wait_matching(ODOM, 10)
+    sent: list[tuple[float, bytes]] = []
+    began = time.monotonic()
+    while time.monotonic() - began < 2.5:  # the recorder's own clock: it must go on while time passes
+        payload = len(sent).to_bytes(4, "big")
+        bus.put(ODOM, payload)
+        sent.append((time.monotonic(), payload))
+        time.sleep(0.005)
+    running.kill()
+    killed = time.monotonic()
+    found = recover(only_file(tmp_path / "logs", ".mcap.active"))
+    key = ODOM.key(bus.robot)
+    got = [raw.payload for raw in read_recording(found.path).payloads({key})]
+    assert got == [payload for _, payload in sent[: len(got)]]
+    # On a machine that stalls, a flush comes late: the age of the last message kept says how late.
+    assert killed - sent[len(got) - 1][0] < 1.0 + stalls(sent)
+
+
+def stalls(sent):
+    """S, the longest pause between two messages: the machine's, not the recorder's."""
+    times = [at for at, _ in sent]
+    return max(b - a for a, b in itertools.pairwise(times)) * 4
+
+
+def test_gaps_are_counted_live_and_in_the_file(recorder, bus, tmp_path):
+    running = recorder()
+    assert bus.wait_matching(ODOM, 10)
+    for number in (0, 1, 2, 7, 8, 0, 1):
+        odom = Odom(stamp_ns=number, seq=number, pose=Pose(x=0.0, y=0.0), twist=Twist(), covariance=[[0.0] * 3] * 3)
+        bus.put(ODOM, odom.encode())
+    pulses, own, key = Inbox(), HEALTH.key(bus.robot, "recorder"), ODOM.key(bus.robot)
+    bus.subscribe(HEALTH, pulses, keep_all=True)
+
+    def shown():
+        entry = pulses.get(0)
+        rows = Health.decode(entry.payload).topics if entry is not None and entry.key == own else []
+        return any((row.key, row.written, row.missing) == (key, 7, 4) for row in rows)
+
+    assert wait_until(shown, 20), running.output
+    assert running.stop()[0] == 0
+    recording = read_recording(only_file(tmp_path / "logs"))
+    count = from_metadata(recording.metadata["counters"])[key]
+    assert (count.received, count.written, count.gaps, count.missing, count.restarts) == (7, 7, 1, 4, 1)
+
+
+def test_invented_keys_do_not_fill_the_file(recorder, bus, tmp_path):
+    running = recorder()
+    assert bus.wait_matching(HEALTH, 10, service="me")
+    for number in range(MAX_KEYS + 200):
+        bus.put(HEALTH, b"", service=f"x{number}")
+    pulses, own = Inbox(), HEALTH.key(bus.robot, "recorder")
+    bus.subscribe(HEALTH, pulses, keep_all=True)
+
+    def turned_away():
+        entry = pulses.get(0)
+        return entry is not None and entry.key == own and Health.decode(entry.payload).counters.get("turned_away", 0)
+
+    assert wait_until(lambda: turned_away() >= 200, 20), running.output
+    assert running.stop()[0] == 0
+    recording = read_recording(only_file(tmp_path / "logs"))
+    assert len(recording.counts()) <= MAX_KEYS
+    counters = from_metadata(recording.metadata["counters"])
+    assert counters["others"].dropped == counters["others"].received >= 200
+    assert counters["others"].written == 0
+
+
+def test_parts_by_time(recorder, bus, tmp_path):
+    running = recorder("--file", "run", "--split-minutes", "0.001")
+    sent = publish(bus, 100)
+    settle(bus, 100)
+    assert wait_until(lambda: len(list((tmp_path / "logs").glob("*.mcap"))) >= 2, 20)  # its own health goes on
+    assert running.stop()[0] == 0
+    files = sorted((tmp_path / "logs").iterdir())
+    assert [file.name for file in files] == [f"run-{k:03d}.mcap" for k in range(1, len(files) + 1)]
+    for topic in TOPICS:
+        key = topic.key(bus.robot, "me")
+        got = [raw.payload for file in files for raw in read_recording(file).payloads({key})]
+        assert got == [payload for sent_key, payload in sent if sent_key == key]
+    assert "counters" in read_recording(files[0]).metadata

@@ -1,0 +1,236 @@
+"""From an unfinished or damaged recording every complete chunk, in a new and whole file; and what is missing."""
+
+from __future__ import annotations
+
+import mmap
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from struct import Struct
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Header, Message, Metadata, Schema
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import Writer
+
+from common.errors import UserError
+from services.recorder.accounting import Ledger
+from services.recorder.reader import MAGIC
+from services.recorder.writer import COMPRESSION, PROFILE, UNFINISHED, claim, is_being_written
+
+PREFIX = Struct("<BQ")  # of every record: opcode, length of what follows (MCAP specification, "Records")
+# Of a chunk: start and end time, size and CRC of what is in it, length of the compression's name.
+CHUNK = Struct("<QQQII")
+TORN = ".torn"  # behind the name of what was recovered from
+PARSERS: dict[int, Callable[[ReadDataStream], object]] = {
+    Opcode.HEADER: Header.read, Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read,
+    Opcode.ATTACHMENT: Attachment.read, Opcode.METADATA: Metadata.read,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Bytes that could not be used."""
+
+    offset: int
+    length: int
+
+
+@dataclass
+class Recovered:
+    """What came of it."""
+
+    source: Path
+    path: Path
+    size: int  # bytes of the source
+    chunks: int = 0
+    messages: Counter[str] = field(default_factory=Counter)  # by key
+    start_ns: int | None = None
+    end_ns: int | None = None
+    damages: list[Damage] = field(default_factory=list)
+    whole: bool = False  # the source had its end: nothing was missing but what is damaged
+    ledger: Ledger = field(default_factory=Ledger)
+
+    def lines(self) -> list[str]:
+        """For the user."""
+        seconds = ((self.end_ns or 0) - (self.start_ns or 0)) * 1e-9
+        told = [f"{self.path}: {self.messages.total()} messages of {seconds:.1f} s, from {self.chunks} chunks"]
+        for damage in self.damages:
+            at = "at its end" if damage.offset + damage.length == self.size else f"from byte {damage.offset}"
+            told.append(f"missing: {damage.length} bytes {at} are no complete chunk")
+        if not self.whole:
+            told.append("missing: its end; what came after the last flush was never in the file")
+        for key, sequence in self.ledger.sequences.items():
+            if sequence.missing:
+                told.append(f"missing: {sequence.missing} messages of {key} by their numbers, in {sequence.gaps} gaps")
+        return told
+
+
+def recover(
+    source: Path, path: Path | None = None, *, on_progress: Callable[[float], None] = lambda _: None
+) -> Recovered:
+    """Write the readable part of ``source`` to ``path`` (none: the finished name); an unfinished file is kept as .torn.
+
+    Raises UserError where the source is still written, is no MCAP file or has nothing in it, or the target is there.
+    """
+    path = path or target_of(source)
+    try:
+        with source.open("rb") as stream:
+            if is_being_written(source):
+                raise UserError(f"{source}: is being written by a recorder that lives; end that first")
+            if stream.read(len(MAGIC)) != MAGIC:
+                raise UserError(f"{source}: not an MCAP file, or not even its first bytes are there")
+            with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                found = _copy(data, Recovered(source, path, len(data)), on_progress)
+    except OSError as error:
+        what = error.filename or source
+        raise UserError(f"{what}: cannot be read or written ({error.strerror}); name another file with --out") from None
+    if source.name.endswith(UNFINISHED):
+        source.rename(source.with_name(source.name.removesuffix(UNFINISHED) + TORN))
+    return found
+
+
+def target_of(source: Path) -> Path:
+    """Where it goes when nobody says."""
+    if source.name.endswith(UNFINISHED):
+        return source.with_name(source.name.removesuffix(UNFINISHED))
+    return source.with_name(source.name.split(".mcap")[0] + "-recovered.mcap")
+
+
+def _copy(data: mmap.mmap, found: Recovered, on_progress: Callable[[float], None]) -> Recovered:
+    active = found.path.with_name(found.path.name + ".recovering")
+    stream = claim(found.path, active)
+    try:
+        copier = _Copier(Writer(stream, chunk_size=1 << 18, compression=COMPRESSION["zstd"]), found)
+        for records, end in _walk(data, found):
+            for record in records:
+                copier.take(record)
+            on_progress(end / found.size)
+        copier.finish()
+        stream.close()
+        active.rename(found.path)
+    finally:
+        stream.close()
+        active.unlink(missing_ok=True)
+    return found
+
+
+class _Copier:
+    """Records of one file into another."""
+
+    def __init__(self, writer: Writer, found: Recovered) -> None:
+        self._writer, self._found = writer, found
+        self._schemas: dict[int, int] = {0: 0}
+        self._channels: dict[int, int] = {}
+        self._keys: dict[int, str] = {}
+        self._started = False
+
+    def take(self, record: object) -> None:
+        """Any; what the writer makes by itself is left out."""
+        if not self._started:
+            header = record if isinstance(record, Header) else Header(PROFILE, "presage recover")
+            self._writer.start(header.profile, header.library)
+            self._started = True
+        if isinstance(record, Message):
+            self._message(record)
+        elif isinstance(record, Schema) and record.id not in self._schemas:
+            self._schemas[record.id] = self._writer.register_schema(record.name, record.encoding, record.data)
+        elif isinstance(record, Channel) and record.id not in self._channels and record.schema_id in self._schemas:
+            self._keys[record.id] = record.topic
+            self._channels[record.id] = self._writer.register_channel(
+                record.topic, record.message_encoding, self._schemas[record.schema_id], record.metadata
+            )
+        elif isinstance(record, Metadata):
+            self._writer.add_metadata(record.name, record.metadata)
+        elif isinstance(record, Attachment):
+            self._writer.add_attachment(
+                record.create_time, record.log_time, record.name, record.media_type, record.data
+            )
+
+    def _message(self, record: Message) -> None:
+        channel, found = self._channels.get(record.channel_id), self._found
+        if channel is None:  # what declared it is damaged
+            return
+        self._writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
+        key = self._keys[record.channel_id]
+        found.messages[key] += 1
+        found.ledger.see(key, record.data)
+        found.start_ns = record.log_time if found.start_ns is None else found.start_ns
+        found.end_ns = record.log_time
+
+    def finish(self) -> None:
+        """With a record of what was done."""
+        found = self._found
+        if not self._started:
+            raise UserError(f"{found.source}: nothing in it can be read")
+        lost = sum(damage.length for damage in found.damages)
+        about = {"from": found.source.name, "bytes": str(found.size), "bytes_not_used": str(lost)}
+        self._writer.add_metadata("recovered", about)
+        self._writer.finish()  # type: ignore[no-untyped-call]
+
+
+def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[list[object], int]]:
+    """Complete records and where each ends; over what is damaged to the next chunk that is whole."""
+    at, size = len(MAGIC), len(data)
+    while at < size:
+        records = _parse(data, at)
+        if records is None:
+            after = _next_chunk(data, at + 1)
+            found.damages.append(Damage(at, after - at))
+            at = after
+            continue
+        opcode, length = PREFIX.unpack_from(data, at)
+        at += PREFIX.size + length
+        if opcode == Opcode.DATA_END:
+            found.whole = True
+            return
+        found.chunks += opcode == Opcode.CHUNK
+        yield records, at
+
+
+def _parse(data: mmap.mmap, at: int) -> list[object] | None:
+    """What is in the record at ``at``; None where it is damaged or cut short."""
+    if at + PREFIX.size > len(data):
+        return None
+    opcode, length = PREFIX.unpack_from(data, at)
+    begin = at + PREFIX.size
+    if begin + length > len(data) or not Opcode.HEADER <= opcode <= Opcode.DATA_END:
+        return None
+    try:
+        return _records(data, opcode, begin, length)
+    except Exception:  # noqa: BLE001 - damage raises kinds of each decompressor
+        return None
+
+
+def _records(data: mmap.mmap, opcode: int, begin: int, length: int) -> list[object] | None:
+    body = ReadDataStream(BytesIO(data[begin : begin + length]))
+    if opcode == Opcode.CHUNK:
+        return list(breakup_chunk(Chunk.read(body), validate_crc=True))
+    if opcode == Opcode.MESSAGE:
+        return [Message.read(body, length)]
+    if opcode == Opcode.ATTACHMENT and zlib.crc32(data[begin : begin + length - 4]) != _crc(data, begin + length):
+        return None
+    return [PARSERS[opcode](body)] if opcode in PARSERS else []
+
+
+def _crc(data: mmap.mmap, end: int) -> int:
+    """The last four bytes of a record."""
+    return int.from_bytes(data[end - 4 : end], "little")
+
+
+def _next_chunk(data: mmap.mmap, at: int) -> int:
+    """Where the next whole chunk begins; the end where there is none."""
+    while (at := data.find(bytes([Opcode.CHUNK]), at)) >= 0:
+        begin = at + PREFIX.size
+        if begin + CHUNK.size > len(data):
+            break
+        length, name = PREFIX.unpack_from(data, at)[1], CHUNK.unpack_from(data, begin)[4]
+        plausible = name in (0, 3, 4) and begin + length <= len(data)
+        if plausible and _parse(data, at):
+            return at
+        at += 1
+    return len(data)
