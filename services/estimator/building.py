@@ -112,12 +112,17 @@ def generative_model(choice: Choice, world: World) -> tuple[GenerativeModel, Arr
     if choice.model == "exact":
         places = world.sample_free(max(4000, int(60 * shapely.area(world.free_space))), np.random.default_rng(0), 0.05)
         return RayCaster(world), thin_places(places, SPACING), 1.0
-    if choice.model == "learned":
-        path = weights.find(choice.models or weights.FOLDER, world, choice.asked)
-    elif (path := Path(choice.model)).suffix != ".safetensors":
-        raise UserError(f"no model {choice.model!r}: give learned, exact, or a file of weights (.safetensors)")
-    model, places, card = weights.load(path)
+    model, places, card = weights.load(field_path(choice, world))
     return model, places, card.inflation
+
+
+def field_path(choice: Choice, world: World) -> Path:
+    """Where the learned field lies; raises UserError where there is none."""
+    if choice.model == "learned":
+        return weights.find(choice.models or weights.FOLDER, world, choice.asked)
+    if (path := Path(choice.model)).suffix != ".safetensors":
+        raise UserError(f"no model {choice.model!r}: give learned, exact, or a file of weights (.safetensors)")
+    return path
 
 
 def _compile(model: GenerativeModel, seeds: Seeds, likelihood: Likelihood) -> None:

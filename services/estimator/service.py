@@ -13,6 +13,8 @@ from common.messages import (
     Goal,
     Hypothesis,
     LocaliseRequest,
+    ModelReply,
+    ModelRequest,
     Odom,
     Pose,
     Prediction,
@@ -23,9 +25,10 @@ from common.messages import (
 )
 from common.se2 import Array
 from common.service import Service
-from common.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, ODOM, PREDICTION, SCAN, Query, Topic
+from common.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, MODEL, ODOM, PREDICTION, SCAN, Query, Topic
 from services.estimator.building import Choice, Factory, Geometry, prepare
 from services.estimator.interface import Estimator, Observation, Posterior
+from services.estimator.model_card import ModelInUse, model_in_use
 from services.estimator.perception import Descent
 from services.estimator.settings import EstimatorSettings
 
@@ -35,17 +38,23 @@ class EstimatorService(Service):
 
     name: ClassVar[str] = "estimator"
     inputs: ClassVar[tuple[Topic, ...]] = (SCAN, GOAL)
-    queries: ClassVar[tuple[Query, ...]] = (LOCALISE,)
+    queries: ClassVar[tuple[Query, ...]] = (LOCALISE, MODEL)
 
     def __init__(self, settings: EstimatorSettings) -> None:
         """Models are loaded in `open`; the estimator is made for the beams of the first scan."""
         super().__init__(settings)
         self.options = settings
+        self.choice = Choice(
+            settings.world, settings.estimator, settings.model, settings.models, settings.sigma, settings.seed,
+            initial_pose=_pose(settings.initial_pose),
+            descent=Descent(alpha=settings.alpha, beta=settings.beta, iterations=settings.iterations),
+        )  # fmt: skip
         more = {"odometry": (ODOM,), "command": (CMD_VEL,)}.get(settings.prior, ())
         self.inputs = (SCAN, GOAL, *more)  # type: ignore[misc]
         self.factory: Factory | None = None
         self.geometry: Geometry | None = None
         self.estimator: Estimator | None = None
+        self.model: ModelInUse | str = "no scan has come yet"  # or why it is not known
         self.goal: Goal | None = None
         self.odom: Odom | None = None
         self.command: CmdVel | None = None
@@ -55,13 +64,8 @@ class EstimatorService(Service):
     def open(self) -> None:
         """Fail now, not at the first scan, where a world has no weights."""
         options = self.options
-        self.factory = prepare(
-            Choice(
-                options.world, options.estimator, options.model, options.models, options.sigma, options.seed,
-                initial_pose=_pose(options.initial_pose),
-                descent=Descent(alpha=options.alpha, beta=options.beta, iterations=options.iterations),
-            )
-        )  # fmt: skip
+        self.factory = prepare(self.choice)
+        self._look_at_model(None)
         self.log.info("estimator", name=options.estimator, world=options.world, prior=options.prior)
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
@@ -87,7 +91,11 @@ class EstimatorService(Service):
             self._perceive(scan)
 
     def on_request(self, query: Query, request: Request) -> Reply:
-        """Localise anew."""
+        """Localise anew, or say what the estimator was made of."""
+        if isinstance(request, ModelRequest):
+            if isinstance(self.model, str):
+                return ModelReply(ok=False, reason=self.model)
+            return self.model.reply(weights=request.weights)
         if query is not LOCALISE or not isinstance(request, LocaliseRequest):
             return super().on_request(query, request)
         if self.estimator is None:
@@ -116,6 +124,8 @@ class EstimatorService(Service):
             if self.geometry is None or not self.geometry.same(geometry):
                 made = self.factory(geometry)
                 self.estimator, self.geometry = made, geometry
+                if self.options.estimator == "paper":  # whose weights were chosen by the beams just now
+                    self._look_at_model(len(geometry.angles))
         except UserError as error:
             self.counters["unfit_scans"] += 1
             if self.note != str(error):
@@ -124,6 +134,13 @@ class EstimatorService(Service):
             return None
         self.note = ""
         return self.estimator
+
+    def _look_at_model(self, beams: int | None) -> None:
+        """What was just loaded, before somebody writes other files; no scan is refused where that fails."""
+        try:
+            self.model = model_in_use(self.choice, beams)
+        except UserError as error:
+            self.model = str(error)
 
     def _observation(self, scan: Scan) -> Observation:
         prior = self.options.prior

@@ -1,34 +1,94 @@
-"""Asks each service that appears what it is: its configuration, and the simulator its world. In a thread of its own."""
+"""Asks each service that appears what it is: configuration, world, model. In a thread of its own."""
 
 from __future__ import annotations
 
 import queue
+import re
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 from common.bus import Bus
 from common.errors import UserError
 from common.log import Logger
-from common.messages import ConfigReply, Request, WorldReply
-from common.topics import CONFIG, WORLD
+from common.messages import ConfigReply, ModelReply, ModelRequest, Request, WorldReply
+from common.topics import CONFIG, MODEL, WORLD, Query
+from common.world import save_world
 
 TIMEOUT = 2.0  # s, for one answer
 RETRY = 5.0  # s, until one that did not answer is asked again
 ATTEMPTS = 5
+NOT_YET = 0.5  # s, until an estimator that has seen no scan is asked again for its model
+AGAIN = 5.0  # s, until the model is looked at again: another scanner may call for other weights
+MAX_WEIGHTS = 16 << 20  # bytes; larger weights are named by their digest alone
 
-Answer = ConfigReply | WorldReply
+Answer = ConfigReply | WorldReply | ModelReply
+
+
+@dataclass(frozen=True)
+class MetadataRecord:
+    """A named map of text for the file."""
+
+    name: str
+    values: dict[str, str]
+
+
+@dataclass(frozen=True)
+class AttachmentRecord:
+    """A file inside the file."""
+
+    name: str
+    data: bytes
+    media_type: str
+
+
+def records_of(service: str, answer: Answer) -> Iterator[MetadataRecord | AttachmentRecord]:
+    """What an answer is stored as; what metadata speaks of comes before it. Pure."""
+    if isinstance(answer, WorldReply):
+        yield from _records_of_world(answer)
+    elif isinstance(answer, ModelReply):
+        yield from _records_of_model(answer)
+    else:
+        yield MetadataRecord(f"config:{service}", {"config": answer.config, **answer.versions})
+
+
+def _records_of_world(reply: WorldReply) -> Iterator[MetadataRecord | AttachmentRecord]:
+    """The world as a file that `load_world` reads; scanner and robot as JSON."""
+    if reply.world is not None:
+        yield AttachmentRecord("world.yaml", save_world(reply.world).encode(), "application/yaml")
+    described = {"scanner": reply.scanner, "robot": reply.robot}
+    yield MetadataRecord("world", {name: d.model_dump_json() for name, d in described.items() if d is not None})
+
+
+def _records_of_model(reply: ModelReply) -> Iterator[MetadataRecord | AttachmentRecord]:
+    """A folder ``model/`` that serves as `--models`, and the estimator's map in it."""
+    # The name comes from the bus and will be a file's: nothing that could lead out of a folder.
+    named = re.fullmatch(r"[\w.-]+\.safetensors", reply.file) is not None
+    stored = "none: nothing was learned" if not reply.file else "not stored"
+    if reply.world is not None:
+        yield AttachmentRecord("model/world.yaml", save_world(reply.world).encode(), "application/yaml")
+    if named:
+        card = f"model/{reply.file.removesuffix('.safetensors')}.json"
+        yield AttachmentRecord(card, reply.card.encode(), "application/json")
+    if named and len(reply.weights):
+        yield AttachmentRecord(f"model/{reply.file}", reply.weights.tobytes(), "application/octet-stream")
+        stored = "stored"
+    about = {"size": str(reply.size), "sha256": reply.sha256} if reply.file else {}
+    model = {"estimator": reply.estimator, "card": reply.card, "file": reply.file if named else "", **about}
+    yield MetadataRecord("model", {**model, "weights": stored})
 
 
 class Describer:
     """Answers wait in a queue, so that recording goes on while a service is slow or silent."""
 
-    def __init__(self, bus: Bus, me: str, log: Logger) -> None:
-        """Begin to watch; ``me`` is not asked."""
-        self._bus, self._me, self._log = bus, me, log
+    def __init__(self, bus: Bus, me: str, log: Logger, *, weights: bool | None = None) -> None:
+        """Begin to watch; ``me`` is not asked. ``weights``: with the model's, up to `MAX_WEIGHTS`; None: no model."""
+        self._bus, self._me, self._log, self._weights = bus, me, log, weights
         self._seen: queue.SimpleQueue[tuple[str, bool] | None] = queue.SimpleQueue()  # from zenoh's thread
         self._answers: queue.SimpleQueue[tuple[str, Answer]] = queue.SimpleQueue()
-        self._waiting: dict[str, tuple[float, int]] = {}  # service: when to ask, attempts before
+        self._waiting: dict[tuple[str, str], tuple[float, int]] = {}  # service, query: when to ask, attempts before
+        self._last: dict[tuple[str, str], Answer] = {}  # what was said once is not stored again
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="describer", daemon=True)
         self._thread.start()
@@ -54,12 +114,22 @@ class Describer:
     def _run(self) -> None:
         while not self._stopping.is_set():
             self._hear()
-            for service, (due, attempts) in list(self._waiting.items()):
+            for (service, query), (due, attempts) in list(self._waiting.items()):
                 if due > time.monotonic() or self._stopping.is_set():
                     continue
-                del self._waiting[service]
-                if not self._ask(service) and attempts + 1 < ATTEMPTS:
-                    self._waiting[service] = (time.monotonic() + RETRY, attempts + 1)
+                del self._waiting[service, query]
+                self._put_question(service, QUESTIONS[query], attempts)
+
+    def _put_question(self, service: str, query: Query, attempts: int) -> None:
+        """Ask, and say when to ask again, if at all."""
+        try:
+            again, attempts = self._ask(service, query), 0
+        except UserError as error:
+            again, attempts = RETRY if attempts + 1 < ATTEMPTS else None, attempts + 1
+            if not self._stopping.is_set():
+                self._log.warning("a service did not describe itself", service=service, why=str(error))
+        if again is not None:
+            self._waiting[service, query.name] = (time.monotonic() + again, attempts)
 
     def _hear(self) -> None:
         """Wait for a service to come or go, or for the next to be asked."""
@@ -71,19 +141,43 @@ class Describer:
         if seen is None or seen[0] == self._me:
             return
         service, there = seen
-        if there:
-            self._waiting[service] = (time.monotonic(), 0)
-        else:
-            self._waiting.pop(service, None)
+        for query in QUESTIONS.values():
+            if query is MODEL and self._weights is None:
+                continue
+            if not there:
+                self._waiting.pop((service, query.name), None)
+            elif query.per_service or query.server == service:
+                self._waiting[service, query.name] = (time.monotonic(), 0)
 
-    def _ask(self, service: str) -> bool:
-        try:
-            reply = self._bus.ask(CONFIG, Request(), ConfigReply, timeout=TIMEOUT, service=service)
-            self._answers.put((service, reply))
-            if service == WORLD.server:
-                self._answers.put((service, self._bus.ask(WORLD, Request(), WorldReply, timeout=TIMEOUT)))
-        except UserError as error:
-            if not self._stopping.is_set():
-                self._log.warning("a service did not describe itself", service=service, why=str(error))
-            return False
-        return True
+    def _ask(self, service: str, query: Query) -> float | None:
+        """Put a new answer into the queue; seconds until the question is worth asking again, or None."""
+        if query is CONFIG:
+            self._keep(service, query, self._bus.ask(CONFIG, Request(), ConfigReply, TIMEOUT, service))
+        elif query is WORLD:
+            self._keep(service, query, self._bus.ask(WORLD, Request(), WorldReply, TIMEOUT))
+        else:
+            return self._ask_for_model(service)
+        return None
+
+    def _ask_for_model(self, service: str) -> float:
+        reply = self._bus.ask(MODEL, ModelRequest(), ModelReply, TIMEOUT)
+        if not reply.ok:
+            return NOT_YET
+        if reply != self._last.get((service, MODEL.name)):
+            whole = reply
+            if self._weights and 0 < reply.size <= MAX_WEIGHTS:
+                whole = self._bus.ask(MODEL, ModelRequest(weights=True), ModelReply, TIMEOUT)
+                if not whole.ok:
+                    self._log.warning("the weights are not stored", why=whole.reason)
+                    whole = reply
+            self._last[service, MODEL.name] = reply
+            self._answers.put((service, whole))
+        return AGAIN
+
+    def _keep(self, service: str, query: Query, answer: ConfigReply | WorldReply) -> None:
+        if answer != self._last.get((service, query.name)):
+            self._last[service, query.name] = answer
+            self._answers.put((service, answer))
+
+
+QUESTIONS = {query.name: query for query in (CONFIG, WORLD, MODEL)}

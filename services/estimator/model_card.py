@@ -1,0 +1,82 @@
+"""What an estimator was made of, so that a recording can hold it: its map, and its weights with their card."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from common.errors import UserError
+from common.messages import ModelReply
+from common.world import World, load_world
+from services.estimator.building import Choice, field_path
+from services.estimator.precise import weights as precise_weights
+
+
+@dataclass(frozen=True)
+class ModelInUse:
+    """Described when it was loaded, for the files may be others later."""
+
+    estimator: str
+    world: World  # the estimator's map
+    path: Path | None = None  # of the weights; None: nothing was learned
+    file: str = ""  # the name that `--models FOLDER` looks for
+    card: str = ""  # JSON, as it stands in its file
+    size: int = 0  # bytes of the weights
+    sha256: str = ""  # of the weights
+
+    def reply(self, *, weights: bool) -> ModelReply:
+        """The answer, with the weights or without; raises UserError where they are others by now."""
+        data = b""
+        if weights and self.path is not None:
+            data = _read(self.path)
+            if hashlib.sha256(data).hexdigest() != self.sha256:
+                raise UserError(f"{self.path} was changed since the estimator loaded it: start the estimator anew")
+        return ModelReply(
+            estimator=self.estimator,
+            world=self.world,
+            card=self.card,
+            file=self.file,
+            size=self.size,
+            sha256=self.sha256,
+            weights=np.frombuffer(data, np.uint8),
+        )
+
+
+def model_in_use(choice: Choice, beams: int | None) -> ModelInUse:
+    """The model of that choice, for scans of so many beams (None: no scan has come); raises UserError where unknown."""
+    world = choice.world if isinstance(choice.world, World) else load_world(choice.world)
+    if choice.estimator == "precise" and choice.model != "exact":
+        path = field_path(choice, world)
+        if choice.model != "learned":  # a file of any name, whose own world is the map
+            world = World.model_validate(json.loads(_card(path))["world"])
+        return _learned(choice.estimator, world, path, precise_weights.path_of(Path(), world.name).name)
+    if choice.estimator == "paper":
+        if beams is None:
+            raise UserError("no scan has come yet: how many beams, and so which weights, is not known")
+        # Torch takes a second to import; the other estimators do without.
+        from services.estimator import weights as paper_weights  # noqa: PLC0415
+
+        path = paper_weights.find(choice.models or paper_weights.FOLDER, world.name, "paper", beams)
+        return _learned(choice.estimator, world, path, path.name)
+    return ModelInUse(choice.estimator, world)
+
+
+def _learned(estimator: str, world: World, path: Path, file: str) -> ModelInUse:
+    data = _read(path)
+    digest = hashlib.sha256(data).hexdigest()
+    return ModelInUse(estimator, world, path, file, _card(path), len(data), digest)
+
+
+def _card(path: Path) -> str:
+    return _read(path.with_suffix(".json")).decode()
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from None

@@ -1,0 +1,126 @@
+"""What the estimator says it was made of, and that a folder made of the answer makes it again."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.numpy
+
+from common.errors import UserError
+from common.messages import ModelRequest
+from common.topics import MODEL, SCAN
+from common.world import load_world, save_world
+from services.estimator import weights
+from tests.estimator.test_service import TRUTH, a_scan, opened
+
+
+def ask(service, *, with_weights=True):
+    return service.on_request(MODEL, ModelRequest(weights=with_weights))
+
+
+def extracted(reply, folder):
+    """The answer as files, the way a recording hands them out."""
+    folder.mkdir()
+    (folder / reply.file).write_bytes(reply.weights.tobytes())
+    (folder / reply.file).with_suffix(".json").write_text(reply.card)
+    (folder / "world.yaml").write_text(save_world(reply.world))
+    return folder
+
+
+@pytest.fixture
+def shipped(tmp_path):
+    """The shipped weights in a folder of our own, which a test may harm."""
+    return Path(shutil.copytree(weights.FOLDER, tmp_path / "mine", ignore=shutil.ignore_patterns("*.png")))
+
+
+def beliefs(service):
+    rng = np.random.default_rng(0)
+    for stamp in range(3):
+        exact = a_scan(stamp, TRUTH)
+        service.on_message(SCAN, a_scan(stamp, ranges=exact.ranges + rng.normal(0, 0.02, 622)))
+    return service.sent
+
+
+@pytest.mark.parametrize(
+    ("settings", "file"),
+    [({"estimator": "precise"}, "corridor-precise"), ({"estimator": "paper"}, "corridor-paper-622")],
+)
+def test_the_answer_makes_the_very_same_estimator(settings, file, shipped, tmp_path):
+    # Weights that nobody ships: whoever falls back on the shipped ones is found out.
+    changed = shipped / f"{file}.safetensors"
+    tensors = safetensors.numpy.load_file(changed)
+    safetensors.numpy.save_file({k: (v * 1.02).astype(v.dtype) for k, v in tensors.items()}, changed)
+    data = changed.read_bytes()
+    service = opened(models=shipped, **settings)
+    first = beliefs(service)
+    reply = ask(service)
+    assert reply.estimator == settings["estimator"]
+    assert reply.file == f"{file}.safetensors"
+    assert reply.weights.tobytes() == data
+    assert reply.size == len(data)
+    assert reply.card == (shipped / f"{file}.json").read_text()
+    folder = extracted(reply, tmp_path / "model")
+    shutil.rmtree(shipped)
+    again = opened(models=folder, world=str(folder / "world.yaml"), **settings)
+    assert beliefs(again) == first
+    assert ask(again) == reply
+    assert beliefs(opened(**settings)) != first  # the difference is one that shows
+
+
+def test_weights_come_only_when_asked_for(shipped):
+    service = opened(models=shipped)
+    reply = ask(service, with_weights=False)
+    assert len(reply.weights) == 0
+    assert reply.size == (shipped / reply.file).stat().st_size
+    assert reply == ask(service).model_copy(update={"weights": reply.weights})
+
+
+def test_a_file_of_weights_gets_the_name_that_a_folder_wants(shipped, tmp_path):
+    for suffix in (".safetensors", ".json"):
+        (shipped / f"corridor-precise{suffix}").rename(tmp_path / f"mine-of-old{suffix}")
+    service = opened(model=str(tmp_path / "mine-of-old.safetensors"), world="maze")
+    reply = ask(service)
+    assert reply.file == "corridor-precise.safetensors"
+    assert reply.world == load_world("corridor")
+    folder = extracted(reply, tmp_path / "model")
+    assert beliefs(opened(models=folder, world=str(folder / "world.yaml"))) == beliefs(service)
+
+
+@pytest.mark.parametrize("settings", [{"estimator": "particle-filter"}, {"model": "exact"}])
+def test_what_learned_nothing_says_so_and_names_its_map(settings):
+    reply = ask(opened(**settings))
+    assert reply.ok
+    assert (reply.file, reply.card, reply.size) == ("", "", 0)
+    assert reply.world == load_world("corridor")
+
+
+def test_the_paper_does_not_know_its_weights_before_it_knows_the_beams():
+    service = opened(estimator="paper")
+    reply = ask(service)
+    assert not reply.ok
+    assert "no scan has come yet" in reply.reason
+    service.on_message(SCAN, a_scan(1))
+    assert ask(service).file == "corridor-paper-622.safetensors"
+    beams = np.full(811, 2.0)
+    service.on_message(SCAN, a_scan(2, ranges=beams, angle_increment=2 * -a_scan(1).angle_min / 810))
+    assert ask(service).file == "corridor-paper-811.safetensors"
+    assert json.loads(ask(service).card)["scanner"]["beams"] == 811
+
+
+def test_weights_changed_on_disk_are_not_passed_off_as_those_in_use(shipped):
+    service = opened(models=shipped)
+    path = shipped / "corridor-precise.safetensors"
+    before = ask(service)
+    path.write_bytes(path.read_bytes()[:-1] + b"\x01")
+    with pytest.raises(UserError, match=f"{path} was changed since the estimator loaded it"):
+        ask(service)
+    assert ask(service, with_weights=False).sha256 == before.sha256
+    service.on_message(SCAN, a_scan(1, TRUTH))  # the first scan does not look again
+    assert ask(service, with_weights=False).sha256 == before.sha256
+    path.unlink()
+    with pytest.raises(UserError, match="cannot be read"):
+        ask(service)
