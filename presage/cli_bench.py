@@ -109,3 +109,21 @@ def bench_decoders(
     from presage.accuracy.decoders import bench_decoders as run  # noqa: PLC0415
 
     raise typer.Exit(run(world, samples, steps, seed, json_file, console))
+
+
+@app.command("recorder")
+def bench_recorder(
+    rate: Annotated[float, typer.Option(min=1, max=100_000, help="Messages a second; a session has about 100.")] = 2000,
+    seconds: Annotated[float, typer.Option(min=0.1, help="How long.")] = 60.0,
+    beams: Annotated[int, typer.Option(min=1, max=100_000, help="Of each message; 811 are 3.4 kB.")] = 811,
+    out: Annotated[Path | None, typer.Option(help="Folder that keeps the recording; none: it is removed.")] = None,
+    json_file: Json = None,
+) -> None:
+    """Twenty times the normal load into a real recorder: nothing lost, every byte as sent, memory and processor.
+
+    Examples: `presage bench recorder`; `presage bench recorder --seconds 10 --rate 5000 --json recorder.json`.
+    """
+    from presage.bench_recorder import Load  # noqa: PLC0415
+    from presage.bench_recorder import bench_recorder as run  # noqa: PLC0415
+
+    raise typer.Exit(run(Load(rate, seconds, beams), out, json_file, console))

@@ -1,14 +1,19 @@
-"""`presage bench latency`: it measures, and nothing of it stays, however it ends."""
+"""`presage bench latency` and `recorder`: they measure, and nothing of them stays, however they end."""
 
 from __future__ import annotations
 
 import json
 import signal
+import zlib
 
 import psutil
 import pytest
 
 from common.bus import wait_until
+from common.topics import TRUTH
+from presage.bench_recorder import _compare
+from services.recorder.accounting import Count, as_metadata
+from services.recorder.writer import RecordingWriter
 
 
 def test_latency_is_measured_and_written(process, tmp_path):
@@ -40,3 +45,25 @@ def test_numbers_that_cannot_be_written_are_said_first(process, tmp_path):
     assert bench.wait(60) == 2
     assert "l.json: cannot be written to (No such file or directory)" in bench.output
     assert "Traceback" not in bench.output
+
+
+def test_a_recorder_under_load_keeps_every_byte(process, tmp_path):
+    args = ("--seconds", "2", "--rate", "700", "--out", str(tmp_path / "kept"), "--json", str(tmp_path / "r.json"))
+    bench = process("presage.__main__", "bench", "recorder", *args)
+    assert bench.wait(120) == 0, bench.output
+    numbers = json.loads((tmp_path / "r.json").read_text())
+    assert numbers["sent"] == numbers["received"] == numbers["written"] == numbers["in_file"] == 1400
+    assert (numbers["dropped"], numbers["missing"], numbers["bytes_as_sent"]) == (0, 0, True)
+    assert [file.name for file in tmp_path.glob("kept/*.mcap*")] == ["bench.mcap"]
+
+
+def test_a_loss_is_noticed(tmp_path):
+    """The comparison itself: one message less in the file, or one byte other."""
+    key = TRUTH.key("bench")
+    for payloads, whole in (([b"a", b"b"], True), ([b"a"], False), ([b"a", b"c"], False), ([b"b", b"a"], False)):
+        writer = RecordingWriter(tmp_path / f"{b''.join(payloads).decode()}.mcap")
+        for number, payload in enumerate(payloads):
+            writer.write(TRUTH, key, payload, number, number)
+        writer.metadata("counters", as_metadata({key: Count(received=2, written=len(payloads))}))
+        sent = {"sent": {key: {"count": 2, "crc": zlib.crc32(b"ab")}}, "late_s": 0.0}
+        assert _compare(sent, writer.finish())["bytes_as_sent"] is whole
