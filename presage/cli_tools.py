@@ -1,4 +1,4 @@
-"""Commands for a running session: goal, teleport, localise, topics, hz, echo, doctor."""
+"""Commands for a running session: goal, teleport, localise, topics, hz, doctor."""
 
 from __future__ import annotations
 
@@ -119,23 +119,6 @@ def hz(
     from presage.tools import show_rates  # noqa: PLC0415
 
     raise typer.Exit(show_rates(link_of(connect, robot), topic, seconds, console))
-
-
-@app.command()
-def echo(
-    topic: str,
-    count: Annotated[int, typer.Option("-n", "--count", min=0, help="End after so many; 0: Ctrl-C.")] = 0,
-    full: Annotated[bool, typer.Option("--full", help="Long arrays whole.")] = False,
-    robot: RobotName = "robot",
-    connect: Connect = DEFAULT_ENDPOINT,
-) -> None:
-    """Print a topic's messages, one JSON line each.
-
-    Examples: `presage echo belief -n 1`; `presage echo scan --full -n 1 | jq .ranges`.
-    """
-    from presage.tools import echo as show  # noqa: PLC0415
-
-    raise typer.Exit(show(link_of(connect, robot), topic, count, console, full=full))
 
 
 @app.command()
