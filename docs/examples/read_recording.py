@@ -1,0 +1,21 @@
+"""A reader of recordings with nothing but mcap and msgpack: position error of the belief against the truth."""
+
+import math
+import sys
+
+import msgpack
+from mcap.reader import make_reader
+
+truth, errors = {}, []
+with open(sys.argv[1], "rb") as file:
+    for _, channel, message in make_reader(file).iter_messages():
+        fields = msgpack.unpackb(message.data)
+        name = channel.metadata["topic"]
+        if name == "scan":
+            ranges = memoryview(fields["ranges"]).cast("f")  # little-endian float32, m; inf is no return
+        elif name == "truth":
+            truth[fields["stamp_ns"]] = fields["pose"]
+        elif name == "belief" and fields["stamp_ns"] in truth:
+            here, there = truth[fields["stamp_ns"]], fields["pose"]
+            errors.append(math.hypot(here["x"] - there["x"], here["y"] - there["y"]))
+print(f"{len(errors)} beliefs, {len(ranges)} beams, median error {sorted(errors)[len(errors) // 2]:.4f} m")
