@@ -16,15 +16,17 @@ from matplotlib.transforms import ScaledTranslation
 
 from common import safety
 from common.errors import UserError
-from common.messages import Goal, Prediction, Scan
+from common.messages import Goal, Scan
 from common.se2 import Array, compose
 from common.world import World
-from presage.session import Session, load_session, summary_of
+from presage.inspection.gathering import Session, load_session
+from presage.session import summary_of
 
 # Okabe and Ito: told apart by the colour-blind.
 TRUTH, BELIEF, MEASURED, GOAL = "#000000", "#D55E00", "#0072B2", "#009E73"
 WALL, FURNITURE, INK = "#8C8C8C", "#C8C8C8", "#555555"
 WALL_THICKNESS = 0.12  # m, as drawn
+MOST_TIES = 200  # lines between belief and truth
 SMALLEST = 1e-3  # m, the least error a logarithmic axis shows
 
 
@@ -61,8 +63,8 @@ def _headline(session: Session) -> str:
     """The session in one line."""
     summary = summary_of(session)
     parts = [f"world {summary.world}" if summary.world else "world unknown"]
-    if session.beliefs:
-        estimator = f" by preset {session.beliefs[-1].estimator}" if session.beliefs[-1].estimator else ""
+    if len(session.belief):
+        estimator = f" by preset {session.estimator}" if session.estimator else ""
         parts.append(
             f"localised after {summary.localised_after_scans} scans{estimator}"
             if summary.localised_after_scans is not None
@@ -105,14 +107,14 @@ def _draw_world(axes: Axes, world: World) -> None:
 
 
 def _draw_map(axes: Axes, session: Session) -> None:
-    true, believed, goal = session.true_path(), session.believed_path(), session.goal()
+    true, believed, goal = session.truth.poses, session.belief.poses, session.goal()
     if session.world is None and not len(true) and not len(believed):
         _missing(axes, "world and no path")
         return
     if session.world is not None:
         _draw_world(axes, session.world)
-    if session.scans and len(true):
-        points = _scan_in_map(session.scans[-1], true[-1])
+    if session.last_scan is not None and len(true):
+        points = _scan_in_map(session.last_scan, true[-1])
         axes.plot(*points.T, ".", color=MEASURED, markersize=2, label="last scan", zorder=2)
     if goal is not None:
         _draw_goal(axes, goal)
@@ -141,16 +143,26 @@ def _draw_goal(axes: Axes, goal: Goal) -> None:
 
 
 def _draw_ties(axes: Axes, session: Session) -> None:
-    """Truth to belief of the same moment, once a second: paths that lie on each other may be apart in time."""
-    due, label = -np.inf, "same moment, each second"
-    for belief, truth in zip(session.beliefs, session.true_of, strict=True):
-        if truth is not None and belief.stamp_ns * 1e-9 >= due - 1e-6:
-            due = belief.stamp_ns * 1e-9 + 1.0
-            ends = np.array([belief.pose.array(), truth.pose.array()])
-            axes.plot(ends[:, 0], ends[:, 1], color=INK, linewidth=0.9, alpha=0.6, label=label, zorder=3.5)
-            axes.plot(*ends[1, :2], ".", color=TRUTH, markersize=5, zorder=5)
-            axes.plot(*ends[0, :2], ".", color=BELIEF, markersize=5, zorder=4)
-            label = ""
+    """Truth to belief of the same moment: paths that lie on each other may be apart in time.
+
+    Once a second, in long sessions less often: some two hundred are as many as can be told apart.
+    """
+    stamps = session.belief.stamps_ns
+    known = np.flatnonzero(np.isfinite(session.true_poses[:, 0]))
+    if not len(known):
+        return
+    every = max(1, round(float(np.ptp(stamps[known])) * 1e-9 / MOST_TIES))  # s
+    chosen, due = list[int](), -np.inf
+    for row in known:
+        if stamps[row] * 1e-9 >= due - 1e-6:
+            due = stamps[row] * 1e-9 + every
+            chosen.append(int(row))
+    believed, true = session.belief.poses[chosen, :2], session.true_poses[chosen, :2]
+    ties = np.stack([believed, true, np.full_like(true, np.nan)], axis=1).reshape(-1, 2)
+    label = "same moment, each second" if every == 1 else f"same moment, every {every} s"
+    axes.plot(*ties.T, color=INK, linewidth=0.9, alpha=0.6, label=label, zorder=3.5)
+    axes.plot(*true.T, ".", color=TRUTH, markersize=5, zorder=5)
+    axes.plot(*believed.T, ".", color=BELIEF, markersize=5, zorder=4)
 
 
 def _scan_in_map(scan: Scan, pose: Array) -> Array:
@@ -160,12 +172,10 @@ def _scan_in_map(scan: Scan, pose: Array) -> Array:
 
 def _draw_scan(axes: Axes, session: Session) -> None:
     """The paper's figure 2c, for the last scan that was predicted."""
-    scans = {scan.stamp_ns: scan for scan in session.scans}
-    pairs: list[tuple[Scan, Prediction]] = [(scans[p.stamp_ns], p) for p in session.predictions if p.stamp_ns in scans]
-    if not pairs:
+    if session.predicted is None:
         _missing(axes, "predicted scan")
         return
-    scan, prediction = pairs[-1]
+    scan, prediction = session.predicted
     expected = np.where(np.isfinite(prediction.ranges), prediction.ranges, np.nan).astype(np.float64)
     measured = np.where(np.isfinite(scan.ranges), scan.ranges, np.nan)
     angles = np.rad2deg(prediction.angle_min + prediction.angle_increment * np.arange(len(expected)))
@@ -181,11 +191,11 @@ def _draw_scan(axes: Axes, session: Session) -> None:
 
 
 def _draw_free_energy(axes: Axes, session: Session) -> None:
-    if not session.beliefs:
+    if not len(session.belief):
         _missing(axes, "belief")
         return
-    time = np.array([b.stamp_ns for b in session.beliefs]) * 1e-9
-    total, accuracy, complexity = np.array([(b.free_energy, b.accuracy, b.complexity) for b in session.beliefs]).T
+    time = session.belief.stamps_ns * 1e-9
+    total, accuracy, complexity = session.energies().T
     shown = [total]
     axes.plot(time, total, color=BELIEF, lw=2.2 if complexity.any() else 1.5, label="free energy F")
     if complexity.any():
@@ -208,11 +218,11 @@ def _draw_errors(axes: Axes, session: Session) -> None:
     if not known.any():
         _missing(axes, "truth beside beliefs")
         return
-    time = np.array([b.stamp_ns for b in session.beliefs]) * 1e-9
+    time = session.belief.stamps_ns * 1e-9
     axes.semilogy(time[known], np.maximum(errors[known], SMALLEST), color=BELIEF, lw=1.4, label="position error")
     if goal is not None:
-        since = np.array([t.stamp_ns for t in session.truths])
-        away = np.hypot(*(session.true_path() - goal.pose.array())[:, :2].T)
+        since = session.truth.stamps_ns
+        away = np.hypot(*(session.truth.poses - goal.pose.array())[:, :2].T)
         asked = since >= session.goal_times_ns[-1]
         shown = np.maximum(away[asked], SMALLEST)
         axes.semilogy(since[asked] * 1e-9, shown, color=GOAL, lw=1.4, label="distance to goal")
@@ -228,6 +238,6 @@ def _mark_moments(axes: Axes, session: Session) -> None:
     """When the belief claimed to know the place, and when the goal was reached."""
     first, reached = session.localised(), session.reached_ns()
     if first is not None:
-        axes.axvline(session.beliefs[first].stamp_ns * 1e-9, color=INK, lw=0.9, ls=":", label="localised")
+        axes.axvline(session.belief.stamps_ns[first] * 1e-9, color=INK, lw=0.9, ls=":", label="localised")
     if reached is not None:
         axes.axvline(reached * 1e-9, color=GOAL, lw=0.9, ls=":", label="goal reached")
