@@ -64,3 +64,42 @@ def replay(
 
     how = Again(file, with_services, rate, every_scan=every_scan)
     raise typer.Exit(again_command(how, json_file, console))
+
+
+@app.command()
+def rerun(
+    file: Path,
+    estimator: Annotated[
+        str | None, typer.Option(help="precise, paper, particle-filter or amcl-defaults; none: the recorded one.")
+    ] = None,
+    model: Annotated[
+        str | None, typer.Option(help="Of precise: learned, exact, or a file of weights; none: the recorded one.")
+    ] = None,
+    models: Annotated[Path | None, typer.Option(help="Folder of weights; none: the recorded or shipped ones.")] = None,
+    prior: Annotated[
+        str | None, typer.Option(help="Of motion: motion, odometry, command; none: the recorded one.")
+    ] = None,
+    initial_pose: Annotated[str | None, typer.Option(help="x,y[,yaw_deg]; '' is nothing known; none: as then.")] = None,
+    sigma: Annotated[float | None, typer.Option(help="The scanner's noise, m; none: the recorded one.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of what is drawn; none: the recorded one.")] = None,
+    world: Annotated[str | None, typer.Option(help="A shipped world or a file; none: the recorded one.")] = None,
+    out: Annotated[Path | None, typer.Option(help="NEW.mcap; none: FILE-ESTIMATOR.mcap beside the recording.")] = None,
+    json_file: Json = None,
+) -> None:
+    """Run an estimator over a recording offline, as fast as it goes; old and new beliefs in one new recording.
+
+    The new recording has every byte of the old one, and the new beliefs and predictions under presage/ROBOT-rerun/.
+    Printed and drawn (NEW.png, .pdf, data in .csv): errors against the recorded truth, NEES, share tracking, times, the
+    difference between the two. What is not said on the command line is as it was recorded.
+
+    Examples: `presage rerun run.mcap --estimator particle-filter --json pf.json`;
+    `presage rerun run.mcap --model exact --out exact.mcap`; `presage rerun run.mcap --prior odometry`;
+    `presage rerun run.mcap --estimator precise --initial-pose ''` (from nothing known).
+    """
+    from presage.replays.rerun import Rerun, rerun_command  # noqa: PLC0415
+
+    said = {
+        "estimator": estimator, "model": model, "models": str(models) if models else None, "prior": prior,
+        "initial_pose": initial_pose, "sigma": sigma, "seed": seed, "world": world,
+    }  # fmt: skip
+    rerun_command(Rerun(file, {k: v for k, v in said.items() if v is not None}, out), json_file, console)

@@ -52,8 +52,8 @@ def recorded_settings(recording: Recording, service: str) -> Unpacked | None:
     return Unpacked({name: value for name, value in values.items() if name in known}, notes)
 
 
-def estimator_settings(recording: Recording, folder: Path, values: dict[str, Any]) -> Unpacked:
-    """``values`` with world and weights as recorded, written into ``folder`` where they are in the file.
+def estimator_settings(recording: Recording, folder: Path, values: dict[str, Any], *, weights: bool = True) -> Unpacked:
+    """``values`` with world and (``weights``) model as recorded, written into ``folder`` where they are in the file.
 
     Weights that are not in the file are looked for where they lay, then among the shipped ones, and taken only if
     their card, and their digest where it was recorded, are the recorded ones; else UserError.
@@ -64,12 +64,11 @@ def estimator_settings(recording: Recording, folder: Path, values: dict[str, Any
     learned = values.get("estimator", "precise") == "paper" or (
         values.get("estimator", "precise") == "precise" and values.get("model", "learned") != "exact"
     )
-    if not learned:
+    if not learned or not weights:
         return Unpacked(values)
     model = recording.metadata.get("model", {})
     if not model.get("file") or model.get("estimator") != values.get("estimator", "precise"):
-        said = "the recording does not say which weights were used"
-        return Unpacked(values, (f"{said}: those for world {values.get('world', 'corridor')} here are taken",))
+        return Unpacked(values, ("the recording does not say which weights were used: those of this world here are",))
     if not FILE.fullmatch(model["file"]):
         raise UserError(f"{recording.path}: weights are named {model['file']!r}, which is no file name")
     found = _from_file(recording, folder, model) or _from_disk(recording, values, model)
