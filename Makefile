@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
 
-.PHONY: help install demo test check bench clean FORCE
+.PHONY: help install demo test bless check bench clean FORCE
 .DELETE_ON_ERROR:
 
 help: ## this list
@@ -60,6 +60,9 @@ demo: install ## localise and drive in the corridor: every service, a recording,
 
 test: install ## all tests, the fast ones first
 	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
+
+bless: install ## show what services answer differently than their references, and accept it
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.process_replay.bless $(ARGS)
 
 check: install ## style, format and types
 	$(BIN)/ruff check

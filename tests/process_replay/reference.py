@@ -1,0 +1,177 @@
+"""References as text: rows of plain values, numbers rounded, long arrays as a few statistics and samples.
+
+Two rows are compared field by field. States, counts and text must be equal. Numbers may differ by `tolerance`: another
+processor sums in another order and rounds a sine another way, so the last digits are nobody's decision.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+Row = dict[str, Any]
+
+FOLDER = Path(__file__).resolve().parent / "references"
+DIGITS = 7  # significant, of a number in a file
+SAMPLES = 6  # of a long array
+FIRST = 6  # differences that are shown
+MISSING = "nothing"
+# Absolute and relative, by the last name of a field's path that has a row here; else that of "". Where the same code
+# ran without AVX and FMA, with another BLAS kernel and two threads, the network of preset paper (float32) was off by
+# 6e-7 relative and 3e-7 m, all else by 1e-15: ten times that is allowed. xi is a difference of large numbers.
+TOLERANCES = {"": (1e-6, 5e-6), "xi": (1e-2, 1e-5)}
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One field of one message that is not as the reference has it."""
+
+    number: int  # of the row, from 0
+    message: str  # what it is
+    field: str  # its path; empty: the whole message
+    expected: Any
+    got: Any
+
+    def __str__(self) -> str:
+        where = f"message {self.number} ({self.message})" + (f": {self.field}" if self.field else "")
+        text = f"{where}: expected {_short(self.expected)}, got {_short(self.got)}"
+        if _is_number(self.expected) and _is_number(self.got):
+            allowed = tolerance(self.field, self.expected)
+            text += f" (off by {abs(self.got - self.expected):.3g}, allowed {allowed:.2g})"
+        return text
+
+
+def of_array(values: np.ndarray) -> Row:
+    """A long array (N,) in a few numbers."""
+    finite = values[np.isfinite(values)]
+    row: Row = {"count": len(values), "inf": int(np.isposinf(values).sum()), "-inf": int(np.isneginf(values).sum())}
+    if len(finite):
+        row |= {"mean": finite.mean(), "std": finite.std(), "min": finite.min(), "max": finite.max()}
+    step = -(-len(values) // SAMPLES)
+    return {k: float(v) if isinstance(v, np.floating) else v for k, v in row.items()} | {
+        f"every {step}": values[::step].tolist()
+    }
+
+
+def of_symmetric(matrix: np.ndarray) -> Row:
+    """A covariance or a curvature (3, 3): its scale by axis, and what is left of the rest, from -1 to 1."""
+    root = np.sqrt(np.abs(np.diag(matrix)))
+    scale = np.where(root > 0, root, 1.0)
+    scaled = matrix / np.outer(scale, scale)
+    return {"root": root.tolist(), "correlation": scaled[np.triu_indices(3, 1)].tolist()}
+
+
+def tolerance(field: str, expected: float) -> float:
+    """By how much a number may differ from the reference's."""
+    names = [part.partition("[")[0] for part in field.split(".")]
+    absolute, relative = next((TOLERANCES[name] for name in reversed(names) if name in TOLERANCES), TOLERANCES[""])
+    return absolute + relative * abs(expected)
+
+
+def compare(expected: Sequence[Row], got: Sequence[Row]) -> Iterator[Difference]:
+    """Every field that differs; where messages are missing or in another order, that alone from there on."""
+    for number, (old, new) in enumerate(zip(expected, got, strict=False)):
+        if _kind(old) != _kind(new):
+            yield Difference(number, _kind(old), "", f"{_kind(old)} of event {old.get('event')}", _kind(new))
+            return
+        yield from _compare(number, _kind(old), "", old, new)
+    for number in range(len(got), len(expected)):
+        yield Difference(number, _kind(expected[number]), "", _kind(expected[number]), MISSING)
+    for number in range(len(expected), len(got)):
+        yield Difference(number, _kind(got[number]), "", MISSING, _kind(got[number]))
+
+
+def _compare(number: int, message: str, path: str, old: Any, new: Any) -> Iterator[Difference]:
+    if isinstance(old, dict) and isinstance(new, dict):
+        for name in dict.fromkeys([*old, *new]):
+            below = f"{path}.{name}" if path else name
+            yield from _compare(number, message, below, old.get(name, MISSING), new.get(name, MISSING))
+    elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for index, (a, b) in enumerate(zip(old, new, strict=True)):
+            yield from _compare(number, message, f"{path}[{index}]", a, b)
+    elif not _same(path, old, new):
+        yield Difference(number, message, path, old, new)
+
+
+def _same(path: str, old: Any, new: Any) -> bool:
+    if _is_number(old) and _is_number(new) and (isinstance(old, float) or isinstance(new, float)):
+        return old == new or (math.isfinite(old) and abs(old - new) <= tolerance(path, old))
+    return type(old) is type(new) and old == new
+
+
+def merged(old: Any, new: Any, path: str = "") -> Any:
+    """The new rows, but the old number wherever it is within tolerance: a bless changes no line without need."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        return {k: merged(old.get(k), v, f"{path}.{k}" if path else k) for k, v in new.items()}
+    if isinstance(old, list) and isinstance(new, list):
+        padded = [*old, *[None] * len(new)]
+        return [merged(a, b, path) for a, b in zip(padded, new, strict=False)]
+    return old if old is not None and _same(path, old, new) else new
+
+
+def report(name: str, differences: Sequence[Difference], first: int = FIRST) -> str:
+    """For a person: the first few, and how many of what."""
+    messages = len({d.number for d in differences})
+    lines = [f"{name}: {messages} message(s) differ from the reference, {len(differences)} field(s):"]
+    lines += [f"  {difference}" for difference in differences[:first]]
+    if len(differences) > first:
+        lines.append(f"  and {len(differences) - first} more; all of them by field:")
+        kinds: dict[str, list[Difference]] = {}
+        for each in differences:
+            kinds.setdefault(f"{each.message.split(',')[0]} {_without_index(each.field)}".strip(), []).append(each)
+        by_count = sorted(kinds.items(), key=lambda item: -len(item[1]))
+        lines += [f"    {len(of_kind):4} x {kind}{_farthest(of_kind)}" for kind, of_kind in by_count[:FIRST]]
+        lines += [f"    and {len(kinds) - FIRST} more fields"] if len(kinds) > FIRST else []
+    return "\n".join(lines)
+
+
+def _farthest(differences: Sequence[Difference]) -> str:
+    """The largest of some numbers' differences, in words."""
+    off = [abs(d.got - d.expected) for d in differences if _is_number(d.got) and _is_number(d.expected)]
+    return f", by up to {max(off):.3g}" if off else ""
+
+
+def read(name: str, folder: Path = FOLDER) -> list[Row]:
+    """A reference; empty where there is none yet."""
+    path = folder / f"{name}.jsonl"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def write(name: str, rows: Sequence[Row], folder: Path = FOLDER) -> Path:
+    """One line a row, numbers rounded."""
+    path = folder / f"{name}.jsonl"
+    path.write_text("".join(json.dumps(_rounded(row)) + "\n" for row in rows))
+    return path
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _rounded(each) for name, each in value.items()}
+    if isinstance(value, list):
+        return [_rounded(each) for each in value]
+    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
+
+
+def _kind(row: Row) -> str:
+    first = next(name for name in row if name != "event")
+    name = row[first] if first == "topic" else f"{first} {row[first]}" if isinstance(row[first], str) else first
+    return f"{name}, stamp {row['stamp_ns'] * 1e-9:.3f} s" if "stamp_ns" in row else name
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
+
+
+def _without_index(field: str) -> str:
+    return "".join(part.partition("]")[2] if "]" in part else part for part in field.split("["))
+
+
+def _short(value: Any) -> str:
+    text = f"{value:.7g}" if isinstance(value, float) else json.dumps(value) if value is not MISSING else MISSING
+    return text if len(text) <= 80 else text[:77] + "..."
