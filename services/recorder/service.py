@@ -17,11 +17,10 @@ from common.inbox import OTHERS, Sample
 from common.log import Logger
 from common.messages import WorldReply
 from common.service import Service
-from common.topics import TOPICS, Topic
+from common.topics import TOPICS, WORLD, Topic
 from common.versions import versions
-from common.world import save_world
 from services.recorder.accounting import Ledger, as_metadata
-from services.recorder.describing import Describer
+from services.recorder.describing import Answer, Describer, MetadataRecord, records_of
 from services.recorder.parts import Limits, PartsWriter
 from services.recorder.settings import RecorderSettings
 from services.recorder.writer import UNFINISHED, NameTakenError, RecordingWriter, is_being_written
@@ -64,7 +63,7 @@ class RecorderService(Service):
         writer.flush()
         self._flush_at = time.monotonic() + options.flush
         self._warn_at = time.monotonic() + LINK_WITHIN if options.link().connect else None
-        self.describer = Describer(self.loop.bus, self.name, self.log)
+        self.describer = Describer(self.loop.bus, self.name, self.log, weights=options.weights)
         self.log.info("recording", file=str(writer.part.path))
 
     def on_sample(self, sample: Sample) -> None:
@@ -139,10 +138,7 @@ class RecorderService(Service):
         if self.writer is None or self.describer is None:
             return
         for service, answer in self.describer.answers():
-            if isinstance(answer, WorldReply):
-                write_world(self.writer, answer)
-            else:
-                self.writer.metadata(f"config:{service}", {"config": answer.config, **answer.versions})
+            write_answer(self.writer, service, answer)
 
 
 def open_writer(options: RecorderSettings) -> RecordingWriter:
@@ -192,9 +188,15 @@ def chosen_topics(names: str) -> tuple[Topic, ...]:
     return tuple(recorded[name] for name in dict.fromkeys(wanted)) if wanted else tuple(recorded.values())
 
 
+def write_answer(writer: RecordingWriter | PartsWriter, service: str, answer: Answer) -> None:
+    """What a service said of itself, as `records_of` has it."""
+    for record in records_of(service, answer):
+        if isinstance(record, MetadataRecord):
+            writer.metadata(record.name, record.values)
+        else:
+            writer.attachment(record.name, record.data, record.media_type, time.time_ns())
+
+
 def write_world(writer: RecordingWriter | PartsWriter, reply: WorldReply) -> None:
     """The world as an attachment that `load_world` reads; scanner and robot as JSON."""
-    if reply.world is not None:
-        writer.attachment("world.yaml", save_world(reply.world).encode(), "application/yaml", time.time_ns())
-    described = {"scanner": reply.scanner, "robot": reply.robot}
-    writer.metadata("world", {name: d.model_dump_json() for name, d in described.items() if d is not None})
+    write_answer(writer, WORLD.server, reply)
