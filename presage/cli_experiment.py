@@ -121,7 +121,7 @@ def e3(
 
 @app.command("alpha")
 def alpha_sweep(
-    trials: Trials = 50,
+    trials: Trials = 25,
     alphas: Annotated[str, typer.Option(help="Comma-separated, m²; empty: 2e-4 to 2e-2.")] = "",
     seed: ExperimentSeed = 1,
     out: Out = OUT,
