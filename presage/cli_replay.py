@@ -44,7 +44,8 @@ def replay(
     `--with estimator` needs nothing but the file: a router and the services named run here as they were configured,
     over the recorded world and model, hear what they heard, and what they say is compared with the recording. Each scan
     waits for the belief of the last (unless `--rate` is given). Where the session ran in lockstep both must be equal
-    bit for bit; the status is 1 where they are not.
+    bit for bit; else, once tracking, within 0.01 m and 0.01 rad: a recording does not hold requests (`presage
+    localise`), restarts, or what was seen before the recorder came. The status is 1 where they are not.
 
     Examples: `presage replay run.mcap --only scan,odom` (with `python -m services.estimator` beside it);
     `presage replay run.mcap --rate 4 --start 10 --end -5 --loop`; `presage replay run.mcap --except belief,prediction`;

@@ -98,7 +98,8 @@ class Pairs:
 class Outcome:
     """What it came to."""
 
-    lockstep: bool  # the session ran so
+    lockstep: bool  # the session ran so, and runs so again: equality is required
+    why: str = ""  # it is not
     beliefs: Pairs = field(default_factory=Pairs)
     commands: Pairs = field(default_factory=Pairs)
     scans: int = 0  # in the recording
@@ -122,7 +123,7 @@ class Outcome:
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
         return {
-            "lockstep": self.lockstep, "good": self.good, "scans": self.scans, "scans_left_out": self.left_out,
+            "lockstep": self.lockstep, "why_not": self.why, "good": self.good, "scans": self.scans, "scans_left_out": self.left_out,
             "scans_unanswered": self.unanswered, "beliefs": self.beliefs.as_dict(),
             "commands": {
                 "compared": self.commands.compared, "equal": self.commands.equal,

@@ -16,7 +16,7 @@ from common import se2
 from common.errors import UserError
 from common.messages import Belief, Truth
 from common.se2 import Array
-from presage.experiments.drawing import COLOURS, figure_of, log_metres
+from presage.experiments.drawing import COLOURS, figure_of, legend_below, log_metres
 
 OLD = "#444444"
 SMALLEST = 1e-4  # m, the least a logarithmic axis shows
@@ -254,7 +254,7 @@ def figure_of_curves(columns: dict[str, Array], comparison: Comparison, title: s
     log_metres(axes)
     axes.set(xlabel="time (s)", ylabel="position error (m)" if len(shown) > 1 else "difference (m)", title=title)
     if axes.lines:
-        axes.legend(fontsize=9, frameon=False)
+        legend_below(figure, axes)
     return figure
 
 

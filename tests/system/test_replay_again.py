@@ -4,29 +4,89 @@ from __future__ import annotations
 
 import json
 
+from common.messages import Belief, Pose
+from common.topics import BELIEF, topic_of
+from services.recorder.reader import read_recording
+from services.recorder.writer import RecordingWriter
+from tests.recorder import sessions as made
 from tests.system.test_loop import SCANS, run_in_lockstep
 
 
-def again(process, tmp_path, recording, *more, env=None):
-    """Status, output and the numbers of a replay with services."""
-    numbers = tmp_path / "again.json"
-    done = process("presage.__main__", "replay", str(recording), *more, "--json", str(numbers), env=env)
-    status = done.wait(150)
+def command(process, numbers, *args, env=None):
+    """Status, output and numbers of a command with ``--json``."""
+    done = process("presage.__main__", *map(str, args), "--json", str(numbers), env=env)
+    status = done.wait(120)
     return status, done.output, json.loads(numbers.read_text()) if numbers.exists() else {}
+
+
+def altered(recording, path, stamp_ns, count):
+    """The recording's first scans, with one belief a nanometre elsewhere."""
+    writer, scans = RecordingWriter(path), 0
+    for name, values in recording.metadata.items():
+        writer.metadata(name, values)
+    for name, data in recording.attachments.items():
+        writer.attachment(name, data, "application/octet-stream", 0)
+    for raw in recording.payloads():
+        topic, payload = topic_of(raw.key), raw.payload
+        scans += topic.name == "scan"
+        if scans > count:
+            break
+        if topic is BELIEF and (belief := Belief.decode(payload)).stamp_ns == stamp_ns:
+            moved = Pose(x=belief.pose.x + 1e-9, y=belief.pose.y, yaw=belief.pose.yaw)
+            payload = belief.model_copy(update={"pose": moved}).encode()
+        writer.write(topic, raw.key, payload, raw.published_ns, raw.logged_ns)
+    return writer.finish()
 
 
 def test_a_lockstep_session_is_believed_again_to_the_last_bit(process, bus, tmp_path):
     run_in_lockstep(process, bus, tmp_path, "run")
+    file = tmp_path / "run.mcap"
     # What the environment says is not what was recorded.
-    status, said, numbers = again(
-        process, tmp_path, tmp_path / "run.mcap", "--with", "estimator,controller", env={"PRESAGE_SIGMA": "0.5"}
+    status, said, numbers = command(
+        process, tmp_path / "a.json", "replay", file, "--with", "estimator,controller", env={"PRESAGE_SIGMA": "0.5"}
     )
     assert status == 0, said
     beliefs, commands = numbers["beliefs"], numbers["commands"]
     assert numbers["lockstep"]
-    assert numbers["good"]
     assert beliefs["equal"] == beliefs["compared"] >= SCANS
     assert beliefs["position_difference_max_m"] == 0.0
     assert beliefs["recorded_without_new"] == 0
     assert commands["equal"] == commands["compared"] >= SCANS
     assert "this is what it believed" in said
+
+    # Offline too.
+    status, said, numbers = command(process, tmp_path / "r.json", "rerun", file, "--out", tmp_path / "new.mcap")
+    assert status == 0, said
+    assert numbers["difference"] == {"position_median_m": 0.0, "position_max_m": 0.0, "heading_max_rad": 0.0}
+    assert numbers["scans_compared"] >= SCANS
+    bytes_of = {"robot": [], "robot-rerun": []}
+    for raw in read_recording(tmp_path / "new.mcap").payloads():
+        if raw.key.endswith("/belief"):
+            whose = "robot-rerun" if raw.key.split("/")[1].endswith("-rerun") else "robot"
+            bytes_of[whose].append(raw.payload)
+    assert bytes_of["robot"] == bytes_of["robot-rerun"][: len(bytes_of["robot"])]
+
+    # A nanometre is seen.
+    stamp = Belief.decode(bytes_of["robot"][10]).stamp_ns
+    other = altered(read_recording(file), tmp_path / "other.mcap", stamp, 20)
+    status, said, numbers = command(process, tmp_path / "o.json", "replay", other, "--with", "estimator")
+    assert status == 1, said
+    assert numbers["beliefs"]["equal"] == numbers["beliefs"]["compared"] - 1
+    assert 0.5e-9 < numbers["beliefs"]["position_difference_max_m"] < 2e-9
+    assert "should be equal bit for bit, and are not" in said
+
+
+def test_what_a_file_does_not_hold_is_named(process, tmp_path):
+    file = made.write(tmp_path / "made.mcap")  # of no process at all
+    started = {
+        "the estimator's configuration was not recorded": ("replay", str(file), "--with", "estimator"),
+        "give estimator, or estimator,controller": ("replay", str(file), "--with", "simulator"),
+        "it takes no other choice than --rate": ("replay", str(file), "--with", "estimator", "--loop"),
+        "go with --with": ("replay", str(file), "--every-scan"),
+        "--robot 'a/b'": ("replay", str(file), "--robot", "a/b"),
+    }
+    running = {says: process("presage.__main__", *args) for says, args in started.items()}
+    for says, command in running.items():
+        assert command.wait(60) == 2, command.output
+        (line,) = command.output.splitlines()
+        assert says in line
