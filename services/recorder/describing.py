@@ -82,8 +82,8 @@ def _records_of_model(reply: ModelReply) -> Iterator[MetadataRecord | Attachment
 class Describer:
     """Answers wait in a queue, so that recording goes on while a service is slow or silent."""
 
-    def __init__(self, bus: Bus, me: str, log: Logger, *, weights: bool | None = None) -> None:
-        """Begin to watch; ``me`` is not asked. ``weights``: with the model's, up to `MAX_WEIGHTS`; None: no model."""
+    def __init__(self, bus: Bus, me: str, log: Logger, *, weights: bool = True) -> None:
+        """Begin to watch; ``me`` is not asked. ``weights``: ask for the model's, up to `MAX_WEIGHTS`."""
         self._bus, self._me, self._log, self._weights = bus, me, log, weights
         self._seen: queue.SimpleQueue[tuple[str, bool] | None] = queue.SimpleQueue()  # from zenoh's thread
         self._answers: queue.SimpleQueue[tuple[str, Answer]] = queue.SimpleQueue()
@@ -142,8 +142,6 @@ class Describer:
             return
         service, there = seen
         for query in QUESTIONS.values():
-            if query is MODEL and self._weights is None:
-                continue
             if not there:
                 self._waiting.pop((service, query.name), None)
             elif query.per_service or query.server == service:

@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from difflib import SequenceMatcher
 from pathlib import Path
 from typing import Any
 
@@ -32,15 +33,17 @@ TOLERANCES = {"": (1e-6, 5e-6), "xi": (1e-2, 1e-5)}
 class Difference:
     """One field of one message that is not as the reference has it."""
 
-    number: int  # of the row, from 0
+    number: int  # of the row in the reference, from 0; of a new one, its own
     message: str  # what it is
     field: str  # its path; empty: the whole message
     expected: Any
     got: Any
 
     def __str__(self) -> str:
-        where = f"message {self.number} ({self.message})" + (f": {self.field}" if self.field else "")
-        text = f"{where}: expected {_short(self.expected)}, got {_short(self.got)}"
+        where = f"message {self.number} ({self.message})"
+        if not self.field:
+            return f"{where}: " + ("missing" if self.got is MISSING else "new, the reference has none")
+        text = f"{where}: {self.field}: expected {_short(self.expected)}, got {_short(self.got)}"
         if _is_number(self.expected) and _is_number(self.got):
             allowed = tolerance(self.field, self.expected)
             text += f" (off by {abs(self.got - self.expected):.3g}, allowed {allowed:.2g})"
@@ -75,16 +78,24 @@ def tolerance(field: str, expected: float) -> float:
 
 
 def compare(expected: Sequence[Row], got: Sequence[Row]) -> Iterator[Difference]:
-    """Every field that differs; where messages are missing or in another order, that alone from there on."""
-    for number, (old, new) in enumerate(zip(expected, got, strict=False)):
-        if _kind(old) != _kind(new):
-            yield Difference(number, _kind(old), "", f"{_kind(old)} of event {old.get('event')}", _kind(new))
-            return
-        yield from _compare(number, _kind(old), "", old, new)
-    for number in range(len(got), len(expected)):
-        yield Difference(number, _kind(expected[number]), "", _kind(expected[number]), MISSING)
-    for number in range(len(expected), len(got)):
-        yield Difference(number, _kind(got[number]), "", MISSING, _kind(got[number]))
+    """Every field that differs, and every message that is missing or new."""
+    for number, old, new in _aligned(expected, got):
+        if old is None or new is None:
+            kind = _kind(new if old is None else old)
+            yield Difference(number, kind, "", MISSING if old is None else kind, MISSING if new is None else kind)
+        else:
+            yield from _compare(number, _kind(old), "", old, new)
+
+
+def _aligned(expected: Sequence[Row], got: Sequence[Row]) -> Iterator[tuple[int, Row | None, Row | None]]:
+    """Number, expected and got, of messages of one kind and stamp; those without a partner alone."""
+    matcher = SequenceMatcher(None, [_kind(row) for row in expected], [_kind(row) for row in got], autojunk=False)
+    for what, a, after_a, b, after_b in matcher.get_opcodes():
+        if what == "equal":
+            yield from ((a + k, expected[a + k], got[b + k]) for k in range(after_a - a))
+        else:
+            yield from ((number, expected[number], None) for number in range(a, after_a))
+            yield from ((number, None, got[number]) for number in range(b, after_b))
 
 
 def _compare(number: int, message: str, path: str, old: Any, new: Any) -> Iterator[Difference]:
@@ -105,14 +116,18 @@ def _same(path: str, old: Any, new: Any) -> bool:
     return type(old) is type(new) and old == new
 
 
-def merged(old: Any, new: Any, path: str = "") -> Any:
+def merged(expected: Sequence[Row], got: Sequence[Row]) -> list[Row]:
     """The new rows, but the old number wherever it is within tolerance: a bless changes no line without need."""
+    pairs = _aligned(expected, got)
+    return [new if old is None else _merged(old, new, "") for _, old, new in pairs if new is not None]
+
+
+def _merged(old: Any, new: Any, path: str) -> Any:
     if isinstance(old, dict) and isinstance(new, dict):
-        return {k: merged(old.get(k), v, f"{path}.{k}" if path else k) for k, v in new.items()}
-    if isinstance(old, list) and isinstance(new, list):
-        padded = [*old, *[None] * len(new)]
-        return [merged(a, b, path) for a, b in zip(padded, new, strict=False)]
-    return old if old is not None and _same(path, old, new) else new
+        return {k: _merged(old.get(k, MISSING), v, f"{path}.{k}" if path else k) for k, v in new.items()}
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        return [_merged(a, b, path) for a, b in zip(old, new, strict=True)]
+    return old if _same(path, old, new) else new
 
 
 def report(name: str, differences: Sequence[Difference], first: int = FIRST) -> str:

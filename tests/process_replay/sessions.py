@@ -213,7 +213,9 @@ def recorder(folder: Path, **changes: Any) -> list[Row]:
             if topic in bus.subscribed:
                 loop.inbox.put(sample(topic, payload, 1_000_000 * (number + 1)))
         active = folder / "session.mcap.active"
-        assert wait_until(lambda: not len(loop.inbox) and b"config:estimator" in active.read_bytes(), 20)
+        assert wait_until(
+            lambda: not len(loop.inbox) and b"model/corridor-precise.safetensors" in active.read_bytes(), 20
+        )
     finally:
         loop.stop()
         thread.join(20)

@@ -1,0 +1,121 @@
+"""A session is re-run from its file alone: the map and the weights in it make the very same estimator."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+import safetensors.numpy
+
+from common.bus import wait_until
+from common.inbox import Inbox, Sample
+from common.messages import Belief, Scan
+from common.topics import BELIEF, SCAN
+from services.recorder.reader import read_recording
+from tests.conftest import ROOT
+
+SCANS = 15  # a second
+SERVICES = {"recorder", "controller", "estimator", "simulator"}
+
+
+def until_heard(inbox, kind, condition, timeout=60.0):
+    """Wait for a message of a kind; it."""
+    found = []
+
+    def look():
+        while isinstance(sample := inbox.get(0), Sample):
+            message = sample.topic.message.decode(sample.payload)
+            if isinstance(message, kind) and condition(message):
+                found.append(message)
+                return True
+        return False
+
+    assert wait_until(look, timeout), f"no {kind.__name__} as wanted within {timeout:g} s"
+    return found[0]
+
+
+def other_weights(folder, file):
+    """Weights that nobody ships, so that whoever falls back on the shipped ones is found out."""
+    folder.mkdir()
+    tensors = safetensors.numpy.load_file(ROOT / "models" / f"{file}.safetensors")
+    other = {name: (tensor * 1.02).astype(tensor.dtype) for name, tensor in tensors.items()}
+    safetensors.numpy.save_file(other, folder / f"{file}.safetensors")
+    shutil.copy(ROOT / "models" / f"{file}.json", folder)
+    return folder
+
+
+def record(process, bus, folder, *estimator):
+    """A second of a session in lockstep, and the file."""
+    scans = Inbox()
+    bus.subscribe(SCAN, scans, keep_all=True)
+    started = [
+        process("recorder", "--directory", str(folder), "--file", "session"),
+        process("controller", "--belief-timeout", "60"),
+        process("estimator", "--initial-pose", "3.1,1.6", "--seed", "4", *estimator),
+        process("simulator", "--beams", "622", "--pace", "lockstep", "--wait-for", "estimator,controller,recorder"),
+    ]
+    assert wait_until(lambda: bus.alive() >= SERVICES, 60)
+    until_heard(scans, Scan, lambda scan: scan.seq >= SCANS)
+    active = folder / "session.mcap.active"
+    assert wait_until(lambda: b"model/world.yaml" in active.read_bytes(), 30), started[0].output
+    for running in reversed(started):
+        assert running.stop()[0] == 0, running.output
+    return read_recording(folder / "session.mcap")
+
+
+def extract(recording, folder):
+    """The attachments as files, under their names."""
+    for name, data in recording.attachments.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
+    return folder
+
+
+def rerun(process, bus, config, folder, scans):
+    """An estimator with the recorded settings over the recorded scans; its beliefs."""
+    kept = {name: config[name] for name in ("estimator", "model", "initial_pose", "seed", "sigma", "prior")}
+    args = [part for name, value in kept.items() for part in (f"--{name.replace('_', '-')}", str(value))]
+    beliefs = Inbox()
+    bus.subscribe(BELIEF, beliefs, keep_all=True)
+    running = process(
+        "estimator", "--models", str(folder / "model"), "--world", str(folder / "model/world.yaml"), *args
+    )
+    assert wait_until(lambda: "estimator" in bus.alive(), 60), running.output
+    assert bus.wait_matching(SCAN, 10)
+    found = []
+    for scan in scans:
+        bus.put(SCAN, scan.encode())
+        found.append(until_heard(beliefs, Belief, lambda belief, s=scan: belief.stamp_ns == s.stamp_ns))
+    assert running.stop()[0] == 0
+    return found
+
+
+@pytest.mark.parametrize(("estimator", "file"), [("precise", "corridor-precise"), ("paper", "corridor-paper-622")])
+def test_the_file_alone_makes_the_same_estimator_again(process, bus, tmp_path, estimator, file):
+    mine = other_weights(tmp_path / "mine", file)
+    recording = record(process, bus, tmp_path / "logs", "--estimator", estimator, "--models", str(mine))
+    model = recording.metadata["model"]
+    assert model["estimator"] == estimator
+    assert model["file"] == f"{file}.safetensors"
+    assert model["card"] == (mine / f"{file}.json").read_text()
+    assert recording.attachments[f"model/{file}.safetensors"] == (mine / f"{file}.safetensors").read_bytes()
+    assert recording.attachments[f"model/{file}.json"] == model["card"].encode()
+    shutil.rmtree(mine)
+
+    messages = [message for _, message, _ in recording.messages(SCAN, BELIEF)]
+    before = {m.stamp_ns: m for m in messages if isinstance(m, Belief)}
+    scans = [m for m in messages if isinstance(m, Scan) and m.stamp_ns in before]
+    assert len(scans) >= SCANS
+    config = json.loads(recording.metadata["config:estimator"]["config"])
+    again = rerun(process, bus, config, extract(recording, tmp_path / "extracted"), scans)
+    assert again == [before[scan.stamp_ns] for scan in scans]
+
+
+def test_a_particle_filter_s_file_has_its_map(process, bus, tmp_path):
+    recording = record(process, bus, tmp_path / "logs", "--estimator", "particle-filter")
+    assert recording.metadata["model"] == {
+        "estimator": "particle-filter", "card": "", "file": "", "weights": "none: nothing was learned",
+    }  # fmt: skip
+    assert recording.attachments["model/world.yaml"]
+    assert not any(name.endswith(".safetensors") for name in recording.attachments)
