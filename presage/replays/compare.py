@@ -105,6 +105,7 @@ class Outcome:
     scans: int = 0  # in the recording
     left_out: int = 0  # never answered live
     unanswered: int = 0  # now
+    goals_placed: bool = True  # between the beliefs where the controller took them
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -112,8 +113,8 @@ class Outcome:
         """Equal bit for bit; where the session did not run in lockstep, within the tolerance once tracking."""
         pairs, left = self.beliefs, self.beliefs.unmatched()["recorded"]
         if self.lockstep:
-            commands = self.commands
-            return 0 < pairs.compared == pairs.equal and not left and commands.compared == commands.equal
+            driven = self.commands.compared == self.commands.equal or not self.goals_placed
+            return 0 < pairs.compared == pairs.equal and not left and driven
         numbers = pairs.as_dict()
         most_m, most_rad = (
             numbers[f"{what}_difference_tracking_max_{unit}"] for what, unit in (("position", "m"), ("heading", "rad"))
@@ -123,7 +124,8 @@ class Outcome:
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
         return {
-            "lockstep": self.lockstep, "why_not": self.why, "good": self.good, "scans": self.scans, "scans_left_out": self.left_out,
+            "lockstep": self.lockstep, "why_not": self.why, "good": self.good,
+            "scans": self.scans, "scans_left_out": self.left_out,
             "scans_unanswered": self.unanswered, "beliefs": self.beliefs.as_dict(),
             "commands": {
                 "compared": self.commands.compared, "equal": self.commands.equal,

@@ -12,9 +12,10 @@ from common.bus import Bus
 from common.errors import UserError
 from common.inbox import Inbox, Sample
 from common.messages import Belief, CmdVel, Health, Stamped
-from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, SCAN, Topic
+from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, SCAN, STATUS, Topic
 from common.wire import DecodeError
 from presage.replays.compare import Outcome
+from presage.replays.goals import Goals
 from presage.replays.source import robot_of
 from presage.stack import Stack
 from services.recorder.player import Player
@@ -45,15 +46,20 @@ class Feed:
         self._received: Counter[str] = Counter()  # goals, by service, as their health says
         self._goals = 0
         self._answered = False  # once
+        self._when: Counter[int | None] | None = None  # goals by the stamp after whose answer they came
+        self._held: list[bytes] = []  # goals still to come, where that is known
         for topic in (*self.asked, HEALTH):
             bus.subscribe(topic, self.inbox, keep_all=True)
 
     def run(self, console: Console) -> None:
         """Raises UserError where a service ends."""
         taken = self._taken()
+        if self.rate is None and CMD_VEL in self.asked:
+            self._place_goals()
         began, player = time.monotonic(), None
         for topic in {SCAN, GOAL} & set(self.topics.values()):  # all others are of no use to most configurations
             self.bus.wait_matching(topic, WITHIN)
+        self._give_goals(None)
         if self.rate is not None:
             player = Player(0.0, float("inf"), self.rate, now=began)
         columns = (
@@ -94,11 +100,31 @@ class Feed:
                 self.outcome.left_out += 1
                 return
             taken[message.stamp_ns] -= 1
+        if topic is GOAL and self._when is not None:
+            return  # has its place already
         self.bus.put(topic, raw.payload)
         if topic is GOAL and self.rate is None:
             self._goal_heard()
         elif topic is SCAN and self.rate is None:
             self._wait_for_answers(message)
+            self._give_goals(message.stamp_ns)
+
+    def _place_goals(self) -> None:
+        """Where the controller took them, if its statuses tell."""
+        held = [raw.payload for _, _, raw in self.recording.messages(GOAL) if raw.key in self.topics]
+        goals, robot = Goals(), self.bus.robot
+        mine = {STATUS.key(robot), CMD_VEL.key(robot)}
+        goals.see(message for _, message, raw in self.recording.messages(STATUS, CMD_VEL) if raw.key in mine)
+        self._held, self._when = held, goals.taken(len(held))
+        self.outcome.goals_placed = self._when is not None
+        if self._when is None:
+            self.outcome.notes.append("when the controller took which goal is not known: its commands may differ")
+
+    def _give_goals(self, stamp_ns: int | None) -> None:
+        """Those that came after the answer to the scan of that stamp."""
+        for _ in range(self._when.pop(stamp_ns, 0) if self._when is not None else 0):
+            self.bus.put(GOAL, self._held.pop(0))
+            self._goal_heard()
 
     def _goal_heard(self) -> None:
         """Goals and scans go on keys of their own, between which the bus keeps no order."""

@@ -16,10 +16,11 @@ from rich.console import Console
 
 from common import se2
 from common.errors import UserError
-from common.messages import Belief, CmdVel, Pose, Truth, Twist
+from common.messages import Belief, CmdVel, Pose, Status, Truth, Twist
 from common.topics import BELIEF, PREDICTION, SCAN, TRUTH
 from presage.replays import rerun as shell
 from presage.replays.compare import Outcome, Pairs
+from presage.replays.goals import Goals
 from presage.replays.report import Series, Track
 from presage.replays.rerun import Rerun, another_name, rerun_command
 from presage.replays.source import estimator_settings, recorded_settings, robot_of
@@ -286,3 +287,37 @@ def test_only_scans_both_answered_are_compared():
     numbers = track.compare().as_dict()
     assert numbers["scans_answered"] == {"recorded": 5, "new": 10}
     assert numbers["new"]["position_error_max_m"] == 0.5
+
+
+# When a controller took its goals.
+
+
+def said(*entries):
+    """``g``: a status about a goal just taken; a number: a belief of that stamp is answered, with a goal or without."""
+    goals, last, goal, messages = Goals(), 0, None, []
+    for entry in entries:
+        if entry == "g":
+            goal = Pose(x=1.0, y=1.0)
+            messages.append(Status(stamp_ns=last, state="navigating", goal=goal))
+        else:
+            last = entry
+            distance = 1.0 if goal else None
+            messages.append(Status(stamp_ns=last, state="idle", goal=goal, distance=distance))
+            messages.append(CmdVel(stamp_ns=last, twist=Twist()))
+    goals.see(messages)
+    return goals
+
+
+def test_a_status_without_a_command_is_a_goal_taken():
+    assert said(1, 2, "g", 3, "g", "g", 4).taken(3) == {2: 1, 3: 2}
+    assert said("g", 0, 1).taken(1) == {None: 1}
+    assert said(0, "g", 1).taken(1) == {0: 1}
+    assert said(1, 2).taken(0) == {}
+    assert said(1, "g", 2).taken(2) is None  # a goal nobody took
+    assert Goals().taken(1) is None
+
+
+def test_the_end_of_a_recording_may_cut_an_answer_in_two():
+    goals = said(1, "g", 2)
+    goals.see([Status(stamp_ns=3, state="navigating", goal=Pose(x=1.0, y=1.0), distance=1.0)])
+    assert goals.taken(1) == {1: 1, 3: 0}
