@@ -119,3 +119,17 @@ def test_a_particle_filter_s_file_has_its_map(process, bus, tmp_path):
     }  # fmt: skip
     assert recording.attachments["model/world.yaml"]
     assert not any(name.endswith(".safetensors") for name in recording.attachments)
+
+
+def test_a_service_started_anew_with_other_settings_is_asked_again(process, bus, tmp_path):
+    recorder = process("recorder", "--directory", str(tmp_path), "--file", "session")
+    recorder.wait_for("ready")
+    active = tmp_path / "session.mcap.active"
+    for gamma in ("0.41", "0.42", "0.41"):
+        known, told = len(active.read_bytes()), f'"gamma": {gamma}'.encode()
+        running = process("controller", "--gamma", gamma)
+        assert wait_until(lambda at=known, t=told: t in active.read_bytes()[at:], 30), recorder.output
+        running.kill()  # without a farewell: the one who comes next is noticed all the same
+    assert recorder.stop()[0] == 0
+    config = json.loads(read_recording(tmp_path / "session.mcap").metadata["config:controller"]["config"])
+    assert config["gamma"] == 0.41
