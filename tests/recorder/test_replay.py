@@ -7,7 +7,10 @@ import threading
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
+import msgpack
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from common.bus import open_bus, wait_until
 from common.errors import UserError
@@ -204,6 +207,27 @@ def test_it_is_steered_over_the_bus(running, listening, bus, link):
     assert wait_until(lambda: len(listening) == 10, 10)
     assert sorted(payload[0] for _, payload in drain(listening)) == sorted([*range(95, 100)] * 2)
     assert sum(counts.values()) == 17
+
+
+def test_hostile_requests_are_refused_and_it_goes_on(running, bus):
+    running(Choice(rate=1e-6))
+    assert wait_until(lambda: "replay" in bus.alive(), 20)
+
+    @settings(max_examples=200, suppress_health_check=list(HealthCheck))
+    @given(
+        st.binary(max_size=60) | st.dictionaries(st.text(max_size=8), st.integers(-9, 9) | st.text()).map(msgpack.packb)
+    )
+    def ask(payload):
+        (answer,) = bus._session.get(PLAYER.key(bus.robot), payload=payload, timeout=30)
+        assert answer.err is not None
+        assert "PlayerRequest" in answer.err.payload.to_string()
+
+    ask()
+    for value in (float("nan"), float("inf")):
+        request = msgpack.packb({"action": "seek", "value": value})
+        (answer,) = bus._session.get(PLAYER.key(bus.robot), payload=request, timeout=30)
+        assert answer.err is not None
+    assert bus.ask(PLAYER, PlayerRequest(action="status"), PlayerReply, timeout=10).ok
 
 
 def test_it_says_what_it_is(running, bus, scans):
