@@ -49,8 +49,8 @@ def tracked(found: Iterator[Entry], total: int, what: str, console: Console) -> 
 
 
 def stem_of(recording: Path) -> str:
-    """A recording's name without .mcap or .mcap.active."""
-    return recording.name.removesuffix(".active").removesuffix(".mcap")
+    """A recording's name without .mcap, .mcap.active, .mcap.torn."""
+    return recording.name.split(".mcap")[0]
 
 
 def refuse_to_overwrite(paths: list[Path], *, force: bool) -> None:

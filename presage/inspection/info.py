@@ -41,7 +41,7 @@ class Facts:
     file: str
     file_bytes: int
     complete: bool
-    checked: bool  # every payload was read, with its checksum
+    checked: bool  # every payload was read, with its chunk's checksum
     warning: str
     robots: list[str]
     world: str | None

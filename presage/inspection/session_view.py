@@ -92,6 +92,7 @@ class SessionView:
         self._clock = Clock()
         self._odoms, self._truths = Recent(), Recent()
         self._chain: dict[str, tuple[str, Array, int]] = {}  # child: parent, pose, ns
+        self._driving: tuple[int, Array] = (-1, np.zeros(3))  # the last stamp and pose of the driver
         self._goal: Array | None = None
         self._said: dict[str, str] = {}  # by name: what the log said last
         self._makers: dict[type[Stamped], Callable[[Any, int, int], Iterator[tuple[str, Any]]]] = {
@@ -124,6 +125,9 @@ class SessionView:
         self._odoms.keep(odom.stamp_ns, pose)
         if self.driver == "odom" and "odom" not in self._chain:
             self._chain["odom"] = ("map", np.zeros(3), at)
+        stamp, driving = self._driving
+        if stamp == odom.stamp_ns:  # the pose of this stamp came before the odometry
+            self._chain["odom"] = ("map", compose(driving, between(pose, np.zeros(3))), at)
         yield self._moved("odom", "base_link", pose, at)
         yield "/odom", shapes.pose_in("odom", pose, at)
 
@@ -193,6 +197,7 @@ class SessionView:
 
     def _corrected(self, pose: Array, stamp: int, at: int) -> tuple[str, FrameTransforms]:
         """Sets map → odom so that base_link stands at ``pose`` (3,) in map, against the odometry of the same stamp."""
+        self._driving = (stamp, pose)
         odom = self._odoms.get(stamp)
         if odom is None:
             odom = next(reversed(self._odoms.values()), None)

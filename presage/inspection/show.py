@@ -47,7 +47,7 @@ def info(file: Path, json_file: Path | None, check: bool | None, console: Consol
 
 
 def _head(facts: Facts, recording: Recording, console: Console) -> None:
-    state = "whole" + (", every checksum right" if facts.checked else ", by its index")
+    state = "whole" + (", every chunk's checksum right" if facts.checked else ", by its index")
     about = recording.metadata.get("presage", {})
     rows = [
         ("file", f"{facts.file}, {_size(facts.file_bytes)}"),
