@@ -65,13 +65,14 @@ def plot(
     out: Annotated[Path | None, typer.Option(help="PNG; none: beside the recording.")] = None,
     json_file: Json = None,
 ) -> None:
-    """Draw a recording and print its summary.
+    """Draw a recording and print its summary; of an unfinished one as far as it goes.
 
-    Example: `presage plot recordings/run.mcap --out run.png`.
+    Examples: `presage plot recordings/run.mcap --out run.png`; `presage plot run.mcap.active --json run.json`.
     """
     from presage.demo import plot_command  # noqa: PLC0415
+    from presage.inspection.choosing import stem_of  # noqa: PLC0415
 
-    plot_command(file, out or file.with_suffix(".png"), json_file, console)
+    plot_command(file, out or file.with_name(stem_of(file) + ".png"), json_file, console)
 
 
 @app.command()

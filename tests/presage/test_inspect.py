@@ -201,3 +201,12 @@ def test_the_commands_do_what_they_say(tmp_path):
         assert (tmp_path / made).stat().st_size > 0
     assert CliRunner().invoke(app, ["plot", str(path)]).exit_code == 0
     assert (tmp_path / "run.png").exists()
+
+
+def test_an_unfinished_recording_is_drawn_beside_itself(tmp_path):
+    path = driven.write(tmp_path / "run.mcap", finish=False)
+    done = CliRunner().invoke(app, ["plot", str(path), "--json", str(tmp_path / "run.json")])
+    assert done.exit_code == 0
+    assert "incomplete" in done.stdout
+    assert (tmp_path / "run.png").exists()
+    assert json.loads((tmp_path / "run.json").read_text())["scans"] == driven.STEPS
