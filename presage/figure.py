@@ -228,6 +228,9 @@ def _draw_errors(axes: Axes, session: Session) -> None:
         axes.semilogy(since[asked] * 1e-9, shown, color=GOAL, lw=1.4, label="distance to goal")
     _mark_moments(axes, session)
     _dress(axes, "d", "position error and distance to goal")
+    low, high = axes.get_ylim()
+    if high < 2 * low:  # all but constant: an axis of rounding errors says nothing
+        axes.set_ylim(low / 2, 2 * high)
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.grid(visible=True, which="minor", color="#EEEEEE", linewidth=0.4)
     axes.set(xlabel="time (s)", ylabel="distance (m)")
