@@ -151,6 +151,12 @@ class Goal(Stamped):
     cancel: bool = False  # forget the goal and stand
 
 
+class Drive(Stamped):
+    """A velocity steered by hand; it goes before any goal, for 0.5 s unless said again."""
+
+    twist: Twist  # base_link; zero for longer than 0.5 s: the goal counts again
+
+
 class CmdVel(Stamped):
     """A velocity command; its stamp is that of the scan it answers, so that an old one is known as old."""
 
@@ -160,7 +166,7 @@ class CmdVel(Stamped):
 class Status(Stamped):
     """What the controller is doing, and why."""
 
-    state: Literal["idle", "navigating", "reached", "blocked", "lost"]
+    state: Literal["idle", "navigating", "reached", "blocked", "lost", "manual"]  # manual: driven by hand
     reason: Text = ""
     goal: Pose | None = None  # base_link in map
     goal_seq: Count = 0  # which goal this is about
@@ -219,6 +225,12 @@ class ResetRequest(Request):
     seed: Count | None = None  # None keeps the seed
 
 
+class SpeedRequest(Request):
+    """How fast the simulation's clock runs in realtime pace."""
+
+    factor: Annotated[float, Field(allow_inf_nan=False, ge=0.1, le=20)]  # times wall time
+
+
 class ObstacleRequest(Request):
     """Change the furniture of a running simulator."""
 
@@ -266,6 +278,21 @@ class PlayerReply(Reply):
     duration_s: NotNegative = 0.0  # s, of the recording
     rate: NotNegative = 1.0  # times the original timing; 0: as fast as it goes
     loop: bool = False  # begins anew at its end
+
+
+class RecordRequest(Request):
+    """Begin or end a recording, or ask how it stands."""
+
+    action: Literal["start", "stop", "status"]  # stop: the file is complete; start: a new one
+
+
+class RecordReply(Reply):
+    """How the recorder stands after the request."""
+
+    recording: bool = False
+    file: Text = ""  # path as the recorder sees it: the one being written, or the last one; empty: none yet
+    messages: Count = 0  # in that file
+    seconds: NotNegative = 0.0  # s, wall time, since that file was begun; once complete, from begin to end
 
 
 class ConfigReply(Reply):

@@ -52,24 +52,30 @@ BELIEF = Topic("belief", m.Belief, "estimator", 15, "newest", about="where the e
 PREDICTION = Topic("prediction", m.Prediction, "estimator", 15, "newest", about="the scan expected at the belief")
 CMD_VEL = Topic("cmd_vel", m.CmdVel, "controller", 15, "newest", about="velocity command")
 GOAL = Topic("goal", m.Goal, "presage goal, viewer", 0, "newest", about="where to go")
+DRIVE = Topic("drive", m.Drive, "viewer", 0, "newest", about="velocity by hand, before any goal")
 STATUS = Topic("status", m.Status, "controller", 15, "newest", about="what the controller does, and why")
 HEALTH = Topic("health", m.Health, "every service", 1, "all", per_service=True, about="counters of a service")
 
-TOPICS: tuple[Topic, ...] = (SCAN, ODOM, TRUTH, BELIEF, PREDICTION, GOAL, CMD_VEL, STATUS, HEALTH)
+TOPICS: tuple[Topic, ...] = (SCAN, ODOM, TRUTH, BELIEF, PREDICTION, GOAL, DRIVE, CMD_VEL, STATUS, HEALTH)
 
 TELEPORT = Query("teleport", m.PoseRequest, m.Reply, "simulator", about="carry the robot to a pose")
 RESET = Query("reset", m.ResetRequest, m.Reply, "simulator", about="begin anew, with a seed")
 PAUSE = Query("pause", m.Request, m.Reply, "simulator", about="stop the simulation's clock")
 RESUME = Query("resume", m.Request, m.Reply, "simulator", about="let it run on")
+STEP = Query("step", m.Request, m.Reply, "simulator", about="while paused, one scan further")
+SPEED = Query("speed", m.SpeedRequest, m.Reply, "simulator", about="how fast the simulation's clock runs")
 OBSTACLE = Query("obstacle", m.ObstacleRequest, m.Reply, "simulator", about="add, move or remove furniture")
 SAMPLE = Query("sample", m.SampleRequest, m.SampleReply, "simulator", about="the scans seen from a batch of poses")
 WORLD = Query("world", m.Request, m.WorldReply, "simulator", about="world, scanner and robot as data")
 LOCALISE = Query("localise", m.LocaliseRequest, m.Reply, "estimator", about="begin localisation anew")
 PLAYER = Query("player", m.PlayerRequest, m.PlayerReply, "replay", about="pause, step, seek a replay")
+RECORDING = Query("recording", m.RecordRequest, m.RecordReply, "recorder", about="begin or end a recording")
 MODEL = Query("model", m.ModelRequest, m.ModelReply, "estimator", about="the model in use: card, map, weights")
 CONFIG = Query("config", m.Request, m.ConfigReply, "every service", per_service=True, about="effective configuration")
 
-QUERIES: tuple[Query, ...] = (TELEPORT, RESET, PAUSE, RESUME, OBSTACLE, SAMPLE, WORLD, LOCALISE, PLAYER, MODEL, CONFIG)
+QUERIES: tuple[Query, ...] = (
+    TELEPORT, RESET, PAUSE, RESUME, STEP, SPEED, OBSTACLE, SAMPLE, WORLD, LOCALISE, PLAYER, RECORDING, MODEL, CONFIG,
+)  # fmt: skip
 
 
 def alive_key(robot: str, service: str = "*") -> str:
