@@ -1,0 +1,52 @@
+// A canvas that is as sharp as the screen.
+
+/** Calls `resized` with each new size in CSS pixels; the context is scaled to them. */
+export function sharp(canvas, resized) {
+  const context = canvas.getContext("2d");
+  const state = { context, width: 0, height: 0 };
+  const fit = () => {
+    const ratio = window.devicePixelRatio || 1;
+    const { width, height } = canvas.getBoundingClientRect();
+    const w = Math.max(1, Math.round(width * ratio)), h = Math.max(1, Math.round(height * ratio));
+    if (canvas.width !== w || canvas.height !== h) {
+      canvas.width = w;
+      canvas.height = h;
+    }
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    Object.assign(state, { width, height });
+    resized(state);
+  };
+  new ResizeObserver(fit).observe(canvas);
+  fit();
+  return state;
+}
+
+/** A function that draws once in the next picture, however often it is asked; it may ask again. */
+export function eachPicture(draw) {
+  let asked = false;
+  return () => {
+    if (asked) return;
+    asked = true;
+    requestAnimationFrame((now) => {
+      asked = false;
+      draw(now);
+    });
+  };
+}
+
+/** Round tick values between two numbers, about `count` of them. */
+export function ticks(low, high, count) {
+  const raw = (high - low) / Math.max(1, count);
+  if (!(raw > 0) || !Number.isFinite(raw)) return [];
+  const power = 10 ** Math.floor(Math.log10(raw));
+  const step = [1, 2, 2.5, 5, 10].map((m) => m * power).find((s) => s >= raw * 0.999);
+  const values = [];
+  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + step * 1e-9; k++) values.push(k * step);
+  return values;
+}
+
+/** A tick's label: no more digits than its step needs. */
+export function tickLabel(value, step) {
+  const digits = Math.max(0, Math.ceil(-Math.log10(step) - 1e-9) + (Math.abs((step / 10 ** Math.floor(Math.log10(step))) - 2.5) < 1e-6 ? 1 : 0));
+  return (Math.abs(value) < step * 1e-6 ? 0 : value).toFixed(Math.min(6, digits)).replace("-", "−");
+}

@@ -1,0 +1,184 @@
+// The robot: as it believes, as it is, where else it might be, and where it wants to go.
+
+import { degrees, metres } from "./format.js";
+import { ellipse, niceAtLeast } from "./geometry.js";
+import { label } from "./draw_world.js";
+
+const VISIBLE = 16; // px, a smaller 2 sigma ellipse is drawn enlarged, and said so
+
+/** A path over the last minute, older parts fainter. */
+export function drawTrail(ctx, camera, path, colour, { dash = [], width = 2 } = {}) {
+  const parts = 6, size = Math.ceil(path.length / parts);
+  ctx.strokeStyle = colour;
+  ctx.lineWidth = width;
+  ctx.lineJoin = "round";
+  ctx.setLineDash(dash);
+  for (let k = 0; k < parts; k++) {
+    const from = Math.max(0, k * size - 1), until = Math.min(path.length, (k + 1) * size);
+    ctx.globalAlpha = 0.12 + (0.6 * (k + 1)) / parts;
+    ctx.beginPath();
+    let open = false;
+    for (let i = from; i < until; i++) {
+      const point = path[i];
+      const [px, py] = point ? camera.toScreen(point[0], point[1]) : [0, 0];
+      if (point) ctx[open && !point[2] ? "lineTo" : "moveTo"](px, py);
+      open = point !== null;
+    }
+    ctx.stroke();
+  }
+  ctx.setLineDash([]);
+  ctx.globalAlpha = 1;
+}
+
+/** The round body with a wedge ahead; never so small that it is lost. */
+export function drawBody(ctx, camera, pose, radius, { stroke, fill, dash = [], width = 2, alpha = 1 }) {
+  const [px, py] = camera.toScreen(pose.x, pose.y);
+  const r = Math.max(radius * camera.scale, 7);
+  ctx.save();
+  ctx.translate(px, py);
+  ctx.rotate(-pose.yaw);
+  ctx.globalAlpha = alpha;
+  ctx.beginPath();
+  ctx.arc(0, 0, r, 0, 2 * Math.PI);
+  if (fill) {
+    ctx.fillStyle = fill;
+    ctx.globalAlpha = alpha * 0.2;
+    ctx.fill();
+    ctx.globalAlpha = alpha;
+  }
+  ctx.setLineDash(dash);
+  ctx.lineWidth = width;
+  ctx.strokeStyle = stroke;
+  ctx.stroke();
+  ctx.setLineDash([]);
+  ctx.beginPath();
+  ctx.moveTo(r * 0.92, 0);
+  ctx.lineTo(r * 0.28, r * 0.4);
+  ctx.lineTo(r * 0.28, -r * 0.4);
+  ctx.closePath();
+  if (fill) {
+    ctx.fillStyle = stroke;
+    ctx.fill();
+  } else ctx.stroke();
+  ctx.restore();
+}
+
+/** Two standard deviations of the position; returns the factor it is enlarged by. */
+export function drawCovariance(ctx, camera, pose, cov, colour, { enlarge = true, alpha = 1 } = {}) {
+  const { major, minor, angle } = ellipse(cov);
+  const size = 2 * major * camera.scale;
+  const factor = enlarge && size > 0 && size < VISIBLE ? niceAtLeast(VISIBLE / size) : 1;
+  const [px, py] = camera.toScreen(pose.x, pose.y);
+  ctx.beginPath();
+  ctx.ellipse(px, py, Math.max(size * factor, 0.5), Math.max(2 * minor * camera.scale * factor, 0.5), -angle, 0, 2 * Math.PI);
+  ctx.fillStyle = ctx.strokeStyle = colour;
+  ctx.globalAlpha = 0.16 * alpha;
+  ctx.fill();
+  ctx.globalAlpha = 0.9 * alpha;
+  ctx.lineWidth = 1.25;
+  ctx.setLineDash(factor > 1 ? [3, 2] : []);
+  ctx.stroke();
+  ctx.setLineDash([]);
+  ctx.globalAlpha = 1;
+  return factor;
+}
+
+/** The believed pose, its ellipse and what is to be said beside it. */
+export function drawBelief(ctx, camera, frame, radius, colours) {
+  const { belief } = frame;
+  const vague = belief.state !== "tracking";
+  drawBody(ctx, camera, belief, radius, { stroke: colours.predicted, fill: colours.predicted, dash: vague ? [5, 3] : [] });
+  const factor = belief.cov ? drawCovariance(ctx, camera, belief, belief.cov, colours.predicted) : 1;
+  const [px, py] = camera.toScreen(belief.x, belief.y);
+  const beside = px + Math.max(radius * camera.scale, VISIBLE) + 9;
+  if (factor > 1) label(ctx, `2σ × ${factor}`, beside, py - 7, colours, { colour: colours.predicted, size: 10.5 });
+  if (frame.error > 0.1) label(ctx, `${metres(frame.error)} off`, beside, py + 7, colours, { size: 10.5 });
+}
+
+/** The true pose, and a line to what is believed where the two differ. */
+export function drawTruth(ctx, camera, frame, radius, colours) {
+  const { truth, belief } = frame;
+  if (belief && frame.error > radius) {
+    ctx.beginPath();
+    ctx.moveTo(...camera.toScreen(truth.x, truth.y));
+    ctx.lineTo(...camera.toScreen(belief.x, belief.y));
+    ctx.strokeStyle = colours.truth;
+    ctx.globalAlpha = 0.45;
+    ctx.lineWidth = 1;
+    ctx.setLineDash([2, 4]);
+    ctx.stroke();
+    ctx.setLineDash([]);
+    ctx.globalAlpha = 1;
+  }
+  drawBody(ctx, camera, truth, radius, { stroke: colours.truth, dash: [3, 3], width: 1.6 });
+}
+
+/** The mixture's other modes: the heavier, the stronger. */
+export function drawHypotheses(ctx, camera, frame, radius, colours) {
+  const all = frame.belief.hypotheses ?? [];
+  if (all.length < 2) return;
+  for (const one of [...all].reverse()) {
+    const alpha = 0.25 + 0.75 * Math.sqrt(one.weight);
+    if (one.cov) drawCovariance(ctx, camera, one, one.cov, colours.hypothesis, { enlarge: false, alpha });
+    drawBody(ctx, camera, one, radius, { stroke: colours.hypothesis, fill: colours.hypothesis, width: 1 + 2 * one.weight, alpha });
+    const [px, py] = camera.toScreen(one.x, one.y);
+    const above = py - Math.max(radius * camera.scale, 7) - 9;
+    if (one.weight >= 0.01) label(ctx, `${Math.round(one.weight * 100)} %`, px, above, colours, { align: "center", colour: colours.hypothesis });
+  }
+}
+
+/** The goal with its tolerance, and the way to it. */
+export function drawGoal(ctx, camera, goal, from, colours, { tolerance, planned = false } = {}) {
+  const [px, py] = camera.toScreen(goal.x, goal.y);
+  ctx.strokeStyle = ctx.fillStyle = colours.goal;
+  if (from && !planned) {
+    ctx.globalAlpha = 0.55;
+    ctx.lineWidth = 1.25;
+    ctx.setLineDash([2, 5]);
+    ctx.beginPath();
+    ctx.moveTo(...camera.toScreen(from.x, from.y));
+    ctx.lineTo(px, py);
+    ctx.stroke();
+    ctx.setLineDash([]);
+  }
+  ctx.beginPath();
+  ctx.arc(px, py, Math.max((tolerance ?? 0.2) * camera.scale, 8), 0, 2 * Math.PI);
+  ctx.globalAlpha = 0.14;
+  ctx.fill();
+  ctx.globalAlpha = 1;
+  ctx.lineWidth = 1.75;
+  ctx.setLineDash(planned ? [4, 3] : []);
+  ctx.stroke();
+  ctx.setLineDash([]);
+  ctx.beginPath();
+  ctx.arc(px, py, 2.5, 0, 2 * Math.PI);
+  ctx.fill();
+  if (Number.isFinite(goal.yaw)) drawHeading(ctx, px, py, goal.yaw, Math.max(0.45 * camera.scale, 24));
+}
+
+/** An arrow from a point in pixels. */
+export function drawHeading(ctx, px, py, yaw, length) {
+  const tx = px + length * Math.cos(yaw), ty = py - length * Math.sin(yaw);
+  ctx.lineWidth = 2;
+  ctx.lineCap = "round";
+  ctx.beginPath();
+  ctx.moveTo(px, py);
+  ctx.lineTo(tx, ty);
+  for (const side of [2.6, -2.6]) {
+    ctx.moveTo(tx, ty);
+    ctx.lineTo(tx + 8 * Math.cos(yaw + side), ty - 8 * Math.sin(yaw + side));
+  }
+  ctx.stroke();
+}
+
+/** What a belief amounts to, in a few words. */
+export function describeBelief(belief) {
+  if (belief.state === "tracking" && belief.cov) {
+    return `± ${metres(2 * ellipse(belief.cov).major)}, ± ${degrees(2 * Math.sqrt(Math.max(0, belief.cov[8])), 1)}`;
+  }
+  const rivals = (belief.hypotheses ?? []).filter((one) => one.weight > 0.02).length;
+  if (belief.state === "ambiguous") return rivals > 1 ? `${rivals} places would explain the scan` : "more than one place would explain the scan";
+  if (belief.state === "lost") return "the scan is not what this place predicts";
+  if (belief.state === "localising") return "searching the whole map";
+  return belief.estimator ?? "";
+}

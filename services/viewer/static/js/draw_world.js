@@ -1,0 +1,111 @@
+// Walls, furniture, grid and scale: what holds still.
+
+import { boundsOf, middle, ring } from "./geometry.js";
+
+/** A path of world points, closed. */
+function trace(ctx, camera, points) {
+  points.forEach(([x, y], i) => ctx[i ? "lineTo" : "moveTo"](...camera.toScreen(x, y)));
+  ctx.closePath();
+}
+
+/** The free floor with a grid of metres, clipped to the walls. */
+export function drawFloor(ctx, camera, world, colours) {
+  const step = [0.5, 1, 5, 10, 50].find((s) => s * camera.scale >= 26) ?? 100;
+  ctx.save();
+  ctx.beginPath();
+  trace(ctx, camera, world.boundary);
+  ctx.fillStyle = colours.free;
+  ctx.fill();
+  ctx.clip();
+  const [x0, y0, x1, y1] = boundsOf(world.boundary);
+  ctx.beginPath();
+  for (let x = Math.ceil(x0 / step) * step; x < x1; x += step) line(ctx, camera.toScreen(x, y0), camera.toScreen(x, y1));
+  for (let y = Math.ceil(y0 / step) * step; y < y1; y += step) line(ctx, camera.toScreen(x0, y), camera.toScreen(x1, y));
+  ctx.strokeStyle = colours.grid;
+  ctx.lineWidth = 1;
+  ctx.stroke();
+  ctx.restore();
+}
+
+function line(ctx, [ax, ay], [bx, by]) {
+  ctx.moveTo(Math.round(ax) + 0.5, Math.round(ay) + 0.5);
+  ctx.lineTo(Math.round(bx) + 0.5, Math.round(by) + 0.5);
+}
+
+/** Walls and obstacles; `ghost` stands in for the obstacle of its name while it is dragged. */
+export function drawWalls(ctx, camera, world, colours, { selected, hovered, ghost }) {
+  for (const obstacle of world.obstacles) {
+    drawObstacle(ctx, camera, ghost?.name && ghost.name === obstacle.name ? ghost : obstacle, colours, {
+      selected: selected === obstacle.name && selected !== "",
+      hovered: hovered === obstacle.name && hovered !== "",
+    });
+  }
+  ctx.beginPath();
+  trace(ctx, camera, world.boundary);
+  ctx.strokeStyle = colours.wall;
+  ctx.lineWidth = 3;
+  ctx.lineJoin = "miter";
+  ctx.stroke();
+}
+
+function outline(ctx, camera, obstacle) {
+  ctx.beginPath();
+  if (obstacle.circle) {
+    const [px, py] = camera.toScreen(...obstacle.circle.center);
+    ctx.arc(px, py, obstacle.circle.radius * camera.scale, 0, 2 * Math.PI);
+  } else trace(ctx, camera, ring(obstacle));
+}
+
+function drawObstacle(ctx, camera, obstacle, colours, { selected, hovered }) {
+  outline(ctx, camera, obstacle);
+  ctx.fillStyle = colours.obstacle;
+  ctx.fill();
+  ctx.strokeStyle = selected || hovered ? colours.accent : colours["obstacle-line"];
+  ctx.lineWidth = selected ? 2.5 : 1.25;
+  ctx.stroke();
+  if (!selected) return;
+  const [px, py] = camera.toScreen(...middle(obstacle));
+  label(ctx, obstacle.name, px, py, colours, { align: "center" });
+}
+
+/** An obstacle that is not there yet. */
+export function drawPlan(ctx, camera, obstacle, colours) {
+  outline(ctx, camera, obstacle);
+  ctx.setLineDash([4, 3]);
+  ctx.strokeStyle = colours.accent;
+  ctx.lineWidth = 1.5;
+  ctx.stroke();
+  ctx.setLineDash([]);
+}
+
+/** Metres along the left and lower wall. */
+export function drawRulers(ctx, camera, world, colours) {
+  const [x0, y0, x1, y1] = boundsOf(world.boundary);
+  const step = [1, 2, 5, 10, 20, 50].find((s) => s * camera.scale >= 56) ?? 100;
+  ctx.fillStyle = colours["ink-3"];
+  ctx.font = `10.5px ${colours.sans}`;
+  ctx.textAlign = "center";
+  ctx.textBaseline = "top";
+  const bottom = Math.min(camera.toScreen(x0, y0)[1] + 6, camera.height - 16);
+  for (let x = Math.ceil(x0 / step) * step; x <= x1 + 1e-9; x += step) ctx.fillText(`${x}`, camera.toScreen(x, y0)[0], bottom);
+  ctx.textAlign = "right";
+  ctx.textBaseline = "middle";
+  const left = Math.max(camera.toScreen(x0, y0)[0] - 7, 16);
+  for (let y = Math.ceil(y0 / step) * step; y <= y1 + 1e-9; y += step) {
+    const py = camera.toScreen(x0, y)[1];
+    ctx.fillText(y === 0 && x0 === 0 ? "0 m" : `${y}`, left, py);
+  }
+}
+
+/** Small words that stay readable over anything. */
+export function label(ctx, text, x, y, colours, { align = "left", colour = colours.ink, size = 11 } = {}) {
+  ctx.font = `550 ${size}px ${colours.sans}`;
+  ctx.textAlign = align;
+  ctx.textBaseline = "middle";
+  ctx.lineJoin = "round";
+  ctx.lineWidth = 3.5;
+  ctx.strokeStyle = colours.free;
+  ctx.strokeText(text, x, y);
+  ctx.fillStyle = colour;
+  ctx.fillText(text, x, y);
+}

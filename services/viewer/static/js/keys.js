@@ -1,0 +1,49 @@
+// The keyboard.
+
+import { $, h } from "./dom.js";
+
+const HELP = [
+  ["click, drag", "set a goal, with a heading"], ["shift + click", "carry the robot off"], ["right drag, two fingers", "move the view"],
+  ["W A S D, arrows", "drive; Q and E sideways, shift faster"], ["space", "pause, or go on"], [".", "one scan further, while paused"],
+  ["G C O V", "goal, carry, obstacle, look"], ["X", "forget the goal"], ["L", "localise from nothing"], ["R", "record, or stop"],
+  ["T", "show or hide the true pose"], ["F", "follow the robot"], ["+ − 0", "zoom, and the whole world"],
+  ["Del, [ ]", "remove or turn the chosen obstacle"], ["Esc", "never mind"], ["?", "this"],
+];
+
+export function startKeys({ store, view, modes, actions, drive, player, toolbar }) {
+  const list = $("shortcuts");
+  for (const [keys, text] of HELP) list.append(h("dt", {}, h("kbd", {}, keys)), h("dd", {}, text));
+  const help = () => $("help-dialog").showModal();
+  $("help-button").addEventListener("click", help);
+  for (const dialog of document.querySelectorAll("dialog")) {
+    dialog.querySelector("[data-close]").addEventListener("click", () => dialog.close());
+    dialog.addEventListener("click", (event) => event.target === dialog && dialog.close());
+  }
+  const live = (run) => () => modes.can && run();
+  const turn = (angle) => live(() => modes.selected && !modes.selected.circle && actions.turnObstacle(modes.selected, angle));
+  const remove = live(() => modes.selected && actions.removeObstacle(modes.selected.name));
+  const commands = {
+    " ": () => (store.player ? player.toggle() : modes.can && toolbar.togglePause()),
+    ".": () => (store.player ? player.ask("step") : modes.can && toolbar.standing && actions.step()),
+    g: () => modes.set("goal"), c: () => modes.set("carry"), o: () => modes.set("obstacle"), v: () => modes.set("look"),
+    x: live(() => actions.cancel()), l: live(() => actions.localise()), r: live(() => actions.record(actions.recording ? "stop" : "start")),
+    t: () => view.show("truth", !view.shown.truth), f: () => view.follow(!view.camera.follow),
+    "+": () => view.zoom(1.35), "=": () => view.zoom(1.35), "-": () => view.zoom(1 / 1.35), "0": () => view.fit(),
+    delete: remove, backspace: remove, "[": turn(Math.PI / 12), "]": turn(-Math.PI / 12),
+    escape: () => { modes.cancel(); modes.select(""); }, "?": help,
+  };
+  addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]") || typing(event)) return;
+    const command = commands[event.key.toLowerCase()];
+    if (command && !event.repeat) command();
+    if (command || (modes.can && drive.press(event))) event.preventDefault();
+  });
+  addEventListener("keyup", (event) => drive.lift(event));
+}
+
+/** Whether the key belongs to the element that has the focus. */
+function typing({ target, key }) {
+  if (!(target instanceof Element)) return false;
+  if (target.matches("input:not([type=checkbox]), select, textarea")) return true;
+  return target.matches("button, a, input, .scroll") && (key === " " || key === "Enter" || (key.startsWith("Arrow") && target.matches(".scroll, [role=radio]")));
+}

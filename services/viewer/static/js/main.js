@@ -1,0 +1,159 @@
+// Puts the page together: the socket fills the store, the store is drawn.
+
+import { Actions } from "./actions.js";
+import { eachPicture } from "./canvas.js";
+import { Connection } from "./connection.js";
+import { $, h, remembered, setText } from "./dom.js";
+import { Drive } from "./drive.js";
+import { boundsOf } from "./geometry.js";
+import { startKeys } from "./keys.js";
+import { MapView } from "./map.js";
+import { Modes } from "./modes.js";
+import { Panels } from "./panels.js";
+import { Player } from "./player.js";
+import { Services } from "./services.js";
+import { Store } from "./store.js";
+import { startTheme } from "./theme.js";
+import { toast } from "./toasts.js";
+import { Toolbar } from "./toolbar.js";
+
+const store = new Store();
+const view = new MapView(store);
+const panels = new Panels(store);
+const services = new Services(store, toast);
+const connection = new Connection({ message: take, frame: takeFrame, state: connectionChanged });
+const actions = new Actions(store, connection, toast);
+const modes = new Modes(store, view, actions);
+const toolbar = new Toolbar(store, modes, actions);
+const drive = new Drive(store, actions, () => modes.can);
+const player = new Player(store, connection, toast);
+const draw = eachPicture(() => panels.draw());
+let layout = remembered("layout"); // "wide", "side", or by the world's shape
+let wanted = new URLSearchParams(location.search).get("robot");
+
+startTheme(() => {
+  view.invalidate();
+  draw();
+});
+startKeys({ store, view, modes, actions, drive, player, toolbar });
+$("robot").addEventListener("change", () => {
+  wanted = $("robot").value;
+  store.clear();
+  actions.watch(wanted);
+  redraw();
+});
+$("banner-retry").addEventListener("click", () => connection.retry());
+$("layout").addEventListener("click", () => {
+  layout = $("main").dataset.layout === "wide" ? "side" : "wide";
+  remembered("layout", layout);
+  arrange();
+});
+setInterval(() => {
+  toolbar.draw();
+  services.drawMissing();
+  panels.drawVitals();
+}, 500);
+
+/** A message of the server; one that is unknown is newer than this page. */
+function take(message) {
+  const known = {
+    hello: takeHello, world: takeWorld, services: takeServices, history: takeHistory, player: takePlayer, closed: takeClosed,
+  }[message.type];
+  known?.(message);
+}
+
+function takeHello(hello) {
+  const first = !store.connected;
+  const moved = store.hello && store.hello.robot !== hello.robot;
+  if (moved) store.clear();
+  if (first) Object.assign(store, { player: null, servicesKnown: false });
+  store.hello = hello;
+  store.connected = true;
+  const names = hello.robots.includes(hello.robot) || !hello.robot ? hello.robots : [hello.robot, ...hello.robots];
+  $("robot").replaceChildren(...names.map((name) => h("option", { value: name }, name)));
+  $("robot").value = hello.robot ?? "";
+  $("robot").parentElement.hidden = names.length < 1;
+  $("robot").disabled = names.length < 2;
+  if (first && wanted && wanted !== hello.robot && names.includes(wanted)) actions.watch(wanted);
+  else wanted = hello.robot;
+  if (first && hello.control) actions.recordStatus();
+  $("joystick").hidden = !hello.control || !matchMedia("(pointer: coarse)").matches;
+  redraw();
+}
+
+function takeWorld({ world, scanner, robot }) {
+  const before = store.world;
+  Object.assign(store, { world, scanner, robot });
+  if (!before || before.name !== world.name || String(before.boundary) !== String(world.boundary)) {
+    arrange();
+    view.fit();
+  }
+  if (view.gesture.selected && !modes.selected) modes.select("");
+  redraw();
+}
+
+function takeServices({ services: rows, missing }) {
+  Object.assign(store, { services: rows, missing: missing ?? [], servicesKnown: true });
+  services.draw();
+  draw();
+}
+
+function takeHistory({ samples }) {
+  store.takeHistory(samples);
+  draw();
+}
+
+function takeFrame(frame) {
+  const before = store.frame;
+  store.takeFrame(frame, performance.now());
+  if (before && frame.t > before.t && store.paused) {
+    if (!store.stepped) store.paused = false; // somebody else let it run
+    store.stepped = false;
+  }
+  const state = frame.belief?.state ?? frame.status?.state ?? "";
+  const title = `${frame.robot}${state ? ` · ${state}` : ""} · presage`;
+  if (document.title !== title) document.title = title;
+  view.invalidate();
+  draw();
+}
+
+function takePlayer(state) {
+  const opened = !store.player;
+  store.player = state;
+  player.draw();
+  if (opened) toolbar.draw();
+}
+
+function takeClosed({ reason }) {
+  store.player = null;
+  if (reason) toast(reason, false);
+  redraw();
+}
+
+function connectionChanged(state, wait) {
+  if (state === "waiting") {
+    drive.stop();
+    store.connected = false;
+    store.player = null;
+    setText($("banner-text"), `No connection to the viewer. Trying again ${wait < 1000 ? "now" : `in ${Math.round(wait / 1000)} s`}…`);
+  } else if (!$("banner").hidden) toast("Connected again");
+  $("banner").hidden = state === "open";
+  document.body.dataset.connection = state;
+  redraw();
+}
+
+function arrange() {
+  const [x0, y0, x1, y1] = store.world ? boundsOf(store.world.boundary) : [0, 0, 2, 1];
+  $("main").dataset.layout = layout ?? ((x1 - x0) / (y1 - y0) > 1.9 ? "wide" : "side");
+}
+
+function redraw() {
+  player.draw();
+  toolbar.draw();
+  services.draw();
+  view.invalidate();
+  draw();
+}
+
+// For tests and the curious: what the page knows.
+window.presage = { store, view, connection, modes, actions };

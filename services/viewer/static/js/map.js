@@ -1,0 +1,131 @@
+// The map: draws the store through the camera, only when something changed.
+
+import { Camera } from "./camera.js";
+import { eachPicture, sharp } from "./canvas.js";
+import { $, h, remembered, stillness } from "./dom.js";
+import * as robot from "./draw_belief.js";
+import * as scan from "./draw_scan.js";
+import * as ground from "./draw_world.js";
+import { boundsOf } from "./geometry.js";
+import { palette } from "./theme.js";
+
+const LAYERS = [
+  { key: "measured", label: "measured scan", tone: "measured", mark: "dots" },
+  { key: "predicted", label: "predicted scan", tone: "predicted", mark: "line" },
+  { key: "belief", label: "believed pose", tone: "predicted", mark: "disc" },
+  { key: "hypotheses", label: "hypotheses", tone: "hypothesis", mark: "disc" },
+  { key: "truth", label: "true pose", tone: "truth", mark: "ring" },
+  { key: "path", label: "path, last minute", tone: "predicted", mark: "trail" },
+  { key: "goal", label: "goal", tone: "goal", mark: "disc" },
+];
+
+export class MapView {
+  constructor(store) {
+    this.store = store;
+    this.camera = new Camera();
+    this.shown = Object.fromEntries(LAYERS.map(({ key }) => [key, remembered(`layer.${key}`) !== "off"]));
+    this.gesture = {}; // what the pointer is doing: ghost, plan, goal, carry, hovered, selected
+    this.invalidate = eachPicture(() => this.draw());
+    this.surface = sharp($("map"), ({ width, height }) => {
+      this.camera.padding = width < 600
+        ? { left: 26, right: 16, top: 12, bottom: 112 }
+        : { left: 34, right: 34, top: 30, bottom: 118 };
+      this.camera.resize(width, height);
+      this.invalidate();
+    });
+    this.buildLegend();
+    this.buildZoom();
+  }
+
+  buildLegend() {
+    for (const { key, label, tone, mark } of LAYERS) {
+      const box = h("input", { type: "checkbox", onchange: () => this.show(key, box.checked) });
+      box.checked = this.shown[key];
+      const swatch = h("i", { data: { mark }, "aria-hidden": "true" });
+      swatch.style.setProperty("--tone", `var(--${tone})`);
+      $("legend").append(h("label", { data: { layer: key } }, box, swatch, h("span", {}, label)));
+    }
+  }
+
+  show(key, shown) {
+    this.shown[key] = shown;
+    remembered(`layer.${key}`, shown ? "on" : "off");
+    const box = $("legend").querySelector(`[data-layer="${key}"] input`);
+    box.checked = shown;
+    this.invalidate();
+  }
+
+  buildZoom() {
+    const { camera } = this;
+    const zoom = (factor) => () => this.zoom(factor);
+    $("zoom-in").addEventListener("click", zoom(1.35));
+    $("zoom-out").addEventListener("click", zoom(1 / 1.35));
+    $("fit").addEventListener("click", () => this.fit());
+    $("follow").addEventListener("click", () => this.follow(!camera.follow));
+  }
+
+  zoom(factor) {
+    this.camera.zoomAt(this.camera.width / 2, this.camera.height / 2, factor);
+    this.invalidate();
+  }
+
+  fit() {
+    if (this.store.world) this.camera.fit(boundsOf(this.store.world.boundary));
+    this.invalidate();
+  }
+
+  follow(on) {
+    this.camera.follow = on;
+    if (on && this.camera.scale < 60) this.camera.zoomAt(this.camera.width / 2, this.camera.height / 2, 60 / this.camera.scale);
+    this.invalidate();
+  }
+
+  get radius() {
+    return this.store.robot?.radius ?? 0.27;
+  }
+
+  draw() {
+    const { context: ctx, width, height } = this.surface;
+    const { store, camera, shown, gesture } = this;
+    const colours = palette(), { world, frame } = store;
+    if ($("follow").getAttribute("aria-pressed") !== String(camera.follow)) $("follow").setAttribute("aria-pressed", camera.follow);
+    const centre = frame?.belief ?? frame?.truth;
+    if (camera.follow && centre && camera.approach(centre.x, centre.y, stillness.matches)) this.invalidate();
+    ctx.fillStyle = colours.outside;
+    ctx.fillRect(0, 0, width, height);
+    ctx.globalAlpha = store.connected ? 1 : 0.45;
+    if (world) {
+      ground.drawFloor(ctx, camera, world, colours);
+      ground.drawRulers(ctx, camera, world, colours);
+    }
+    const pose = frame ? scan.scannerPose(frame) : null;
+    if (pose && shown.measured) scan.drawFan(ctx, camera, frame, pose, colours);
+    if (world) ground.drawWalls(ctx, camera, world, colours, gesture);
+    if (frame) this.drawRobot(ctx, frame, pose, colours);
+    this.drawGesture(ctx, colours);
+    ctx.globalAlpha = 1;
+  }
+
+  drawRobot(ctx, frame, pose, colours) {
+    const { store, camera, shown, radius } = this;
+    if (shown.path) {
+      if (shown.truth) robot.drawTrail(ctx, camera, store.trail.truth, colours.truth, { width: 1.25, dash: [4, 4] });
+      robot.drawTrail(ctx, camera, store.trail.belief, colours.predicted);
+    }
+    if (pose && shown.predicted) scan.drawPredicted(ctx, camera, frame, pose, colours);
+    if (pose && shown.measured) scan.drawMeasured(ctx, camera, frame, pose, colours);
+    const goal = frame.status?.goal;
+    if (shown.goal && goal) robot.drawGoal(ctx, camera, goal, frame.belief ?? frame.truth, colours, { tolerance: goal.tolerance });
+    if (frame.belief && shown.hypotheses) robot.drawHypotheses(ctx, camera, frame, radius, colours);
+    if (frame.belief && shown.belief) robot.drawBelief(ctx, camera, frame, radius, colours);
+    if (frame.truth && shown.truth) robot.drawTruth(ctx, camera, frame, radius, colours);
+  }
+
+  /** What a drag is about to do. */
+  drawGesture(ctx, colours) {
+    const { gesture, camera, radius } = this;
+    if (gesture.goal) robot.drawGoal(ctx, camera, gesture.goal, null, colours, { planned: true });
+    if (gesture.carry) robot.drawBody(ctx, camera, gesture.carry, radius, { stroke: colours.accent, fill: colours.accent, dash: [4, 3] });
+    if (gesture.plan) ground.drawPlan(ctx, camera, gesture.plan, colours);
+  }
+}

@@ -1,0 +1,145 @@
+// What the pointer on the map does: set a goal, carry the robot off, move furniture, or only look.
+
+import { $, remembered } from "./dom.js";
+import { distance, moved } from "./geometry.js";
+
+const GRIP = 8; // px around an obstacle that still take hold of it
+const MOVE_EVERY = 180; // ms between two moves of a dragged obstacle
+
+export class Modes {
+  constructor(store, view, actions) {
+    Object.assign(this, { store, view, actions });
+    this.shape = "box";
+    this.size = 0.5; // m
+    this.changed = () => {};
+    this.set(remembered("mode") ?? "goal");
+    for (const button of document.querySelectorAll("[data-mode]")) {
+      button.addEventListener("click", () => this.set(button.dataset.mode));
+    }
+  }
+
+  set(name) {
+    this.name = ["goal", "carry", "obstacle", "look"].includes(name) ? name : "goal";
+    remembered("mode", this.name);
+    for (const button of document.querySelectorAll("[data-mode]")) {
+      button.setAttribute("aria-checked", button.dataset.mode === this.name);
+    }
+    if (this.name !== "obstacle") this.select("");
+    this.cancel();
+    $("map").style.cursor = this.name === "look" ? "grab" : "crosshair";
+    this.changed();
+  }
+
+  get can() {
+    return this.store.control && !this.store.player && this.store.connected;
+  }
+
+  get gesture() {
+    return this.view.gesture;
+  }
+
+  select(name) {
+    this.gesture.selected = name;
+    this.changed();
+    this.view.invalidate();
+  }
+
+  get selected() {
+    return this.obstacles.find((one) => one.name && one.name === this.gesture.selected) ?? null;
+  }
+
+  get obstacles() {
+    return this.store.world?.obstacles ?? [];
+  }
+
+  /** The obstacle under a point, where it may be taken hold of. */
+  grip(point) {
+    if (!this.can || point.shift || this.name === "look" || this.name === "carry") return null;
+    const reach = (this.name === "obstacle" ? GRIP : 1) / this.view.camera.scale;
+    return this.obstacles.findLast((one) => one.name && distance(one, point.x, point.y) <= reach) ?? null;
+  }
+
+  hover(point) {
+    const held = point && this.grip(point);
+    const name = held?.name ?? "";
+    if (this.gesture.hovered !== name) {
+      this.gesture.hovered = name;
+      this.view.invalidate();
+    }
+    const plan = point && !held && this.can && this.name === "obstacle" ? this.planned(point.x, point.y) : null;
+    if (plan || this.gesture.plan) this.view.invalidate();
+    this.gesture.plan = plan;
+    return held || this.name === "look" || !this.can ? "grab" : "crosshair";
+  }
+
+  begin(point) {
+    if (this.name === "look" || !this.can) return "pan";
+    this.held = this.grip(point);
+    if (this.held) this.select(this.held.name);
+    return "";
+  }
+
+  drag(point, start) {
+    const heading = Math.atan2(point.y - start.y, point.x - start.x);
+    const pose = { x: start.x, y: start.y, yaw: heading };
+    if (this.held) {
+      this.gesture.ghost = moved(this.held, point.x - start.x, point.y - start.y);
+      this.push(false);
+    } else if (this.name === "carry" || start.shift) this.gesture.carry = pose;
+    else if (this.name === "goal") this.gesture.goal = pose;
+  }
+
+  /** The dragged obstacle's place to the simulator, one question at a time. */
+  push(last) {
+    const now = performance.now(), { ghost } = this.gesture;
+    if (!ghost) return;
+    if (last) this.actions.moveObstacle(ghost, true).then(() => this.letGo(ghost));
+    else if (!this.moving && now - (this.movedAt ?? 0) > MOVE_EVERY) {
+      this.movedAt = now;
+      this.moving = true;
+      this.actions.moveObstacle(ghost, false).then(() => { this.moving = false; });
+    }
+  }
+
+  letGo(ghost) {
+    if (this.gesture.ghost === ghost) this.gesture.ghost = null;
+    this.view.invalidate();
+  }
+
+  end(point, start, clicked) {
+    const { goal, carry } = this.gesture;
+    this.gesture.goal = this.gesture.carry = null;
+    if (this.held) {
+      if (!clicked) this.push(true);
+      this.held = null;
+    } else if (this.name === "carry" || start.shift) {
+      this.actions.teleport(carry ?? { x: start.x, y: start.y, yaw: this.yaw() });
+    } else if (this.name === "goal") this.actions.goal(goal ?? { x: start.x, y: start.y });
+    else if (this.name === "obstacle" && clicked) {
+      if (this.gesture.selected) this.select("");
+      else this.actions.addObstacle(this.planned(start.x, start.y));
+    }
+  }
+
+  cancel() {
+    Object.assign(this.gesture, { goal: null, carry: null, plan: null, ghost: null });
+    this.held = null;
+    this.view.invalidate();
+  }
+
+  yaw() {
+    return this.store.frame?.truth?.yaw ?? this.store.frame?.belief?.yaw ?? 0;
+  }
+
+  /** A new obstacle of the chosen shape, with a name that is free. */
+  planned(x, y) {
+    const round = (value) => Math.round(value * 100) / 100;
+    const taken = new Set(this.obstacles.map((one) => one.name));
+    let n = 1;
+    while (taken.has(`${this.shape}-${n}`)) n += 1;
+    const center = [round(x), round(y)], name = `${this.shape}-${n}`;
+    return this.shape === "circle"
+      ? { name, circle: { center, radius: this.size / 2 } }
+      : { name, box: { center, size: [this.size, this.size], yaw_deg: 0 } };
+  }
+}

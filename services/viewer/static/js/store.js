@@ -1,0 +1,106 @@
+// What the page knows: the newest of everything, and the last minute.
+
+export const WINDOW = 60; // s of history
+const SERIES = ["free_energy", "accuracy", "complexity", "error", "speed"];
+const JUMP = 0.4; // m between two frames: carried off, no path between them
+
+const nan = (value) => (value === null || value === undefined ? NaN : value);
+
+export class Store {
+  constructor() {
+    this.hello = null;
+    this.connected = false;
+    this.clear();
+  }
+
+  /** Forget the robot that was watched. */
+  clear() {
+    this.world = this.scanner = this.robot = this.frame = null;
+    this.services = [];
+    this.missing = [];
+    this.servicesKnown = false;
+    this.player = null;
+    this.paused = false;
+    this.arrivals = [];
+    this.forget();
+  }
+
+  /** Forget the history alone. */
+  forget() {
+    this.history = Object.fromEntries(["t", ...SERIES].map((name) => [name, []]));
+    this.trail = { t: [], belief: [], truth: [] };
+    this.events = []; // {t, state}: the estimator's changes of mind
+  }
+
+  get control() {
+    return Boolean(this.hello?.control);
+  }
+
+  get hasWorld() {
+    return this.world !== null;
+  }
+
+  /** Hz over the last arrivals, 0 where none came for two seconds. */
+  rate(now) {
+    const times = this.arrivals;
+    if (times.length < 2 || now - times[times.length - 1] > 2000) return 0;
+    return ((times.length - 1) * 1000) / (times[times.length - 1] - times[0]);
+  }
+
+  takeHistory(samples) {
+    this.forget();
+    this.history.t = [...samples.t];
+    for (const name of SERIES) this.history[name] = (samples[name] ?? []).map(nan);
+  }
+
+  takeFrame(frame, now) {
+    const before = this.frame;
+    if (before && frame.robot !== before.robot) this.forget();
+    this.frame = frame;
+    this.arrivals.push(now);
+    while (this.arrivals.length > 45 || now - this.arrivals[0] > 3000) this.arrivals.shift();
+    this.cut(frame.t);
+    const { history } = this;
+    history.t.push(frame.t);
+    history.free_energy.push(nan(frame.belief?.free_energy));
+    history.accuracy.push(nan(frame.belief?.accuracy));
+    history.complexity.push(nan(frame.belief?.complexity));
+    history.error.push(nan(frame.error));
+    history.speed.push(nan(frame.speed ?? speedOf(frame.odom)));
+    this.trail.t.push(frame.t);
+    this.trail.belief.push(step(this.trail.belief, frame.belief));
+    this.trail.truth.push(step(this.trail.truth, frame.truth));
+    if (before?.belief && frame.belief && before.belief.state !== frame.belief.state) {
+      this.events.push({ t: frame.t, state: frame.belief.state });
+    }
+    this.trim(frame.t - WINDOW);
+  }
+
+  /** Time went back (a reset, a seek): what was after it is gone. */
+  cut(t) {
+    const times = this.history.t;
+    if (times.length === 0 || times[times.length - 1] < t) return;
+    const keep = times.findIndex((value) => value >= t);
+    for (const values of Object.values(this.history)) values.length = keep;
+    const keepTrail = this.trail.t.filter((value) => value < t).length;
+    for (const values of Object.values(this.trail)) values.length = keepTrail;
+    this.events = this.events.filter((event) => event.t < t);
+  }
+
+  trim(oldest) {
+    const drop = this.history.t.findIndex((value) => value >= oldest);
+    if (drop > 0) for (const values of Object.values(this.history)) values.splice(0, drop);
+    const dropTrail = this.trail.t.findIndex((value) => value >= oldest);
+    if (dropTrail > 0) for (const values of Object.values(this.trail)) values.splice(0, dropTrail);
+    this.events = this.events.filter((event) => event.t >= oldest);
+  }
+}
+
+/** [x, y, begins a new line] of a pose after the path so far; null without a pose. */
+function step(path, pose) {
+  if (!pose) return null;
+  const last = path[path.length - 1];
+  return [pose.x, pose.y, !last || Math.hypot(pose.x - last[0], pose.y - last[1]) > JUMP];
+}
+
+const speedOf = (twist) => (twist && Number.isFinite(twist.vx) ? Math.hypot(twist.vx, twist.vy) : null);

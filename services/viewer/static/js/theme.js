@@ -1,0 +1,38 @@
+// Light, dark, or as the system says; the canvases read their colours from the style sheet.
+
+import { $, remembered } from "./dom.js";
+
+const NAMES = ["bg", "surface", "line", "line-strong", "ink", "ink-2", "ink-3", "measured", "predicted", "goal", "hypothesis",
+  "warn", "truth", "outside", "free", "grid", "wall", "obstacle", "obstacle-line", "accent"];
+const system = matchMedia("(prefers-color-scheme: dark)");
+const CHOICES = ["system", "light", "dark"];
+let current = null;
+
+/** Colours by their names in the style sheet. */
+export function palette() {
+  if (!current) {
+    const style = getComputedStyle(document.documentElement);
+    current = Object.fromEntries(NAMES.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]));
+    current.sans = style.getPropertyValue("--sans").trim();
+  }
+  return current;
+}
+
+/** Obey the system and the switch; `changed` is called after each change. */
+export function startTheme(changed) {
+  let choice = CHOICES.includes(remembered("theme")) ? remembered("theme") : "system";
+  const apply = () => {
+    document.documentElement.toggleAttribute("data-dark", choice === "dark" || (choice === "system" && system.matches));
+    $("theme").title = `Colours: ${choice}`;
+    $("theme").setAttribute("aria-label", `Colours: ${choice}`);
+    current = null;
+    changed();
+  };
+  system.addEventListener("change", apply);
+  $("theme").addEventListener("click", () => {
+    choice = CHOICES[(CHOICES.indexOf(choice) + 1) % CHOICES.length];
+    remembered("theme", choice);
+    apply();
+  });
+  apply();
+}

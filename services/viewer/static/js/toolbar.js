@@ -1,0 +1,111 @@
+// The tools under the map, and the line above them that belongs to the chosen mode.
+
+import { $, h, setIcon, setText } from "./dom.js";
+
+const HINTS = {
+  goal: "Click sets a goal, drag gives its heading",
+  carry: "Click carries the robot off, drag gives its heading",
+  look: "Drag moves the view, the wheel zooms",
+};
+
+export class Toolbar {
+  constructor(store, modes, actions) {
+    Object.assign(this, { store, modes, actions });
+    $("pause").addEventListener("click", () => this.togglePause());
+    $("step").addEventListener("click", () => actions.step());
+    $("reset").addEventListener("click", () => actions.reset());
+    $("speed").addEventListener("change", () => actions.speed(Number($("speed").value)));
+    $("localise").addEventListener("click", () => actions.localise());
+    $("record").addEventListener("click", () => actions.record(actions.recording ? "stop" : "start"));
+    $("sub").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.submit();
+    });
+    modes.changed = () => this.draw();
+    actions.changed = () => this.draw();
+    this.draw();
+  }
+
+  /** Whether the simulation stands: told so, or no scan for longer than the slowest speed needs. */
+  get standing() {
+    const last = this.store.arrivals.at(-1);
+    return this.store.paused || (last !== undefined && performance.now() - last > 1500);
+  }
+
+  togglePause() {
+    this.actions.pause(!this.standing);
+  }
+
+  draw() {
+    const { store, modes, actions } = this;
+    const can = modes.can;
+    $("watch-only").hidden = !store.hello || store.control;
+    document.body.toggleAttribute("data-playing", Boolean(store.player));
+    for (const id of ["pause", "step", "reset", "speed", "localise", "record"]) $(id).disabled = !can;
+    for (const button of document.querySelectorAll("[data-mode]")) button.disabled = !can && button.dataset.mode !== "look";
+    $("open").disabled = !store.connected || !store.control;
+    $("step").disabled = !can || !this.standing;
+    setIcon($("pause"), this.standing ? "i-play" : "i-pause");
+    $("pause").setAttribute("aria-label", this.standing ? "Resume" : "Pause");
+    $("record").setAttribute("aria-pressed", String(actions.recording));
+    setText($("record-label"), actions.recording ? "Stop" : "Record");
+    $("record").title = actions.recording ? "Stop recording (R)" : "Record (R)";
+    this.drawSub(can);
+  }
+
+  drawSub(can) {
+    const { modes } = this;
+    $("sub").hidden = Boolean(this.store.player) || !this.store.hello;
+    const selected = modes.selected;
+    const kind = !can ? "none" : selected ? `selected ${selected.name} ${Boolean(selected.circle)}` : modes.name;
+    if (this.kind === kind) return;
+    this.kind = kind;
+    $("sub").replaceChildren(...this.parts(can, selected));
+  }
+
+  parts(can, selected) {
+    const { modes, actions } = this;
+    if (!can) return [h("span", { class: "hint" }, this.store.control ? "Not connected" : "Watching only; whoever started this page allows no more")];
+    const hint = (text) => h("span", { class: "hint" }, text);
+    const button = (text, run, attributes = {}) => h("button", { type: "button", onclick: run, ...attributes }, text);
+    if (selected) {
+      const turns = selected.circle ? [] : [
+        button("⟲ 15°", () => actions.turnObstacle(this.modes.selected ?? selected, Math.PI / 12), { "aria-label": "Turn left by 15 degrees" }),
+        button("⟳ 15°", () => actions.turnObstacle(this.modes.selected ?? selected, -Math.PI / 12), { "aria-label": "Turn right by 15 degrees" }),
+      ];
+      return [hint(selected.name), ...turns, button("Remove", () => actions.removeObstacle(selected.name)), button("Done", () => modes.select(""))];
+    }
+    if (modes.name === "goal") return [hint(HINTS.goal), ...this.place(), h("button", { class: "primary" }, "Go"), button("Forget goal", () => actions.cancel())];
+    if (modes.name === "carry") return [hint(HINTS.carry), ...this.place(), h("button", { class: "primary" }, "Carry")];
+    if (modes.name === "obstacle") return this.furniture(hint);
+    return [hint(HINTS.look)];
+  }
+
+  furniture(hint) {
+    const { modes } = this;
+    const shape = h("select", { "aria-label": "Shape", onchange: () => { modes.shape = shape.value; } },
+      h("option", { value: "box" }, "box"), h("option", { value: "circle" }, "circle"));
+    shape.value = modes.shape;
+    const size = h("input", { type: "number", min: 0.05, max: 20, step: 0.05, value: modes.size, "aria-label": "Size in metres",
+      oninput: () => { if (size.valueAsNumber >= 0.05 && size.valueAsNumber <= 20) modes.size = size.valueAsNumber; } });
+    return [hint("Click adds, drag moves"), shape, h("label", {}, size, "m"), ...this.place(false), h("button", { class: "primary" }, "Add")];
+  }
+
+  /** Fields for those who do not point. */
+  place(heading = true) {
+    const field = (name, label, unit, required) => h("label", { class: "field" }, label,
+      h("input", { type: "number", step: "any", name, required, "aria-label": `${name}, ${unit}` }), unit === "degrees" ? "°" : null);
+    return [field("x", "x", "metres", true), field("y", "y", "metres", true), ...(heading ? [field("heading", "heading", "degrees", false)] : [])];
+  }
+
+  submit() {
+    const { modes, actions } = this;
+    const fields = new FormData($("sub"));
+    if (!fields.get("x") || !fields.get("y")) return;
+    const x = Number(fields.get("x")), y = Number(fields.get("y"));
+    const heading = fields.get("heading") ? (Number(fields.get("heading")) * Math.PI) / 180 : undefined;
+    if (modes.name === "goal") actions.goal({ x, y, yaw: heading });
+    if (modes.name === "carry") actions.teleport({ x, y, yaw: heading ?? modes.yaw() });
+    if (modes.name === "obstacle") actions.addObstacle(modes.planned(x, y));
+  }
+}

@@ -1,0 +1,121 @@
+"""A made-up session over the viewer's socket, to look at the page without a bus: no zenoh, no simulator, no estimator.
+
+python -m tests.viewer.stub_server --port 8123 --scene ambiguous
+
+Scenes: tracking, ambiguous, lost, half-dead, empty, watching.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+from pathlib import Path
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.routing import Mount, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from common.robot import Robot
+from common.world import load_world
+from tests.viewer.stub_session import DT, SCANNER, SCENES, Session, pulses
+
+STATIC = Path(__file__).resolve().parents[2] / "services" / "viewer" / "static"
+
+
+class Visitor:
+    """One page."""
+
+    def __init__(self, socket: WebSocket, session: Session) -> None:
+        """They share the session's robot."""
+        self.socket, self.session = socket, session
+
+    async def tell(self, **message: object) -> None:
+        """As JSON."""
+        await self.socket.send_text(json.dumps(message))
+
+    async def world(self) -> None:
+        """What the scanner's side knows."""
+        world = self.session.world.model_dump(mode="json")
+        await self.tell(
+            type="world", world=world, scanner=SCANNER.model_dump(mode="json"), robot=Robot().model_dump(mode="json")
+        )
+
+    async def feed(self) -> None:
+        """Frames and pulses until it leaves."""
+        session, count = self.session, 0
+        live = session.scene != "empty"
+        await self.tell(
+            type="hello", control=session.scene != "watching", version="stub", robots=["robot"] * live, robot="robot"
+        )
+        if live:
+            await self.world()
+            columns = zip(*session.history, strict=True) if session.history else [[]] * 6
+            names = ("t", "free_energy", "accuracy", "complexity", "error", "speed")
+            await self.tell(type="history", samples={n: list(c) for n, c in zip(names, columns, strict=True)})
+        while True:
+            if live and not session.paused:
+                await self.socket.send_bytes(session.step())
+            if count % 15 == 0:
+                await self.tell(**pulses(session.scene))
+            if session.position >= 0 and count % 3 == 0:
+                session.position = min(31.5, session.position + 3 * DT)
+                await self.tell(
+                    type="player",
+                    ok=True,
+                    paused=False,
+                    position_s=session.position,
+                    duration_s=31.5,
+                    rate=1.0,
+                    loop=False,
+                    file="presage-robot-1.mcap",
+                )
+            count += 1
+            await asyncio.sleep(DT / session.speed)
+
+    async def listen(self) -> None:
+        """Answers until it leaves."""
+        while True:
+            ask = json.loads(await self.socket.receive_text())
+            await self.tell(type="answer", id=ask.get("id"), **self.session.act(ask))
+            if ask.get("do") == "obstacle":
+                await self.world()
+            if ask.get("do") == "close":
+                await self.tell(type="closed")
+
+
+def application(session: Session) -> Starlette:
+    """The page and its socket."""
+
+    async def socket(websocket: WebSocket) -> None:
+        await websocket.accept()
+        visitor = Visitor(websocket, session)
+        feeding = asyncio.create_task(visitor.feed())
+        try:
+            await visitor.listen()
+        except WebSocketDisconnect:
+            pass
+        finally:
+            feeding.cancel()
+
+    return Starlette(routes=[WebSocketRoute("/ws", socket), Mount("/", StaticFiles(directory=STATIC, html=True))])
+
+
+def main() -> None:
+    """From the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--port", type=int, default=8123)
+    parser.add_argument("--scene", choices=SCENES, default="tracking")
+    parser.add_argument("--world", default="corridor")
+    parser.add_argument("--warm", type=float, default=0.0, help="seconds of the past to begin with")
+    args = parser.parse_args()
+    session = Session(load_world(args.world), args.scene)
+    for _ in range(int(args.warm / DT)):
+        session.step()
+    uvicorn.run(application(session), host="127.0.0.1", port=args.port, log_level="warning")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,239 @@
+"""A robot that is only made up, for the stub server: where it is, what it sees, what an estimator would say."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from common.scanner import SCANNERS
+from common.world import Obstacle, World
+from services.viewer.frames import encode
+
+SCENES = ("tracking", "ambiguous", "lost", "half-dead", "empty", "watching")
+SCANNER = SCANNERS["tim571"]
+DT = 1 / SCANNER.rate
+COV = (4e-6, 1e-6, 0, 1e-6, 2.5e-6, 0, 0, 0, 3e-6)
+WIDE = (0.09, 0.02, 0, 0.02, 0.04, 0, 0, 0, 0.02)
+
+
+class Session:
+    """A robot that drives from goal to goal, and what an estimator would say of it."""
+
+    def __init__(self, world: World, scene: str) -> None:
+        """At the world's start, on the way to a goal."""
+        self.map, self.world, self.scene = world, world, scene
+        self.rng = np.random.default_rng(1)
+        self.pose = np.array([*world.start_pose(0.3)])
+        self.t, self.twist, self.seek = 0.0, np.zeros(3), 0.0  # s, m/s and rad/s, s of searching still to do
+        self.goal: np.ndarray | None = self.far_goal()
+        self.drive, self.driven = np.zeros(3), -1.0
+        self.history: deque[list[float]] = deque(maxlen=900)
+        self.paused, self.recording, self.position = False, False, -1.0
+        self.speed = 1.0
+
+    def far_goal(self) -> np.ndarray:
+        """Somewhere across the room."""
+        places = self.map.sample_free(60, self.rng, 0.5)
+        return np.asarray(places[np.argmax(np.hypot(*(places - self.pose[:2]).T))])
+
+    def step(self) -> bytes:
+        """One scan later: the frame."""
+        self.t += DT
+        self.twist += np.clip(self.wish() - self.twist, -0.08, 0.08)
+        c, s = np.cos(self.pose[2]), np.sin(self.pose[2])
+        step = (
+            np.array([c * self.twist[0] - s * self.twist[1], s * self.twist[0] + c * self.twist[1], self.twist[2]]) * DT
+        )
+        if self.world.clearance((self.pose + step)[None, :2])[0] > 0.27:
+            self.pose = self.pose + step
+        return self.frame()
+
+    def wish(self) -> np.ndarray:
+        """m/s and rad/s in base_link."""
+        if self.t - self.driven < 0.5:
+            return self.drive
+        if self.goal is None or self.seek > 0 or self.scene == "lost":
+            return np.zeros(3)
+        away = self.goal[:2] - self.pose[:2]
+        if np.hypot(*away) < 0.15:
+            self.goal = self.far_goal()
+        direction = np.arctan2(away[1], away[0]) - self.pose[2]
+        speed = min(0.9, float(np.hypot(*away)))
+        turn = 0.9 * np.arctan2(np.sin(direction), np.cos(direction))
+        return np.array([speed * np.cos(direction), speed * np.sin(direction), turn])
+
+    def believed(self) -> tuple[str, np.ndarray, list[dict]]:
+        """State, pose, mixture."""
+        x0, y0, x1, y1 = self.map.bounds
+        self.seek = max(0.0, self.seek - DT)
+        if self.scene == "lost":
+            return "lost", self.pose + np.array([2.6, -0.4, 0.5]), []
+        if self.seek > 0 or self.scene == "ambiguous":
+            mirror = np.array([x0 + x1 - self.pose[0], y0 + y1 - self.pose[1], self.pose[2] + np.pi])
+            poses = [
+                mirror,
+                *(self.pose + np.array([[0.5, 0.1, 0.1], [-2.0, 0.3, 0.2]])),
+                mirror + np.array([1.5, -0.2, 0.1]),
+            ]
+            weights = (0.46, 0.38, 0.11, 0.05)
+            mixture = [mode(p, w, WIDE) for p, w in zip(poses, weights, strict=True)]
+            return ("ambiguous" if self.seek < 1.5 else "localising"), mirror, mixture
+        pose = self.pose + self.rng.normal(0, [0.0015, 0.0012, 0.001])
+        return "tracking", pose, [mode(pose, 1.0, COV)]
+
+    def frame(self) -> bytes:
+        """All of one moment."""
+        angles = SCANNER.angles()
+        measured = self.world.ray_distances([self.laser(self.pose)], angles)[0]
+        measured = SCANNER.limit(measured + self.rng.normal(0, 0.012, len(measured)))
+        state, pose, mixture = self.believed()
+        expected = self.map.ray_distances([self.laser(pose)], angles)[0]
+        sigma = np.clip(0.018 + 0.6 * np.abs(np.gradient(expected)), 0.018, 1.2)
+        z = np.where(np.isfinite(measured), (measured - expected) / sigma, 0)
+        accuracy = float(np.sum(np.minimum(0.5 * z**2, 12) + np.log(sigma * np.sqrt(2 * np.pi))))
+        complexity = 7.5 + 1.2 * float(self.rng.normal()) + (30 if state != "tracking" else 0)
+        speed = float(np.hypot(*self.twist[:2]))
+        error = float(np.hypot(*(pose - self.pose)[:2]))
+        self.history.append([self.t, accuracy + complexity, accuracy, complexity, error, speed])
+        blind = self.scene == "half-dead"
+        status = (
+            "manual"
+            if self.t - self.driven < 0.5
+            else "navigating"
+            if state == "tracking" and self.goal is not None
+            else "lost"
+        )
+        away = float(np.hypot(*(self.goal[:2] - self.pose[:2]))) if self.goal is not None else None
+        reason = {"lost": f"the belief is {state}: standing until it tracks", "manual": "driven by hand"}.get(
+            status, ""
+        )
+        goal = self.goal
+        header = {
+            "type": "frame", "t": self.t, "stamp_ns": int(self.t * 1e9), "robot": "robot",
+            "truth": {**as_pose(self.pose), "contact": False, "stopped": False},
+            "belief": None if blind else {
+                "state": state, **as_pose(pose), "cov": list(COV if state == "tracking" else WIDE),
+                "free_energy": accuracy + complexity, "accuracy": accuracy, "complexity": complexity,
+                "hypotheses": mixture, "estimator": "stub",
+            },
+            "odom": None, "cmd": None, "error": None if blind else error, "speed": speed,
+            "status": {
+                "state": status, "reason": reason, "distance": away,
+                "goal": None if goal is None else dict(zip(("x", "y", "yaw"), goal.tolist(), strict=False)),
+            },
+            "latency_ms": 6.4 + float(self.rng.normal()),
+            "scan": {
+                "angle_min": SCANNER.angle_min, "angle_increment": SCANNER.angle_increment,
+                "range_max": SCANNER.range_max,
+                "mount": as_pose(np.array(SCANNER.mount)),
+            },
+        }  # fmt: skip
+        none = np.zeros(0, np.float32)
+        return encode(header, {
+            "ranges": measured.astype(np.float32),
+            "predicted": none if blind else expected.astype(np.float32),
+            "sigma": none if blind else sigma.astype(np.float32),
+        })  # fmt: skip
+
+    def laser(self, pose: np.ndarray) -> np.ndarray:
+        """The scanner's pose."""
+        return pose + SCANNER.mount[0] * np.array([np.cos(pose[2]), np.sin(pose[2]), 0])
+
+    def act(self, ask: dict) -> dict:
+        """What a visitor wants; the answer's fields."""
+        if self.scene == "watching":
+            return {"ok": False, "reason": "visitors only watch here"}
+        reason = getattr(self, f"do_{ask.get('do')}", lambda _: "")(ask)
+        more = reason if isinstance(reason, dict) else {"reason": reason or ""}
+        return {"ok": not more.get("reason"), "reason": "", **more}
+
+    def do_goal(self, ask: dict) -> str:
+        if self.world.clearance([[ask["x"], ask["y"]]])[0] < 0.27:
+            return "the robot does not fit there"
+        self.goal = np.array([ask["x"], ask["y"], *([ask["yaw"]] if "yaw" in ask else [])])
+        return ""
+
+    def do_cancel(self, _: dict) -> None:
+        self.goal = None
+
+    def do_teleport(self, ask: dict) -> None:
+        self.seek, self.pose = 3.0, np.array([ask["x"], ask["y"], ask["yaw"]])
+
+    def do_localise(self, _: dict) -> None:
+        self.seek = 3.0
+
+    def do_obstacle(self, ask: dict) -> None:
+        others = [o for o in self.world.obstacles if o.name != ask["name"]]
+        new = [] if ask["action"] == "remove" else [Obstacle.model_validate(ask["obstacle"])]
+        self.world = World.model_validate(self.world.model_copy(update={"obstacles": others + new}).model_dump())
+
+    def do_pause(self, _: dict) -> None:
+        self.paused = True
+
+    def do_resume(self, _: dict) -> None:
+        self.paused = False
+
+    def do_drive(self, ask: dict) -> None:
+        self.drive, self.driven = np.array([ask["vx"], ask["vy"], ask["wz"]]), self.t
+
+    def do_speed(self, ask: dict) -> None:
+        self.speed = ask["factor"]
+
+    def do_record(self, ask: dict) -> dict:
+        self.recording = {"start": True, "stop": False}.get(ask["action"], self.recording)
+        return {"recording": self.recording}
+
+    def do_recordings(self, _: dict) -> dict:
+        names = [f"presage-robot-20261121-12090{n}.mcap" for n in (1, 2)]
+        return {"files": [{"name": name, "size": 8_400_000, "duration": 31.5} for name in names]}
+
+    def do_open(self, _: dict) -> None:
+        self.position = 0.0
+
+    def do_close(self, _: dict) -> None:
+        self.position = -1.0
+
+    def do_player(self, ask: dict) -> None:
+        if ask["action"] == "seek":
+            self.position = ask["value"]
+
+
+def as_pose(pose: np.ndarray) -> dict:
+    """Fields of a pose."""
+    return {"x": float(pose[0]), "y": float(pose[1]), "yaw": float(pose[2])}
+
+
+def mode(pose: np.ndarray, weight: float, cov: tuple[float, ...]) -> dict:
+    """One hypothesis."""
+    return {**as_pose(pose), "weight": weight, "cov": list(cov)}
+
+
+def pulses(scene: str) -> dict:
+    """Services as they would be."""
+    sends = {
+        "simulator": ("scan", "odom", "truth"),
+        "estimator": ("belief", "prediction"),
+        "controller": ("cmd_vel", "status"),
+        "recorder": (),
+    }
+    hears = {
+        "simulator": ("cmd_vel",),
+        "estimator": ("scan", "odom"),
+        "controller": ("belief", "goal", "scan"),
+        "recorder": ("scan", "odom", "truth", "belief", "prediction", "cmd_vel", "status"),
+    }
+    gone = {"half-dead": {"estimator"}, "empty": set(sends)}.get(scene, set())
+    quiet = {"published_hz": 0, "received_hz": 0, "dropped": 0, "undecodable": 0}
+    rows = [
+        {
+            "name": name, "alive": True, "age_s": 0.4, "uptime_s": 754.0, "note": "",
+            "rates": [{**quiet, "topic": t, "published_hz": 15.0} for t in sends[name]]
+            + [{**quiet, "topic": t, "received_hz": 15.0, "dropped": 2 * (t == "scan")} for t in hears[name]],
+        }
+        for name in sends if name not in gone
+    ]  # fmt: skip
+    missing = [
+        {"name": n, "start": f"python -m services.{n}"} for n in ("simulator", "estimator", "controller") if n in gone
+    ]
+    return {"type": "services", "services": rows, "missing": missing}
