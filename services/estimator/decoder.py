@@ -13,6 +13,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from services.estimator.forward_mode import ForwardMode
+
 if TYPE_CHECKING:
     from common.se2 import Array
 
@@ -101,31 +103,15 @@ class PaperModel:
         """Wrap a decoder for inference."""
         self.decoder, self.norm = decoder.eval().requires_grad_(requires_grad=False), norm
         self.dtype = next(decoder.parameters()).dtype
+        self._forward = ForwardMode(self.decoder.layers())
 
     def predict(self, pose: Array) -> tuple[Array, Array]:
         """See GenerativeModel; the derivative by yaw is zero, for the paper freezes it."""
-        with torch.no_grad():
-            ranges, tangents = self._forward_mode(self.norm.position(pose[None], self.dtype))
+        position = self.norm.position(pose[None], self.dtype).numpy()[0]
+        ranges, tangents = (rows[..., : self.decoder.shape.beams] for rows in self._forward(position))
         full = np.zeros((len(ranges), 3))
-        full[:, :2] = tangents.T.double().numpy() * self.norm.range_scale / np.array(self.norm.half_size)
-        return ranges.double().numpy() * self.norm.range_scale, full
-
-    def _forward_mode(self, position: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Ranges (B,) and their derivatives (2, B): a batch of the value, two tangents and a zero, layer by layer.
-
-        An affine layer maps a tangent to layer(tangent) - layer(0), a ReLU passes it where the value is positive.
-        Faster than torch's generic forward mode on a network this small.
-        """
-        rows = torch.cat([position, torch.eye(2, dtype=self.dtype), torch.zeros(1, 2, dtype=self.dtype)])
-        for layer in self.decoder.layers():
-            if isinstance(layer, nn.ReLU):
-                rows = rows * (rows[:1] > 0)
-                continue
-            rows = layer(rows)
-            if not isinstance(layer, nn.Unflatten):
-                rows = torch.cat([rows[:1], rows[1:3] - rows[3:], torch.zeros_like(rows[3:])])
-        flat = rows[:, 0, : self.decoder.shape.beams]
-        return flat[0], flat[1:3]
+        full[:, :2] = tangents.T * self.norm.range_scale / np.array(self.norm.half_size)
+        return ranges.astype(np.float64) * self.norm.range_scale, full
 
     def ranges(self, poses: Array) -> Array:
         """(N, B) m expected at poses (N, 3)."""
