@@ -30,7 +30,7 @@ export class Chart {
 
   end() {
     const times = this.store.history.t;
-    return times.length ? Math.max(times[times.length - 1], times[0] + 0) : null;
+    return times.length ? times[times.length - 1] : null;
   }
 
   /** Lowest and highest value in view, with some air; null without any. */

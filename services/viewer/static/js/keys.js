@@ -45,5 +45,5 @@ export function startKeys({ store, view, modes, actions, drive, player, toolbar 
 function typing({ target, key }) {
   if (!(target instanceof Element)) return false;
   if (target.matches("input:not([type=checkbox]), select, textarea")) return true;
-  return target.matches("button, a, input, .scroll") && (key === " " || key === "Enter" || (key.startsWith("Arrow") && target.matches(".scroll, [role=radio]")));
+  return target.matches("button, a, input, .scroll") && (key === " " || key === "Enter" || (key.startsWith("Arrow") && target.matches(".scroll")));
 }

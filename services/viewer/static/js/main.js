@@ -51,6 +51,7 @@ $("layout").addEventListener("click", () => {
 setInterval(() => {
   toolbar.draw();
   services.drawMissing();
+  panels.drawBadges();
   panels.drawVitals();
 }, 500);
 

@@ -38,6 +38,7 @@ export class MapView {
   }
 
   buildLegend() {
+    $("legend").open = innerWidth > 760;
     for (const { key, label, tone, mark } of LAYERS) {
       const box = h("input", { type: "checkbox", onchange: () => this.show(key, box.checked) });
       box.checked = this.shown[key];

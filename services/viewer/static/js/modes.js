@@ -1,6 +1,6 @@
 // What the pointer on the map does: set a goal, carry the robot off, move furniture, or only look.
 
-import { $, remembered } from "./dom.js";
+import { $ } from "./dom.js";
 import { distance, moved } from "./geometry.js";
 
 const GRIP = 8; // px around an obstacle that still take hold of it
@@ -12,17 +12,19 @@ export class Modes {
     this.shape = "box";
     this.size = 0.5; // m
     this.changed = () => {};
-    this.set(remembered("mode") ?? "goal");
+    this.set("goal");
     for (const button of document.querySelectorAll("[data-mode]")) {
-      button.addEventListener("click", () => this.set(button.dataset.mode));
+      button.addEventListener("click", (event) => {
+        this.set(button.dataset.mode);
+        if (event.detail > 0) $("map").focus({ preventScroll: true }); // clicked, so keys are the map's again
+      });
     }
   }
 
   set(name) {
     this.name = ["goal", "carry", "obstacle", "look"].includes(name) ? name : "goal";
-    remembered("mode", this.name);
     for (const button of document.querySelectorAll("[data-mode]")) {
-      button.setAttribute("aria-checked", button.dataset.mode === this.name);
+      button.setAttribute("aria-pressed", button.dataset.mode === this.name);
     }
     if (this.name !== "obstacle") this.select("");
     this.cancel();

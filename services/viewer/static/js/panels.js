@@ -6,6 +6,7 @@ import { describeBelief } from "./draw_belief.js";
 import { metres, number } from "./format.js";
 import { ScanPlot } from "./scan_plot.js";
 
+const WORDS_EVERY = 180; // ms; faster nobody reads
 const BELIEF = { tracking: ["s-dot", "good"], localising: ["s-half", "work"], ambiguous: ["s-diamond", "warn"], lost: ["s-triangle", "bad"] };
 const STATUS = {
   idle: ["s-ring", ""], navigating: ["s-play", "work"], reached: ["s-check", "good"], blocked: ["s-square", "warn"],
@@ -28,13 +29,21 @@ export class Panels {
       complexity: key("k-energy", "goal", "complexity"), error: key("k-error", "predicted", ""), speed: key("k-speed", "measured", ""),
     };
     this.badges = { estimator: badge("estimator-badge", "estimator"), controller: badge("controller-badge", "controller") };
-    cursor.changed = () => this.draw();
+    this.wordsAt = -Infinity;
+    cursor.changed = () => {
+      this.drawKeys();
+      this.draw();
+    };
   }
 
   draw() {
-    this.drawBadges();
-    this.drawVitals();
-    this.drawKeys();
+    const now = performance.now();
+    if (now - this.wordsAt > WORDS_EVERY) {
+      this.wordsAt = now;
+      this.drawBadges();
+      this.drawVitals();
+      this.drawKeys();
+    }
     for (const chart of this.charts) chart.draw();
     this.scan.draw();
   }
@@ -82,7 +91,7 @@ function key(box, tone, name) {
 
 /** A state with its shape, colour and reason; returns what sets them, and touches the page only at a change. */
 function badge(id, name) {
-  const box = $(id), state = h("b"), why = h("span", { class: "why" });
+  const box = $(id), state = h("b", { role: "status" }), why = h("span", { class: "why" });
   const shape = icon("s-ring");
   box.append(shape, h("span", { class: "who" }, name), state, why);
   let shown = "";

@@ -49,6 +49,7 @@ export class Toolbar {
     $("pause").setAttribute("aria-label", this.standing ? "Resume" : "Pause");
     $("record").setAttribute("aria-pressed", String(actions.recording));
     setText($("record-label"), actions.recording ? "Stop" : "Record");
+    $("record").setAttribute("aria-label", actions.recording ? "Stop recording" : "Record");
     $("record").title = actions.recording ? "Stop recording (R)" : "Record (R)";
     this.drawSub(can);
   }
