@@ -83,6 +83,13 @@ class Inbox:
         self._counted.add(key)
         return key
 
+    def tally(self) -> tuple[Counter[str], Counter[str], Counter[str]]:
+        """By key and as of one moment: received and no longer waiting, dropped, oversized."""
+        with self._changed:
+            taken = self.received.copy()
+            taken.subtract(self.counted_as(entry.key) for entry in self._entries.values() if isinstance(entry, Sample))
+            return taken, self.dropped.copy(), self.oversized.copy()
+
     def get(self, timeout: float) -> Sample | Call | None:
         """The oldest entry, waiting at most ``timeout`` s for one; None when none came."""
         with self._changed:

@@ -291,8 +291,8 @@ class RecordReply(Reply):
 
     recording: bool = False
     file: Text = ""  # path as the recorder sees it: the one being written, or the last one; empty: none yet
-    messages: Count = 0  # in that file
-    seconds: NotNegative = 0.0  # s, wall time, since that file was begun; once complete, from begin to end
+    messages: Count = 0  # in that recording
+    seconds: NotNegative = 0.0  # s, wall time, since it was begun; once complete, from beginning to end
 
 
 class ConfigReply(Reply):

@@ -12,7 +12,7 @@ from common.bus import Bus
 from common.errors import UserError
 from common.inbox import Inbox, Sample
 from common.messages import Belief, CmdVel, Health, Stamped
-from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, SCAN, STATUS, Topic
+from common.topics import BELIEF, CMD_VEL, DRIVE, GOAL, HEALTH, ODOM, SCAN, STATUS, Topic
 from common.wire import DecodeError
 from presage.replays.compare import Outcome
 from presage.replays.goals import Goals
@@ -38,7 +38,7 @@ class Feed:
         self.services = stack.processes.keys() - {"router"}
         robot = robot_of(recording)
         self.asked: set[Topic] = {t for t in (BELIEF, CMD_VEL) if t.publisher in self.services}
-        heard = {SCAN, ODOM, GOAL, CMD_VEL, BELIEF} - self.asked
+        heard = {SCAN, ODOM, GOAL, DRIVE, CMD_VEL, BELIEF} - self.asked
         there = recording.counts()
         self.topics = {t.key(robot): t for t in heard | self.asked if there[t.key(robot)]}
         self.heard = heard
@@ -119,6 +119,9 @@ class Feed:
         self.outcome.goals_placed = self._when is not None
         if self._when is None:
             self.outcome.notes.append("when the controller took which goal is not known: its commands may differ")
+        if DRIVE in self.topics.values():
+            self.outcome.goals_placed = False
+            self.outcome.notes.append("somebody drove by hand, between which scans is not known: commands may differ")
 
     def _give_goals(self, stamp_ns: int | None) -> None:
         """Those that came after the answer to the scan of that stamp."""

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from common import safety
-from common.messages import Belief, CmdVel, Goal, Scan, Status, Twist
+from common.messages import Belief, CmdVel, Drive, Goal, Scan, Status, Twist
 from common.robot import Robot
 from services.controller.action import Preference, next_action, observed_position, preferred_position
+from services.controller.hand import Hand
 
 if TYPE_CHECKING:
     from common.se2 import Array
@@ -38,12 +39,20 @@ class Navigator:
         self._action = np.zeros(2)
         self._velocity = np.zeros(3)
         self._standing_since: int | None = None
-        self._last_stamp: int | None = None
+        self._last_stamp: int | None = None  # of the last command
+        self._scan_stamp: int | None = None
         self._points = np.zeros((0, 2))
+        self._hand = Hand()
+        self._interrupted: tuple[Array, Array] | None = None  # action and velocity when time stood still
 
     def hear_scan(self, scan: Scan) -> None:
         """Remember what stands around, (K, 2) m in base_link."""
-        self._points = safety.scan_points(scan)
+        self._points, self._scan_stamp = safety.scan_points(scan), scan.stamp_ns
+
+    def hear_drive(self, drive: Drive) -> None:
+        """Somebody drives by hand: that goes before any goal."""
+        stamps = [stamp for stamp in (self._scan_stamp, self._last_stamp) if stamp is not None]
+        self._hand.hear(drive, max(stamps, default=0))
 
     def hear_goal(self, goal: Goal) -> None:
         """A new preference, or none; a goal inside a wall is refused."""
@@ -67,18 +76,59 @@ class Navigator:
 
     def step(self, belief: Belief) -> tuple[CmdVel, Status]:
         """The answer to one belief, with its stamp."""
-        period = 0.0 if self._last_stamp is None else max(0.0, (belief.stamp_ns - self._last_stamp) * 1e-9)
-        self._last_stamp = belief.stamp_ns
-        pose = belief.pose.array()
+        pose, by_hand = belief.pose.array(), self._hand.twist(belief.stamp_ns)
+        self._go_on(belief.stamp_ns)
+        if by_hand is not None:
+            self._put_goal_off()
         distance = None if self.goal is None else float(np.hypot(*(self.goal.pose.array() - pose)[:2]))
-        wanted = self._wanted(belief, pose, distance)
+        wanted = self._wanted(belief, pose, distance) if by_hand is None else by_hand
+        command, held_back = self._limited(belief.stamp_ns, wanted)
+        if by_hand is not None:
+            return command, self._manual(belief.stamp_ns, distance)
+        self._watch_progress(belief.stamp_ns, held_back=held_back)
+        return command, self.status(belief.stamp_ns, distance)
+
+    def steer(self, stamp_ns: int) -> tuple[CmdVel, Status] | None:
+        """The answer to a scan that no belief follows: a hand needs none. None where nobody drives and it stands."""
+        by_hand = self._hand.twist(stamp_ns)
+        if by_hand is None and not self._velocity.any():
+            return None
+        self._go_on(stamp_ns)
+        if by_hand is not None:
+            self._put_goal_off()
+            return self._limited(stamp_ns, by_hand)[0], self._manual(stamp_ns, None)
+        self._lose_goal("no belief: is the estimator running?")
+        return self._limited(stamp_ns, np.zeros(3))[0], self.status(stamp_ns, None)
+
+    def _go_on(self, stamp_ns: int) -> None:
+        """As before an interruption, where no time has passed since by the stamps: a simulation that was paused."""
+        if self._interrupted is None:
+            return
+        if self._last_stamp is not None and 0 < stamp_ns - self._last_stamp <= self.robot.command_timeout * 1e9:
+            self._action, self._velocity = self._interrupted
+        self._interrupted = None
+
+    def _limited(self, stamp_ns: int, wanted: Array) -> tuple[CmdVel, bool]:
+        """What is wanted (3,) within every limit; whether the scan held it back."""
+        period = 0.0 if self._last_stamp is None else max(0.0, (stamp_ns - self._last_stamp) * 1e-9)
+        self._last_stamp = stamp_ns
         ramped = safety.ramp(self._velocity, safety.clip_twist(wanted, self.robot), self.robot, period)
         self._velocity, held_back = safety.limit_velocity(ramped, self._points, self.robot)
-        self._watch_progress(belief.stamp_ns, held_back=held_back)
         vx, vy, wz = map(float, self._velocity)
-        return CmdVel(stamp_ns=belief.stamp_ns, twist=Twist(vx=vx, vy=vy, wz=wz)), self.status(
-            belief.stamp_ns, distance
-        )
+        return CmdVel(stamp_ns=stamp_ns, twist=Twist(vx=vx, vy=vy, wz=wz)), held_back
+
+    def _put_goal_off(self) -> None:
+        """A goal waits while somebody drives; one that was reached is done with."""
+        if self.state == "reached":
+            self.goal = None
+        if not self._refused:
+            self.state, self.reason = "idle" if self.goal is None else "navigating", ""
+        self._action, self._standing_since, self._waiting = np.zeros(2), None, False
+
+    def _manual(self, stamp_ns: int, distance: float | None) -> Status:
+        """By hand: the goal's own state is kept for later."""
+        reason = "driven by hand" + ("; the goal waits" if self.goal is not None and not self._refused else "")
+        return self.status(stamp_ns, distance).model_copy(update={"state": "manual", "reason": reason})
 
     def _wanted(self, belief: Belief, pose: Array, distance: float | None) -> Array:
         """The command free energy asks for, before any limit; (3,) in base_link."""
@@ -129,8 +179,14 @@ class Navigator:
 
     def without_belief(self, stamp_ns: int, why: str) -> tuple[CmdVel, Status]:
         """Stand: nothing is known about now. The goal is kept."""
+        if self._scan_stamp is not None and self._scan_stamp == self._last_stamp:
+            self._interrupted = self._action, self._velocity  # no scan waits for its belief: it is time that stands
         self._action, self._velocity = np.zeros(2), np.zeros(3)
-        if self.state in {"navigating", "blocked"} and not self._refused:
-            self.state, self.reason, self._waiting = "lost", why, True
+        self._lose_goal(why)
         status = self.status(stamp_ns, None).model_copy(update={"reason": why})  # idle, too, says so
         return CmdVel(stamp_ns=stamp_ns, twist=Twist()), status
+
+    def _lose_goal(self, why: str) -> None:
+        """The way to it waits for a belief."""
+        if self.state in {"navigating", "blocked"} and not self._refused:
+            self.state, self.reason, self._waiting = "lost", why, True

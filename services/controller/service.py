@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from typing import ClassVar
 
-from common.messages import Belief, CmdVel, Goal, Scan, Stamped, Status
+from common.messages import Belief, CmdVel, Drive, Goal, Scan, Stamped, Status
 from common.robot import Robot
 from common.service import Service
-from common.topics import BELIEF, CMD_VEL, GOAL, SCAN, STATUS, Topic
+from common.topics import BELIEF, CMD_VEL, DRIVE, GOAL, SCAN, STATUS, Topic
 from common.world import load_world
 from services.controller.action import Preference
 from services.controller.navigator import Navigator
@@ -19,7 +19,7 @@ class ControllerService(Service):
     """Action as a process."""
 
     name: ClassVar[str] = "controller"
-    inputs: ClassVar[tuple[Topic, ...]] = (SCAN, BELIEF, GOAL)
+    inputs: ClassVar[tuple[Topic, ...]] = (SCAN, BELIEF, GOAL, DRIVE)
 
     def __init__(self, settings: ControllerSettings) -> None:
         """Standing, until told."""
@@ -43,18 +43,27 @@ class ControllerService(Service):
         """A belief is answered by a command of the same stamp; a goal by a status, at once."""
         if isinstance(message, Scan):
             self.navigator.hear_scan(message)
+            # A hand needs no belief, and so no estimator.
+            if self._belief_at is None and (answer := self.navigator.steer(message.stamp_ns)) is not None:
+                self._answer(*answer)
+        elif isinstance(message, Drive):
+            self.navigator.hear_drive(message)
         elif isinstance(message, Goal):
             self.navigator.hear_goal(message)
             self.log.info("goal", x=message.pose.x, y=message.pose.y, cancel=message.cancel)
             self.publish(STATUS, self.navigator.status(self._last[0] if self._last else 0, None))
         elif isinstance(message, Belief):
             self._belief_at = time.monotonic()
-            if self._last is None or self._last[0] != message.stamp_ns:  # one sent again is answered again
-                before = self.navigator.state
-                self._last = (message.stamp_ns, *self.navigator.step(message))
-                if self.navigator.state != before:
-                    self.log.info(self.navigator.state, reason=self.navigator.reason)
-            self._send(self._last[1], self._last[2])
+            if self._last is None or self._last[0] != message.stamp_ns:
+                self._answer(*self.navigator.step(message))
+            else:  # one sent again is answered again
+                self._send(self._last[1], self._last[2])
+
+    def _answer(self, command: CmdVel, status: Status) -> None:
+        if status.state != (self._last[2].state if self._last is not None else "idle"):
+            self.log.info(status.state, reason=status.reason)
+        self._last = (command.stamp_ns, command, status)
+        self._send(command, status)
 
     def due(self) -> float | None:
         """Until the belief is too old."""

@@ -21,6 +21,7 @@ RETRY = 5.0  # s, until one that did not answer is asked again
 ATTEMPTS = 5
 NOT_YET = 0.5  # s, until an estimator that has seen no scan is asked again for its model
 AGAIN = 5.0  # s, until the model is looked at again: another scanner may call for other weights
+EVERYBODY = "*"
 MAX_WEIGHTS = 16 << 20  # bytes; larger weights are named by their digest alone
 
 Answer = ConfigReply | WorldReply | ModelReply
@@ -89,6 +90,7 @@ class Describer:
         self._answers: queue.SimpleQueue[tuple[str, Answer]] = queue.SimpleQueue()
         self._waiting: dict[tuple[str, str], tuple[float, int]] = {}  # service, query: when to ask, attempts before
         self._last: dict[tuple[str, str], Answer] = {}  # what was said once is not stored again
+        self.present: frozenset[str] = frozenset()  # services that are there
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="describer", daemon=True)
         self._thread.start()
@@ -101,6 +103,10 @@ class Describer:
                 yield self._answers.get_nowait()
             except queue.Empty:
                 return
+
+    def ask_again(self) -> None:
+        """Ask everybody once more; an answer that is new is among `answers`."""
+        self._seen.put((EVERYBODY, True))
 
     def stop(self) -> None:
         """Ask nobody any more; an answer under way may still come."""
@@ -141,10 +147,21 @@ class Describer:
         if seen is None or seen[0] == self._me:
             return
         service, there = seen
+        if service == EVERYBODY:
+            for each in self.present:
+                self._expect(each)
+        elif there:
+            self.present |= {service}
+            self._expect(service)
+        else:
+            self.present -= {service}
+            for query in QUESTIONS:
+                self._waiting.pop((service, query), None)
+
+    def _expect(self, service: str) -> None:
+        """It is to be asked now, whatever it can be asked."""
         for query in QUESTIONS.values():
-            if not there:
-                self._waiting.pop((service, query.name), None)
-            elif query.per_service or query.server == service:
+            if query.per_service or query.server == service:
                 self._waiting[service, query.name] = (time.monotonic(), 0)
 
     def _ask(self, service: str, query: Query) -> float | None:

@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import itertools
-import json
-import sys
 import time
-from collections.abc import Callable
-from contextlib import nullcontext, suppress
-from datetime import datetime, timezone
-from pathlib import Path
+from collections import Counter
 from typing import ClassVar
 
 from common.errors import UserError
 from common.inbox import OTHERS, Sample
-from common.log import Logger
-from common.messages import WorldReply
+from common.messages import RecordReply, RecordRequest, Reply, Request, WorldReply
 from common.service import Service
-from common.topics import TOPICS, WORLD, Topic
-from common.versions import versions
-from services.recorder.accounting import Ledger, as_metadata
-from services.recorder.describing import Answer, Describer, MetadataRecord, records_of
-from services.recorder.parts import Limits, PartsWriter
+from common.topics import RECORDING, TOPICS, WORLD, Query, Topic
+from services.recorder.describing import Answer, Describer
+from services.recorder.parts import PartsWriter
+from services.recorder.recording import OpenRecording, tell_of_unfinished, write_answer
 from services.recorder.settings import RecorderSettings
-from services.recorder.writer import UNFINISHED, NameTakenError, RecordingWriter, is_being_written
+from services.recorder.writer import RecordingWriter
 
 LINK_WITHIN = 3.0  # s; a recorder may come before the others, but should not wait for nobody in silence
 
@@ -33,59 +25,99 @@ class RecorderService(Service):
 
     name: ClassVar[str] = "recorder"
     inputs: ClassVar[tuple[Topic, ...]] = tuple(topic for topic in TOPICS if topic.recorded)
+    queries: ClassVar[tuple[Query, ...]] = (RECORDING,)
     keep_all: ClassVar[bool] = True
 
     def __init__(self, settings: RecorderSettings) -> None:
-        """The file is opened in `open`."""
+        """The file is opened in `open`, or when somebody asks."""
         super().__init__(settings)
         self.options = settings
         self.inputs = chosen_topics(settings.topics)  # type: ignore[misc]
-        self.writer: PartsWriter | None = None
-        self.ledger = Ledger()
+        self.recording: OpenRecording | None = None
         self.describer: Describer | None = None
+        self._said: dict[tuple[str, type[Answer]], Answer] = {}  # by services of themselves, the last of each kind
+        self._ended = RecordReply()  # how the last recording stood at its end
+        self._written: Counter[str] = Counter()  # by key, into recordings that are complete
+        self._missing: Counter[str] = Counter()
         self._flush_at = 0.0
-        self._logged_ns = 0  # of the last message
         self._warn_at: float | None = None  # of nobody there; None: no more
+        self._alone = ""  # what to say of that
 
     def open(self) -> None:
-        """What is known of the session first, so that even a torn file explains itself."""
+        """Begin to record, unless told to wait; ask who is there what it is."""
         options = self.options
         self.loop.inbox.capacity = options.capacity
         tell_of_unfinished(options.directory, self.log)
-        limits = Limits(int(options.split_size * 1e6), options.split_minutes * 60)
-        writer = self.writer = PartsWriter(parts_of(options), limits, self._counters)
-        session = {"robot": options.robot, "command": " ".join(sys.argv), **versions()}
-        writer.metadata("presage", session)
-        writer.metadata("config:recorder", {"config": json.dumps(options.effective())})
-        for topic in self.inputs:
-            if not topic.per_service:
-                writer.declare(topic, topic.key(options.robot))
-        writer.flush()
+        if not options.idle:
+            self._begin(numbered=False)
+        self._say_whether_it_records()
         self._flush_at = time.monotonic() + options.flush
         self._warn_at = time.monotonic() + LINK_WITHIN if options.link().connect else None
         self.describer = Describer(self.loop.bus, self.name, self.log, weights=options.weights)
-        self.log.info("recording", file=str(writer.part.path))
 
     def on_sample(self, sample: Sample) -> None:
-        """Bytes as they came, whether or not they make sense."""
-        assert self.writer is not None  # noqa: S101 - set in open
+        """Into the file, where there is one."""
+        if self.recording is None:
+            return
         if self.loop.inbox.counted_as(sample.key) != sample.key:  # somebody invents keys
             self.loop.inbox.dropped[OTHERS] += 1
             self.counters["turned_away"] += 1
             return
-        self._logged_ns = max(self._logged_ns, sample.received_ns)  # in order, though a clock be set back
-        published = sample.published_ns or sample.received_ns
-        self.writer.write(sample.topic, sample.key, sample.payload, published, self._logged_ns)
-        self.ledger.see(sample.key, sample.payload)
+        self.recording.write(sample)
         self.counters["written"] += 1
+
+    def on_request(self, query: Query, request: Request) -> Reply:
+        """Begin, end, or say how it stands."""
+        if not isinstance(request, RecordRequest):
+            return super().on_request(query, request)
+        state = self._state()
+        if request.action == "start":
+            if self.recording is not None:
+                return state.model_copy(update={"ok": False, "reason": f"records already, into {state.file}"})
+            self._begin(numbered=True)
+        elif request.action == "stop":
+            if self.recording is None:
+                return state.model_copy(update={"ok": False, "reason": "records nothing: start first"})
+            self._write_answers()
+            self._end()
+        return self._state()
+
+    def _state(self) -> RecordReply:
+        return self._ended if self.recording is None else self.recording.state()
+
+    def _begin(self, *, numbered: bool) -> None:
+        """A new file, with what is known of those who are there; they are asked again, for a world changes."""
+        self.recording = OpenRecording(self.options, self.inputs, self.loop.inbox, numbered=numbered)
+        self._say_whether_it_records()
+        self.log.info("recording", file=self.recording.state().file)
+        if self.describer is not None:
+            for (service, _), answer in self._said.items():
+                if service in self.describer.present:
+                    self.recording.describe(service, answer)
+            self.describer.ask_again()
+
+    def _end(self) -> None:
+        """Complete the file. What fails is over all the same."""
+        recording, self.recording = self.recording, None
+        assert recording is not None  # noqa: S101 - callers have looked
+        state, dropped, missing = recording.state(), recording.dropped(), recording.missing()
+        self._ended = state.model_copy(update={"recording": False})
+        self._say_whether_it_records()
+        for key, written in recording.ledger.written.items():
+            self._written[key] += written
+            self._missing[key] += recording.ledger.lost(key).missing
+        *_, path = files = recording.writer.finish()
+        self._ended = self._ended.model_copy(update={"file": str(path)})
+        parts = {"parts": len(files)} if len(files) > 1 else {}
+        self.log.info("recorded", file=str(path), messages=state.messages, dropped=dropped, missing=missing, **parts)
 
     def counted(self, key: str) -> dict[str, int]:
         """For health: what was written of a key, and what never came."""
-        return {"written": self.ledger.written.get(key, 0), "missing": self.ledger.lost(key).missing}
-
-    def _counters(self) -> dict[str, dict[str, str]]:
-        inbox = self.loop.inbox
-        return {"counters": as_metadata(self.ledger.counts(inbox.received, inbox.dropped, inbox.oversized))}
+        written, missing = self._written[key], self._missing[key]
+        if self.recording is not None:
+            ledger = self.recording.ledger
+            written, missing = written + ledger.written.get(key, 0), missing + ledger.lost(key).missing
+        return {"written": written, "missing": missing}
 
     def due(self) -> float | None:
         """Until the next flush."""
@@ -96,17 +128,17 @@ class RecorderService(Service):
         self._flush_at = time.monotonic() + self.options.flush
         self._write_answers()
         self._look_for_others()
-        if self.writer is not None:
-            self.writer.flush()
+        if self.recording is not None:
+            self.recording.writer.flush()
 
     def close(self) -> None:
         """What still waits, then the end of the file."""
-        writer, inbox = self.writer, self.loop.inbox
-        if writer is None or self.describer is None:
+        inbox, describer = self.loop.inbox, self.describer
+        if describer is None:
             return
-        self.describer.stop()
+        describer.stop()
         try:
-            if not writer.failed:
+            if self.recording is not None and not self.recording.writer.failed:
                 for _ in range(inbox.capacity):  # bounded: others may go on publishing
                     if (entry := inbox.get(0)) is None:
                         break
@@ -114,69 +146,36 @@ class RecorderService(Service):
                         self.on_sample(entry)
                 self._write_answers()
         finally:
-            *_, path = files = writer.finish()
-            self.describer.join()
-        written, dropped = sum(self.ledger.written.values()), sum(inbox.dropped.values())
-        missing = sum(sequence.missing for sequence in self.ledger.sequences.values())
-        parts = {"parts": len(files)} if len(files) > 1 else {}
-        self.log.info("recorded", file=str(path), messages=written, dropped=dropped, missing=missing, **parts)
+            if self.recording is not None:
+                self._end()
+            describer.join()
 
     def _look_for_others(self) -> None:
         """Say once that nobody is there, and when somebody comes after that."""
         if self._warn_at is None or time.monotonic() < self._warn_at:
             return
         linked = self.loop.bus.linked()
-        if not linked and not self.note:
-            self.note = f"nothing answers at {', '.join(self.options.link().connect)}"
-            self.log.warning(self.note, advice="start a session with `presage up`, or say where it is with --connect")
+        if not linked and not self._alone:
+            self._alone = f"nothing answers at {', '.join(self.options.link().connect)}"
+            advice = "start a session with `presage up`, or say where it is with --connect"
+            self.log.warning(self._alone, advice=advice)
         elif linked:
-            if self.note:
+            if self._alone:
                 self.log.info("there it is")
-            self._warn_at, self.note = None, ""
+            self._warn_at, self._alone = None, ""
+        self._say_whether_it_records()
+
+    def _say_whether_it_records(self) -> None:
+        """The note in health."""
+        self.note = self._alone or ("" if self.recording is not None else "records nothing until told")
 
     def _write_answers(self) -> None:
-        if self.writer is None or self.describer is None:
+        if self.describer is None:
             return
         for service, answer in self.describer.answers():
-            write_answer(self.writer, service, answer)
-
-
-def open_writer(options: RecorderSettings) -> RecordingWriter:
-    """Under the name asked for; a name of our own making gets a number where another recorder was first."""
-    return parts_of(options)(1)
-
-
-def parts_of(options: RecorderSettings) -> Callable[[int], RecordingWriter]:
-    """Opens part number k: NAME.mcap, or NAME-001.mcap, NAME-002.mcap … where there may be several."""
-    first, several = file_path(options), bool(options.split_size or options.split_minutes)
-    chosen: list[Path] = []  # the name that was free for the first part
-
-    def open_part(part: int) -> RecordingWriter:
-        for number in itertools.count(1):
-            path = first if number == 1 else first.with_stem(f"{first.stem}-{number}")
-            path = chosen[0] if chosen else path
-            file = path.with_stem(f"{path.stem}-{part:03d}") if several else path
-            with suppress(NameTakenError) if not (options.file or chosen) else nullcontext():
-                writer = RecordingWriter(file, options.compression, options.chunk_size)
-                chosen.append(path)
-                return writer
-        raise AssertionError
-
-    return open_part
-
-
-def tell_of_unfinished(folder: Path, log: Logger) -> None:
-    """Files of recorders that were killed, and what to do with them."""
-    for path in sorted(folder.glob(f"*.mcap{UNFINISHED}")) if folder.is_dir() else ():
-        if not is_being_written(path):
-            log.warning("unfinished recording", file=str(path), advice=f"presage recover {path}")
-
-
-def file_path(options: RecorderSettings) -> Path:
-    """Where to record: the name asked for, or one of robot and time."""
-    stamp = datetime.now(timezone.utc).strftime("%Y%m%d-%H%M%S")
-    name = options.file or f"presage-{options.robot}-{stamp}.mcap"
-    return options.directory / (name if name.endswith(".mcap") else name + ".mcap")
+            self._said[service, type(answer)] = answer
+            if self.recording is not None:
+                self.recording.describe(service, answer)
 
 
 def chosen_topics(names: str) -> tuple[Topic, ...]:
@@ -186,15 +185,6 @@ def chosen_topics(names: str) -> tuple[Topic, ...]:
     if unknown := [name for name in wanted if name not in recorded]:
         raise UserError(f"no topic {', '.join(unknown)}: choose from {', '.join(recorded)}")
     return tuple(recorded[name] for name in dict.fromkeys(wanted)) if wanted else tuple(recorded.values())
-
-
-def write_answer(writer: RecordingWriter | PartsWriter, service: str, answer: Answer) -> None:
-    """What a service said of itself, as `records_of` has it."""
-    for record in records_of(service, answer):
-        if isinstance(record, MetadataRecord):
-            writer.metadata(record.name, record.values)
-        else:
-            writer.attachment(record.name, record.data, record.media_type, time.time_ns())
 
 
 def write_world(writer: RecordingWriter | PartsWriter, reply: WorldReply) -> None:

@@ -19,6 +19,7 @@ class RecorderSettings(ServiceSettings):
       python -m services.recorder                                    into recordings/
       python -m services.recorder --directory logs --file run.mcap
       python -m services.recorder --topics scan,odom --compression none
+      python -m services.recorder --idle                             records when the page, or a program, says so
       python -m services.recorder --split-minutes 10                 run-001.mcap, run-002.mcap, each whole by itself
 
     """
@@ -27,6 +28,7 @@ class RecorderSettings(ServiceSettings):
 
     directory: Annotated[Path, Field(description="folder, made where it is missing")] = Path("recordings")
     file: Annotated[str, Field(pattern=r"^[^/]*$", description="name; none: presage-ROBOT-TIME.mcap, UTC")] = ""
+    idle: Annotated[bool, Field(description="record nothing until told to: query `recording`")] = False
     topics: Annotated[str, Field(description="comma-separated topic names; empty: all that the table marks")] = ""
     compression: Annotated[Literal["zstd", "lz4", "none"], Field(description="zstd, lz4 or none")] = "zstd"
     chunk_size: Annotated[int, Field(ge=1024, le=1 << 30, description="bytes; a crash loses at most one chunk")] = (

@@ -18,6 +18,7 @@ from common.messages import (
     ResetRequest,
     SampleReply,
     SampleRequest,
+    SpeedRequest,
     Stamped,
     WorldReply,
 )
@@ -32,6 +33,8 @@ from common.topics import (
     RESUME,
     SAMPLE,
     SCAN,
+    SPEED,
+    STEP,
     TELEPORT,
     TRUTH,
     WORLD,
@@ -52,13 +55,14 @@ class SimulatorService(Service):
 
     name: ClassVar[str] = "simulator"
     inputs: ClassVar[tuple[Topic, ...]] = (CMD_VEL,)
-    queries: ClassVar[tuple[Query, ...]] = (TELEPORT, RESET, PAUSE, RESUME, OBSTACLE, SAMPLE, WORLD)
+    queries: ClassVar[tuple[Query, ...]] = (TELEPORT, RESET, PAUSE, RESUME, STEP, SPEED, OBSTACLE, SAMPLE, WORLD)
 
     def __init__(self, settings: SimulatorSettings) -> None:
         """The world is built in `open`."""
         super().__init__(settings)
         self.options = settings
         self.paused = False
+        self.speed = 1.0  # simulated time over wall time, in pace realtime
         self._sent: tuple[Stamped, Stamped, Stamped] | None = None  # the observation of now, once published
         self._next = 0.0  # wall time of the next step, or in lockstep of the next complaint
         self._alive: set[str] = set()
@@ -68,6 +72,11 @@ class SimulatorService(Service):
     def lockstep(self) -> bool:
         """Whether each scan waits for its command."""
         return self.options.pace == "lockstep"
+
+    @property
+    def _period(self) -> float:
+        """S of wall time between scans."""
+        return self.simulation.period_ns * 1e-9 / self.speed
 
     def open(self) -> None:
         """Build world and robot; begin once those waited for are there."""
@@ -79,7 +88,7 @@ class SimulatorService(Service):
         self.simulation = Simulation(self.setup)
         self._next = time.monotonic()
         if self._wait_for:
-            self.note = f"waits for {', '.join(sorted(self._wait_for))}"
+            self._say_how_time_goes()
             self.log.info(self.note)
             self.loop.bus.watch_alive(self._changed)
 
@@ -104,7 +113,8 @@ class SimulatorService(Service):
     def on_timer(self) -> None:
         """Step, by the pace asked for."""
         if self._wait_for:
-            self._wait_for, self.note = set(), ""
+            self._wait_for = set()
+            self._say_how_time_goes()
             self._next = time.monotonic()
         if self._sent is None:
             self._observe()
@@ -127,6 +137,9 @@ class SimulatorService(Service):
         if self.lockstep and message.stamp_ns != self.simulation.stamp_ns:
             self.counters["stale_commands"] += 1
             return
+        if self.paused and self.simulation.answered:  # a controller that waits in vain lets the robot stand: not now
+            self.counters["stale_commands"] += 1
+            return
         if not self.simulation.command(message.stamp_ns, message.twist):
             self.counters["stale_commands"] += 1
             return
@@ -147,7 +160,7 @@ class SimulatorService(Service):
         if self.lockstep:
             self._next = now + self.options.lockstep_deadline
         else:
-            self._next += self.simulation.period_ns * 1e-9
+            self._next += self._period
             if now - self._next > LATE:
                 self.counters["late"] += 1
                 self._next = now
@@ -159,6 +172,10 @@ class SimulatorService(Service):
             return WorldReply(world=simulation.world, scanner=self.setup.scanner, robot=self.setup.robot)
         if isinstance(request, SampleRequest):
             return self._sample(request)
+        if query is STEP:
+            return self._step()
+        if isinstance(request, SpeedRequest):
+            return self._set_speed(request.factor)
         if isinstance(request, PoseRequest):
             self.simulation.teleport(request.pose.array())
         elif isinstance(request, ObstacleRequest):
@@ -174,9 +191,41 @@ class SimulatorService(Service):
 
     def _pause(self, *, paused: bool) -> None:
         self.paused = paused
-        self.note = "paused" if paused else ""
+        self._say_how_time_goes()
         # In lockstep the answer may have come during the pause: the scan is sent again at once.
         self._next = time.monotonic()
+
+    def _say_how_time_goes(self) -> None:
+        """The note in health."""
+        waits = f"waits for {', '.join(sorted(self._wait_for))}" if self._wait_for else ""
+        speed = f"runs at {self.speed:g} x real time" if self.speed != 1 else ""
+        self.note = "paused" if self.paused else waits or speed
+
+    def _step(self) -> Reply:
+        """While paused, one scan further; in lockstep, as ever, not before the scan of now has its command."""
+        if not self.paused:
+            return Reply(ok=False, reason="time runs: pause first, then step")
+        if self._wait_for:
+            return Reply(ok=False, reason=f"time has not begun: waits for {', '.join(sorted(self._wait_for))}")
+        self._next = time.monotonic()
+        if self._sent is not None and self.lockstep and not self.simulation.answered:
+            self._publish()
+            return Reply(ok=False, reason="no command has answered this scan yet; it is sent again: ask once more")
+        if self._sent is not None:
+            self.simulation.advance()
+        self._observe()
+        return Reply()
+
+    def _set_speed(self, factor: float) -> Reply:
+        """Times real time, from now on."""
+        if self.options.pace != "realtime":
+            why = "each scan waits for its command" if self.lockstep else "it goes as fast as it can"
+            return Reply(ok=False, reason=f"the pace is {self.options.pace}: {why}; a speed needs --pace realtime")
+        self.speed = factor
+        self._next = min(self._next, time.monotonic() + self._period)  # the next scan may have been far off
+        self._say_how_time_goes()
+        self.log.info("speed", factor=factor)
+        return Reply()
 
     def _reset(self, seed: int | None) -> None:
         self.setup = replace(self.setup, seed=self.setup.seed if seed is None else seed)

@@ -71,6 +71,11 @@ class Simulation:
         """Simulation time."""
         return self.steps * self.period_ns
 
+    @property
+    def answered(self) -> bool:
+        """Whether the command that answers the scan of now has come."""
+        return self._command is not None and self._command[0] == self.stamp_ns
+
     def command(self, stamp_ns: int, twist: Twist) -> bool:
         """Take a command; False where it answers a scan too old, or one that never was."""
         age = self.stamp_ns - stamp_ns

@@ -21,7 +21,7 @@ ALSO_SHELL = {
     "services/estimator/building.py",  # opens what the names name
     "services/estimator/model_card.py",  # reads the files a recording is to hold
     "services/recorder/reader.py", "services/recorder/replay.py", "services/recorder/writer.py",
-    "services/recorder/parts.py", "services/recorder/recover.py",
+    "services/recorder/parts.py", "services/recorder/recording.py", "services/recorder/recover.py",
     "services/recorder/describing.py",  # a thread that asks
     "services/simulator/physics.py",  # pybullet reads the robot's URDF from a file
 }  # fmt: skip

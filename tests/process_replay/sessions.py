@@ -19,6 +19,7 @@ from common.messages import (
     Belief,
     CmdVel,
     ConfigReply,
+    Drive,
     Goal,
     LocaliseRequest,
     ModelReply,
@@ -31,6 +32,7 @@ from common.messages import (
     ResetRequest,
     SampleRequest,
     Scan,
+    SpeedRequest,
     Twist,
     WorldReply,
 )
@@ -40,6 +42,7 @@ from common.service import Loop
 from common.topics import (
     BELIEF,
     CMD_VEL,
+    DRIVE,
     GOAL,
     LOCALISE,
     MODEL,
@@ -50,6 +53,8 @@ from common.topics import (
     RESUME,
     SAMPLE,
     SCAN,
+    SPEED,
+    STEP,
     TELEPORT,
     WORLD,
 )
@@ -112,6 +117,15 @@ def simulator_events() -> Iterator[Event]:
     yield Event.of(RESET, ResetRequest(seed=9))
     yield TIMER
     yield command(0, 0.5)
+    yield Event.of(SPEED, SpeedRequest(factor=2.0))  # of a lockstep there is none
+    yield Event.of(STEP, Request())  # time runs
+    yield Event.of(PAUSE, Request())
+    yield Event.of(STEP, Request())  # no command answers this scan yet
+    yield command(1, 0.5)
+    yield command(1, 0.0)  # a controller that got tired of waiting
+    yield Event.of(STEP, Request())
+    yield command(2, 0.5)
+    yield Event.of(STEP, Request())
 
 
 def estimator_events() -> Iterator[Event]:
@@ -139,19 +153,22 @@ def estimator_events() -> Iterator[Event]:
 
 
 def controller_events() -> Iterator[Event]:
-    """Goals refused, taken, reached and cancelled; a belief that does not know, one twice, none any more."""
+    """Goals refused, taken, reached and cancelled; a belief that does not know, one twice, none any more; by hand."""
     rng = np.random.default_rng(SEED)
     target = np.array([5.2, 1.5])
-    for number in [*range(39), 55, 72, 73]:
+    for number in [*range(39), 55, 72, 73, *range(90, 112)]:
         state = "localising" if number < 4 else "ambiguous" if number in {10, 11} else "tracking"
         position = np.array([3.2, 1.4]) + (target - [3.2, 1.4]) * min(1.0, max(0, number - 4) / 31)
         goal = {1: Goal(stamp_ns=0, seq=1, pose=Pose(x=30.0, y=1.0)),
                 2: Goal(stamp_ns=0, seq=2, pose=Pose(x=5.2, y=1.5), tolerance=0.2),
                 38: Goal(stamp_ns=0, seq=3, pose=Pose(x=9.0, y=1.5)),
-                73: Goal(stamp_ns=0, seq=4, pose=Pose(x=9.0, y=1.5), cancel=True)}.get(number)  # fmt: skip
+                73: Goal(stamp_ns=0, seq=4, pose=Pose(x=9.0, y=1.5), cancel=True),
+                90: Goal(stamp_ns=0, seq=5, pose=Pose(x=3.4, y=1.5))}.get(number)  # fmt: skip
         if goal is not None:
             yield Event.of(GOAL, goal)
         scan = scan_at(number, np.array([*position, 0.1]), rng)
+        if number in range(92, 104):  # then stands, by hand, until the goal's turn comes again
+            yield Event.of(DRIVE, Drive(stamp_ns=0, twist=Twist(vx=-0.3, vy=2.0, wz=0.5) if number < 96 else Twist()))
         if number in {18, 19, 38, 55, 72}:  # somebody steps in front of it; from 38 on, and stays
             near = np.where(np.abs(scan.angles()) < 0.3, 0.25 if number < 38 else 0.12, scan.ranges)
             scan = scan.model_copy(update={"ranges": near.astype(np.float32)})
@@ -165,6 +182,10 @@ def controller_events() -> Iterator[Event]:
         if number == 20:
             yield Event.of(BELIEF, belief)
     yield TIMER  # nothing came for too long
+    for number in range(112, 126):  # a hand needs no belief; it falls silent, and the robot brakes
+        if number < 114:
+            yield Event.of(DRIVE, Drive(stamp_ns=0, twist=Twist(vx=-0.8)))
+        yield Event.of(SCAN, scan_at(number, np.array([*target, 0.1]), rng))
 
 
 def simulator(folder: Path, **changes: Any) -> list[Row]:

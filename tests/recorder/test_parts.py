@@ -11,7 +11,7 @@ from common.messages import Pose, Truth, Twist
 from common.topics import SCAN, TRUTH
 from services.recorder.parts import Limits, PartsWriter
 from services.recorder.reader import read_recording
-from services.recorder.service import parts_of
+from services.recorder.recording import parts_of
 from services.recorder.settings import RecorderSettings
 
 KEY = "presage/r/truth"

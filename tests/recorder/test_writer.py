@@ -17,7 +17,8 @@ from common.messages import Pose, Truth, Twist
 from common.topics import HEALTH, ODOM, SCAN, TOPICS, TRUTH
 from common.world import load_world
 from services.recorder.reader import MAGIC, read_recording
-from services.recorder.service import RecorderService, chosen_topics, open_writer
+from services.recorder.recording import open_writer
+from services.recorder.service import RecorderService, chosen_topics
 from services.recorder.settings import RecorderSettings
 from services.recorder.writer import NameTakenError, RecordingWriter
 from tests.recorder import sessions as made

@@ -48,11 +48,11 @@ def test_numbers_that_cannot_be_written_are_said_first(process, tmp_path):
 
 
 def test_a_recorder_under_load_keeps_every_byte(process, tmp_path):
-    args = ("--seconds", "2", "--rate", "700", "--out", str(tmp_path / "kept"), "--json", str(tmp_path / "r.json"))
+    args = ("--seconds", "2", "--rate", "720", "--out", str(tmp_path / "kept"), "--json", str(tmp_path / "r.json"))
     bench = process("presage.__main__", "bench", "recorder", *args)
     assert bench.wait(120) == 0, bench.output
     numbers = json.loads((tmp_path / "r.json").read_text())
-    assert numbers["sent"] == numbers["received"] == numbers["written"] == numbers["in_file"] == 1400
+    assert numbers["sent"] == numbers["received"] == numbers["written"] == numbers["in_file"] == 1440
     assert (numbers["dropped"], numbers["missing"], numbers["bytes_as_sent"]) == (0, 0, True)
     assert [file.name for file in tmp_path.glob("kept/*.mcap*")] == ["bench.mcap"]
 

@@ -18,8 +18,8 @@ from tests.common.samples import message_of
 from tests.conftest import Processes
 
 SERVICES = ("simulator", "estimator", "controller", "recorder")
-EXAMPLES = 560  # a key; 18 keys
-HEARD = {"simulator": ["cmd_vel"], "estimator": ["scan", "goal"], "controller": ["scan", "belief", "goal"]}
+EXAMPLES = 560  # a key; 22 keys
+HEARD = {"simulator": ["cmd_vel"], "estimator": ["scan", "goal"], "controller": ["scan", "belief", "goal", "drive"]}
 
 JUNK = st.one_of(
     st.none(),

@@ -1,0 +1,125 @@
+"""One recording from its first byte to its last: its name, what describes the session, and counters of its own."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import sys
+import time
+from collections.abc import Callable, Iterable
+from contextlib import nullcontext, suppress
+from datetime import datetime, timezone
+from pathlib import Path
+
+from common.inbox import Inbox, Sample
+from common.log import Logger
+from common.messages import RecordReply
+from common.topics import Topic
+from common.versions import versions
+from services.recorder.accounting import Count, Ledger, as_metadata
+from services.recorder.describing import Answer, MetadataRecord, records_of
+from services.recorder.parts import Limits, PartsWriter
+from services.recorder.settings import RecorderSettings
+from services.recorder.writer import UNFINISHED, NameTakenError, RecordingWriter, is_being_written
+
+
+class OpenRecording:
+    """What is being written. Every step raises UserError where it fails."""
+
+    def __init__(
+        self, options: RecorderSettings, topics: Iterable[Topic], inbox: Inbox, *, numbered: bool = False
+    ) -> None:
+        """Open the file: what is known first, so that even a torn one explains itself; ``numbered`` as `parts_of`."""
+        self.ledger = Ledger()
+        self._inbox, self._before, self._began = inbox, inbox.tally(), time.monotonic()
+        self._logged_ns = 0  # of the last message
+        limits = Limits(int(options.split_size * 1e6), options.split_minutes * 60)
+        writer = self.writer = PartsWriter(parts_of(options, numbered=numbered), limits, self._counters)
+        writer.metadata("presage", {"robot": options.robot, "command": " ".join(sys.argv), **versions()})
+        writer.metadata("config:recorder", {"config": json.dumps(options.effective())})
+        for topic in topics:
+            if not topic.per_service:
+                writer.declare(topic, topic.key(options.robot))
+        writer.flush()
+
+    def write(self, sample: Sample) -> None:
+        """Bytes as they came, whether or not they make sense."""
+        self._logged_ns = max(self._logged_ns, sample.received_ns)  # in order, though a clock be set back
+        published = sample.published_ns or sample.received_ns
+        self.writer.write(sample.topic, sample.key, sample.payload, published, self._logged_ns)
+        self.ledger.see(sample.key, sample.payload)
+
+    def describe(self, service: str, answer: Answer) -> None:
+        """What a service said of itself."""
+        write_answer(self.writer, service, answer)
+
+    def state(self) -> RecordReply:
+        """How it stands."""
+        written, seconds = sum(self.ledger.written.values()), time.monotonic() - self._began
+        return RecordReply(recording=True, file=str(self.writer.part.path), messages=written, seconds=seconds)
+
+    def missing(self) -> int:
+        """Messages that were sent and never came, by their numbers."""
+        return sum(sequence.missing for sequence in self.ledger.sequences.values())
+
+    def dropped(self) -> int:
+        """Messages for which the queue had no room."""
+        return sum(count.dropped for count in self._counts().values())
+
+    def _counts(self) -> dict[str, Count]:
+        now = [count - before for count, before in zip(self._inbox.tally(), self._before, strict=True)]
+        return self.ledger.counts(*now)
+
+    def _counters(self) -> dict[str, dict[str, str]]:
+        return {"counters": as_metadata(self._counts())}
+
+
+def open_writer(options: RecorderSettings) -> RecordingWriter:
+    """Under the name asked for; a name of our own making gets a number where another recorder was first."""
+    return parts_of(options)(1)
+
+
+def parts_of(options: RecorderSettings, *, numbered: bool = False) -> Callable[[int], RecordingWriter]:
+    """Opens part number k: NAME.mcap, or NAME-001.mcap, NAME-002.mcap … where there may be several.
+
+    Where the name is taken another with a number is, if it is of our own making or ``numbered``; else that is an error.
+    """
+    first, several = file_path(options), bool(options.split_size or options.split_minutes)
+    chosen: list[Path] = []  # the name that was free for the first part
+
+    def open_part(part: int) -> RecordingWriter:
+        for number in itertools.count(1):
+            path = first if number == 1 else first.with_stem(f"{first.stem}-{number}")
+            path = chosen[0] if chosen else path
+            file = path.with_stem(f"{path.stem}-{part:03d}") if several else path
+            another = (numbered or not options.file) and not chosen
+            with suppress(NameTakenError) if another else nullcontext():
+                writer = RecordingWriter(file, options.compression, options.chunk_size)
+                chosen.append(path)
+                return writer
+        raise AssertionError
+
+    return open_part
+
+
+def tell_of_unfinished(folder: Path, log: Logger) -> None:
+    """Files of recorders that were killed, and what to do with them."""
+    for path in sorted(folder.glob(f"*.mcap{UNFINISHED}")) if folder.is_dir() else ():
+        if not is_being_written(path):
+            log.warning("unfinished recording", file=str(path), advice=f"presage recover {path}")
+
+
+def file_path(options: RecorderSettings) -> Path:
+    """Where to record: the name asked for, or one of robot and time."""
+    stamp = datetime.now(timezone.utc).strftime("%Y%m%d-%H%M%S")
+    name = options.file or f"presage-{options.robot}-{stamp}.mcap"
+    return options.directory / (name if name.endswith(".mcap") else name + ".mcap")
+
+
+def write_answer(writer: RecordingWriter | PartsWriter, service: str, answer: Answer) -> None:
+    """What a service said of itself, as `records_of` has it."""
+    for record in records_of(service, answer):
+        if isinstance(record, MetadataRecord):
+            writer.metadata(record.name, record.values)
+        else:
+            writer.attachment(record.name, record.data, record.media_type, time.time_ns())
