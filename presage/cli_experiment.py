@@ -67,7 +67,7 @@ def e1(
 
 @app.command("e2")
 def e2(
-    trials: Trials = 12,
+    trials: Trials = 10,
     step: Annotated[float, typer.Option(min=1e-3, max=1.0, help="m, of each teleport.")] = 0.05,
     estimators: Estimators = "",
     alpha: Alpha = None,
@@ -178,7 +178,7 @@ def samples_needed(
 
 @app.command("aliasing")
 def similar_objects(
-    places: Annotated[int, typer.Option(min=1, help="In each world.")] = 50,
+    places: Annotated[int, typer.Option(min=1, help="In each world.")] = 30,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
     workers: Workers = CORES,
