@@ -16,8 +16,7 @@ export function sharp(canvas, resized) {
     Object.assign(state, { width, height });
     resized(state);
   };
-  new ResizeObserver(fit).observe(canvas);
-  fit();
+  new ResizeObserver(fit).observe(canvas); // says the first size too
   return state;
 }
 

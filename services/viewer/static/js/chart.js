@@ -47,9 +47,16 @@ export class Chart {
     const { log, low: least = Infinity, high: most = -Infinity } = this.options;
     low = Math.min(low, least);
     high = Math.max(high, most);
+    if (log) low = Math.min(least, this.lower()); // a moment of hardly any error is not worth a decade
     if (log) return [10 ** Math.floor(Math.log10(Math.max(low, 1e-4)) + 1e-9), 10 ** Math.ceil(Math.log10(Math.max(high, 2e-4)) - 1e-9)];
     const air = Math.max((high - low) * 0.08, Math.abs(high) * 0.002, 1e-6);
     return [least === low ? low : low - air, high + air];
+  }
+
+  /** What one value in twenty lies below. */
+  lower() {
+    const values = this.series.flatMap(({ key }) => this.store.history[key]).filter(Number.isFinite).sort((a, b) => a - b);
+    return values[Math.floor(values.length / 20)];
   }
 
   draw() {

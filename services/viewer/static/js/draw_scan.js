@@ -38,7 +38,7 @@ export function drawFan(ctx, camera, frame, pose, colours) {
 
 /** Measured ranges as points. */
 export function drawMeasured(ctx, camera, frame, pose, colours) {
-  const ray = rays(frame, pose), size = camera.scale > 70 ? 3 : 2.4;
+  const ray = rays(frame, pose), size = camera.scale > 70 ? 2.4 : 1.8;
   ctx.fillStyle = colours.measured;
   ctx.beginPath();
   for (let i = 0; i < frame.ranges.length; i++) {
@@ -86,10 +86,10 @@ export function drawPredicted(ctx, camera, frame, pose, colours) {
   for (let k = 0; k < BUCKETS; k++) {
     const vague = k / (BUCKETS - 1);
     ctx.globalAlpha = 0.24 - 0.15 * vague;
-    ctx.lineWidth = 2.2;
+    ctx.lineWidth = 2.4;
     ctx.stroke(bands[k]);
     ctx.globalAlpha = 1 - 0.65 * vague;
-    ctx.lineWidth = 2.4 - 1.2 * vague;
+    ctx.lineWidth = 3.6 - 2 * vague;
     ctx.stroke(lines[k]);
   }
   ctx.globalAlpha = 1;

@@ -29,7 +29,7 @@ export class MapView {
     this.surface = sharp($("map"), ({ width, height }) => {
       this.camera.padding = width < 600
         ? { left: 26, right: 16, top: 12, bottom: 112 }
-        : { left: 34, right: 34, top: 30, bottom: 118 };
+        : { left: width > 1000 ? 176 : 40, right: width > 1000 ? 64 : 40, top: 28, bottom: 122 };
       this.camera.resize(width, height);
       this.invalidate();
     });

@@ -74,9 +74,10 @@ export class Panels {
     const { history } = this.store;
     const i = cursor.t === null ? history.t.length - 1 : indexAt(history.t, cursor.t);
     const value = (name) => history[name][i];
-    this.keys.free_energy(number(value("free_energy"), 1));
-    this.keys.accuracy(number(value("accuracy"), 1));
-    this.keys.complexity(`${number(value("complexity"), 1)} nats`);
+    const nats = (name) => number(value(name), Math.abs(value(name)) < 100 ? 1 : 0);
+    this.keys.free_energy(nats("free_energy"));
+    this.keys.accuracy(nats("accuracy"));
+    this.keys.complexity(nats("complexity"));
     this.keys.error(metres(value("error")));
     this.keys.speed(`${number(value("speed"), 2)} m/s`);
   }
