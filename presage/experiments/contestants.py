@@ -22,7 +22,7 @@ NAMES = (
     "paper", f"paper, {STEPS}", "precise", "particle-filter", "particle-filter, heading known",
     "amcl-defaults", "precise, odometry", "particle-filter, odometry", "amcl-defaults, odometry",
 )  # fmt: skip
-# One gradient step a scan, as the paper's algorithm 1. The step size is the best of `presage experiment alpha`.
+# One gradient step a scan, as the paper's algorithm 1. The step size lies where `presage experiment alpha` is flat.
 PAPER = Descent(iterations=1)
 
 
