@@ -67,7 +67,7 @@ def e1(
 
 @app.command("e2")
 def e2(
-    trials: Trials = 10,
+    trials: Trials = 12,
     step: Annotated[float, typer.Option(min=1e-3, max=1.0, help="m, of each teleport.")] = 0.05,
     estimators: Estimators = "",
     alpha: Alpha = None,

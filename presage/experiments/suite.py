@@ -50,7 +50,7 @@ def run_all(trials: int, seed: int, out: Path, workers: int, console: Console) -
         "e3": lambda: navigation.run(navigation.Job(0, seed), few(50), out, workers + 1, console),
         "any/e3": lambda: navigation.run(any_pair, few(10), folder("any"), workers, console),
         "alpha": lambda: step_size.run(localisation.Job(0, seed, 50), few(25), out, workers, console),
-        "steps": lambda: stepping.run(stepping.Job(0, seed), few(12), out, workers, console),
+        "steps": lambda: stepping.run(stepping.Job(0, seed), few(10), out, workers, console),
         "samples": lambda: samples.run(samples.Job(seed, places=few(50)), out, workers, console),
         "aliasing": lambda: aliasing.run(aliasing.Job(seed, places=few(30)), out, workers, console),
         "prediction": lambda: prediction.run(prediction.Job(seed), out, 1, console),
