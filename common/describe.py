@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from common import messages, robot, scanner, world
+from common import messages, pose, robot, scanner, world
 from common.topics import MAX_BYTES, QUERIES, ROOT, TOPICS, alive_key
 
 HEAD = f"""# Messages
@@ -56,7 +56,7 @@ def _queries() -> list[str]:
 
 def _models() -> list[type[BaseModel]]:
     found: list[type[BaseModel]] = []
-    for module in (messages, world, scanner, robot):
+    for module in (pose, messages, world, scanner, robot):
         mine = [c for c in vars(module).values() if inspect.isclass(c) and issubclass(c, BaseModel)]
         found += [c for c in mine if c.__module__ == module.__name__ and not c.__name__.startswith("_")]
     return found

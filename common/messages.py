@@ -12,40 +12,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
+from common.pose import Pose as Pose  # noqa: PLC0414 - most take it from here
+from common.pose import Twist as Twist  # noqa: PLC0414
 from common.robot import Robot
 from common.scanner import Scanner
 from common.wire import Bytes, Count, Finite, Floats, Matrix3, Message, Name, NotNegative, Poses, Positive, Ranges, Text
 from common.world import Obstacle, World
-
-
-class Pose(Message):
-    """A pose in the plane; its frame is said where it is used."""
-
-    x: Finite  # m
-    y: Finite  # m
-    yaw: Finite = 0.0  # rad, counter-clockwise from x
-
-    def array(self) -> npt.NDArray[np.float64]:
-        """(3,) x, y, yaw."""
-        return np.array([self.x, self.y, self.yaw])
-
-    @classmethod
-    def of(cls, pose: npt.ArrayLike) -> Pose:
-        """From (3,) x, y, yaw."""
-        x, y, yaw = np.asarray(pose, float)
-        return cls(x=float(x), y=float(y), yaw=float(yaw))
-
-
-class Twist(Message):
-    """A velocity in base_link (geometry_msgs/Twist, in the plane)."""
-
-    vx: Finite = 0.0  # m/s, forward
-    vy: Finite = 0.0  # m/s, left; 0 for a differential drive
-    wz: Finite = 0.0  # rad/s, counter-clockwise
-
-    def array(self) -> npt.NDArray[np.float64]:
-        """(3,) vx, vy, wz."""
-        return np.array([self.vx, self.vy, self.wz])
 
 
 class Stamped(Message):

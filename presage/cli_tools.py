@@ -1,4 +1,4 @@
-"""Commands for a running session: goal, teleport, localise, topics, hz, doctor."""
+"""Commands for a running session: goal, teleport, localise, topics, hz, top, doctor."""
 
 from __future__ import annotations
 
@@ -119,6 +119,23 @@ def hz(
     from presage.tools import show_rates  # noqa: PLC0415
 
     raise typer.Exit(show_rates(link_of(connect, robot), topic, seconds, console))
+
+
+@app.command()
+def top(
+    robot: Annotated[
+        list[str], typer.Option(envvar="PRESAGE_ROBOT", help="Which robot; may be given more than once.")
+    ] = ["robot"],  # noqa: B006 - typer copies it
+    once: Annotated[bool, typer.Option("--once", help="One table; status 1 where something is missing.")] = False,
+    connect: Connect = DEFAULT_ENDPOINT,
+) -> None:
+    """The health of every service, live until Ctrl-C: rates, latency, drops, who is missing and how to start it.
+
+    Examples: `presage top`; `presage top --once`; `presage top --robot one --robot two`.
+    """
+    from presage.top import run_top  # noqa: PLC0415
+
+    raise typer.Exit(run_top(link_of(connect, robot[0]), list(dict.fromkeys(robot)), console, once=once))
 
 
 @app.command()

@@ -11,7 +11,7 @@ from contextlib import nullcontext, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 
-from common.inbox import Inbox, Sample
+from common.inbox import OTHERS, Inbox, Sample
 from common.log import Logger
 from common.messages import RecordReply
 from common.topics import Topic
@@ -67,8 +67,12 @@ class OpenRecording:
         return sum(count.dropped for count in self._counts().values())
 
     def _counts(self) -> dict[str, Count]:
-        now = [count - before for count, before in zip(self._inbox.tally(), self._before, strict=True)]
-        return self.ledger.counts(*now)
+        """Of messages; what was asked of the recorder is counted by the inbox under the query's name, and left out."""
+        since = [now - before for now, before in zip(self._inbox.tally(), self._before, strict=True)]
+        received, dropped, oversized = (
+            {key: number for key, number in counts.items() if "/" in key or key == OTHERS} for counts in since
+        )
+        return self.ledger.counts(received, dropped, oversized)
 
     def _counters(self) -> dict[str, dict[str, str]]:
         return {"counters": as_metadata(self._counts())}

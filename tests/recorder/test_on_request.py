@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -238,6 +239,6 @@ def test_one_that_is_gone_is_not_described(recorder, bus, tell, process, tmp_pat
 
     def absent():
         tell("start")
-        return "config:controller" not in read_recording(tell("stop").file).metadata
+        return "config:controller" not in read_recording(Path(tell("stop").file)).metadata
 
     assert wait_until(absent, 20, 0.1)

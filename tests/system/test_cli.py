@@ -87,6 +87,7 @@ def test_help_has_examples_for_every_command(process):
         "train",
         "topics",
         "hz",
+        "top",
         "echo",
         "doctor",
     ]

@@ -1,0 +1,88 @@
+"""`presage top`: the table of a real session, once and live."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from common.bus import wait_until
+
+NAMES = ("simulator", "estimator", "controller")
+
+
+def words(text: str) -> str:
+    """Without the table's lines, so that what was wrapped reads on."""
+    return " ".join("".join(" " if c in "│┃─━┏┓┗┛└┘├┤┡┩╇╋┳┬┴┻┼" else c for c in text).split())
+
+
+def row_of(output: str, service: str) -> str:
+    return next(words(line) for line in output.splitlines() if words(line).startswith(service))
+
+
+def test_a_whole_session_is_well(process, bus):
+    for name in NAMES:
+        process(name, *(("--initial-pose", "3,1.5") if name == "estimator" else ()))
+    assert wait_until(lambda: set(NAMES) <= bus.alive(), 60)
+
+    def once():
+        top = process("presage.__main__", "top", "--once")
+        return top.wait(60), top.output
+
+    status, output = once()
+    assert wait_until(lambda: "ms" in row_of(once()[1], "controller"), 60)  # the first scans take their time
+    assert status == 0, output
+    status, output = once()
+    assert f"robot {bus.robot}" in output
+    for name, sends in zip(NAMES, ("scan", "belief", "cmd_vel"), strict=True):
+        row = row_of(output, name)
+        assert row.startswith(f"{name} alive"), output
+        assert f"{sends} 1" in row, output  # ten to twenty a second
+    assert "ms" in row_of(output, "estimator")
+    assert "not running" in row_of(output, "recorder")
+    assert "Traceback" not in output
+
+
+def test_who_is_missing_is_said_with_what_starts_it(process, bus, link):
+    controller = process("controller")
+    assert wait_until(lambda: "controller" in bus.alive(), 60)
+    top = process("presage.__main__", "top", "--once")
+    assert top.wait(60) == 1
+    assert row_of(top.output, "controller").startswith("controller alive")
+    assert row_of(top.output, "estimator").startswith("estimator missing")
+    start = f"python -m services.simulator --robot {bus.robot} --connect {link.connect[0]}"
+    assert start.replace(" ", "") in words(top.output).replace(" ", "")
+    assert controller.running
+
+
+def test_several_robots_have_a_table_each(process, bus):
+    process("controller")
+    assert wait_until(lambda: "controller" in bus.alive(), 60)
+    top = process("presage.__main__", "top", "--once", "--robot", bus.robot, "--robot", "nobody")
+    assert top.wait(60) == 1
+    assert row_of(top.output, "controller").startswith("controller alive")
+    assert "robot nobody" in top.output
+    assert words(top.output).count("controller missing") == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_live_it_follows_and_ends_cleanly(process, bus, number):
+    top = process("presage.__main__", "top", env={"FORCE_COLOR": "1", "COLUMNS": "160", "LINES": "40"})
+    top.wait_for("missing")
+    controller = process("controller")
+    top.wait_for("alive")
+    controller.kill()
+    top.wait_for("gone")
+    status, seconds = top.stop(number)
+    assert status == 0
+    assert seconds < 5
+    assert "\x1b[?1049h" in top.output
+    assert top.output.rstrip().endswith(("\x1b[?25h", "\x1b[?1049l"))  # the terminal is given back
+    assert "Traceback" not in top.output
+
+
+def test_no_session_is_one_line(process):
+    top = process("presage.__main__", "top", "--connect", "tcp/127.0.0.1:9")
+    assert top.wait(60) == 2
+    assert "start a session with `presage up`" in top.output
+    assert "Traceback" not in top.output
