@@ -59,13 +59,13 @@ export class Actions {
 
   async pause(paused) {
     const answer = await this.ask(paused ? "pause" : "resume", {}, paused ? "Paused" : "Running", { quiet: true });
-    if (answer.ok) this.store.paused = paused;
+    if (answer.ok) Object.assign(this.store, { paused, pausedAt: performance.now() });
     this.changed();
   }
 
   async step() {
     const answer = await this.ask("step", {}, "", { quiet: true });
-    if (answer.ok) this.store.stepped = true;
+    if (answer.ok) this.store.pausedAt = performance.now();
   }
 
   async reset() {

@@ -47,16 +47,9 @@ export class Chart {
     const { log, low: least = Infinity, high: most = -Infinity } = this.options;
     low = Math.min(low, least);
     high = Math.max(high, most);
-    if (log) low = Math.min(least, this.lower()); // a moment of hardly any error is not worth a decade
-    if (log) return [10 ** Math.floor(Math.log10(Math.max(low, 1e-4)) + 1e-9), 10 ** Math.ceil(Math.log10(Math.max(high, 2e-4)) - 1e-9)];
+    if (log) return [least, 10 ** Math.ceil(Math.log10(Math.max(high, 10 * least)) - 1e-9)]; // less than `low` is drawn as it
     const air = Math.max((high - low) * 0.08, Math.abs(high) * 0.002, 1e-6);
     return [least === low ? low : low - air, high + air];
-  }
-
-  /** What one value in twenty lies below. */
-  lower() {
-    const values = this.series.flatMap(({ key }) => this.store.history[key]).filter(Number.isFinite).sort((a, b) => a - b);
-    return values[Math.floor(values.length / 20)];
   }
 
   draw() {
@@ -128,7 +121,7 @@ export class Chart {
     const lines = [];
     const every = Math.ceil((Math.log10(high / low) * 16) / Math.max(h, 1));
     for (let k = Math.round(Math.log10(low)); k <= Math.log10(high) + 1e-9; k += every) {
-      lines.push([10 ** k, k >= 0 ? `${10 ** k} m` : k >= -2 ? `${10 ** (k + 2)} cm` : `${10 ** (k + 3)} mm`]);
+      lines.push([10 ** k, k >= 0 ? `${10 ** k} m` : k >= -2 ? `${10 ** (k + 2)} cm` : k >= -3 ? `${10 ** (k + 3)} mm` : "0.1 mm"]);
     }
     return lines;
   }
@@ -147,7 +140,7 @@ export class Chart {
     ctx.setLineDash([]);
   }
 
-  drawSeries(ctx, { key, tone, width = 1.5, fill = false }, x, y, plot, colours) {
+  drawSeries(ctx, { key, tone, width = 1.2, fill = false }, x, y, plot, colours) {
     const { history } = this.store, values = history[key];
     const path = new Path2D(), area = new Path2D();
     let from = null, last = null;

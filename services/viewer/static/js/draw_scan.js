@@ -38,7 +38,7 @@ export function drawFan(ctx, camera, frame, pose, colours) {
 
 /** Measured ranges as points. */
 export function drawMeasured(ctx, camera, frame, pose, colours) {
-  const ray = rays(frame, pose), size = camera.scale > 70 ? 2.4 : 1.8;
+  const ray = rays(frame, pose), size = camera.scale > 50 ? 2.6 : 2;
   ctx.fillStyle = colours.measured;
   ctx.beginPath();
   for (let i = 0; i < frame.ranges.length; i++) {
@@ -89,7 +89,7 @@ export function drawPredicted(ctx, camera, frame, pose, colours) {
     ctx.lineWidth = 2.4;
     ctx.stroke(bands[k]);
     ctx.globalAlpha = 1 - 0.65 * vague;
-    ctx.lineWidth = 3.6 - 2 * vague;
+    ctx.lineWidth = 3 - 1.6 * vague;
     ctx.stroke(lines[k]);
   }
   ctx.globalAlpha = 1;

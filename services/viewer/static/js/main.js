@@ -11,6 +11,7 @@ import { MapView } from "./map.js";
 import { Modes } from "./modes.js";
 import { Panels } from "./panels.js";
 import { Player } from "./player.js";
+import { Pointer } from "./pointer.js";
 import { Services } from "./services.js";
 import { Store } from "./store.js";
 import { startTheme } from "./theme.js";
@@ -24,6 +25,7 @@ const services = new Services(store, toast);
 const connection = new Connection({ message: take, frame: takeFrame, state: connectionChanged });
 const actions = new Actions(store, connection, toast);
 const modes = new Modes(store, view, actions);
+new Pointer($("map"), view, modes);
 const toolbar = new Toolbar(store, modes, actions);
 const drive = new Drive(store, actions, () => modes.can);
 const player = new Player(store, connection, toast);
@@ -107,10 +109,8 @@ function takeHistory({ samples }) {
 function takeFrame(frame) {
   const before = store.frame;
   store.takeFrame(frame, performance.now());
-  if (before && frame.t > before.t && store.paused) {
-    if (!store.stepped) store.paused = false; // somebody else let it run
-    store.stepped = false;
-  }
+  // Frames go on well after a pause or a step: somebody else let it run.
+  if (store.paused && before && frame.t > before.t && performance.now() - store.pausedAt > 1000) store.paused = false;
   const state = frame.belief?.state ?? frame.status?.state ?? "";
   const title = `${frame.robot}${state ? ` · ${state}` : ""} · presage`;
   if (document.title !== title) document.title = title;

@@ -18,9 +18,9 @@ export class Panels {
     this.store = store;
     const chart = (id, series, options) => new Chart($(id), store, series, options);
     this.charts = [
-      chart("c-energy", [{ key: "accuracy", tone: "measured", width: 1.25 }, { key: "free_energy", tone: "predicted", width: 1.5 }], { axis: false, nothing: "no belief yet" }),
+      chart("c-energy", [{ key: "accuracy", tone: "measured", width: 1 }, { key: "free_energy", tone: "predicted" }], { axis: false, nothing: "no belief yet" }),
       chart("c-complexity", [{ key: "complexity", tone: "goal", fill: true }], { low: 0, high: 1 }),
-      chart("c-error", [{ key: "error", tone: "predicted", fill: true }], { log: true, low: 0.001, high: 0.1, nothing: "no true pose to compare with" }),
+      chart("c-error", [{ key: "error", tone: "predicted", fill: true }], { log: true, low: 0.0001, high: 0.01, nothing: "no true pose to compare with" }),
       chart("c-speed", [{ key: "speed", tone: "measured", fill: true }], { low: 0, high: 0.5 }),
     ];
     this.scan = new ScanPlot($("c-scan"), store);

@@ -21,6 +21,7 @@ export class Store {
     this.servicesKnown = false;
     this.player = null;
     this.paused = false;
+    this.pausedAt = 0; // ms, the last pause or step
     this.arrivals = [];
     this.forget();
   }

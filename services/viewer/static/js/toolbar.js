@@ -56,7 +56,7 @@ export class Toolbar {
 
   drawSub(can) {
     const { modes } = this;
-    $("sub").hidden = Boolean(this.store.player) || !this.store.hello;
+    $("sub").hidden = Boolean(this.store.player) || !this.store.world;
     const selected = modes.selected;
     const kind = !can ? "none" : selected ? `selected ${selected.name} ${Boolean(selected.circle)}` : modes.name;
     if (this.kind === kind) return;
