@@ -10,6 +10,7 @@ import msgpack
 
 from common.topics import topic_of
 
+MOST = 1 << 62  # a count that is larger, by numbers somebody made up, stays there: a message must hold it
 FAR = 64  # a number so much below the last is a publisher that began anew, not a late message
 
 
@@ -28,7 +29,7 @@ class Sequence:
         due = number if self._next is None else self._next
         if number > due:
             self.gaps += 1
-            self.missing += number - due
+            self.missing = min(MOST, self.missing + number - due)
         elif number < due:
             if number and due - number <= FAR:
                 self.reordered += 1
@@ -116,4 +117,4 @@ def sequence_of(payload: bytes) -> int | None:
         number = msgpack.unpackb(payload).get("seq", 0)
     except Exception:  # noqa: BLE001 - msgpack raises many kinds, and the payload may be anything
         return None
-    return number if isinstance(number, int) and number >= 0 else None
+    return number if isinstance(number, int) and 0 <= number < 1 << 63 else None

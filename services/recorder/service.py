@@ -11,6 +11,7 @@ from common.inbox import OTHERS, Sample
 from common.messages import RecordReply, RecordRequest, Reply, Request, WorldReply
 from common.service import Service
 from common.topics import RECORDING, TOPICS, WORLD, Query, Topic
+from services.recorder.accounting import MOST
 from services.recorder.describing import Answer, Describer
 from services.recorder.parts import PartsWriter
 from services.recorder.recording import OpenRecording, tell_of_unfinished, write_answer
@@ -117,7 +118,7 @@ class RecorderService(Service):
         if self.recording is not None:
             ledger = self.recording.ledger
             written, missing = written + ledger.written.get(key, 0), missing + ledger.lost(key).missing
-        return {"written": written, "missing": missing}
+        return {"written": written, "missing": min(missing, MOST)}
 
     def due(self) -> float | None:
         """Until the next flush."""

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import itertools
 
+import msgpack
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.messages import Goal, Pose, Truth, Twist
+from common.messages import Goal, Pose, TopicHealth, Truth, Twist
 from services.recorder.accounting import FAR, Count, Ledger, Sequence, as_metadata, from_metadata, sequence_of
 
 SCAN, GOAL = "presage/r/scan", "presage/r/goal"
@@ -80,3 +81,13 @@ def test_what_is_no_count_is_left_out():
 def test_any_payload_may_come(payload):
     number = sequence_of(payload)
     assert number is None or number >= 0
+
+
+@pytest.mark.parametrize("numbers", [[0, 2**63 - 1], [0, 2**64 - 1, 5], [0, 2**62, 0, 2**62, 0, 2**62, 0, 2**62]])
+def test_numbers_somebody_made_up_still_make_a_count_that_health_can_hold(numbers):
+    ledger = Ledger()
+    for number in numbers:
+        ledger.see(SCAN, msgpack.packb({"seq": number}))
+    missing = ledger.lost(SCAN).missing
+    assert TopicHealth(key="k", missing=missing).missing == missing
+    assert missing > 0
