@@ -85,8 +85,10 @@ class Bus:
         publisher: Any = self.publisher(topic, service, key)  # zenoh's stub has the status wrong
         return wait_until(lambda: bool(publisher.matching_status.matching), timeout)
 
-    def subscribe(self, topic: Topic, inbox: Inbox, *, keep_all: bool = False, robot: str | None = None) -> None:
-        """Move the topic's payloads to ``inbox`` by the topic's queue policy, or all of them."""
+    def subscribe(
+        self, topic: Topic, inbox: Inbox, *, keep_all: bool = False, robot: str | None = None
+    ) -> Callable[[], None]:
+        """Move the topic's payloads to ``inbox`` by the topic's queue policy, or all of them; a call ends it."""
         newest = topic.queue == "newest" and not keep_all
 
         def move(sample: zenoh.Sample) -> None:
@@ -95,7 +97,14 @@ class Bus:
             entry = Sample(topic, str(sample.key_expr), sample.payload.to_bytes(), published, time.time_ns())
             inbox.put(entry, newest_only=newest)
 
-        self._declared.append(self._session.declare_subscriber(topic.key(robot or self.robot), move))
+        subscriber = self._session.declare_subscriber(topic.key(robot or self.robot), move)
+        self._declared.append(subscriber)
+
+        def end() -> None:
+            self._declared.remove(subscriber)
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+        return end
 
     def serve(self, query: Query, inbox: Inbox, service: str = "*") -> None:
         """Move requests to ``inbox``; the loop answers them."""
@@ -118,9 +127,12 @@ class Bus:
 
         self._declared.append(self._session.declare_queryable(query.key(self.robot, service), move, complete=True))
 
-    def ask(self, query: Query, request: Request, reply: type[R], timeout: float = 5.0, service: str = "*") -> R:
+    def ask(
+        self, query: Query, request: Request, reply: type[R], timeout: float = 5.0, service: str = "*",
+        robot: str | None = None,
+    ) -> R:  # fmt: skip
         """The first answer; raises UserError where nobody answers, the answer is an error, or makes no sense."""
-        key = query.key(self.robot, service)
+        key = query.key(robot or self.robot, service)
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
             answers = list(self._session.get(key, payload=request.encode(), encoding=ENCODING, timeout=left))
@@ -152,6 +164,15 @@ class Bus:
 
         subscriber = self._session.liveliness().declare_subscriber(alive_key(self.robot), move, history=True)
         self._declared.append(subscriber)
+
+    def watch_robots(self, changed: Callable[[str, str, bool], None]) -> None:
+        """The same for every robot: ``changed(robot, service, is_there)``."""
+
+        def move(sample: zenoh.Sample) -> None:
+            _, robot, _, service = str(sample.key_expr).split("/")
+            changed(robot, service, sample.kind == zenoh.SampleKind.PUT)
+
+        self._declared.append(self._session.liveliness().declare_subscriber(alive_key("*"), move, history=True))
 
     def linked(self) -> bool:
         """Whether any other session is reached."""

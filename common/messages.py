@@ -239,7 +239,8 @@ class PlayerRequest(Request):
     """Steer a running replay."""
 
     action: Literal["pause", "resume", "step", "seek", "rate", "status"]  # step: to the end of the next scan, paused
-    value: Finite = 0.0  # seek: s from the recording's beginning; rate: times the original timing, 0 flat out
+    value: Finite = 0.0
+    # seek: s from the recording's beginning; rate: times the original timing, 0 flat out; step: how many, at least 1
 
 
 class PlayerReply(Reply):

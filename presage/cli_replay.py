@@ -27,6 +27,8 @@ def replay(
     loop: Annotated[bool, typer.Option("--loop", help="Begin anew at the end, until Ctrl-C.")] = False,
     robot: Annotated[str, typer.Option(help="Another robot's name in the keys; empty: the recorded one.")] = "",
     force: Annotated[bool, typer.Option("--force", help="Beside a live publisher of the same keys too.")] = False,
+    paused: Annotated[bool, typer.Option("--paused", help="Begin paused.")] = False,
+    stay: Annotated[bool, typer.Option("--stay", help="Stay at the end, paused, until Ctrl-C.")] = False,
     with_services: Annotated[
         str, typer.Option("--with", help="estimator[,controller]: start them here, as recorded, and compare.")
     ] = "",
@@ -53,13 +55,13 @@ def replay(
     """
     from presage.replaying import choice_of, run_replay  # noqa: PLC0415
 
-    choice = choice_of(only, leave_out, rate, start, end, robot, loop=loop, force=force)
+    choice = choice_of(only, leave_out, rate, start, end, robot, loop=loop, force=force, paused=paused, stay=stay)
     if not with_services:
         if json_file is not None or every_scan:
             raise UserError("--json and --every-scan go with --with: a plain replay compares nothing")
         run_replay(file, link_of(connect, "robot"), choice, console)
         return
-    if only or leave_out or robot or force or loop or start is not None or end is not None:
+    if only or leave_out or robot or force or loop or paused or stay or start is not None or end is not None:
         raise UserError("--with replays the whole of what those services heard: it takes no other choice than --rate")
     from presage.replays.again import Again, again_command  # noqa: PLC0415
 

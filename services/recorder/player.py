@@ -13,6 +13,7 @@ from common.messages import PlayerReply, PlayerRequest
 from common.topics import CMD_VEL, HEALTH, ROOT, TOPICS, Topic
 
 LATE = 1.0  # s behind its own time, beyond which a replay goes on from where it is and does not hurry
+MOST_STEPS = 10_000
 GAP = 0.1  # s between the end of a loop and its beginning anew
 
 
@@ -57,7 +58,7 @@ class Player:
         if request.action in ("pause", "step"):
             self._anchor(self.position(now), now)
             self.paused = True
-            self._steps += request.action == "step"
+            self._steps += max(1, round(min(request.value, MOST_STEPS))) if request.action == "step" else 0
         elif request.action == "resume":
             self._anchor(self.position(now), now)
             self.paused, self._steps = False, 0
@@ -85,6 +86,11 @@ class Player:
     def again(self, now: float) -> None:
         """From the beginning, a moment later."""
         self.seek(self.begin, now + (GAP if self.rate else 0.0))
+
+    def finish(self, now: float) -> None:
+        """At the end, paused, whatever was asked for: nothing comes after it."""
+        self._anchor(self.end, now)
+        self.paused, self._steps = True, 0
 
     def jump(self) -> float | None:
         """Where to read from now on, once after each seek."""

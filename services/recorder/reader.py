@@ -19,6 +19,7 @@ from pydantic import ValidationError
 from common.errors import UserError
 from common.messages import Stamped
 from common.robot import Robot
+from common.scanner import Scanner
 from common.topics import Topic, topic_of
 from common.wire import DecodeError
 from common.world import NOT_YAML, World
@@ -129,6 +130,13 @@ class Recording:
             return Robot.model_validate_json(self.metadata.get("world", {}).get("robot", "{}"))
         except ValidationError:
             return Robot()
+
+    def scanner(self) -> Scanner | None:
+        """The scanner that was read, where it was recorded."""
+        try:
+            return Scanner.model_validate_json(self.metadata.get("world", {}).get("scanner", ""))
+        except ValidationError:
+            return None
 
     def _indexed(
         self, stream: BinaryIO, keys: Collection[str] | None, start_ns: int | None, end_ns: int | None

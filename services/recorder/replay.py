@@ -20,8 +20,8 @@ from pathlib import Path
 from common.bus import Bus, Link, open_bus, wait_until
 from common.errors import UserError
 from common.inbox import Call, Inbox
-from common.messages import ConfigReply, PlayerReply, PlayerRequest
-from common.topics import CONFIG, PLAYER, SCAN, Topic
+from common.messages import ConfigReply, PlayerReply, PlayerRequest, WorldReply
+from common.topics import CONFIG, PLAYER, SCAN, WORLD, Topic
 from common.versions import versions
 from common.wire import DecodeError
 from services.recorder.player import Player, conflicts, renamed, robots, selected, span
@@ -45,6 +45,8 @@ class Choice:
     loop: bool = False
     robot: str = ""  # instead of the recorded one
     force: bool = False  # beside a live publisher too
+    paused: bool = False  # until told otherwise
+    stay: bool = False  # paused at the end, until told otherwise
 
 
 class Remote:
@@ -92,10 +94,13 @@ class Replay:
 
     def announce(self) -> None:
         """Refuse beside live publishers; then be steerable, alive, and heard."""
-        if not self.choice.force and (why := conflicts(self._published(), self._alive())):
+        alive = self._alive()
+        if not self.choice.force and (why := conflicts(self._published(), alive)):
             raise UserError(why)
         for key, topic in self._published().items():  # all before the first wait: each asks who listens
             self.bus.publisher(topic, key=key)
+        if WORLD.server not in alive.get(self.bus.robot, set()):  # a simulator knows better
+            self.bus.serve(WORLD, self.inbox)
         self.bus.serve(PLAYER, self.inbox)
         self.bus.serve(CONFIG, self.inbox, NAME)
         self.bus.declare_alive(NAME)
@@ -112,6 +117,7 @@ class Replay:
         """Until the end, `Remote.quit` or ``stop``."""
         player = self.player
         player.seek(player.begin, time.monotonic())
+        player.paused = self.choice.paused
         while (place := player.jump()) is not None:
             for raw in self.recording.payloads(self.topics.keys(), *self._window(place)):
                 at = (raw.logged_ns - self.recording.start_ns) * 1e-9
@@ -123,6 +129,8 @@ class Replay:
                 break
             if player.loop and not player.jumped:
                 player.again(time.monotonic())
+            elif self.choice.stay and not player.jumped:
+                self._rest(on_progress, stop)
 
     def _window(self, place: float) -> tuple[int, int | None]:
         """Of the recording's own times, ns; the end is not part of it, the recording's last message is."""
@@ -143,6 +151,14 @@ class Replay:
             if entry is None and self.player.wait(at, time.monotonic()) <= 0:
                 return True
 
+    def _rest(self, on_progress: Callable[[PlayerReply], None], stop: threading.Event) -> None:
+        """Paused at the end, until somebody seeks."""
+        while not (stop.is_set() or self.remote.quitting or self.player.jumped):
+            self.player.finish(time.monotonic())
+            on_progress(self.player.state(time.monotonic()))
+            if isinstance(entry := self.inbox.get(TURN), Call):
+                self._answer(entry)
+
     def _send(self, raw: Raw, at: float) -> None:
         topic, key = self.topics[raw.key], self.keys[raw.key]
         self.bus.put(topic, raw.payload, key=key)
@@ -155,12 +171,22 @@ class Replay:
             plain = json.dumps(config, default=sorted)
             call.reply(ConfigReply(service=NAME, config=plain, versions=versions()).encode())
             return
+        if call.query is WORLD:
+            call.reply(self._world().encode())
+            return
         try:
             request = PlayerRequest.decode(call.payload)
         except DecodeError as error:
             call.refuse(str(error))
             return
         call.reply(self.player.handle(request, time.monotonic()).encode())
+
+    def _world(self) -> WorldReply:
+        """As the recording has it."""
+        recording, world = self.recording, self.recording.world()
+        if world is None:
+            return WorldReply(ok=False, reason=f"{recording.path.name} does not hold its world")
+        return WorldReply(world=world, scanner=recording.scanner(), robot=recording.robot())
 
     def _published(self) -> dict[str, Topic]:
         """By the key it is published on."""
