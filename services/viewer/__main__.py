@@ -1,0 +1,22 @@
+"""`python -m services.viewer`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from common.service import main
+from services.viewer.settings import ViewerSettings
+
+if TYPE_CHECKING:
+    from common.service import Service
+
+
+def make(settings: ViewerSettings) -> Service:
+    """Imports the web server here, so that --help answers at once."""
+    from services.viewer.service import ViewerService  # noqa: PLC0415
+
+    return ViewerService(settings)
+
+
+if __name__ == "__main__":
+    main(ViewerSettings, make)

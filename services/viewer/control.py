@@ -1,0 +1,227 @@
+"""What visitors ask of a robot, done over the bus and answered in words. Blocks: for threads that may wait.
+
+Every action ends in an `Answer`; what cannot be done is said by raising UserError with the reason.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from common.bus import Bus, wait_until
+from common.errors import UserError
+from common.messages import (
+    Drive,
+    Goal,
+    LocaliseRequest,
+    ObstacleRequest,
+    Pose,
+    PoseRequest,
+    RecordReply,
+    RecordRequest,
+    Reply,
+    Request,
+    ResetRequest,
+    SpeedRequest,
+    Status,
+    Twist,
+    WorldReply,
+)
+from common.robot import Robot
+from common.topics import (
+    DRIVE,
+    GOAL,
+    LOCALISE,
+    OBSTACLE,
+    PAUSE,
+    RECORDING,
+    RESET,
+    RESUME,
+    SPEED,
+    STEP,
+    TELEPORT,
+    Query,
+    Topic,
+)
+from services.viewer import actions as a
+from services.viewer.pulses import how_to_start
+from services.viewer.roster import Roster
+
+WITHIN = 3.0  # s, for an answer
+LISTENER_WITHIN = 2.0  # s, for a subscriber to be known: a put before that is lost
+CLOCK = {"pause": PAUSE, "resume": RESUME, "step": STEP}
+DONE = {"pause": "paused", "resume": "running", "step": "one scan further"}
+R = TypeVar("R", bound=Reply)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a visitor is told."""
+
+    ok: bool
+    reason: str = ""
+    more: dict[str, Any] = field(default_factory=dict)  # further fields of the answer
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What the viewer knows of a robot that an action needs."""
+
+    status: Callable[[str], Status | None]  # the controller's last word about a robot
+    stamp_ns: Callable[[str], int]  # of the newest scan
+    world: Callable[[str], WorldReply | None]
+
+
+class Control:
+    """Actions on robots."""
+
+    def __init__(self, bus: Bus, roster: Roster, sight: Sight, connect: str = "") -> None:
+        """``connect``: endpoints to name where a service is missing, if they are not the default."""
+        self._bus, self._roster, self._sight, self._connect = bus, roster, sight, connect
+        self._numbers: defaultdict[str, Iterator[int]] = defaultdict(itertools.count)  # of drives, by robot
+        self._do: dict[type[a.Action], Callable[[str, Any], Answer]] = {
+            a.GoTo: self._goal,
+            a.Cancel: self._cancel,
+            a.Carry: self._teleport,
+            a.Localise: self._localise,
+            a.Furnish: self._obstacle,
+            a.Clock: self._clock,
+            a.Reset: self._reset,
+            a.Pace: self._speed,
+            a.Steer: self._drive,
+            a.Record: self._record,
+        }
+
+    def do(self, robot: str, action: a.Action) -> Answer:
+        """Done, or why not; never raises."""
+        if "replay" in self._roster.services(robot):
+            return Answer(ok=False, reason="this is a recording: choose the live robot to act on it")
+        try:
+            return self._do[type(action)](robot, action)
+        except UserError as error:
+            return Answer(ok=False, reason=str(error))
+
+    def ask(self, robot: str, query: Query, request: Request, reply: type[R]) -> R:
+        """A service's answer; raises UserError where it is not there, does not answer, or says no."""
+        self._need(robot, query.server)
+        answer = self._bus.ask(query, request, reply, WITHIN, robot=robot)
+        if not answer.ok:
+            raise UserError(answer.reason or f"the {query.server} refused")
+        return answer
+
+    def tolerant_ask(self, robot: str, query: Query, request: Request, reply: type[R]) -> R:
+        """Whatever anybody answers, a refusal included."""
+        return self._bus.ask(query, request, reply, WITHIN, robot=robot)
+
+    def _need(self, robot: str, service: str) -> None:
+        if service not in self._roster.services(robot):
+            start = how_to_start(service, robot, self._connect)
+            raise UserError(f"the {service} is not running; start it with: {start}")
+
+    def _heard(self, robot: str, topic: Topic, service: str) -> None:
+        """Make sure that a put will be heard."""
+        self._need(robot, service)
+        if not self._bus.wait_matching(topic, LISTENER_WITHIN, key=topic.key(robot)):
+            raise UserError(f"the {service} does not listen to {topic.name}: is it of this version?")
+
+    def _goal(self, robot: str, action: a.GoTo) -> Answer:
+        self._check_place(robot, action.x, action.y)
+        self._heard(robot, GOAL, "controller")
+        # The time numbers it: the status says which goal it is about, whoever gave the others.
+        goal = Goal(
+            stamp_ns=self._sight.stamp_ns(robot),
+            seq=time.time_ns(),
+            pose=Pose(x=action.x, y=action.y, yaw=action.yaw or 0.0),
+            tolerance=action.tolerance or 0.2,
+        )
+        self._bus.put(GOAL, goal.encode(), key=GOAL.key(robot))
+        status = self._status(robot, lambda status: status.goal_seq == goal.seq)
+        if status is None:
+            raise UserError(f"the controller did not take the goal within {WITHIN:g} s")
+        if status.state == "blocked":
+            raise UserError(status.reason)
+        return Answer(ok=True, reason=f"going to ({action.x:.2f}, {action.y:.2f})")
+
+    def _cancel(self, robot: str, _action: a.Cancel) -> Answer:
+        self._heard(robot, GOAL, "controller")
+        goal = Goal(stamp_ns=self._sight.stamp_ns(robot), seq=time.time_ns(), pose=Pose(x=0.0, y=0.0), cancel=True)
+        self._bus.put(GOAL, goal.encode(), key=GOAL.key(robot))
+        if self._status(robot, lambda status: status.goal is None) is None:
+            raise UserError("the controller did not confirm it")
+        return Answer(ok=True, reason="the robot stands")
+
+    def _status(self, robot: str, wanted: Callable[[Status], bool]) -> Status | None:
+        """The controller's word once it is as wanted; None where that does not happen in time."""
+
+        def there() -> bool:
+            status = self._sight.status(robot)
+            return status is not None and wanted(status)
+
+        return self._sight.status(robot) if wait_until(there, WITHIN) else None
+
+    def _check_place(self, robot: str, x: float, y: float) -> None:
+        reply = self._sight.world(robot)
+        if reply is None or reply.world is None:
+            return  # a robot that does not know its world: the controller has the say
+        radius = (reply.robot or Robot()).radius
+        clearance = float(reply.world.clearance([[x, y]])[0])
+        if clearance < radius:
+            what = "inside a wall or outside the world" if clearance < 0 else f"{clearance:.2f} m from a wall"
+            raise UserError(f"({x:.2f}, {y:.2f}) is {what}; the robot needs {radius:g} m around it")
+
+    def _teleport(self, robot: str, action: a.Carry) -> Answer:
+        pose = Pose(x=action.x, y=action.y, yaw=action.yaw)
+        self.ask(robot, TELEPORT, PoseRequest(pose=pose), Reply)
+        return Answer(ok=True, reason=f"carried to ({action.x:.2f}, {action.y:.2f}); nobody told the estimator")
+
+    def _localise(self, robot: str, action: a.Localise) -> Answer:
+        if (action.x is None) != (action.y is None):
+            raise UserError("a place is x and y, in m")
+        pose = None
+        if action.x is not None and action.y is not None:
+            pose = Pose(x=action.x, y=action.y, yaw=action.yaw or 0.0)
+        self.ask(robot, LOCALISE, LocaliseRequest(pose=pose), Reply)
+        return Answer(ok=True, reason="localising anew" + (" from there" if pose is not None else " from nothing"))
+
+    def _obstacle(self, robot: str, action: a.Furnish) -> Answer:
+        request = ObstacleRequest(action=action.action, name=action.name, obstacle=action.obstacle)
+        self.ask(robot, OBSTACLE, request, Reply)
+        done = {"add": "added", "move": "moved", "remove": "removed"}[action.action]
+        return Answer(ok=True, reason=f"{action.name}: {done}")
+
+    def _clock(self, robot: str, action: a.Clock) -> Answer:
+        self.ask(robot, CLOCK[action.do], Request(), Reply)
+        return Answer(ok=True, reason=DONE[action.do])
+
+    def _reset(self, robot: str, action: a.Reset) -> Answer:
+        self.ask(robot, RESET, ResetRequest(seed=action.seed), Reply)
+        return Answer(ok=True, reason="begun anew" + (f" with seed {action.seed}" if action.seed is not None else ""))
+
+    def _speed(self, robot: str, action: a.Pace) -> Answer:
+        if not 0.1 <= action.factor <= 20:
+            raise UserError(f"{action.factor:g} times real time cannot be: between 0.1 and 20")
+        self.ask(robot, SPEED, SpeedRequest(factor=action.factor), Reply)
+        return Answer(ok=True, reason=f"{action.factor:g} times real time")
+
+    def _drive(self, robot: str, action: a.Steer) -> Answer:
+        key = DRIVE.key(robot)
+        if robot not in self._numbers:
+            self._heard(robot, DRIVE, "controller")
+        else:
+            self._need(robot, "controller")
+        twist = Twist(vx=action.vx, vy=action.vy, wz=action.wz)
+        drive = Drive(stamp_ns=self._sight.stamp_ns(robot), seq=next(self._numbers[robot]), twist=twist)
+        self._bus.put(DRIVE, drive.encode(), key=key)
+        return Answer(ok=True)
+
+    def _record(self, robot: str, action: a.Record) -> Answer:
+        reply = self.ask(robot, RECORDING, RecordRequest(action=action.action), RecordReply)
+        more = {
+            "recording": reply.recording, "file": reply.file, "messages": reply.messages, "seconds": reply.seconds,
+        }  # fmt: skip
+        how = f"recording into {reply.file}" if reply.recording else f"recorded {reply.file}" if reply.file else "idle"
+        return Answer(ok=True, reason=how, more=more)

@@ -1,0 +1,247 @@
+"""The viewer's thin shell: what the bus brings becomes frames, once for all; the web server's thread sends them.
+
+Two threads meet in the hub: this loop hands it finished bytes, it says which robots are watched. A robot that nobody
+watches costs little: of its messages those are read that the charts' last minute is made of.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from typing import ClassVar
+
+from common.bus import DEFAULT_ENDPOINT
+from common.inbox import Sample
+from common.messages import Health, Status, WorldReply
+from common.service import Service
+from common.topics import (
+    BELIEF,
+    CMD_VEL,
+    HEALTH,
+    ODOM,
+    PREDICTION,
+    SCAN,
+    STATUS,
+    TOPICS,
+    TRUTH,
+    Topic,
+)
+from common.versions import versions
+from common.wire import DecodeError
+from services.viewer.control import Control, Sight
+from services.viewer.desk import Desk, Office
+from services.viewer.playback import Playback
+from services.viewer.pulses import Pulses, how_to_start, missing
+from services.viewer.roster import Roster
+from services.viewer.settings import ViewerSettings
+from services.viewer.view import RobotView
+from services.viewer.visitors import Hub, Visitor
+from services.viewer.web import WebServer, create_app, link, listen
+
+ALWAYS = (BELIEF, TRUTH, HEALTH)  # read though nobody watches
+SHOWN = (*ALWAYS, SCAN, ODOM, PREDICTION, STATUS, CMD_VEL)
+TICK = 1.0  # s
+SCANNING = 2.0  # s since the last scan
+
+
+@dataclass
+class Followed:
+    """One robot."""
+
+    view: RobotView
+    pulses: Pulses = field(default_factory=Pulses)
+    unread: dict[Topic, Sample] = field(default_factory=dict)  # the newest of each, until somebody watches
+    scan_at: float = -1e9  # s, a clock that only goes forward
+    ends: list[Callable[[], None]] = field(default_factory=list)  # of the subscriptions
+
+
+class ViewerService(Service):
+    """The page as a process."""
+
+    name: ClassVar[str] = "viewer"
+
+    def __init__(self, settings: ViewerSettings) -> None:
+        """Sockets are opened in `open`."""
+        super().__init__(settings)
+        self.options = settings
+        self.hub = Hub(self._wake)
+        self.roster = Roster(settings.robot)
+        self.playback = Playback(settings.recordings, settings.robot, settings.connect)
+        self.pool = ThreadPoolExecutor(16, "action")
+        self.robots: dict[str, Followed] = {}
+        self._renew: set[str] = set()  # robots under whose name another recording runs
+        self._changed: deque[str] = deque()  # robots whose services came or went
+        self._connect = "" if settings.connect == DEFAULT_ENDPOINT else settings.connect  # to be named in advice
+        self._tick_at = 0.0
+        self._web: WebServer | None = None
+
+    def open(self) -> None:
+        """Listen to the robot, then to visitors."""
+        options = self.options
+        listener = listen(options)
+        self._follow(options.robot)
+        self.loop.bus.watch_robots(self._came_or_went)
+        sight = Sight(self._status, self._stamp_ns, self._world)
+        control = Control(self.loop.bus, self.roster, sight, self._connect)
+        version = versions().get("presage", versions()["commit"])
+        self.desk = Desk(
+            Office(
+                self.hub, control, self.playback, self.roster, self.pool, options.control, version, self._renew.add
+            )
+        )  # fmt: skip
+        self._web = WebServer(create_app(self.desk, options.token, self.hub.run_in), listener)
+        self._web.start()
+        print(f"page: {link(options, listener)}", flush=True)
+        if not options.on_loopback and not options.token:
+            self.log.warning("whoever reaches this machine sees the page", advice="PRESAGE_VIEWER_TOKEN asks for one")
+
+    def close(self) -> None:
+        """Visitors first, then the recording."""
+        if self._web is not None:
+            self._web.stop()
+        self.playback.leave()
+        self.pool.shutdown(wait=False, cancel_futures=True)
+
+    # ---- what comes
+
+    def on_sample(self, sample: Sample) -> None:
+        """Read it, or keep the newest for the first who watches."""
+        robot = sample.key.split("/")[1]
+        followed = self.robots.get(robot)
+        if followed is None or sample.topic not in SHOWN:
+            return
+        if sample.topic is SCAN:
+            followed.scan_at = time.monotonic()
+        if robot in self.hub.watched or sample.topic in ALWAYS:
+            self._read(robot, followed, sample)
+        else:
+            followed.unread[sample.topic] = sample
+
+    def _read(self, robot: str, followed: Followed, sample: Sample) -> None:
+        try:
+            message = sample.topic.message.decode(sample.payload)
+        except DecodeError as error:
+            self.loop.reject(sample.key, str(error))
+            return
+        now = time.monotonic()
+        if isinstance(message, Health):
+            followed.pulses.hear(message, now)
+            return
+        self._show(robot, followed.view.hear(sample.topic, message, now, sample.published_ns))
+        if followed.view.began_anew:
+            followed.view.began_anew = False
+            self.hub.call(partial(self.hub.tell, robot, "history", _history(followed.view)))
+
+    def _show(self, robot: str, frame: bytes | None) -> None:
+        if frame is not None and robot in self.hub.watched:
+            self.counters["frames"] += 1
+            self.hub.call(partial(self.hub.show, robot, frame))
+
+    def _came_or_went(self, robot: str, service: str, there: bool) -> None:  # noqa: FBT001 - zenoh's thread
+        self.roster.change(robot, service, there)
+        self._changed.append(robot)
+        self._wake()
+
+    # ---- what is due
+
+    def due(self) -> float | None:
+        """Until a newcomer is to be told, a scan has waited enough, or a second is over."""
+        if self.hub.newcomers or self._changed or self._renew:
+            return 0.0
+        now = time.monotonic()
+        waits = [wait for f in self.robots.values() if (wait := f.view.due(now)) is not None]
+        return max(0.0, min([self._tick_at - now, *waits]))
+
+    def on_timer(self) -> None:
+        """Whatever of that it is."""
+        now = time.monotonic()
+        while self._renew:
+            if (followed := self.robots.get(robot := self._renew.pop())) is not None:
+                followed.view, followed.unread = RobotView(robot, live=False), {}
+        if changed := {self._changed.popleft() for _ in range(len(self._changed))}:
+            self.hub.call(partial(self.desk.robots_changed, frozenset(changed)))
+        while self.hub.newcomers:
+            self._welcome(*self.hub.newcomers.popleft())
+        for robot, followed in self.robots.items():
+            self._show(robot, followed.view.overdue(now))
+        if now >= self._tick_at:
+            self._tick_at = now + TICK
+            self._tick()
+
+    def _welcome(self, visitor: Visitor, robot: str) -> None:
+        """What has been, for who has just come."""
+        followed = self._follow(robot)
+        for sample in sorted(followed.unread.values(), key=lambda sample: sample.received_ns):
+            self._read(robot, followed, sample)
+        followed.unread.clear()
+        history, services = _history(followed.view), self._services(robot, followed)
+
+        def tell() -> None:
+            if visitor.robot != robot:
+                return
+            visitor.say(history, "history")
+            visitor.say(services, "services")
+            if (frame := followed.view.frame) is not None:
+                visitor.show(frame)
+
+        self.hub.call(tell)
+
+    def _tick(self) -> None:
+        watched = self.hub.watched
+        for robot in [r for r in self.robots if r not in watched and r != self.options.robot]:
+            for end in self.robots.pop(robot).ends:
+                end()
+        for robot, followed in self.robots.items():
+            followed.view.live = "replay" not in self.roster.services(robot)
+            if robot in watched:
+                self.hub.call(partial(self.hub.tell, robot, "services", self._services(robot, followed)))
+        self.counters.update({name: n - self.counters[name] for name, n in dict(self.hub.counters).items()})
+        self.counters["visitors"] = len(self.hub)
+        if self._web is not None and not self._web.running and not self.note:
+            self.note = "the web server ended"
+            self.log.error(self.note)
+
+    def _services(self, robot: str, followed: Followed) -> str:
+        now, alive, linked = time.monotonic(), self.roster.services(robot), self.loop.bus.linked()
+        lacking = missing(alive, linked=linked, scans=now - followed.scan_at < SCANNING)
+        rows = [{"name": name, "start": how_to_start(name, robot, self._connect)} for name in lacking]
+        return json.dumps({
+            "type": "services", "services": followed.pulses.rows(alive, now), "missing": rows, "linked": linked,
+        })  # fmt: skip
+
+    def _follow(self, robot: str) -> Followed:
+        """Subscribe, once."""
+        if robot not in self.robots:
+            live = "replay" not in self.roster.services(robot)
+            followed = self.robots[robot] = Followed(RobotView(robot, live=live))
+            for topic in TOPICS:
+                # A step of a replay comes at once: the newest alone would be half of the next moment.
+                end = self.loop.bus.subscribe(topic, self.loop.inbox, keep_all=not live, robot=robot)
+                followed.ends.append(end)
+        return self.robots[robot]
+
+    # ---- for other threads
+
+    def _wake(self) -> None:
+        if self._loop is not None:
+            self._loop.inbox.wake()
+
+    def _status(self, robot: str) -> Status | None:
+        followed = self.robots.get(robot)
+        return followed.view.status if followed is not None else None
+
+    def _stamp_ns(self, robot: str) -> int:
+        followed = self.robots.get(robot)
+        return followed.view.stamp_ns if followed is not None else 0
+
+    def _world(self, robot: str) -> WorldReply | None:
+        return self.desk.worlds.get(robot)
+
+
+def _history(view: RobotView) -> str:
+    return json.dumps({"type": "history", "samples": view.history.columns()})

@@ -1,0 +1,62 @@
+"""What the viewer can be told."""
+
+from __future__ import annotations
+
+import ipaddress
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+from pydantic import Field
+
+from common.config import ServiceSettings
+
+FIRST_PORT = 8080
+
+
+class ViewerSettings(ServiceSettings):
+    """Viewer: the live page, and the socket behind it.
+
+    Whoever reaches the page watches. On loopback they may also act (goals, teleport, driving); elsewhere only with
+    --allow-control. A token keeps others out: PRESAGE_VIEWER_TOKEN, so that it is in no list of processes.
+
+    Examples:
+      python -m services.viewer                                      http://127.0.0.1:8080/, or the next free port
+      python -m services.viewer --port 0                             any free port
+      PRESAGE_VIEWER_TOKEN=tea python -m services.viewer --host 0.0.0.0 --allow-control
+
+    """
+
+    service: ClassVar[str] = "viewer"
+    private: ClassVar[frozenset[str]] = frozenset({"host", "port", "token", "address"})
+
+    host: Annotated[str, Field(min_length=1, max_length=255, description="address to listen on")] = "127.0.0.1"
+    port: Annotated[
+        int | None, Field(ge=0, le=65535, description=f"0: any free one; none: {FIRST_PORT}, or the next free one")
+    ] = None
+    token: Annotated[
+        str, Field(pattern=r"^[A-Za-z0-9_.~-]{0,200}$", description="asked of visitors; letters, digits, _ . ~ -")
+    ] = ""
+    allow_control: Annotated[bool, Field(description="visitors beyond loopback may act too, not only watch")] = False
+    recordings: Annotated[Path, Field(description="folder of recordings that visitors may open")] = Path("recordings")
+    address: Annotated[
+        str, Field(pattern=r"^$|^https?://[^\s/]+$", description="the page's address as visitors see it, to be printed")
+    ] = ""
+
+    @property
+    def on_loopback(self) -> bool:
+        """Whether nobody beyond this machine can connect."""
+        if self.host == "localhost":
+            return True
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return False
+
+    @property
+    def control(self) -> bool:
+        """Whether visitors may act."""
+        return self.allow_control or self.on_loopback
+
+    def effective(self) -> dict[str, Any]:
+        """Every setting as it holds, but for the token, which must not get into recordings."""
+        return {**super().effective(), "token": "set" if self.token else ""}

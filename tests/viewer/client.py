@@ -1,0 +1,113 @@
+"""A visitor without a browser: what the page's script does, by the protocol's description alone."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import struct
+import time
+from dataclasses import dataclass, field
+from urllib.parse import urlsplit
+
+import numpy as np
+from websockets.sync.client import connect
+
+PATIENCE = 30.0  # s
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Header, arrays by name, and all bytes."""
+
+    header: dict
+    arrays: dict = field(repr=False)
+    data: bytes = field(repr=False)
+
+
+def read_frame(data: bytes) -> Frame:
+    """By the layout in the contract."""
+    (length,) = struct.unpack_from("<I", data)
+    assert (4 + length) % 4 == 0
+    header = json.loads(data[4 : 4 + length], parse_constant=no_json)
+    floats = np.frombuffer(data, "<f4", offset=4 + length)
+    arrays = {name: floats[offset : offset + count] for name, (offset, count) in header["arrays"].items()}
+    assert sum(map(len, arrays.values())) == len(floats)
+    return Frame(header, arrays, data)
+
+
+def no_json(name):
+    raise AssertionError(f"{name} is no JSON")
+
+
+def page_of(running, timeout=PATIENCE):
+    """The link a viewer printed."""
+    running.wait_for("page: ", timeout)
+    return next(line for line in running.output.splitlines() if line.startswith("page: ")).removeprefix("page: ")
+
+
+class Page:
+    """An open socket."""
+
+    def __init__(self, link, origin=None, **options):
+        parts = urlsplit(link)
+        query = f"?{parts.query}" if parts.query else ""
+        options = {"open_timeout": PATIENCE, "compression": None, "max_size": None, "close_timeout": 2, **options}
+        origin = origin or f"http://{parts.netloc}"
+        self.socket = connect(f"ws://{parts.netloc}/ws{query}", origin=origin, **options).__enter__()
+        self.numbers = itertools.count(1)
+        self.last = {}  # by type
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.socket.close()
+
+    def next(self, timeout=PATIENCE):
+        """The next message: a Frame, or a dict."""
+        data = self.socket.recv(timeout)
+        message = read_frame(data) if isinstance(data, bytes) else json.loads(data)
+        self.last["frame" if isinstance(message, Frame) else message["type"]] = message
+        return message
+
+    def until(self, wanted, timeout=PATIENCE):
+        """The first message that is as wanted."""
+        deadline = time.monotonic() + timeout
+        while (left := deadline - time.monotonic()) > 0:
+            try:
+                message = self.next(left)
+            except TimeoutError:
+                break
+            if wanted(message):
+                return message
+        last = "\n".join(f"{kind}: {str(message)[:600]}" for kind, message in self.last.items())
+        raise AssertionError(f"nothing as wanted within {timeout:g} s; the last were\n{last}")
+
+    def told(self, kind, wanted=lambda _: True, timeout=PATIENCE):
+        """The first text of a type that is as wanted."""
+        return self.until(lambda m: isinstance(m, dict) and m["type"] == kind and wanted(m), timeout)
+
+    def by_now(self, kind, wanted, timeout=PATIENCE):
+        """The same, or the last that came if it is."""
+        last = self.last.get(kind)
+        if last is not None and wanted(last):
+            return last
+        if kind == "frame":
+            return self.until(lambda m: isinstance(m, Frame) and wanted(m), timeout)
+        return self.told(kind, wanted, timeout)
+
+    def frame(self, wanted=lambda _: True, timeout=PATIENCE):
+        """The first frame whose header is as wanted."""
+        return self.until(lambda m: isinstance(m, Frame) and wanted(m.header), timeout)
+
+    def ask(self, do, timeout=PATIENCE, **fields):
+        """The answer to an action."""
+        number = next(self.numbers)
+        self.socket.send(json.dumps({"id": number, "do": do, **fields}))
+        return self.told("answer", lambda m: m["id"] == number, timeout)
+
+    def done(self, do, **fields):
+        """The same, and it was done."""
+        answer = self.ask(do, **fields)
+        assert answer["ok"], answer
+        return answer

@@ -1,0 +1,378 @@
+"""The viewer as a process, over zenoh: who is let in, a robot made of messages, hostile visitors."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import time
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from common.bus import Link, open_bus, wait_until
+from common.inbox import Call, Inbox, Sample
+from common.messages import Health, Reply, WorldReply
+from common.robot import Robot
+from common.scanner import SCANNERS
+from common.topics import HEALTH, PAUSE, SCAN, TOPICS, TRUTH, WORLD
+from common.world import load_world
+from services.viewer.service import SHOWN
+from tests.conftest import PATIENCE
+from tests.viewer.client import Page, page_of
+from tests.viewer.messages import RANGES, at
+
+
+@pytest.fixture
+def viewer(process):
+    """Calls start a viewer with arguments: the process and its link."""
+
+    def start(*args, env=None):
+        running = process("viewer", "--port", "0", *args, env=env)
+        return running, page_of(running)
+
+    return start
+
+
+def fetch(url, **headers):
+    """Status, headers and text of a page."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=PATIENCE) as answer:
+            return answer.status, answer.headers, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.headers, error.read().decode()
+
+
+class Pretence:
+    """A robot made of messages."""
+
+    def __init__(self, bus):
+        self.bus = bus
+        assert all(bus.wait_matching(topic, PATIENCE) for topic in SHOWN if topic is not HEALTH)
+
+    def say(self, stamp_s, **how):
+        for topic, message in at(stamp_s, **how).items():
+            self.bus.put(topic, message.encode())
+
+    def keep_saying(self, page, wanted, begin=1.0, timeout=PATIENCE):
+        """A stamp after another until a frame is as wanted."""
+        deadline, stamp = time.monotonic() + timeout, begin
+        while time.monotonic() < deadline:
+            stamp += 1 / 15
+            self.say(stamp)
+            with contextlib.suppress(AssertionError):
+                return page.frame(wanted, 0.2)
+        raise AssertionError("no frame as wanted")
+
+
+def test_an_empty_system_is_shown_as_such(viewer, link):
+    _, where = viewer()
+    with Page(where) as page:
+        hello = page.told("hello")
+        assert hello == {"type": "hello", "control": True, "version": hello["version"], "robots": [link.robot],
+                         "robot": link.robot}  # fmt: skip
+        assert page.told("history")["samples"]["t"] == []
+        services = page.told("services", lambda m: m["linked"])
+        assert [row["name"] for row in services["missing"]] == ["simulator", "estimator", "controller"]
+        start = services["missing"][1]["start"]
+        assert start == f"python -m services.estimator --robot {link.robot} --connect {link.connect[0]}"
+        assert page.told("services", lambda m: m["services"] and m["services"][0]["rates"])["services"][0]["name"] == (
+            "viewer"
+        )
+        began = time.monotonic()
+        answer = page.ask("teleport", x=1, y=1)
+        assert not answer["ok"]
+        assert "the simulator is not running; start it with: python -m services.simulator" in answer["reason"]
+        assert time.monotonic() - began < 2.0  # nobody waits for who is not there
+
+
+def test_the_page_is_served_with_headers_that_keep_it_to_itself(viewer):
+    _, where = viewer()
+    status, headers, text = fetch(where)
+    assert status == 200
+    assert "<html" in text.lower()
+    assert headers["content-security-policy"].startswith("default-src 'self';")
+    assert headers["x-content-type-options"] == "nosniff"
+    assert "http://" not in text.replace("http://www.w3.org", "")  # nothing from other hosts
+    assert "https://" not in text
+    for outside in ("../settings.py", "%2e%2e/settings.py", "..%2fsettings.py", "ws", "no/such"):
+        assert fetch(where + outside)[0] in {400, 403, 404, 426}, outside
+
+
+def test_only_the_own_page_may_connect(viewer):
+    _, where = viewer()
+    port = int(where.rstrip("/").rsplit(":", 1)[1])
+    for origin in ("http://evil.example", f"http://127.0.0.1:{port + 1}", f"http://localhost:{port}", "null"):
+        with pytest.raises(InvalidStatus) as refused:
+            Page(where, origin=origin)
+        assert refused.value.response.status_code == 403, origin
+    # A name of somebody else's that leads here.
+    status, _, text = fetch(where, Host=f"evil.example:{port}")
+    assert (status, "token" in text) == (403, True)
+    assert fetch(where, Host=f"localhost:{port}")[0] == 200
+
+
+def test_a_token_is_asked_for(viewer):
+    running, where = viewer(env={"PRESAGE_VIEWER_TOKEN": "tea-2"})
+    assert where.endswith("/?token=tea-2")
+    base = where.split("?")[0]
+    for url in (base, base + "?token=coffee", base + "js/main.js"):
+        status, headers, _ = fetch(url)
+        assert (status, headers["set-cookie"]) == (401, None), url
+    status, headers, _ = fetch(where)
+    assert status == 200
+    cookie = headers["set-cookie"].split(";")[0]
+    assert "HttpOnly" in headers["set-cookie"]
+    assert fetch(base, Cookie=cookie)[0] == 200
+    assert fetch(base, Cookie=cookie, Host="robot.example")[0] == 200  # a page of another's cannot have it
+    with pytest.raises(InvalidStatus) as refused:
+        Page(base)
+    assert refused.value.response.status_code == 401
+    with pytest.raises(InvalidStatus) as refused:
+        Page(where, origin="http://evil.example")
+    assert refused.value.response.status_code == 403
+    with Page(base, additional_headers={"Cookie": cookie}) as page:
+        assert page.told("hello")["control"] is True
+    assert running.running
+
+
+def test_beyond_loopback_visitors_watch(viewer, bus, link):
+    _, where = viewer("--host", "0.0.0.0")
+    inbox = Inbox()
+    for topic in TOPICS:
+        bus.subscribe(topic, inbox, keep_all=True)
+    with Page(where) as page:
+        assert page.told("hello")["control"] is False
+        for do, fields in [
+            ("goal", {"x": 1, "y": 1}), ("drive", {"vx": 1}), ("pause", {}), ("recordings", {}),
+            ("open", {"name": "a.mcap"}), ("player", {"action": "pause"}), ("record", {"action": "start"}),
+        ]:  # fmt: skip
+            answer = page.ask(do, **fields)
+            assert not answer["ok"]
+            assert "only watch" in answer["reason"]
+        page.done("watch", robot=link.robot)
+        page.told("services", lambda m: any(row["name"] == "viewer" for row in m["services"]))
+    heard = set()
+    while isinstance(sample := inbox.get(0), Sample):
+        heard.add(sample.topic)
+    assert heard <= {HEALTH}
+    _, where = viewer("--host", "0.0.0.0", "--allow-control")
+    with Page(where) as page:
+        assert page.told("hello")["control"] is True
+
+
+def test_a_robot_made_of_messages_is_shown(viewer, bus):
+    _, where = viewer()
+    robot = Pretence(bus)
+    with Page(where) as page:
+        page.told("hello")
+        frame = robot.keep_saying(page, lambda h: h["belief"] and h["cmd"] and h["status"])
+        header = frame.header
+        assert header["robot"] == bus.robot
+        assert header["belief"]["stamp_ns"] == header["stamp_ns"]
+        assert header["error"] == pytest.approx(0.5)
+        np.testing.assert_array_equal(frame.arrays["ranges"], RANGES)
+        np.testing.assert_array_equal(frame.arrays["predicted"], np.arange(5))
+        services = page.told("services", lambda m: len(m["missing"]) < 3)
+        assert "simulator" not in [row["name"] for row in services["missing"]]  # scans come from somewhere
+    with Page(where) as page:  # who comes later sees the last frame and what has been
+        assert page.frame().header["stamp_ns"] == header["stamp_ns"]
+        assert len(page.last["history"]["samples"]["t"]) > 0
+        errors = page.last["history"]["samples"]["error"]
+        assert errors == [pytest.approx(0.5)] * len(errors)
+
+
+def test_time_that_goes_back_is_told(viewer, bus):
+    _, where = viewer()
+    robot = Pretence(bus)
+    with Page(where) as page:
+        robot.keep_saying(page, lambda h: h["t"] > 100, begin=100.0)
+        robot.keep_saying(page, lambda h: h["t"] < 10)
+        assert max(page.last["history"]["samples"]["t"], default=0) < 10
+
+
+def test_several_robots(viewer, bus, link):
+    _, where = viewer()
+    with Page(where) as page, Page(where) as other, open_bus(Link("two" + link.robot, link.connect)) as second:
+        page.told("hello")
+        assert not page.ask("watch", robot="two" + link.robot)["ok"]
+        second.declare_alive("simulator")
+        assert page.told("hello", lambda m: len(m["robots"]) == 2)["robots"] == [link.robot, "two" + link.robot]
+        page.done("watch", robot="two" + link.robot)
+        assert page.last["hello"]["robot"] == "two" + link.robot
+        Pretence(second).keep_saying(page, lambda h: h["robot"] == "two" + link.robot)
+        Pretence(bus).keep_saying(other, lambda h: h["robot"] == link.robot)
+        page.done("watch", robot=link.robot)
+        assert page.frame().header["robot"] == link.robot
+
+
+class Servant:
+    """Answers queries as services do."""
+
+    def __init__(self, bus, *queries):
+        self.inbox, self.world = Inbox(), load_world("maze")
+        for query in queries:
+            bus.serve(query, self.inbox)
+
+    def answer(self, name, timeout=PATIENCE):
+        """Answer what comes until a query of that name was."""
+        deadline = time.monotonic() + timeout
+        while (left := deadline - time.monotonic()) > 0:
+            call = self.inbox.get(left)
+            if not isinstance(call, Call):
+                continue
+            reply = Reply()
+            if call.query is WORLD:
+                reply = WorldReply(world=self.world, scanner=SCANNERS["tim571"], robot=Robot(radius=0.3))
+            call.reply(reply.encode())
+            if call.query.name == name:
+                return
+        raise AssertionError(f"nobody asked for {name}")
+
+
+def test_the_world_is_told_and_told_again_when_it_changes(viewer, bus):
+    _, where = viewer()
+    servant = Servant(bus, WORLD)
+    bus.declare_alive("simulator")
+    with Page(where) as page:
+        servant.answer("world")
+        told = page.told("world")
+        assert told["world"]["name"] == "maze"
+        assert told["robot"]["radius"] == 0.3
+        assert told["scanner"]["beams"] == 811
+        servant.world = load_world("office")
+        servant.answer("world", 20)
+        assert page.told("world")["world"]["name"] == "office"
+
+
+HOSTILE = [
+    "", "{", "[" * 4000, '{"id": 1}', '{"id": 1, "do": "goal", "x": NaN, "y": 1}', '{"id": 1, "do": "__init__"}',
+    '{"id": {"$gt": 0}, "do": "watch", "robot": "../**"}', "x" * 5000, b"\x00\x01", b"",
+    '{"do": "open", "name": "../../a"}',
+    '{"do": "obstacle", "action": "add", "name": "", "obstacle": {"polygon": []}}', '"😀"', "\x00",
+]  # fmt: skip
+
+
+# All but the one that only names a file that is not there; and one that is too long.
+def test_hostile_messages_are_answered_and_do_nothing(viewer, bus):
+    running, where = viewer()
+    inbox = Inbox()
+    bus.subscribe(HEALTH, inbox)
+    with Page(where) as page:
+        for message in HOSTILE:
+            page.socket.send(message)
+            assert not page.told("answer")["ok"], message
+        assert page.ask("recordings")["ok"]
+    with Page(where) as page:  # too long to be read at all
+        page.told("hello")
+        with pytest.raises(ConnectionClosed):  # noqa: PT012 - sending may fail already
+            page.socket.send("x" * 200_000)
+            for _ in range(100):
+                page.next()
+    raw = socket.create_connection(("127.0.0.1", int(where.rstrip("/").rsplit(":", 1)[1])), PATIENCE)
+    with raw:
+        raw.sendall(b"GET /ws HTTP/1.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Key: \xff\r\n\r\n")
+        raw.shutdown(socket.SHUT_WR)
+        while raw.recv(4096):
+            pass
+    with Page(where) as page:
+        page.told("hello")
+        assert page.ask("recordings")["ok"]
+
+    def counted():
+        while isinstance(sample := inbox.get(0), Sample):
+            health = Health.decode(sample.payload)
+            if health.service == "viewer" and health.counters.get("malformed", 0) == len(HOSTILE):
+                return True
+        return False
+
+    assert wait_until(counted, PATIENCE)
+    assert running.running
+    assert "Traceback" not in running.output
+
+
+def test_a_flood_is_read_no_faster_than_anybody_clicks(viewer):
+    running, where = viewer()
+    with Page(where) as flood, Page(where) as page:
+        page.told("hello")
+        with contextlib.suppress(ConnectionClosed, TimeoutError):
+            for i in range(1000):
+                flood.socket.send(json.dumps({"id": i, "do": "recordings"}))
+        began = time.monotonic()
+        assert page.ask("recordings")["ok"]
+        assert time.monotonic() - began < 5.0
+    assert running.running
+    assert "Traceback" not in running.output
+
+
+def test_who_does_not_read_slows_nobody_and_then_sees_the_newest(viewer, bus):
+    _, where = viewer()
+    Pretence(bus)
+    base = where.rstrip("/")
+    narrow = socket.socket()
+    narrow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    narrow.connect(("127.0.0.1", int(base.rsplit(":", 1)[1])))
+    big = {"ranges": np.ones(4000, np.float32)}  # 16 kB
+    sent = 400
+    with Page(where) as quick, Page(where, sock=narrow, max_queue=1) as slow:
+        quick.told("history")
+        slow.told("history")
+        seen = set()
+        for i in range(sent):  # 6 MB, more than any buffer on the way holds
+            stamp = 100.0 + i / 15
+            message = at(stamp)
+            for topic in (TRUTH, SCAN):
+                bus.put(topic, message[topic].model_copy(update=big if topic is SCAN else {}).encode())
+            seen.add(quick.frame(lambda h, s=stamp: abs(h["t"] - s) < 1e-6).header["stamp_ns"])
+        assert len(seen) == sent
+        stamps = []
+        last = 100.0 + (sent - 1) / 15
+        while not stamps or stamps[-1] < last - 1e-6:
+            stamps.append(slow.frame().header["t"])
+        assert stamps == sorted(stamps)
+        assert len(stamps) < sent / 2
+
+
+def test_a_router_that_comes_back_is_found_again(processes, tmp_path):
+    router, port = processes.start_router()
+    env = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "again"}
+    running = processes.start("viewer", "--port", "0", env=env)
+    with Page(page_of(running)) as page:
+        page.told("services", lambda m: m["linked"])
+        router.stop()
+        lost = page.told("services", lambda m: not m["linked"])
+        assert lost["missing"][0] == {"name": "router", "start": "python -m common.router"}
+        processes.start("common.router", "--listen", f"tcp/127.0.0.1:{port}")
+        page.told("services", lambda m: m["linked"])
+        with open_bus(Link("again", (f"tcp/127.0.0.1:{port}",))) as bus:
+            Pretence(bus).keep_saying(page, lambda h: h["belief"])
+
+
+def test_it_ends_at_once_though_visitors_watch(viewer):
+    running, where = viewer()
+    with Page(where) as page:
+        page.told("hello")
+        idle = socket.create_connection(("127.0.0.1", int(where.rstrip("/").rsplit(":", 1)[1])))
+        with idle:
+            status, seconds = running.stop()
+        assert status == 0, running.output
+        assert seconds < 5.0
+        with pytest.raises(ConnectionClosed):  # noqa: PT012 - some may be on the way
+            for _ in range(100):
+                page.next()
+    assert "Traceback" not in running.output
+
+
+def test_an_answer_that_does_not_come_is_said(viewer, bus):
+    _, where = viewer()
+    bus.declare_alive("simulator")
+    bus.serve(PAUSE, Inbox())  # takes the question, and keeps it
+    with Page(where) as page:
+        page.told("hello")
+        answer = page.ask("pause")
+        assert not answer["ok"]
+        assert "nobody answers" in answer["reason"]

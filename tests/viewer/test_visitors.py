@@ -1,0 +1,145 @@
+"""Frames go to whoever takes them; who does not, gets the newest when it does, and nobody waits."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from services.viewer.visitors import MAX_WAITING, Hub, TooSlowError, Visitor
+
+
+class Line:
+    """A connection that takes one thing at each permit, or everything."""
+
+    def __init__(self, *, slow=False):
+        self.taken = []
+        self.permits = asyncio.Semaphore(0) if slow else None
+
+    async def take(self, what):
+        if self.permits is not None:
+            await self.permits.acquire()
+        self.taken.append(what)
+
+
+async def settle():
+    for _ in range(20):
+        await asyncio.sleep(0)
+
+
+def scene(*lines):
+    """A hub with a visitor for each line, all on one robot, and their running senders."""
+    hub = Hub()
+    visitors = [Visitor(line.take, line.take) for line in lines]
+    for visitor in visitors:
+        hub.watch(visitor, "robot")
+    return hub, visitors, [asyncio.create_task(visitor.run()) for visitor in visitors]
+
+
+def run(story):
+    async def whole():
+        tasks = []
+        try:
+            await story(tasks)
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    asyncio.run(whole())
+
+
+def test_a_slow_visitor_gets_fewer_frames_and_slows_nobody():
+    async def story(tasks):
+        quick, slow = Line(), Line(slow=True)
+        hub, visitors, running = scene(quick, slow)
+        tasks += running
+        frames = [bytes([i]) for i in range(30)]
+        for i, frame in enumerate(frames):
+            hub.show("robot", frame)
+            await settle()
+            if i == 14:
+                slow.permits.release()
+                await settle()
+        assert quick.taken == frames
+        assert slow.taken == [frames[0]]  # it was being sent when the others came
+        slow.permits.release()
+        slow.permits.release()
+        await settle()
+        assert slow.taken == [frames[0], frames[14], frames[29]]
+        assert [visitor.sent for visitor in visitors] == [30, 3]
+        assert visitors[1].skipped == 27
+        hub.leave(visitors[1])
+        assert hub.counters == {"frames_sent": 3, "frames_skipped": 27}
+
+    run(story)
+
+
+def test_answers_keep_their_order_and_news_its_newest():
+    async def story(tasks):
+        line = Line(slow=True)
+        _, (visitor,), running = scene(line)
+        tasks += running
+        visitor.say("first")
+        await settle()  # being sent
+        visitor.say("services 1", "services")
+        visitor.say("second")
+        visitor.say("services 2", "services")
+        visitor.show(b"frame")
+        for _ in range(9):
+            line.permits.release()
+        await settle()
+        assert line.taken == ["first", "services 2", "second", b"frame"]
+
+    run(story)
+
+
+def test_who_takes_no_answers_is_sent_away():
+    async def story(tasks):
+        line = Line(slow=True)
+        _, (visitor,), running = scene(line)
+        tasks += running
+        for i in range(2 * MAX_WAITING):
+            visitor.say(str(i))
+            await asyncio.sleep(0)
+        line.permits.release()
+        with pytest.raises(TooSlowError):
+            await asyncio.wait_for(running[0], 5)
+
+    run(story)
+
+
+def test_another_robot_another_view():
+    async def story(tasks):
+        line = Line(slow=True)
+        hub, (visitor,), running = scene(line)
+        tasks += running
+        visitor.say("hello")
+        await settle()
+        hub.show("robot", b"old")
+        visitor.say("old world", "world")
+        visitor.say("answer")
+        hub.watch(visitor, "ghost")
+        hub.show("robot", b"other")
+        hub.show("ghost", b"new")
+        for _ in range(9):
+            line.permits.release()
+        await settle()
+        assert line.taken == ["hello", "answer", b"new"]
+        assert hub.watched == {"ghost"}
+        assert [robot for _, robot in hub.newcomers] == ["robot", "ghost"]
+
+    run(story)
+
+
+def test_a_hub_without_a_loop_is_silent():
+    hub, called = Hub(), []
+    hub.call(lambda: called.append(1))
+    loop = asyncio.new_event_loop()
+    hub.run_in(loop)
+    hub.call(lambda: called.append(2))
+    loop.call_soon(loop.stop)
+    loop.run_forever()
+    loop.close()
+    hub.call(lambda: called.append(3))
+    assert called == [2]
