@@ -74,7 +74,7 @@ export class Panels {
     const { history } = this.store;
     const i = cursor.t === null ? history.t.length - 1 : indexAt(history.t, cursor.t);
     const value = (name) => history[name][i];
-    const nats = (name) => number(value(name), Math.abs(value(name)) < 100 ? 1 : 0);
+    const nats = (name) => number(value(name), Math.abs(value(name)) < 10 ? 1 : 0);
     this.keys.free_energy(nats("free_energy"));
     this.keys.accuracy(nats("accuracy"));
     this.keys.complexity(nats("complexity"));

@@ -59,7 +59,7 @@ export class Store {
     if (before && frame.robot !== before.robot) this.forget();
     this.frame = frame;
     this.arrivals.push(now);
-    while (this.arrivals.length > 45 || now - this.arrivals[0] > 3000) this.arrivals.shift();
+    while (now - this.arrivals[0] > 4000) this.arrivals.shift();
     this.cut(frame.t);
     const { history } = this;
     history.t.push(frame.t);

@@ -1,0 +1,93 @@
+"""A headless Chromium to look at the page with: Debian's, steered by playwright."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from playwright.sync_api import Browser, Page, sync_playwright
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+ARGUMENTS = [
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--force-color-profile=srgb",
+]  # fmt: skip
+
+
+def find_browser() -> str | None:
+    """Its path: PRESAGE_TEST_BROWSER, or the first of the usual names."""
+    asked = os.environ.get("PRESAGE_TEST_BROWSER")
+    return asked or next((path for name in NAMES if (path := shutil.which(name))), None)
+
+
+@contextmanager
+def open_browser(path: str) -> Iterator[Browser]:
+    """Ended with the block; its profile is a folder of its own that goes with it."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+@dataclass
+class Visit:
+    """One open page, and whatever its console complained of."""
+
+    page: Page
+    complaints: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Listen before anything is loaded."""
+        self.page.on("console", lambda m: self.complaints.append(m.text) if m.type in {"error", "warning"} else None)
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("requestfailed", lambda request: self.complaints.append(f"failed: {request.url}"))
+
+    def see(self, expression: str, argument: Any = None) -> Any:
+        """A JavaScript expression's value; `store`, `view` and the like are the page's own."""
+        return self.page.evaluate(
+            f"(arg) => {{ const {{ store, view, modes }} = presage; return {expression}; }}", argument
+        )
+
+    def wait(self, condition: str, seconds: float = 30.0, argument: Any = None) -> None:
+        """Until an expression is true; raises playwright's TimeoutError."""
+        body = f"(arg) => {{ const {{ store, view, modes }} = presage; return Boolean({condition}); }}"
+        self.page.wait_for_function(body, arg=argument, timeout=1000 * seconds)
+
+    def at(self, x: float, y: float) -> tuple[float, float]:
+        """Pixels of the page at which the map shows a place, m."""
+        box = self.page.locator("#map").bounding_box()
+        assert box is not None
+        px, py = self.see("view.camera.toScreen(arg[0], arg[1])", [x, y])
+        return box["x"] + px, box["y"] + py
+
+    def click(self, x: float, y: float) -> None:
+        """On the map, m."""
+        self.page.mouse.click(*self.at(x, y))
+
+    def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """On the map, m."""
+        self.page.mouse.move(*self.at(*start))
+        self.page.mouse.down()
+        self.page.mouse.move(*self.at(*end), steps=8)
+        self.page.mouse.up()
+
+    def toast(self, text: str = "", *, ok: bool = True) -> str:
+        """The newest answer with some text in it, once it is there."""
+        found = self.page.locator(f'.toast[data-ok="{str(ok).lower()}"]', has_text=text).last
+        found.wait_for(timeout=20_000)
+        return found.inner_text()
+
+
+def visit(browser: Browser, address: str, *, width: int = 1440, height: int = 900, **options: Any) -> Visit:
+    """A page in a context of its own, once its socket is open."""
+    context = browser.new_context(viewport={"width": width, "height": height}, **options)
+    seen = Visit(context.new_page())
+    seen.page.goto(address)
+    seen.page.wait_for_function("() => window.presage && presage.store.connected")
+    return seen

@@ -1,0 +1,111 @@
+"""`make screenshots`: docs/page.png and docs/page.webp, of a real session in a real browser.
+
+A robot is carried off, finds itself, and drives to a goal around what a visitor put in its way.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import re
+import sys
+import tempfile
+from itertools import pairwise
+from pathlib import Path
+
+from PIL import Image
+
+from tests.conftest import ROOT, Processes
+from tests.viewer.browser import Visit, find_browser, open_browser, visit
+
+SERVICES = ("simulator", "estimator", "controller")
+SMALL = (960, 600)  # px of the animation
+PERIOD = 0.2  # s of the robot's time between its pictures, at least
+
+
+def start(processes: Processes) -> str:
+    """Everything, and the page's address."""
+    _, port = processes.start_router()
+    environment = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "robot"}
+    for name in SERVICES:
+        processes.start(name, env=environment)
+    processes.start("recorder", "--idle", "--directory", str(processes.folder), env=environment)
+    viewer = processes.start("viewer", "--port", "0", env=environment)
+    viewer.wait_for("page: ")
+    match = re.search(r"page: (\S+)", viewer.output)
+    assert match is not None
+    return match[1]
+
+
+def picture(seen: Visit) -> Image.Image:
+    """What is on the screen."""
+    return Image.open(io.BytesIO(seen.page.screenshot())).convert("RGB")
+
+
+def film(seen: Visit, seconds: float) -> list[tuple[float, Image.Image]]:
+    """Pictures of the robot's next seconds, small, each with its time; as many as this machine manages."""
+    began = now = seen.see("store.frame.t")
+    pictures = []
+    while now < began + seconds:
+        pictures.append((now, picture(seen).resize(SMALL, Image.Resampling.LANCZOS)))
+        seen.wait("store.frame.t > arg", argument=now + PERIOD)
+        now = seen.see("store.frame.t")
+    return pictures
+
+
+def quiet(seen: Visit) -> None:
+    """No answers over the picture, no ring around what the keyboard is at."""
+    seen.page.evaluate("document.getElementById('toasts').replaceChildren(); document.activeElement.blur()")
+
+
+def play(seen: Visit) -> tuple[Image.Image, list[tuple[float, Image.Image]]]:
+    """A visitor plays: the picture, and the film of it."""
+    tracked = "store.frame?.belief?.state === 'tracking' && Math.abs(store.frame.belief.x - store.frame.truth.x) < 0.1"
+    seen.wait(f"{tracked} && store.history.t.length > 60", 90)
+    seen.click(14.6, 1.4)
+    seen.wait("store.frame.speed > 0.4")
+    pictures = film(seen, 2)
+    seen.page.keyboard.down("Shift")
+    seen.click(6.0, 1.6)
+    seen.page.keyboard.up("Shift")
+    pictures += film(seen, 3)
+    seen.wait(tracked, 60)
+    seen.click(15.0, 1.2)
+    seen.wait("store.frame.truth.x > 8.5", 60)
+    quiet(seen)
+    still = picture(seen)
+    return still, pictures + film(seen, 3)
+
+
+def main() -> None:
+    """From the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=ROOT / "docs", help="folder of page.png and page.webp")
+    parser.add_argument("--dark", action="store_true", help="the page's dark colours")
+    args = parser.parse_args()
+    path = find_browser()
+    if path is None:
+        sys.exit("screenshots: no Chromium; on Debian and Ubuntu: apt-get install chromium")
+    with tempfile.TemporaryDirectory() as folder:
+        processes = Processes(Path(folder))
+        try:
+            address = start(processes)
+            with open_browser(path) as browser:
+                colours = "dark" if args.dark else "light"
+                seen = visit(browser, address, device_scale_factor=1.25, color_scheme=colours)
+                still, pictures = play(seen)
+        finally:
+            processes.close()
+    still.save(args.out / "page.png", optimize=True)
+    times = [t for t, _ in pictures]
+    durations = [int(1000 * min(0.5, max(0.05, after - t))) for t, after in pairwise(times)] + [1500]
+    first, *rest = [image for _, image in pictures]
+    first.save(
+        args.out / "page.webp", save_all=True, append_images=rest, duration=durations, loop=0, quality=60, method=4
+    )
+    for name in ("page.png", "page.webp"):
+        print(f"{args.out / name}: {(args.out / name).stat().st_size / 1e3:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()

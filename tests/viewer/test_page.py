@@ -1,0 +1,247 @@
+"""The page in a real browser, before the real system: simulator, estimator, controller, recorder, viewer."""
+
+from __future__ import annotations
+
+import re
+import signal
+import socket
+
+import pytest
+
+from common.bus import wait_until
+from tests.conftest import PATIENCE, ROOT, Processes, free_tcp_port
+
+browser_tools = pytest.importorskip("tests.viewer.browser", reason="NO PLAYWRIGHT: the page is not tested")
+BROWSER = browser_tools.find_browser()
+needs_browser = pytest.mark.skipif(
+    BROWSER is None, reason="NO CHROMIUM (apt-get install chromium): the page is not tested"
+)
+STATIC = ROOT / "services" / "viewer" / "static"
+AWAY = "Math.hypot({0}.x - arg[0], {0}.y - arg[1])"  # m from a place that is given
+NAMELESS = """[...document.querySelectorAll("button")].filter(
+    (button) => !(button.innerText.trim() || button.getAttribute("aria-label"))).length"""
+SCENES = ("tracking", "ambiguous", "lost", "half-dead", "empty", "watching")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with browser_tools.open_browser(BROWSER) as opened:
+        yield opened
+
+
+class System:
+    """Everything that `presage up` starts, and a recorder that waits to be told."""
+
+    def __init__(self, folder):
+        self.processes = Processes(folder)
+        _, port = self.processes.start_router()
+        self.environment = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "robot"}
+        self.folder, self.running = folder / "recordings", {}
+        self.folder.mkdir()
+        for name in ("simulator", "estimator", "controller"):
+            self.start(name)
+        self.start("recorder", "--idle", "--directory", str(self.folder))
+        viewer = self.start("viewer", "--port", "0", "--recordings", str(self.folder))
+        viewer.wait_for("page: ")
+        self.address = re.search(r"page: (\S+)", viewer.output)[1]
+
+    def start(self, name, *args):
+        self.running[name] = self.processes.start(name, *args, env=self.environment)
+        return self.running[name]
+
+
+@pytest.fixture(scope="module")
+def system(tmp_path_factory):
+    made = System(tmp_path_factory.mktemp("system"))
+    try:
+        yield made
+    finally:
+        made.processes.close()
+
+
+@pytest.fixture
+def page(browser, system):
+    """A visitor who sees the robot tracked."""
+    seen = browser_tools.visit(browser, system.address)
+    seen.wait("store.frame?.belief?.state === 'tracking' && store.world", 60)
+    yield seen
+    seen.page.context.close()
+    assert seen.complaints == []
+
+
+def test_no_text_is_ever_read_as_html():
+    code = {path.name: path.read_text() for path in (STATIC / "js").glob("*.js")}
+    assert len(code) > 10
+    forbidden = re.compile(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function|srcdoc")
+    assert {name: found for name, text in code.items() if (found := forbidden.findall(text))} == {}
+
+
+def test_the_page_needs_no_other_host_and_no_inline_code():
+    text = (STATIC / "index.html").read_text() + "".join(path.read_text() for path in STATIC.rglob("*.css"))
+    assert not re.search(r"https?://|\bstyle=|\bon[a-z]+=|<style|@import", text)
+    assert re.findall(r"<script[^>]*>", text) == ['<script type="module" src="js/main.js">']
+
+
+@needs_browser
+def test_frames_arrive_at_the_scans_rate_and_nothing_complains(page):
+    page.wait("store.arrivals.length >= 40 && Math.abs(store.rate(performance.now()) - 15) < 1", 40)
+    beams = page.see("[store.frame.ranges.length, store.frame.predicted.length, store.frame.sigma.length]")
+    assert beams[0] > 500
+    assert beams[1] == beams[0]
+    assert page.page.locator("#estimator-badge b").inner_text() == "tracking"
+    assert page.page.locator("#services tr").count() >= 5
+    drawn = """(() => {
+        const canvas = document.getElementById("c-scan");
+        return new Set(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data).size;
+    })()"""
+    assert page.see(drawn) > 20  # more than an empty canvas has
+
+
+@needs_browser
+def test_a_click_becomes_a_goal_and_the_robot_gets_there(page):
+    x, y = page.see("[store.frame.truth.x, store.frame.truth.y]")
+    goal = (x + (1.5 if x < 9 else -1.5), y)
+    page.page.keyboard.press("g")
+    page.click(*goal)
+    page.toast()
+    page.wait(f"store.frame.status?.goal && {AWAY.format('store.frame.status.goal')} < 0.1", 10, goal)
+    page.wait("store.frame.status.state === 'reached'", 40)
+    page.wait(f"{AWAY.format('store.frame.truth')} < 0.35", 5, goal)
+
+
+@needs_browser
+def test_a_goal_in_a_wall_is_refused_in_words(page):
+    page.page.keyboard.press("g")
+    page.click(9.0, 0.05)
+    assert "wall" in page.toast(ok=False)
+
+
+@needs_browser
+def test_a_robot_that_was_carried_off_is_found_again(page):
+    x = page.see("store.frame.truth.x")
+    there = (13.0, 1.2) if x < 9 else (5.0, 1.2)
+    page.page.mouse.move(*page.at(*there))
+    page.page.keyboard.down("Shift")
+    page.click(*there)
+    page.page.keyboard.up("Shift")
+    page.toast("carried")
+    page.wait(f"{AWAY.format('store.frame.truth')} < 0.5", 10, there)
+    found = f"store.frame.belief.state === 'tracking' && {AWAY.format('store.frame.belief')} < 0.6"
+    page.wait(f"{found} && store.frame.error < 0.1", 60, there)
+
+
+@needs_browser
+def test_obstacles_are_added_dragged_and_removed(page):
+    page.page.keyboard.press("o")
+    page.click(9.0, 3.0)
+    page.toast("added")
+    page.wait("store.world.obstacles.some((o) => o.name === 'box-1')", 10)
+    page.drag((9.0, 3.0), (9.0, 2.2))
+    page.wait("Math.abs(store.world.obstacles.find((o) => o.name === 'box-1').box.center[1] - 2.2) < 0.1", 10)
+    page.page.get_by_role("button", name="Remove").click()
+    page.wait("!store.world.obstacles.some((o) => o.name === 'box-1')", 10)
+
+
+@needs_browser
+def test_keys_drive_pause_and_step(page):
+    page.page.locator("#map").focus()
+    page.page.keyboard.press("x")
+    pose = page.see("[store.frame.truth.x, store.frame.truth.y, store.frame.truth.yaw]")
+    page.page.keyboard.down("a")
+    page.wait("store.frame.status.state === 'manual'", 10)
+    page.wait("Math.abs(Math.sin((store.frame.truth.yaw - arg[2]) / 2)) > 0.1", 10, pose)
+    page.page.keyboard.up("a")
+    page.wait("store.frame.status.state !== 'manual'", 10)
+    page.page.keyboard.press(" ")
+    page.wait("store.paused", 10)
+    page.wait("performance.now() - store.arrivals.at(-1) > 500", 10)
+    stood = page.see("store.frame.stamp_ns")
+    page.page.keyboard.press(".")
+    page.wait("store.frame.stamp_ns > arg", 10, stood)
+    assert page.see("store.frame.stamp_ns") - stood < 0.1e9
+    page.page.keyboard.press(" ")
+    page.wait("store.frame.stamp_ns > arg + 5e8", 10, stood)
+
+
+@needs_browser
+def test_a_recording_is_made_opened_and_scrubbed(page, system):
+    page.page.locator("#record").click()
+    page.wait("document.getElementById('record').getAttribute('aria-pressed') === 'true'", 10)
+    began = page.see("store.frame.t")
+    page.wait("store.frame.t > arg + 4", 30, began)
+    page.page.locator("#record").click()
+    page.wait("document.getElementById('record').getAttribute('aria-pressed') === 'false'", 10)
+    name = next(path.name for path in system.folder.glob("*.mcap"))
+    page.page.locator("#open").click()
+    page.page.locator(f'[data-file="{name}"]').click()
+    page.wait("store.player && store.frame && store.world", 60)
+    length = page.see("store.player.duration_s")
+    assert length > 3
+    times = []
+    for share in (0.2, 0.8, 0.4):
+        page.page.locator("#player-seek").fill(str(round(share * length, 2)))
+        page.wait("Math.abs(store.player.position_s - arg) < 0.5", 10, share * length)
+        page.wait("store.frame.t !== arg", 10, times[-1] if times else -1)
+        times.append(page.see("store.frame.t"))
+    assert times[0] < times[2] < times[1]
+    page.page.locator("#player-close").click()
+    page.wait("!store.player && store.frame?.robot === 'robot'", 20)
+
+
+@needs_browser
+def test_a_missing_service_is_named_with_what_starts_it(page, system):
+    system.running["estimator"].stop()
+    notice = page.page.locator(".notice", has_text="estimator is missing")
+    notice.wait_for(timeout=20_000)
+    assert "python -m services.estimator" in notice.locator("code").inner_text()
+    assert page.page.locator("#estimator-badge b").inner_text() == "missing"
+    system.start("estimator")
+    notice.wait_for(state="detached", timeout=40_000)
+    page.wait("store.frame?.belief?.state === 'tracking'", 60)
+
+
+@needs_browser
+def test_the_page_comes_back_by_itself(browser, processes):
+    port = str(free_tcp_port())
+    first = processes.start("tests.viewer.stub_server", "--port", port)
+    assert wait_until(lambda: accepts(port), PATIENCE)
+    seen = browser_tools.visit(browser, f"http://127.0.0.1:{port}/")
+    seen.wait("store.arrivals.length > 10")
+    first.stop(signal.SIGKILL)
+    seen.page.locator("#banner").wait_for(timeout=10_000)
+    assert "No connection" in seen.page.locator("#banner").inner_text()
+    processes.start("tests.viewer.stub_server", "--port", port)
+    seen.page.locator("#banner").wait_for(state="hidden", timeout=30_000)
+    seen.wait("store.connected && store.frame && performance.now() - store.arrivals.at(-1) < 500", 20)
+    seen.page.context.close()
+
+
+def accepts(port):
+    with socket.socket() as probe:
+        probe.settimeout(0.5)
+        return probe.connect_ex(("127.0.0.1", int(port))) == 0
+
+
+@needs_browser
+@pytest.mark.parametrize("scene", SCENES)
+def test_every_state_fits_a_phone_and_names_its_buttons(browser, processes, scene):
+    port = str(free_tcp_port())
+    processes.start("tests.viewer.stub_server", "--port", port, "--scene", scene)
+    assert wait_until(lambda: accepts(port), PATIENCE)
+    address = f"http://127.0.0.1:{port}/"
+    seen = browser_tools.visit(browser, address, width=360, height=740, has_touch=True, color_scheme="dark")
+    seen.wait("store.servicesKnown")
+    assert seen.see("document.documentElement.scrollWidth") <= 360
+    assert seen.see(
+        "matchMedia('(prefers-color-scheme: dark)').matches && document.documentElement.hasAttribute('data-dark')"
+    )
+    assert seen.see(NAMELESS) == 0
+    empty = seen.page.locator("#empty").is_visible()
+    assert empty == (scene == "empty")
+    if scene == "watching":
+        assert seen.page.locator("#watch-only").is_visible()
+        assert seen.page.locator("#pause").is_disabled()
+    if scene == "half-dead":
+        assert "python -m services.estimator" in seen.page.locator(".notice code").inner_text()
+    assert seen.complaints == []
+    seen.page.context.close()
