@@ -28,6 +28,22 @@ def bench_latency(
     raise typer.Exit(run(scans, rate, beams, json_file, console))
 
 
+@app.command("viewer")
+def bench_viewer(
+    seconds: Annotated[float, typer.Option(min=1.0, help="Of one round.")] = 20.0,
+    rounds: Annotated[int, typer.Option(min=1, help="Without and with, so often.")] = 3,
+    beams: Annotated[int, typer.Option(help="Beams of a scan.")] = 622,
+    json_file: Json = None,
+) -> None:
+    """The live page's processor time with one visitor, and the loop's latency with and without it.
+
+    Example: `presage bench viewer --json viewer.json`.
+    """
+    from presage.bench_viewer import bench_viewer as run  # noqa: PLC0415
+
+    raise typer.Exit(run(seconds, rounds, beams, json_file, console))
+
+
 @app.command("localisation")
 def bench_localisation(
     world: WorldName = "corridor",

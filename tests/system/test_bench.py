@@ -1,4 +1,4 @@
-"""`presage bench latency` and `recorder`: they measure, and nothing of them stays, however they end."""
+"""`presage bench latency`, `viewer` and `recorder`: they measure, and nothing of them stays, however they end."""
 
 from __future__ import annotations
 
@@ -45,6 +45,17 @@ def test_numbers_that_cannot_be_written_are_said_first(process, tmp_path):
     assert bench.wait(60) == 2
     assert "l.json: cannot be written to (No such file or directory)" in bench.output
     assert "Traceback" not in bench.output
+
+
+def test_what_the_viewer_costs_is_measured_and_written(process, tmp_path):
+    args = ("--seconds", "2", "--rounds", "1", "--json", str(tmp_path / "v.json"))
+    bench = process("presage.__main__", "bench", "viewer", *args)
+    assert bench.wait(150) == 0, bench.output
+    numbers = json.loads((tmp_path / "v.json").read_text())
+    assert numbers["frames_hz"] > 1
+    assert 0 < numbers["viewer_cpu_share"] < 1
+    for name in ("without", "with"):
+        assert 0 < numbers[f"scan_to_command_median_{name}_ms"] <= numbers[f"scan_to_command_p99_{name}_ms"]
 
 
 def test_a_recorder_under_load_keeps_every_byte(process, tmp_path):
