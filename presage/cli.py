@@ -18,10 +18,12 @@ from presage.options import (
     EstimatorName,
     Json,
     ModelName,
+    OpenPage,
     Port,
     PriorName,
     RobotName,
     Seed,
+    Viewer,
     WorldName,
     console,
     err_console,
@@ -52,11 +54,14 @@ def up(
     estimator: EstimatorName = "precise",
     model: ModelName = "learned",
     prior: PriorName = "motion",
+    viewer: Viewer = True,
+    open_page: OpenPage = False,
 ) -> None:
-    """Start router, simulator, estimator and controller here, until Ctrl-C.
+    """Start router, simulator, estimator, controller and the live page here, until Ctrl-C.
 
+    The page's link is printed; PRESAGE_VIEWER_PORT and PRESAGE_VIEWER_TOKEN choose its port and who may see it.
     Examples: `presage up`, then elsewhere `presage goal 15 1.5 --wait`; `presage up --estimator particle-filter`;
-    `presage up --record recordings --seed 7`; `presage up --world my.yaml --port 7500`.
+    `presage up --record recordings --seed 7`; `presage up --world my.yaml --port 7500`; `presage up --no-viewer`.
     """
     from presage.up import run_up  # noqa: PLC0415
 
@@ -71,6 +76,8 @@ def up(
         port=port,
         console=console,
         estimator=("--estimator", estimator, "--model", model, "--prior", prior),
+        viewer=viewer,
+        open_page=open_page,
     )
 
 
@@ -84,18 +91,21 @@ def demo(
     pace: Annotated[str, typer.Option(help="realtime, fast or lockstep.")] = "realtime",
     port: Port = 0,
     json_file: Json = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Without the services' own lines.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Without the services' own lines, and the page.")] = False,
     estimator: EstimatorName = "precise",
     model: ModelName = "learned",
+    viewer: Viewer = True,
+    open_page: OpenPage = False,
 ) -> None:
-    """The whole loop: localise from nothing, drive to a goal, record, draw, summarise.
+    """The whole loop, live on a page: localise from nothing, drive to a goal, record, draw, summarise.
 
     Examples: `presage demo`; `presage demo --goal 12 2 --seed 3 --json run.json`; `presage demo --pace lockstep`.
     """
     from presage.demo import Demo, demo_command  # noqa: PLC0415
 
     how = ("--estimator", estimator, "--model", model)
-    raise typer.Exit(demo_command(Demo(world, goal, out, beams, seed, pace, port or None, how), json_file, quiet=quiet))
+    asked = Demo(world, goal, out, beams, seed, pace, port or None, how, viewer, open_page)
+    raise typer.Exit(demo_command(asked, json_file, quiet=quiet))
 
 
 @app.command()

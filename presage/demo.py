@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from common.versions import commit
 from common.world import World, load_world
 from presage.figure import draw_session
 from presage.output import check_file, make_folder, write_json
+from presage.page import say_page, start_page
 from presage.session import SessionSummary, summarise
 from presage.stack import Stack
 from presage.watch import Watch
@@ -46,6 +47,8 @@ class Demo:
     pace: str = "realtime"
     port: int | None = None  # None: any free one
     estimator: tuple[str, ...] = ()  # arguments
+    viewer: bool = True
+    open_page: bool = False  # where there is a display
 
 
 def run_demo(demo: Demo, stack: Stack, console: Console) -> tuple[Path, bool]:
@@ -58,6 +61,7 @@ def run_demo(demo: Demo, stack: Stack, console: Console) -> tuple[Path, bool]:
     stack.start_router()
     with open_bus(stack.link()) as bus:
         watch = Watch(bus, TRUTH, BELIEF, STATUS, HEALTH)
+        page = demo.viewer and start_page(stack, demo.out, console)
         stack.start("recorder", "--directory", str(demo.out), "--file", recording.name)
         stack.start(
             "controller", "--world", demo.world, *(["--belief-timeout", "20"] if demo.pace == "lockstep" else [])
@@ -69,6 +73,8 @@ def run_demo(demo: Demo, stack: Stack, console: Console) -> tuple[Path, bool]:
         stack.start("simulator", *simulator)
         with console.status("starting simulator, estimator, controller, recorder"):
             stack.wait_alive(bus)
+        if page:
+            say_page(stack, console, open_it=demo.open_page)
         reached = _localise(watch, stack, console) and _navigate(bus, watch, stack, goal, console)
         stack.check()
         for name in ("controller", "estimator", "simulator"):
@@ -182,6 +188,8 @@ def demo_command(demo: Demo, json_file: Path | None, *, quiet: bool) -> int:
     """Everything; the exit status."""
     console = Console(width=None if sys.stdout.isatty() else 150)
     check_file(json_file, "--json")
+    if quiet:  # nobody looks
+        demo = replace(demo, viewer=False)
     with Stack("robot", demo.port, quiet=quiet) as stack:
         recording, reached = run_demo(demo, stack, console)
     figure = recording.with_suffix(".png")

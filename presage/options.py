@@ -34,6 +34,10 @@ ModelName = Annotated[str, typer.Option(help="Of precise: learned, exact (the wo
 PriorName = Annotated[str, typer.Option(help="Of motion between scans: motion (scans alone), odometry, command.")]
 
 
+Viewer = Annotated[bool, typer.Option(help="Serve the live page.")]
+OpenPage = Annotated[bool, typer.Option("--open/--no-open", help="Open the page, where there is a display.")]
+
+
 def link_of(connect: str, robot: str) -> Link:
     """The session these options name."""
     return replace(Link(), robot=robot, connect=split_endpoints(connect))

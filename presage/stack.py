@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import socket
@@ -19,11 +18,12 @@ from typing_extensions import Self
 
 from common.bus import Bus, Link
 from common.errors import UserError
+from common.processes import dying_with_us
 
-COLOURS = {"router": 37, "simulator": 36, "estimator": 35, "controller": 33, "recorder": 32}
+COLOURS = {"router": 37, "simulator": 36, "estimator": 35, "controller": 33, "recorder": 32, "viewer": 34}
 GRACE = 5.0  # s between asking a process to end and ending it
 # Who is asked first: the robot stops before its eyes close, and the recorder sees all of it.
-ENDING = ("controller", "estimator", "simulator", "recorder", "router")
+ENDING = ("controller", "estimator", "simulator", "viewer", "recorder", "router")
 
 
 @dataclass
@@ -86,6 +86,18 @@ class Stack:
                 raise UserError(f"not alive within {timeout:g} s: {', '.join(sorted(missing))}; their lines are above")
             time.sleep(0.05)
 
+    def said(self, name: str, beginning: str, timeout: float = 30.0) -> str:
+        """What a child's line says after ``beginning``; raises UserError where it ends, or does not say it in time."""
+        deadline = time.monotonic() + timeout
+        while True:
+            for line in self.processes[name].lines:
+                if line.startswith(beginning):
+                    return line.removeprefix(beginning)
+            self.check()
+            if time.monotonic() > deadline:
+                raise UserError(f"{name} did not say {beginning!r} within {timeout:g} s; its lines are above")
+            time.sleep(0.02)
+
     def ended(self) -> list[str]:
         """Names of children that are gone."""
         return [name for name, process in self.processes.items() if process.child.poll() is not None]
@@ -105,7 +117,6 @@ class Stack:
             "PRESAGE_ROBOT": self.robot,
             "PYTHONUNBUFFERED": "1",
         }
-        parent = os.getpid()
         child = subprocess.Popen(  # noqa: S603 - our own modules
             [sys.executable, *args],
             env=environment,
@@ -115,7 +126,7 @@ class Stack:
             text=True,
             errors="replace",
             start_new_session=True,  # Ctrl-C is ours to pass on, in order
-            preexec_fn=lambda: die_with(parent),  # noqa: PLW1509 - one call, before any thread of the child
+            preexec_fn=dying_with_us(),  # noqa: PLW1509 - one call, before any thread of the child
         )
         process = Process(name, child, threading.Thread(target=lambda: self._pass_on(process), daemon=True))
         process.reader.start()
@@ -165,16 +176,6 @@ def _end(process: Process) -> int:
     if child.stdout is not None:
         child.stdout.close()
     return child.returncode
-
-
-def die_with(parent: int) -> None:
-    """Linux: end this process when its parent ends, even by SIGKILL."""
-    pr_set_pdeathsig = 1
-    libc = ctypes.CDLL(None, use_errno=True)
-    if hasattr(libc, "prctl"):
-        libc.prctl(pr_set_pdeathsig, signal.SIGTERM)
-        if os.getppid() != parent:  # it ended before we asked
-            os._exit(1)
 
 
 @contextmanager

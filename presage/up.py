@@ -9,7 +9,10 @@ from rich.console import Console
 
 from common.bus import open_bus
 from common.world import load_world
+from presage.page import say_page, start_page
 from presage.stack import Stack
+
+RECORDINGS = Path("recordings")  # where the page finds them, and puts those it makes
 
 
 def run_up(
@@ -24,24 +27,29 @@ def run_up(
     port: int,
     console: Console,
     estimator: tuple[str, ...] = (),
+    viewer: bool = True,
+    open_page: bool = False,
 ) -> None:
     """Start, wait until all are alive, say what can be done, and watch; a service that ends is named, not restarted."""
     load_world(world)  # one clear line now rather than three from the children
     with Stack(robot, port or None) as stack:
         stack.start_router()
         lockstep = pace == "lockstep"
-        if record is not None:
-            stack.start("recorder", "--directory", str(record))
+        page = viewer and start_page(stack, record or RECORDINGS, console)
+        if page or record is not None:  # idle, it waits for the page's button
+            stack.start("recorder", "--directory", str(record or RECORDINGS), *(["--idle"] if record is None else []))
         stack.start("estimator", "--world", world, *estimator)
         if drive == "holonomic":
             stack.start("controller", "--world", world, *(["--belief-timeout", "20"] if lockstep else []))
         else:
             console.print("the controller does not turn yet: none is started for a differential drive")
-        waits = ",".join(sorted(set(stack.processes) - {"router"}))
+        waits = ",".join(sorted(set(stack.processes) - {"router", "viewer"}))
         simulator = ["--world", world, "--beams", str(beams), "--drive", drive, "--pace", pace, "--seed", str(seed)]
         stack.start("simulator", *simulator, *(["--wait-for", waits] if pace != "realtime" else []))
         with open_bus(stack.link()) as bus:
             stack.wait_alive(bus)
+        if page:
+            say_page(stack, console, open_it=open_page)
         where = "" if port == 7447 else f" --connect {stack.endpoint}"
         console.print(
             f"[bold green]all alive[/] at {stack.endpoint}. In another terminal: "

@@ -34,6 +34,7 @@ def test_compose_up_ends_in_a_robot_at_its_goal(tmp_path, free_port):
     name = f"presage-test-{uuid.uuid4().hex[:8]}"
     environment = {
         **os.environ, "COMPOSE_PROJECT_NAME": name, "PRESAGE_IMAGE": name, "PRESAGE_PORT": str(free_port()),
+        "PRESAGE_PAGE_PORT": str(free_port()),
         "PRESAGE_RECORDINGS": str(tmp_path / "recordings"), "COMPOSE_PROGRESS": "plain",
     }  # fmt: skip
 
@@ -47,7 +48,7 @@ def test_compose_up_ends_in_a_robot_at_its_goal(tmp_path, free_port):
         up = compose("up", "--exit-code-from", "goal", timeout=240)
         assert up.returncode == 0, up.stdout[-5000:] + up.stderr[-2000:]
         assert "reached: within 0.2 m of the goal" in up.stdout
-        for service in ("simulator", "estimator", "controller", "recorder", "router"):
+        for service in ("simulator", "estimator", "controller", "recorder", "viewer", "router"):
             assert f"{service}-1 exited with code 0" in up.stdout + up.stderr
     finally:
         compose("down", "--volumes", timeout=60)

@@ -14,6 +14,7 @@ from common.messages import Belief, Goal, Health, Pose, Scan
 from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, PREDICTION, SCAN, STATUS, TRUTH
 from services.recorder.reader import read_recording
 from tests.recorder import sessions as made
+from tests.viewer.client import Page
 
 SCANS = 90
 REPEATED = (SCAN, ODOM, TRUTH, BELIEF, PREDICTION, STATUS, CMD_VEL)
@@ -123,7 +124,16 @@ def test_demo_localises_navigates_records_and_draws(process, tmp_path):
     (goal,) = [message for _, message, _ in told.messages(GOAL)]
     assert goal.seq > 0
     assert {message.goal_seq for _, message, _ in told.messages(STATUS) if message.goal} == {goal.seq}
-    for word in ("distance to goal", "localisation error", "scans", "dropped", "recording", "figure", "goal reached"):
+    for word in (
+        "page: http://127.0.0.1:",
+        "distance to goal",
+        "localisation error",
+        "scans",
+        "dropped",
+        "recording",
+        "figure",
+        "goal reached",
+    ):
         assert word in demo.output
 
 
@@ -153,7 +163,7 @@ def test_no_process_outlives_presage_up(process, free_port, number):
     up = process("presage.__main__", "up", "--port", str(free_port()))
     up.wait_for("all alive", 90)
     children = psutil.Process(up.child.pid).children(recursive=True)
-    assert len(children) == 4
+    assert len(children) == 6  # router, simulator, estimator, controller, viewer, and a recorder that waits
     up.send(number)
     assert up.wait(20) == (-9 if number == signal.SIGKILL else 130)
     assert wait_until(lambda: not any(child.is_running() and child.status() != "zombie" for child in children), 10)
@@ -166,4 +176,23 @@ def test_up_names_a_service_that_ends_and_keeps_the_others(process, free_port):
     estimator.kill()
     up.wait_for("estimator ended with status -9", 20)
     assert "python -m services.estimator" in up.output
-    assert len([c for c in psutil.Process(up.child.pid).children() if c.status() != "zombie"]) == 3
+    assert len([c for c in psutil.Process(up.child.pid).children() if c.status() != "zombie"]) == 5
+
+
+def test_up_serves_the_page(process, free_port):
+    up = process("presage.__main__", "up", "--port", str(free_port()), env={"PRESAGE_VIEWER_PORT": "0"})
+    up.wait_for("all alive", 90)
+    (where,) = [line.split()[-1] for line in up.output.splitlines() if line.startswith("page:")]
+    with Page(where) as page:
+        assert page.told("world")["world"]["name"] == "corridor"
+        assert page.frame(lambda h: h["belief"] is not None)
+        assert page.told("services", lambda m: len(m["services"]) == 5)["missing"] == []
+        assert page.done("record", action="status")["recording"] is False
+    assert up.stop(signal.SIGINT, 20)[0] == 130
+
+
+def test_up_without_a_page(process, free_port):
+    up = process("presage.__main__", "up", "--port", str(free_port()), "--no-viewer")
+    up.wait_for("all alive", 90)
+    assert "page:" not in up.output
+    assert len(psutil.Process(up.child.pid).children()) == 4
