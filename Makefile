@@ -55,8 +55,8 @@ echo "make: install Python 3.11 (Debian: apt-get install python3.11 python3.11-v
 exit 1
 endef
 
-demo: install ## localise and drive in the corridor: every service, a recording, a picture
-	$(BIN)/presage demo $(ARGS)
+demo: install ## localise and drive in the corridor: every service, a live page, a recording, a picture
+	$(BIN)/presage demo --open $(ARGS)
 
 test: install ## all tests, the fast ones first
 	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
