@@ -153,7 +153,8 @@ def plain(message: Message, *, full: bool) -> dict[str, Any]:
 
     def convert(value: Any) -> Any:
         if isinstance(value, np.ndarray):
-            numbers = [v if np.isfinite(v) else str(v) for v in np.round(value.astype(float), 4).ravel().tolist()]
+            # Significant digits: a covariance is in millionths, a range in metres.
+            numbers = [float(f"{v:.6g}") if np.isfinite(v) else str(v) for v in value.astype(float).ravel().tolist()]
             if full or len(numbers) <= 9:
                 return numbers
             return [*numbers[:3], f"... {len(numbers)} ...", *numbers[-3:]]

@@ -56,7 +56,12 @@ class Facts:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
-        return asdict(self)
+        return asdict(self) | {"missing": self.missing}
+
+    @property
+    def missing(self) -> int:
+        """Messages that were sent and are not in it: by the publishers' numbers, or dropped by the recorder."""
+        return sum((topic.missing or 0) + (topic.dropped or 0) for topic in self.topics)
 
 
 class _Pass:
@@ -108,7 +113,7 @@ def survey(recording: Recording, check: bool | None = None) -> Facts:
         complete=recording.complete,
         checked=seen is not None,
         warning=recording.warning,
-        robots=robots_of(recording) or [about["robot"]] * ("robot" in about),
+        robots=robots_of(recording) or ([about["robot"]] if "robot" in about else []),
         world=world.name if world else None,
         started=datetime.fromtimestamp(recording.start_ns * 1e-9, timezone.utc).isoformat(timespec="milliseconds"),
         duration_s=(recording.end_ns - recording.start_ns) * 1e-9,

@@ -43,11 +43,14 @@ def info(file: Path, json_file: Path | None, check: bool | None, console: Consol
     if not facts.checked:
         console.print("gaps and bytes are counted from the payloads themselves with --check", style="dim")
     write_json(json_file, facts.as_dict())
-    return 0 if facts.complete else 1
+    return 0 if facts.complete and not facts.missing else 1
 
 
 def _head(facts: Facts, recording: Recording, console: Console) -> None:
-    state = "whole" + (", every chunk's checksum right" if facts.checked else ", by its index")
+    state = f"readable, but {facts.missing} messages are missing" if facts.missing else "whole"
+    state += ", every chunk's checksum right" if facts.checked else ", by its index"
+    if (recovered := recording.metadata.get("recovered")) is not None:
+        state += f", recovered from {recovered.get('from', 'another file')}"
     about = recording.metadata.get("presage", {})
     rows = [
         ("file", f"{facts.file}, {_size(facts.file_bytes)}"),

@@ -28,6 +28,7 @@ from presage.replays.compare import BIT_FOR_BIT, TOLERANCE_M, TOLERANCE_RAD, Out
 from presage.replays.feed import Feed
 from presage.replays.source import SETTINGS, estimator_settings, other_versions, recorded_settings, robot_of, world_file
 from presage.stack import Stack
+from services.recorder.accounting import Sequence
 from services.recorder.reader import Recording, read_recording
 
 
@@ -81,9 +82,21 @@ def run_again(how: Again, console: Console) -> Outcome:
                 stack.wait_alive(bus)
             feed = Feed(recording, bus, stack, outcome, rate=how.rate, every_scan=how.every_scan)
             feed.run(console)
+    outcome.damaged = recording.problem  # found where it was read
+    if lost := missing_scans(recording, robot):
+        outcome.notes.append(f"{lost} scans are missing from the recording by their numbers: what came of them is too")
     if not outcome.good:
         outcome.notes += differences(recording, names)
     return outcome
+
+
+def missing_scans(recording: Recording, robot: str) -> int:
+    """Numbers that the scanner's publisher left out."""
+    numbers = Sequence()
+    for _, message, raw in recording.messages(SCAN):
+        if raw.key == SCAN.key(robot):
+            numbers.see(message.seq)
+    return numbers.missing
 
 
 def configure(recording: Recording, names: tuple[str, ...], folder: Path, notes: list[str]) -> Path:
@@ -143,8 +156,7 @@ def differences(recording: Recording, names: tuple[str, ...]) -> list[str]:
 def words(outcome: Outcome) -> list[str]:
     """For a terminal."""
     pairs, numbers = outcome.beliefs, outcome.beliefs.as_dict()
-    given = outcome.scans - outcome.left_out
-    lines = [f"scans: {given} of {outcome.scans} given"]
+    lines = [f"scans: {outcome.given} of {outcome.scans} given"]
     if outcome.left_out:
         lines[0] += f"; {outcome.left_out} left out that the live estimator never answered (--every-scan gives them)"
     if outcome.unanswered:
@@ -171,6 +183,8 @@ def words(outcome: Outcome) -> list[str]:
 
 
 def _verdict(outcome: Outcome) -> str:
+    if outcome.damaged:
+        return f"[bold red]the recording is damaged ({outcome.damaged}): what comes after that was not compared[/]"
     if outcome.lockstep and outcome.good:
         return "[bold green]the session ran in lockstep, and this is what it believed[/]"
     if outcome.lockstep:

@@ -103,15 +103,19 @@ class Outcome:
     beliefs: Pairs = field(default_factory=Pairs)
     commands: Pairs = field(default_factory=Pairs)
     scans: int = 0  # in the recording
+    given: int = 0
     left_out: int = 0  # never answered live
     unanswered: int = 0  # now
     goals_placed: bool = True  # between the beliefs where the controller took them
     notes: list[str] = field(default_factory=list)
+    damaged: str = ""  # what kept the recording from being read to its end
 
     @property
     def good(self) -> bool:
         """Equal bit for bit; where the session did not run in lockstep, within the tolerance once tracking."""
         pairs, left = self.beliefs, self.beliefs.unmatched()["recorded"]
+        if self.damaged:
+            return False
         if self.lockstep:
             driven = self.commands.compared == self.commands.equal or not self.goals_placed
             return 0 < pairs.compared == pairs.equal and not left and driven
@@ -124,7 +128,7 @@ class Outcome:
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
         return {
-            "lockstep": self.lockstep, "why_not": self.why, "good": self.good,
+            "lockstep": self.lockstep, "why_not": self.why, "good": self.good, "damaged": self.damaged,
             "scans": self.scans, "scans_left_out": self.left_out,
             "scans_unanswered": self.unanswered, "beliefs": self.beliefs.as_dict(),
             "commands": {

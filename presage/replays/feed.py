@@ -103,6 +103,7 @@ class Feed:
         if topic is GOAL and self._when is not None:
             return  # has its place already
         self.bus.put(topic, raw.payload)
+        self.outcome.given += topic is SCAN
         if topic is GOAL and self.rate is None:
             self._goal_heard()
         elif topic is SCAN and self.rate is None:

@@ -95,6 +95,8 @@ def rerun_command(job: Rerun, json_file: Path | None, console: Console) -> None:
             service = Offline(settings)
             service.open()
         track = write_both(recording, robot, service, out, console)
+    if recording.problem:  # found where it was read
+        console.print(f"[bold red]{recording.warning}[/]", highlight=False, soft_wrap=True)
     comparison = track.compare()
     if not comparison.new.beliefs:
         console.print(f"[bold]no belief came of it[/]: {service.note or 'the scans could not be used'}")

@@ -94,6 +94,11 @@ class Recording:
             raise _unreadable(self.path, error) from None
 
     @property
+    def indexed(self) -> bool:
+        """Whether it was finished: damage is then found only where it is read."""
+        return self._finished
+
+    @property
     def raw(self) -> list[Raw]:
         """All of it at once, for short recordings."""
         return list(self.payloads())

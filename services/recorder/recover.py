@@ -6,6 +6,7 @@ import mmap
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -18,7 +19,7 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import Writer
 
 from common.errors import UserError
-from services.recorder.accounting import Ledger
+from services.recorder.accounting import Ledger, as_metadata
 from services.recorder.reader import MAGIC
 from services.recorder.writer import COMPRESSION, PROFILE, UNFINISHED, claim, is_being_written
 
@@ -82,6 +83,8 @@ def recover(
         with source.open("rb") as stream:
             if is_being_written(source):
                 raise UserError(f"{source}: is being written by a recorder that lives; end that first")
+            if source.stat().st_size == 0:
+                raise UserError(f"{source}: is empty, there is nothing to recover: it can be removed")
             if stream.read(len(MAGIC)) != MAGIC:
                 raise UserError(f"{source}: not an MCAP file, or not even its first bytes are there")
             with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
@@ -103,7 +106,9 @@ def target_of(source: Path) -> Path:
 
 def _copy(data: mmap.mmap, found: Recovered, on_progress: Callable[[float], None]) -> Recovered:
     active = found.path.with_name(found.path.name + ".recovering")
-    stream = claim(found.path, active)
+    if not is_being_written(active):  # of a recovery that was cut short
+        active.unlink(missing_ok=True)
+    stream = claim(found.path, active, remedy="--out")
     try:
         copier = _Copier(Writer(stream, chunk_size=1 << 18, compression=COMPRESSION["zstd"]), found)
         for records, end in _walk(data, found):
@@ -114,8 +119,9 @@ def _copy(data: mmap.mmap, found: Recovered, on_progress: Callable[[float], None
         stream.close()
         active.rename(found.path)
     finally:
-        stream.close()
         active.unlink(missing_ok=True)
+        with suppress(OSError):  # what is buffered may not fit on the disk either
+            stream.close()
     return found
 
 
@@ -144,7 +150,7 @@ class _Copier:
             self._channels[record.id] = self._writer.register_channel(
                 record.topic, record.message_encoding, self._schemas[record.schema_id], record.metadata
             )
-        elif isinstance(record, Metadata):
+        elif isinstance(record, Metadata) and record.name != "counters":  # those were of the whole
             self._writer.add_metadata(record.name, record.metadata)
         elif isinstance(record, Attachment):
             self._writer.add_attachment(
@@ -169,6 +175,8 @@ class _Copier:
             raise UserError(f"{found.source}: nothing in it can be read")
         lost = sum(damage.length for damage in found.damages)
         about = {"from": found.source.name, "bytes": str(found.size), "bytes_not_used": str(lost)}
+        counts = found.ledger.counts(found.messages, {}, {})
+        self._writer.add_metadata("counters", as_metadata(counts))
         self._writer.add_metadata("recovered", about)
         self._writer.finish()  # type: ignore[no-untyped-call]
 

@@ -234,6 +234,8 @@ def replay(
         running.announce()
         with steering(running.remote):
             running.run(on_progress, stop or threading.Event())
+    if recording.problem and recording.indexed:  # found where it was read
+        print(f"warning: {recording.warning}", file=sys.stderr)
     return running.counts
 
 

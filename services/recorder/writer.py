@@ -148,9 +148,9 @@ def is_being_written(path: Path) -> bool:
     return False
 
 
-def claim(path: Path, active: Path) -> BufferedWriter:
+def claim(path: Path, active: Path, remedy: str = "--file") -> BufferedWriter:
     """The unfinished file, open; whoever makes it owns the name, so two recorders never write one recording."""
-    taken = "is there already; choose another name with --file, or another folder"
+    taken = f"is there already; choose another name with {remedy}, or another folder"
     try:
         stream = active.open("xb")
         with suppress(OSError):  # some network file systems have no locks

@@ -10,6 +10,7 @@ from mcap.reader import NonSeekingReader, make_reader
 from common.errors import UserError
 from common.messages import Pose, Truth, Twist
 from common.topics import TRUTH
+from services.recorder.accounting import Count, as_metadata, from_metadata
 from services.recorder.reader import MAGIC, read_recording
 from services.recorder.recover import recover
 from services.recorder.writer import RecordingWriter
@@ -123,7 +124,7 @@ def test_a_recording_that_lives_is_left_alone(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [(None, "cannot be read"), (b"", "not an MCAP file"), (b"\x89PNG" * 9, "not an MCAP file")],
+    [(None, "cannot be read"), (b"", "is empty, there is nothing to recover"), (b"\x89PNG" * 9, "not an MCAP file")],
     ids=["missing", "empty", "picture"],
 )
 def test_what_is_no_recording_is_named(tmp_path, content, said):
@@ -141,3 +142,24 @@ def test_nothing_is_written_over(tmp_path):
         recover(active)
     assert (tmp_path / "run.mcap").read_bytes() == b"precious"
     assert active.exists()
+
+
+def test_a_recovery_that_was_cut_short_does_not_stop_the_next(tmp_path):
+    active, _ = torn(tmp_path / "run.mcap")
+    (tmp_path / "run.mcap.recovering").write_bytes(b"half")
+    assert recover(active).messages == {KEY: CHUNKS * EACH}
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["run.mcap", "run.mcap.torn"]
+
+
+def test_what_was_counted_of_the_whole_is_not_said_of_what_is_left(tmp_path):
+    writer = RecordingWriter(tmp_path / "run.mcap", "none", chunk_size=1024)
+    for number in range(40):
+        writer.write(TRUTH, KEY, truth(number), number, number)
+    writer.metadata("counters", as_metadata({KEY: Count(received=40, written=40)}))
+    whole = bytearray(writer.finish().read_bytes())
+    whole[whole.find(truth(20)) + 5] ^= 1
+    (tmp_path / "bad.mcap").write_bytes(whole)
+    found = recover(tmp_path / "bad.mcap")
+    count = from_metadata(read_recording(found.path).metadata["counters"])[KEY]
+    assert count.written == count.received == found.messages[KEY] < 40
+    assert count.missing == 40 - count.written
