@@ -9,12 +9,12 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
 
-.PHONY: help install demo test bless check bench clean FORCE
+.PHONY: help install demo test bless check bench screenshots clean FORCE
 .DELETE_ON_ERROR:
 
 help: ## this list
 	@echo 'make TARGET [PYTHON=python3.11] [WHEEL_INDEX=URL] [ARGS="..."]'
-	@sed -n 's/^\([a-z]*\):[^#]*## /  \1	/p' $(firstword $(MAKEFILE_LIST)) | expand -t 12
+	@sed -n 's/^\([a-z]*\):[^#]*## /  \1	/p' $(firstword $(MAKEFILE_LIST)) | expand -t 16
 	@echo 'PyTorch without gigabytes of CUDA: WHEEL_INDEX is the URL of its index of CPU wheels (see pytorch.org)'
 
 install: $(STAMP) ## make .venv with everything in it; does nothing where nothing changed
@@ -71,6 +71,9 @@ check: install ## style, format and types
 
 bench: install ## latency from scan to command beside the raw zenoh round trip
 	$(BIN)/presage bench latency $(ARGS)
+
+screenshots: install ## docs/page.png and docs/page.webp of the live page; needs Chromium
+	$(BIN)/python -m tests.viewer.screenshots $(ARGS)
 
 clean: ## remove .venv and what tools leave behind; recordings stay
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist

@@ -87,7 +87,7 @@ function takeHello(hello) {
 function takeWorld({ world, scanner, robot }) {
   const before = store.world;
   Object.assign(store, { world, scanner, robot });
-  if (!before || before.name !== world.name || String(before.boundary) !== String(world.boundary)) {
+  if (!before || before.name !== world?.name || String(before.boundary) !== String(world?.boundary)) {
     arrange();
     view.fit();
   }
