@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import socket
 import subprocess
@@ -34,6 +35,12 @@ class Process:
     child: subprocess.Popen[str]
     reader: threading.Thread
     lines: list[str] = field(default_factory=list)  # the last few, to explain an end
+    args: list[str] = field(default_factory=list)  # of Python
+
+    def again(self, stack: Stack) -> str:
+        """The command that starts another like it, for a shell."""
+        said = f"PRESAGE_CONNECT={stack.endpoint} PRESAGE_ROBOT={stack.robot} "
+        return ("" if self.name == "router" else said) + shlex.join(["python", *self.args])
 
 
 class Stack:
@@ -129,6 +136,7 @@ class Stack:
             preexec_fn=dying_with_us(),  # noqa: PLW1509 - one call, before any thread of the child
         )
         process = Process(name, child, threading.Thread(target=lambda: self._pass_on(process), daemon=True))
+        process.args = args
         process.reader.start()
         self.processes[name] = process
 

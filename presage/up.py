@@ -67,10 +67,9 @@ def _watch(stack: Stack, console: Console) -> None:
             if name not in said:
                 said.add(name)
                 process = stack.processes[name]
-                again = "common.router" if name == "router" else f"services.{name}"
                 console.print(
                     f"[bold red]{name} ended with status {process.child.returncode}[/]; it is not restarted. "
-                    f"Start it again with: PRESAGE_CONNECT={stack.endpoint} python -m {again}",
+                    f"Start it again with: {process.again(stack)}",
                     soft_wrap=True,
                 )
         if len(said) == len(stack.processes):
