@@ -106,6 +106,19 @@ def test_info_prints_it_and_writes_it(tmp_path):
     assert {row["key"] for row in numbers["topics"]} >= {KEY, SCAN.key("rob")}
 
 
+def test_a_file_with_gaps_is_not_called_whole(tmp_path):
+    path = driven.write(tmp_path / "run.mcap", ODOM, also=odoms(0, 1, 5))
+    console = Console(file=io.StringIO(), width=150)
+    assert info(path, None, None, console) == 1
+    assert "readable, but 3 messages are missing" in console.file.getvalue()
+
+
+def test_a_file_whose_description_is_lost_is_described_all_the_same(tmp_path):
+    path = driven.write(tmp_path / "run.mcap")
+    (tmp_path / "t.mcap").write_bytes(path.read_bytes()[:12])
+    assert facts_of(tmp_path / "t.mcap")[0].robots == []
+
+
 @pytest.mark.parametrize("how", ["active", "cut", "damaged"])
 def test_info_of_a_file_that_is_not_whole_says_what_to_do(tmp_path, how):
     if how == "active":

@@ -19,6 +19,7 @@ from common.errors import UserError
 from common.messages import Belief, CmdVel, Pose, Status, Truth, Twist
 from common.topics import BELIEF, PREDICTION, SCAN, TRUTH
 from presage.replays import rerun as shell
+from presage.replays.again import words
 from presage.replays.compare import Outcome, Pairs
 from presage.replays.goals import Goals
 from presage.replays.report import Series, Track
@@ -321,3 +322,16 @@ def test_the_end_of_a_recording_may_cut_an_answer_in_two():
     goals = said(1, "g", 2)
     goals.see([Status(stamp_ns=3, state="navigating", goal=Pose(x=1.0, y=1.0), distance=1.0)])
     assert goals.taken(1) == {1: 1, 3: 0}
+
+
+def test_a_damaged_recording_proves_nothing():
+    outcome = Outcome(lockstep=True)
+    belief = Belief(
+        stamp_ns=1, state="tracking", pose=Pose(x=0.0, y=0.0), xi=np.zeros(3, np.float32), free_energy=0.0, accuracy=0.0
+    )
+    outcome.beliefs.recorded(belief)
+    outcome.beliefs.new(belief)
+    assert outcome.good
+    outcome.damaged = "damaged: a chunk's checksum"
+    assert not outcome.good
+    assert "what comes after that was not compared" in words(outcome)[-1]
