@@ -17,6 +17,7 @@ import psutil
 import pytest
 
 from common.bus import Link, open_bus, wait_until
+from common.inbox import Sample
 
 ROOT = Path(__file__).resolve().parent.parent
 PATIENCE = 30.0  # s, deadline of a wait for what takes well under a second on an idle machine
@@ -71,6 +72,22 @@ def accepts(port: int) -> bool:
 def free_port():
     """Calls give TCP ports of loopback that are free now."""
     return free_tcp_port
+
+
+def next_of(inbox, kind, condition, timeout=60.0):
+    """The first message of a kind that meets a condition."""
+    found = []
+
+    def look():
+        while isinstance(sample := inbox.get(0), Sample):
+            message = sample.topic.message.decode(sample.payload)
+            if isinstance(message, kind) and condition(message):
+                found.append(message)
+                return True
+        return False
+
+    assert wait_until(look, timeout), f"no {kind.__name__} as wanted within {timeout:g} s"
+    return found[0]
 
 
 class Running:

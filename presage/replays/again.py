@@ -28,7 +28,6 @@ from presage.replays.compare import BIT_FOR_BIT, TOLERANCE_M, TOLERANCE_RAD, Out
 from presage.replays.feed import Feed
 from presage.replays.source import SETTINGS, estimator_settings, other_versions, recorded_settings, robot_of, world_file
 from presage.stack import Stack
-from services.recorder.accounting import Sequence
 from services.recorder.reader import Recording, read_recording
 
 
@@ -83,20 +82,11 @@ def run_again(how: Again, console: Console) -> Outcome:
             feed = Feed(recording, bus, stack, outcome, rate=how.rate, every_scan=how.every_scan)
             feed.run(console)
     outcome.damaged = recording.problem  # found where it was read
-    if lost := missing_scans(recording, robot):
+    if lost := outcome.numbers.missing:
         outcome.notes.append(f"{lost} scans are missing from the recording by their numbers: what came of them is too")
     if not outcome.good:
         outcome.notes += differences(recording, names)
     return outcome
-
-
-def missing_scans(recording: Recording, robot: str) -> int:
-    """Numbers that the scanner's publisher left out."""
-    numbers = Sequence()
-    for _, message, raw in recording.messages(SCAN):
-        if raw.key == SCAN.key(robot):
-            numbers.see(message.seq)
-    return numbers.missing
 
 
 def configure(recording: Recording, names: tuple[str, ...], folder: Path, notes: list[str]) -> Path:

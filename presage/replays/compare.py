@@ -10,6 +10,7 @@ import numpy as np
 
 from common import se2
 from common.messages import Belief, CmdVel, Stamped
+from services.recorder.accounting import Sequence
 
 BIT_FOR_BIT = "state, pose, covariance, free energy"
 # Beliefs that both call tracking, where equality is not required:
@@ -103,6 +104,7 @@ class Outcome:
     beliefs: Pairs = field(default_factory=Pairs)
     commands: Pairs = field(default_factory=Pairs)
     scans: int = 0  # in the recording
+    numbers: Sequence = field(default_factory=Sequence)  # of all recorded scans
     given: int = 0
     left_out: int = 0  # never answered live
     unanswered: int = 0  # now

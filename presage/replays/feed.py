@@ -95,6 +95,8 @@ class Feed:
         if topic in self.asked:
             (self.outcome.beliefs if topic is BELIEF else self.outcome.commands).recorded(message)
             return
+        if topic is SCAN:
+            self.outcome.numbers.see(message.seq)
         if topic is SCAN and not self.every_scan:
             if not taken[message.stamp_ns]:
                 self.outcome.left_out += 1

@@ -218,7 +218,6 @@ def _read_summary(recording: Recording, stream: BinaryIO) -> bool:
 
 def _read_through(recording: Recording, stream: BinaryIO) -> None:
     """From the beginning, as far as it goes."""
-    stream.seek(0)
     keys: dict[int, str] = {}
     for record in _records(recording, stream):
         if isinstance(record, Header):

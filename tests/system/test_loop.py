@@ -9,31 +9,16 @@ import psutil
 import pytest
 
 from common.bus import wait_until
-from common.inbox import Inbox, Sample
+from common.inbox import Inbox
 from common.messages import Belief, Goal, Health, Pose, Scan
 from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, PREDICTION, SCAN, STATUS, TRUTH
 from services.recorder.reader import read_recording
+from tests.conftest import next_of
 from tests.recorder import sessions as made
 from tests.viewer.client import Page
 
 SCANS = 90
 REPEATED = (SCAN, ODOM, TRUTH, BELIEF, PREDICTION, STATUS, CMD_VEL)
-
-
-def next_of(inbox, kind, condition, timeout=60.0):
-    """The first message of a kind that meets a condition."""
-    found = []
-
-    def look():
-        while isinstance(sample := inbox.get(0), Sample):
-            message = sample.topic.message.decode(sample.payload)
-            if isinstance(message, kind) and condition(message):
-                found.append(message)
-                return True
-        return False
-
-    assert wait_until(look, timeout), f"no {kind.__name__} as wanted within {timeout:g} s"
-    return found[0]
 
 
 def run_in_lockstep(process, bus, folder, name):

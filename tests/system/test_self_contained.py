@@ -9,30 +9,14 @@ import pytest
 import safetensors.numpy
 
 from common.bus import wait_until
-from common.inbox import Inbox, Sample
+from common.inbox import Inbox
 from common.messages import Belief, Scan
 from common.topics import BELIEF, SCAN
 from services.recorder.reader import read_recording
-from tests.conftest import ROOT
+from tests.conftest import ROOT, next_of
 
 SCANS = 15  # a second
 SERVICES = {"recorder", "controller", "estimator", "simulator"}
-
-
-def until_heard(inbox, kind, condition, timeout=60.0):
-    """Wait for a message of a kind; it."""
-    found = []
-
-    def look():
-        while isinstance(sample := inbox.get(0), Sample):
-            message = sample.topic.message.decode(sample.payload)
-            if isinstance(message, kind) and condition(message):
-                found.append(message)
-                return True
-        return False
-
-    assert wait_until(look, timeout), f"no {kind.__name__} as wanted within {timeout:g} s"
-    return found[0]
 
 
 def other_weights(folder, file):
@@ -56,7 +40,7 @@ def record(process, bus, folder, *estimator):
         process("simulator", "--beams", "622", "--pace", "lockstep", "--wait-for", "estimator,controller,recorder"),
     ]
     assert wait_until(lambda: bus.alive() >= SERVICES, 60)
-    until_heard(scans, Scan, lambda scan: scan.seq >= SCANS)
+    next_of(scans, Scan, lambda scan: scan.seq >= SCANS)
     active = folder / "session.mcap.active"
     assert wait_until(lambda: b"model/world.yaml" in active.read_bytes(), 30), started[0].output
     for running in reversed(started):
@@ -86,7 +70,7 @@ def rerun(process, bus, config, folder, scans):
     found = []
     for scan in scans:
         bus.put(SCAN, scan.encode())
-        found.append(until_heard(beliefs, Belief, lambda belief, s=scan: belief.stamp_ns == s.stamp_ns))
+        found.append(next_of(beliefs, Belief, lambda belief, s=scan: belief.stamp_ns == s.stamp_ns))
     assert running.stop()[0] == 0
     return found
 

@@ -49,3 +49,20 @@ export function tickLabel(value, step) {
   const digits = Math.max(0, Math.ceil(-Math.log10(step) - 1e-9) + (Math.abs((step / 10 ** Math.floor(Math.log10(step))) - 2.5) < 1e-6 ? 1 : 0));
   return (Math.abs(value) < step * 1e-6 ? 0 : value).toFixed(Math.min(6, digits)).replace("-", "−");
 }
+
+/** Begins the path of a plot's grid with its level lines, `[value, text]` each, `gap` px between text and plot. */
+export function beginGrid(ctx, plot, lines, y, colours, gap) {
+  ctx.strokeStyle = colours.line;
+  ctx.fillStyle = colours["ink-3"];
+  ctx.lineWidth = 1;
+  ctx.font = `10.5px ${colours.sans}`;
+  ctx.textBaseline = "middle";
+  ctx.textAlign = "right";
+  ctx.beginPath();
+  for (const [value, text] of lines) {
+    const py = Math.round(y(value)) + 0.5;
+    ctx.moveTo(plot.x, py);
+    ctx.lineTo(plot.x + plot.w, py);
+    ctx.fillText(text, plot.x - gap, py);
+  }
+}

@@ -1,6 +1,6 @@
 // Numbers over the last minute on a canvas; one cursor for all charts.
 
-import { sharp, tickLabel, ticks } from "./canvas.js";
+import { beginGrid, sharp, tickLabel, ticks } from "./canvas.js";
 import { palette } from "./theme.js";
 import { WINDOW } from "./store.js";
 
@@ -90,19 +90,7 @@ export class Chart {
   }
 
   drawAxes(ctx, plot, [low, high], y, colours) {
-    ctx.strokeStyle = colours.line;
-    ctx.fillStyle = colours["ink-3"];
-    ctx.lineWidth = 1;
-    ctx.font = `10.5px ${colours.sans}`;
-    ctx.textBaseline = "middle";
-    ctx.textAlign = "right";
-    ctx.beginPath();
-    for (const [value, text] of this.gridLines(low, high, plot.h)) {
-      const py = Math.round(y(value)) + 0.5;
-      ctx.moveTo(plot.x, py);
-      ctx.lineTo(plot.x + plot.w, py);
-      ctx.fillText(text, plot.x - 6, py);
-    }
+    beginGrid(ctx, plot, this.gridLines(low, high, plot.h), y, colours, 6);
     ctx.stroke();
     if (this.options.axis === false) return;
     ctx.textBaseline = "alphabetic";

@@ -1,6 +1,6 @@
 // The unrolled scan: range against angle, the prediction with its stated precision over the measurement.
 
-import { sharp, tickLabel, ticks } from "./canvas.js";
+import { beginGrid, sharp, tickLabel, ticks } from "./canvas.js";
 import { niceAtLeast } from "./geometry.js";
 import { palette } from "./theme.js";
 
@@ -54,20 +54,9 @@ export class ScanPlot {
   }
 
   drawAxes(ctx, plot, first, last, y, colours) {
-    ctx.strokeStyle = colours.line;
-    ctx.fillStyle = colours["ink-3"];
-    ctx.lineWidth = 1;
-    ctx.font = `10.5px ${colours.sans}`;
-    ctx.textBaseline = "middle";
-    ctx.textAlign = "right";
-    ctx.beginPath();
     const values = ticks(0, this.top, Math.max(2, Math.floor(plot.h / 36)));
-    for (const value of values) {
-      const py = Math.round(y(value)) + 0.5;
-      ctx.moveTo(plot.x, py);
-      ctx.lineTo(plot.x + plot.w, py);
-      ctx.fillText(tickLabel(value, values[1] - values[0]) + (value === 0 ? " m" : ""), plot.x - 5, py);
-    }
+    const label = (value) => tickLabel(value, values[1] - values[0]) + (value === 0 ? " m" : "");
+    beginGrid(ctx, plot, values.map((value) => [value, label(value)]), y, colours, 5);
     ctx.textBaseline = "alphabetic";
     const by = plot.w > 260 ? 45 : 90;
     for (let angle = Math.ceil(first / DEGREE / by - 1e-6) * by; angle <= last / DEGREE + 1e-6; angle += by) {
