@@ -118,6 +118,9 @@ class RobotView:
             self._truths[message.stamp_ns] = message
             if len(self._truths) > TRUTHS:
                 self._truths.popitem(last=False)
+            belief = self._heard.get(BELIEF.name)
+            if belief is not None and belief.message.stamp_ns == message.stamp_ns:  # the network turned them round
+                self._keep(belief.message)
         elif isinstance(message, Belief):
             t, error, speed = message.stamp_ns * 1e-9, self._error(message), self._speed()
             self.history.add(Sample(t, message.free_energy, message.accuracy, message.complexity, error, speed))

@@ -170,7 +170,7 @@ def test_a_robot_made_of_messages_is_shown(viewer, bus):
     robot = Pretence(bus)
     with Page(where) as page:
         page.told("hello")
-        frame = robot.keep_saying(page, lambda h: h["belief"] and h["cmd"] and h["status"])
+        frame = robot.keep_saying(page, lambda h: all(h[k] for k in ("truth", "belief", "cmd", "status", "error")))
         header = frame.header
         assert header["robot"] == bus.robot
         assert header["belief"]["stamp_ns"] == header["stamp_ns"]

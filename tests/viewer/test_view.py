@@ -9,7 +9,7 @@ from random import Random
 import numpy as np
 import pytest
 
-from common.topics import BELIEF, CMD_VEL, PREDICTION, SCAN, STATUS
+from common.topics import BELIEF, CMD_VEL, PREDICTION, SCAN, STATUS, TRUTH
 from services.viewer.frames import encode
 from services.viewer.history import History, Sample
 from services.viewer.moments import QUIET
@@ -235,3 +235,10 @@ def test_history_remembers_what_beliefs_said():
         "t": [1.0], "free_energy": [12.0], "accuracy": [10.0], "complexity": [2.0],
         "error": [pytest.approx(0.5)], "speed": [pytest.approx(0.5)],
     }  # fmt: skip
+
+
+def test_a_truth_that_comes_after_its_belief_still_gives_the_error():
+    view, messages = RobotView("robot"), at(1.0)
+    for topic in (SCAN, BELIEF, TRUTH):
+        view.hear(topic, messages[topic], 1.0)
+    assert view.history.columns()["error"] == [pytest.approx(0.5)]
