@@ -113,8 +113,8 @@ def stopping_path(current: Array, wanted: Array, robot: Robot, hold: float) -> A
 def _ramped(current: Array, wanted: Array, robot: Robot, times: Array) -> Array:
     """(T, 3) velocities at ``times`` (T,) s of a ramp."""
     change = wanted - current
-    linear = float(np.hypot(change[0], change[1]))
-    scale = np.minimum(1.0, robot.acceleration * times / linear) if linear > 0 else np.ones_like(times)
+    linear = max(float(np.hypot(change[0], change[1])), 1e-12)
+    scale = np.minimum(1.0, robot.acceleration * times / linear)
     turn = robot.turn_acceleration * times
     return np.column_stack([current[:2] + change[:2] * scale[:, None], current[2] + np.clip(change[2], -turn, turn)])
 
