@@ -14,7 +14,8 @@ import zenoh
 
 from common.errors import UserError
 from common.inbox import Call, Inbox, Sample
-from common.messages import Reply, Request, Stamped
+from common.messages import Stamped
+from common.requests import Reply, Request
 from common.topics import Query, Topic, alive_key, topic_of
 from common.wire import ENCODING, DecodeError, Message
 

@@ -9,12 +9,13 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from common import messages, pose, robot, scanner, world
+from common import messages, pose, requests, robot, scanner, world
 from common.topics import MAX_BYTES, QUERIES, ROOT, TOPICS, alive_key
 
 HEAD = f"""# Messages
 
-Written by `python -m common.describe > docs/messages.md` from `common/topics.py` and `common/messages.py`; do not edit.
+Written by `python -m common.describe > docs/messages.md` from `topics.py`, `messages.py` and
+`requests.py` in `common/`; do not edit.
 
 Keys are `{ROOT}/<robot>/<topic>`. A payload is one MessagePack map with the field names below; a field with a
 default may be left out, an unknown one is ignored. *Binary* fields are MessagePack `bin`: little-endian numbers of the
@@ -56,7 +57,7 @@ def _queries() -> list[str]:
 
 def _models() -> list[type[BaseModel]]:
     found: list[type[BaseModel]] = []
-    for module in (pose, messages, world, scanner, robot):
+    for module in (pose, messages, requests, world, scanner, robot):
         mine = [c for c in vars(module).values() if inspect.isclass(c) and issubclass(c, BaseModel)]
         found += [c for c in mine if c.__module__ == module.__name__ and not c.__name__.startswith("_")]
     return found

@@ -1,4 +1,4 @@
-"""Every message that crosses the bus. SI units; the frame stands in each field's comment (REP-103, REP-105).
+"""Every message of a topic (of a query: requests.py). SI units; a field's comment says its frame (REP-103, REP-105).
 
 Frames: `map` is the world, `odom` drifts, `base_link` is the robot's centre, `laser` the scanner.
 A new field gets a default; a field never changes its type. docs/messages.md is written from this file.
@@ -14,10 +14,7 @@ from pydantic import Field, model_validator
 
 from common.pose import Pose as Pose  # noqa: PLC0414 - most take it from here
 from common.pose import Twist as Twist  # noqa: PLC0414
-from common.robot import Robot
-from common.scanner import Scanner
-from common.wire import Bytes, Count, Finite, Floats, Matrix3, Message, Name, NotNegative, Poses, Positive, Ranges, Text
-from common.world import Obstacle, World
+from common.wire import Count, Finite, Floats, Matrix3, Message, Name, NotNegative, Points, Positive, Ranges, Text
 
 
 class Stamped(Message):
@@ -138,11 +135,39 @@ class CmdVel(Stamped):
 class Status(Stamped):
     """What the controller is doing, and why."""
 
-    state: Literal["idle", "navigating", "reached", "blocked", "lost", "manual"]  # manual: driven by hand
+    state: Literal["idle", "navigating", "reached", "blocked", "lost", "manual", "exploring"]
+    # manual: driven by hand; exploring: it moves to find out where it is
     reason: Text = ""
     goal: Pose | None = None  # base_link in map
     goal_seq: Count = 0  # which goal this is about
     distance: NotNegative | None = None  # m, from the believed pose to the goal
+
+
+class Plan(Stamped):
+    """The way the controller means to take, and what it knows that its map does not."""
+
+    path: Points = np.zeros((0, 2), np.float32)  # (K, 2) m in map, from the believed place to the goal; empty: none
+    motion: Points = np.zeros((0, 2), np.float32)  # (T, 2) m in map, where the command leads until it would stand
+    obstacles: Points = np.zeros((0, 2), np.float32)  # (M, 2) m in map, seen by the scan and not in the map
+    frame_id: Name = "map"
+
+
+class Preference(Stamped):
+    """The goal prior as a field over known free space; sent when map, goal or obstacles change."""
+
+    goal: Pose  # base_link in map
+    origin: Pose  # lower left corner of the first cell, in map; yaw 0
+    resolution: Positive  # m, a cell's edge
+    width: Annotated[int, Field(ge=1, le=4096)]  # cells along x
+    height: Annotated[int, Field(ge=1, le=4096)]  # cells along y
+    distance: Ranges  # (height * width,) m to go with clearance, row by row along x; +inf: out of reach
+    frame_id: Name = "map"
+
+    @model_validator(mode="after")
+    def _shape(self) -> Preference:
+        if len(self.distance) != self.width * self.height:
+            raise ValueError(f"{len(self.distance)} distances for {self.height} rows of {self.width}")
+        return self
 
 
 class TopicHealth(Message):
@@ -166,129 +191,3 @@ class Health(Stamped):
     topics: list[TopicHealth] = []  # noqa: RUF012
     counters: dict[str, Count] = {}  # noqa: RUF012 - pydantic copies defaults
     note: Text = ""  # what the service waits for or last complained of
-
-
-class Request(Message):
-    """What a queryable is asked; this one needs nothing."""
-
-
-class Reply(Message):
-    """What a queryable answers."""
-
-    ok: bool = True
-    reason: Text = ""  # why not, where ok is false
-
-
-class PoseRequest(Request):
-    """Carry the robot, or the belief, to a pose."""
-
-    pose: Pose  # base_link in map
-
-
-class LocaliseRequest(Request):
-    """Begin localisation anew, from a pose or from nothing."""
-
-    pose: Pose | None = None  # base_link in map
-
-
-class ResetRequest(Request):
-    """Begin the simulation anew."""
-
-    seed: Count | None = None  # None keeps the seed
-
-
-class SpeedRequest(Request):
-    """How fast the simulation's clock runs in realtime pace."""
-
-    factor: Annotated[float, Field(allow_inf_nan=False, ge=0.1, le=20)]  # times wall time
-
-
-class ObstacleRequest(Request):
-    """Change the furniture of a running simulator."""
-
-    action: Literal["add", "move", "remove"]
-    name: Name
-    obstacle: Obstacle | None = None  # for add and move, in map
-
-
-class SampleRequest(Request):
-    """Ask what the scanner would see from poses."""
-
-    poses: Poses  # (N, 3) base_link in map
-    beams: Annotated[int, Field(ge=2, le=100_000)] | None = None  # None: the scanner's own count
-    noise: bool = False
-    seed: Count = 0  # of the noise
-
-
-class SampleReply(Reply):
-    """Scans, row by row."""
-
-    scanner: Scanner | None = None
-    ranges: Ranges = np.zeros(0, np.float32)  # (N * B,) m, row-major
-
-
-class WorldReply(Reply):
-    """What the scanner's side knows of itself."""
-
-    world: World | None = None
-    scanner: Scanner | None = None
-    robot: Robot | None = None
-
-
-class PlayerRequest(Request):
-    """Steer a running replay."""
-
-    action: Literal["pause", "resume", "step", "seek", "rate", "status"]  # step: to the end of the next scan, paused
-    value: Finite = 0.0
-    # seek: s from the recording's beginning; rate: times the original timing, 0 flat out; step: how many, at least 1
-
-
-class PlayerReply(Reply):
-    """Where a replay stands after the request."""
-
-    paused: bool = False
-    position_s: NotNegative = 0.0  # s from the recording's beginning
-    duration_s: NotNegative = 0.0  # s, of the recording
-    rate: NotNegative = 1.0  # times the original timing; 0: as fast as it goes
-    loop: bool = False  # begins anew at its end
-
-
-class RecordRequest(Request):
-    """Begin or end a recording, or ask how it stands."""
-
-    action: Literal["start", "stop", "status"]  # stop: the file is complete; start: a new one
-
-
-class RecordReply(Reply):
-    """How the recorder stands after the request."""
-
-    recording: bool = False
-    file: Text = ""  # path as the recorder sees it: the one being written, or the last one; empty: none yet
-    messages: Count = 0  # in that recording
-    seconds: NotNegative = 0.0  # s, wall time, since it was begun; once complete, from beginning to end
-
-
-class ConfigReply(Reply):
-    """Effective configuration and versions of a service."""
-
-    service: Name = ""
-    config: Text = ""  # JSON
-    versions: dict[str, str] = {}  # noqa: RUF012
-
-
-class ModelRequest(Request):
-    """Ask the estimator what it was made of."""
-
-    weights: bool = False  # with the weights themselves
-
-
-class ModelReply(Reply):
-    """What makes the estimator the very same again: its map, and the weights it loaded with their card."""
-
-    estimator: Name = ""
-    world: World | None = None  # the estimator's map
-    card: Text = ""  # JSON, the model card; empty: nothing was learned
-    file: Text = ""  # of the weights, NAME.safetensors, the card's is NAME.json; empty: nothing was learned
-    size: Count = 0  # bytes of the weights
-    sha256: Name = ""  # of the weights, hexadecimal
-    weights: Bytes = np.zeros(0, np.uint8)  # the weights, where they were asked for

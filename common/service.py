@@ -16,7 +16,8 @@ from common.config import ServiceSettings, load_settings
 from common.errors import UserError
 from common.inbox import Call, Inbox, Sample
 from common.log import Logger, OncePerSecond, logger, set_up_logging
-from common.messages import ConfigReply, Health, Reply, Request, Stamped, TopicHealth
+from common.messages import Health, Stamped, TopicHealth
+from common.requests import ConfigReply, Reply, Request
 from common.topics import CONFIG, HEALTH, Query, Topic
 from common.versions import versions
 from common.wire import DecodeError

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from common import messages as m
+from common import requests as r
 
 ROOT = "presage"
 MAX_BYTES = 1 << 20  # a larger payload is not even queued
@@ -34,8 +35,8 @@ class Query:
     """One queryable: request in, reply out."""
 
     name: str
-    request: type[m.Request]
-    reply: type[m.Reply]
+    request: type[r.Request]
+    reply: type[r.Reply]
     server: str
     per_service: bool = False
     about: str = ""
@@ -54,27 +55,44 @@ CMD_VEL = Topic("cmd_vel", m.CmdVel, "controller", 15, "newest", about="velocity
 GOAL = Topic("goal", m.Goal, "presage goal, viewer", 0, "newest", about="where to go")
 DRIVE = Topic("drive", m.Drive, "viewer", 0, "newest", about="velocity by hand, before any goal")
 STATUS = Topic("status", m.Status, "controller", 15, "newest", about="what the controller does, and why")
+PLAN = Topic("plan", m.Plan, "controller", 15, "newest", about="the way ahead, and obstacles the map does not know")
+PREFERENCE = Topic("preference", m.Preference, "controller", 0, "newest", about="the goal prior over free space")
 HEALTH = Topic("health", m.Health, "every service", 1, "all", per_service=True, about="counters of a service")
 
-TOPICS: tuple[Topic, ...] = (SCAN, ODOM, TRUTH, BELIEF, PREDICTION, GOAL, DRIVE, CMD_VEL, STATUS, HEALTH)
+TOPICS: tuple[Topic, ...] = (
+    SCAN,
+    ODOM,
+    TRUTH,
+    BELIEF,
+    PREDICTION,
+    GOAL,
+    DRIVE,
+    CMD_VEL,
+    STATUS,
+    PLAN,
+    PREFERENCE,
+    HEALTH,
+)
 
-TELEPORT = Query("teleport", m.PoseRequest, m.Reply, "simulator", about="carry the robot to a pose")
-RESET = Query("reset", m.ResetRequest, m.Reply, "simulator", about="begin anew, with a seed")
-PAUSE = Query("pause", m.Request, m.Reply, "simulator", about="stop the simulation's clock")
-RESUME = Query("resume", m.Request, m.Reply, "simulator", about="let it run on")
-STEP = Query("step", m.Request, m.Reply, "simulator", about="while paused, one scan further")
-SPEED = Query("speed", m.SpeedRequest, m.Reply, "simulator", about="how fast the simulation's clock runs")
-OBSTACLE = Query("obstacle", m.ObstacleRequest, m.Reply, "simulator", about="add, move or remove furniture")
-SAMPLE = Query("sample", m.SampleRequest, m.SampleReply, "simulator", about="the scans seen from a batch of poses")
-WORLD = Query("world", m.Request, m.WorldReply, "simulator", about="world, scanner and robot as data")
-LOCALISE = Query("localise", m.LocaliseRequest, m.Reply, "estimator", about="begin localisation anew")
-PLAYER = Query("player", m.PlayerRequest, m.PlayerReply, "replay", about="pause, step, seek a replay")
-RECORDING = Query("recording", m.RecordRequest, m.RecordReply, "recorder", about="begin or end a recording")
-MODEL = Query("model", m.ModelRequest, m.ModelReply, "estimator", about="the model in use: card, map, weights")
-CONFIG = Query("config", m.Request, m.ConfigReply, "every service", per_service=True, about="effective configuration")
+TELEPORT = Query("teleport", r.PoseRequest, r.Reply, "simulator", about="carry the robot to a pose")
+RESET = Query("reset", r.ResetRequest, r.Reply, "simulator", about="begin anew, with a seed")
+PAUSE = Query("pause", r.Request, r.Reply, "simulator", about="stop the simulation's clock")
+RESUME = Query("resume", r.Request, r.Reply, "simulator", about="let it run on")
+STEP = Query("step", r.Request, r.Reply, "simulator", about="while paused, one scan further")
+SPEED = Query("speed", r.SpeedRequest, r.Reply, "simulator", about="how fast the simulation's clock runs")
+OBSTACLE = Query("obstacle", r.ObstacleRequest, r.Reply, "simulator", about="add, move or remove furniture")
+SAMPLE = Query("sample", r.SampleRequest, r.SampleReply, "simulator", about="the scans seen from a batch of poses")
+WORLD = Query("world", r.Request, r.WorldReply, "simulator", about="world, scanner and robot as data")
+LOCALISE = Query("localise", r.LocaliseRequest, r.Reply, "estimator", about="begin localisation anew")
+PLAYER = Query("player", r.PlayerRequest, r.PlayerReply, "replay", about="pause, step, seek a replay")
+RECORDING = Query("recording", r.RecordRequest, r.RecordReply, "recorder", about="begin or end a recording")
+MODEL = Query("model", r.ModelRequest, r.ModelReply, "estimator", about="the model in use: card, map, weights")
+PREDICT = Query("predict", r.PredictRequest, r.PredictReply, "estimator", about="the scans expected from poses")
+CONFIG = Query("config", r.Request, r.ConfigReply, "every service", per_service=True, about="effective configuration")
 
 QUERIES: tuple[Query, ...] = (
-    TELEPORT, RESET, PAUSE, RESUME, STEP, SPEED, OBSTACLE, SAMPLE, WORLD, LOCALISE, PLAYER, RECORDING, MODEL, CONFIG,
+    TELEPORT, RESET, PAUSE, RESUME, STEP, SPEED, OBSTACLE, SAMPLE, WORLD, LOCALISE, PLAYER, RECORDING, MODEL, PREDICT,
+    CONFIG,
 )  # fmt: skip
 
 

@@ -78,6 +78,7 @@ Name = Annotated[str, Field(max_length=200)]
 Ranges = Annotated[npt.NDArray[np.float32], Binary("<f4", values="ranges")]
 Floats = Annotated[npt.NDArray[np.float32], Binary("<f4")]
 Bytes = Annotated[npt.NDArray[np.uint8], Binary("u1")]
+Points = Annotated[npt.NDArray[np.float32], Binary("<f4", (2,))]
 Poses = Annotated[npt.NDArray[np.float64], Binary("<f8", (3,))]
 Matrix3 = Annotated[npt.NDArray[np.float64], Binary("<f8", (3,))]
 

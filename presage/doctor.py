@@ -14,7 +14,7 @@ from rich.table import Table
 
 from common.bus import Bus, Link, open_bus, wait_until
 from common.errors import UserError
-from common.messages import Request, WorldReply
+from common.requests import Request, WorldReply
 from common.topics import CMD_VEL, TOPICS, WORLD
 from common.versions import versions
 from common.world import known_worlds

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from common.bus import Link
 from common.errors import UserError
-from common.messages import PlayerReply
+from common.requests import PlayerReply
 from presage.replays.keyboard import HELP, keyboard
 from presage.watch import session
 from services.recorder.replay import Choice, Remote, names_of, replay

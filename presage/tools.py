@@ -14,7 +14,8 @@ from rich.table import Table
 from common.bus import Bus, Link
 from common.errors import UserError
 from common.inbox import Inbox, Sample
-from common.messages import Goal, LocaliseRequest, Pose, PoseRequest, Reply, Request, Status, WorldReply
+from common.messages import Goal, Pose, Status
+from common.requests import LocaliseRequest, PoseRequest, Reply, Request, WorldReply
 from common.robot import Robot
 from common.topics import GOAL, LOCALISE, QUERIES, STATUS, TELEPORT, TOPICS, WORLD, Topic
 from common.wire import DecodeError, Message

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from common.bus import Bus, Link, open_bus, wait_until
 from common.errors import UserError
-from common.messages import Request, SampleReply, SampleRequest, WorldReply
+from common.requests import Request, SampleReply, SampleRequest, WorldReply
 from common.robot import Robot
 from common.scanner import SCANNERS, Scanner
 from common.se2 import Array

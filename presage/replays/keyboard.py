@@ -11,7 +11,7 @@ import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from common.messages import PlayerReply, PlayerRequest
+from common.requests import PlayerReply, PlayerRequest
 from services.recorder.replay import Remote
 
 HELP = "space pause/go on, . one scan, left/right or h/l 5 s back/on, down/up slower/faster, q quit"

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from common.errors import UserError
-from common.messages import ModelReply
+from common.requests import ModelReply
 from common.world import World, load_world
 from services.estimator.building import Choice, field_path
 from services.estimator.precise import weights as precise_weights

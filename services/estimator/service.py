@@ -7,22 +7,8 @@ from typing import ClassVar
 import numpy as np
 
 from common.errors import UserError
-from common.messages import (
-    Belief,
-    CmdVel,
-    Goal,
-    Hypothesis,
-    LocaliseRequest,
-    ModelReply,
-    ModelRequest,
-    Odom,
-    Pose,
-    Prediction,
-    Reply,
-    Request,
-    Scan,
-    Stamped,
-)
+from common.messages import Belief, CmdVel, Goal, Hypothesis, Odom, Pose, Prediction, Scan, Stamped
+from common.requests import LocaliseRequest, ModelReply, ModelRequest, Reply, Request
 from common.se2 import Array
 from common.service import Service
 from common.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, MODEL, ODOM, PREDICTION, SCAN, Query, Topic

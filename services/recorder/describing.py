@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from common.bus import Bus
 from common.errors import UserError
 from common.log import Logger
-from common.messages import ConfigReply, ModelReply, ModelRequest, Request, WorldReply
+from common.requests import ConfigReply, ModelReply, ModelRequest, Request, WorldReply
 from common.topics import CONFIG, MODEL, WORLD, Query
 from common.world import save_world
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Collection, Iterable, Mapping
 
 from common.errors import UserError
-from common.messages import PlayerReply, PlayerRequest
+from common.requests import PlayerReply, PlayerRequest
 from common.topics import CMD_VEL, HEALTH, ROOT, TOPICS, Topic
 
 LATE = 1.0  # s behind its own time, beyond which a replay goes on from where it is and does not hurry

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from common.inbox import OTHERS, Inbox, Sample
 from common.log import Logger
-from common.messages import RecordReply
+from common.requests import RecordReply
 from common.topics import Topic
 from common.versions import versions
 from services.recorder.accounting import Count, Ledger, as_metadata

@@ -20,7 +20,7 @@ from pathlib import Path
 from common.bus import Bus, Link, open_bus, wait_until
 from common.errors import UserError
 from common.inbox import Call, Inbox
-from common.messages import ConfigReply, PlayerReply, PlayerRequest, WorldReply
+from common.requests import ConfigReply, PlayerReply, PlayerRequest, WorldReply
 from common.topics import CONFIG, PLAYER, SCAN, WORLD, Topic
 from common.versions import versions
 from common.wire import DecodeError

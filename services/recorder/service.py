@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from common.errors import UserError
 from common.inbox import OTHERS, Sample
-from common.messages import RecordReply, RecordRequest, Reply, Request, WorldReply
+from common.requests import RecordReply, RecordRequest, Reply, Request, WorldReply
 from common.service import Service
 from common.topics import RECORDING, TOPICS, WORLD, Query, Topic
 from services.recorder.accounting import MOST

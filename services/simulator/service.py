@@ -9,8 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from common.errors import UserError
-from common.messages import (
-    CmdVel,
+from common.messages import CmdVel, Stamped
+from common.requests import (
     ObstacleRequest,
     PoseRequest,
     Reply,
@@ -19,7 +19,6 @@ from common.messages import (
     SampleReply,
     SampleRequest,
     SpeedRequest,
-    Stamped,
     WorldReply,
 )
 from common.robot import Robot

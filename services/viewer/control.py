@@ -14,12 +14,10 @@ from typing import Any, TypeVar
 
 from common.bus import Bus, wait_until
 from common.errors import UserError
-from common.messages import (
-    Drive,
-    Goal,
+from common.messages import Drive, Goal, Pose, Status, Twist
+from common.requests import (
     LocaliseRequest,
     ObstacleRequest,
-    Pose,
     PoseRequest,
     RecordReply,
     RecordRequest,
@@ -27,8 +25,6 @@ from common.messages import (
     Request,
     ResetRequest,
     SpeedRequest,
-    Status,
-    Twist,
     WorldReply,
 )
 from common.robot import Robot

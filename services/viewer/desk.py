@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, ParamSpec, TypeVar
 
 from common.errors import UserError
-from common.messages import PlayerReply, PlayerRequest, Request, WorldReply
+from common.requests import PlayerReply, PlayerRequest, Request, WorldReply
 from common.topics import PLAYER, WORLD
 from services.viewer import actions as a
 from services.viewer.control import Answer, Control

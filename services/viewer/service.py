@@ -17,7 +17,8 @@ from typing import ClassVar
 
 from common.bus import DEFAULT_ENDPOINT
 from common.inbox import Sample
-from common.messages import Health, Status, WorldReply
+from common.messages import Health, Status
+from common.requests import WorldReply
 from common.service import Service
 from common.topics import (
     BELIEF,

@@ -12,10 +12,12 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from common.messages import Belief, Hypothesis, Robot, Scanner, World
+from common.messages import Belief, Hypothesis, Preference
+from common.robot import Robot
+from common.scanner import Scanner
 from common.topics import QUERIES, TOPICS
 from common.wire import Binary, Message
-from common.world import Box, Circle, Obstacle
+from common.world import Box, Circle, Obstacle, World
 
 WORLD = World(
     name="w",
@@ -44,6 +46,9 @@ def message_of(cls: type[Message]) -> st.SearchStrategy:
         three = st.builds(np.array, st.lists(st.floats(-1e6, 1e6, width=64), min_size=9, max_size=9))
         matrix = st.none() | three.map(lambda m: m.reshape(3, 3))
         rows["covariance"] = matrix
+    if cls is Preference:
+        rows |= {"width": st.just(3), "height": st.just(2)}
+        rows["distance"] = st.lists(st.floats(0, allow_nan=False, width=32), min_size=6, max_size=6)
     if cls is Belief:
         rows |= {"xi": st.lists(st.floats(-1e6, 1e6, width=32), min_size=3, max_size=3), "curvature": matrix}
     return st.builds(cls, **rows)

@@ -9,7 +9,8 @@ from pydantic import Field
 
 from common.config import ServiceSettings
 from common.errors import UserError
-from common.messages import CmdVel, Goal, Pose, Reply, Scan
+from common.messages import CmdVel, Goal, Pose, Scan
+from common.requests import Reply
 from common.service import Service, main
 from common.topics import CMD_VEL, GOAL, HEALTH, SCAN, TELEPORT
 

@@ -13,7 +13,8 @@ import pytest
 from common.bus import Link, open_bus, wait_until
 from common.errors import UserError
 from common.inbox import Inbox
-from common.messages import Pose, PoseRequest, Reply, Request, Scan
+from common.messages import Pose, Scan
+from common.requests import PoseRequest, Reply, Request
 from common.topics import CONFIG, HEALTH, MAX_BYTES, SCAN, TELEPORT
 
 PATIENCE = 30.0

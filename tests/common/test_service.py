@@ -13,7 +13,8 @@ import pytest
 from common.bus import wait_until
 from common.errors import UserError
 from common.inbox import Inbox
-from common.messages import CmdVel, ConfigReply, Goal, Health, Pose, PoseRequest, Reply, Request, Scan
+from common.messages import CmdVel, Goal, Health, Pose, Scan
+from common.requests import ConfigReply, PoseRequest, Reply, Request
 from common.topics import CMD_VEL, CONFIG, GOAL, HEALTH, MAX_BYTES, SCAN, TELEPORT
 
 PATIENCE = 30.0

@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common import messages
-from common.messages import Belief, CmdVel, Odom, Pose, Prediction, SampleReply, Scan, Twist
+from common.messages import Belief, CmdVel, Odom, Pose, Prediction, Scan, Twist
+from common.requests import SampleReply
 from common.topics import QUERIES, TOPICS
 from common.wire import DecodeError
 from tests.common.samples import all_messages, message_of

@@ -11,7 +11,7 @@ import pytest
 import safetensors.numpy
 
 from common.errors import UserError
-from common.messages import ModelRequest
+from common.requests import ModelRequest
 from common.topics import MODEL, SCAN
 from common.world import load_world, save_world
 from services.estimator import weights

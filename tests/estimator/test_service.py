@@ -7,7 +7,8 @@ import pytest
 
 from common import se2
 from common.errors import UserError
-from common.messages import Belief, CmdVel, Goal, LocaliseRequest, Odom, Pose, Prediction, Scan, Twist
+from common.messages import Belief, CmdVel, Goal, Odom, Pose, Prediction, Scan, Twist
+from common.requests import LocaliseRequest
 from common.scanner import SCANNERS
 from common.topics import CMD_VEL, GOAL, LOCALISE, ODOM, SCAN
 from common.world import load_world

@@ -19,8 +19,8 @@ from common.messages import (
     TopicHealth,
     Truth,
     Twist,
-    WorldReply,
 )
+from common.requests import WorldReply
 from common.robot import Robot
 from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, PREDICTION, SCAN, STATUS, TRUTH
 from services.recorder.service import write_world

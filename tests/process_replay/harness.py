@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import BaseModel
 
 from common.inbox import Call, Inbox, Sample
-from common.messages import ModelReply, Reply, Request, SampleReply, Stamped, WorldReply
+from common.messages import Stamped
+from common.requests import ModelReply, Reply, Request, SampleReply, WorldReply
 from common.service import Loop, Service
 from common.topics import Query, Topic
 from tests.process_replay.reference import Row, of_array, of_symmetric

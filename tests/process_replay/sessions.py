@@ -15,25 +15,18 @@ import numpy as np
 from common import se2
 from common.bus import wait_until
 from common.inbox import Inbox
-from common.messages import (
-    Belief,
-    CmdVel,
+from common.messages import Belief, CmdVel, Drive, Goal, Odom, Pose, Scan, Twist
+from common.requests import (
     ConfigReply,
-    Drive,
-    Goal,
     LocaliseRequest,
     ModelReply,
     ModelRequest,
     ObstacleRequest,
-    Odom,
-    Pose,
     PoseRequest,
     Request,
     ResetRequest,
     SampleRequest,
-    Scan,
     SpeedRequest,
-    Twist,
     WorldReply,
 )
 from common.robot import Robot

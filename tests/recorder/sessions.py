@@ -7,20 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from common import se2
-from common.messages import (
-    Belief,
-    Goal,
-    Health,
-    Pose,
-    Prediction,
-    Scan,
-    Stamped,
-    Status,
-    TopicHealth,
-    Truth,
-    Twist,
-    WorldReply,
-)
+from common.messages import Belief, Goal, Health, Pose, Prediction, Scan, Stamped, Status, TopicHealth, Truth, Twist
+from common.requests import WorldReply
 from common.robot import Robot
 from common.scanner import SCANNERS
 from common.topics import BELIEF, GOAL, HEALTH, PREDICTION, SCAN, STATUS, TRUTH, Topic

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from common.bus import wait_until
 from common.errors import UserError
 from common.log import logger
-from common.messages import ConfigReply, ModelReply, WorldReply
+from common.requests import ConfigReply, ModelReply, WorldReply
 from common.robot import Robot
 from common.topics import CONFIG, MODEL, WORLD
 from common.world import World

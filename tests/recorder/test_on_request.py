@@ -10,7 +10,8 @@ import pytest
 
 from common.bus import wait_until
 from common.inbox import Inbox
-from common.messages import Health, Odom, Pose, RecordReply, RecordRequest, Twist, WorldReply
+from common.messages import Health, Odom, Pose, Twist
+from common.requests import RecordReply, RecordRequest, WorldReply
 from common.robot import Robot
 from common.scanner import SCANNERS
 from common.service import Loop, Service

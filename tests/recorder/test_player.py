@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.errors import UserError
-from common.messages import PlayerRequest
+from common.requests import PlayerRequest
 from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, SCAN, TOPICS
 from services.recorder.player import GAP, LATE, Player, conflicts, renamed, selected, span
 

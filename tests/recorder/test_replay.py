@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from common.bus import open_bus, wait_until
 from common.errors import UserError
 from common.inbox import Inbox, Sample
-from common.messages import ConfigReply, PlayerReply, PlayerRequest, Request
+from common.requests import ConfigReply, PlayerReply, PlayerRequest, Request
 from common.topics import BELIEF, CONFIG, GOAL, HEALTH, ODOM, PLAYER, SCAN, TOPICS
 from services.recorder import player as core
 from services.recorder import replay as shell

@@ -8,7 +8,7 @@ import pytest
 
 from common.bus import wait_until
 from common.inbox import Inbox, Sample
-from common.messages import PlayerReply, PlayerRequest, Request, WorldReply
+from common.requests import PlayerReply, PlayerRequest, Request, WorldReply
 from common.topics import BELIEF, PLAYER, SCAN, WORLD
 from services.recorder.replay import Choice, replay
 from tests.recorder import sessions as made

@@ -13,7 +13,8 @@ import pytest
 
 from common.bus import wait_until
 from common.inbox import MAX_KEYS, Inbox
-from common.messages import Health, Odom, Pose, Twist, WorldReply
+from common.messages import Health, Odom, Pose, Twist
+from common.requests import WorldReply
 from common.robot import Robot
 from common.scanner import SCANNERS
 from common.service import Loop, Service

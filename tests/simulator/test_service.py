@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from common.inbox import Call, Inbox
-from common.messages import CmdVel, Request, ResetRequest, SpeedRequest, Twist
+from common.messages import CmdVel, Twist
+from common.requests import Request, ResetRequest, SpeedRequest
 from common.service import Loop
 from common.topics import PAUSE, RESET, RESUME, SCAN, SPEED, STEP, TRUTH
 from services.simulator import service as shell

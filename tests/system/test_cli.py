@@ -7,56 +7,74 @@ import socket
 import pytest
 
 from common.bus import wait_until
+from tests.conftest import Processes
 from tests.recorder import sessions as made
 
+AT_ONCE = 4
 NOWHERE = ("--connect", "tcp/127.0.0.1:9")  # the discard port: nobody is there
 
 
-@pytest.mark.parametrize(
-    ("args", "says"),
-    [
-        (("up", "--world", "nowhere"), "give a file or one of corridor, maze, office"),
-        (("demo", "--world", "{tmp}/no.yaml"), "give a file or one of"),
-        (("demo", "--goal", "6.8", "3.95"), "from a wall of 'corridor'"),
-        (("up", "--world", "maze", "--estimator", "paper", "--port", "0"), "presage train --world maze"),
-        (("goal", "1", "1", *NOWHERE), "start a session with `presage up`"),
-        (("goal",), "X Y in m"),
-        (("goal", "-1", "2", *NOWHERE), "start a session"),
-        (("goal", "nan", "1"), "nan 1: a place is finite numbers"),
-        (("goal", "1", "1", "--tolerance", "inf"), "--tolerance inf"),
-        (("goal", "1", "2", "--wiat"), "--wiat"),
-        (("teleport", "inf", "1"), "inf 1 90: a place is finite numbers"),
-        (("teleport", "-1", "-1.5", "-90", *NOWHERE), "start a session"),
-        (("localise", "nan", "1"), "a place is finite numbers"),
-        (("localise", "-1", "-.5", *NOWHERE), "start a session"),
-        (("localise", "1"), "a position is two numbers"),
-        (("demo", "--goal", "nan", "1"), "two finite numbers"),
-        (("demo", "--out", "/dev/null/x"), "/dev/null/x: cannot be written to"),
-        (("demo", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
-        (("demo", "--seed", "99999999999999999999"), "--seed"),
-        (("demo", "--beams", "1000000", "--out", "{tmp}/d"), "beams: Input should be less than"),
-        (("demo", "--world", "{tmp}/bad.yaml"), "bad.yaml: no YAML"),
-        (("plot", "{tmp}/run.mcap", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
-        (("plot", "{tmp}/run.mcap", "--out", "/proc/no.png"), "/proc/no.png: cannot be written to"),
-        (("bench", "latency", "--beams", "1"), "tim571 with 1 beams"),
-        (("train", "--out", "/dev/null/m"), "/dev/null/m: cannot be written to"),
-        (("record", "--out", "/dev/null"), "/dev/null: cannot be written to"),
-        (("teleport", "1", "1", *NOWHERE), "start a session"),
-        (("echo", "nothing"), "no topic 'nothing': choose one of scan"),
-        (("hz", *NOWHERE), "start a session"),
-        (("replay", "{tmp}/no.mcap"), "no.mcap"),
-        (("replay", "{tmp}/run.mcap", *NOWHERE), "start a session"),
-        (("plot", "{tmp}/foreign.mcap"), "foreign.mcap"),
-        (("train", "--preset", "better"), "no preset 'better'"),
-        (("train", "--scanner", "sonar", "--out", "{tmp}/m"), "no scanner 'sonar': choose one of tim571"),
-        (("record", "--topics", "smell", "--out", "{tmp}/r"), "smell"),
-    ],
-)
-def test_bad_input_is_one_line(process, tmp_path, args, says):
-    (tmp_path / "foreign.mcap").write_bytes(b"no recording at all, but long enough to be looked at twice")
-    (tmp_path / "bad.yaml").write_text("since: 2020-13-45")
-    made.write(tmp_path / "run.mcap")
-    running = process("presage.__main__", *[a.format(tmp=tmp_path) for a in args])
+WRONG = [
+    (("up", "--world", "nowhere"), "give a file or one of corridor, maze, office"),
+    (("demo", "--world", "{tmp}/no.yaml"), "give a file or one of"),
+    (("demo", "--goal", "6.8", "3.95"), "from a wall of 'corridor'"),
+    (("up", "--world", "maze", "--estimator", "paper", "--port", "0"), "presage train --world maze"),
+    (("goal", "1", "1", *NOWHERE), "start a session with `presage up`"),
+    (("goal",), "X Y in m"),
+    (("goal", "-1", "2", *NOWHERE), "start a session"),
+    (("goal", "nan", "1"), "nan 1: a place is finite numbers"),
+    (("goal", "1", "1", "--tolerance", "inf"), "--tolerance inf"),
+    (("goal", "1", "2", "--wiat"), "--wiat"),
+    (("teleport", "inf", "1"), "inf 1 90: a place is finite numbers"),
+    (("teleport", "-1", "-1.5", "-90", *NOWHERE), "start a session"),
+    (("localise", "nan", "1"), "a place is finite numbers"),
+    (("localise", "-1", "-.5", *NOWHERE), "start a session"),
+    (("localise", "1"), "a position is two numbers"),
+    (("demo", "--goal", "nan", "1"), "two finite numbers"),
+    (("demo", "--out", "/dev/null/x"), "/dev/null/x: cannot be written to"),
+    (("demo", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
+    (("demo", "--seed", "99999999999999999999"), "--seed"),
+    (("demo", "--beams", "1000000", "--out", "{tmp}/d"), "beams: Input should be less than"),
+    (("demo", "--world", "{tmp}/bad.yaml"), "bad.yaml: no YAML"),
+    (("plot", "{tmp}/run.mcap", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
+    (("plot", "{tmp}/run.mcap", "--out", "/proc/no.png"), "/proc/no.png: cannot be written to"),
+    (("bench", "latency", "--beams", "1"), "tim571 with 1 beams"),
+    (("train", "--out", "/dev/null/m"), "/dev/null/m: cannot be written to"),
+    (("record", "--out", "/dev/null"), "/dev/null: cannot be written to"),
+    (("teleport", "1", "1", *NOWHERE), "start a session"),
+    (("echo", "nothing"), "no topic 'nothing': choose one of scan"),
+    (("hz", *NOWHERE), "start a session"),
+    (("replay", "{tmp}/no.mcap"), "no.mcap"),
+    (("replay", "{tmp}/run.mcap", *NOWHERE), "start a session"),
+    (("plot", "{tmp}/foreign.mcap"), "foreign.mcap"),
+    (("train", "--preset", "better"), "no preset 'better'"),
+    (("train", "--scanner", "sonar", "--out", "{tmp}/m"), "no scanner 'sonar': choose one of tim571"),
+    (("record", "--topics", "smell", "--out", "{tmp}/r"), "smell"),
+]
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory, router):
+    """Each of `WRONG`, ended. Several run at once: most wait for somebody who is not there."""
+    folder = tmp_path_factory.mktemp("wrong")
+    (folder / "foreign.mcap").write_bytes(b"no recording at all, but long enough to be looked at twice")
+    (folder / "bad.yaml").write_text("since: 2020-13-45")
+    made.write(folder / "run.mcap")
+    children = Processes(folder)
+    talk = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{router}", "PRESAGE_ROBOT": "wrong"}
+    try:
+        for number, (args, _) in enumerate(WRONG):
+            if number >= AT_ONCE:
+                children.started[number - AT_ONCE].wait(90)
+            children.start("presage.__main__", *[a.format(tmp=folder) for a in args], env=talk)
+        yield children.started
+    finally:
+        children.close()
+
+
+@pytest.mark.parametrize("number", range(len(WRONG)), ids=lambda number: " ".join(WRONG[number][0])[:40])
+def test_bad_input_is_one_line(ended, number):
+    running, says = ended[number], WRONG[number][1]
     assert running.wait(90) not in {0, None}
     assert "Traceback" not in running.output, running.output
     complaints = [line for line in running.output.splitlines() if says in line]

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from common.bus import Link, open_bus, wait_until
 from common.errors import UserError
 from common.inbox import Inbox, Sample
-from common.messages import ConfigReply, Health, Request, Scan, Truth
+from common.messages import Health, Scan, Truth
+from common.requests import ConfigReply, Request
 from common.topics import CONFIG, HEALTH, MAX_BYTES, QUERIES, SCAN, TOPICS, TRUTH
 from common.wire import DecodeError
 from services.recorder.reader import read_recording

@@ -19,7 +19,8 @@ import pytest
 from common import se2
 from common.bus import wait_until
 from common.inbox import Inbox, Sample
-from common.messages import Belief, CmdVel, Goal, Health, PlayerReply, PlayerRequest, Pose, Scan
+from common.messages import Belief, CmdVel, Goal, Health, Pose, Scan
+from common.requests import PlayerReply, PlayerRequest
 from common.scanner import SCANNERS
 from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, PLAYER, SCAN
 from common.world import load_world

@@ -66,20 +66,20 @@ def test_the_scanner_on_the_bus_is_asked(process, bus, tmp_path):
 
 def test_an_interrupted_training_is_taken_up_and_ends_in_the_same_weights(process, tmp_path):
     (tmp_path / "w.yaml").write_text(WORLD)
-    whole = train(process, tmp_path, *PAPER, "40")
+    whole = train(process, tmp_path, *PAPER, "15")
     assert whole.wait(150) == 0, whole.output
     weights = tmp_path / "m" / "closet-paper-61.safetensors"
     first = weights.read_bytes()
     weights.unlink()
 
-    cut = train(process, tmp_path, *PAPER, "40")
+    cut = train(process, tmp_path, *PAPER, "15")
     state = tmp_path / "m" / ".closet-paper-61.unfinished" / "state.safetensors"
     assert wait_until(lambda: state.exists() or not cut.running, 60)
     cut.send(signal.SIGINT)
     assert cut.wait(30) == 130, cut.output
     assert not weights.exists()
 
-    again = train(process, tmp_path, *PAPER, "40")
+    again = train(process, tmp_path, *PAPER, "15")
     assert again.wait(150) == 0, again.output
     assert "of an interrupted run" in again.output
     assert weights.read_bytes() == first

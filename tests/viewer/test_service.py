@@ -15,7 +15,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from common.bus import Link, open_bus, wait_until
 from common.inbox import Call, Inbox, Sample
-from common.messages import Health, Reply, WorldReply
+from common.messages import Health
+from common.requests import Reply, WorldReply
 from common.robot import Robot
 from common.scanner import SCANNERS
 from common.topics import HEALTH, PAUSE, SCAN, TOPICS, TRUTH, WORLD
