@@ -57,6 +57,7 @@ class Truth(Stamped):
     twist: Twist  # base_link
     contact: bool = False  # the body touches something
     stopped: bool = False  # the obstacle stop holds the wheels back
+    people: Points = np.zeros((0, 2), np.float32)  # (K, 2) m in map, where people stand; no map knows them
     frame_id: Name = "map"
 
 
@@ -117,6 +118,7 @@ class Goal(Stamped):
 
     pose: Pose  # base_link in map
     tolerance: Positive = 0.2  # m, reached within it
+    yaw_tolerance: Positive | None = None  # rad, of the heading once it is there; None: any heading will do
     cancel: bool = False  # forget the goal and stand
 
 

@@ -55,7 +55,7 @@ CMD_VEL = Topic("cmd_vel", m.CmdVel, "controller", 15, "newest", about="velocity
 GOAL = Topic("goal", m.Goal, "presage goal, viewer", 0, "newest", about="where to go")
 DRIVE = Topic("drive", m.Drive, "viewer", 0, "newest", about="velocity by hand, before any goal")
 STATUS = Topic("status", m.Status, "controller", 15, "newest", about="what the controller does, and why")
-PLAN = Topic("plan", m.Plan, "controller", 15, "newest", about="the way ahead, and obstacles the map does not know")
+PLAN = Topic("plan", m.Plan, "controller", 0, "newest", about="the way ahead, and what the map does not know")
 PREFERENCE = Topic("preference", m.Preference, "controller", 0, "newest", about="the goal prior over free space")
 HEALTH = Topic("health", m.Health, "every service", 1, "all", per_service=True, about="counters of a service")
 

@@ -6,16 +6,13 @@ import importlib.util
 import platform
 import sys
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 
 from rich.console import Console
 from rich.table import Table
 
-from common.bus import Bus, Link, open_bus, wait_until
-from common.errors import UserError
-from common.requests import Request, WorldReply
-from common.topics import CMD_VEL, TOPICS, WORLD
+from common.bus import Link, open_bus, wait_until
+from common.topics import CMD_VEL, TOPICS
 from common.versions import versions
 from common.world import known_worlds
 from presage.tools import measure_rates
@@ -23,9 +20,10 @@ from presage.tools import measure_rates
 NEEDED = {
     "simulator": ("pybullet",),
     "estimator": ("torch", "safetensors"),
-    "controller": (),
+    "controller": ("scipy",),
     "recorder": ("mcap", "zstandard", "lz4"),
 }
+OPTIONAL = {"recorder": "needed only to record, with"}  # a healthy session can do without
 SLOW = 0.8  # of the nominal rate
 
 
@@ -70,12 +68,12 @@ def running(link: Link, seconds: float) -> Iterator[Finding]:
         yield Finding(True, f"session at {where}")
         # A session that has just opened hears of the others one by one.
         wait_until(lambda: set(NEEDED) - {"recorder"} <= bus.alive(timeout=0.5), 2.0)
-        alive, optional = bus.alive(), _optional(bus)
+        alive = bus.alive()
     for service in NEEDED:
         there = service in alive
         what = f"{service} of {link.robot!r}: {'alive' if there else 'not there'}"
-        advice = "" if there else f"{optional.get(service, 'start it with')}: python -m services.{service}"
-        yield Finding(there or (None if service in optional else False), what, advice)
+        advice = "" if there else f"{OPTIONAL.get(service, 'start it with')}: python -m services.{service}"
+        yield Finding(there or (None if service in OPTIONAL else False), what, advice)
     times = measure_rates(link, TOPICS, seconds)
     for topic in TOPICS:
         if not topic.rate or topic.per_service:
@@ -87,20 +85,10 @@ def running(link: Link, seconds: float) -> Iterator[Finding]:
         )
         if topic is CMD_VEL and rate > 1.5 * topic.rate:
             ok, advice = False, "more than one driver? stop all controllers but one"
-        absent = topic.publisher in optional and topic.publisher not in alive and not rate
+        absent = topic.publisher in OPTIONAL and topic.publisher not in alive and not rate
         yield Finding(
             None if absent else ok, f"{topic.name}: {rate:.1f} of {topic.rate:g} Hz", "" if absent else advice
         )
-
-
-def _optional(bus: Bus) -> dict[str, str]:
-    """Services a healthy session can do without, and why."""
-    found = {"recorder": "needed only to record, with"}
-    with suppress(UserError):
-        here = bus.ask(WORLD, Request(), WorldReply, timeout=1.0)
-        if here.robot is not None and here.robot.drive != "holonomic":
-            found["controller"] = f"none drives a {here.robot.drive} base yet; for a holonomic one"
-    return found
 
 
 def examine(link: Link, seconds: float, console: Console) -> int:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import FrameType, TracebackType
@@ -41,6 +41,16 @@ class Process:
         """The command that starts another like it, for a shell."""
         said = f"PRESAGE_CONNECT={stack.endpoint} PRESAGE_ROBOT={stack.robot} "
         return ("" if self.name == "router" else said) + shlex.join(["python", *self.args])
+
+
+def controller_arguments(
+    world: str, estimator: Sequence[str], drive: str = "holonomic", *, lockstep: bool = False
+) -> list[str]:
+    """Of the controller beside an estimator with these arguments: the paper's two belong together, at one heading."""
+    arguments = ["--world", world, "--drive", drive]
+    if "paper" in estimator:
+        arguments += ["--preset", "paper"]
+    return [*arguments, *(["--belief-timeout", "20"] if lockstep else [])]
 
 
 class Stack:

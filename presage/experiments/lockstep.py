@@ -84,7 +84,7 @@ def run(errand: Errand, stack: Stack) -> Track:
     pose, world, seed = f"{x!r},{y!r},{yaw!r}", ("--world", errand.world), ("--seed", str(errand.seed))
     with open_bus(stack.link()) as bus:
         watch = Watch(bus, TRUTH, BELIEF, STATUS)
-        stack.start("controller", *world, "--belief-timeout", "60")
+        stack.start("controller", *world, "--preset", "paper", "--belief-timeout", "60")
         stack.start("estimator", *world, *seed, "--initial-pose", pose, *errand.estimator)
         stack.start(
             "simulator", *world, *seed, "--start", pose, "--beams", str(errand.beams), "--pace", "lockstep",

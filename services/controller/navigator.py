@@ -7,11 +7,14 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from common import safety
+from common import safety, se2
 from common.messages import Belief, CmdVel, Drive, Goal, Scan, Status, Twist
 from common.robot import Robot
-from services.controller.action import Preference, next_action, observed_position, preferred_position
+from services.controller.action import Preference
+from services.controller.decision import Decision, Preset
 from services.controller.hand import Hand
+from services.controller.motion import turn_rate
+from services.controller.straight import Straight
 
 if TYPE_CHECKING:
     from common.se2 import Array
@@ -23,61 +26,56 @@ BLOCKED_AFTER = 2.0  # s of standing on the way
 
 @dataclass
 class Navigator:
-    """Preset `paper`'s controller: state in, command and status out."""
+    """State in, command and status out; how a goal becomes an action is the preset's."""
 
     robot: Robot = field(default_factory=Robot)
-    preference: Preference = field(default_factory=Preference)
+    preference: Preference = field(default_factory=Preference)  # of preset `paper`
     world: World | None = None  # to refuse a goal inside a wall; None: any goal is tried
+    preset: Preset | None = None  # None: `paper`
 
     def __post_init__(self) -> None:
         """Idle, standing."""
+        self.mind: Preset = self.preset or Straight(self.robot, self.preference, self.world)
+        self.decision = Decision()  # the last one
         self.goal: Goal | None = None
-        self.state: Literal["idle", "navigating", "reached", "blocked", "lost"] = "idle"
+        self.state: Literal["idle", "navigating", "reached", "blocked", "lost", "exploring"] = "idle"
         self.reason = ""
         self._refused = False  # the goal lies in a wall
         self._waiting = False  # for a belief that knows where it is
-        self._action = np.zeros(2)
         self._velocity = np.zeros(3)
         self._standing_since: int | None = None
         self._last_stamp: int | None = None  # of the last command
-        self._scan_stamp: int | None = None
+        self._scan: Scan | None = None
         self._points = np.zeros((0, 2))
         self._hand = Hand()
-        self._interrupted: tuple[Array, Array] | None = None  # action and velocity when time stood still
+        self._interrupted: Array | None = None  # the velocity when time stood still
 
     def hear_scan(self, scan: Scan) -> None:
         """Remember what stands around, (K, 2) m in base_link."""
-        self._points, self._scan_stamp = safety.scan_points(scan), scan.stamp_ns
+        self._points, self._scan = safety.scan_points(scan), scan
 
     def hear_drive(self, drive: Drive) -> None:
         """Somebody drives by hand: that goes before any goal."""
-        stamps = [stamp for stamp in (self._scan_stamp, self._last_stamp) if stamp is not None]
-        self._hand.hear(drive, max(stamps, default=0))
+        scan = self._scan.stamp_ns if self._scan is not None else 0
+        self._hand.hear(drive, max(scan, self._last_stamp or 0))
 
     def hear_goal(self, goal: Goal) -> None:
         """A new preference, or none; a goal inside a wall is refused."""
-        self._action, self._standing_since = np.zeros(2), None
+        self._standing_since = None
         self.goal, self.state, self.reason, self._refused = goal, "navigating", "", False
         if goal.cancel:
             self.goal, self.state, self.reason = None, "idle", "cancelled"
-        elif (refusal := self._refusal(goal)) is not None:
+        elif (refusal := self.mind.refusal(goal.pose.array()[:2])) is not None:
             self.state, self.reason, self._refused = "blocked", refusal, True
-
-    def _refusal(self, goal: Goal) -> str | None:
-        if self.world is None:
-            return None
-        clearance = float(self.world.clearance(goal.pose.array()[:2])[0])
-        if clearance < self.robot.radius:
-            where = f"({goal.pose.x:.2f}, {goal.pose.y:.2f}) in {self.world.name}"
-            return (
-                f"goal refused: {where} is {'inside something' if clearance < 0 else f'{clearance:.2f} m from a wall'}"
-            )
-        return None
+        self.mind.aim(None if self.goal is None or self._refused else goal.pose.array()[:2])
 
     def step(self, belief: Belief) -> tuple[CmdVel, Status]:
         """The answer to one belief, with its stamp."""
         pose, by_hand = belief.pose.array(), self._hand.twist(belief.stamp_ns)
         self._go_on(belief.stamp_ns)
+        self.decision = Decision()
+        if self._scan is not None and self._scan.stamp_ns == belief.stamp_ns:
+            self.mind.see(self._scan, belief)
         if by_hand is not None:
             self._put_goal_off()
         distance = None if self.goal is None else float(np.hypot(*(self.goal.pose.array() - pose)[:2]))
@@ -105,7 +103,8 @@ class Navigator:
         if self._interrupted is None:
             return
         if self._last_stamp is not None and 0 < stamp_ns - self._last_stamp <= self.robot.command_timeout * 1e9:
-            self._action, self._velocity = self._interrupted
+            self._velocity = self._interrupted
+            self.mind.go_on()
         self._interrupted = None
 
     def _limited(self, stamp_ns: int, wanted: Array) -> tuple[CmdVel, bool]:
@@ -123,7 +122,8 @@ class Navigator:
             self.goal = None
         if not self._refused:
             self.state, self.reason = "idle" if self.goal is None else "navigating", ""
-        self._action, self._standing_since, self._waiting = np.zeros(2), None, False
+        self.mind.interrupt()
+        self._standing_since, self._waiting = None, False
 
     def _manual(self, stamp_ns: int, distance: float | None) -> Status:
         """By hand: the goal's own state is kept for later."""
@@ -132,39 +132,47 @@ class Navigator:
 
     def _wanted(self, belief: Belief, pose: Array, distance: float | None) -> Array:
         """The command free energy asks for, before any limit; (3,) in base_link."""
-        stand = np.zeros(3)
-        if self.goal is None or distance is None or self.state == "reached" or self._refused:
-            self._action = np.zeros(2)
-            return stand
+        if self.goal is None or distance is None or self._refused:
+            return np.zeros(3)
+        if self.state == "reached":
+            return self._turn(pose)
         if belief.state in {"lost", "localising", "ambiguous"}:
-            self._action = np.zeros(2)
-            self._waiting = True
-            self.state = "lost" if belief.state == "lost" else "navigating"
-            self.reason = f"standing until localised: the belief is {belief.state}"
-            return stand
+            self.decision, self._waiting = self.mind.seek(belief, self._velocity), True
+            self.state, self.reason = self.decision.state, self.decision.reason
+            return self.decision.action
         if distance <= self.goal.tolerance:
             self.state, self.reason = "reached", f"within {self.goal.tolerance:g} m of the goal"
-            self._action = np.zeros(2)
-            return stand
+            self.mind.interrupt()
+            return self._turn(pose)
         if self._waiting:
             self._waiting, self.state, self.reason = False, "navigating", ""
-        observed = observed_position(pose, belief.xi.astype(np.float64), belief.curvature)
-        preferred = preferred_position(observed, self.goal.pose.array(), self.preference.reach)
-        self._action = next_action(self._action, observed, preferred, float(pose[2]), self.preference)
-        return np.array([self._action[0], self._action[1], 0.0])
+        if (refusal := self.mind.refusal(self.goal.pose.array()[:2])) is not None:
+            self.state, self.reason, self._refused = "blocked", refusal, True
+            return np.zeros(3)
+        self.decision = self.mind.decide(belief, self._velocity)
+        return self.decision.action
+
+    def _turn(self, pose: Array) -> Array:
+        """At the goal: into its heading, where one is asked for; (3,) in base_link."""
+        if self.goal is None or self.goal.yaw_tolerance is None:
+            return np.zeros(3)
+        away = float(se2.wrap(self.goal.pose.yaw - pose[2]))
+        return np.array([0.0, 0.0, turn_rate(away, self.robot) if abs(away) > self.goal.yaw_tolerance / 2 else 0.0])
 
     def _watch_progress(self, stamp_ns: int, *, held_back: bool) -> None:
-        """Navigating, held back by what the scan shows, and standing for a while: blocked."""
+        """Standing for a while on the way, for what the scan shows or for what the preset says: blocked."""
         if self.state not in {"navigating", "blocked"} or self._refused or self._waiting:
             self._standing_since = None
             return
-        if np.hypot(*self._velocity[:2]) > CREEP or not held_back:
+        self.reason = self.decision.reason or ("slowed by the scan" if held_back else "")
+        waits = held_back or self.decision.state == "blocked"
+        if float(np.hypot(*self._velocity[:2])) + abs(float(self._velocity[2])) > CREEP or not waits:
             self._standing_since = None
-            self.state, self.reason = "navigating", ""
+            self.state = "navigating"
             return
         self._standing_since = stamp_ns if self._standing_since is None else self._standing_since
         if (stamp_ns - self._standing_since) * 1e-9 >= BLOCKED_AFTER:
-            self.state, self.reason = "blocked", "the scan shows something in the way"
+            self.state, self.reason = "blocked", self.decision.reason or "the scan shows something in the way"
 
     def status(self, stamp_ns: int, distance: float | None) -> Status:
         """What is going on."""
@@ -179,14 +187,15 @@ class Navigator:
 
     def without_belief(self, stamp_ns: int, why: str) -> tuple[CmdVel, Status]:
         """Stand: nothing is known about now. The goal is kept."""
-        if self._scan_stamp is not None and self._scan_stamp == self._last_stamp:
-            self._interrupted = self._action, self._velocity  # no scan waits for its belief: it is time that stands
-        self._action, self._velocity = np.zeros(2), np.zeros(3)
+        if self._scan is not None and self._scan.stamp_ns == self._last_stamp:
+            self._interrupted = self._velocity  # no scan waits for its belief: it is time that stands
+        self.mind.interrupt()
+        self._velocity = np.zeros(3)
         self._lose_goal(why)
         status = self.status(stamp_ns, None).model_copy(update={"reason": why})  # idle, too, says so
         return CmdVel(stamp_ns=stamp_ns, twist=Twist()), status
 
     def _lose_goal(self, why: str) -> None:
         """The way to it waits for a belief."""
-        if self.state in {"navigating", "blocked"} and not self._refused:
+        if self.state in {"navigating", "blocked", "exploring"} and not self._refused:
             self.state, self.reason, self._waiting = "lost", why, True

@@ -5,14 +5,30 @@ from __future__ import annotations
 import time
 from typing import ClassVar
 
-from common.messages import Belief, CmdVel, Drive, Goal, Scan, Stamped, Status
+import numpy as np
+
+from common.errors import UserError
+from common.messages import Belief, CmdVel, Drive, Goal, Plan, Pose, Scan, Stamped, Status
+from common.messages import Preference as Prior
 from common.robot import Robot
 from common.service import Service
-from common.topics import BELIEF, CMD_VEL, DRIVE, GOAL, SCAN, STATUS, Topic
+from common.topics import BELIEF, CMD_VEL, DRIVE, GOAL, PLAN, PREFERENCE, SCAN, STATUS, Topic
 from common.world import load_world
 from services.controller.action import Preference
+from services.controller.geodesic import Field
 from services.controller.navigator import Navigator
+from services.controller.pilot import Pilot
 from services.controller.settings import ControllerSettings
+
+
+def prior_of(field: Field, goal: Goal, stamp_ns: int) -> Prior:
+    """The message of a field."""
+    grid = field.roads.grid
+    rows, columns = grid.shape
+    return Prior(
+        stamp_ns=stamp_ns, goal=goal.pose, origin=Pose(x=grid.origin[0], y=grid.origin[1]), resolution=grid.resolution,
+        width=columns, height=rows, distance=field.cost.ravel().astype(np.float32),
+    )  # fmt: skip
 
 
 class ControllerService(Service):
@@ -26,7 +42,9 @@ class ControllerService(Service):
         super().__init__(settings)
         self.options = settings
         self.navigator = Navigator()
+        self.pilot: Pilot | None = None
         self._last: tuple[int, CmdVel, Status] | None = None
+        self._planned = False  # a plan was published that is not empty
         self._belief_at: float | None = None  # wall time of the last belief; None: its absence has been said
 
     def open(self) -> None:
@@ -34,9 +52,16 @@ class ControllerService(Service):
         options = self.options
         robot = Robot(drive=options.drive, max_speed=options.max_speed, acceleration=options.acceleration)
         world = load_world(options.world) if options.world else None
-        self.navigator = Navigator(robot, Preference(gamma=options.gamma, reach=options.reach), world)
+        if options.preset == "geodesic":
+            if world is None:
+                raise UserError("preset geodesic needs a map: give --world, or --preset paper")
+            self.pilot = Pilot(robot, world, keep_heading=options.heading == "keep")
+        elif options.drive != "holonomic":
+            raise UserError("preset paper moves without turning: give --drive holonomic, or --preset geodesic")
+        preference = Preference(gamma=options.gamma, reach=options.reach)
+        self.navigator = Navigator(robot, preference, world, self.pilot)
         # Declared before anybody asks: the first message on a key just declared may be lost.
-        for topic in (STATUS, CMD_VEL):
+        for topic in (STATUS, CMD_VEL, PLAN, PREFERENCE):
             self.loop.bus.publisher(topic, self.name)
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
@@ -64,6 +89,7 @@ class ControllerService(Service):
             self.log.info(status.state, reason=status.reason)
         self._last = (command.stamp_ns, command, status)
         self._send(command, status)
+        self._show(command.stamp_ns)
 
     def due(self) -> float | None:
         """Until the belief is too old."""
@@ -83,3 +109,18 @@ class ControllerService(Service):
     def _send(self, command: CmdVel, status: Status) -> None:
         self.publish(STATUS, status)
         self.publish(CMD_VEL, command)
+
+    def _show(self, stamp_ns: int) -> None:
+        """What it means to do and why, for whoever looks on."""
+        if self.pilot is None:
+            return
+        decision, obstacles = self.navigator.decision, self.pilot.obstacles.points().astype(np.float32)
+        path, motion = decision.path.astype(np.float32), decision.motion.astype(np.float32)
+        something = bool(len(path) or len(obstacles))
+        if something or self._planned:  # once more where there is nothing any more
+            self.publish(PLAN, Plan(stamp_ns=stamp_ns, path=path, motion=motion, obstacles=obstacles))
+        self._planned = something
+        if self.pilot.changed and self.navigator.goal is not None:
+            self.pilot.changed = False
+            if (field := self.pilot.field) is not None:
+                self.publish(PREFERENCE, prior_of(field, self.navigator.goal, stamp_ns))

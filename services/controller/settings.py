@@ -15,18 +15,28 @@ class ControllerSettings(ServiceSettings):
     Examples:
       python -m services.controller
       python -m services.controller --max-speed 0.5      more careful
-      python -m services.controller --world ''           do not check goals against a world
+      python -m services.controller --drive differential
+      python -m services.controller --preset paper       straight to the goal, as the paper has it
+      python -m services.controller --preset paper --world ''    with no map at all
       presage goal 15 1.5                                gives it something to do
 
     """
 
     service: ClassVar[str] = "controller"
 
-    world: Annotated[str, Field(description="world that goals are checked against; empty: none")] = "corridor"
-    preset: Annotated[Literal["paper"], Field(description="paper: equation 4, straight to the goal")] = "paper"
-    drive: Annotated[Literal["holonomic"], Field(description="the paper's robot moves without turning")] = "holonomic"
+    world: Annotated[str, Field(description="the map; empty, of preset paper alone: none")] = "corridor"
+    preset: Annotated[
+        Literal["geodesic", "paper"],
+        Field(description="geodesic: round walls and what the scan shows; paper: equation 4, straight to the goal"),
+    ] = "geodesic"
+    drive: Annotated[Literal["holonomic", "differential"], Field(description="of the robot; paper: holonomic")] = (
+        "holonomic"
+    )
+    heading: Annotated[
+        Literal["travel", "keep"], Field(description="a holonomic robot turns into its way, or keeps its heading")
+    ] = "travel"
     max_speed: Annotated[float, Field(gt=0, le=10, description="m/s")] = 1.0
     acceleration: Annotated[float, Field(gt=0, le=20, description="m/s²")] = 1.0
-    gamma: Annotated[float, Field(gt=0, lt=1, description="action step size a scan (eq. 4)")] = 0.3
-    reach: Annotated[float, Field(gt=0, le=100, description="m by which the goal attracts the belief at most")] = 2.0
+    gamma: Annotated[float, Field(gt=0, lt=1, description="paper: action step size a scan (eq. 4)")] = 0.3
+    reach: Annotated[float, Field(gt=0, le=100, description="paper: m by which the goal attracts at most")] = 2.0
     belief_timeout: Annotated[float, Field(gt=0, le=60, description="s without a belief until the robot stands")] = 0.5

@@ -1,0 +1,211 @@
+"""From a belief and a goal to an action, where walls stand between: the prior as a field, its attractor, the choice.
+
+Pure: beliefs, scans and stamps in, actions and reasons out. The limits that have the last word are the navigator's.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from common import se2
+from services.controller.decision import Decision, State
+from services.controller.geodesic import Field, Roads
+from services.controller.grid import FreeSpace
+from services.controller.motion import STEP, turn_rate
+from services.controller.obstacles import TemporaryObstacles
+from services.controller.policy import Around, choose
+
+if TYPE_CHECKING:
+    from common.messages import Belief, Scan
+    from common.robot import Robot
+    from common.se2 import Array
+    from common.world import World
+
+KEEP = 0.06  # m between footprint and what the map does not know: the scanner's noise, and half a cell
+REPLAN = 400_000_000  # ns between two plans for another picture of what stands in the way
+STUCK = 3_000_000_000  # ns without progress until it backs off
+BACK_OFF = 1_500_000_000  # ns of it
+TURNING = 0.4  # share of the acceleration that a turn on the way may take
+FACING = 0.5  # m from the attractor, nearer a base that need not turn keeps its heading
+RANGE = 3.0  # m about the robot within which what the map does not know matters to its next second
+ASIDE = 0.25  # m of clearance that backing off aims at more than there is
+
+
+class Pilot:
+    """Navigation in a known world; heading turned into the way unless told to keep it."""
+
+    def __init__(self, robot: Robot, world: World, *, keep_heading: bool = False) -> None:
+        """Without a goal."""
+        self.robot, self.world, self.keep_heading = robot, world, keep_heading
+        self.free = FreeSpace.of(world)
+        self.roads = Roads(self.free, robot.radius)
+        self.obstacles = TemporaryObstacles(self.free)
+        self.field: Field | None = None  # of the goal, with what is known to stand in the way
+        self.changed = False  # the field is another one; for whoever publishes it, who sets it False
+        self._goal: Array | None = None
+        self._component: int | None = None  # of the roads, where the robot was last known to be
+        self._scan: Scan | None = None
+        self._planned: tuple[int, npt.NDArray[Any]] = (
+            -REPLAN,
+            np.zeros(0, int),
+        )  # ns, and the cells that were blocked then
+        self._view = np.pi
+        self._stuck_since: int | None = None
+        self._backing_until: int | None = None
+
+    def refusal(self, goal: Array) -> str | None:
+        """A goal (2,) inside something, or out of reach of where the robot was last; with the nearest that is not."""
+        here = self._component
+        cell = self.roads.nearest_free(goal, self.robot.radius)
+        clearance = float(self.world.clearance(goal)[0])
+        if clearance >= self.robot.radius and cell is not None and here in (None, self.roads.component[cell]):
+            return None
+        if clearance < 0:
+            why = "is inside something"
+        elif clearance < self.robot.radius or cell is None:
+            why = f"is {clearance:.2f} m from a wall"
+        else:
+            why = "cannot be reached from here"
+        nearest = self.roads.nearest_free(goal, component=here)
+        instead = ""
+        if nearest is not None:
+            x, y = self.free.grid.centres([nearest])[0]
+            instead = f"; the nearest place that can be reached is ({x:.2f}, {y:.2f})"
+        return f"goal refused: ({goal[0]:.2f}, {goal[1]:.2f}) in {self.world.name} {why}{instead}"
+
+    def aim(self, goal: Array | None) -> None:
+        """Prefer a place (2,) m in map; None: none."""
+        self._goal, self.field = goal, None
+        self.interrupt()
+
+    def interrupt(self) -> None:
+        """Nobody is stuck who does not drive."""
+        self._stuck_since = self._backing_until = None
+
+    def go_on(self) -> None:
+        """Nothing was given up."""
+
+    def see(self, scan: Scan, belief: Belief) -> None:
+        """What the map does not know, and how far the scanner looks."""
+        outermost = np.abs(scan.angles()[[0, -1]] + scan.mount.yaw)
+        self._view = float(min(np.pi, outermost.min()))
+        self._scan = scan
+        if belief.state != "tracking":
+            self.obstacles.clear()  # seen from somewhere else, perhaps
+            return
+        pose = belief.pose.array()
+        self.obstacles.see(scan, pose)
+        if (cell := self.roads.nearest_free(pose[:2], self.roads.least)) is not None:
+            self._component = int(self.roads.component[cell])
+
+    def decide(self, belief: Belief, velocity: Array) -> Decision:
+        """The action of least expected free energy, going with ``velocity`` (3,) in base_link."""
+        pose, stamp_ns = belief.pose.array(), belief.stamp_ns
+        self._plan(stamp_ns)
+        way = self.field.path(pose[:2]) if self.field is not None else np.zeros((0, 2))
+        if not len(way):
+            return Decision(reason=self._no_way(), state="blocked")
+        around = self._around(pose, stamp_ns)
+        if self._backing_until is not None and stamp_ns < self._backing_until:
+            return self._back_off(pose, velocity, around, way)
+        assert self.field is not None  # noqa: S101 - there is a way
+        point, _ = self.field.attractor(pose[:2], way)
+        attractor = se2.rotate(-pose[2], point - pose[:2])
+        choice = choose(velocity, attractor, around, self.robot)
+        action = choice.action.copy()
+        if self.robot.drive == "holonomic" and not self.keep_heading and np.hypot(*attractor) > FACING:
+            action = self._facing(action, attractor)
+        self._watch(stamp_ns, moves=bool(np.hypot(*action[:2]) > 0 or abs(action[2]) > 0))
+        reason = ""
+        if choice.held:
+            reason = self._what_holds(pose, around, stood=not choice.action.any())
+        stands = choice.held and not choice.action.any()
+        return Decision(action, reason, "blocked" if stands else "navigating", way, _in_map(pose, choice.way))
+
+    def _facing(self, action: Array, attractor: Array) -> Array:
+        """The action (3,) with a turn towards where it goes, so that the scanner sees what comes."""
+        speed = float(np.hypot(*action[:2]))
+        # A base that turns must change its velocity in base_link to keep it in map, for which it has an acceleration.
+        most = TURNING * self.robot.acceleration / max(speed, 1e-3)
+        turn = float(np.clip(turn_rate(float(np.arctan2(attractor[1], attractor[0])), self.robot), -most, most))
+        return np.array([*se2.rotate(-turn * STEP / 2, action[:2]), turn])
+
+    def seek(self, belief: Belief, velocity: Array) -> Decision:  # noqa: ARG002
+        """Stand."""
+        state: State = "lost" if belief.state == "lost" else "navigating"
+        return Decision(reason=f"standing until localised: the belief is {belief.state}", state=state)
+
+    def _plan(self, stamp_ns: int) -> None:
+        """The field anew where goal or obstacles changed."""
+        if self._goal is None:
+            self.field = None
+            return
+        points = self.obstacles.points()
+        cells = np.unique(self.free.grid.cell_of(points)) if len(points) else np.zeros(0, int)
+        when, before = self._planned
+        changed = not np.array_equal(cells, before)
+        if self.field is not None and (not changed or 0 <= stamp_ns - when < REPLAN):
+            return
+        if changed:
+            self.roads.block(points)
+        self.field, self.changed = self.roads.from_(self._goal, self.robot.radius + 2 * self.free.grid.resolution), True
+        self._planned = (stamp_ns, cells)
+
+    def _around(self, pose: Array, stamp_ns: int) -> Around:
+        points, moving = self.obstacles.points(), self.obstacles.moving(stamp_ns)
+        near = np.hypot(*(points - pose[:2]).T) < RANGE if len(points) else np.zeros(0, bool)
+        radius = self.robot.radius
+
+        def known(places: Array) -> Array:
+            return self.free.clear(pose[:2] + se2.rotate(pose[2], places))
+
+        return Around(
+            known, se2.rotate(-pose[2], points[near] - pose[:2]), moving[near], self.roads.least, radius + KEEP,
+            view=self._view,
+        )  # fmt: skip
+
+    def _watch(self, stamp_ns: int, *, moves: bool) -> None:
+        if moves:
+            self._stuck_since = None
+        elif self._stuck_since is None or stamp_ns < self._stuck_since:
+            self._stuck_since = stamp_ns
+        elif stamp_ns - self._stuck_since > STUCK:
+            self._stuck_since, self._backing_until = None, stamp_ns + BACK_OFF
+
+    def _back_off(self, pose: Array, velocity: Array, around: Around, way: Array) -> Decision:
+        """Recovery: towards where there is more room, by the map and by what is seen."""
+        angle = np.arange(16) * np.pi / 8
+        places = 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        gaps = around.gaps(places[:, None, :], np.zeros(1))[:, 0]
+        if self.robot.drive == "differential":
+            gaps = gaps - 0.05 * np.abs(angle - np.pi) / np.pi  # straight back, where that is as good
+        best = int(np.argmax(gaps))
+        choice = choose(velocity, places[best], around, self.robot)
+        action = choice.action
+        if self.robot.drive == "differential" and abs(angle[best] - np.pi) < np.pi / 4:
+            action = np.array([-0.1, 0.0, 0.0])
+        return Decision(action, "stuck: backing off", path=way, motion=_in_map(pose, choice.way))
+
+    def _what_holds(self, pose: Array, around: Around, *, stood: bool) -> str:
+        does = "waiting" if stood else "slowing"
+        if not len(around.points):
+            return f"{does}: a wall is near"
+        away = np.hypot(*around.points.T)
+        nearest = int(np.argmin(away))
+        x, y = pose[:2] + se2.rotate(pose[2], around.points[nearest])
+        what = "something that moves" if around.moving[nearest] else "something the map does not know"
+        return f"{does}: {what}, {away[nearest]:.1f} m away at ({x:.1f}, {y:.1f})"
+
+    def _no_way(self) -> str:
+        if self._goal is None:
+            return "no goal"
+        if len(self.obstacles.points()):
+            return "no way: what the map does not know closes it; waiting"
+        return "no way to the goal from here"
+
+
+def _in_map(pose: Array, way: Array) -> Array:
+    return np.asarray(pose[:2] + se2.rotate(pose[2], way[:, :2]))

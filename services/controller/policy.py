@@ -1,0 +1,104 @@
+"""Choosing an action by its expected free energy: what is preferred of its outcome, and what must not happen. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from common import se2
+from services.controller import motion
+
+if TYPE_CHECKING:
+    from common.robot import Robot
+    from common.se2 import Array
+
+COMFORT = 0.25  # m beside the footprint, below which progress counts for less
+DISCOMFORT = 0.5  # by how much less, at the least gap
+CLOSE = 0.3  # m, nearer to the attractor than this the heading towards it matters less and less
+BLIND_SPEED = 0.25  # m/s, where the scanner does not look
+LEAST_PROGRESS = 0.004  # m; what gains less is as good as standing
+STEADY = 0.02  # m per m/s, for going on as before
+
+
+@dataclass(frozen=True)
+class Around:
+    """What a motion must keep away from, in base_link of now."""
+
+    known: Callable[[Array], Array]  # (..., 2) m -> (...,) m to the nearest wall of the map; inf where there is no map
+    points: Array  # (K, 2) m, seen and not in the map
+    moving: Array  # (K,) bool, those that may come nearer
+    least: float  # m to anything the map knows
+    keep: float  # m to points
+    walking: float = 1.0  # m/s, of those that move
+    view: float = np.pi  # rad to either side of x that the scanner sees
+
+    def gaps(self, poses: Array, times: Array) -> Array:
+        """(N, T) m left between footprint and anything at poses (N, T, 3); less where somebody may be by then."""
+        places = poses[..., :2]
+        gap = self.known(places) - self.least
+        for moves in (False, True):
+            these = self.points[self.moving == moves]
+            if len(these):
+                apart, _ = cKDTree(these).query(places)
+                gap = np.minimum(gap, apart - self.keep - (self.walking * times if moves else 0.0))
+        return np.asarray(gap)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The best of the candidates."""
+
+    action: Array  # (3,) m/s, m/s, rad/s in base_link
+    way: Array  # (T, 3) where it leads, in base_link of now, until it would stand
+    progress: float  # m that it brings the place of standing nearer to the goal
+    held: bool  # something in the way, or that may come, made it slower
+
+
+def choose(current: Array, attractor: Array, around: Around, robot: Robot) -> Choice:
+    """Of all candidates the one of least expected free energy; ``attractor`` (2,) m and ``current`` (3,) in base_link.
+
+    The preference is ``-ln p = lambda d`` with the distance d to go from where the robot would stand, so a candidate's
+    expected free energy, in units of lambda, is the d it leaves. One whose way is not free, or may not stay free before
+    the robot stands, has none. lambda does not change which is least.
+    """
+    actions = motion.candidates(current, attractor, robot)
+    actions = _seen(actions, around.view)
+    poses, times = motion.rollouts(current, actions, robot)
+    gaps = around.gaps(poses, times)
+    now = float(around.gaps(np.zeros((1, 1, 3)), np.zeros(1))[0, 0])
+    # From where it is too near already, any way is free that leads away.
+    free = np.all(gaps >= min(0.0, now) - 1e-3, axis=1)
+    gain = to_go(poses[0, -1], attractor, robot) - to_go(poses[:, -1], attractor, robot)
+    tight = np.clip(1 - np.min(gaps, axis=1) / COMFORT, 0, 1)
+    weighed = np.where(gain > 0, gain * (1 - DISCOMFORT * tight**2), gain)
+    weighed = weighed - STEADY * np.hypot(*(actions - current)[:, :2].T)
+    # Braking is always there, though somebody may come meanwhile.
+    open_ = np.where(free, weighed, -np.inf)
+    open_[0] = 0.0
+    best = int(np.argmax(open_))
+    if gain[best] < LEAST_PROGRESS:
+        best = 0
+    wished = int(np.argmax(np.where(np.isfinite(weighed), weighed, -np.inf)))
+    return Choice(actions[best], poses[best], float(gain[best]), held=bool(weighed[wished] > open_[best] + 0.05))
+
+
+def to_go(poses: Array, attractor: Array, robot: Robot) -> Array:
+    """(...,) m from poses (..., 3) to the attractor; where a base must turn, with the m it could go meanwhile."""
+    away = attractor - poses[..., :2]
+    distance = np.hypot(away[..., 0], away[..., 1])
+    if robot.drive == "holonomic":
+        return np.asarray(distance)
+    turn = np.abs(se2.wrap(np.arctan2(away[..., 1], away[..., 0]) - poses[..., 2]))
+    return np.asarray(distance + turn * robot.max_speed / robot.max_turn * np.minimum(1.0, distance / CLOSE))
+
+
+def _seen(actions: Array, view: float) -> Array:
+    """The actions (N, 3), slowed where the scanner does not look."""
+    speed = np.hypot(actions[:, 0], actions[:, 1])
+    blind = np.abs(np.arctan2(actions[:, 1], actions[:, 0])) > view
+    scale = np.where(blind & (speed > BLIND_SPEED), BLIND_SPEED / np.maximum(speed, 1e-9), 1.0)
+    return np.column_stack([actions[:, :2] * scale[:, None], actions[:, 2]])
