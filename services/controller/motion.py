@@ -18,8 +18,10 @@ HOLD = 0.4  # s that an action is held in the prediction; the next scan asks ane
 STEP = 1 / 15  # s
 
 
-def rollouts(current: Array, actions: Array, robot: Robot, hold: float = HOLD) -> tuple[Array, Array]:
-    """(N, T, 3) poses in base_link of now, and (T,) s, of each action (N, 3) held for ``hold`` s and then braked.
+def rollouts(current: Array, actions: Array, robot: Robot, hold: float = HOLD) -> tuple[Array, Array, Array]:
+    """(N, T, 3) poses in base_link of now at (T,) s, of each action (N, 3) held for ``hold`` s and then braked.
+
+    And (N,) s, after which it stands, but for a turn on the spot.
 
     ``current`` (3,) is the velocity of now, in base_link. A holonomic base keeps its direction in the map while it
     turns (each scan commands it anew); a differential one drives arcs.
@@ -45,7 +47,9 @@ def rollouts(current: Array, actions: Array, robot: Robot, hold: float = HOLD) -
         cos, sin = np.cos(middle), np.sin(middle)
         vx, vy = velocity[..., 0], velocity[..., 1]
         way = np.stack([cos * vx - sin * vy, sin * vx + cos * vy], axis=-1)
-    return np.concatenate([np.cumsum(way, axis=1) * STEP, yaw[..., None]], axis=-1), times + STEP / 2
+    poses = np.concatenate([np.cumsum(way, axis=1) * STEP, yaw[..., None]], axis=-1)
+    fastest = np.hypot(*(current[:2] + change[:, :2] * np.minimum(1.0, robot.acceleration * hold / linear)).T)
+    return poses, times + STEP / 2, hold + fastest / robot.acceleration
 
 
 def longest_brake(robot: Robot) -> float:

@@ -69,6 +69,11 @@ class Navigator:
             self.state, self.reason, self._refused = "blocked", refusal, True
         self.mind.aim(None if self.goal is None or self._refused else goal.pose.array()[:2])
 
+    @property
+    def wants_to_go(self) -> bool:
+        """Whether there is a goal that it is on the way to."""
+        return self.goal is not None and not self._refused and self.state != "reached"
+
     def step(self, belief: Belief) -> tuple[CmdVel, Status]:
         """The answer to one belief, with its stamp."""
         pose, by_hand = belief.pose.array(), self._hand.twist(belief.stamp_ns)

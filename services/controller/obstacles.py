@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from common import se2
 
@@ -18,6 +19,7 @@ UNEXPLAINED = 0.2  # m from every wall of the map: ten times the scanner's noise
 FARTHEST = 8.0  # m; beyond it an error of heading moves an end point too far
 CELL = 0.05  # m
 STANDS = 1_000_000_000  # ns; what has stood that long is furniture, until it goes
+BESIDE = 0.3  # m
 FORGET = 20_000_000_000  # ns after which what is out of sight is forgotten
 BEYOND = 0.15  # m behind a cell that a beam must reach to show it free
 
@@ -57,8 +59,18 @@ class TemporaryObstacles:
         return np.asarray(np.stack([columns + 0.5, rows + 0.5], axis=-1) * CELL + self._origin)
 
     def moving(self, stamp_ns: int) -> npt.NDArray[np.bool_]:
-        """(K,) bool: came there so lately that it may walk on."""
-        return np.asarray(stamp_ns - self._first < STANDS)
+        """(K,) bool: came there so lately that it may walk on.
+
+        What shows itself beside something that stands is another side of it. Who walks has no cell that stands: each of
+        theirs is left again within a second.
+        """
+        young = stamp_ns - self._first < STANDS
+        old = ~young & (self._last == stamp_ns)
+        if young.any() and old.any():
+            points = self.points()
+            apart, _ = cKDTree(points[old]).query(points[young], distance_upper_bound=BESIDE)
+            young[young] = ~np.isfinite(apart)
+        return np.asarray(young)
 
     def _number(self, points: Array) -> npt.NDArray[np.int64]:
         where = np.floor((points - self._origin) / CELL).astype(np.int64)

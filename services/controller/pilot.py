@@ -10,19 +10,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from common import se2
-from services.controller.decision import Decision, State
+from common import safety, se2
+from services.controller.decision import Decision
 from services.controller.geodesic import Field, Roads
 from services.controller.grid import FreeSpace
 from services.controller.motion import STEP, turn_rate
 from services.controller.obstacles import TemporaryObstacles
 from services.controller.policy import Around, choose
+from services.controller.seeking import Seeker
 
 if TYPE_CHECKING:
     from common.messages import Belief, Scan
+    from common.requests import PredictReply
     from common.robot import Robot
     from common.se2 import Array
     from common.world import World
+    from services.controller.epistemic import Options
 
 KEEP = 0.06  # m between footprint and what the map does not know: the scanner's noise, and half a cell
 REPLAN = 400_000_000  # ns between two plans for another picture of what stands in the way
@@ -37,12 +40,14 @@ ASIDE = 0.25  # m of clearance that backing off aims at more than there is
 class Pilot:
     """Navigation in a known world; heading turned into the way unless told to keep it."""
 
-    def __init__(self, robot: Robot, world: World, *, keep_heading: bool = False) -> None:
-        """Without a goal."""
+    def __init__(self, robot: Robot, world: World, *, keep_heading: bool = False, epistemic: bool = True) -> None:
+        """Without a goal; ``epistemic``: while it does not know where it is, it moves so as to find out."""
+        self.epistemic = epistemic
         self.robot, self.world, self.keep_heading = robot, world, keep_heading
         self.free = FreeSpace.of(world)
         self.roads = Roads(self.free, robot.radius)
         self.obstacles = TemporaryObstacles(self.free)
+        self.seeker = Seeker(robot, self.roads, robot.radius + KEEP)
         self.field: Field | None = None  # of the goal, with what is known to stand in the way
         self.changed = False  # the field is another one; for whoever publishes it, who sets it False
         self._goal: Array | None = None
@@ -79,6 +84,7 @@ class Pilot:
     def aim(self, goal: Array | None) -> None:
         """Prefer a place (2,) m in map; None: none."""
         self._goal, self.field = goal, None
+        self.seeker.forget()
         self.interrupt()
 
     def interrupt(self) -> None:
@@ -96,6 +102,7 @@ class Pilot:
         if belief.state != "tracking":
             self.obstacles.clear()  # seen from somewhere else, perhaps
             return
+        self.seeker.forget()
         pose = belief.pose.array()
         self.obstacles.see(scan, pose)
         if (cell := self.roads.nearest_free(pose[:2], self.roads.least)) is not None:
@@ -133,10 +140,28 @@ class Pilot:
         turn = float(np.clip(turn_rate(float(np.arctan2(attractor[1], attractor[0])), self.robot), -most, most))
         return np.array([*se2.rotate(-turn * STEP / 2, action[:2]), turn])
 
-    def seek(self, belief: Belief, velocity: Array) -> Decision:  # noqa: ARG002
-        """Stand."""
-        state: State = "lost" if belief.state == "lost" else "navigating"
-        return Decision(reason=f"standing until localised: the belief is {belief.state}", state=state)
+    def question(self, belief: Belief) -> Options | None:
+        """Where scans must be predicted before `seek` can choose where to go; None: nowhere, now."""
+        if self._goal is None or not self.epistemic:
+            return None
+        return self.seeker.question(belief)
+
+    def answer(self, reply: PredictReply) -> None:
+        """What is expected there."""
+        if self._scan is not None:
+            self.seeker.answer(reply, self._scan.range_max)
+
+    def seek(self, belief: Belief, velocity: Array) -> Decision:
+        """Find out where it is; without the epistemic term the goal leads, as if the best hypothesis were true."""
+        if self._scan is None:
+            return Decision(reason=f"standing until localised: the belief is {belief.state}")
+        if self.epistemic or belief.state != "ambiguous":
+            points = safety.scan_points(self._scan)
+            points = points[np.hypot(*points.T) < RANGE]
+            return self.seeker.act(belief, self._scan, points, velocity, self._view)
+        decision = self.decide(belief, velocity)
+        decision.reason = decision.reason or f"the belief is {belief.state}: going by its best guess"
+        return decision
 
     def _plan(self, stamp_ns: int) -> None:
         """The field anew where goal or obstacles changed."""

@@ -36,15 +36,21 @@ class Around:
     walking: float = 1.0  # m/s, of those that move
     view: float = np.pi  # rad to either side of x that the scanner sees
 
-    def gaps(self, poses: Array, times: Array) -> Array:
-        """(N, T) m left between footprint and anything at poses (N, T, 3); less where somebody may be by then."""
+    def gaps(self, poses: Array, times: Array, stands: Array | float = np.inf) -> Array:
+        """(N, T) m left between footprint and anything at poses (N, T, 3); less where somebody may be by then.
+
+        Once the robot stands, after ``stands`` (N,) s, whoever walks does not walk into it: passive safety.
+        """
         places = poses[..., :2]
         gap = self.known(places) - self.least
         for moves in (False, True):
             these = self.points[self.moving == moves]
             if len(these):
                 apart, _ = cKDTree(these).query(places)
-                gap = np.minimum(gap, apart - self.keep - (self.walking * times if moves else 0.0))
+                left = apart - self.keep
+                if moves:
+                    left = np.where(times <= np.asarray(stands)[..., None], left - self.walking * times, np.inf)
+                gap = np.minimum(gap, left)
         return np.asarray(gap)
 
 
@@ -67,8 +73,8 @@ def choose(current: Array, attractor: Array, around: Around, robot: Robot) -> Ch
     """
     actions = motion.candidates(current, attractor, robot)
     actions = _seen(actions, around.view)
-    poses, times = motion.rollouts(current, actions, robot)
-    gaps = around.gaps(poses, times)
+    poses, times, stands = motion.rollouts(current, actions, robot)
+    gaps = around.gaps(poses, times, stands)
     now = float(around.gaps(np.zeros((1, 1, 3)), np.zeros(1))[0, 0])
     # From where it is too near already, any way is free that leads away.
     free = np.all(gaps >= min(0.0, now) - 1e-3, axis=1)

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import time
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from common.errors import UserError
 from common.messages import Belief, CmdVel, Drive, Goal, Plan, Pose, Scan, Stamped, Status
 from common.messages import Preference as Prior
+from common.requests import PredictReply, PredictRequest, Reply
 from common.robot import Robot
 from common.service import Service
-from common.topics import BELIEF, CMD_VEL, DRIVE, GOAL, PLAN, PREFERENCE, SCAN, STATUS, Topic
+from common.topics import BELIEF, CMD_VEL, DRIVE, GOAL, PLAN, PREDICT, PREFERENCE, SCAN, STATUS, Query, Topic
 from common.world import load_world
 from services.controller.action import Preference
-from services.controller.geodesic import Field
 from services.controller.navigator import Navigator
-from services.controller.pilot import Pilot
 from services.controller.settings import ControllerSettings
+
+if TYPE_CHECKING:
+    from services.controller.geodesic import Field
+    from services.controller.pilot import Pilot
+
+PREDICTED_BEAMS = 61  # of a scan expected elsewhere
+PREDICTED_WITHIN = 0.3  # s that a command waits for predictions; once a second at most, and only while it seeks
 
 
 def prior_of(field: Field, goal: Goal, stamp_ns: int) -> Prior:
@@ -44,6 +50,9 @@ class ControllerService(Service):
         self.navigator = Navigator()
         self.pilot: Pilot | None = None
         self._last: tuple[int, CmdVel, Status] | None = None
+        self._waiting: Belief | None = None  # for predictions
+        self._questioning_ns = 0
+        self._asked, self._asked_at = -1, 0.0  # number of that request, and when it was made
         self._planned = False  # a plan was published that is not empty
         self._belief_at: float | None = None  # wall time of the last belief; None: its absence has been said
 
@@ -55,7 +64,10 @@ class ControllerService(Service):
         if options.preset == "geodesic":
             if world is None:
                 raise UserError("preset geodesic needs a map: give --world, or --preset paper")
-            self.pilot = Pilot(robot, world, keep_heading=options.heading == "keep")
+            # scipy takes a third of a second to import; preset paper does without.
+            from services.controller.pilot import Pilot  # noqa: PLC0415
+
+            self.pilot = Pilot(robot, world, keep_heading=options.heading == "keep", epistemic=options.epistemic)
         elif options.drive != "holonomic":
             raise UserError("preset paper moves without turning: give --drive holonomic, or --preset geodesic")
         preference = Preference(gamma=options.gamma, reach=options.reach)
@@ -79,10 +91,50 @@ class ControllerService(Service):
             self.publish(STATUS, self.navigator.status(self._last[0] if self._last else 0, None))
         elif isinstance(message, Belief):
             self._belief_at = time.monotonic()
-            if self._last is None or self._last[0] != message.stamp_ns:
-                self._answer(*self.navigator.step(message))
-            else:  # one sent again is answered again
-                self._send(self._last[1], self._last[2])
+            if self._last is not None and self._last[0] == message.stamp_ns:
+                self._send(self._last[1], self._last[2])  # one sent again is answered again
+            elif self._waiting is None or self._waiting.stamp_ns != message.stamp_ns:
+                self._take(message)
+
+    def _take(self, belief: Belief) -> None:
+        """Answer it; where it must be known first what would be seen elsewhere, ask, and answer when that has come."""
+        began = time.thread_time_ns()
+        options = self.pilot.question(belief) if self.pilot is not None and self.navigator.wants_to_go else None
+        self._questioning_ns = time.thread_time_ns() - began
+        if options is None:
+            self._waiting = None
+            self._step(belief)
+        else:
+            self._waiting, self._asked_at = belief, time.monotonic()
+            self._asked = self.request(
+                PREDICT, PredictRequest(poses=options.poses(), beams=PREDICTED_BEAMS), PREDICTED_WITHIN
+            )
+
+    def on_reply(self, query: Query, number: int, reply: Reply) -> None:  # noqa: ARG002 - it asks for nothing else
+        """What is expected elsewhere has come, or a refusal."""
+        if number != self._asked or self.pilot is None:
+            return
+        if isinstance(reply, PredictReply) and reply.ok:
+            self.pilot.answer(reply)
+        else:
+            self.log.warning("no predictions", why=reply.reason)
+        self._go_without()
+
+    def _go_without(self) -> None:
+        """Answer the belief that waits."""
+        belief, self._waiting, self._asked = self._waiting, None, -1
+        if belief is not None:
+            self._step(belief)
+
+    def _step(self, belief: Belief) -> None:
+        """One belief, one command; what it costs is counted in the thread's own time."""
+        began = time.thread_time_ns()
+        answer = self.navigator.step(belief)
+        took = (time.thread_time_ns() - began + self._questioning_ns) // 1000
+        self.counters["steps"] += 1
+        self.counters["step_us"] += took
+        self.counters["step_us_max"] = max(self.counters["step_us_max"], took)
+        self._answer(*answer)
 
     def _answer(self, command: CmdVel, status: Status) -> None:
         if status.state != (self._last[2].state if self._last is not None else "idle"):
@@ -92,13 +144,19 @@ class ControllerService(Service):
         self._show(command.stamp_ns)
 
     def due(self) -> float | None:
-        """Until the belief is too old."""
+        """Until the belief is too old, or what was asked for too late."""
         if self._belief_at is None:
             return None
-        return self._belief_at + self.options.belief_timeout - time.monotonic()
+        until = self._belief_at + self.options.belief_timeout
+        if self._waiting is not None:
+            until = min(until, self._asked_at + PREDICTED_WITHIN)
+        return until - time.monotonic()
 
     def on_timer(self) -> None:
         """No fresh belief: stand, and say so once."""
+        if self._waiting is not None:
+            self._go_without()
+            return
         self._belief_at = None
         stamp = self._last[0] if self._last is not None else 0
         why = f"no belief for {self.options.belief_timeout:g} s: is the estimator running?"

@@ -37,6 +37,9 @@ class ControllerSettings(ServiceSettings):
     ] = "travel"
     max_speed: Annotated[float, Field(gt=0, le=10, description="m/s")] = 1.0
     acceleration: Annotated[float, Field(gt=0, le=20, description="m/s²")] = 1.0
+    epistemic: Annotated[
+        bool, Field(description="with a goal and several possible places, drive to where they can be told apart")
+    ] = True
     gamma: Annotated[float, Field(gt=0, lt=1, description="paper: action step size a scan (eq. 4)")] = 0.3
     reach: Annotated[float, Field(gt=0, le=100, description="paper: m by which the goal attracts at most")] = 2.0
     belief_timeout: Annotated[float, Field(gt=0, le=60, description="s without a belief until the robot stands")] = 0.5
