@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import zenoh
 
 from common.errors import UserError
-from common.inbox import Call, Inbox, Sample
+from common.inbox import Answer, Call, Inbox, Sample
 from common.messages import Stamped
 from common.requests import Reply, Request
 from common.topics import Query, Topic, alive_key, topic_of
@@ -147,6 +147,31 @@ class Bus:
             time.sleep(0.02)  # a session that has just opened does not know yet who is there: nothing was asked
         who = service if service != "*" else query.server
         raise UserError(f"nobody answers {key} within {timeout:g} s: is the {who} running? `presage doctor` looks")
+
+    def request(
+        self, query: Query, request: Request, number: int, inbox: Inbox, timeout: float = 5.0, service: str = "*"
+    ) -> None:  # fmt: skip
+        """Ask and return at once; exactly one `Answer` with ``number`` comes to ``inbox``, within ``timeout`` s or so.
+
+        Nobody is asked twice: a session that has just opened, and does not know yet who is there, hears of nobody.
+        """
+        key, owed = query.key(self.robot, service), threading.Lock()
+
+        def settle(payload: bytes, refusal: str = "") -> None:
+            if owed.acquire(blocking=False):  # the first answer counts, and is never given back
+                inbox.put(Answer(query, number, payload, refusal))
+
+        def move(answer: zenoh.Reply) -> None:
+            if answer.ok is not None:
+                settle(answer.ok.payload.to_bytes())
+            elif answer.err is not None and (why := answer.err.payload.to_string()) != "Timeout":
+                settle(b"", f"{key}: refused: {why}")
+
+        def end() -> None:
+            settle(b"", f"nobody answers {key}: is the {service if service != '*' else query.server} running?")
+
+        handler = zenoh.handlers.Callback(move, end)
+        self._session.get(key, handler, payload=request.encode(), encoding=ENCODING, timeout=timeout)
 
     def declare_alive(self, service: str) -> None:
         """Say that the service is there, until the session ends. Declare it last: order is kept."""

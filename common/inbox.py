@@ -5,9 +5,11 @@ from __future__ import annotations
 import threading
 from collections import Counter, OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from common.requests import Reply
 from common.topics import MAX_BYTES, Query, Topic
+from common.wire import DecodeError
 
 MAX_KEYS = 1000  # counted by name; a sender that invents keys must not fill memory
 OTHERS = "others"  # what the rest is counted under
@@ -34,6 +36,25 @@ class Call:
     refuse: Callable[[str], None]
 
 
+@dataclass(frozen=True)
+class Answer:
+    """What became of a request of ours: an answer as it came, or why there is none."""
+
+    query: Query
+    number: int  # of the request
+    payload: bytes
+    refusal: str = ""  # why there is no payload
+
+    def reply(self) -> Reply:
+        """The answer decoded; where there is none that makes sense, one with ok false that says why."""
+        if self.refusal:
+            return self.query.reply(ok=False, reason=self.refusal)
+        try:
+            return self.query.reply.decode(self.payload)
+        except DecodeError as error:
+            return self.query.reply(ok=False, reason=f"the answer makes no sense: {error}")
+
+
 class Inbox:
     """A bounded queue in which a newest-only key takes one place, and every drop is counted."""
 
@@ -43,13 +64,13 @@ class Inbox:
         self.received: Counter[str] = Counter()  # by key
         self.dropped: Counter[str] = Counter()
         self.oversized: Counter[str] = Counter()
-        self._entries: OrderedDict[object, Sample | Call] = OrderedDict()
+        self._entries: OrderedDict[object, Sample | Call | Answer] = OrderedDict()
         self._bytes = 0
         self._serial = 0
         self._counted: set[str] = set()
         self._changed = threading.Condition()  # reentrant: a signal handler may wake us inside wait
 
-    def put(self, entry: Sample | Call, *, newest_only: bool = False) -> None:
+    def put(self, entry: Sample | Call | Answer, *, newest_only: bool = False) -> None:
         """Add an entry; where a newest-only key still waits, the new one takes the old one's place."""
         size = len(entry.payload)
         full_key = entry.key if isinstance(entry, Sample) else entry.query.name
@@ -60,14 +81,18 @@ class Inbox:
                 self.oversized[key] += 1
                 if isinstance(entry, Call):
                     entry.refuse(f"{size} bytes are too many")
-                return
+                if not isinstance(entry, Answer):
+                    return
+                entry, size = replace(entry, payload=b"", refusal=f"the answer's {size} bytes are too many"), 0
             self._serial += 1
             slot: object = full_key if newest_only else self._serial
             old = self._entries.get(slot)
             if old is not None:
                 self._bytes -= len(old.payload)
                 self.dropped[key] += 1
-            elif len(self._entries) >= self.capacity or self._bytes + size > self.max_bytes:
+            elif not isinstance(entry, Answer) and (  # of those come no more than were asked for
+                len(self._entries) >= self.capacity or self._bytes + size > self.max_bytes
+            ):
                 self.dropped[key] += 1
                 if isinstance(entry, Call):
                     entry.refuse("too many requests wait")
@@ -90,7 +115,7 @@ class Inbox:
             taken.subtract(self.counted_as(entry.key) for entry in self._entries.values() if isinstance(entry, Sample))
             return taken, self.dropped.copy(), self.oversized.copy()
 
-    def get(self, timeout: float) -> Sample | Call | None:
+    def get(self, timeout: float) -> Sample | Call | Answer | None:
         """The oldest entry, waiting at most ``timeout`` s for one; None when none came."""
         with self._changed:
             if not self._entries and timeout > 0:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 from common.bus import Bus, open_bus
 from common.config import ServiceSettings, load_settings
 from common.errors import UserError
-from common.inbox import Call, Inbox, Sample
+from common.inbox import Answer, Call, Inbox, Sample
 from common.log import Logger, OncePerSecond, logger, set_up_logging
 from common.messages import Health, Stamped, TopicHealth
 from common.requests import ConfigReply, Reply, Request
@@ -75,6 +75,9 @@ class Service(ABC):
         """A valid request came; the answer."""
         return Reply(ok=False, reason=f"{self.name} does not answer {query.name} ({type(request).__name__})")
 
+    def on_reply(self, query: Query, number: int, reply: Reply) -> None:
+        """What `request` asked for, or ok false and why there is no answer; each request gets exactly one."""
+
     def due(self) -> float | None:
         """Seconds until `on_timer` is wanted; None: not."""
         return None
@@ -89,6 +92,10 @@ class Service(ABC):
         """Send a message with the next sequence number of its key."""
         self.loop.publish(topic, message)
 
+    def request(self, query: Query, request: Request, timeout: float = 5.0) -> int:
+        """Ask without waiting: the number under which `on_reply` is called, within ``timeout`` s or so."""
+        return self.loop.request(query, request, timeout)
+
 
 class Loop:
     """Runs one service on one session."""
@@ -99,6 +106,7 @@ class Loop:
         self.published: Counter[str] = Counter()  # by key
         self.undecodable: Counter[str] = Counter()
         self.failed = 0
+        self._asked = 0
         self._may_log = OncePerSecond()
         self._stopping = False
         self._began = self._health_at = self._counted_at = time.monotonic()
@@ -134,6 +142,12 @@ class Loop:
         self.bus.put(topic, numbered.encode(), self.service.name)
         self.published[key] += 1
 
+    def request(self, query: Query, request: Request, timeout: float) -> int:
+        """Ask; the answer comes through the inbox like everything else."""
+        self._asked += 1
+        self.bus.request(query, request, self._asked, self.inbox, timeout)
+        return self._asked
+
     def reject(self, key: str, why: str) -> None:
         """Count a payload that could not be used; say so once a second at most."""
         name = self.inbox.counted_as(key)
@@ -149,6 +163,8 @@ class Loop:
             self._guard(lambda: self.service.on_sample(event))
         elif isinstance(event, Call):
             self._answer(event)
+        elif isinstance(event, Answer):
+            self._guard(lambda: self.service.on_reply(event.query, event.number, event.reply()))
         due = self.service.due()
         if due is not None and due <= 0:
             self._guard(self.service.on_timer)

@@ -10,9 +10,9 @@ from pydantic import Field
 from common.config import ServiceSettings
 from common.errors import UserError
 from common.messages import CmdVel, Goal, Pose, Scan
-from common.requests import Reply
+from common.requests import PoseRequest, Reply
 from common.service import Service, main
-from common.topics import CMD_VEL, GOAL, HEALTH, SCAN, TELEPORT
+from common.topics import CMD_VEL, GOAL, HEALTH, PREDICT, SCAN, TELEPORT
 
 
 class SmallSettings(ServiceSettings):
@@ -48,6 +48,9 @@ class Small(Service):
         if isinstance(message, Scan):
             self.counters["scans"] += 1
             self.publish(CMD_VEL, CmdVel(stamp_ns=message.stamp_ns, twist={"vx": 0.5}))
+        elif isinstance(message, Goal) and message.cancel:
+            # Of itself: who waited here would wait for ever.
+            self.request(TELEPORT if message.pose.y == 0 else PREDICT, PoseRequest(pose=message.pose), timeout=1.0)
         elif isinstance(message, Goal) and message.pose.x < 0:
             raise ValueError("a bug in on_message")
         elif isinstance(message, Goal) and message.pose.x > 100:
@@ -61,6 +64,10 @@ class Small(Service):
         if request.pose.x > 100:
             raise ValueError("a bug in on_request")
         return Reply(reason=f"at {request.pose.x:g}")
+
+    def on_reply(self, query, number, reply):
+        self.counters["replies"] += 1
+        self.note = f"{number} {query.name} {reply.ok} {reply.reason}"
 
     def due(self):
         return None if self.fail != "timer" else 0.05

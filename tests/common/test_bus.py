@@ -163,6 +163,58 @@ def test_nobody_there_is_said_with_what_to_do(bus):
         bus.ask(CONFIG, Request(), Reply, timeout=0.3, service="estimator")
 
 
+def _reply_to(bus, number, timeout=PATIENCE, x=1.0):
+    """What a request that waits for nobody comes to: one answer, and no second."""
+    inbox = Inbox()
+    bus.request(TELEPORT, PoseRequest(pose=Pose(x=x, y=2.0)), number, inbox, timeout)
+    assert wait_until(lambda: len(inbox) > 0, PATIENCE)
+    answer = inbox.get(0)
+    assert (answer.query, answer.number) == (TELEPORT, number)
+    assert len(inbox) == 0
+    return answer.reply()
+
+
+def test_a_request_is_answered_later_and_meanwhile_nobody_waits(bus, other):
+    may_answer, inbox = threading.Event(), Inbox()
+
+    def answer(call):
+        x = PoseRequest.decode(call.payload).pose.x
+        assert x == -1 or may_answer.wait(PATIENCE)
+        call.reply(Reply(reason=f"at {x:g}").encode())
+
+    with answering(other, TELEPORT, answer):
+        assert wait_until(lambda: _reply_to(bus, 1, x=-1.0).reason == "at -1", PATIENCE)
+        for number in range(20):
+            bus.request(TELEPORT, PoseRequest(pose=Pose(x=float(number), y=0.0)), number, inbox, PATIENCE)
+        assert len(inbox) == 0  # all were asked, and none is answered yet
+        may_answer.set()
+        assert wait_until(lambda: len(inbox) >= 20, PATIENCE)
+    answers = [inbox.get(0) for _ in range(len(inbox))]
+    assert sorted((a.number, a.reply().reason) for a in answers) == [(n, f"at {n}") for n in range(20)]
+
+
+def test_a_request_that_is_refused_or_answered_senselessly_or_not_at_all_gets_one_answer_too(bus, other):
+    nobody = _reply_to(bus, 3)
+    assert not nobody.ok
+    assert "is the simulator running?" in nobody.reason
+    kept = []
+    ways = {
+        "not on a Sunday": lambda call: call.refuse("not on a Sunday"),
+        "makes no sense": lambda call: call.reply(b"\xc1"),
+        "nobody answers": kept.append,
+    }
+    now = ["not on a Sunday"]
+
+    def answer(call):
+        ways[now[0]](call)
+
+    with answering(other, TELEPORT, answer):
+        for text in ways:
+            now[0] = text
+            assert wait_until(lambda t=text: t in _reply_to(bus, 4, 0.5).reason, PATIENCE)
+    assert kept
+
+
 def test_an_asker_that_is_gone_harms_nobody(bus, other):
     calls = Inbox()
     other.serve(TELEPORT, calls)

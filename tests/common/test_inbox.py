@@ -10,7 +10,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from common.inbox import MAX_KEYS, Call, Inbox, Sample
+from common.inbox import MAX_KEYS, Answer, Call, Inbox, Sample
+from common.requests import Reply
 from common.topics import HEALTH, MAX_BYTES, SCAN, TELEPORT
 
 
@@ -113,6 +114,24 @@ def test_a_request_that_is_too_large_is_refused_at_once():
     inbox.put(Call(TELEPORT, bytes(64 * MAX_BYTES + 1), lambda _: None, refused.append))
     assert len(inbox) == 0
     assert len(refused) == 1
+
+
+def test_an_answer_is_owed_and_comes_even_to_a_full_inbox():
+    inbox = Inbox(capacity=1)
+    inbox.put(sample())
+    inbox.put(Answer(TELEPORT, 7, Reply(reason="here").encode()))
+    inbox.put(Answer(TELEPORT, 8, bytes(64 * MAX_BYTES + 1)))
+    inbox.get(0)
+    assert inbox.get(0).reply() == Reply(reason="here")
+    large = inbox.get(0)
+    assert (large.number, large.payload) == (8, b"")
+    assert large.reply() == Reply(ok=False, reason=f"the answer's {64 * MAX_BYTES + 1} bytes are too many")
+
+
+def test_an_answer_that_makes_no_sense_is_one_that_says_so():
+    reply = Answer(TELEPORT, 1, b"\xc1").reply()
+    assert not reply.ok
+    assert "makes no sense" in reply.reason
 
 
 def test_invented_keys_do_not_fill_memory():

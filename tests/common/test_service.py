@@ -51,8 +51,8 @@ class Beside:
     def row(self, health: Health, topic):
         return next((row for row in health.topics if row.key == topic.key(self.bus.robot)), None)
 
-    def goal(self, x: float) -> None:
-        self.bus.put(GOAL, Goal(stamp_ns=0, pose=Pose(x=x, y=0.0)).encode())
+    def goal(self, x: float, y: float = 0.0, *, cancel: bool = False) -> None:
+        self.bus.put(GOAL, Goal(stamp_ns=0, pose=Pose(x=x, y=y), cancel=cancel).encode())
 
 
 @pytest.fixture
@@ -127,6 +127,27 @@ def test_a_user_error_in_a_step_ends_it_with_one_line(small):
     assert "small: the map ends before that" in small.running.output
     assert "Traceback" not in small.running.output
     assert "closed" in small.running.output
+
+
+def test_a_service_asks_without_waiting_even_itself(small):
+    asked = [
+        (3.0, 0.0, "1 teleport True at 3"),
+        (-3.0, 0.0, "2 teleport False inside a wall"),
+        (101.0, 0.0, "refused: small failed: ValueError: a bug in on_request"),
+        (1.0, 1.0, "4 predict False nobody answers"),
+    ]
+    for count, (x, y, text) in enumerate(asked, 1):
+        small.goal(x, y, cancel=True)
+        assert small.until(lambda h, n=count: h.counters.get("replies") == n), small.running.output
+        assert text in small.latest.note
+
+
+def test_it_ends_though_an_answer_is_owed(small):
+    small.goal(1.0, 1.0, cancel=True)
+    status, seconds = small.running.stop()
+    assert status == 0, small.running.output
+    assert seconds < 5
+    assert "Traceback" not in small.running.output
 
 
 def test_requests_are_answered_refused_and_survived(small):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from common.inbox import Call, Inbox, Sample
+from common.inbox import Answer, Call, Inbox, Sample
 from common.messages import Stamped
 from common.requests import ModelReply, Reply, Request, SampleReply, WorldReply
 from common.service import Loop, Service
@@ -43,6 +43,12 @@ class FakeBus:
 
     def ask(self, query: Query, request: Request, reply: type[Reply], timeout: float = 5.0, service: str = "*") -> Any:
         return self.replies[service if query.per_service else query.server, query.name]
+
+    def request(
+        self, query: Query, request: Request, number: int, inbox: Inbox, timeout: float = 5.0, service: str = "*"
+    ) -> None:
+        reply = self.replies.get((query.server, query.name))
+        inbox.put(Answer(query, number, reply.encode() if reply else b"", "" if reply else "nobody answers"))
 
     def linked(self) -> bool:
         return True
@@ -81,6 +87,8 @@ def drive(service: Service, events: Iterable[Event]) -> list[Row]:
     try:
         for number, event in enumerate(events):
             _happen(loop, event, number, rows)
+            while isinstance(answer := loop.inbox.get(0), Answer):
+                loop.service.on_reply(answer.query, answer.number, answer.reply())
             rows += [
                 {"event": number, "topic": topic.name, **row_of(topic.message.decode(payload))}
                 for topic, payload in bus.sent
