@@ -75,6 +75,7 @@ def prepare(choice: Choice) -> Factory:
     if choice.estimator == "precise":
         return _precise(choice, world)
     tuned = choice.estimator == "particle-filter"
+    RayCaster(world).expect(np.zeros((1, 3)), np.zeros(1))  # compiled now, no request waits for it
 
     def make(geometry: Geometry) -> Estimator:
         settings = ParticleSettings.tuned() if tuned else ParticleSettings()

@@ -64,6 +64,14 @@ class Posterior:
         return self.accuracy + self.complexity
 
 
+@dataclass(frozen=True)
+class Predicted:
+    """The scans expected from N poses along B beams."""
+
+    ranges: Array  # (N, B) m; +inf: no return expected
+    sigma: Array  # (N, B) m, their stated standard deviation
+
+
 class Estimator(Protocol):
     """Perception, whatever its method."""
 
@@ -71,6 +79,14 @@ class Estimator(Protocol):
 
     def update(self, observation: Observation) -> Posterior:
         """The posterior after one more scan."""
+        ...
+
+    def predict(self, poses: Array, angles: Array) -> Predicted:
+        """What would be seen from base_link poses (N, 3) in map along beams at ``angles`` (B,) rad in laser.
+
+        Wherever the poses are, inside walls too; the belief does not change. Raises UserError where the model cannot
+        predict such poses or beams.
+        """
         ...
 
     def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:

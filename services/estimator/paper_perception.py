@@ -9,7 +9,7 @@ import numpy as np
 from common import se2
 from common.errors import UserError
 from services.estimator.generative import Expected
-from services.estimator.interface import Hypothesis, Observation, Posterior
+from services.estimator.interface import Hypothesis, Observation, Posterior, Predicted
 from services.estimator.perception import Descent, PaperEstimator
 from services.estimator.training import usable_ranges
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from services.estimator.weights import ModelCard
 
 ANGLE_TOLERANCE = 1e-4  # rad and m, between a scan's beams or mounting and the model's
+HEADING_TOLERANCE = 1e-3  # rad, between a pose's and the model's
 
 
 def check_geometry(scanner: Scanner, angles: Array, mount: Array | None, remedy: str) -> None:
@@ -39,7 +40,7 @@ class PaperPerception:
 
     def __init__(self, model: PaperModel, card: ModelCard, descent: Descent, pose: Array | None = None) -> None:
         """``pose`` (3,) to begin with; none: the map's centre."""
-        self.card = card
+        self.card, self.model = card, model
         self._first = pose
         self.estimator = PaperEstimator(
             model, card.test_l1_mean, card.world.bounds, self._initial(pose), descent,
@@ -68,6 +69,22 @@ class PaperPerception:
             found.curvature,
             estimate.predicted,
         )
+
+    def predict(self, poses: Array, angles: Array) -> Predicted:
+        """See Estimator: the decoder knows one heading, and the beams of its training. Sigma is its mean error."""
+        off = np.abs(se2.wrap(poses[:, 2] - self.card.heading))
+        if (off > HEADING_TOLERANCE).any():
+            raise UserError(
+                f"preset paper predicts at its one heading, {np.rad2deg(self.card.heading):.1f} deg, "
+                f"and was asked for {np.rad2deg(poses[off.argmax(), 2]):.1f} deg"
+            )
+        own = self.card.scanner.angles()
+        index = np.abs(own[None, :] - angles[:, None]).argmin(axis=1)
+        if np.abs(own[index] - angles).max() > ANGLE_TOLERANCE:
+            raise UserError("the paper's decoder predicts the beams of its training alone")
+        # Far outside the map single precision has no number.
+        ranges = np.nan_to_num(self.model.ranges(poses)[:, index], nan=np.inf, posinf=np.inf)
+        return Predicted(ranges, np.full(ranges.shape, self.card.test_l1_mean))
 
 
 class PaperScans:

@@ -8,10 +8,11 @@ import numpy as np
 
 from common.errors import UserError
 from common.messages import Belief, CmdVel, Goal, Hypothesis, Odom, Pose, Prediction, Scan, Stamped
-from common.requests import LocaliseRequest, ModelReply, ModelRequest, Reply, Request
+from common.requests import LocaliseRequest, ModelReply, ModelRequest, PredictRequest, Reply, Request
 from common.se2 import Array
 from common.service import Service
-from common.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, MODEL, ODOM, PREDICTION, SCAN, Query, Topic
+from common.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, MODEL, ODOM, PREDICT, PREDICTION, SCAN, Query, Topic
+from services.estimator import predicting
 from services.estimator.building import Choice, Factory, Geometry, prepare
 from services.estimator.interface import Estimator, Observation, Posterior
 from services.estimator.model_card import ModelInUse, model_in_use
@@ -24,7 +25,7 @@ class EstimatorService(Service):
 
     name: ClassVar[str] = "estimator"
     inputs: ClassVar[tuple[Topic, ...]] = (SCAN, GOAL)
-    queries: ClassVar[tuple[Query, ...]] = (LOCALISE, MODEL)
+    queries: ClassVar[tuple[Query, ...]] = (LOCALISE, MODEL, PREDICT)
 
     def __init__(self, settings: EstimatorSettings) -> None:
         """Models are loaded in `open`; the estimator is made for the beams of the first scan."""
@@ -77,15 +78,17 @@ class EstimatorService(Service):
             self._perceive(scan)
 
     def on_request(self, query: Query, request: Request) -> Reply:
-        """Localise anew, or say what the estimator was made of."""
+        """Localise anew, predict scans, or say what the estimator was made of."""
         if isinstance(request, ModelRequest):
             if isinstance(self.model, str):
                 return ModelReply(ok=False, reason=self.model)
             return self.model.reply(weights=request.weights)
-        if query is not LOCALISE or not isinstance(request, LocaliseRequest):
+        if self.estimator is None or self.geometry is None:
+            return query.reply(ok=False, reason="no scan has come yet")
+        if isinstance(request, PredictRequest):
+            return predicting.answer(self.estimator, request, self.geometry.angles, self.geometry.range_max)
+        if not isinstance(request, LocaliseRequest):
             return super().on_request(query, request)
-        if self.estimator is None:
-            return Reply(ok=False, reason="no scan has come yet")
         self.estimator.restart(None if request.pose is None else request.pose.array())
         return Reply()
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common import se2
-from services.estimator.interface import Observation, Posterior, State
+from services.estimator.generative import RayCaster
+from services.estimator.interface import Observation, Posterior, Predicted, State
 from services.estimator.particle_filter import motion, resampling
 from services.estimator.particle_filter.clusters import hypotheses
 from services.estimator.particle_filter.recovery import Recovery
@@ -95,6 +96,11 @@ class ParticleFilter:
             self._resample()
         self._last = observation
         return posterior
+
+    def predict(self, poses: Array, angles: Array) -> Predicted:
+        """See Estimator: exact rays in its map; sigma is that of a hit while it tracks."""
+        ranges = RayCaster(self.world).expect(se2.compose(poses, self.mount), angles).ranges
+        return Predicted(ranges, np.full(ranges.shape, self.settings.sigma_hit))
 
     def _anywhere(self, count: int, places: Array | None = None) -> Array:
         """(count, 3) poses uniform over free space, at ``places`` (count, 2) or at ones sampled in advance."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common import se2
-from services.estimator.interface import Hypothesis, Observation, Posterior, State
+from services.estimator.interface import Hypothesis, Observation, Posterior, Predicted, State
 from services.estimator.precise import mixture
 from services.estimator.precise.gauss_newton import Prior, View, descend, polish
 from services.estimator.precise.likelihood import Likelihood
@@ -92,6 +92,11 @@ class PreciseEstimator:
         self._usual += 0.1 * (best.explained - self._usual)
         self._energy += 0.1 * (best.accuracy - self._energy)
         return self._posterior(view, best)
+
+    def predict(self, poses: Array, angles: Array) -> Predicted:
+        """See Estimator; sigma is the scanner's noise and the model's stated error together."""
+        expected = self.model.expect(se2.compose(poses, self.mount), angles)
+        return Predicted(expected.ranges, np.sqrt(expected.scale**2 + self.likelihood.sigma**2))
 
     def _track(self, view: View, observation: Observation) -> None:
         """Each hypothesis on: where it may have moved, where the scan says it is, both fused."""
@@ -197,7 +202,7 @@ class PreciseEstimator:
         return stamp - self._stamp
 
     def _posterior(self, view: View, best: Mode) -> Posterior:
-        expected = self.model.expect(se2.compose(best.pose, self.mount)[None], view.angles)
+        expected = self.predict(best.pose[None], view.angles)
         state = self._state(best)
         unknown = self.seeds.spread * (best.explained < self.settings.believable)
         hypotheses = tuple(
@@ -212,7 +217,7 @@ class PreciseEstimator:
             best.xi,
             best.curvature,
             expected.ranges[0],
-            np.sqrt(expected.scale[0] ** 2 + self.likelihood.sigma**2),
+            expected.sigma[0],
         )
 
     def _state(self, best: Mode) -> State:

@@ -1,0 +1,70 @@
+"""`predict` through a real estimator over zenoh: asked by somebody who waits and by somebody who does not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common import se2
+from common.bus import wait_until
+from common.errors import UserError
+from common.inbox import Answer, Inbox
+from common.messages import Pose, Scan
+from common.requests import PredictReply, PredictRequest
+from common.scanner import SCANNERS
+from common.topics import BELIEF, PREDICT, SCAN
+from common.world import load_world
+
+PATIENCE = 60.0
+SCANNER = SCANNERS["tim571"].with_beams(180)
+WORLD = load_world("office")
+
+
+def seen(pose):
+    return WORLD.ray_distances(se2.compose(pose, np.array(SCANNER.mount)), SCANNER.angles())[0]
+
+
+@pytest.fixture
+def estimator(bus, process):
+    """A running estimator that has had one scan, and answered it."""
+    running, beliefs = process("estimator", "--world", "office"), Inbox()
+    bus.subscribe(BELIEF, beliefs)
+    assert wait_until(lambda: "estimator" in bus.alive(), PATIENCE), running.output
+    assert bus.wait_matching(SCAN, PATIENCE)
+    early = bus.ask(PREDICT, PredictRequest(poses=np.zeros((1, 3))), PredictReply)
+    assert early.reason == "no scan has come yet"
+    scan = Scan(
+        stamp_ns=1, angle_min=SCANNER.angle_min, angle_increment=SCANNER.angle_increment, range_min=0.05,
+        range_max=25.0, ranges=seen(np.array([3.0, 4.0, 0.0])), mount=Pose.of(SCANNER.mount),
+    )  # fmt: skip
+    bus.put(SCAN, scan.encode())
+    assert wait_until(lambda: len(beliefs) > 0, PATIENCE), running.output
+    return running
+
+
+def test_predictions_come_to_who_asks(estimator, bus):
+    rng = np.random.default_rng(0)
+    poses = np.column_stack([WORLD.sample_free(100, rng, 0.27), rng.uniform(-np.pi, np.pi, 100)])
+    request = PredictRequest(poses=poses, beams=61)
+    waited = bus.ask(PREDICT, request, PredictReply)
+    ranges = waited.ranges.reshape(100, 61)
+    exact = WORLD.ray_distances(se2.compose(poses, np.array(SCANNER.mount)), waited.angles)
+    assert np.median(np.abs(ranges - exact)) < 0.001
+    inbox = Inbox()
+    for number in range(5):
+        bus.request(PREDICT, request, number, inbox, PATIENCE)
+    assert wait_until(lambda: len(inbox) == 5, PATIENCE)
+    answers = [inbox.get(0) for _ in range(5)]
+    assert all(isinstance(each, Answer) and each.reply() == waited for each in answers)
+    assert sorted(each.number for each in answers) == list(range(5))
+
+    for hostile in (PredictRequest(poses=np.zeros((1001, 3))), PredictRequest(poses=poses, beams=181)):
+        assert not bus.ask(PREDICT, hostile, PredictReply).ok
+    walls = PredictRequest(poses=np.array([[0.0, 0.0, 0.0], [1e200, -5.0, 7.0], [4.6, 0.9, 1.0]]))
+    assert bus.ask(PREDICT, walls, PredictReply).ok
+    not_finite = PredictRequest.model_construct(poses=np.full((1, 3), np.nan), beams=None)
+    with pytest.raises(UserError, match=r"refused: PredictRequest\.poses: .* not finite"):
+        bus.ask(PREDICT, not_finite, PredictReply)
+    assert bus.ask(PREDICT, request, PredictReply) == waited
+    assert estimator.stop()[0] == 0
+    assert "Traceback" not in estimator.output
