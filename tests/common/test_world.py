@@ -8,8 +8,10 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
+from common import se2
 from common.errors import UserError
 from common.robot import Robot
+from common.scanner import SCANNERS
 from common.world import World, known_worlds, load_world, save_world
 
 ROOM = World(
@@ -101,6 +103,24 @@ def test_the_corridor_is_the_paper_s():
     assert all(o.shape().bounds[1] > 3 for o in world.obstacles)  # all along one wall
 
 
+def test_the_twins_look_alike_inside_and_their_corridor_tells():
+    """A scan from most of a room is the very scan of its twin; from the doorway on a fifth of the beams differ."""
+    world, scanner, twin = load_world("twins"), SCANNERS["tim571"].with_beams(271), np.array([6.1, 0, 0])
+
+    def differ(poses):
+        scans = [
+            world.ray_distances(se2.compose(each, scanner.mount), scanner.angles()) for each in (poses, poses + twin)
+        ]
+        return (np.abs(scans[0] - scans[1]) > 3 * scanner.sigma).mean(axis=1)
+
+    rng = np.random.default_rng(0)
+    places = world.sample_free(600, rng, Robot().radius)
+    places = places[(places[:, 0] < 5.9) & (places[:, 1] < 4.4)]
+    assert (differ(np.column_stack([places, rng.uniform(-np.pi, np.pi, len(places))])) == 0).mean() > 0.75
+    assert differ(np.array([[2.0, 2.2, yaw] for yaw in np.linspace(-3, 3, 7)])).max() == 0
+    assert differ(np.array([[2.95, y, np.pi / 2] for y in (4.5, 4.8, 5.4)])).min() > 0.2
+
+
 def test_what_is_saved_loads(tmp_path):
     path = tmp_path / "w.yaml"
     path.write_text(save_world(ROOM))
@@ -134,5 +154,5 @@ def test_a_bad_file_is_one_line_that_says_where(tmp_path, text, why):
 
 
 def test_an_unknown_world_names_those_there_are():
-    with pytest.raises(UserError, match="corridor, maze, office"):
+    with pytest.raises(UserError, match="corridor, maze, office, twins"):
         load_world("nowhere")
