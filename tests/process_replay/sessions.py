@@ -198,10 +198,14 @@ def estimator(name: str) -> Callable[..., list[Row]]:
     return run
 
 
-def controller(folder: Path, **changes: Any) -> list[Row]:
-    """With the world, so that it can refuse a goal."""
-    settings = {"world": "corridor", "robot": ROBOT}
-    return drive(ControllerService(ControllerSettings(**{**settings, **changes})), controller_events())
+def controller(preset: str) -> Callable[..., list[Row]]:
+    """Of that preset; with the world, so that it can refuse a goal."""
+
+    def run(folder: Path, **changes: Any) -> list[Row]:
+        settings = {"world": "corridor", "preset": preset, "robot": ROBOT}
+        return drive(ControllerService(ControllerSettings(**{**settings, **changes})), controller_events())
+
+    return run
 
 
 def recorder(folder: Path, **changes: Any) -> list[Row]:
@@ -265,6 +269,7 @@ SESSIONS: dict[str, Callable[..., list[Row]]] = {
     "estimator-precise": estimator("precise"),
     "estimator-paper": estimator("paper"),
     "estimator-particle-filter": estimator("particle-filter"),
-    "controller": controller,
+    "controller-geodesic": controller("geodesic"),
+    "controller-paper": controller("paper"),
     "recorder": recorder,
 }
