@@ -25,9 +25,7 @@ from common.requests import (
     Request,
     ResetRequest,
     SpeedRequest,
-    WorldReply,
 )
-from common.robot import Robot
 from common.topics import (
     DRIVE,
     GOAL,
@@ -48,6 +46,7 @@ from services.viewer.pulses import how_to_start
 from services.viewer.roster import Roster
 
 WITHIN = 3.0  # s, for an answer
+HEADING = 0.15  # rad, of a goal that was given one
 LISTENER_WITHIN = 2.0  # s, for a subscriber to be known: a put before that is lost
 CLOCK = {"pause": PAUSE, "resume": RESUME, "step": STEP}
 DONE = {"pause": "paused", "resume": "running", "step": "one scan further"}
@@ -69,7 +68,6 @@ class Sight:
 
     status: Callable[[str], Status | None]  # the controller's last word about a robot
     stamp_ns: Callable[[str], int]  # of the newest scan
-    world: Callable[[str], WorldReply | None]
 
 
 class Control:
@@ -125,7 +123,6 @@ class Control:
             raise UserError(f"the {service} does not listen to {topic.name}: is it of this version?")
 
     def _goal(self, robot: str, action: a.GoTo) -> Answer:
-        self._check_place(robot, action.x, action.y)
         self._heard(robot, GOAL, "controller")
         # The time numbers it: the status says which goal it is about, whoever gave the others.
         goal = Goal(
@@ -133,6 +130,7 @@ class Control:
             seq=time.time_ns(),
             pose=Pose(x=action.x, y=action.y, yaw=action.yaw or 0.0),
             tolerance=action.tolerance or 0.2,
+            yaw_tolerance=None if action.yaw is None else HEADING,
         )
         self._bus.put(GOAL, goal.encode(), key=GOAL.key(robot))
         status = self._status(robot, lambda status: status.goal_seq == goal.seq)
@@ -158,16 +156,6 @@ class Control:
             return status is not None and wanted(status)
 
         return self._sight.status(robot) if wait_until(there, WITHIN) else None
-
-    def _check_place(self, robot: str, x: float, y: float) -> None:
-        reply = self._sight.world(robot)
-        if reply is None or reply.world is None:
-            return  # a robot that does not know its world: the controller has the say
-        radius = (reply.robot or Robot()).radius
-        clearance = float(reply.world.clearance([[x, y]])[0])
-        if clearance < radius:
-            what = "inside a wall or outside the world" if clearance < 0 else f"{clearance:.2f} m from a wall"
-            raise UserError(f"({x:.2f}, {y:.2f}) is {what}; the robot needs {radius:g} m around it")
 
     def _teleport(self, robot: str, action: a.Carry) -> Answer:
         pose = Pose(x=action.x, y=action.y, yaw=action.yaw)

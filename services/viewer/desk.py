@@ -53,7 +53,7 @@ class Desk:
     def __init__(self, office: Office) -> None:
         """Nothing is known yet."""
         self.office = office
-        self.worlds: dict[str, WorldReply] = {}  # by robot; read by other threads
+        self.worlds: dict[str, WorldReply] = {}  # by robot
         self._texts: dict[str, str] = {}  # the same for visitors
         self._stale: set[str] = set()
         self._ask = asyncio.Event()

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from common.messages import Belief, CmdVel, Odom, Pose, Prediction, Scan, Status, Truth, Twist
+from common.messages import Belief, CmdVel, Goal, Odom, Plan, Pose, Prediction, Scan, Status, Truth, Twist
 
 Json = dict[str, Any]
 COMPACT = (",", ":")
@@ -32,13 +32,19 @@ def encode(header: Json, arrays: Mapping[str, npt.NDArray[np.float32]]) -> bytes
     return b"".join([*parts, *(np.asarray(array, "<f4").tobytes() for array in arrays.values())])
 
 
-def arrays_of(scan: Scan, prediction: Prediction | None) -> dict[str, npt.NDArray[np.float32]]:
-    """Measured ranges, expected ranges and their stated sigma, m; empty where there are none."""
+def arrays_of(
+    scan: Scan, prediction: Prediction | None, plan: Plan | None, truth: Truth | None
+) -> dict[str, npt.NDArray[np.float32]]:
+    """Measured ranges, expected ranges and their stated sigma, m; points in map as x, y, x, y, ..., m; empty: none."""
     none = np.zeros(0, np.float32)
     return {
         "ranges": scan.ranges,
         "predicted": prediction.ranges if prediction is not None else none,
         "sigma": prediction.sigma if prediction is not None else none,
+        "path": plan.path.ravel() if plan is not None else none,
+        "motion": plan.motion.ravel() if plan is not None else none,
+        "obstacles": plan.obstacles.ravel() if plan is not None else none,
+        "people": truth.people.ravel() if truth is not None else none,
     }
 
 
@@ -88,11 +94,14 @@ def belief_of(belief: Belief | None) -> Json | None:
     }  # fmt: skip
 
 
-def status_of(status: Status | None) -> Json | None:
-    """What the controller does, and why."""
+def status_of(status: Status | None, goals: Mapping[int, Goal]) -> Json | None:
+    """What the controller does, and why; what is asked of the goal where it is one of ``goals``, by number."""
     if status is None:
         return None
-    goal = pose_of(status.goal) if status.goal is not None else None
+    goal: Json | None = pose_of(status.goal) if status.goal is not None else None
+    asked = goals.get(status.goal_seq)
+    if goal is not None and asked is not None and asked.pose == status.goal:
+        goal |= {"tolerance": asked.tolerance, "yaw_tolerance": asked.yaw_tolerance}
     return {"state": status.state, "reason": status.reason[:500], "distance": status.distance, "goal": goal}
 
 

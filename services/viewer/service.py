@@ -18,20 +18,8 @@ from typing import ClassVar
 from common.bus import DEFAULT_ENDPOINT
 from common.inbox import Sample
 from common.messages import Health, Status
-from common.requests import WorldReply
 from common.service import Service
-from common.topics import (
-    BELIEF,
-    CMD_VEL,
-    HEALTH,
-    ODOM,
-    PREDICTION,
-    SCAN,
-    STATUS,
-    TOPICS,
-    TRUTH,
-    Topic,
-)
+from common.topics import SCAN, TOPICS, Topic
 from common.versions import versions
 from common.wire import DecodeError
 from services.viewer.control import Control, Sight
@@ -40,12 +28,10 @@ from services.viewer.playback import Playback
 from services.viewer.pulses import Pulses, how_to_start, missing
 from services.viewer.roster import Roster
 from services.viewer.settings import ViewerSettings
-from services.viewer.view import RobotView
+from services.viewer.view import ALWAYS, SHOWN, RobotView
 from services.viewer.visitors import Hub, Visitor
 from services.viewer.web import WebServer, create_app, link, listen
 
-ALWAYS = (BELIEF, TRUTH, HEALTH)  # read though nobody watches
-SHOWN = (*ALWAYS, SCAN, ODOM, PREDICTION, STATUS, CMD_VEL)
 TICK = 1.0  # s
 SCANNING = 2.0  # s since the last scan
 
@@ -87,7 +73,7 @@ class ViewerService(Service):
         listener = listen(options)
         self._follow(options.robot)
         self.loop.bus.watch_robots(self._came_or_went)
-        sight = Sight(self._status, self._stamp_ns, self._world)
+        sight = Sight(self._status, self._stamp_ns)
         control = Control(self.loop.bus, self.roster, sight, self._connect)
         version = versions().get("presage", versions()["commit"])
         self.desk = Desk(
@@ -133,15 +119,25 @@ class ViewerService(Service):
         if isinstance(message, Health):
             followed.pulses.hear(message, now)
             return
-        self._show(robot, followed.view.hear(sample.topic, message, now, sample.published_ns))
-        if followed.view.began_anew:
-            followed.view.began_anew = False
-            self.hub.call(partial(self.hub.tell, robot, "history", _history(followed.view)))
+        view = followed.view
+        self._show(robot, view, view.hear(sample.topic, message, now, sample.published_ns))
+        if view.began_anew:
+            view.began_anew = False
+            self._tell(robot, "history", _history(view))
+        if view.new_row:
+            view.new_row = False
+            self._tell(robot, "journal", _journal(view))
 
-    def _show(self, robot: str, frame: bytes | None) -> None:
+    def _show(self, robot: str, view: RobotView, frame: bytes | None) -> None:
+        if (field := view.fields.change(view.stamp_ns, live=view.live)) is not None:
+            self._tell(robot, "field", field)
         if frame is not None and robot in self.hub.watched:
             self.counters["frames"] += 1
             self.hub.call(partial(self.hub.show, robot, frame))
+
+    def _tell(self, robot: str, kind: str, text: str | bytes) -> None:
+        if robot in self.hub.watched:
+            self.hub.call(partial(self.hub.tell, robot, kind, text))
 
     def _came_or_went(self, robot: str, service: str, there: bool) -> None:  # noqa: FBT001 - zenoh's thread
         self.roster.change(robot, service, there)
@@ -169,7 +165,7 @@ class ViewerService(Service):
         while self.hub.newcomers:
             self._welcome(*self.hub.newcomers.popleft())
         for robot, followed in self.robots.items():
-            self._show(robot, followed.view.overdue(now))
+            self._show(robot, followed.view, followed.view.overdue(now))
         if now >= self._tick_at:
             self._tick_at = now + TICK
             self._tick()
@@ -180,15 +176,20 @@ class ViewerService(Service):
         for sample in sorted(followed.unread.values(), key=lambda sample: sample.received_ns):
             self._read(robot, followed, sample)
         followed.unread.clear()
-        history, services = _history(followed.view), self._services(robot, followed)
+        view = followed.view
+        known = {
+            "history": _history(view), "services": self._services(robot, followed), "journal": _journal(view),
+            "field": view.fields.shown,
+        }  # fmt: skip
 
         def tell() -> None:
             if visitor.robot != robot:
                 return
-            visitor.say(history, "history")
-            visitor.say(services, "services")
-            if (frame := followed.view.frame) is not None:
-                visitor.show(frame)
+            for kind, what in known.items():
+                if what is not None:
+                    visitor.say(what, kind)
+            if view.frame is not None:
+                visitor.show(view.frame)
 
         self.hub.call(tell)
 
@@ -200,7 +201,7 @@ class ViewerService(Service):
         for robot, followed in self.robots.items():
             followed.view.live = "replay" not in self.roster.services(robot)
             if robot in watched:
-                self.hub.call(partial(self.hub.tell, robot, "services", self._services(robot, followed)))
+                self._tell(robot, "services", self._services(robot, followed))
         self.counters.update({name: n - self.counters[name] for name, n in dict(self.hub.counters).items()})
         self.counters["visitors"] = len(self.hub)
         if self._web is not None and not self._web.running and not self.note:
@@ -240,9 +241,10 @@ class ViewerService(Service):
         followed = self.robots.get(robot)
         return followed.view.stamp_ns if followed is not None else 0
 
-    def _world(self, robot: str) -> WorldReply | None:
-        return self.desk.worlds.get(robot)
-
 
 def _history(view: RobotView) -> str:
     return json.dumps({"type": "history", "samples": view.history.columns()})
+
+
+def _journal(view: RobotView) -> str:
+    return json.dumps({"type": "journal", "rows": view.journal.rows()})

@@ -12,17 +12,35 @@ from typing import TypeVar
 
 import numpy as np
 
-from common.messages import Belief, CmdVel, Odom, Prediction, Scan, Stamped, Status, Truth
-from common.topics import BELIEF, CMD_VEL, ODOM, PREDICTION, SCAN, STATUS, TRUTH, Topic
+from common.messages import Belief, CmdVel, Goal, Odom, Plan, Prediction, Preference, Scan, Stamped, Status, Truth
+from common.topics import (
+    BELIEF,
+    CMD_VEL,
+    GOAL,
+    HEALTH,
+    ODOM,
+    PLAN,
+    PREDICTION,
+    PREFERENCE,
+    SCAN,
+    STATUS,
+    TRUTH,
+    Topic,
+)
 from services.viewer import frames
+from services.viewer.fields import Fields
 from services.viewer.history import History, Sample
+from services.viewer.journal import Journal
 from services.viewer.moments import Moments
 
 PATIENCE = 0.05  # s of the wall's clock after a scan in which its answers are waited for
 SILENT = 2.0  # s behind the scan, by stamps and by the wall: no longer waited for, no longer shown
+ALWAYS = (BELIEF, TRUTH, STATUS, GOAL, HEALTH)  # read though nobody watches
+SHOWN = (*ALWAYS, SCAN, ODOM, PREDICTION, CMD_VEL, PLAN, PREFERENCE)
 BEGINNING = (ODOM, TRUTH, SCAN)  # what a new stamp begins with
-ANSWERS = (ODOM, TRUTH, BELIEF, PREDICTION, CMD_VEL)
+ANSWERS = (ODOM, TRUTH, BELIEF, PREDICTION, CMD_VEL, PLAN)
 TRUTHS = 256  # stamps; a belief may come that much later than its truth
+GOALS = 8  # the last ones given
 
 M = TypeVar("M", bound=Stamped)
 
@@ -42,17 +60,21 @@ class RobotView:
     def __init__(self, robot: str, *, live: bool = True) -> None:
         """Nothing heard; ``live``: not a replay."""
         self.robot, self.live = robot, live
-        self.history = History()
-        self.began_anew = False  # stamps went back; for whoever tells visitors, who sets it False
+        self.history, self.journal, self.fields = History(), Journal(), Fields()
+        self.began_anew = self.new_row = False  # stamps went back; the journal grew. For who tells visitors
         self.frame: bytes | None = None  # the last one
         self._heard: dict[str, Heard] = {}
         self._truths: OrderedDict[int, Truth] = OrderedDict()  # by stamp
+        self._goals: OrderedDict[int, Goal] = OrderedDict()  # by number
         self._moments = Moments()  # of a replay
         self._waiting: tuple[int, float] | None = None  # stamp of the scan that waits for its answers, and since when
         self._latency_ms: float | None = None
 
     def hear(self, topic: Topic, message: Stamped, at: float, published_ns: int = 0) -> bytes | None:
         """Take a message; a frame, where one is complete with it or complete no more."""
+        if isinstance(message, Preference | Goal):
+            self._keep_aside(message)
+            return None
         last, frame = self._heard.get(topic.name), None
         if topic in BEGINNING and last is not None and message.stamp_ns < last.message.stamp_ns:
             self._begin_anew()
@@ -111,7 +133,17 @@ class RobotView:
         self._moments.clear()
         self._truths.clear()
         self.history.clear()
-        self._waiting, self._latency_ms, self.began_anew = None, None, True
+        self.journal.clear()
+        self._waiting, self._latency_ms, self.began_anew, self.new_row = None, None, True, True
+
+    def _keep_aside(self, message: Preference | Goal) -> None:
+        """What is about no scan."""
+        if isinstance(message, Preference):
+            self.fields.hear(message, self.robot, live=self.live)
+            return
+        self._goals[message.seq] = message
+        if len(self._goals) > GOALS:
+            self._goals.popitem(last=False)
 
     def _keep(self, message: Stamped) -> None:
         if isinstance(message, Truth):
@@ -126,6 +158,8 @@ class RobotView:
             self.history.add(Sample(t, message.free_energy, message.accuracy, message.complexity, error, speed))
         elif isinstance(message, CmdVel):
             self._latency_ms = self._latency(message)
+        elif isinstance(message, Status):
+            self.new_row |= self.journal.add(message)
 
     def _error(self, belief: Belief) -> float | None:
         """m, between the belief and the truth of its stamp."""
@@ -155,7 +189,8 @@ class RobotView:
         """Whether all who spoke lately have spoken about the waiting scan."""
         if self._waiting is None:
             return False
-        known = [message for topic in ANSWERS if (message := self.fresh(topic, Stamped, at)) is not None]
+        last = (self.fresh(topic, Stamped, at) for topic in ANSWERS)
+        known = [message for message in last if message is not None and not _is_over(message)]
         # Where nobody has answered yet it is too early to say that nobody will.
         return bool(known) and all(message.stamp_ns >= self._waiting[0] for message in known)
 
@@ -173,12 +208,18 @@ class RobotView:
             "truth": frames.truth_of(self.fresh(TRUTH, Truth, at)),
             "belief": frames.belief_of(belief),
             "odom": frames.odom_of(self.fresh(ODOM, Odom, at)),
-            "status": frames.status_of(self.fresh(STATUS, Status, at)),
+            "status": frames.status_of(self.fresh(STATUS, Status, at), self._goals),
             "cmd": frames.cmd_of(self.fresh(CMD_VEL, CmdVel, at)),
             "error": self._error(belief) if belief is not None else None,
             "speed": self._speed(),
             "latency_ms": self._latency_ms,
             "scan": frames.scan_of(scan),
         }
-        self.frame = frames.encode(header, frames.arrays_of(scan, self.fresh(PREDICTION, Prediction, at)))
+        prediction, plan = self.fresh(PREDICTION, Prediction, at), self.fresh(PLAN, Plan, at)
+        self.frame = frames.encode(header, frames.arrays_of(scan, prediction, plan, self.fresh(TRUTH, Truth, at)))
         return self.frame
+
+
+def _is_over(message: Stamped) -> bool:
+    """A plan with nothing in it is the last one for a while."""
+    return isinstance(message, Plan) and not len(message.path) and not len(message.obstacles)

@@ -26,13 +26,13 @@ class Visitor:
         self.robot = ""
         self.sent = self.skipped = 0  # frames
         self._text, self._data = text, data
-        self._texts: OrderedDict[object, str] = OrderedDict()
+        self._texts: OrderedDict[object, str | bytes] = OrderedDict()
         self._frame: bytes | None = None
         self._serial = itertools.count()
         self._something = asyncio.Event()
         self._overrun = False
 
-    def say(self, text: str, kind: str = "") -> None:
+    def say(self, text: str | bytes, kind: str = "") -> None:
         """Something to be sent; what still waits of the same ``kind`` is replaced, in its place."""
         if len(self._texts) >= MAX_WAITING:
             self._overrun = True
@@ -61,7 +61,8 @@ class Visitor:
                 if self._overrun:
                     raise TooSlowError
                 if self._texts:
-                    await self._text(self._texts.popitem(last=False)[1])
+                    said = self._texts.popitem(last=False)[1]
+                    await (self._data(said) if isinstance(said, bytes) else self._text(said))
                 elif (frame := self._frame) is not None:
                     self._frame = None
                     await self._data(frame)
@@ -125,7 +126,7 @@ class Hub:
             if visitor.robot == robot:
                 visitor.show(frame)
 
-    def tell(self, robot: str, kind: str, text: str) -> None:
+    def tell(self, robot: str, kind: str, text: str | bytes) -> None:
         """To all who watch the robot."""
         for visitor in self.of(robot):
             visitor.say(text, kind)

@@ -17,7 +17,7 @@ PATIENCE = 30.0  # s
 
 @dataclass(frozen=True)
 class Frame:
-    """Header, arrays by name, and all bytes."""
+    """A binary message: header, arrays by name, and all bytes."""
 
     header: dict
     arrays: dict = field(repr=False)
@@ -33,6 +33,10 @@ def read_frame(data: bytes) -> Frame:
     arrays = {name: floats[offset : offset + count] for name, (offset, count) in header["arrays"].items()}
     assert sum(map(len, arrays.values())) == len(floats)
     return Frame(header, arrays, data)
+
+
+def kind_of(message):
+    return (message.header if isinstance(message, Frame) else message)["type"]
 
 
 def no_json(name):
@@ -67,7 +71,7 @@ class Page:
         """The next message: a Frame, or a dict."""
         data = self.socket.recv(timeout)
         message = read_frame(data) if isinstance(data, bytes) else json.loads(data)
-        self.last["frame" if isinstance(message, Frame) else message["type"]] = message
+        self.last[kind_of(message)] = message
         return message
 
     def until(self, wanted, timeout=PATIENCE):
@@ -84,21 +88,19 @@ class Page:
         raise AssertionError(f"nothing as wanted within {timeout:g} s; the last were\n{last}")
 
     def told(self, kind, wanted=lambda _: True, timeout=PATIENCE):
-        """The first text of a type that is as wanted."""
-        return self.until(lambda m: isinstance(m, dict) and m["type"] == kind and wanted(m), timeout)
+        """The first message of a type that is as wanted."""
+        return self.until(lambda m: kind_of(m) == kind and wanted(m), timeout)
 
     def by_now(self, kind, wanted, timeout=PATIENCE):
         """The same, or the last that came if it is."""
         last = self.last.get(kind)
         if last is not None and wanted(last):
             return last
-        if kind == "frame":
-            return self.until(lambda m: isinstance(m, Frame) and wanted(m), timeout)
         return self.told(kind, wanted, timeout)
 
     def frame(self, wanted=lambda _: True, timeout=PATIENCE):
         """The first frame whose header is as wanted."""
-        return self.until(lambda m: isinstance(m, Frame) and wanted(m.header), timeout)
+        return self.told("frame", lambda m: wanted(m.header), timeout)
 
     def ask(self, do, timeout=PATIENCE, **fields):
         """The answer to an action."""

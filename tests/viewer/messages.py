@@ -4,10 +4,27 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.messages import Belief, CmdVel, Hypothesis, Odom, Pose, Prediction, Scan, Status, Truth, Twist
-from common.topics import BELIEF, CMD_VEL, ODOM, PREDICTION, SCAN, STATUS, TRUTH
+from common.messages import (
+    Belief,
+    CmdVel,
+    Hypothesis,
+    Odom,
+    Plan,
+    Pose,
+    Prediction,
+    Preference,
+    Scan,
+    Status,
+    Truth,
+    Twist,
+)
+from common.topics import BELIEF, CMD_VEL, ODOM, PLAN, PREDICTION, SCAN, STATUS, TRUTH
 
 SECOND = 1_000_000_000
+PEOPLE = np.array([[5, 6], [7, 8]], np.float32)
+PATH = np.array([[1.5, 2], [3, 2.5], [9, 2]], np.float32)
+MOTION = np.array([[1.5, 2], [1.75, 2]], np.float32)
+UNMAPPED = np.array([[4, 2.25]], np.float32)
 RANGES = np.array([1.5, np.inf, -np.inf, 4.0, 25.0], np.float32)
 
 
@@ -19,7 +36,7 @@ def at(stamp_s: float, x: float = 1.0, error: float = 0.5) -> dict:
     believed = Pose(x=x + error, y=2.0, yaw=0.25)
     return {
         ODOM: Odom(stamp_ns=stamp, pose=pose, twist=twist, covariance=covariance),
-        TRUTH: Truth(stamp_ns=stamp, pose=pose, twist=twist, contact=True),
+        TRUTH: Truth(stamp_ns=stamp, pose=pose, twist=twist, contact=True, people=PEOPLE),
         SCAN: Scan(
             stamp_ns=stamp, angle_min=-1.0, angle_increment=0.5, range_min=0.05, range_max=25.0, ranges=RANGES,
             mount=Pose(x=0.2, y=0.0),
@@ -35,4 +52,14 @@ def at(stamp_s: float, x: float = 1.0, error: float = 0.5) -> dict:
         ),
         STATUS: Status(stamp_ns=stamp, state="navigating", goal=Pose(x=9.0, y=2.0), distance=8.0),
         CMD_VEL: CmdVel(stamp_ns=stamp, twist=Twist(vx=0.3, vy=0.4)),
+        PLAN: Plan(stamp_ns=stamp, path=PATH, motion=MOTION, obstacles=UNMAPPED),
     }  # fmt: skip
+
+
+def preference(stamp_s: float, x: float = 9.0, width: int = 3, height: int = 2) -> Preference:
+    """A field of distances to x, 2; the last cell is out of reach."""
+    distance = np.append(np.arange(width * height - 1, dtype=np.float32), np.float32(np.inf))
+    return Preference(
+        stamp_ns=round(stamp_s * SECOND), goal=Pose(x=x, y=2.0), origin=Pose(x=-1.0, y=-2.0), resolution=0.5,
+        width=width, height=height, distance=distance,
+    )  # fmt: skip

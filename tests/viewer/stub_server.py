@@ -2,7 +2,7 @@
 
 python -m tests.viewer.stub_server --port 8123 --scene ambiguous
 
-Scenes: tracking, ambiguous, lost, half-dead, empty, watching.
+Scenes: tracking, planning, blocked, exploring, ambiguous, lost, half-dead, empty, watching.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from common.robot import Robot
 from common.world import load_world
-from tests.viewer.stub_session import DT, SCANNER, SCENES, Session, pulses
+from tests.viewer.stub_session import DT, SCANNER, SCENES, WORLDS, Session, pulses
 
 STATIC = Path(__file__).resolve().parents[2] / "services" / "viewer" / "static"
 
@@ -31,6 +31,7 @@ class Visitor:
     def __init__(self, socket: WebSocket, session: Session) -> None:
         """They share the session's robot."""
         self.socket, self.session = socket, session
+        self.field: bytes | None = None  # the last one sent
 
     async def tell(self, **message: object) -> None:
         """As JSON."""
@@ -55,9 +56,13 @@ class Visitor:
             columns = zip(*session.history, strict=True) if session.history else [[]] * 6
             names = ("t", "free_energy", "accuracy", "complexity", "error", "speed")
             await self.tell(type="history", samples={n: list(c) for n, c in zip(names, columns, strict=True)})
+            await self.tell(**session.journal())
         while True:
             if live and not session.paused:
                 await self.socket.send_bytes(session.step())
+                if session.planner is not None and session.planner.news is not self.field:
+                    self.field = session.planner.news
+                    await self.socket.send_bytes(self.field)
             if count % 15 == 0:
                 await self.tell(**pulses(session.scene))
             if session.position >= 0 and count % 3 == 0:
@@ -108,10 +113,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--port", type=int, default=8123)
     parser.add_argument("--scene", choices=SCENES, default="tracking")
-    parser.add_argument("--world", default="corridor")
+    parser.add_argument("--world", help="another than the scene's own")
     parser.add_argument("--warm", type=float, default=0.0, help="seconds of the past to begin with")
     args = parser.parse_args()
-    session = Session(load_world(args.world), args.scene)
+    session = Session(load_world(args.world or WORLDS.get(args.scene, "corridor")), args.scene)
     for _ in range(int(args.warm / DT)):
         session.step()
     uvicorn.run(application(session), host="127.0.0.1", port=args.port, log_level="warning")

@@ -9,8 +9,17 @@ import numpy as np
 from common.scanner import SCANNERS
 from common.world import Obstacle, World
 from services.viewer.frames import encode
+from tests.viewer import stub_plan
 
-SCENES = ("tracking", "ambiguous", "lost", "half-dead", "empty", "watching")
+SCENES = ("tracking", "planning", "blocked", "exploring", "ambiguous", "lost", "half-dead", "empty", "watching")
+WORLDS = {"planning": "office", "blocked": "office", "exploring": "maze"}  # other scenes: corridor
+PLANNED = tuple(WORLDS)
+REASONS = {
+    "blocked": "somebody stands in the only way, 0.62 m ahead: waiting until 12 s are over, then another way is tried",
+    "exploring": "2 places are possible: going to (6.3, 4.1) to tell them apart",
+    "manual": "driven by hand",
+}
+PAST = (("idle", ""), ("navigating", ""), ("blocked", "the scan shows something in the way"), ("navigating", ""))
 SCANNER = SCANNERS["tim571"]
 DT = 1 / SCANNER.rate
 COV = (4e-6, 1e-6, 0, 1e-6, 2.5e-6, 0, 0, 0, 3e-6)
@@ -26,6 +35,7 @@ class Session:
         self.rng = np.random.default_rng(1)
         self.pose = np.array([*world.start_pose(0.3)])
         self.t, self.twist, self.seek = 0.0, np.zeros(3), 0.0  # s, m/s and rad/s, s of searching still to do
+        self.planner = stub_plan.Planner(world) if scene in PLANNED else None
         self.goal: np.ndarray | None = self.far_goal()
         self.drive, self.driven = np.zeros(3), -1.0
         self.history: deque[list[float]] = deque(maxlen=900)
@@ -53,11 +63,12 @@ class Session:
         """m/s and rad/s in base_link."""
         if self.t - self.driven < 0.5:
             return self.drive
-        if self.goal is None or self.seek > 0 or self.scene == "lost":
+        if self.goal is None or self.seek > 0 or self.scene in {"lost", "blocked"}:
             return np.zeros(3)
-        away = self.goal[:2] - self.pose[:2]
-        if np.hypot(*away) < 0.15:
+        if np.hypot(*(self.goal[:2] - self.pose[:2])) < 0.15:
             self.goal = self.far_goal()
+        ahead = self.planner.ahead(self.pose[:2]) if self.planner is not None else None
+        away = (self.goal[:2] if ahead is None else ahead) - self.pose[:2]
         direction = np.arctan2(away[1], away[0]) - self.pose[2]
         speed = min(0.9, float(np.hypot(*away)))
         turn = 0.9 * np.arctan2(np.sin(direction), np.cos(direction))
@@ -69,7 +80,7 @@ class Session:
         self.seek = max(0.0, self.seek - DT)
         if self.scene == "lost":
             return "lost", self.pose + np.array([2.6, -0.4, 0.5]), []
-        if self.seek > 0 or self.scene == "ambiguous":
+        if self.seek > 0 or self.scene in {"ambiguous", "exploring"}:
             mirror = np.array([x0 + x1 - self.pose[0], y0 + y1 - self.pose[1], self.pose[2] + np.pi])
             poses = [
                 mirror,
@@ -97,18 +108,12 @@ class Session:
         error = float(np.hypot(*(pose - self.pose)[:2]))
         self.history.append([self.t, accuracy + complexity, accuracy, complexity, error, speed])
         blind = self.scene == "half-dead"
-        status = (
-            "manual"
-            if self.t - self.driven < 0.5
-            else "navigating"
-            if state == "tracking" and self.goal is not None
-            else "lost"
-        )
+        status = self.status(state)
         away = float(np.hypot(*(self.goal[:2] - self.pose[:2]))) if self.goal is not None else None
-        reason = {"lost": f"the belief is {state}: standing until it tracks", "manual": "driven by hand"}.get(
-            status, ""
-        )
+        reason = {"lost": f"the belief is {state}: standing until it tracks", **REASONS}.get(status, "")
         goal = self.goal
+        if self.planner is not None:
+            self.planner.aim(None if goal is None else goal[:2], self.t)
         header = {
             "type": "frame", "t": self.t, "stamp_ns": int(self.t * 1e9), "robot": "robot",
             "truth": {**as_pose(self.pose), "contact": False, "stopped": False},
@@ -120,7 +125,10 @@ class Session:
             "odom": None, "cmd": None, "error": None if blind else error, "speed": speed,
             "status": {
                 "state": status, "reason": reason, "distance": away,
-                "goal": None if goal is None else dict(zip(("x", "y", "yaw"), goal.tolist(), strict=False)),
+                "goal": None if goal is None else {
+                    "x": goal[0], "y": goal[1], "yaw": goal[2] if len(goal) > 2 else 0.0, "tolerance": 0.2,
+                    "yaw_tolerance": 0.15 if len(goal) > 2 else None,
+                },
             },
             "latency_ms": 6.4 + float(self.rng.normal()),
             "scan": {
@@ -134,7 +142,33 @@ class Session:
             "ranges": measured.astype(np.float32),
             "predicted": none if blind else expected.astype(np.float32),
             "sigma": none if blind else sigma.astype(np.float32),
+            **{name: np.asarray(points, np.float32).ravel() for name, points in self.plan(pose).items()},
         })  # fmt: skip
+
+    def status(self, state: str) -> str:
+        """The controller's, with such a belief."""
+        if self.t - self.driven < 0.5:
+            return "manual"
+        if self.scene in REASONS:
+            return self.scene
+        return "lost" if state != "tracking" else "idle" if self.goal is None else "navigating"
+
+    def plan(self, pose: np.ndarray) -> dict[str, np.ndarray]:
+        """Points in map, m, of one that plans."""
+        if self.planner is None:
+            return {}
+        people = stub_plan.people(self.t, self.map)
+        return {
+            "path": self.planner.path(pose[:2]) if self.goal is not None else [],
+            "motion": stub_plan.motion(pose, self.twist), "people": people,
+            "obstacles": stub_plan.seen_of(people, pose[:2]),
+        }  # fmt: skip
+
+    def journal(self) -> dict:
+        """What the controller said."""
+        past = [{"t": self.t - 9 + 2 * i, "state": s, "reason": r} for i, (s, r) in enumerate(PAST)]
+        now = [{"t": self.t, "state": self.scene, "reason": REASONS[self.scene]}] if self.scene in REASONS else []
+        return {"type": "journal", "rows": [*past, *now]}
 
     def laser(self, pose: np.ndarray) -> np.ndarray:
         """The scanner's pose."""

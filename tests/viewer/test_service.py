@@ -19,12 +19,12 @@ from common.messages import Health
 from common.requests import Reply, WorldReply
 from common.robot import Robot
 from common.scanner import SCANNERS
-from common.topics import HEALTH, PAUSE, SCAN, TOPICS, TRUTH, WORLD
+from common.topics import HEALTH, PAUSE, PREFERENCE, SCAN, TOPICS, TRUTH, WORLD
 from common.world import load_world
-from services.viewer.service import SHOWN
+from services.viewer.view import SHOWN
 from tests.conftest import PATIENCE
 from tests.viewer.client import Page, page_of
-from tests.viewer.messages import RANGES, at
+from tests.viewer.messages import RANGES, at, preference
 
 
 @pytest.fixture
@@ -185,6 +185,26 @@ def test_a_robot_made_of_messages_is_shown(viewer, bus):
         assert len(page.last["history"]["samples"]["t"]) > 0
         errors = page.last["history"]["samples"]["error"]
         assert errors == [pytest.approx(0.5)] * len(errors)
+
+
+def test_who_comes_late_is_told_the_field_and_what_was_done(viewer, bus):
+    _, where = viewer()
+    robot = Pretence(bus)
+    with Page(where) as page:
+        page.told("history")
+        bus.put(PREFERENCE, preference(1.0).encode())
+        first = page.told("field")
+        robot.keep_saying(page, lambda h: h["status"])
+        rows = page.by_now("journal", lambda m: m["rows"])["rows"]
+        assert [row["state"] for row in rows] == ["navigating"]
+        bus.put(PREFERENCE, preference(2.0, x=3.0).encode())
+        second = page.told("field")
+        assert [field.header["goal"]["x"] for field in (first, second)] == [9.0, 3.0]
+    bus.put(PREFERENCE, preference(3.0, x=4.0).encode())  # nobody watches
+    time.sleep(0.2)
+    with Page(where) as page:
+        assert page.by_now("field", lambda f: f.header["goal"]["x"] == 4.0).arrays["distance"][-1] == np.inf
+        assert page.by_now("journal", lambda m: m["rows"])["rows"] == rows
 
 
 def test_time_that_goes_back_is_told(viewer, bus):

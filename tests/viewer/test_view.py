@@ -9,15 +9,17 @@ from random import Random
 import numpy as np
 import pytest
 
-from common.topics import BELIEF, CMD_VEL, PREDICTION, SCAN, STATUS, TRUTH
+from common.messages import Goal, Plan, Pose
+from common.topics import BELIEF, CMD_VEL, GOAL, PLAN, PREDICTION, PREFERENCE, SCAN, STATUS, TRUTH
 from services.viewer.frames import encode
 from services.viewer.history import History, Sample
 from services.viewer.moments import QUIET
 from services.viewer.view import PATIENCE, RobotView
 from tests.viewer.client import read_frame
-from tests.viewer.messages import RANGES, at
+from tests.viewer.messages import MOTION, PATH, PEOPLE, RANGES, UNMAPPED, at, preference
 
 PERIOD = 1 / 15
+REST = (BELIEF, PREDICTION, STATUS, CMD_VEL, PLAN)  # what answers a scan
 
 
 def feed(view, stamp, now=None, *leave_out, **how):
@@ -58,6 +60,8 @@ def test_a_frame_is_one_moment():
     np.testing.assert_array_equal(frame.arrays["ranges"], RANGES)
     np.testing.assert_array_equal(frame.arrays["predicted"], np.arange(5))
     np.testing.assert_allclose(frame.arrays["sigma"], 0.1)
+    for name, points in (("path", PATH), ("motion", MOTION), ("obstacles", UNMAPPED), ("people", PEOPLE)):
+        np.testing.assert_array_equal(frame.arrays[name], points.ravel(), err_msg=name)
     assert frame.data == view.frame
 
 
@@ -79,7 +83,7 @@ def test_a_number_that_json_does_not_have_is_not_sent():
 def test_it_waits_for_those_who_spoke_lately_and_no_longer_than_its_patience():
     view = RobotView("robot")
     feed(view, 1.0)
-    late = {BELIEF, PREDICTION, STATUS, CMD_VEL}
+    late = {BELIEF, PREDICTION, STATUS, CMD_VEL, PLAN}
     assert feed(view, 1.1, 1.1, *late) == []
     assert view.due(1.1) == pytest.approx(PATIENCE)
     assert view.overdue(1.1 + PATIENCE / 2) is None
@@ -116,8 +120,8 @@ def test_who_fell_silent_is_not_shown_and_not_waited_for():
 def test_while_time_stands_still_nobody_falls_silent():
     view = RobotView("robot")
     feed(view, 1.0)
-    assert feed(view, 1.1, 100.0, BELIEF, PREDICTION, STATUS, CMD_VEL) == []  # one step after a long pause: it waits
-    rest = {topic: message for topic, message in at(1.1).items() if topic in {BELIEF, PREDICTION, STATUS, CMD_VEL}}
+    assert feed(view, 1.1, 100.0, *REST) == []  # one step after a long pause: it waits
+    rest = {topic: message for topic, message in at(1.1).items() if topic in REST}
     frames = [view.hear(topic, message, 100.01) for topic, message in rest.items()]
     assert read_frame(frames[-1]).header["belief"]["stamp_ns"] == 1_100_000_000
 
@@ -126,9 +130,6 @@ def shown(view, now):
     """The frame of a replay once it is quiet."""
     frame = view.overdue(now + QUIET)
     return frame if frame is None else read_frame(frame)
-
-
-REST = (BELIEF, PREDICTION, STATUS, CMD_VEL)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -242,3 +243,107 @@ def test_a_truth_that_comes_after_its_belief_still_gives_the_error():
     for topic in (SCAN, BELIEF, TRUTH):
         view.hear(topic, messages[topic], 1.0)
     assert view.history.columns()["error"] == [pytest.approx(0.5)]
+
+
+def test_an_empty_plan_is_the_last_one_and_nobody_waits_for_another():
+    view = RobotView("robot")
+    feed(view, 1.0)
+    assert feed(view, 1.1, 1.1, PLAN) == []  # there was one
+    view.hear(PLAN, Plan(stamp_ns=1_100_000_000), 1.11)
+    (frame,) = feed(view, 1.2, 1.2, PLAN)
+    assert len(frame.arrays["path"]) == len(frame.arrays["obstacles"]) == 0
+    assert view.due(1.2) is None
+
+
+def test_what_a_goal_asks_for_is_shown_with_it():
+    view, goal = RobotView("robot"), Pose(x=9.0, y=2.0)
+    said = at(1.0)[STATUS].model_copy(update={"goal_seq": 7})
+
+    def shown_goal(number, **asks):
+        view.hear(GOAL, Goal(stamp_ns=0, seq=number, pose=goal, **asks), 1.0)
+        view.hear(STATUS, said, 1.0)
+        (frame,) = feed(view, view.stamp_ns * 1e-9 + 0.1, 1.0, STATUS)
+        return frame.header["status"]["goal"]
+
+    assert "tolerance" not in shown_goal(3, tolerance=0.5)  # another goal's
+    assert shown_goal(7, tolerance=0.5)["yaw_tolerance"] is None
+    asked = shown_goal(7, tolerance=0.4, yaw_tolerance=0.15)
+    assert (asked["tolerance"], asked["yaw_tolerance"]) == (0.4, 0.15)
+
+
+def told_field(view):
+    data = view.fields.change(view.stamp_ns, live=view.live)
+    return data if data is None else read_frame(data)
+
+
+def test_a_field_is_told_once_and_outlives_a_reset():
+    view = RobotView("robot")
+    feed(view, 5.0)
+    assert told_field(view) is None
+    view.hear(PREFERENCE, preference(5.0), 5.0)
+    field = told_field(view)
+    assert field.header == {
+        "type": "field", "robot": "robot", "t": 5.0, "goal": {"x": 9.0, "y": 2.0, "yaw": 0.0},
+        "origin": {"x": -1.0, "y": -2.0}, "resolution": 0.5, "width": 3, "height": 2, "arrays": {"distance": [0, 6]},
+    }  # fmt: skip
+    np.testing.assert_array_equal(field.arrays["distance"], [0, 1, 2, 3, 4, np.inf])
+    feed(view, 6.0)
+    assert told_field(view) is None
+    feed(view, 1.0)  # the simulation began anew; its goal is the same
+    assert view.began_anew
+    assert view.fields.shown == field.data
+    view.hear(PREFERENCE, preference(1.0, x=3.0), 7.0)
+    assert told_field(view).header["goal"]["x"] == 3.0
+
+
+def test_a_replay_shows_the_field_of_its_time():
+    view = RobotView("ghost", live=False)
+    for stamp, x in ((1.0, 1.0), (5.0, 5.0)):
+        view.hear(PREFERENCE, preference(stamp, x), stamp)
+        feed(view, stamp)
+        assert told_field(view).header["goal"]["x"] == x
+    feed(view, 3.0)  # back
+    assert told_field(view).header["goal"]["x"] == 1.0
+    feed(view, 0.5)
+    assert told_field(view) is None
+    feed(view, 6.0)
+    assert told_field(view).header["goal"]["x"] == 5.0
+
+
+def test_a_large_field_is_thinned_out_and_its_cells_stay_where_they_were():
+    view, side = RobotView("robot"), 401
+    view.hear(PREFERENCE, preference(1.0, width=side, height=side), 1.0)
+    field = told_field(view)
+    header, values = field.header, field.arrays["distance"]
+    assert header["width"] == header["height"] == 134
+    assert header["resolution"] == 1.5
+    for cell in (0, 77, 134 * 50 + 3):
+        row, column = divmod(cell, 134)
+        x, y = (header["origin"][k] + (n + 0.5) * 1.5 for k, n in (("x", column), ("y", row)))
+        old = int((y + 2) / 0.5) * side + int((x + 1) / 0.5)
+        assert values[cell] == old
+        assert (x + 1) / 0.5 % 1 == pytest.approx(0.5)  # the middle of a cell
+
+
+def test_the_journal_has_a_row_for_each_change_of_mind():
+    view = RobotView("robot")
+
+    def say(stamp, state, reason=""):
+        view.hear(STATUS, at(stamp)[STATUS].model_copy(update={"state": state, "reason": reason}), stamp)
+        grew, view.new_row = view.new_row, False
+        return grew
+
+    assert say(1.0, "navigating")
+    assert not say(1.1, "navigating")
+    assert say(2.0, "blocked", "somebody stands 0.52 m ahead")
+    assert not say(2.1, "blocked", "somebody stands 0.49 m ahead")  # numbers go on changing
+    assert say(3.0, "blocked", "no way round")
+    assert [(row["t"], row["state"], row["reason"]) for row in view.journal.rows()] == [
+        (1.0, "navigating", ""), (2.0, "blocked", "somebody stands 0.52 m ahead"), (3.0, "blocked", "no way round"),
+    ]  # fmt: skip
+    for i in range(50):
+        assert say(4.0 + i, ("idle", "navigating")[i % 2])
+    assert len(view.journal.rows()) == 20
+    feed(view, 60.0)
+    feed(view, 1.0)  # back
+    assert [row["t"] for row in view.journal.rows()] == [1.0]

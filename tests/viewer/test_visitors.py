@@ -85,11 +85,13 @@ def test_answers_keep_their_order_and_news_its_newest():
         visitor.say("services 1", "services")
         visitor.say("second")
         visitor.say("services 2", "services")
+        visitor.say(b"field 1", "field")
+        visitor.say(b"field 2", "field")
         visitor.show(b"frame")
         for _ in range(9):
             line.permits.release()
         await settle()
-        assert line.taken == ["first", "services 2", "second", b"frame"]
+        assert line.taken == ["first", "services 2", "second", b"field 2", b"frame"]
 
     run(story)
 

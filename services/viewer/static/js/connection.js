@@ -1,6 +1,6 @@
 // The socket: questions with answers, and its own return after a loss.
 
-import { decodeFrame } from "./protocol.js";
+import { decode } from "./protocol.js";
 
 const SILENCE = 6000; // ms without a message: the other side is gone, services are told every second
 const ANSWER = 20000; // ms until a question counts as unanswered
@@ -44,7 +44,7 @@ export class Connection {
   receive(data) {
     let message;
     try {
-      message = typeof data === "string" ? JSON.parse(data) : decodeFrame(data);
+      message = typeof data === "string" ? JSON.parse(data) : decode(data);
     } catch {
       this.undecodable += 1;
       return;

@@ -127,8 +127,8 @@ export function drawHypotheses(ctx, camera, frame, radius, colours) {
   }
 }
 
-/** The goal with its tolerance, and the way to it. */
-export function drawGoal(ctx, camera, goal, from, colours, { tolerance, planned = false } = {}) {
+/** The goal with its tolerance, the heading it asks for, and a straight line to it from `from`. */
+export function drawGoal(ctx, camera, goal, from, colours, { planned = false } = {}) {
   const [px, py] = camera.toScreen(goal.x, goal.y);
   ctx.strokeStyle = ctx.fillStyle = colours.goal;
   if (from && !planned) {
@@ -142,7 +142,7 @@ export function drawGoal(ctx, camera, goal, from, colours, { tolerance, planned 
     ctx.setLineDash([]);
   }
   ctx.beginPath();
-  ctx.arc(px, py, Math.max((tolerance ?? 0.2) * camera.scale, 8), 0, 2 * Math.PI);
+  ctx.arc(px, py, Math.max((goal.tolerance ?? 0.2) * camera.scale, 8), 0, 2 * Math.PI);
   ctx.globalAlpha = 0.14;
   ctx.fill();
   ctx.globalAlpha = 1;
@@ -153,7 +153,7 @@ export function drawGoal(ctx, camera, goal, from, colours, { tolerance, planned 
   ctx.beginPath();
   ctx.arc(px, py, 2.5, 0, 2 * Math.PI);
   ctx.fill();
-  if (Number.isFinite(goal.yaw)) drawHeading(ctx, px, py, goal.yaw, Math.max(0.45 * camera.scale, 24));
+  if (planned ? Number.isFinite(goal.yaw) : goal.yaw_tolerance != null) drawHeading(ctx, px, py, goal.yaw, Math.max(0.45 * camera.scale, 24));
 }
 
 /** An arrow from a point in pixels. */

@@ -12,6 +12,7 @@ import { Modes } from "./modes.js";
 import { Panels } from "./panels.js";
 import { Player } from "./player.js";
 import { Pointer } from "./pointer.js";
+import { Reasons } from "./reasons.js";
 import { Services } from "./services.js";
 import { Store } from "./store.js";
 import { startTheme } from "./theme.js";
@@ -21,6 +22,7 @@ import { Toolbar } from "./toolbar.js";
 const store = new Store();
 const view = new MapView(store);
 const panels = new Panels(store);
+const reasons = new Reasons(store);
 const services = new Services(store, toast);
 const connection = new Connection({ message: take, frame: takeFrame, state: connectionChanged });
 const actions = new Actions(store, connection, toast);
@@ -30,6 +32,7 @@ const toolbar = new Toolbar(store, modes, actions);
 const drive = new Drive(store, actions, () => modes.can);
 const player = new Player(store, connection, toast);
 const draw = eachPicture(() => panels.draw());
+reasons.drawJournal();
 let layout = remembered("layout"); // "wide", "side", or by the world's shape
 let wanted = new URLSearchParams(location.search).get("robot");
 
@@ -55,12 +58,14 @@ setInterval(() => {
   services.drawMissing();
   panels.drawBadges();
   panels.drawVitals();
+  reasons.draw();
 }, 500);
 
 /** A message of the server; one that is unknown is newer than this page. */
 function take(message) {
   const known = {
     hello: takeHello, world: takeWorld, services: takeServices, history: takeHistory, player: takePlayer, closed: takeClosed,
+    journal: takeJournal, field: takeField,
   }[message.type];
   known?.(message);
 }
@@ -81,6 +86,7 @@ function takeHello(hello) {
   else wanted = hello.robot;
   if (first && hello.control) actions.recordStatus();
   $("joystick").hidden = !hello.control || !matchMedia("(pointer: coarse)").matches;
+  view.rearrange();
   redraw();
 }
 
@@ -106,6 +112,16 @@ function takeHistory({ samples }) {
   draw();
 }
 
+function takeJournal({ rows }) {
+  store.journal = rows;
+  reasons.drawJournal();
+}
+
+function takeField(field) {
+  store.field = field;
+  view.invalidate();
+}
+
 function takeFrame(frame) {
   const before = store.frame;
   store.takeFrame(frame, performance.now());
@@ -114,6 +130,7 @@ function takeFrame(frame) {
   const state = frame.belief?.state ?? frame.status?.state ?? "";
   const title = `${frame.robot}${state ? ` · ${state}` : ""} · presage`;
   if (document.title !== title) document.title = title;
+  if (before?.status?.state !== frame.status?.state) reasons.draw();
   view.invalidate();
   draw();
 }
@@ -152,6 +169,8 @@ function redraw() {
   player.draw();
   toolbar.draw();
   services.draw();
+  reasons.draw();
+  reasons.drawJournal();
   view.invalidate();
   draw();
 }

@@ -5,7 +5,9 @@ import { eachPicture, sharp } from "./canvas.js";
 import { $, h, remembered, stillness } from "./dom.js";
 import * as robot from "./draw_belief.js";
 import * as scan from "./draw_scan.js";
+import * as way from "./draw_way.js";
 import * as ground from "./draw_world.js";
+import { drawField } from "./field.js";
 import { boundsOf } from "./geometry.js";
 import { palette } from "./theme.js";
 
@@ -14,22 +16,25 @@ const LAYERS = [
   { key: "predicted", label: "predicted scan", tone: "predicted", mark: "line" },
   { key: "belief", label: "believed pose", tone: "predicted", mark: "disc" },
   { key: "hypotheses", label: "hypotheses", tone: "hypothesis", mark: "disc" },
-  { key: "truth", label: "true pose", tone: "truth", mark: "ring" },
-  { key: "path", label: "path, last minute", tone: "predicted", mark: "trail" },
+  { key: "truth", label: "true pose, people", tone: "truth", mark: "ring" },
+  { key: "path", label: "way, last minute", tone: "predicted", mark: "trail" },
+  { key: "motion", label: "predicted motion", tone: "predicted", mark: "thick" },
   { key: "goal", label: "goal", tone: "goal", mark: "disc" },
+  { key: "plan", label: "planned path", tone: "goal", mark: "plain" },
+  { key: "field", label: "distance to go", tone: "goal", mark: "rings" },
+  { key: "unmapped", label: "not in the map", tone: "unmapped", mark: "diamond" },
 ];
 
 export class MapView {
   constructor(store) {
     this.store = store;
     this.camera = new Camera();
-    this.shown = Object.fromEntries(LAYERS.map(({ key }) => [key, remembered(`layer.${key}`) !== "off"]));
+    const usual = (key) => (key === "field" && innerWidth <= 760 ? "off" : "on"); // a phone's map is small
+    this.shown = Object.fromEntries(LAYERS.map(({ key }) => [key, (remembered(`layer.${key}`) ?? usual(key)) === "on"]));
     this.gesture = {}; // what the pointer is doing: ghost, plan, goal, carry, hovered, selected
     this.invalidate = eachPicture(() => this.draw());
     this.surface = sharp($("map"), ({ width, height }) => {
-      this.camera.padding = width < 600
-        ? { left: 26, right: 16, top: 12, bottom: 112 }
-        : { left: width > 1000 ? 176 : 40, right: width > 1000 ? 64 : 40, top: 28, bottom: 122 };
+      this.arrange(width);
       this.camera.resize(width, height);
       this.invalidate();
     });
@@ -37,8 +42,17 @@ export class MapView {
     this.buildZoom();
   }
 
+  /** Room beside the map for what floats over it. */
+  arrange(width) {
+    const stick = $("joystick").hidden ? 0 : 100;
+    this.camera.padding = width < 600
+      ? { left: 26, right: 16, top: 52, bottom: 112 + stick }
+      : { left: $("legend").open ? 186 : 40, right: 64, top: 28, bottom: 122 };
+  }
+
   buildLegend() {
     $("legend").open = innerWidth > 760;
+    $("legend").addEventListener("toggle", () => this.rearrange());
     for (const { key, label, tone, mark } of LAYERS) {
       const box = h("input", { type: "checkbox", onchange: () => this.show(key, box.checked) });
       box.checked = this.shown[key];
@@ -46,6 +60,14 @@ export class MapView {
       swatch.style.setProperty("--tone", `var(--${tone})`);
       $("legend").append(h("label", { data: { layer: key } }, box, swatch, h("span", {}, label)));
     }
+  }
+
+  /** After something that floats over the map came or went. */
+  rearrange() {
+    const { width, height } = this.surface;
+    this.arrange(width);
+    this.camera.resize(width, height);
+    this.invalidate();
   }
 
   show(key, shown) {
@@ -97,6 +119,7 @@ export class MapView {
     ctx.globalAlpha = store.connected ? 1 : 0.45;
     if (world) {
       ground.drawFloor(ctx, camera, world, colours);
+      if (store.prior && shown.field) drawField(ctx, camera, store.prior, colours);
       ground.drawRulers(ctx, camera, world, colours);
     }
     const pose = frame ? scan.scannerPose(frame) : null;
@@ -115,8 +138,12 @@ export class MapView {
     }
     if (pose && shown.predicted) scan.drawPredicted(ctx, camera, frame, pose, colours);
     if (pose && shown.measured) scan.drawMeasured(ctx, camera, frame, pose, colours);
-    const goal = frame.status?.goal;
-    if (shown.goal && goal) robot.drawGoal(ctx, camera, goal, frame.belief ?? frame.truth, colours, { tolerance: goal.tolerance });
+    const goal = frame.status?.goal, planned = frame.path.length > 0;
+    if (shown.plan && planned) way.drawPath(ctx, camera, frame.path, colours);
+    if (shown.goal && goal) robot.drawGoal(ctx, camera, goal, planned ? null : frame.belief ?? frame.truth, colours);
+    if (shown.unmapped) way.drawUnmapped(ctx, camera, frame.obstacles, colours);
+    if (shown.truth) way.drawPeople(ctx, camera, frame.people, colours);
+    if (shown.motion && frame.belief) way.drawMotion(ctx, camera, frame.motion, frame.belief, colours);
     if (frame.belief && shown.hypotheses) robot.drawHypotheses(ctx, camera, frame, radius, colours);
     if (frame.belief && shown.belief) robot.drawBelief(ctx, camera, frame, radius, colours);
     if (frame.truth && shown.truth) robot.drawTruth(ctx, camera, frame, radius, colours);

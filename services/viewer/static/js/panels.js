@@ -4,14 +4,11 @@ import { Chart, cursor, indexAt } from "./chart.js";
 import { $, h, icon, setText } from "./dom.js";
 import { describeBelief } from "./draw_belief.js";
 import { metres, number } from "./format.js";
+import { STATUS } from "./reasons.js";
 import { ScanPlot } from "./scan_plot.js";
 
 const WORDS_EVERY = 180; // ms; faster nobody reads
 const BELIEF = { tracking: ["s-dot", "good"], localising: ["s-half", "work"], ambiguous: ["s-diamond", "warn"], lost: ["s-triangle", "bad"] };
-const STATUS = {
-  idle: ["s-ring", ""], navigating: ["s-play", "work"], reached: ["s-check", "good"], blocked: ["s-square", "warn"],
-  lost: ["s-triangle", "bad"], manual: ["s-dot", "work"],
-};
 
 export class Panels {
   constructor(store) {

@@ -15,7 +15,9 @@ export class Store {
 
   /** Forget the robot that was watched. */
   clear() {
-    this.world = this.scanner = this.robot = this.frame = null;
+    this.world = this.scanner = this.robot = this.frame = this.field = null;
+    this.journal = []; // {t, state, reason} of the controller, the oldest first
+    this.stoppedAt = 0; // ms, since when the obstacle stop holds the wheels back
     this.services = [];
     this.missing = [];
     this.servicesKnown = false;
@@ -37,8 +39,11 @@ export class Store {
     return Boolean(this.hello?.control);
   }
 
-  get hasWorld() {
-    return this.world !== null;
+  /** The goal prior, where it is about the goal there is. */
+  get prior() {
+    const goal = this.frame?.status?.goal, { field } = this;
+    const same = goal && field?.robot === this.frame.robot && Math.hypot(field.goal.x - goal.x, field.goal.y - goal.y) < 0.01;
+    return same ? field : null;
   }
 
   /** Hz over the last arrivals, 0 where none came for two seconds. */
@@ -57,6 +62,7 @@ export class Store {
   takeFrame(frame, now) {
     const before = this.frame;
     if (before && frame.robot !== before.robot) this.forget();
+    if (!before?.truth?.stopped) this.stoppedAt = now;
     this.frame = frame;
     this.arrivals.push(now);
     while (now - this.arrivals[0] > 4000) this.arrivals.shift();

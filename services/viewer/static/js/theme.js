@@ -3,7 +3,7 @@
 import { $, remembered } from "./dom.js";
 
 const NAMES = ["bg", "surface", "line", "line-strong", "ink", "ink-2", "ink-3", "measured", "predicted", "goal", "hypothesis",
-  "warn", "truth", "outside", "free", "grid", "wall", "obstacle", "obstacle-line", "accent"];
+  "warn", "truth", "outside", "free", "grid", "wall", "obstacle", "obstacle-line", "accent", "unmapped", "unmapped-line"];
 const system = matchMedia("(prefers-color-scheme: dark)");
 const CHOICES = ["system", "light", "dark"];
 let current = null;

@@ -1,0 +1,53 @@
+// Why the robot stands or wanders: in full over the map while it does, and the last reasons with their times.
+
+import { $, h, icon, setText } from "./dom.js";
+
+export const STATUS = {
+  idle: ["s-ring", ""], navigating: ["s-play", "work"], reached: ["s-check", "good"], blocked: ["s-square", "warn"],
+  lost: ["s-triangle", "bad"], manual: ["s-dot", "work"], exploring: ["i-localise", "work"],
+};
+const TOLD = { blocked: "Standing", lost: "Lost", exploring: "Exploring" };
+const HELD_BACK = 600; // ms of the obstacle stop that are worth a word
+
+export class Reasons {
+  constructor(store) {
+    this.store = store;
+    this.title = h("b");
+    this.text = h("span");
+    this.mark = icon("s-square");
+    $("why").append(this.mark, h("div", {}, this.title, " ", this.text));
+  }
+
+  /** What is said over the map: state, title and text; null where all is well. */
+  get now() {
+    const { frame, missing, connected, stoppedAt } = this.store, status = frame?.status;
+    if (!connected || missing.some((one) => one.name === "controller")) return null;
+    if (status && status.state in TOLD) return [status.state, `${TOLD[status.state]}:`, status.reason || "no reason given"];
+    if (frame?.truth?.contact) return ["lost", "Contact:", "the robot touches something"];
+    if (frame?.truth?.stopped && performance.now() - stoppedAt > HELD_BACK) {
+      return ["blocked", "Obstacle stop:", "something is too near ahead; the robot's own stop holds its wheels back"];
+    }
+    return null;
+  }
+
+  draw() {
+    const now = this.now;
+    $("why").hidden = !now;
+    if (!now) return;
+    const [state, title, text] = now, [mark, tone] = STATUS[state];
+    $("why").dataset.tone = tone;
+    this.mark.querySelector("use").setAttribute("href", `#${mark}`);
+    setText(this.title, title);
+    setText(this.text, text);
+  }
+
+  /** The log, the newest first. */
+  drawJournal() {
+    const rows = [...this.store.journal].reverse().map(({ t, state, reason }) => {
+      const [mark, tone] = STATUS[state] ?? STATUS.idle;
+      return h("li", { data: { tone } }, h("time", {}, `${t.toFixed(1)} s`), icon(mark),
+        h("span", {}, h("b", {}, state), reason ? ` ${reason}` : ""));
+    });
+    $("journal").replaceChildren(...(rows.length ? rows : [h("li", { class: "quiet" }, "The controller has said nothing yet.")]));
+  }
+}

@@ -1,0 +1,81 @@
+"""What a controller that plans would say of the stub's robot: field, path, motion, what the map does not know."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from common.messages import Pose, Preference
+from common.world import World
+from services.controller.geodesic import Field, Roads
+from services.controller.grid import FreeSpace
+from services.viewer.fields import field_of
+
+RADIUS = 0.27  # m
+AHEAD = 0.8  # m of the path, the point that is driven to
+
+
+class Planner:
+    """In a world that is known."""
+
+    def __init__(self, world: World) -> None:
+        """No goal yet."""
+        self.roads = Roads(FreeSpace.of(world), RADIUS)
+        self.goal: np.ndarray | None = None
+        self.field: Field | None = None
+        self.news: bytes | None = None  # the field, until somebody has sent it
+
+    def aim(self, goal: np.ndarray | None, t: float) -> None:
+        """Another goal (2,) m, or none; at a time, s."""
+        if goal is None or (self.goal is not None and np.allclose(goal, self.goal)):
+            return
+        self.goal, self.field = goal, self.roads.from_(goal)
+        if self.field is None:
+            return
+        grid = self.roads.grid
+        message = Preference(
+            stamp_ns=int(t * 1e9), goal=Pose(x=goal[0], y=goal[1]), origin=Pose(x=grid.origin[0], y=grid.origin[1]),
+            resolution=grid.resolution, width=grid.shape[1], height=grid.shape[0],
+            distance=self.field.cost.ravel().astype(np.float32),
+        )  # fmt: skip
+        self.news = field_of(message, "robot")
+
+    def path(self, place: np.ndarray) -> np.ndarray:
+        """(K, 2) m to the goal."""
+        return self.field.path(place) if self.field is not None else np.zeros((0, 2))
+
+    def ahead(self, place: np.ndarray) -> np.ndarray | None:
+        """(2,) m on the path, some way on."""
+        path = self.path(place)
+        if not len(path):
+            return None
+        gone = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+        return np.asarray(path[min(np.searchsorted(gone, AHEAD), len(path) - 1)])
+
+
+def motion(pose: np.ndarray, twist: np.ndarray) -> np.ndarray:
+    """(T, 2) m, where a velocity (3,) in base_link leads while it brakes at 1 m/s²."""
+    speed = float(np.hypot(*twist[:2]))
+    heading = pose[2] + np.arctan2(twist[1], twist[0])
+    times = np.linspace(0, speed, 12)
+    way = speed * times - times**2 / 2
+    bent = heading + 0.5 * twist[2] * times
+    return np.stack([pose[0] + way * np.cos(bent), pose[1] + way * np.sin(bent)], axis=1)
+
+
+def people(t: float, world: World) -> np.ndarray:
+    """(3, 2) m, three who walk up and down."""
+    x0, y0, x1, y1 = world.bounds
+    share = 0.5 + 0.4 * np.sin(0.3 * t + np.array([0.0, 2.0, 4.0]))
+    across = np.array([0.5, 0.45, 0.55])
+    return np.stack([x0 + share * (x1 - x0), y0 + across * (y1 - y0)], axis=1)
+
+
+def seen_of(people: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """(M, 2) m, the side of each person and of a box that is turned to the robot."""
+    around = np.linspace(-1.2, 1.2, 9)
+    sides = []
+    for person in people:
+        if np.hypot(*(person - place)) < 5:
+            towards = np.arctan2(*(place - person)[::-1])
+            sides.append(person + 0.25 * np.stack([np.cos(towards + around), np.sin(towards + around)], axis=1))
+    return np.concatenate(sides) if sides else np.zeros((0, 2))
