@@ -1,0 +1,57 @@
+"""Two identical rooms: both are kept while no scan tells, and the corridor decides, without odometry."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from common.world import load_world
+from presage.accuracy.scenes import Scene
+from services.estimator.building import Choice, Geometry, prepare
+
+TWIN = np.array([6.0, 0.0, 0.0])
+WORLD = load_world("twins")
+RATE = 15.0
+
+
+def begun(model, seed):
+    scene = Scene.of(WORLD, 622, seed)
+    scanner = scene.scanner
+    made = prepare(Choice("twins", model=model))(Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max))
+    return made, scene
+
+
+def drive(start, *corners, speed=0.8):
+    """(N, 3) poses, one a scan, with the heading of the start."""
+    points = np.array([start[:2], *corners])
+    legs = [np.linspace(a, b, int(np.hypot(*(b - a)) / speed * RATE)) for a, b in pairwise(points)]
+    places = np.concatenate(legs)
+    return np.column_stack([places, np.full(len(places), start[2])])
+
+
+# The two fields, each with errors of its own, differ by up to about 24 nats (40 places); evidence counts a twentieth.
+@pytest.mark.parametrize(("model", "most"), [("learned", 0.85), ("exact", 0.55)])
+@pytest.mark.parametrize("room", [0, 1])
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+def test_both_rooms_are_kept_until_the_corridor_tells(model, most, room, yaw):
+    made, scene = begun(model, 10 * room + int(yaw))
+    start = np.array([2.0, 2.2, yaw])
+    stands = np.tile(start, (30, 1))
+    path = np.concatenate([stands, drive(start, [2.95, 3.6], [2.95, 5.4], [4.5, 5.4])]) + room * TWIN
+    clean, states, off = scene.clean(path), [], []
+    for k, pose in enumerate(path):
+        posterior = made.update(scene.observe(clean[k], k / RATE))
+        states.append(posterior.state)
+        off.append(float(np.hypot(*(posterior.pose - pose)[:2])))
+        if k in {0, 29}:
+            assert posterior.state == "ambiguous"
+            first, second = posterior.hypotheses
+            both = sorted([first.pose, second.pose], key=lambda p: p[0])
+            assert np.array(both) == pytest.approx(np.array([start, start + TWIN]), abs=0.01)
+            assert first.weight < most
+    assert states[-1] == "tracking"
+    assert max(off[-15:]) < 0.01
+    sure = np.array(states) == "tracking"
+    assert (np.array(off)[sure] < 0.05).all()  # what is claimed is true, all the way
