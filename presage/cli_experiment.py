@@ -2,41 +2,38 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from common.errors import UserError
+from presage.cli_driving import navigate
+from presage.experiment_options import (
+    CORES,
+    OUT,
+    Alpha,
+    Beams,
+    Estimators,
+    ExperimentSeed,
+    Out,
+    Steps,
+    Trials,
+    Workers,
+    World,
+    show,
+)
 from presage.options import console
 from presage.output import make_folder
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from types import ModuleType
-
-    from presage.experiments.results import Result
-
 app = typer.Typer(
-    help="The experiments of Burghardt & Lanillos 2021, for presets paper and precise and the particle filter.",
+    help="The experiments of Burghardt & Lanillos 2021, for presets paper and precise and the particle filter; and "
+    "navigation round walls and people.",
     no_args_is_help=True,
 )
 
-Trials = Annotated[int, typer.Option(min=1, help="How many; few are enough for a look.")]
-ExperimentSeed = Annotated[int, typer.Option("--seed", min=0, max=2**31, help="Of places, noise, particles.")]
-Out = Annotated[Path, typer.Option(help="Folder for NAME.json, .csv, .pdf, .png.")]
-Workers = Annotated[int, typer.Option(min=1, help="Processes side by side; none: one a core.")]
-Estimators = Annotated[str, typer.Option(help="Comma-separated, as the table names them, without their own commas.")]
-Alpha = Annotated[float | None, typer.Option(min=1e-8, max=1.0, help="Paper: step size, m²; none: the best found.")]
-Steps = Annotated[int | None, typer.Option(min=1, help="Paper: gradient steps a scan; none: 1, as the paper.")]
-World = Annotated[str, typer.Option(help="World that the paper's decoder and a field were trained for.")]
-Beams = Annotated[int, typer.Option(min=2, help="Beams of the scanner.")]
-
-OUT = Path("experiments")
 FEWEST = 50  # samples that anything can be learned from
-CORES = os.cpu_count() or 1
 
 
 @app.command("e1")
@@ -62,7 +59,7 @@ def e1(
 
     job = localisation.Job(0, seed, iterations, field=Field(world, beams), descent=descent_of(alpha, steps))
     job = replace(job, estimators=chosen(estimators)) if estimators else job
-    _show(localisation, lambda: localisation.run(job, trials, out, workers, console), out)
+    show(localisation, lambda: localisation.run(job, trials, out, workers, console), out)
 
 
 @app.command("e2")
@@ -87,7 +84,7 @@ def e2(
 
     job = crossing.Job(0, seed, step, field=Field(world, beams), descent=descent_of(alpha, steps))
     job = replace(job, estimators=chosen(estimators)) if estimators else job
-    _show(crossing, lambda: crossing.run(job, trials, out, workers, console), out)
+    show(crossing, lambda: crossing.run(job, trials, out, workers, console), out)
 
 
 @app.command("e3")
@@ -116,7 +113,7 @@ def e3(
 
     job = navigation.Job(0, seed, apart, free=free, field=Field(world, beams), descent=descent_of(alpha, steps))
     job = replace(job, estimators=chosen(estimators)) if estimators else job
-    _show(navigation, lambda: navigation.run(job, trials, out, workers, console), out)
+    show(navigation, lambda: navigation.run(job, trials, out, workers, console), out)
 
 
 @app.command("alpha")
@@ -139,7 +136,7 @@ def alpha_sweep(
         raise UserError(f"--alphas {alphas!r}: give numbers, such as 2e-4,4e-4") from None
     if not all(1e-8 <= value <= 1 for value in wanted):
         raise UserError(f"--alphas {alphas!r}: each must lie between 1e-8 and 1 m²")
-    _show(step_size, lambda: step_size.run(localisation.Job(0, seed, 50), trials, out, workers, console, wanted), out)
+    show(step_size, lambda: step_size.run(localisation.Job(0, seed, 50), trials, out, workers, console, wanted), out)
 
 
 @app.command("steps")
@@ -150,7 +147,7 @@ def step_sizes(trials: Trials = 10, seed: ExperimentSeed = 1, out: Out = OUT, wo
     """
     from presage.experiments import stepping  # noqa: PLC0415
 
-    _show(stepping, lambda: stepping.run(stepping.Job(0, seed), trials, out, workers, console), out)
+    show(stepping, lambda: stepping.run(stepping.Job(0, seed), trials, out, workers, console), out)
 
 
 @app.command("samples")
@@ -173,7 +170,7 @@ def samples_needed(
         raise UserError(f"--sizes {sizes!r}: give whole numbers, such as 500,2000") from None
     if min(wanted) < FEWEST:
         raise UserError(f"--sizes {sizes!r}: each must be at least {FEWEST} samples")
-    _show(samples, lambda: samples.run(samples.Job(seed, places=places), out, workers, console, wanted), out)
+    show(samples, lambda: samples.run(samples.Job(seed, places=places), out, workers, console, wanted), out)
 
 
 @app.command("aliasing")
@@ -189,7 +186,7 @@ def similar_objects(
     """
     from presage.experiments import aliasing  # noqa: PLC0415
 
-    _show(aliasing, lambda: aliasing.run(aliasing.Job(seed, places=places), out, workers, console), out)
+    show(aliasing, lambda: aliasing.run(aliasing.Job(seed, places=places), out, workers, console), out)
 
 
 @app.command("prediction")
@@ -204,17 +201,7 @@ def predicted(
     """
     from presage.experiments import prediction  # noqa: PLC0415
 
-    _show(prediction, lambda: prediction.run(prediction.Job(seed, scans), out, 1, console), out)
-
-
-def _show(experiment: ModuleType, run: Callable[[], Result], out: Path) -> None:
-    """Run it; its table, its notes, and where everything lies."""
-    make_folder(out, "--out")
-    result = run()
-    print(f"\n{experiment.table(result.summary)}\n")
-    if result.notes:
-        console.print(*result.notes, sep="\n")
-    console.print(f"{out / result.name}.json, .csv, .trials.jsonl, .pdf, .png")
+    show(prediction, lambda: prediction.run(prediction.Job(seed, scans), out, 1, console), out)
 
 
 @app.command("all")
@@ -250,7 +237,11 @@ def tables(
         page.write_text(filled(page.read_text(encoding="utf-8"), out), encoding="utf-8")
         return
     found = [name for name in MODULES if (out / f"{name}.json").exists()]
+    found += sorted(path.stem for path in out.glob("navigation-*.json"))
     if not found:
         raise UserError(f"{out}: no results there; make them with: presage experiment all")
     for name in found:
         print(f"\n{name}\n\n{table_of(name, out)}")
+
+
+app.command("navigation")(navigate)

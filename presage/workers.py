@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -30,8 +31,13 @@ def pool(workers: int) -> Iterator[ProcessPoolExecutor]:
         executor.shutdown(wait=False, cancel_futures=True)
         for child in children:
             child.terminate()
+        deadline = time.monotonic() + ENDS_WITHIN
         for child in children:
-            child.join(ENDS_WITHIN)
+            child.join(max(0.0, deadline - time.monotonic()))
+        for child in children:
+            if child.is_alive():  # it was ending what it had started, and would take up the next task
+                child.kill()
+                child.join()
         raise
     executor.shutdown()
 

@@ -16,9 +16,9 @@ from presage.experiments.results import mean_std, number
 # Experiments in the order of the page, and the modules that run them.
 MODULES = {
     "e1": "localisation", "e2": "crossing", "e3": "navigation", "alpha": "step_size", "steps": "stepping",
-    "samples": "samples", "aliasing": "aliasing", "prediction": "prediction",
+    "samples": "samples", "aliasing": "aliasing", "prediction": "prediction", "navigation": "driving",
 }  # fmt: skip
-MARKED = re.compile(r"(<!-- table (?P<name>[\w/]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+MARKED = re.compile(r"(<!-- table (?P<name>[\w/.-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 Summary = dict[str, dict[str, Any]]
 
 
@@ -26,7 +26,7 @@ def table_of(name: str, folder: Path) -> str:
     """The table and the notes of one result in ``folder``, or `overview` of several; e1, converged/e1."""
     if name == "overview":
         return overview(folder)
-    kind = name.rsplit("/", maxsplit=1)[-1]
+    kind = name.rsplit("/", maxsplit=1)[-1].partition("-")[0]  # navigation-unknown is one of navigation's
     if kind not in MODULES:
         raise UserError(f"no experiment {kind!r}: choose from {', '.join(MODULES)}")
     table: Callable[[Summary], str] = import_module(f"presage.experiments.{MODULES[kind]}").table
