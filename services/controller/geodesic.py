@@ -71,9 +71,14 @@ class Roads:
         s = np.where(clearance >= self.least, self.slowness.ravel(), np.inf)
         self._graph.data[:] = self._length * (s[self._from] + s[self._to]) / 2
 
-    def nearest_free(self, point: Array, within: float = np.inf, component: int | None = None) -> int | None:
-        """Flat number of the free cell nearest to a point (2,) m, of one component if told; None: none so near."""
-        free = self.clearance.ravel() >= self.least
+    def nearest_free(
+        self, point: Array, within: float = np.inf, component: int | None = None, *, by_map: bool = False
+    ) -> int | None:
+        """Flat number of the free cell nearest to a point (2,) m, of one component if told; None: none so near.
+
+        ``by_map``: whatever stands there now.
+        """
+        free = (self.free.clearance if by_map else self.clearance).ravel() >= self.least
         if component is not None:
             free &= self.component == component
         cells = np.flatnonzero(free)

@@ -20,7 +20,8 @@ FARTHEST = 8.0  # m; beyond it an error of heading moves an end point too far
 CELL = 0.05  # m
 STANDS = 1_000_000_000  # ns; what has stood that long is furniture, until it goes
 BESIDE = 0.3  # m
-FORGET = 20_000_000_000  # ns after which what is out of sight is forgotten
+FORGET = 20_000_000_000  # ns after which furniture that is out of sight is forgotten
+FORGET_YOUNG = 2_000_000_000  # ns for what was not seen to stand
 BEYOND = 0.15  # m behind a cell that a beam must reach to show it free
 
 
@@ -99,5 +100,6 @@ class TemporaryObstacles:
         measured = scan.ranges.astype(np.float64)[np.clip(beam, 0, len(scan.ranges) - 1)]
         # No return is no proof of free space: a dark or a slanting surface gives none either.
         through = seen & np.isfinite(measured) & (measured > distance + BEYOND)
-        keep = ~through & (stamp_ns - self._last < FORGET) & (stamp_ns >= self._last)
+        long = np.where(self._last - self._first < 3 * STANDS, FORGET_YOUNG, FORGET)
+        keep = ~through & (stamp_ns - self._last < long) & (stamp_ns >= self._last)
         self._cells, self._first, self._last = self._cells[keep], self._first[keep], self._last[keep]

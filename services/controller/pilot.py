@@ -49,6 +49,7 @@ class Pilot:
         self.obstacles = TemporaryObstacles(self.free)
         self.seeker = Seeker(robot, self.roads, robot.radius + KEEP)
         self.field: Field | None = None  # of the goal, with what is known to stand in the way
+        self.closed = False  # the field is the map's alone, for what stands about leaves no way
         self.changed = False  # the field is another one; for whoever publishes it, who sets it False
         self._goal: Array | None = None
         self._component: int | None = None  # of the roads, where the robot was last known to be
@@ -64,7 +65,7 @@ class Pilot:
     def refusal(self, goal: Array) -> str | None:
         """A goal (2,) inside something, or out of reach of where the robot was last; with the nearest that is not."""
         here = self._component
-        cell = self.roads.nearest_free(goal, self.robot.radius)
+        cell = self.roads.nearest_free(goal, self.robot.radius, by_map=True)
         clearance = float(self.world.clearance(goal)[0])
         if clearance >= self.robot.radius and cell is not None and here in (None, self.roads.component[cell]):
             return None
@@ -74,7 +75,7 @@ class Pilot:
             why = f"is {clearance:.2f} m from a wall"
         else:
             why = "cannot be reached from here"
-        nearest = self.roads.nearest_free(goal, component=here)
+        nearest = self.roads.nearest_free(goal, component=here, by_map=True)
         instead = ""
         if nearest is not None:
             x, y = self.free.grid.centres([nearest])[0]
@@ -105,16 +106,16 @@ class Pilot:
         self.seeker.forget()
         pose = belief.pose.array()
         self.obstacles.see(scan, pose)
-        if (cell := self.roads.nearest_free(pose[:2], self.roads.least)) is not None:
+        if (cell := self.roads.nearest_free(pose[:2], self.roads.least, by_map=True)) is not None:
             self._component = int(self.roads.component[cell])
 
     def decide(self, belief: Belief, velocity: Array) -> Decision:
         """The action of least expected free energy, going with ``velocity`` (3,) in base_link."""
         pose, stamp_ns = belief.pose.array(), belief.stamp_ns
-        self._plan(stamp_ns)
+        self._plan(pose[:2], stamp_ns)
         way = self.field.path(pose[:2]) if self.field is not None else np.zeros((0, 2))
         if not len(way):
-            return Decision(reason=self._no_way(), state="blocked")
+            return Decision(reason="no way to the goal from here", state="blocked")
         around = self._around(pose, stamp_ns)
         if self._backing_until is not None and stamp_ns < self._backing_until:
             return self._back_off(pose, velocity, around, way)
@@ -129,7 +130,9 @@ class Pilot:
         reason = ""
         if choice.held:
             reason = self._what_holds(pose, around, stood=not choice.action.any())
-        stands = choice.held and not choice.action.any()
+        if self.closed:
+            reason = self._no_way(pose, around)
+        stands = bool(reason) and not choice.action.any()
         return Decision(action, reason, "blocked" if stands else "navigating", way, _in_map(pose, choice.way))
 
     def _facing(self, action: Array, attractor: Array) -> Array:
@@ -163,20 +166,26 @@ class Pilot:
         decision.reason = decision.reason or f"the belief is {belief.state}: going by its best guess"
         return decision
 
-    def _plan(self, stamp_ns: int) -> None:
+    def _plan(self, here: Array, stamp_ns: int) -> None:
         """The field anew where goal or obstacles changed."""
         if self._goal is None:
             self.field = None
             return
         points = self.obstacles.points()
+        points = points[~self.obstacles.moving(stamp_ns)]  # whoever walks will have gone on
         cells = np.unique(self.free.grid.cell_of(points)) if len(points) else np.zeros(0, int)
         when, before = self._planned
         changed = not np.array_equal(cells, before)
         if self.field is not None and (not changed or 0 <= stamp_ns - when < REPLAN):
             return
+        near = self.robot.radius + 2 * self.free.grid.resolution
         if changed:
             self.roads.block(points)
-        self.field, self.changed = self.roads.from_(self._goal, self.robot.radius + 2 * self.free.grid.resolution), True
+        self.field, self.changed, self.closed = self.roads.from_(self._goal, near), True, False
+        if self.field is None or not self.field.reaches(here):
+            # By the map alone: up to what closes the way, and there until it opens.
+            self.roads.block(np.zeros((0, 2)))
+            self.field, self.closed = self.roads.from_(self._goal, near), bool(len(points))
         self._planned = (stamp_ns, cells)
 
     def _around(self, pose: Array, stamp_ns: int) -> Around:
@@ -224,12 +233,12 @@ class Pilot:
         what = "something that moves" if around.moving[nearest] else "something the map does not know"
         return f"{does}: {what}, {away[nearest]:.1f} m away at ({x:.1f}, {y:.1f})"
 
-    def _no_way(self) -> str:
-        if self._goal is None:
-            return "no goal"
-        if len(self.obstacles.points()):
-            return "no way: what the map does not know closes it; waiting"
-        return "no way to the goal from here"
+    def _no_way(self, pose: Array, around: Around) -> str:
+        where = ""
+        if len(around.points):
+            x, y = pose[:2] + se2.rotate(pose[2], around.points[int(np.argmin(np.hypot(*around.points.T)))])
+            where = f" at ({x:.1f}, {y:.1f})"
+        return f"no way round what the map does not know{where}: waiting until it clears"
 
 
 def _in_map(pose: Array, way: Array) -> Array:
