@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from common.messages import Goal, Pose
+from common.messages import Goal, Pose, Truth
 from common.robot import Robot
 from common.se2 import Array
 from common.world import World
@@ -94,11 +94,19 @@ def _touching(track: Track) -> dict[str, Any]:
     return {
         "contacts_moving": int((touches & moves).sum()),
         "contacts_standing": int((touches & ~moves).sum()),
-        "contact_at": [
-            [round(track.truths[k].stamp_ns * 1e-9, 2), *(round(float(v), 3) for v in track.truths[k].pose.array())]
-            for k in np.flatnonzero(touches)[:10]
-        ],
+        "contact_at": [_contact(track.truths[k], float(speed[k])) for k in np.flatnonzero(touches)[:10]],
     }
+
+
+def _contact(truth: Truth, speed: float) -> dict[str, Any]:
+    """When and where, how fast, and where the nearest person stood."""
+    x, y, yaw = (round(float(value), 3) for value in truth.pose.array())
+    person = None
+    if len(truth.people):
+        nearest = int(np.argmin(np.hypot(*(truth.people - (x, y)).T)))
+        person = [round(float(value), 3) for value in truth.people[nearest]]
+    now = round(truth.stamp_ns * 1e-9, 2)
+    return {"s": now, "x": x, "y": y, "yaw": yaw, "speed": round(speed, 3), "person": person}
 
 
 def _clearance(world: World, path: Array) -> Array:
@@ -146,7 +154,7 @@ def _times(track: Track) -> dict[str, Any]:
 
 def plain(reason: str) -> str:
     """A reason without where and how far: "waiting: something that moves, 0.8 m away at (1.2, 3.4)" up to the comma."""
-    return re.sub(r"(,? -?\d[\d.]* m away at)? \(-?[\d.]+, -?[\d.]+\)", "", reason)
+    return re.sub(r"(,? \d[\d.]* m away)?( at| to)? \(-?[\d.]+, -?[\d.]+\)", "", reason)
 
 
 def _steps(track: Track) -> dict[str, Any]:

@@ -171,8 +171,9 @@ def worst(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 def _why(row: dict[str, Any]) -> str:
     parts = [row["why"]] if row["why"] else []
     if touched := row["contacts_moving"] + row["contacts_standing"]:
-        when, x, y, _ = row["contact_at"][0]
-        parts.append(f"touched something in {touched} scans, first at {when:g} s, ({x:.2f}, {y:.2f})")
+        first = row["contact_at"][0]
+        where = f"{first['s']:g} s, ({first['x']:.2f}, {first['y']:.2f}), {first['speed']:.2f} m/s"
+        parts.append(f"touched something in {touched} scans, first at {where}")
     if row["reached"]:
         parts.append(f"{row['time_over_least']:.2f} times the least time, {row['path_over_shortest']:.2f} the way")
         said = {reason: s for reason, s in row["reason_s"].items() if not reason.startswith("reached")}

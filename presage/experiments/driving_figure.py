@@ -65,9 +65,8 @@ def _map(axes: Axes, world: World, group: str, rows: Rows) -> None:
         axes.plot(row["x_m"], row["y_m"], color=colour, linewidth=0.7, alpha=0.8, zorder=above)
         axes.plot(*row["start"][:2], "o", color="black", markersize=2.5, zorder=5)
         axes.plot(*row["goal"], "x", color=drawing.MEASURED if row["reached"] else colour, markersize=4, zorder=5)
-        if row["contact_at"]:
-            x, y = np.array(row["contact_at"])[:, 1:3].T
-            axes.plot(x, y, "o", color="#CC79A7", fillstyle="none", markersize=8, zorder=6)
+        for each in row["contact_at"]:
+            axes.plot(each["x"], each["y"], "o", color="#CC79A7", fillstyle="none", markersize=8, zorder=6)
     reached = sum(row["reached"] for row in rows)
     axes.set_title(f"{group}: {reached} of {len(rows)} reached", fontsize=10)
 
