@@ -122,17 +122,19 @@ def _apart_from_people(track: Track, robot: Robot) -> float | None:
 
 
 def _localised(track: Track) -> dict[str, Any]:
-    """Error since it first claims to know, and when that was."""
+    """Error since it first claims to know, and when that was; of the claims alone; for how long it claims nothing."""
     count = min(len(track.truths), len(track.beliefs))  # one less where it was cut short
     tracking = np.array([belief.state == "tracking" for belief in track.beliefs[:count]], bool)
     if not tracking.any():
-        return {"tracking_s": None, "error_median_m": None, "error_max_m": None}
+        return dict.fromkeys(("tracking_s", "untracked_s", "error_median_m", "error_max_m", "claimed_error_max_m"))
     first = int(np.argmax(tracking))
     error = np.hypot(*(track.believed()[first:count] - track.path()[first:count])[:, :2].T)
     return {
         "tracking_s": track.truths[first].stamp_ns * 1e-9,
+        "untracked_s": float(np.mean(~tracking[first:])) * (_seconds(track) - track.truths[first].stamp_ns * 1e-9),
         "error_median_m": float(np.median(error)),
         "error_max_m": float(error.max()),
+        "claimed_error_max_m": float(error[tracking[first:]].max()),
     }
 
 

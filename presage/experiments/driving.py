@@ -36,7 +36,7 @@ CHOICES = {
 WORST = 5  # trials named in the summary
 QUANTITIES = {  # of reached trials; others by name in `worst`
     "path_over_shortest": ("median", "max"), "time_over_least": ("median", "max"), "seconds": ("median", "max"),
-    "time_over_bound": ("median", "max"),
+    "time_over_bound": ("median", "max"), "untracked_s": ("median", "max"), "claimed_error_max_m": ("max",),
     "error_median_m": ("median",), "error_max_m": ("max",), "tracking_s": ("median", "max"),
     "replans": ("median", "max"),
 }  # fmt: skip
