@@ -19,6 +19,7 @@ from presage.options import (
     Json,
     ModelName,
     OpenPage,
+    People,
     Port,
     PriorName,
     RobotName,
@@ -56,12 +57,14 @@ def up(
     prior: PriorName = "motion",
     viewer: Viewer = True,
     open_page: OpenPage = False,
+    people: People = 0,
 ) -> None:
     """Start router, simulator, estimator, controller and the live page here, until Ctrl-C.
 
     The page's link is printed; PRESAGE_VIEWER_PORT and PRESAGE_VIEWER_TOKEN choose its port and who may see it.
     Examples: `presage up`, then elsewhere `presage goal 15 1.5 --wait`; `presage up --estimator particle-filter`;
-    `presage up --record recordings --seed 7`; `presage up --world my.yaml --port 7500`; `presage up --no-viewer`.
+    `presage up --record recordings --seed 7`; `presage up --world my.yaml --port 7500`; `presage up --no-viewer`;
+    `presage up --world office --people 10`.
     """
     from presage.up import run_up  # noqa: PLC0415
 
@@ -78,6 +81,7 @@ def up(
         estimator=("--estimator", estimator, "--model", model, "--prior", prior),
         viewer=viewer,
         open_page=open_page,
+        people=people,
     )
 
 
@@ -96,15 +100,17 @@ def demo(
     model: ModelName = "learned",
     viewer: Viewer = True,
     open_page: OpenPage = False,
+    people: People = 0,
 ) -> None:
     """The whole loop, live on a page: localise from nothing, drive to a goal, record, draw, summarise.
 
-    Examples: `presage demo`; `presage demo --goal 12 2 --seed 3 --json run.json`; `presage demo --pace lockstep`.
+    Examples: `presage demo`; `presage demo --goal 12 2 --seed 3 --json run.json`; `presage demo --pace lockstep`;
+    `presage demo --people 3`.
     """
     from presage.demo import Demo, demo_command  # noqa: PLC0415
 
     how = ("--estimator", estimator, "--model", model)
-    asked = Demo(world, goal, out, beams, seed, pace, port or None, how, viewer, open_page)
+    asked = Demo(world, goal, out, beams, seed, pace, port or None, how, viewer, open_page, people)
     raise typer.Exit(demo_command(asked, json_file, quiet=quiet))
 
 

@@ -24,7 +24,7 @@ from presage.figure import draw_session
 from presage.output import check_file, make_folder, write_json
 from presage.page import say_page, start_page
 from presage.session import SessionSummary, summarise
-from presage.stack import Stack
+from presage.stack import Stack, controller_arguments
 from presage.watch import Watch
 
 # By the messages' stamps, whatever the pace:
@@ -49,6 +49,7 @@ class Demo:
     estimator: tuple[str, ...] = ()  # arguments
     viewer: bool = True
     open_page: bool = False  # where there is a display
+    people: int = 0  # who walk about
 
 
 def run_demo(demo: Demo, stack: Stack, console: Console) -> tuple[Path, bool]:
@@ -63,11 +64,10 @@ def run_demo(demo: Demo, stack: Stack, console: Console) -> tuple[Path, bool]:
         watch = Watch(bus, TRUTH, BELIEF, STATUS, HEALTH)
         page = demo.viewer and start_page(stack, demo.out, console)
         stack.start("recorder", "--directory", str(demo.out), "--file", recording.name)
-        stack.start(
-            "controller", "--world", demo.world, *(["--belief-timeout", "20"] if demo.pace == "lockstep" else [])
-        )
+        stack.start("controller", *controller_arguments(demo.world, demo.estimator, lockstep=demo.pace == "lockstep"))
         stack.start("estimator", "--world", demo.world, *demo.estimator)
         simulator = ["--world", demo.world, "--beams", str(demo.beams), "--seed", str(demo.seed), "--pace", demo.pace]
+        simulator += ["--people", str(demo.people)]
         if demo.pace != "realtime":  # time must not have run off before the others see it
             simulator += ["--wait-for", "estimator,controller,recorder"]
         stack.start("simulator", *simulator)

@@ -34,6 +34,9 @@ ModelName = Annotated[str, typer.Option(help="Of precise: learned, exact (the wo
 PriorName = Annotated[str, typer.Option(help="Of motion between scans: motion (scans alone), odometry, command.")]
 
 
+People = Annotated[
+    int, typer.Option(min=0, max=100, envvar="PRESAGE_PEOPLE", help="How many walk about, unknown to the map.")
+]
 Viewer = Annotated[bool, typer.Option(help="Serve the live page.")]
 OpenPage = Annotated[bool, typer.Option("--open/--no-open", help="Open the page, where there is a display.")]
 

@@ -10,7 +10,7 @@ from rich.console import Console
 from common.bus import open_bus
 from common.world import load_world
 from presage.page import say_page, start_page
-from presage.stack import Stack
+from presage.stack import Stack, controller_arguments
 
 RECORDINGS = Path("recordings")  # where the page finds them, and puts those it makes
 
@@ -29,6 +29,7 @@ def run_up(
     estimator: tuple[str, ...] = (),
     viewer: bool = True,
     open_page: bool = False,
+    people: int = 0,
 ) -> None:
     """Start, wait until all are alive, say what can be done, and watch; a service that ends is named, not restarted."""
     load_world(world)  # one clear line now rather than three from the children
@@ -39,12 +40,10 @@ def run_up(
         if page or record is not None:  # idle, it waits for the page's button
             stack.start("recorder", "--directory", str(record or RECORDINGS), *(["--idle"] if record is None else []))
         stack.start("estimator", "--world", world, *estimator)
-        if drive == "holonomic":
-            stack.start("controller", "--world", world, *(["--belief-timeout", "20"] if lockstep else []))
-        else:
-            console.print("the controller does not turn yet: none is started for a differential drive")
+        stack.start("controller", *controller_arguments(world, estimator, drive, lockstep=lockstep))
         waits = ",".join(sorted(set(stack.processes) - {"router", "viewer"}))
         simulator = ["--world", world, "--beams", str(beams), "--drive", drive, "--pace", pace, "--seed", str(seed)]
+        simulator += ["--people", str(people)]
         stack.start("simulator", *simulator, *(["--wait-for", waits] if pace != "realtime" else []))
         with open_bus(stack.link()) as bus:
             stack.wait_alive(bus)

@@ -20,7 +20,7 @@ CIRCLE_CORNERS = 360  # 0.02 mm off at a radius of 0.5 m
 END = 0.1  # m, length of a wall's first and last piece
 RAYS_A_CALL = 16_000  # pybullet takes 16 384
 MOTOR_FORCE = (300.0, 300.0, 100.0)  # N, N, N m: ten times what the limits of acceleration need
-WORLD_GROUP, ROBOT_GROUP = 1, 2  # rays see group 1 alone, not the body they start in
+WORLD_GROUP, ROBOT_GROUP, PEOPLE_GROUP = 1, 2, 4  # rays see groups they name, never the body they start in
 
 
 class Physics:
@@ -36,8 +36,10 @@ class Physics:
             str(Path(__file__).with_name("robot.urdf")), useFixedBase=True, physicsClientId=self.client
         )
         for link in range(-1, p.getNumJoints(self.body, physicsClientId=self.client)):
-            p.setCollisionFilterGroupMask(self.body, link, ROBOT_GROUP, WORLD_GROUP, physicsClientId=self.client)
+            touches = WORLD_GROUP | PEOPLE_GROUP
+            p.setCollisionFilterGroupMask(self.body, link, ROBOT_GROUP, touches, physicsClientId=self.client)
         self.shapes: dict[str, int] = {}
+        self.people: list[int] = []
         self._add_ring("boundary", np.array(world.boundary))
         self.place(pose)
 
@@ -48,11 +50,7 @@ class Physics:
     def add(self, name: str, obstacle: Obstacle) -> None:
         """Put a piece of furniture into the world."""
         if obstacle.circle is not None:
-            angle = np.arange(CIRCLE_CORNERS) * 2 * np.pi / CIRCLE_CORNERS
-            unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-            # Between inscribed and circumscribed, so that the error has no sign.
-            radius = obstacle.circle.radius * (1 + (np.pi / CIRCLE_CORNERS) ** 2 / 4)
-            self._add_ring(name, np.array(obstacle.circle.center) + radius * unit)
+            self._add_ring(name, np.array(obstacle.circle.center) + _round(obstacle.circle.radius))
         else:
             ring = obstacle.ring()
             assert ring is not None  # noqa: S101 - not a circle
@@ -62,25 +60,45 @@ class Physics:
         """Take a piece of furniture away."""
         pybullet.removeBody(self.shapes.pop(name), physicsClientId=self.client)
 
+    def add_people(self, places: Array, radius: float) -> None:
+        """Round bodies at ``places`` (K, 2) m that touch the robot alone; one shape for all."""
+        shape = self._shape(_round(radius))
+        for x, y in places.tolist():
+            body = pybullet.createMultiBody(0, shape, basePosition=[x, y, 0.0], physicsClientId=self.client)
+            # Group 1 is a ray's own.
+            pybullet.setCollisionFilterGroupMask(
+                body, -1, PEOPLE_GROUP, WORLD_GROUP | ROBOT_GROUP, physicsClientId=self.client
+            )
+            self.people.append(body)
+
+    def move_people(self, places: Array) -> None:
+        """Put them at ``places`` (K, 2) m."""
+        for body, (x, y) in zip(self.people, places.tolist(), strict=True):
+            pybullet.resetBasePositionAndOrientation(body, [x, y, 0.0], [0, 0, 0, 1], physicsClientId=self.client)
+
     def _add_ring(self, name: str, ring: Array) -> None:
-        """Walls along a closed ring (V, 2) m, as triangles: rays and contacts are exact, concave rings too."""
+        """Walls along a closed ring (V, 2) m."""
+        body = pybullet.createMultiBody(0, self._shape(ring), physicsClientId=self.client)
+        pybullet.setCollisionFilterGroupMask(
+            body, -1, WORLD_GROUP, WORLD_GROUP | ROBOT_GROUP, physicsClientId=self.client
+        )
+        self.shapes[name] = body
+
+    def _shape(self, ring: Array) -> int:
+        """A closed ring (V, 2) m as triangles: rays and contacts are exact, concave rings too."""
         ring = _with_short_ends(ring)
         count = len(ring)
         low, high = (np.column_stack([ring, np.full(count, z)]) for z in (-WALL_HEIGHT, WALL_HEIGHT))
         i, j = np.arange(count), np.roll(np.arange(count), -1)
         walls = np.concatenate([np.stack([i, j, j + count], -1), np.stack([i, j + count, i + count], -1)])
-        shape = pybullet.createCollisionShape(
+        shape: int = pybullet.createCollisionShape(
             pybullet.GEOM_MESH,
             vertices=np.concatenate([low, high]).tolist(),
             indices=walls.ravel().tolist(),
             flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
             physicsClientId=self.client,
         )
-        body = pybullet.createMultiBody(0, shape, physicsClientId=self.client)
-        pybullet.setCollisionFilterGroupMask(
-            body, -1, WORLD_GROUP, WORLD_GROUP | ROBOT_GROUP, physicsClientId=self.client
-        )
-        self.shapes[name] = body
+        return shape
 
     def place(self, pose: Array) -> None:
         """Carry the robot to a pose (3,), standing."""
@@ -115,8 +133,11 @@ class Physics:
         contacts: Any = pybullet.getContactPoints(bodyA=self.body, physicsClientId=self.client)
         return any(contact[8] <= 0 or contact[9] > 0 for contact in contacts)
 
-    def ranges(self, lasers: Array, angles: Array, reach: float) -> Array:
-        """(N, B) m from laser poses (N, 3) in map along ``angles`` (B,); +inf where nothing is hit within ``reach``."""
+    def ranges(self, lasers: Array, angles: Array, reach: float, *, people: bool = True) -> Array:
+        """(N, B) m from laser poses (N, 3) in map along ``angles`` (B,); +inf where nothing is hit within ``reach``.
+
+        Without ``people``, as if none were there.
+        """
         heading = (lasers[:, 2:3] + angles).ravel()
         origin = np.column_stack([np.repeat(lasers[:, :2], len(angles), axis=0), np.full(len(heading), LASER_HEIGHT)])
         end = origin + reach * np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(heading))])
@@ -127,11 +148,17 @@ class Physics:
                 origin[part].tolist(),
                 end[part].tolist(),
                 numThreads=1,
-                collisionFilterMask=WORLD_GROUP,
+                collisionFilterMask=WORLD_GROUP | PEOPLE_GROUP if people else WORLD_GROUP,
                 physicsClientId=self.client,
             )
             found[part] = [hit[2] if hit[0] >= 0 else np.inf for hit in hits]
         return (found * reach).reshape(len(lasers), len(angles))
+
+
+def _round(radius: float) -> Array:
+    """(V, 2) m around the origin, between inscribed and circumscribed, so that the error has no sign."""
+    angle = np.arange(CIRCLE_CORNERS) * 2 * np.pi / CIRCLE_CORNERS
+    return radius * (1 + (np.pi / CIRCLE_CORNERS) ** 2 / 4) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
 def _with_short_ends(ring: Array) -> Array:

@@ -83,8 +83,13 @@ class SimulatorService(Service):
         drift = Drift(options.turn_by_turn, options.turn_by_path, options.path_by_path, options.path_by_turn)
         robot = Robot(drive=options.drive)
         scanner = options.the_scanner()
-        self.setup = Setup(load_world(options.world), scanner, robot, options.start_pose(), options.seed, drift)
+        self.setup = Setup(
+            load_world(options.world), scanner, robot, options.start_pose(), options.seed, drift,
+            options.obstacle_stop, options.people, options.people_speed,
+        )  # fmt: skip
         self.simulation = Simulation(self.setup)
+        if not options.obstacle_stop:
+            self.log.warning("the obstacle stop is off, for fault injection: nothing keeps the robot from contact")
         self._next = time.monotonic()
         if self._wait_for:
             self._say_how_time_goes()

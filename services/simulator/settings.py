@@ -20,6 +20,7 @@ class SimulatorSettings(ServiceSettings):
       python -m services.simulator --world maze --drive differential
       python -m services.simulator --world my.yaml --start 2,1,90    x m, y m, yaw deg
       python -m services.simulator --beams 622 --pace lockstep --seed 7
+      python -m services.simulator --world office --people 10        who walk about
 
     """
 
@@ -43,6 +44,11 @@ class SimulatorSettings(ServiceSettings):
         str | None,
         Field(description="services waited for before the first scan; lockstep: estimator,controller unless told"),
     ] = None
+    people: Annotated[int, Field(ge=0, le=100, description="how many walk about; the map does not know them")] = 0
+    people_speed: Annotated[float, Field(ge=0, le=3, description="of their walk, m/s")] = 1.0
+    obstacle_stop: Annotated[
+        bool, Field(description="brake before what the scan shows; off only for fault injection")
+    ] = True
     turn_by_turn: Annotated[float, Field(ge=0, description="odometry alpha 1, rad²/rad")] = 1e-3
     turn_by_path: Annotated[float, Field(ge=0, description="odometry alpha 2, rad²/m")] = 5e-4
     path_by_path: Annotated[float, Field(ge=0, description="odometry alpha 3, m²/m")] = 1e-3

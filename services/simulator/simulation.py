@@ -16,6 +16,7 @@ from common.scanner import Scanner
 from common.se2 import Array
 from common.world import Obstacle, World
 from services.simulator.odometry import Drift, Odometer
+from services.simulator.people import People
 from services.simulator.physics import SUBSTEP, Physics
 
 BLOCK = 200  # poses of a sample at once
@@ -31,23 +32,32 @@ class Setup:
     start: tuple[float, float, float] | None = None  # x m, y m, yaw rad; None: the world's own
     seed: int = 0
     drift: Drift = field(default_factory=Drift)
-    obstacle_stop: bool = True  # off only to test that contacts are real
+    obstacle_stop: bool = True  # off only for fault injection
+    people: int = 0
+    people_speed: float = 1.0  # m/s
 
 
 class Simulation:
     """Same setup and commands, same bytes."""
 
     def __init__(self, setup: Setup) -> None:
-        """At time 0; raises UserError where the robot would stand in a wall."""
+        """At time 0; raises UserError where the robot would stand in a wall, or the people have no room."""
         self.setup, self.world = setup, _named(setup.world)
         robot, scanner = setup.robot, setup.scanner
         pose = np.array(setup.start) if setup.start is not None else self.world.start_pose(robot.radius)
         if (why := self.why_not(pose)) is not None:
             raise UserError(f"start {why}")
+        # Streams of their own: people change no noise.
+        scan_seed, odom_seed, people_seed = np.random.SeedSequence(setup.seed).spawn(3)
+        self.people: People | None = None
+        if setup.people:
+            walking = np.random.default_rng(people_seed)
+            self.people = People(self.world, setup.people, setup.people_speed, walking, pose[:2], robot.radius)
         self.physics = Physics(self.world, robot, pose)
         for obstacle in self.world.obstacles:
             self.physics.add(obstacle.name, obstacle)
-        scan_seed, odom_seed = np.random.SeedSequence(setup.seed).spawn(2)
+        if self.people is not None:
+            self.physics.add_people(self.people.places, self.people.radius)
         self._noise = np.random.default_rng(scan_seed)
         self.odometer = Odometer(setup.drift, np.random.default_rng(odom_seed))
         self.substeps = max(1, round(1 / (scanner.rate * SUBSTEP)))
@@ -88,12 +98,20 @@ class Simulation:
         """One scan period."""
         wanted = self._wanted()
         before = self.physics.pose()
+        self._walk(before)
         self._contact = False
         for _ in range(self.substeps):
             self._velocity = safety.ramp(self._velocity, wanted, self.setup.robot, SUBSTEP)
             self._contact |= self.physics.drive(self._velocity)
         self.odometer.move(before, self.physics.pose())
         self.steps += 1
+
+    def _walk(self, pose: Array) -> None:
+        """The people's step; the robot is at ``pose`` (3,)."""
+        if self.people is not None:
+            velocity = se2.rotate(float(pose[2]), self.physics.twist()[:2])
+            self.people.step(self.period_ns * 1e-9, pose[:2], velocity)
+            self.physics.move_people(self.people.places)
 
     def _wanted(self) -> Array:
         """The velocity to aim at: the command while it is fresh, no faster than what the last scan shows allows."""
@@ -119,8 +137,9 @@ class Simulation:
             stamp_ns=self.stamp_ns, pose=Pose.of(odometer.pose), twist=moving, covariance=odometer.covariance.copy()
         )
         truth = Truth(
-            stamp_ns=self.stamp_ns, pose=Pose.of(pose), twist=moving, contact=self._contact, stopped=self._stopped
-        )
+            stamp_ns=self.stamp_ns, pose=Pose.of(pose), twist=moving, contact=self._contact, stopped=self._stopped,
+            people=np.zeros((0, 2), np.float32) if self.people is None else self.people.places.astype(np.float32),
+        )  # fmt: skip
         scan = self._scan(ranges)
         self._points = safety.scan_points(scan)
         return odom, truth, scan
@@ -138,15 +157,19 @@ class Simulation:
             scan_time=1 / scanner.rate,
         )
 
-    def _see(self, poses: Array, scanner: Scanner | None = None) -> Array:
+    def _see(self, poses: Array, scanner: Scanner | None = None, *, people: bool = True) -> Array:
         """(N, B) m without noise or limits from base_link poses (N, 3)."""
         scanner = scanner or self.setup.scanner
         lasers = se2.compose(poses, np.array(scanner.mount))
         # A little beyond the limit, so that noise decides about a return at the limit.
-        return self.physics.ranges(lasers, scanner.angles(), scanner.range_max + 6 * scanner.sigma + 1e-6)
+        reach = scanner.range_max + 6 * scanner.sigma + 1e-6
+        return self.physics.ranges(lasers, scanner.angles(), reach, people=people)
 
     def sample(self, poses: Array, beams: int | None, noise_seed: int | None) -> Array:
-        """(N, B) m seen from poses (N, 3), with noise of a seed or none; the robot and its noise do not notice."""
+        """(N, B) m seen from poses (N, 3), with noise of a seed or none; the robot and its noise do not notice.
+
+        The world alone, for what learns it: no people.
+        """
         scanner = self.setup.scanner.with_beams(beams)
         lasers = se2.compose(poses, np.array(scanner.mount))
         for what, where in (("", poses), (" with the laser", lasers)):
@@ -157,7 +180,7 @@ class Simulation:
                     f"{inside.sum()} of {len(poses)} poses are{what} inside a wall or outside,"
                     f" such as ({x:.2f}, {y:.2f})"
                 )
-        rows = [self._see(poses[i : i + BLOCK], scanner) for i in range(0, len(poses), BLOCK)]
+        rows = [self._see(poses[i : i + BLOCK], scanner, people=False) for i in range(0, len(poses), BLOCK)]
         ranges = np.concatenate(rows) if rows else np.zeros((0, scanner.beams))
         if noise_seed is not None:
             ranges = ranges + scanner.sigma * np.random.default_rng(noise_seed).standard_normal(ranges.shape)
@@ -172,13 +195,19 @@ class Simulation:
         return f"({pose[0]:.2f}, {pose[1]:.2f}) {what} {self.world.name!r}; the robot needs {radius:g} m around it"
 
     def teleport(self, pose: Array) -> None:
-        """Carry the robot off, standing; odometry does not notice. Raises UserError inside a wall."""
+        """Carry the robot off, standing; odometry does not notice, and people make room. Raises UserError in a wall."""
         if (why := self.why_not(pose)) is not None:
             raise UserError(why)
+        self._make_room(pose)
         self.physics.place(pose)
         self._velocity, self._command = np.zeros(3), None
         # What stands around the new place, for a command that comes before the next scan; no noise is drawn.
         self._points = safety.scan_points(self._scan(self.setup.scanner.limit(self._see(pose[None])[0])))
+
+    def _make_room(self, pose: Array, world: World | None = None) -> None:
+        if self.people is not None:
+            self.people.make_room(pose[:2], world)
+            self.physics.move_people(self.people.places)
 
     def change(self, action: str, name: str, obstacle: Obstacle | None) -> None:
         """Add, move or remove furniture; raises UserError with the reason where it cannot be."""
@@ -198,6 +227,7 @@ class Simulation:
             kept.append(obstacle)
         # Built anew, for a copy would keep the old world's cached geometry; first, for it may refuse.
         world = World(name=self.world.name, boundary=self.world.boundary, obstacles=kept, start=self.world.start)
+        self._make_room(self.physics.pose(), world)
         if action != "add":
             self.physics.remove(name)
         if action != "remove" and obstacle is not None:

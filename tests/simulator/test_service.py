@@ -6,12 +6,14 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+from structlog.testing import capture_logs
 
+from common.errors import UserError
 from common.inbox import Call, Inbox
 from common.messages import CmdVel, Twist
 from common.requests import Request, ResetRequest, SpeedRequest
 from common.service import Loop
-from common.topics import PAUSE, RESET, RESUME, SCAN, SPEED, STEP, TRUTH
+from common.topics import PAUSE, RESET, RESUME, SCAN, SPEED, STEP, TRUTH, WORLD
 from services.simulator import service as shell
 from services.simulator.service import SimulatorService
 from services.simulator.settings import SimulatorSettings
@@ -207,3 +209,45 @@ def test_other_paces_have_no_speed(simulator, pace, why):
         assert not reply.ok
         assert why in reply.reason
         assert running.service.speed == 1.0
+
+
+def test_people_stand_while_paused_and_begin_again_with_a_reset(simulator):
+    def people(running):
+        return TRUTH.message.decode([p for topic, p in running.bus.sent if topic is TRUTH][-1]).people
+
+    with simulator(world="office", people=5, seed=2) as running:
+        running.service.on_timer()
+        began = people(running)
+        assert began.shape == (5, 2)
+        running.run(2.0)
+        walked = people(running)
+        assert (walked != began).any()
+        running.ask(PAUSE)
+        running.run(5.0)
+        running.ask(STEP)
+        one = people(running)
+        assert np.hypot(*(one - walked).T).max() < 0.07  # a period's walk, no more
+        for seed, same in ((None, True), (3, False), (2, True)):
+            running.ask(RESET, ResetRequest(seed=seed))
+            running.ask(STEP)
+            assert np.array_equal(people(running), began) == same
+
+
+def test_people_are_not_in_the_world_that_is_told(simulator):
+    with simulator(world="office", people=5) as peopled, simulator(world="office") as plain:
+        assert peopled.ask(WORLD).encode() == plain.ask(WORLD).encode()
+
+
+@pytest.mark.parametrize("stop", [True, False])
+def test_without_the_obstacle_stop_it_says_so_at_each_start(simulator, stop):
+    with capture_logs() as lines, simulator(obstacle_stop=stop) as running:
+        assert running.service.simulation.setup.obstacle_stop is stop
+    said = [line for line in lines if line["event"].startswith("the obstacle stop is off")]
+    assert [line["log_level"] for line in said] == ([] if stop else ["warning"])
+
+
+def test_more_people_than_there_is_room_for_is_one_clear_line(simulator, tmp_path):
+    closet = tmp_path / "closet.yaml"
+    closet.write_text("{name: closet, boundary: [[0, 0], [4, 0], [4, 4], [0, 4]]}")
+    with pytest.raises(UserError, match=r"'closet' has room for \d+ people, .* not for 20: ask for fewer"):
+        simulator(people=20, world=str(closet)).__enter__()

@@ -1,0 +1,113 @@
+"""Fault injection: whoever commands knows no obstacles. The obstacle stop alone keeps the body from contact."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from common import se2
+from common.messages import Twist
+from common.robot import Robot
+from common.scanner import SCANNERS
+from common.world import load_world
+from services.simulator.simulation import Setup, Simulation
+
+SCANNER = SCANNERS["tim571"].with_beams(271)  # a third of them: quicker, and the stop sees less
+WORLDS = ("corridor", "maze", "office")
+CASES = 15  # of each world and drive
+FORWARD = np.deg2rad(13)  # either side of ahead, that all a round body's front may touch is in the scanner's 270 deg
+
+
+@cache
+def simulation(world: str, drive: str) -> Simulation:
+    return Simulation(Setup(load_world(world), SCANNER, robot=Robot(drive=drive)))
+
+
+def targets(world, rng, count):
+    """(count, 2) m points to drive at: corners of walls and furniture, points along their edges, sides of circles."""
+    edges = world.segments[rng.integers(0, len(world.segments), count)]
+    share = np.where(rng.random(count) < 0.4, 0.0, rng.random(count))[:, None]
+    points = edges[:, :2] * (1 - share) + edges[:, 2:] * share
+    for number in np.flatnonzero(rng.random(count) < 0.15 * (len(world.circles) > 0)):
+        x, y, radius = world.circles[rng.integers(len(world.circles))]
+        angle = rng.uniform(-np.pi, np.pi)
+        points[number] = x + radius * np.cos(angle), y + radius * np.sin(angle)
+    return points
+
+
+def starts(world, rng, count):
+    """(count, 3) free poses that look at a target 0.4 to 4 m away, by far enough to be fast in half of them."""
+    found = []
+    while len(found) < count:
+        target = targets(world, rng, 1)[0]
+        away, yaw = rng.uniform(0.4, 4.0), rng.uniform(-np.pi, np.pi)
+        place = target - away * np.array([np.cos(yaw), np.sin(yaw)])
+        if float(world.clearance(place)[0]) >= Robot().radius + 0.02:
+            found.append([*place, yaw + rng.normal(0, 0.05)])  # and a little past it
+    return np.array(found)
+
+
+def fling(simulation, pose, twist, seconds=6.0):
+    """Truths while a twist is commanded from standing at ``pose`` (3,); until it stands again."""
+    simulation.teleport(pose)
+    truths = []
+    for number in range(int(seconds * 15)):
+        simulation.command(simulation.stamp_ns, twist)
+        simulation.advance()
+        truths.append(simulation.observe()[1])
+        if number > 15 and speed(truths[-1]) < 1e-3 and speed(truths[-2]) < 1e-3:
+            break
+    return truths
+
+
+def speed(truth) -> float:
+    return float(np.hypot(truth.twist.vx, truth.twist.vy))
+
+
+def touched(truths):
+    return [truth for truth in truths if truth.contact]
+
+
+@pytest.mark.parametrize("drive", ["holonomic", "differential"])
+@pytest.mark.parametrize("world", WORLDS)
+def test_straight_at_walls_corners_and_furniture_at_1_m_s(world, drive):
+    run, rng = simulation(world, drive), np.random.default_rng([WORLDS.index(world), len(drive)])
+    fastest, held = [], 0
+    for pose in starts(run.world, rng, CASES):
+        angle = rng.uniform(-FORWARD, FORWARD) if drive == "holonomic" else 0.0
+        # Turned, so that the way leads to the target all the same.
+        truths = fling(run, pose - [0, 0, angle], Twist(vx=float(np.cos(angle)), vy=float(np.sin(angle))))
+        assert not touched(truths), (pose, angle)
+        fastest.append(max(map(speed, truths)))
+        held += truths[-1].stopped
+    assert np.median(fastest) > 0.6
+    assert max(fastest) > 0.95
+    assert held > CASES / 2
+
+
+@pytest.mark.parametrize("drive", ["holonomic", "differential"])
+@pytest.mark.parametrize("world", WORLDS)
+def test_in_curves_at_1_m_s(world, drive):
+    run, rng = simulation(world, drive), np.random.default_rng([WORLDS.index(world), len(drive), 1])
+    for pose in starts(run.world, rng, CASES // 2):
+        truths = fling(run, pose, Twist(vx=1.0, wz=float(rng.uniform(-2, 2))), 3.0)
+        assert not touched(truths), pose
+
+
+def test_without_it_the_same_commands_do_touch():
+    """The test above can fail: these starts lead into things."""
+    run = Simulation(Setup(load_world("office"), SCANNER.with_beams(61), obstacle_stop=False))
+    rng = np.random.default_rng(0)
+    hit = sum(bool(touched(fling(run, pose, Twist(vx=1.0)))) for pose in starts(run.world, rng, 10))
+    run.close()
+    assert hit > 5
+
+
+def test_what_is_driven_at_is_seen():
+    """The front of a round body, ``FORWARD`` to either side, is within the scanner's view: else the stop is blind."""
+    front = np.deg2rad(90) + FORWARD
+    at_edge = Robot().radius * np.array([np.cos(front), np.sin(front)])
+    bearing = np.arctan2(at_edge[1] - SCANNER.mount[1], at_edge[0] - SCANNER.mount[0])
+    assert float(se2.wrap(bearing)) < -SCANNER.angle_min

@@ -1,0 +1,183 @@
+"""People in the simulator: seen, touched, waited for, and unknown to the map."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from common import se2
+from common.messages import Twist
+from common.robot import Robot
+from common.scanner import SCANNERS
+from common.world import Circle, Obstacle, World, load_world
+from services.simulator.people import RADIUS
+from services.simulator.simulation import Setup, Simulation
+
+SCANNER = SCANNERS["tim571"].with_beams(271)
+EXACT = SCANNER.model_copy(update={"sigma": 0.0})
+ALLEY = World(name="alley", boundary=[(0, 0), (16, 0), (16, 0.9), (0, 0.9)])
+HALL = World(name="hall", boundary=[(0, 0), (14, 0), (14, 10), (0, 10)])
+STANDING = Twist()
+
+
+@pytest.fixture
+def make():
+    made = []
+
+    def build(world="office", people=10, scanner=SCANNER, **rest) -> Simulation:
+        world = load_world(world) if isinstance(world, str) else world
+        made.append(Simulation(Setup(world, scanner, people=people, **rest)))
+        return made[-1]
+
+    yield build
+    for simulation in made:
+        simulation.close()
+
+
+def run(simulation, seconds, twist=STANDING):
+    """Odometry, truth and scan of each period, the first included."""
+    seen = [simulation.observe()]
+    for _ in range(int(seconds * 15)):
+        simulation.command(simulation.stamp_ns, twist)
+        simulation.advance()
+        seen.append(simulation.observe())
+    return seen
+
+
+def distance(truth) -> float:
+    """M between the robot's centre and the nearest person's."""
+    return float(np.hypot(*(truth.people - truth.pose.array()[:2]).T).min())
+
+
+def test_rays_hit_people_where_they_are(make):
+    simulation = make(scanner=EXACT, seed=4)
+    hits = 0
+    for _, truth, scan in run(simulation, 12, Twist(vx=0.3, wz=0.2))[::5]:
+        solid = [
+            Obstacle(name=f"person-{i}", circle=Circle(center=(float(x), float(y)), radius=RADIUS))
+            for i, (x, y) in enumerate(truth.people)
+        ]
+        office = simulation.world
+        peopled = World(name="peopled", boundary=office.boundary, obstacles=[*office.obstacles, *solid])
+        laser = se2.compose(truth.pose.array()[None], np.array(EXACT.mount))
+        exact = partial(peopled.ray_distances, laser)
+        # Where a beam grazes, what stands within 1 mm of it may be seen: both are right.
+        around = np.stack([exact(scan.angles() + 1e-3 / scan.ranges.astype(float) * k)[0] for k in (-1, -0.5, 0.5, 1)])
+        right = exact(scan.angles())[0]
+        low, high = np.minimum(right, around.min(axis=0)) - 1e-3, np.maximum(right, around.max(axis=0)) + 1e-3
+        assert ((low <= scan.ranges) & (scan.ranges <= high)).all()
+        hits += int((right < office.ray_distances(laser, scan.angles())[0] - 0.01).sum())
+    assert hits > 500
+
+
+def test_without_people_the_same_bytes_and_with_them_the_same_where_nobody_is(make):
+    plain, peopled = (run(make(people=count, seed=7), 10) for count in (0, 6))
+    shorter = 0
+    for (odom, truth, scan), (odom_2, truth_2, scan_2) in zip(plain, peopled, strict=True):
+        assert odom == odom_2
+        assert truth.model_copy(update={"people": truth_2.people}) == truth_2
+        differ = scan.ranges != scan_2.ranges
+        assert (scan_2.ranges[differ] < scan.ranges[differ]).all()
+        shorter += int(differ.sum())
+    assert len(plain[0][1].people) == 0
+    assert 0 < shorter < 0.5 * sum(len(scan.ranges) for *_, scan in plain)
+
+
+def test_same_seed_same_bytes(make):
+    def once(seed):
+        return [message.encode() for row in run(make(seed=seed), 4, Twist(vx=0.5, wz=0.2)) for message in row]
+
+    assert once(3) == once(3)
+    assert once(3) != once(4)
+
+
+def test_a_sample_never_sees_people_and_the_world_does_not_list_them(make):
+    plain, peopled = make(people=0), make(people=30)
+    poses = np.column_stack([plain.world.sample_free(40, np.random.default_rng(1), 0.3), np.zeros(40)])
+    for _ in range(3):
+        assert np.array_equal(plain.sample(poses, None, 5), peopled.sample(poses, None, 5))
+        run(peopled, 1)
+    assert peopled.world == plain.world
+    assert (plain.observe()[2].ranges != peopled.observe()[2].ranges).any()
+
+
+def test_who_walks_up_to_a_standing_robot_does_not_touch_it(make):
+    simulation = make(ALLEY, people=2, start=(8.0, 0.45, 0.0), seed=3)
+    truths = [truth for _, truth, _ in run(simulation, 45)]
+    nearest = min(map(distance, truths)) - RADIUS - Robot().radius
+    assert 0.4 < nearest < 0.6
+    assert not any(truth.contact for truth in truths)
+    assert truths[-1].pose.array() == pytest.approx([8.0, 0.45, 0.0], abs=1e-4)
+
+
+def test_a_robot_driven_into_a_standing_person_touches_them_and_stops_there(make):
+    simulation = make(ALLEY, people=1, start=(0.5, 0.45, 0.0), people_speed=0.0, obstacle_stop=False)
+    truths = [truth for _, truth, _ in run(simulation, 16, Twist(vx=1.0))]
+    assert any(truth.contact for truth in truths)
+    assert distance(truths[-1]) == pytest.approx(RADIUS + Robot().radius, abs=0.02)
+    assert not truths[0].contact
+    first = next(truth for truth in truths if truth.contact)
+    assert distance(first) == pytest.approx(RADIUS + Robot().radius, abs=0.02)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_obstacle_stop_keeps_a_robot_from_people_who_stand_in_its_way(make, seed):
+    """At 1 m/s straight at one after the other, from where each is seen."""
+    simulation = make(HALL, people=12, start=(1.0, 1.0, 0.0), people_speed=0.0, seed=seed)
+    stopped, fastest = 0, 0.0
+    for place in simulation.people.places.copy():
+        before = place - [2.2, 0.25 * (seed - 1)]  # head on, and grazing
+        pose = np.array([*before, 0.0])
+        if simulation.why_not(pose) or np.hypot(*(simulation.people.places - before).T).min() < 0.9:
+            continue
+        simulation.teleport(pose)
+        truths = [truth for _, truth, _ in run(simulation, 3.5, Twist(vx=1.0))]
+        assert not any(truth.contact for truth in truths)
+        fastest = max(fastest, *(float(np.hypot(t.twist.vx, t.twist.vy)) for t in truths))
+        stopped += np.hypot(truths[-1].twist.vx, truths[-1].twist.vy) < 0.05
+    assert stopped > 3
+    assert fastest > 0.9
+
+
+@pytest.mark.parametrize("drive", ["holonomic", "differential"])
+def test_the_obstacle_stop_keeps_a_robot_from_people_who_walk(make, drive):
+    """A robot that drives on at 1 m/s wherever it looks, and turns where it is held: among ten, no contact."""
+    simulation = make(people=10, seed=1, robot=Robot(drive=drive))
+    rng, turn, contacts, gone = np.random.default_rng(0), 0.0, 0, 0.0
+    simulation.observe()
+    for _ in range(70 * 15):
+        simulation.command(simulation.stamp_ns, Twist(vx=1.0, wz=turn))
+        simulation.advance()
+        truth = simulation.observe()[1]
+        gone += truth.twist.vx / 15
+        contacts += truth.contact
+        held = truth.stopped and truth.twist.vx < 0.05
+        turn = (turn or float(rng.choice([-1.5, 1.5]))) if held else 0.0
+    assert contacts == 0
+    assert gone > 15
+
+
+def test_a_teleport_onto_a_person_moves_them_and_is_seen_at_once(make):
+    simulation = make(seed=2)
+    run(simulation, 3)
+    target = simulation.people.places[0].copy()
+    clear = simulation.why_not(np.array([*target, 0.0])) is None
+    assert clear
+    simulation.teleport(np.array([*target, 0.0]))
+    assert np.hypot(*(simulation.people.places[0] - target)) >= 1.5
+    truth = simulation.observe()[1]
+    assert distance(truth) > RADIUS + Robot().radius
+    assert not any(truth.contact for _, truth, _ in run(simulation, 3))
+
+
+def test_furniture_put_onto_a_person_moves_them_and_later_ways_go_round_it(make):
+    simulation = make(HALL, people=3, start=(1.0, 1.0, 0.0), seed=2)
+    run(simulation, 2)
+    place = simulation.people.places[1]
+    simulation.change(
+        "add", "box", Obstacle.model_validate({"box": {"center": tuple(map(float, place)), "size": (1, 1)}})
+    )
+    for _, truth, _ in run(simulation, 15):
+        assert simulation.world.clearance(truth.people).min() >= RADIUS - 1e-6
