@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from common.se2 import Array
 
 TIE = 1e-9  # nats, expected free energies closer than this are one
+LEAST = 1e-6  # a beam's likeness below it is that: fifty of them multiplied are still a number
 SAME = 0.5  # m: a hypothesis does not move further between two beliefs, and nearer destinations are one
 HEADING = 0.5  # m a radian counts for where two poses are compared
 REMEMBERED = 20  # destinations that told nothing
@@ -79,17 +80,25 @@ def information_gain(
     r = np.clip(np.asarray(ranges, float), 0.0, range_max)
     variance = np.asarray(sigma, float) ** 2 + doubt.blur**2
     e = doubt.outliers
-    overlap = np.sqrt(e * (1 - e) / range_max) * (8 * np.pi * variance) ** 0.25
+    tail = e / 2 + np.sqrt(e * (1 - e) / range_max) * (8 * np.pi * variance) ** 0.25
     share = min(1.0, doubt.sectors / max(r.shape[2], 1))
     likeness = np.ones((len(w), len(w), r.shape[1]))  # BC of whole scans
     for i in range(len(w)):
         for j in range(i):
             core = np.exp(-((r[i] - r[j]) ** 2) / (4 * (variance[i] + variance[j])))
-            beams = np.minimum((1 - e) * core + e + overlap[i] + overlap[j], 1.0)
-            likeness[i, j] = likeness[j, i] = np.exp(share * np.log(beams).sum(axis=1))
+            beams = np.clip((1 - e) * core + tail[i] + tail[j], LEAST, 1.0)
+            likeness[i, j] = likeness[j, i] = np.exp(share * _log_product(beams))
     mixed = np.einsum("j,ijm->im", w, likeness)
     gain = -np.einsum("i,im->m", w, np.log(np.where(w[:, None] > 0, mixed, 1.0)))
     return np.asarray(np.clip(gain, 0.0, entropy(w))) + 0.0  # no minus zero
+
+
+def _log_product(factors: Array) -> Array:
+    """(M,) ln of the products over beams of (M, B), each at least LEAST; a logarithm for every fifty is quicker."""
+    if not factors.shape[1]:
+        return np.zeros(len(factors))
+    parts = np.multiply.reduceat(factors, np.arange(0, factors.shape[1], 50), axis=1)
+    return np.asarray(np.log(parts).sum(axis=1))
 
 
 def expected_free_energy(gain: Array, length: Array, nats_per_metre: float) -> Array:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from services.estimator.interface import Estimator
 
 MAX_POSES = 1000
-MAX_RANGES = 1_000_000  # perception waits meanwhile: half a second at most
+MAX_RANGES = 1_000_000  # perception waits meanwhile: about half a second
 
 
 def answer(estimator: Estimator, request: PredictRequest, angles: Array, range_max: float) -> PredictReply:

@@ -72,10 +72,13 @@ def test_the_order_of_hypotheses_motions_and_beams_does_not_matter(given_, rando
     assert found == pytest.approx(information_gain(weights, ranges, sigma, R)[m], abs=1e-12)
 
 
-def test_clearly_different_scans_tell_all():
+@pytest.mark.parametrize("beams", [61, 811])
+@pytest.mark.parametrize("outliers", [0.25, 0.0])
+def test_clearly_different_scans_tell_all(beams, outliers):
     weights = np.array([0.5, 0.3, 0.2])
-    ranges = np.array([[1.0], [4.0], [9.0]]) * np.ones((3, 61))
-    assert gain_of(ranges, weights=weights)[0] == pytest.approx(entropy(weights), rel=2e-3)
+    ranges = np.array([[1.0], [4.0], [9.0]]) * np.ones((3, beams))
+    gain = gain_of(ranges, weights=weights, doubt=Doubt(outliers=outliers))[0]
+    assert gain == pytest.approx(entropy(weights), rel=2e-3)
 
 
 @given(st.integers(1, 60), st.floats(0.01, 1.0))
