@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from contextlib import suppress
 
 import numpy as np
 
@@ -23,10 +24,15 @@ class Fields:
 
     def hear(self, message: Preference, robot: str, *, live: bool) -> None:
         """Keep one; of a live robot, not of a replay, the last alone, though its simulation began anew."""
-        if live:
+        with suppress(ValueError):  # cells larger than all numbers: nobody can draw them
+            picture = field_of(message, robot)
+            self._keep(message.stamp_ns, picture, alone=live)
+
+    def _keep(self, stamp_ns: int, picture: bytes, *, alone: bool) -> None:
+        if alone:
             self._by_stamp.clear()
-        self._by_stamp[message.stamp_ns] = field_of(message, robot)
-        self._by_stamp.move_to_end(message.stamp_ns)
+        self._by_stamp[stamp_ns] = picture
+        self._by_stamp.move_to_end(stamp_ns)
         if len(self._by_stamp) > MOST:
             self._by_stamp.popitem(last=False)
 

@@ -13,7 +13,7 @@ NUMBERS = re.compile(r"[-+\d.,()]+")
 
 
 class Journal:
-    """One row for each change of state or of reason; numbers that go on changing make no new row."""
+    """One row for each change of state, or of reason; none for one that is over or has other numbers in it."""
 
     def __init__(self) -> None:
         """Empty."""
@@ -23,7 +23,8 @@ class Journal:
         """Take a status; whether it made a row."""
         reason = status.reason[:500]
         last = self._rows[-1] if self._rows else None
-        if last is not None and (last["state"], _kind(last["reason"])) == (status.state, _kind(reason)):
+        same = last is not None and last["state"] == status.state
+        if last is not None and same and (not reason or _kind(last["reason"]) == _kind(reason)):
             return False
         self._rows.append({"t": status.stamp_ns * 1e-9, "state": status.state, "reason": reason})
         return True

@@ -34,6 +34,7 @@ from services.viewer.web import WebServer, create_app, link, listen
 
 TICK = 1.0  # s
 SCANNING = 2.0  # s since the last scan
+LINGER = 600.0  # s without a visitor, then another robot is followed no more
 
 
 @dataclass
@@ -44,6 +45,7 @@ class Followed:
     pulses: Pulses = field(default_factory=Pulses)
     unread: dict[Topic, Sample] = field(default_factory=dict)  # the newest of each, until somebody watches
     scan_at: float = -1e9  # s, a clock that only goes forward
+    watched_at: float = field(default_factory=time.monotonic)
     ends: list[Callable[[], None]] = field(default_factory=list)  # of the subscriptions
 
 
@@ -194,10 +196,13 @@ class ViewerService(Service):
         self.hub.call(tell)
 
     def _tick(self) -> None:
-        watched = self.hub.watched
-        for robot in [r for r in self.robots if r not in watched and r != self.options.robot]:
-            for end in self.robots.pop(robot).ends:
-                end()
+        watched, now = self.hub.watched, time.monotonic()
+        for robot in {*watched, self.options.robot} & self.robots.keys():
+            self.robots[robot].watched_at = now
+        for robot, followed in list(self.robots.items()):
+            idle = now - followed.watched_at
+            if idle > LINGER or (idle > 0 and not self.roster.services(robot)):
+                self._leave(robot)
         for robot, followed in self.robots.items():
             followed.view.live = "replay" not in self.roster.services(robot)
             if robot in watched:
@@ -226,6 +231,10 @@ class ViewerService(Service):
                 end = self.loop.bus.subscribe(topic, self.loop.inbox, keep_all=not live, robot=robot)
                 followed.ends.append(end)
         return self.robots[robot]
+
+    def _leave(self, robot: str) -> None:
+        for end in self.robots.pop(robot).ends:
+            end()
 
     # ---- for other threads
 

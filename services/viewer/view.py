@@ -6,11 +6,10 @@ milliseconds after it and is waited for, shortly, from those who have spoken lat
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TypeVar
-
-import numpy as np
 
 from common.messages import Belief, CmdVel, Goal, Odom, Plan, Prediction, Preference, Scan, Stamped, Status, Truth
 from common.topics import (
@@ -166,14 +165,14 @@ class RobotView:
         truth = self._truths.get(belief.stamp_ns)
         if truth is None:
             return None
-        return float(np.hypot(belief.pose.x - truth.pose.x, belief.pose.y - truth.pose.y))
+        return _length(belief.pose.x - truth.pose.x, belief.pose.y - truth.pose.y)
 
     def _speed(self) -> float | None:
         """m/s, the true one, or what dead reckoning says."""
         for topic in (TRUTH, ODOM):
             heard = self._heard.get(topic.name)
             if heard is not None and isinstance(heard.message, Truth | Odom):
-                return float(np.hypot(heard.message.twist.vx, heard.message.twist.vy))
+                return _length(heard.message.twist.vx, heard.message.twist.vy)
         return None
 
     def _latency(self, command: CmdVel) -> float | None:
@@ -208,7 +207,7 @@ class RobotView:
             "truth": frames.truth_of(self.fresh(TRUTH, Truth, at)),
             "belief": frames.belief_of(belief),
             "odom": frames.odom_of(self.fresh(ODOM, Odom, at)),
-            "status": frames.status_of(self.fresh(STATUS, Status, at), self._goals),
+            "status": frames.status_of(self.status, self._goals),
             "cmd": frames.cmd_of(self.fresh(CMD_VEL, CmdVel, at)),
             "error": self._error(belief) if belief is not None else None,
             "speed": self._speed(),
@@ -218,6 +217,12 @@ class RobotView:
         prediction, plan = self.fresh(PREDICTION, Prediction, at), self.fresh(PLAN, Plan, at)
         self.frame = frames.encode(header, frames.arrays_of(scan, prediction, plan, self.fresh(TRUTH, Truth, at)))
         return self.frame
+
+
+def _length(x: float, y: float) -> float | None:
+    """None where it is beyond all numbers."""
+    length = math.hypot(x, y)
+    return length if math.isfinite(length) else None
 
 
 def _is_over(message: Stamped) -> bool:

@@ -51,12 +51,18 @@ def test_a_visitor_drives_the_robot_about(system):
 
         page.done("goal", x=5.0, y=1.5)
         page.frame(lambda h: state_of(h) == "reached" and there(5.0, 1.5)(h))
-        for x, y, why in ((0.05, 1.5, "from a wall"), (-4.0, 1.5, "outside the world")):
+        for x, y, why in ((0.05, 1.5, "from a wall"), (-4.0, 1.5, "inside something")):
             answer = page.ask("goal", x=x, y=y)
             assert not answer["ok"]
             assert why in answer["reason"]
-        page.done("goal", x=12.0, y=1.5)
-        page.frame(lambda h: state_of(h) == "navigating")
+            assert "nearest place that can be reached is (" in answer["reason"]
+        page.done("goal", x=12.0, y=1.5, yaw=1.57)
+        frame = page.frame(lambda h: state_of(h) == "navigating" and h["arrays"]["path"][1] > 4)
+        np.testing.assert_allclose(frame.arrays["path"][-2:], [12.0, 1.5], atol=0.1)
+        assert frame.header["status"]["goal"]["yaw_tolerance"] == 0.15
+        assert len(frame.arrays["motion"]) > 2
+        field = page.by_now("field", lambda f: f.header["goal"]["x"] == 12.0)
+        assert np.isfinite(field.arrays["distance"]).sum() > 1000
         page.done("cancel")
         page.frame(lambda h: h["status"] and h["status"]["goal"] is None)
 

@@ -1,8 +1,9 @@
-"""A made-up session over the viewer's socket, to look at the page without a bus: no zenoh, no simulator, no estimator.
+"""Made-up sessions over the viewer's socket, to look at the page without a bus: no zenoh, no simulator, no estimator.
 
-python -m tests.viewer.stub_server --port 8123 --scene ambiguous
+python -m tests.viewer.stub_server --port 8123
 
-Scenes: tracking, planning, blocked, exploring, ambiguous, lost, half-dead, empty, watching.
+http://127.0.0.1:8123/planning/ is the scene of that name; there are: tracking, planning, blocked, exploring, ambiguous,
+lost, half-dead, empty, watching. Without a name it is `tracking`.
 """
 
 from __future__ import annotations
@@ -91,12 +92,20 @@ class Visitor:
                 await self.tell(type="closed")
 
 
-def application(session: Session) -> Starlette:
-    """The page and its socket."""
+def application(warm: float) -> Starlette:
+    """The page and its socket, for each scene; ``warm`` s of the past to begin with."""
+    sessions: dict[str, Session] = {}
+
+    def session_of(scene: str) -> Session:
+        if scene not in sessions:
+            sessions[scene] = Session(load_world(WORLDS.get(scene, "corridor")), scene)
+            for _ in range(int(warm / DT)):
+                sessions[scene].step()
+        return sessions[scene]
 
     async def socket(websocket: WebSocket) -> None:
         await websocket.accept()
-        visitor = Visitor(websocket, session)
+        visitor = Visitor(websocket, session_of(websocket.path_params.get("scene", "tracking")))
         feeding = asyncio.create_task(visitor.feed())
         try:
             await visitor.listen()
@@ -105,21 +114,20 @@ def application(session: Session) -> Starlette:
         finally:
             feeding.cancel()
 
-    return Starlette(routes=[WebSocketRoute("/ws", socket), Mount("/", StaticFiles(directory=STATIC, html=True))])
+    page = StaticFiles(directory=STATIC, html=True)
+    scenes = [Mount(f"/{scene}", page) for scene in SCENES]
+    return Starlette(
+        routes=[WebSocketRoute("/ws", socket), WebSocketRoute("/{scene}/ws", socket), *scenes, Mount("/", page)]
+    )
 
 
 def main() -> None:
     """From the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--port", type=int, default=8123)
-    parser.add_argument("--scene", choices=SCENES, default="tracking")
-    parser.add_argument("--world", help="another than the scene's own")
     parser.add_argument("--warm", type=float, default=0.0, help="seconds of the past to begin with")
     args = parser.parse_args()
-    session = Session(load_world(args.world or WORLDS.get(args.scene, "corridor")), args.scene)
-    for _ in range(int(args.warm / DT)):
-        session.step()
-    uvicorn.run(application(session), host="127.0.0.1", port=args.port, log_level="warning")
+    uvicorn.run(application(args.warm), host="127.0.0.1", port=args.port, log_level="warning")
 
 
 if __name__ == "__main__":

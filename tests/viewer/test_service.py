@@ -227,8 +227,14 @@ def test_several_robots(viewer, bus, link):
         assert page.last["hello"]["robot"] == "two" + link.robot
         Pretence(second).keep_saying(page, lambda h: h["robot"] == "two" + link.robot)
         Pretence(bus).keep_saying(other, lambda h: h["robot"] == link.robot)
+        second.put(PREFERENCE, preference(1.0).encode())
+        page.told("field", lambda f: f.header["robot"] == "two" + link.robot)
         page.done("watch", robot=link.robot)
         assert page.frame().header["robot"] == link.robot
+        page.told("services")
+        page.told("services")  # long enough for a robot that nobody watches to be let go
+        page.done("watch", robot="two" + link.robot)
+        assert page.told("field").header["robot"] == "two" + link.robot
 
 
 class Servant:

@@ -9,7 +9,7 @@ from random import Random
 import numpy as np
 import pytest
 
-from common.messages import Goal, Plan, Pose
+from common.messages import Goal, Plan, Pose, Twist
 from common.topics import BELIEF, CMD_VEL, GOAL, PLAN, PREDICTION, PREFERENCE, SCAN, STATUS, TRUTH
 from services.viewer.frames import encode
 from services.viewer.history import History, Sample
@@ -338,6 +338,8 @@ def test_the_journal_has_a_row_for_each_change_of_mind():
     assert say(2.0, "blocked", "somebody stands 0.52 m ahead")
     assert not say(2.1, "blocked", "somebody stands 0.49 m ahead")  # numbers go on changing
     assert say(3.0, "blocked", "no way round")
+    assert not say(3.1, "blocked")
+    assert not say(3.2, "blocked", "no way round")
     assert [(row["t"], row["state"], row["reason"]) for row in view.journal.rows()] == [
         (1.0, "navigating", ""), (2.0, "blocked", "somebody stands 0.52 m ahead"), (3.0, "blocked", "no way round"),
     ]  # fmt: skip
@@ -347,3 +349,20 @@ def test_the_journal_has_a_row_for_each_change_of_mind():
     feed(view, 60.0)
     feed(view, 1.0)  # back
     assert [row["t"] for row in view.journal.rows()] == [1.0]
+
+
+def test_numbers_that_no_robot_has_are_shown_as_none():
+    view, messages = RobotView("robot"), at(1.1)
+    feed(view, 1.0)
+    far = Pose(x=1e308, y=0.0)
+    messages[BELIEF] = messages[BELIEF].model_copy(update={"pose": far, "hypotheses": []})
+    messages[TRUTH] = messages[TRUTH].model_copy(
+        update={"pose": Pose(x=-1e308, y=0.0), "twist": Twist(vx=1.5e308, vy=1.5e308)}
+    )
+    for topic, message in messages.items():
+        view.hear(topic, message, 1.1)
+    header = read_frame(view.frame).header
+    assert (header["error"], header["speed"], header["belief"]["x"]) == (None, None, 1e308)
+    huge = preference(1.0, width=401, height=401).model_copy(update={"resolution": 1e308})
+    view.hear(PREFERENCE, huge, 1.0)
+    assert told_field(view) is None

@@ -49,7 +49,8 @@ export class Connection {
       this.undecodable += 1;
       return;
     }
-    if (message.type === "answer") this.answered(message);
+    if (!message?.type) this.undecodable += 1;
+    else if (message.type === "answer") this.answered(message);
     else if (message.type === "frame") this.on.frame(message);
     else {
       if (message.type === "hello" && this.failures >= 0) {

@@ -57,10 +57,10 @@ export function drawUnmapped(ctx, camera, points, colours) {
   });
   ctx.fillStyle = colours.unmapped;
   ctx.strokeStyle = colours["unmapped-line"];
-  ctx.lineWidth = 0.8;
+  ctx.lineWidth = 1.6;
   ctx.lineJoin = "miter";
-  ctx.fill();
   ctx.stroke();
+  ctx.fill(); // over the lines: those that touch become one patch with a rim
 }
 
 /** People as they stand; only a simulator knows. */

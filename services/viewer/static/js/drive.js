@@ -80,10 +80,11 @@ export class Drive {
 
   startStick() {
     const box = $("joystick"), knob = box.firstElementChild;
+    let middle = null; // px, where it was when the thumb came: the page may move under it
     const place = (dx, dy) => { knob.style.transform = `translate(${dx}px, ${dy}px)`; };
     const steer = (event) => {
-      const size = box.getBoundingClientRect(), reach = size.width / 2 - 12;
-      let dx = event.clientX - size.left - size.width / 2, dy = event.clientY - size.top - size.height / 2;
+      const { x, y, reach } = middle;
+      let dx = event.clientX - x, dy = event.clientY - y;
       const far = Math.hypot(dx, dy);
       if (far > reach) [dx, dy] = [(dx * reach) / far, (dy * reach) / far];
       place(dx, dy);
@@ -96,6 +97,8 @@ export class Drive {
     };
     box.addEventListener("pointerdown", (event) => {
       box.setPointerCapture(event.pointerId);
+      const size = box.getBoundingClientRect();
+      middle = { x: size.left + size.width / 2, y: size.top + size.height / 2, reach: size.width / 2 - 12 };
       steer(event);
     });
     box.addEventListener("pointermove", (event) => this.stick && steer(event));

@@ -39,6 +39,13 @@ export function startKeys({ store, view, modes, actions, drive, player, toolbar 
     if (command || (modes.can && drive.press(event))) event.preventDefault();
   });
   addEventListener("keyup", (event) => drive.lift(event));
+  for (const id of ["toolbar", "zoom"]) for (const kind of ["click", "change"]) $(id).addEventListener(kind, backToMap);
+}
+
+/** Who used the mouse wants the next key to be the map's: space to pause, not the button once more. */
+function backToMap({ type, target }) {
+  if (type === "click" && !target.closest("button")) return;
+  if (document.activeElement !== document.body && !document.activeElement.matches(":focus-visible")) $("map").focus({ preventScroll: true });
 }
 
 /** Whether the key belongs to the element that has the focus. */

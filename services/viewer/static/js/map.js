@@ -25,6 +25,8 @@ const LAYERS = [
   { key: "unmapped", label: "not in the map", tone: "unmapped", mark: "diamond" },
 ];
 
+const NARROW = 620; // px, where the legend would cover the map
+
 export class MapView {
   constructor(store) {
     this.store = store;
@@ -34,6 +36,7 @@ export class MapView {
     this.gesture = {}; // what the pointer is doing: ghost, plan, goal, carry, hovered, selected
     this.invalidate = eachPicture(() => this.draw());
     this.surface = sharp($("map"), ({ width, height }) => {
+      if ((width >= NARROW) !== this.roomy) $("legend").open = this.roomy = width >= NARROW;
       this.arrange(width);
       this.camera.resize(width, height);
       this.invalidate();
@@ -44,14 +47,13 @@ export class MapView {
 
   /** Room beside the map for what floats over it. */
   arrange(width) {
-    const stick = $("joystick").hidden ? 0 : 100;
-    this.camera.padding = width < 600
+    const stick = $("joystick").hidden ? 0 : 114;
+    this.camera.padding = width < NARROW
       ? { left: 26, right: 16, top: 52, bottom: 112 + stick }
       : { left: $("legend").open ? 186 : 40, right: 64, top: 28, bottom: 122 };
   }
 
   buildLegend() {
-    $("legend").open = innerWidth > 760;
     $("legend").addEventListener("toggle", () => this.rearrange());
     for (const { key, label, tone, mark } of LAYERS) {
       const box = h("input", { type: "checkbox", onchange: () => this.show(key, box.checked) });

@@ -14,10 +14,7 @@ export class Modes {
     this.changed = () => {};
     this.set("goal");
     for (const button of document.querySelectorAll("[data-mode]")) {
-      button.addEventListener("click", (event) => {
-        this.set(button.dataset.mode);
-        if (event.detail > 0) $("map").focus({ preventScroll: true }); // clicked, so keys are the map's again
-      });
+      button.addEventListener("click", () => this.set(button.dataset.mode));
     }
   }
 

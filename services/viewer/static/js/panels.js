@@ -49,7 +49,8 @@ export class Panels {
     const { frame, missing, servicesKnown } = this.store;
     const gone = (name) => servicesKnown && missing.some((one) => one.name === name);
     const { belief, status } = frame ?? {};
-    const none = (name) => (gone(name) ? ["s-triangle", "bad", "missing", "see the note on the map"] : ["s-ring", "", "silent", "nothing heard yet"]);
+    const none = (name) => (gone(name) ? ["s-triangle", "bad", "missing", "see the note on the map"]
+      : this.store.stuck.some((one) => one.name === name) ? ["s-triangle", "bad", "silent", "see the note on the map"] : ["s-ring", "", "silent", "nothing is heard of it"]);
     this.badges.estimator(...(belief && !gone("estimator") ? [...(BELIEF[belief.state] ?? ["s-ring", ""]), belief.state, describeBelief(belief)] : none("estimator")));
     const why = status?.reason || (status?.state === "navigating" && status.distance !== null ? `${metres(status.distance)} to go` : "");
     this.badges.controller(...(status && !gone("controller") ? [...(STATUS[status.state] ?? ["s-ring", ""]), status.state, why] : none("controller")));

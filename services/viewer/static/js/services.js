@@ -56,7 +56,8 @@ export class Services {
     const now = performance.now();
     const silent = frame && this.store.arrivals.length > 0 && now - this.store.arrivals.at(-1) > 3000;
     const empty = connected && servicesKnown && !player && !world && !frame;
-    const state = JSON.stringify([missing, empty, connected, silent && !this.store.paused, Boolean(player), this.recordingsOffered]);
+    const stuck = this.store.stuck.map((one) => one.name);
+    const state = JSON.stringify([missing, stuck, empty, connected, silent && !this.store.paused, Boolean(player)]);
     if (state === this.shown) return;
     this.shown = state;
     $("empty").hidden = !empty;
@@ -64,7 +65,8 @@ export class Services {
     const notices = [];
     if (connected && servicesKnown && !empty && !player) {
       notices.push(...missing.map((one) => this.notice(`${one.name} is missing.`, consequence(one.name), one.start)));
-      if (silent && !this.store.paused && !missing.length) {
+      notices.push(...stuck.map((name) => this.notice(`${name} is silent.`, "It is connected, but its pulse has stopped: hung, stopped, or starved.", "")));
+      if (silent && !this.store.paused && !missing.length && !stuck.length) {
         notices.push(this.notice("No scan for a while.", "The simulation is paused, or its source has stopped.", ""));
       }
     }
@@ -81,7 +83,7 @@ export class Services {
       ...(all ? [this.start("presage up")] : []),
       ...(missing.length ? [h("p", { class: "or" }, all ? "or one by one:" : "Also missing:")] : []),
       ...missing.map((one) => h("div", {}, this.start(one.start))),
-      ...(all ? [h("p", { class: "or" }, "A recording needs none of them: Open, below.")] : []));
+      ...(all && this.store.control ? [h("p", { class: "or" }, "A recording needs none of them: Open, below.")] : []));
   }
 
   notice(title, text, command) {

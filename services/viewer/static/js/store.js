@@ -2,6 +2,7 @@
 
 export const WINDOW = 60; // s of history
 const SERIES = ["free_energy", "accuracy", "complexity", "error", "speed"];
+const PULSELESS = 4; // s without a pulse, of which there is one a second
 const JUMP = 0.4; // m between two frames: carried off, no path between them
 
 const nan = (value) => (value === null || value === undefined ? NaN : value);
@@ -39,6 +40,11 @@ export class Store {
     return Boolean(this.hello?.control);
   }
 
+  /** Services that are connected and show no sign of life. */
+  get stuck() {
+    return this.services.filter((one) => one.alive && one.age_s > PULSELESS);
+  }
+
   /** The goal prior, where it is about the goal there is. */
   get prior() {
     const goal = this.frame?.status?.goal, { field } = this;
@@ -63,6 +69,7 @@ export class Store {
     const before = this.frame;
     if (before && frame.robot !== before.robot) this.forget();
     if (!before?.truth?.stopped) this.stoppedAt = now;
+    if (this.missing.some((one) => one.name === "controller")) frame.status = null; // its last word is no more
     this.frame = frame;
     this.arrivals.push(now);
     while (now - this.arrivals[0] > 4000) this.arrivals.shift();

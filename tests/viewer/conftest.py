@@ -1,0 +1,16 @@
+"""One browser for all tests of the page."""
+
+from __future__ import annotations
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """A headless Chromium."""
+    tools = pytest.importorskip("tests.viewer.browser", reason="NO PLAYWRIGHT: the page is not tested")
+    path = tools.find_browser()
+    if path is None:
+        pytest.skip("NO CHROMIUM (apt-get install chromium): the page is not tested")
+    with tools.open_browser(path) as opened:
+        yield opened

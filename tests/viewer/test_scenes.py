@@ -1,0 +1,223 @@
+"""The page in a real browser, before made-up sessions: every state, several widths, mouse, fingers and keys."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from common.bus import wait_until
+from tests.conftest import PATIENCE, Processes, accepts, free_tcp_port
+
+browser_tools = pytest.importorskip("tests.viewer.browser", reason="NO PLAYWRIGHT: the page is not tested")
+SCENES = ("tracking", "planning", "blocked", "exploring", "ambiguous", "lost", "half-dead", "empty", "watching")
+STANDING = {"blocked", "exploring", "ambiguous", "lost"}  # and it is said why
+PHONE = {"width": 360, "height": 740, "has_touch": True, "is_mobile": True}
+NAMELESS = """[...document.querySelectorAll("button")].filter(
+    (button) => !(button.innerText.trim() || button.getAttribute("aria-label"))).length"""
+CUT_OFF = """[...document.querySelectorAll(".keys, .services .scroll, .card h2, .vitals dd, #why")].filter(
+    (box) => box.offsetParent && box.scrollWidth > box.clientWidth + 1).map((box) => box.id || box.className)"""
+OVERLAPPING = """((boxes) => boxes.filter(([, a], i) => boxes.some(([, b], k) => k < i && a.left < b.right - 1
+    && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1)).map(([name]) => name))(
+    ["#legend", "#zoom", "#why", "#sub", "#toolbar", "#joystick"].map((name) => [name, document.querySelector(name)])
+        .filter(([, box]) => box.checkVisibility()).map(([name, box]) => [name, box.getBoundingClientRect()]))"""
+PIXEL = """((copy) => {
+    copy.drawImage(document.getElementById("map"), ...arg.map((px) => px * devicePixelRatio), 1, 1, 0, 0, 1, 1);
+    return String(copy.getImageData(0, 0, 1, 1).data);
+})(document.createElement("canvas").getContext("2d", { willReadFrequently: true }))"""
+TWO_METRES_TO_GO = """((field) => {
+    const i = field.distance.findLastIndex((d) => d > 1.9 && d < 2.1), { origin, resolution: cell, width } = field;
+    return [origin.x + (i % width + 0.5) * cell, origin.y + (Math.floor(i / width) + 0.5) * cell];
+})(store.prior)"""
+
+
+@pytest.fixture(scope="module")
+def stub(tmp_path_factory):
+    """Calls start a visit of a scene."""
+    processes, port = Processes(tmp_path_factory.mktemp("stub")), free_tcp_port()
+    processes.start("tests.viewer.stub_server", "--port", str(port))
+    try:
+        assert wait_until(lambda: accepts(port), PATIENCE)
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        processes.close()
+
+
+@pytest.fixture
+def look(browser, stub):
+    """Calls open a scene; its console must have stayed silent."""
+    visits = []
+
+    def start(scene, **options):
+        visits.append(browser_tools.visit(browser, f"{stub}/{scene}/", **options))
+        visits[-1].wait("store.servicesKnown")
+        return visits[-1]
+
+    yield start
+    for seen in visits:
+        seen.see("presage.connection.ask('resume')")  # for the next visitor of the scene
+        seen.page.context.close()
+        assert seen.complaints == []
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_every_state_fits_a_phone_and_names_its_buttons(look, scene):
+    seen = look(scene, **PHONE, color_scheme="dark")
+    assert seen.see("document.documentElement.scrollWidth") <= 360
+    assert seen.see(
+        "matchMedia('(prefers-color-scheme: dark)').matches && document.documentElement.hasAttribute('data-dark')"
+    )
+    assert seen.see(NAMELESS) == 0
+    empty = seen.page.locator("#empty").is_visible()
+    assert empty == (scene == "empty")
+    if scene == "watching":
+        assert seen.page.locator("#watch-only").is_visible()
+        assert seen.page.locator("#pause").is_disabled()
+    if scene == "half-dead":
+        assert "python -m services.estimator" in seen.page.locator(".notice code").inner_text()
+    if scene not in {"empty", "half-dead"}:
+        seen.wait("store.frame?.status")
+        assert seen.page.locator("#why").is_visible() == (scene in STANDING)
+        assert seen.see(OVERLAPPING) == []
+
+
+@pytest.mark.parametrize("width", [800, 1181, 1300, 1920])
+def test_nothing_is_cut_off(look, width):
+    seen = look("blocked", width=width, height=820)
+    seen.wait("store.frame?.status && !document.getElementById('why').hidden")
+    for layout in ("wide", "side"):
+        if seen.see("document.getElementById('main').dataset.layout") != layout:
+            seen.page.locator("#layout").click()
+        assert seen.see("document.documentElement.scrollWidth") <= width
+        assert seen.see(CUT_OFF) == [], layout
+        assert seen.see(OVERLAPPING) == [], layout
+
+
+def test_what_the_controller_means_is_drawn_and_can_be_hidden(look):
+    seen = look("planning", color_scheme="light")
+    seen.wait("store.prior && store.frame.path.length > 4 && store.frame.obstacles.length && store.frame.people.length")
+    seen.page.keyboard.press(" ")  # nothing moves any more
+    seen.wait("store.paused")
+    place, person = seen.see(TWO_METRES_TO_GO), seen.see("[...store.frame.people.slice(0, 2)]")
+    plain = seen.see("[...store.prior.distance].filter(Number.isFinite).length")
+    assert 0 < plain < seen.see("store.prior.distance.length")
+    for layer, where in (("field", place), ("truth", person)):
+        at = seen.see("view.camera.toScreen(arg[0], arg[1])", where)
+        shown = seen.see(PIXEL, at)
+        seen.page.locator(f'[data-layer="{layer}"]').click()
+        seen.wait(f"{PIXEL} !== '{shown}'", 5, at)
+
+
+def test_a_phone_begins_without_the_field_and_a_desk_with_it(look):
+    assert look("planning", **PHONE).see("view.shown.field") is False
+    assert look("planning").see("view.shown.field") is True
+
+
+def test_why_it_stands_is_said_in_full_with_what_was_before(look):
+    seen = look("blocked")
+    seen.wait("store.journal.length > 3 && store.frame?.status")
+    why = seen.page.locator("#why")
+    why.wait_for()
+    reason = seen.see("store.frame.status.reason")
+    assert len(reason) > 80
+    assert why.inner_text().split(":", 1)[1].strip() == reason
+    rows = seen.page.locator("#journal li")
+    assert rows.count() == seen.see("store.journal.length")
+    assert reason in rows.first.inner_text()
+    assert "idle" in rows.last.inner_text()
+
+
+def test_a_click_is_any_heading_and_a_drag_is_that_one(look):
+    seen = look("tracking")
+    seen.wait("store.world && store.frame")
+    seen.click(9.0, 1.5)
+    seen.wait("store.frame.status.goal && Math.abs(store.frame.status.goal.x - 9) < 0.05", 10)
+    assert seen.see("store.frame.status.goal.yaw_tolerance") is None
+    seen.drag((12.0, 1.5), (12.0, 2.5))
+    seen.wait("store.frame.status.goal.yaw_tolerance === 0.15", 10)
+    assert seen.see("store.frame.status.goal.yaw") == pytest.approx(1.571, abs=0.05)
+
+
+class Fingers:
+    """On a touch screen."""
+
+    def __init__(self, seen):
+        self.session = seen.page.context.new_cdp_session(seen.page)
+
+    def do(self, kind, *places):
+        points = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(places)]
+        self.session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+
+def test_two_fingers_zoom_and_set_no_goal(look):
+    seen = look("tracking", **PHONE)
+    seen.wait("store.world && store.frame")
+    goal, scale = seen.see("[store.frame.status.goal, view.camera.scale]")
+    box, fingers = seen.page.locator("#map").bounding_box(), Fingers(seen)
+    x, y = box["x"] + 150, box["y"] + 150
+    under = seen.see("view.camera.toWorld(150, 150)")
+    fingers.do("touchStart", (x - 20, y), (x + 20, y))
+    for k in range(1, 9):
+        fingers.do("touchMove", (x - 20 - 5 * k, y), (x + 20 + 5 * k, y))
+    fingers.do("touchEnd")
+    seen.wait("view.camera.scale > 2.5 * arg", 5, scale)
+    assert seen.see("view.camera.toWorld(150, 150)") == pytest.approx(under, abs=0.05)
+    assert seen.see("[scrollY, visualViewport.scale]") == [0, 1]
+    assert seen.see("store.frame.status.goal") == goal
+
+
+def test_the_joystick_steers_the_same_though_the_page_moves_under_the_thumb(look):
+    seen = look("tracking", **PHONE)
+    seen.wait("store.world && store.frame")
+    seen.see("presage.connection.ask = (action, fields) => ((window.asked ??= []).push({ action, ...fields }), "
+             "Promise.resolve({ ok: true, reason: '' }))")  # fmt: skip
+    box, fingers = seen.page.locator("#joystick").bounding_box(), Fingers(seen)
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    fingers.do("touchStart", (x, y))
+    fingers.do("touchMove", (x, y - 24))
+    seen.see("document.getElementById('banner').hidden = false")  # 40 px of something above
+    fingers.do("touchMove", (x, y - 25))
+    seen.wait("window.asked.length > 3", 5)
+    fingers.do("touchEnd")
+    seen.wait("window.asked.at(-1).vx === 0", 5)
+    *said, last = seen.see("window.asked.filter((one) => one.action === 'drive')")
+    assert all(one["vx"] > 0.2 for one in said[2:]), said
+    assert (last["vx"], last["wz"]) == (0, 0)
+
+
+def test_after_the_mouse_the_space_key_is_the_maps(look):
+    seen = look("tracking")
+    seen.wait("store.world && store.frame")
+    seen.page.locator("#reset").click()
+    seen.toast("anew")
+    seen.page.keyboard.press(" ")
+    seen.wait("store.paused", 5)
+    seen.page.locator("#pause").focus()
+    seen.page.keyboard.press("Tab")
+    assert seen.see("document.activeElement.id") == "step"  # who goes by keys stays where they are
+
+
+def test_the_page_comes_back_by_itself(browser, processes):
+    port = str(free_tcp_port())
+    first = processes.start("tests.viewer.stub_server", "--port", port)
+    assert wait_until(lambda: accepts(int(port)), PATIENCE)
+    seen = browser_tools.visit(browser, f"http://127.0.0.1:{port}/planning/")
+    seen.wait("store.arrivals.length > 5 && store.prior")
+    first.stop(signal.SIGKILL)
+    seen.page.locator("#banner").wait_for(timeout=10_000)
+    assert "No connection" in seen.page.locator("#banner").inner_text()
+    processes.start("tests.viewer.stub_server", "--port", port)
+    seen.page.locator("#banner").wait_for(state="hidden", timeout=30_000)
+    seen.wait("store.connected && store.prior && performance.now() - store.arrivals.at(-1) < 500", 20)
+    seen.page.context.close()
+
+
+def test_what_is_no_frame_is_passed_over(look):
+    seen = look("tracking")
+    seen.wait("store.world && store.frame")
+    before = seen.see("store.frame.t")
+    for text in ("", "null", "[]", "7", "{", '{"type": "of a later version"}', '{"id": 1}'):
+        seen.see("presage.connection.receive(arg)", text)
+    seen.see("[0, 3, 4, 100].forEach((n) => presage.connection.receive(new Uint8Array(n).fill(255).buffer))")
+    assert seen.see("presage.connection.undecodable") == 10
+    seen.wait("store.frame.t > arg", 10, before)
