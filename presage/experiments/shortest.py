@@ -26,7 +26,7 @@ EXACT = 1e-3  # m, polygon instead of arc
 GAP = 0.03  # m between footprint and walls that the shortest way keeps
 SPARE = 0.05  # m, and what start and goal have around the footprint
 APART = 2.0  # m by the shortest way
-TRIES = 2000
+TRIES = 500
 # Where starts are drawn, of worlds that are about one part of them: x0, y0, x1, y1 in m. In the corridor of `twins` a
 # scan tells where it is.
 ROOMS = {"twins": ((0.0, 0.0, 5.9, 4.4), (6.1, 0.0, 12.0, 4.4))}
