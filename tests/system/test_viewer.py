@@ -9,25 +9,53 @@ import numpy as np
 import psutil
 import pytest
 
-from common.bus import wait_until
-from tests.recorder import sessions as made
+from common.bus import Link, open_bus, wait_until
+from tests.conftest import Processes
+from tests.recorder import sessions as recorded
 from tests.viewer.client import Page, page_of
 
 BOX = {"box": {"center": [6.0, 1.5], "size": [0.4, 0.4]}}
 
 
-@pytest.fixture
-def system(process, bus, tmp_path):
-    """Everything, and a viewer; the link, and the viewer's process."""
-    folder = tmp_path / "recordings"
-    running = process("viewer", "--port", "0", "--recordings", str(folder))
-    process("recorder", "--idle", "--directory", str(folder))
-    process("simulator", "--beams", "622", "--seed", "1")
-    process("controller")
-    process("estimator", "--initial-pose", "3,1.5,90")
-    everybody = {"simulator", "estimator", "controller", "recorder", "viewer"}
-    assert wait_until(lambda: everybody <= bus.alive(), 60)
-    return page_of(running), running
+ROBOT = "played"
+
+
+class System:
+    """Everything but a viewer, for all tests."""
+
+    def __init__(self, folder):
+        self.processes, self.folder = Processes(folder), folder / "recordings"
+        self.folder.mkdir()
+        _, port = self.processes.start_router()
+        self.connect = f"tcp/127.0.0.1:{port}"
+        self.start("recorder", "--idle", "--directory", str(self.folder))
+        self.start("simulator", "--beams", "622", "--seed", "1")
+        self.start("controller")
+        self.start("estimator", "--initial-pose", "3,1.5,90")
+
+    def start(self, name, *args):
+        return self.processes.start(name, *args, env={"PRESAGE_CONNECT": self.connect, "PRESAGE_ROBOT": ROBOT})
+
+    def start_viewer(self):
+        running = self.start("viewer", "--port", "0", "--recordings", str(self.folder))
+        return page_of(running), running
+
+
+@pytest.fixture(scope="module")
+def system(tmp_path_factory):
+    made = System(tmp_path_factory.mktemp("system"))
+    try:
+        with open_bus(Link(ROBOT, (made.connect,))) as bus:
+            assert wait_until(lambda: {"simulator", "estimator", "controller", "recorder"} <= bus.alive(), 60)
+        yield made
+    finally:
+        made.processes.close()
+
+
+@pytest.fixture(scope="module")
+def where(system):
+    """A viewer's link."""
+    return system.start_viewer()[0]
 
 
 def there(x, y, off=0.3):
@@ -38,8 +66,7 @@ def state_of(header):
     return header["status"] and header["status"]["state"]
 
 
-def test_a_visitor_drives_the_robot_about(system):
-    where, _ = system
+def test_a_visitor_drives_the_robot_about(where):
     with Page(where) as page:
         assert page.told("world")["world"]["name"] == "corridor"
         frame = page.frame(lambda h: h["belief"] and h["belief"]["state"] == "tracking" and h["error"] is not None)
@@ -77,8 +104,7 @@ def test_a_visitor_drives_the_robot_about(system):
         page.done("localise", x=9.0, y=1.5, yaw=1.57)
 
 
-def test_a_visitor_furnishes_and_winds_the_clock(system):
-    where, _ = system
+def test_a_visitor_furnishes_and_winds_the_clock(where):
     with Page(where) as page, Page(where) as other:
         page.told("world")
         other.told("world")
@@ -113,9 +139,9 @@ def test_a_visitor_furnishes_and_winds_the_clock(system):
         assert max(page.last["history"]["samples"]["t"], default=0) < stepped["t"]
 
 
-def test_a_visitor_drives_by_hand(system):
-    where, _ = system
+def test_a_visitor_drives_by_hand(where):
     with Page(where) as page:
+        page.done("cancel")
         before = page.frame(lambda h: h["truth"] and h["belief"]).header["truth"]
         deadline = time.monotonic() + 30
         moved = 0.0
@@ -146,9 +172,9 @@ def record(page):
     return file
 
 
-def test_a_recording_is_made_opened_and_scrubbed(system, bus):
-    where, running = system
-    ghost = f"{bus.robot}-replay"
+def test_a_recording_is_made_opened_and_scrubbed(system):
+    where, running = system.start_viewer()
+    ghost = f"{ROBOT}-replay"
     with Page(where) as page, Page(where) as other:
         file = record(page)
         assert not page.ask("player", action="resume")["ok"]
@@ -162,8 +188,8 @@ def test_a_recording_is_made_opened_and_scrubbed(system, bus):
         assert state["duration_s"] == pytest.approx(file["duration"], abs=0.01)
         assert page.last["world"]["world"]["name"] == "corridor"
         assert page.last["world"]["scanner"]["beams"] == 622
-        other.by_now("hello", lambda m: ghost in m["robots"] and m["robot"] == bus.robot)
-        assert other.frame().header["robot"] == bus.robot  # nobody else is dragged along
+        other.by_now("hello", lambda m: ghost in m["robots"] and m["robot"] == ROBOT)
+        assert other.frame().header["robot"] == ROBOT  # nobody else is dragged along
 
         page.done("player", action="seek", value=1.5)
         # Under load a moment may be shown before it is whole, and then again.
@@ -185,8 +211,8 @@ def test_a_recording_is_made_opened_and_scrubbed(system, bus):
 
         page.done("close")
         assert "closed" in page.last
-        page.frame(lambda h: h["robot"] == bus.robot)
-        page.by_now("hello", lambda m: m["robots"] == [bus.robot])
+        page.frame(lambda h: h["robot"] == ROBOT)
+        page.by_now("hello", lambda m: m["robots"] == [ROBOT])
         page.done("open", name=file["name"])
         (child,) = psutil.Process(running.child.pid).children()
         assert running.stop()[0] == 0, running.output
@@ -195,7 +221,7 @@ def test_a_recording_is_made_opened_and_scrubbed(system, bus):
 
 def test_a_recording_that_is_none_is_refused_and_a_replay_that_dies_is_told(process, bus, tmp_path):
     (tmp_path / "broken.mcap").write_bytes(b"no recording at all, but long enough to be looked at twice")
-    made.write(tmp_path / "hall.mcap")
+    recorded.write(tmp_path / "hall.mcap")
     running = process("viewer", "--port", "0", "--recordings", str(tmp_path))
     with Page(page_of(running)) as page:
         rows = {row["name"]: row for row in page.done("recordings")["files"]}
