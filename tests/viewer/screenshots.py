@@ -1,6 +1,6 @@
 """`make screenshots`: docs/page.png and docs/page.webp, of a real session in a real browser.
 
-A robot is carried off, finds itself, and drives to a goal around what a visitor put in its way.
+A robot drives through an office with people in it, is carried off on the way, finds itself, and goes on to its goal.
 """
 
 from __future__ import annotations
@@ -18,7 +18,14 @@ from PIL import Image
 from tests.conftest import ROOT, Processes
 from tests.viewer.browser import Visit, find_browser, open_browser, visit
 
-SERVICES = ("simulator", "estimator", "controller")
+WORLD = ("--world", "office")
+SERVICES = {
+    "simulator": (*WORLD, "--people", "3", "--seed", "4"),
+    "estimator": WORLD,
+    "controller": (*WORLD, "--belief-timeout", "5"),  # pictures are taken on the same machine
+}
+GOAL, FACING = (16.5, 6.5), (16.5, 5.6)  # m in map, where the pointer is put down and let go
+ELSEWHERE = (9.5, 1.6)  # m, where the robot is carried
 SMALL = (960, 600)  # px of the animation
 PERIOD = 0.2  # s of the robot's time between its pictures, at least
 
@@ -27,8 +34,8 @@ def start(processes: Processes) -> str:
     """Everything, and the page's address."""
     _, port = processes.start_router()
     environment = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "robot"}
-    for name in SERVICES:
-        processes.start(name, env=environment)
+    for name, arguments in SERVICES.items():
+        processes.start(name, *arguments, env=environment)
     processes.start("recorder", "--idle", "--directory", str(processes.folder), env=environment)
     viewer = processes.start("viewer", "--port", "0", env=environment)
     viewer.wait_for("page: ")
@@ -62,19 +69,19 @@ def play(seen: Visit) -> tuple[Image.Image, list[tuple[float, Image.Image]]]:
     """A visitor plays: the picture, and the film of it."""
     tracked = "store.frame?.belief?.state === 'tracking' && Math.abs(store.frame.belief.x - store.frame.truth.x) < 0.1"
     seen.wait(f"{tracked} && store.history.t.length > 60", 90)
-    seen.click(14.6, 1.4)
-    seen.wait("store.frame.speed > 0.4")
-    pictures = film(seen, 2)
+    seen.drag(GOAL, FACING)
+    seen.wait("store.frame.speed > 0.3 && store.prior", 60)
+    quiet(seen)
+    pictures = film(seen, 3.5)
     seen.page.keyboard.down("Shift")
-    seen.click(6.0, 1.6)
+    seen.click(*ELSEWHERE)
     seen.page.keyboard.up("Shift")
-    pictures += film(seen, 3)
-    seen.wait(tracked, 60)
-    seen.click(15.0, 1.2)
-    seen.wait("store.frame.truth.x > 8.5", 60)
+    seen.wait("Math.hypot(store.frame.truth.x - arg[0], store.frame.truth.y - arg[1]) < 0.5", argument=ELSEWHERE)
+    pictures += film(seen, 2)
+    seen.wait(f"{tracked} && store.frame.speed > 0.5", 60)
     quiet(seen)
     still = picture(seen)
-    return still, pictures + film(seen, 3)
+    return still, pictures + film(seen, 6)
 
 
 def main() -> None:
