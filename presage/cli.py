@@ -46,7 +46,7 @@ app = typer.Typer(
 def up(
     world: WorldName = "corridor",
     beams: Annotated[int, typer.Option(help="Beams of the scanner; 622 are the paper's.")] = 811,
-    drive: Annotated[str, typer.Option(help="holonomic or differential (hand driving only, for now).")] = "holonomic",
+    drive: Annotated[str, typer.Option(help="holonomic or differential.")] = "holonomic",
     pace: Annotated[str, typer.Option(help="realtime, fast or lockstep.")] = "realtime",
     seed: Seed = 0,
     record: Annotated[Path | None, typer.Option(help="Record into this folder.")] = None,
