@@ -25,9 +25,12 @@ SERVICES = {
     "controller": (*WORLD, "--belief-timeout", "5"),  # pictures are taken on the same machine
 }
 GOAL, FACING = (16.5, 6.5), (16.5, 5.6)  # m in map, where the pointer is put down and let go
-ELSEWHERE = (9.5, 1.6)  # m, where the robot is carried
-SMALL = (960, 600)  # px of the animation
-PERIOD = 0.2  # s of the robot's time between its pictures, at least
+ELSEWHERE = (11.8, 1.2)  # m, where the robot is carried
+BACK = (3.6, 6.4)  # m, the next goal
+LARGE, SMALL = {"width": 1440, "height": 900}, {"width": 1100, "height": 740}  # px of the page, still and filmed
+FILM = (960, 646)  # px of the animation
+PERIOD = 0.15  # s of the robot's time between its pictures, at least
+LONGEST = 25.0  # s of the robot's time, of one scene
 
 
 def start(processes: Processes) -> str:
@@ -49,12 +52,12 @@ def picture(seen: Visit) -> Image.Image:
     return Image.open(io.BytesIO(seen.page.screenshot())).convert("RGB")
 
 
-def film(seen: Visit, seconds: float) -> list[tuple[float, Image.Image]]:
-    """Pictures of the robot's next seconds, small, each with its time; as many as this machine manages."""
+def film(seen: Visit, ends: str) -> list[tuple[float, Image.Image]]:
+    """Pictures of the page until an expression is true, small, each with the robot's time."""
     began = now = seen.see("store.frame.t")
     pictures = []
-    while now < began + seconds:
-        pictures.append((now, picture(seen).resize(SMALL, Image.Resampling.LANCZOS)))
+    while now < began + LONGEST and not seen.see(ends):
+        pictures.append((now, picture(seen).resize(FILM, Image.Resampling.LANCZOS)))
         seen.wait("store.frame.t > arg", argument=now + PERIOD)
         now = seen.see("store.frame.t")
     return pictures
@@ -69,19 +72,22 @@ def play(seen: Visit) -> tuple[Image.Image, list[tuple[float, Image.Image]]]:
     """A visitor plays: the picture, and the film of it."""
     tracked = "store.frame?.belief?.state === 'tracking' && Math.abs(store.frame.belief.x - store.frame.truth.x) < 0.1"
     seen.wait(f"{tracked} && store.history.t.length > 60", 90)
+    seen.page.set_viewport_size(SMALL)
+    seen.page.locator("#speed").select_option("0.5")  # pictures take their time
     seen.drag(GOAL, FACING)
-    seen.wait("store.frame.speed > 0.3 && store.prior", 60)
+    seen.wait("store.frame.speed > 0.1 && store.prior", 60)
     quiet(seen)
-    pictures = film(seen, 3.5)
+    pictures = film(seen, "store.frame.truth.x > 4.5")
     seen.page.keyboard.down("Shift")
     seen.click(*ELSEWHERE)
     seen.page.keyboard.up("Shift")
-    seen.wait("Math.hypot(store.frame.truth.x - arg[0], store.frame.truth.y - arg[1]) < 0.5", argument=ELSEWHERE)
-    pictures += film(seen, 2)
-    seen.wait(f"{tracked} && store.frame.speed > 0.5", 60)
+    pictures += film(seen, "store.frame.status?.state === 'reached'")
+    seen.page.set_viewport_size(LARGE)
+    seen.page.locator("#speed").select_option("1")
+    seen.click(*BACK)
+    seen.wait(f"{tracked} && store.frame.truth.x < 11.5 && store.frame.speed > 0.7 && store.frame.path.length", 60)
     quiet(seen)
-    still = picture(seen)
-    return still, pictures + film(seen, 6)
+    return picture(seen), pictures
 
 
 def main() -> None:
