@@ -26,15 +26,16 @@ NUMBERS = {"ignore_unknown_options": True}
 def goal(
     x: Annotated[float | None, typer.Argument(help="m, map")] = None,
     y: Annotated[float | None, typer.Argument(help="m, map")] = None,
+    yaw: Annotated[float | None, typer.Argument(help="deg, the heading there; none: any")] = None,
     tolerance: Annotated[float, typer.Option(min=0.01, help="Reached within this, m.")] = 0.2,
-    wait: Annotated[bool, typer.Option("--wait", help="Until it is reached or blocked.")] = False,
+    wait: Annotated[bool, typer.Option("--wait", help="Until it is reached, refused, or blocked for 30 s.")] = False,
     cancel: Annotated[bool, typer.Option("--cancel", help="Forget the goal and stand.")] = False,
     robot: RobotName = "robot",
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
     """Send the robot somewhere.
 
-    Examples: `presage goal 15 1.5 --wait`; `presage goal --cancel`.
+    Examples: `presage goal 15 1.5 --wait`; `presage goal 15 1.5 90`; `presage goal --cancel`.
     """
     from common.messages import Goal  # noqa: PLC0415
     from presage.tools import give_goal  # noqa: PLC0415
@@ -44,7 +45,10 @@ def goal(
     if not np.isfinite(tolerance):
         raise UserError(f"--tolerance {tolerance}: a finite number is needed, in m")
     # The time numbers it: the controller's status says which goal it is about, whoever gave the others.
-    wish = Goal(stamp_ns=0, seq=time.time_ns(), pose=_pose(x or 0.0, y or 0.0), tolerance=tolerance, cancel=cancel)
+    wish = Goal(
+        stamp_ns=0, seq=time.time_ns(), pose=_pose(x or 0.0, y or 0.0, yaw or 0.0), tolerance=tolerance,
+        yaw_tolerance=None if yaw is None else 0.1, cancel=cancel,
+    )  # fmt: skip
     raise typer.Exit(give_goal(link_of(connect, robot), wish, console, wait=wait))
 
 

@@ -70,14 +70,21 @@ def _check_goal(bus: Bus, pose: Pose) -> None:
         )
 
 
+BLOCKED_FOR = 30.0  # s of stamps; who stands in the way goes on sooner, and the robot with them
+
+
 def _follow(watch: Watch, goal: Goal, console: Console) -> int:
+    moved_ns: int | None = None
     with console.status("navigating") as line:
         while (status := watch.until(Status, lambda _: True, 3.0)) is not None:
             if status.goal_seq != goal.seq:
                 raise UserError("another goal took its place" if status.goal else "the goal was cancelled")
             away = f"{status.distance:.2f} m to go" if status.distance is not None else ""
             line.update(f"{status.state} {away} {status.reason}")
-            if status.state in {"reached", "blocked"}:
+            if status.state != "blocked" or moved_ns is None or status.stamp_ns < moved_ns:
+                moved_ns = status.stamp_ns
+            refused = status.state == "blocked" and status.reason.startswith("goal refused")
+            if status.state == "reached" or refused or status.stamp_ns - moved_ns > BLOCKED_FOR * 1e9:
                 console.print(f"{status.state}: {status.reason}")
                 return 0 if status.state == "reached" else 1
     raise UserError("the controller fell silent")

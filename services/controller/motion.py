@@ -10,12 +10,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from common import se2
+
 if TYPE_CHECKING:
     from common.robot import Robot
     from common.se2 import Array
 
 HOLD = 0.4  # s that an action is held in the prediction; the next scan asks anew
 STEP = 1 / 15  # s
+TURNING = 0.4  # share of the acceleration that a turn on the way may take
+NEAR = 0.5  # m
 
 
 def rollouts(current: Array, actions: Array, robot: Robot, hold: float = HOLD) -> tuple[Array, Array, Array]:
@@ -67,6 +71,20 @@ def turn_rate(angle: float, robot: Robot) -> float:
     """rad/s towards a heading that is ``angle`` rad away, braked in time."""
     rate = robot.turn_acceleration * (np.sqrt(STEP**2 + 2 * abs(angle) / robot.turn_acceleration) - STEP)
     return float(np.sign(angle) * min(robot.max_turn, rate))
+
+
+def facing(action: Array, attractor: Array, robot: Robot) -> Array:
+    """The action (3,) of a holonomic base with a turn towards the attractor (2,) m, so that it sees where it goes.
+
+    Near the attractor, and with it in front, the heading is kept.
+    """
+    bearing = float(np.arctan2(attractor[1], attractor[0]))
+    if np.hypot(*attractor) < NEAR and abs(bearing) < np.pi / 3:
+        return np.array([action[0], action[1], 0.0])
+    # A base that turns must change its velocity in base_link to keep it in map, for which it has an acceleration.
+    most = TURNING * robot.acceleration / max(float(np.hypot(action[0], action[1])), 1e-3)
+    turn = float(np.clip(turn_rate(bearing, robot), -most, most))
+    return np.array([*se2.rotate(-turn * STEP / 2, action[:2]), turn])
 
 
 def candidates(current: Array, towards: Array, robot: Robot) -> Array:

@@ -70,6 +70,11 @@ class Navigator:
         self.mind.aim(None if self.goal is None or self._refused else goal.pose.array()[:2])
 
     @property
+    def scan_stamp(self) -> int | None:
+        """Of the last scan, ns."""
+        return None if self._scan is None else self._scan.stamp_ns
+
+    @property
     def wants_to_go(self) -> bool:
         """Whether there is a goal that it is on the way to."""
         return self.goal is not None and not self._refused and self.state != "reached"

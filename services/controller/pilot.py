@@ -14,7 +14,7 @@ from common import safety, se2
 from services.controller.decision import Decision
 from services.controller.geodesic import Field, Roads
 from services.controller.grid import FreeSpace
-from services.controller.motion import STEP, turn_rate
+from services.controller.motion import facing
 from services.controller.obstacles import TemporaryObstacles
 from services.controller.policy import Around, choose
 from services.controller.seeking import Seeker
@@ -30,9 +30,7 @@ if TYPE_CHECKING:
 KEEP = 0.06  # m between footprint and what the map does not know: the scanner's noise, and half a cell
 REPLAN = 400_000_000  # ns between two plans for another picture of what stands in the way
 STUCK = 3_000_000_000  # ns without progress until it backs off
-BACK_OFF = 1_500_000_000  # ns of it
-TURNING = 0.4  # share of the acceleration that a turn on the way may take
-FACING = 0.5  # m from the attractor, nearer a base that need not turn keeps its heading
+BACK_OFF = 3_000_000_000  # ns of it
 RANGE = 3.0  # m about the robot within which what the map does not know matters to its next second
 ASIDE = 0.25  # m of clearance that backing off aims at more than there is
 
@@ -47,7 +45,7 @@ class Pilot:
         self.free = FreeSpace.of(world)
         self.roads = Roads(self.free, robot.radius)
         self.obstacles = TemporaryObstacles(self.free)
-        self.seeker = Seeker(robot, self.roads, robot.radius + KEEP)
+        self.seeker = Seeker(robot, self.roads, robot.radius + KEEP, turns=not keep_heading)
         self.field: Field | None = None  # of the goal, with what is known to stand in the way
         self.closed = False  # the field is the map's alone, for what stands about leaves no way
         self.changed = False  # the field is another one; for whoever publishes it, who sets it False
@@ -101,8 +99,7 @@ class Pilot:
         self._view = float(min(np.pi, outermost.min()))
         self._scan = scan
         if belief.state != "tracking":
-            self.obstacles.clear()  # seen from somewhere else, perhaps
-            return
+            return  # what was seen before stands where it stood
         self.seeker.forget()
         pose = belief.pose.array()
         self.obstacles.see(scan, pose)
@@ -124,8 +121,8 @@ class Pilot:
         attractor = se2.rotate(-pose[2], point - pose[:2])
         choice = choose(velocity, attractor, around, self.robot)
         action = choice.action.copy()
-        if self.robot.drive == "holonomic" and not self.keep_heading and np.hypot(*attractor) > FACING:
-            action = self._facing(action, attractor)
+        if self.robot.drive == "holonomic" and not self.keep_heading:
+            action = facing(action, attractor, self.robot)
         self._watch(stamp_ns, moves=bool(np.hypot(*action[:2]) > 0 or abs(action[2]) > 0))
         reason = ""
         if choice.held:
@@ -134,14 +131,6 @@ class Pilot:
             reason = self._no_way(pose, around)
         stands = bool(reason) and not choice.action.any()
         return Decision(action, reason, "blocked" if stands else "navigating", way, _in_map(pose, choice.way))
-
-    def _facing(self, action: Array, attractor: Array) -> Array:
-        """The action (3,) with a turn towards where it goes, so that the scanner sees what comes."""
-        speed = float(np.hypot(*action[:2]))
-        # A base that turns must change its velocity in base_link to keep it in map, for which it has an acceleration.
-        most = TURNING * self.robot.acceleration / max(speed, 1e-3)
-        turn = float(np.clip(turn_rate(float(np.arctan2(attractor[1], attractor[0])), self.robot), -most, most))
-        return np.array([*se2.rotate(-turn * STEP / 2, action[:2]), turn])
 
     def question(self, belief: Belief) -> Options | None:
         """Where scans must be predicted before `seek` can choose where to go; None: nowhere, now."""
@@ -198,7 +187,7 @@ class Pilot:
 
         return Around(
             known, se2.rotate(-pose[2], points[near] - pose[:2]), moving[near], self.roads.least, radius + KEEP,
-            view=self._view,
+            view=self._view, turns=not self.keep_heading,
         )  # fmt: skip
 
     def _watch(self, stamp_ns: int, *, moves: bool) -> None:
@@ -213,14 +202,11 @@ class Pilot:
         """Recovery: towards where there is more room, by the map and by what is seen."""
         angle = np.arange(16) * np.pi / 8
         places = 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        gaps = around.gaps(places[:, None, :], np.zeros(1))[:, 0]
-        if self.robot.drive == "differential":
-            gaps = gaps - 0.05 * np.abs(angle - np.pi) / np.pi  # straight back, where that is as good
-        best = int(np.argmax(gaps))
+        best = int(np.argmax(around.gaps(places[:, None, :], np.zeros(1))[:, 0]))
         choice = choose(velocity, places[best], around, self.robot)
         action = choice.action
-        if self.robot.drive == "differential" and abs(angle[best] - np.pi) < np.pi / 4:
-            action = np.array([-0.1, 0.0, 0.0])
+        if self.robot.drive == "holonomic" and not self.keep_heading:
+            action = facing(action, places[best], self.robot)
         return Decision(action, "stuck: backing off", path=way, motion=_in_map(pose, choice.way))
 
     def _what_holds(self, pose: Array, around: Around, *, stood: bool) -> str:

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 COMFORT = 0.25  # m beside the footprint, below which progress counts for less
 DISCOMFORT = 0.5  # by how much less, at the least gap
 CLOSE = 0.3  # m, nearer to the attractor than this the heading towards it matters less and less
-BLIND_SPEED = 0.25  # m/s, where the scanner does not look
+BLIND_SPEED = 0.25  # m/s, where the scanner does not look, for a base that may not turn; others turn first
+SLOW = 0.02  # m/s, slower is standing
+ASIDE = np.pi / 4  # rad by which the scanner must look further than where the body goes, for it is wide
 LEAST_PROGRESS = 0.004  # m; what gains less is as good as standing
 STEADY = 0.02  # m per m/s, for going on as before
 
@@ -35,6 +37,7 @@ class Around:
     keep: float  # m to points
     walking: float = 1.0  # m/s, of those that move
     view: float = np.pi  # rad to either side of x that the scanner sees
+    turns: bool = True  # the base may turn, so nothing need be done unseen
 
     def gaps(self, poses: Array, times: Array, stands: Array | float = np.inf) -> Array:
         """(N, T) m left between footprint and anything at poses (N, T, 3); less where somebody may be by then.
@@ -72,7 +75,7 @@ def choose(current: Array, attractor: Array, around: Around, robot: Robot) -> Ch
     the robot stands, has none. lambda does not change which is least.
     """
     actions = motion.candidates(current, attractor, robot)
-    actions = _seen(actions, around.view)
+    actions = _seen(actions, around)
     poses, times, stands = motion.rollouts(current, actions, robot)
     gaps = around.gaps(poses, times, stands)
     now = float(around.gaps(np.zeros((1, 1, 3)), np.zeros(1))[0, 0])
@@ -102,9 +105,14 @@ def to_go(poses: Array, attractor: Array, robot: Robot) -> Array:
     return np.asarray(distance + turn * robot.max_speed / robot.max_turn * np.minimum(1.0, distance / CLOSE))
 
 
-def _seen(actions: Array, view: float) -> Array:
-    """The actions (N, 3), slowed where the scanner does not look."""
+def _seen(actions: Array, around: Around) -> Array:
+    """The actions (N, 3) that the scanner can answer for; where a base may not turn, the others too, but slow."""
+    if around.view >= np.pi:
+        return actions
     speed = np.hypot(actions[:, 0], actions[:, 1])
-    blind = np.abs(np.arctan2(actions[:, 1], actions[:, 0])) > view
-    scale = np.where(blind & (speed > BLIND_SPEED), BLIND_SPEED / np.maximum(speed, 1e-9), 1.0)
+    moves = speed > BLIND_SPEED if not around.turns else speed > SLOW
+    blind = (np.abs(np.arctan2(actions[:, 1], actions[:, 0])) > around.view - ASIDE) & moves
+    if around.turns:
+        return actions[~blind]
+    scale = np.where(blind, BLIND_SPEED / np.maximum(speed, 1e-9), 1.0)
     return np.column_stack([actions[:, :2] * scale[:, None], actions[:, 2]])

@@ -13,7 +13,7 @@ import numpy as np
 from common import se2
 from services.controller.decision import Decision
 from services.controller.epistemic import Explorer, Options
-from services.controller.motion import turn_rate
+from services.controller.motion import facing
 from services.controller.policy import Around, choose
 
 if TYPE_CHECKING:
@@ -38,8 +38,9 @@ ROOM = 0.7  # m; with less in every direction it turns on the spot
 class Seeker:
     """Where to go to know where one is."""
 
-    def __init__(self, robot: Robot, roads: Roads, keep: float) -> None:
-        """``keep`` m from the robot's centre to whatever the scan shows."""
+    def __init__(self, robot: Robot, roads: Roads, keep: float, *, turns: bool = True) -> None:
+        """``keep`` m from the robot's centre to whatever the scan shows; ``turns``: not bound to its heading."""
+        self.turns = turns
         self.robot = robot.model_copy(update={"max_speed": min(robot.max_speed, SPEED)})
         self.roads, self.keep = roads, keep
         self.explorer = Explorer()
@@ -82,7 +83,7 @@ class Seeker:
 
     def act(self, belief: Belief, scan: Scan, points: Array, velocity: Array, view: float) -> Decision:
         """The action now; ``points`` (K, 2) m in base_link stand about, it sees ``view`` rad to either side."""
-        around = Around(_unknown, points, np.zeros(len(points), bool), 0.0, self.keep, view=view)
+        around = Around(_unknown, points, np.zeros(len(points), bool), 0.0, self.keep, view=view, turns=self.turns)
         likely = [h for h in belief.hypotheses if h.weight >= LIKELY][:MOST]
         if belief.state == "ambiguous" and likely:
             self._since = None
@@ -144,12 +145,10 @@ class Seeker:
     def _towards(self, attractor: Array, around: Around, velocity: Array, reason: str, way: Array) -> Decision:
         choice = choose(velocity, attractor, around, self.robot)
         action = choice.action.copy()
-        bearing = float(np.arctan2(attractor[1], attractor[0]))
-        if self.robot.drive == "holonomic" and np.hypot(*attractor) > self.keep:
-            most = 0.4 * self.robot.acceleration / max(float(np.hypot(*action[:2])), 1e-3)
-            action[2] = np.clip(turn_rate(bearing, self.robot), -most, most)
-        elif not action.any():  # nothing ahead is free: look elsewhere
-            action[2] = float(np.sign(bearing) or 1.0) * 0.5
+        if self.robot.drive == "holonomic" and self.turns:
+            action = facing(action, attractor, self.robot)
+        if not action.any() and self.turns:  # nothing ahead is free: look elsewhere
+            action[2] = 0.5 if attractor[1] >= 0 else -0.5
         return Decision(action, reason, "exploring", way)
 
 

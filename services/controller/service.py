@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from services.controller.pilot import Pilot
 
 PREDICTED_BEAMS = 61  # of a scan expected elsewhere
+SCAN_WITHIN = 0.2  # s that a belief waits for its own scan
 PREDICTED_WITHIN = 0.3  # s that a command waits for predictions; once a second at most, and only while it seeks
 
 
@@ -52,6 +53,8 @@ class ControllerService(Service):
         self._last: tuple[int, CmdVel, Status] | None = None
         self._waiting: Belief | None = None  # for predictions
         self._questioning_ns = 0
+        self._early: Belief | None = None  # it came before its scan
+        self._early_at = 0.0
         self._asked, self._asked_at = -1, 0.0  # number of that request, and when it was made
         self._planned = False  # a plan was published that is not empty
         self._belief_at: float | None = None  # wall time of the last belief; None: its absence has been said
@@ -80,6 +83,8 @@ class ControllerService(Service):
         """A belief is answered by a command of the same stamp; a goal by a status, at once."""
         if isinstance(message, Scan):
             self.navigator.hear_scan(message)
+            if self._early is not None and self._early.stamp_ns <= message.stamp_ns:
+                self._take_early()
             # A hand needs no belief, and so no estimator.
             if self._belief_at is None and (answer := self.navigator.steer(message.stamp_ns)) is not None:
                 self._answer(*answer)
@@ -94,7 +99,18 @@ class ControllerService(Service):
             if self._last is not None and self._last[0] == message.stamp_ns:
                 self._send(self._last[1], self._last[2])  # one sent again is answered again
             elif self._waiting is None or self._waiting.stamp_ns != message.stamp_ns:
-                self._take(message)
+                self._take_early()
+                scan = self.navigator.scan_stamp
+                if scan is not None and scan < message.stamp_ns:  # the network turned them round
+                    self._early, self._early_at = message, time.monotonic()
+                else:
+                    self._take(message)
+
+    def _take_early(self) -> None:
+        """The belief that waits for its scan."""
+        belief, self._early = self._early, None
+        if belief is not None:
+            self._take(belief)
 
     def _take(self, belief: Belief) -> None:
         """Answer it; where it must be known first what would be seen elsewhere, ask, and answer when that has come."""
@@ -150,10 +166,15 @@ class ControllerService(Service):
         until = self._belief_at + self.options.belief_timeout
         if self._waiting is not None:
             until = min(until, self._asked_at + PREDICTED_WITHIN)
+        if self._early is not None:
+            until = min(until, self._early_at + SCAN_WITHIN)
         return until - time.monotonic()
 
     def on_timer(self) -> None:
         """No fresh belief: stand, and say so once."""
+        if self._early is not None:
+            self._take_early()
+            return
         if self._waiting is not None:
             self._go_without()
             return

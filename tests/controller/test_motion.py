@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from common import safety, se2
 from common.robot import Robot
-from services.controller.motion import HOLD, braking_speed, candidates, rollouts, turn_rate
+from services.controller.motion import HOLD, braking_speed, candidates, facing, rollouts, turn_rate
 from services.controller.policy import Around, choose, to_go
 
 DRIVES = [Robot(), Robot(drive="differential")]
@@ -123,9 +123,13 @@ def test_a_wall_across_the_way_is_waited_at():
     assert choice.way[-1, 0] < 0.4 - 0.33 + 1e-3
 
 
-def test_where_the_scanner_does_not_look_it_goes_slowly():
-    choice = choose(np.zeros(3), np.array([-3.0, 0.0]), around(view=np.deg2rad(135)), Robot())
-    assert 0 < np.hypot(*choice.action[:2]) <= 0.25 + 1e-9
+def test_where_the_scanner_does_not_look_it_turns_first_or_goes_slowly():
+    behind, view = np.array([-3.0, 0.0]), np.deg2rad(135)
+    choice = choose(np.zeros(3), behind, around(view=view), Robot())
+    assert abs(np.arctan2(choice.action[1], choice.action[0])) <= np.pi / 2 + 1e-9  # the body is wide
+    assert abs(facing(choice.action, behind, Robot())[2]) > 1.0
+    kept = choose(np.zeros(3), behind, around(view=view, turns=False), Robot())
+    assert 0 < np.hypot(*kept.action[:2]) <= 0.25 + 1e-9
 
 
 def test_candidates_hold_standing_and_going_on():
