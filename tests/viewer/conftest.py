@@ -1,11 +1,11 @@
-"""One browser for all tests of the page."""
+"""A browser for tests of the page."""
 
 from __future__ import annotations
 
 import pytest
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # ended with it: while playwright is open, no other loop of asyncio can run
 def browser():
     """A headless Chromium."""
     tools = pytest.importorskip("tests.viewer.browser", reason="NO PLAYWRIGHT: the page is not tested")
