@@ -84,7 +84,7 @@ class Visit:
         return found.inner_text()
 
 
-def visit(browser: Browser, address: str, *, width: int = 1440, height: int = 900, **options: Any) -> Visit:
+def visit(browser: Browser, address: str, *, width: int = 1100, height: int = 760, **options: Any) -> Visit:
     """A page in a context of its own, once its socket is open."""
     context = browser.new_context(viewport={"width": width, "height": height}, **options)
     seen = Visit(context.new_page())

@@ -105,7 +105,7 @@ def main() -> None:
             address = start(processes)
             with open_browser(path) as browser:
                 colours = "dark" if args.dark else "light"
-                seen = visit(browser, address, device_scale_factor=1.25, color_scheme=colours)
+                seen = visit(browser, address, **LARGE, device_scale_factor=1.25, color_scheme=colours)
                 still, pictures = play(seen)
         finally:
             processes.close()

@@ -192,11 +192,12 @@ def test_a_recording_is_made_opened_and_scrubbed(page, system):
 
 
 def test_a_missing_service_is_named_with_what_starts_it(page, system):
-    system.running["estimator"].stop()
-    notice = page.page.locator(".notice", has_text="estimator is missing")
+    system.running["controller"].stop()
+    notice = page.page.locator(".notice", has_text="controller is missing")
     notice.wait_for(timeout=20_000)
-    assert "python -m services.estimator" in notice.locator("code").inner_text()
-    assert page.page.locator("#estimator-badge b").inner_text() == "missing"
-    system.start("estimator")
+    assert "python -m services.controller" in notice.locator("code").inner_text()
+    assert page.page.locator("#controller-badge b").inner_text() == "missing"
+    page.wait("store.frame.status === null", 10)  # its last word is no more
+    system.start("controller")
     notice.wait_for(state="detached", timeout=40_000)
-    page.wait("store.frame?.belief?.state === 'tracking'", 60)
+    page.wait("store.frame?.status?.state === 'idle'", 60)
