@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 
 from common.messages import Stamped
-from common.topics import SCAN, Topic
+from common.topics import PLAN, SCAN, Topic
 
 QUIET = 0.03  # s without a message: what was sent has come
 LONGEST = 0.06  # s, of one that plays on without a pause
@@ -41,11 +41,14 @@ class Moments:
         return min(self._last + QUIET, self._first + LONGEST) - at if self._news else None
 
     def choose(self) -> Moment | None:
-        """The fullest of those not shown as they are, of several the newest; what is older is forgotten."""
+        """The fullest of those not shown as they are, of several the newest; what is older is forgotten.
+
+        A plan does not count: where the robot stands there is none.
+        """
         self._news = False
         stamp, count = max(
             ((s, len(m)) for s, m in self._by_stamp.items() if SCAN.name in m and self._is_new(s, len(m))),
-            key=lambda moment: (moment[1], moment[0]),
+            key=lambda moment: (moment[1] - (PLAN.name in self._by_stamp[moment[0]]), moment[0]),
             default=self._shown,
         )
         if (stamp, count) == self._shown:

@@ -366,3 +366,10 @@ def test_numbers_that_no_robot_has_are_shown_as_none():
     huge = preference(1.0, width=401, height=401).model_copy(update={"resolution": 1e308})
     view.hear(PREFERENCE, huge, 1.0)
     assert told_field(view) is None
+
+
+def test_a_replay_shows_the_last_moment_though_it_has_no_plan_any_more():
+    view = RobotView("ghost", live=False)
+    feed(view, 1.0)
+    feed(view, 1.1, 1.0, PLAN)
+    assert shown(view, 1.0).header["t"] == pytest.approx(1.1)
