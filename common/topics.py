@@ -56,7 +56,14 @@ GOAL = Topic("goal", m.Goal, "presage goal, viewer", 0, "newest", about="where t
 DRIVE = Topic("drive", m.Drive, "viewer", 0, "newest", about="velocity by hand, before any goal")
 STATUS = Topic("status", m.Status, "controller", 15, "newest", about="what the controller does, and why")
 PLAN = Topic("plan", m.Plan, "controller", 0, "newest", about="the way ahead, and what the map does not know")
-PREFERENCE = Topic("preference", m.Preference, "controller", 0, "newest", about="the goal prior over free space")
+PREFERENCE = Topic(
+    "preference",
+    m.Preference,
+    "controller",
+    0,
+    "newest",
+    about="the goal prior, on change and every 5 s",
+)
 HEALTH = Topic("health", m.Health, "every service", 1, "all", per_service=True, about="counters of a service")
 
 TOPICS: tuple[Topic, ...] = (

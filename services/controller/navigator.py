@@ -142,32 +142,36 @@ class Navigator:
 
     def _wanted(self, belief: Belief, pose: Array, distance: float | None) -> Array:
         """The command free energy asks for, before any limit; (3,) in base_link."""
-        if self.goal is None or distance is None or self._refused:
+        if self.goal is None or distance is None or self._refused or self.state == "reached":
             return np.zeros(3)
-        if self.state == "reached":
-            return self._turn(pose)
         if belief.state in {"lost", "localising", "ambiguous"}:
             self.decision, self._waiting = self.mind.seek(belief, self._velocity), True
             self.state, self.reason = self.decision.state, self.decision.reason
             return self.decision.action
-        if distance <= self.goal.tolerance:
-            self.state, self.reason = "reached", f"within {self.goal.tolerance:g} m of the goal"
-            self.mind.interrupt()
-            return self._turn(pose)
         if self._waiting:
             self._waiting, self.state, self.reason = False, "navigating", ""
+        if distance <= self.goal.tolerance:
+            self.mind.interrupt()
+            turn = self._turn(pose)
+            if turn is None:
+                self.state, self.reason = "reached", f"within {self.goal.tolerance:g} m of the goal"
+                return np.zeros(3)
+            self.decision = Decision(turn, "there: turning into the goal's heading")
+            return turn
         if (refusal := self.mind.refusal(self.goal.pose.array()[:2])) is not None:
             self.state, self.reason, self._refused = "blocked", refusal, True
             return np.zeros(3)
         self.decision = self.mind.decide(belief, self._velocity)
         return self.decision.action
 
-    def _turn(self, pose: Array) -> Array:
-        """At the goal: into its heading, where one is asked for; (3,) in base_link."""
+    def _turn(self, pose: Array) -> Array | None:
+        """At the goal: into the heading asked for, (3,) in base_link; None where it has it, or none is asked for."""
         if self.goal is None or self.goal.yaw_tolerance is None:
-            return np.zeros(3)
+            return None
         away = float(se2.wrap(self.goal.pose.yaw - pose[2]))
-        return np.array([0.0, 0.0, turn_rate(away, self.robot) if abs(away) > self.goal.yaw_tolerance / 2 else 0.0])
+        if abs(away) <= self.goal.yaw_tolerance:
+            return None
+        return np.array([0.0, 0.0, turn_rate(away, self.robot)])
 
     def _watch_progress(self, stamp_ns: int, *, held_back: bool) -> None:
         """Standing for a while on the way, for what the scan shows or for what the preset says: blocked."""

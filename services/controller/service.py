@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from services.controller.pilot import Pilot
 
 PREDICTED_BEAMS = 61  # of a scan expected elsewhere
+SHOWN_AGAIN = 5_000_000_000  # ns between two messages of one field
 SCAN_WITHIN = 0.2  # s that a belief waits for its own scan
 PREDICTED_WITHIN = 0.3  # s that a command waits for predictions; once a second at most, and only while it seeks
 
@@ -53,6 +54,7 @@ class ControllerService(Service):
         self._last: tuple[int, CmdVel, Status] | None = None
         self._waiting: Belief | None = None  # for predictions
         self._questioning_ns = 0
+        self._shown = -SHOWN_AGAIN  # ns, when the field was sent
         self._early: Belief | None = None  # it came before its scan
         self._early_at = 0.0
         self._asked, self._asked_at = -1, 0.0  # number of that request, and when it was made
@@ -199,7 +201,8 @@ class ControllerService(Service):
         if something or self._planned:  # once more where there is nothing any more
             self.publish(PLAN, Plan(stamp_ns=stamp_ns, path=path, motion=motion, obstacles=obstacles))
         self._planned = something
-        if self.pilot.changed and self.navigator.goal is not None:
-            self.pilot.changed = False
+        again = not 0 <= stamp_ns - self._shown < SHOWN_AGAIN  # for who comes later
+        if (self.pilot.changed or again) and self.navigator.goal is not None:
+            self.pilot.changed, self._shown = False, stamp_ns
             if (field := self.pilot.field) is not None:
                 self.publish(PREFERENCE, prior_of(field, self.navigator.goal, stamp_ns))
