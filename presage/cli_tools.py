@@ -26,7 +26,7 @@ NUMBERS = {"ignore_unknown_options": True}
 def goal(
     x: Annotated[float | None, typer.Argument(help="m, map")] = None,
     y: Annotated[float | None, typer.Argument(help="m, map")] = None,
-    yaw: Annotated[float | None, typer.Argument(help="deg, the heading there; none: any")] = None,
+    yaw: Annotated[float | None, typer.Option(help="Heading there, deg; none: any.")] = None,
     tolerance: Annotated[float, typer.Option(min=0.01, help="Reached within this, m.")] = 0.2,
     wait: Annotated[bool, typer.Option("--wait", help="Until it is reached, refused, or blocked for 30 s.")] = False,
     cancel: Annotated[bool, typer.Option("--cancel", help="Forget the goal and stand.")] = False,
@@ -35,7 +35,7 @@ def goal(
 ) -> None:
     """Send the robot somewhere.
 
-    Examples: `presage goal 15 1.5 --wait`; `presage goal 15 1.5 90`; `presage goal --cancel`.
+    Examples: `presage goal 15 1.5 --wait`; `presage goal 15 1.5 --yaw 90`; `presage goal --cancel`.
     """
     from common.messages import Goal  # noqa: PLC0415
     from presage.tools import give_goal  # noqa: PLC0415

@@ -25,8 +25,13 @@ LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 numbers = itertools.count(1)
 
 # No database: nothing is written into the checkout. In CI the examples are the same every time.
-hypothesis.settings.register_profile("local", deadline=None, database=None)
-hypothesis.settings.register_profile("ci", deadline=None, database=None, derandomize=True, print_blob=True)
+# `pytest --hypothesis-profile thorough` looks longer than every run can.
+EXAMPLES = 50
+hypothesis.settings.register_profile("local", deadline=None, database=None, max_examples=EXAMPLES)
+hypothesis.settings.register_profile(
+    "ci", deadline=None, database=None, max_examples=EXAMPLES, derandomize=True, print_blob=True
+)
+hypothesis.settings.register_profile("thorough", deadline=None, database=None, max_examples=1000)
 hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "local")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
@@ -16,8 +17,10 @@ from common.scanner import Scanner
 from common.se2 import Array
 from common.world import Obstacle, World
 from services.simulator.odometry import Drift, Odometer
-from services.simulator.people import People
 from services.simulator.physics import SUBSTEP, Physics
+
+if TYPE_CHECKING:
+    from services.simulator.people import People
 
 BLOCK = 200  # poses of a sample at once
 
@@ -51,6 +54,9 @@ class Simulation:
         scan_seed, odom_seed, people_seed = np.random.SeedSequence(setup.seed).spawn(3)
         self.people: People | None = None
         if setup.people:
+            # scipy takes half a second to import; a world without people does without.
+            from services.simulator.people import People  # noqa: PLC0415
+
             walking = np.random.default_rng(people_seed)
             self.people = People(self.world, setup.people, setup.people_speed, walking, pose[:2], robot.radius)
         self.physics = Physics(self.world, robot, pose)

@@ -63,7 +63,8 @@ def test_a_recorder_under_load_keeps_every_byte(process, tmp_path):
     bench = process("presage.__main__", "bench", "recorder", *args)
     assert bench.wait(120) == 0, bench.output
     numbers = json.loads((tmp_path / "r.json").read_text())
-    assert numbers["sent"] == numbers["received"] == numbers["written"] == numbers["in_file"] == 1440
+    assert numbers["sent"] == numbers["received"] == numbers["written"] == numbers["in_file"]
+    assert 0 < numbers["sent"] <= 1440  # a busy machine sends fewer
     assert (numbers["dropped"], numbers["missing"], numbers["bytes_as_sent"]) == (0, 0, True)
     assert [file.name for file in tmp_path.glob("kept/*.mcap*")] == ["bench.mcap"]
 

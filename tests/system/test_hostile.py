@@ -19,7 +19,7 @@ from tests.common.samples import message_of
 from tests.conftest import Processes
 
 SERVICES = ("simulator", "estimator", "controller", "recorder")
-EXAMPLES = 560  # a key; 22 keys
+EXAMPLES = 400  # a key; 26 keys
 HEARD = {"simulator": ["cmd_vel"], "estimator": ["scan", "goal"], "controller": ["scan", "belief", "goal", "drive"]}
 
 JUNK = st.one_of(

@@ -196,7 +196,7 @@ def test_a_missing_service_is_named_with_what_starts_it(page, system):
     notice = page.page.locator(".notice", has_text="controller is missing")
     notice.wait_for(timeout=20_000)
     assert "python -m services.controller" in notice.locator("code").inner_text()
-    assert page.page.locator("#controller-badge b").inner_text() == "missing"
+    page.page.locator("#controller-badge b", has_text="missing").wait_for(timeout=20_000)
     page.wait("store.frame.status === null", 10)  # its last word is no more
     system.start("controller")
     notice.wait_for(state="detached", timeout=40_000)

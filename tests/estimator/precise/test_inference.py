@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from common import se2
@@ -75,7 +75,8 @@ def test_xi_is_minus_the_gradient_of_accuracy_by_base_link(seed):
     step = 1e-6
     for axis in range(3):
         offset = step * np.eye(3)[axis]
-        low, high = seen.evidence(np.array([pose - offset, pose + offset])).accuracy
+        low, here, high = seen.evidence(np.array([pose - offset, pose, pose + offset])).accuracy
+        assume(abs(high - 2 * here + low) < 1e-6)  # nats; some beam jumps between surfaces all the same
         assert found[axis] == pytest.approx(-(high - low) / (2 * step), rel=2e-2, abs=2.0)
 
 
