@@ -140,6 +140,7 @@ class Status(Stamped):
     state: Literal["idle", "navigating", "reached", "blocked", "lost", "manual", "exploring"]
     # manual: driven by hand; exploring: it moves to find out where it is
     reason: Text = ""
+    refused: bool = False  # blocked for good: the goal cannot be; blocked otherwise, the way may clear
     goal: Pose | None = None  # base_link in map
     goal_seq: Count = 0  # which goal this is about
     distance: NotNegative | None = None  # m, from the believed pose to the goal

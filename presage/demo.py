@@ -164,8 +164,7 @@ def _navigate(bus: Bus, watch: Watch, stack: Stack, place: tuple[float, float], 
             if said.state == "reached":
                 break
             passed = (said.stamp_ns - stamp) * 1e-9
-            refused = said.reason.startswith("goal refused")  # whoever only stands in the way goes on again
-            if refused or (said.state == "lost" and passed > 5 and "standing" not in said.reason):
+            if said.refused or (said.state == "lost" and passed > 5 and "standing" not in said.reason):
                 console.print(f"[bold]{said.state}: {said.reason}[/]")
                 return False
             if passed > ARRIVE_WITHIN or time.monotonic() - began > GIVE_UP:

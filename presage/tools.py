@@ -83,8 +83,7 @@ def _follow(watch: Watch, goal: Goal, console: Console) -> int:
             line.update(f"{status.state} {away} {status.reason}")
             if status.state != "blocked" or moved_ns is None or status.stamp_ns < moved_ns:
                 moved_ns = status.stamp_ns
-            refused = status.state == "blocked" and status.reason.startswith("goal refused")
-            if status.state == "reached" or refused or status.stamp_ns - moved_ns > BLOCKED_FOR * 1e9:
+            if status.state == "reached" or status.refused or status.stamp_ns - moved_ns > BLOCKED_FOR * 1e9:
                 console.print(f"{status.state}: {status.reason}")
                 return 0 if status.state == "reached" else 1
     raise UserError("the controller fell silent")

@@ -28,13 +28,14 @@ class Decision:
     state: State = "navigating"
     path: Array = field(default_factory=_none)  # (K, 2) m in map
     motion: Array = field(default_factory=_none)  # (T, 2) m in map
+    refused: bool = False  # the goal cannot be, as is known by now
 
 
 class Preset(Protocol):
     """How a goal becomes actions."""
 
     def refusal(self, goal: Array) -> str | None:
-        """Why a goal (2,) m in map cannot be; None: it can, as far as is known."""
+        """Why a goal (2,) m in map cannot be; None: it can, as far as is known. What shows later, `decide` says."""
 
     def aim(self, goal: Array | None) -> None:
         """Prefer a place (2,) m in map; None: none. What was under way is forgotten."""

@@ -135,8 +135,8 @@ class Field:
         way = self.roads.grid.centres(np.array(cells))
         return np.concatenate([np.atleast_2d(point), way[1:-1], self.goal[None]])
 
-    def attractor(self, point: Array, path: Array) -> tuple[Array, float]:
-        """(2,) m the point of ``path`` that attracts a robot at ``point``, and m to go from there on."""
+    def attractor(self, point: Array, path: Array) -> Array:
+        """(2,) m the point of ``path`` that attracts a robot at ``point``."""
         reached = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
         near = np.flatnonzero(reached[1:] <= REACH) + 1
         tried = near[np.unique(np.linspace(0, len(near) - 1, LOOKS).astype(int))] if len(near) else np.array([1])
@@ -145,7 +145,7 @@ class Field:
         along = self._to_go(path[:1])[0] - there
         good = np.flatnonzero(ok & (cost <= along * SLACK + 2 * self.roads.grid.resolution))
         best = int(good[-1]) if len(good) else 0
-        return path[tried[best]], float(there[best])
+        return np.asarray(path[tried[best]])
 
     def _to_go(self, points: Array) -> Array:
         cost = self.cost.ravel()[self.roads.grid.cell_of(points)]

@@ -73,11 +73,14 @@ def turn_rate(angle: float, robot: Robot) -> float:
     return float(np.sign(angle) * min(robot.max_turn, rate))
 
 
-def facing(action: Array, attractor: Array, robot: Robot) -> Array:
+def facing(action: Array, attractor: Array, robot: Robot, *, turns: bool) -> Array:
     """The action (3,) of a holonomic base with a turn towards the attractor (2,) m, so that it sees where it goes.
 
-    Near the attractor, and with it in front, the heading is kept.
+    Near the attractor, and with it in front, the heading is kept. Any other base's action, and that of one that may not
+    turn, is as it was.
     """
+    if robot.drive != "holonomic" or not turns:
+        return np.array(action)
     bearing = float(np.arctan2(attractor[1], attractor[0]))
     if np.hypot(*attractor) < NEAR and abs(bearing) < np.pi / 3:
         return np.array([action[0], action[1], 0.0])

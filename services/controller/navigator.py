@@ -158,10 +158,9 @@ class Navigator:
                 return np.zeros(3)
             self.decision = Decision(turn, "there: turning into the goal's heading")
             return turn
-        if (refusal := self.mind.refusal(self.goal.pose.array()[:2])) is not None:
-            self.state, self.reason, self._refused = "blocked", refusal, True
-            return np.zeros(3)
         self.decision = self.mind.decide(belief, self._velocity)
+        if self.decision.refused:
+            self.state, self.reason, self._refused = "blocked", self.decision.reason, True
         return self.decision.action
 
     def _turn(self, pose: Array) -> Array | None:
@@ -194,6 +193,7 @@ class Navigator:
             stamp_ns=stamp_ns,
             state=self.state,
             reason=self.reason,
+            refused=self._refused,
             goal=self.goal.pose if self.goal is not None else None,
             goal_seq=self.goal.seq if self.goal is not None else 0,
             distance=distance,

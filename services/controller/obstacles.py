@@ -38,10 +38,6 @@ class TemporaryObstacles:
         self._first = np.zeros(0, np.int64)  # ns
         self._last = np.zeros(0, np.int64)  # ns
 
-    def clear(self) -> None:
-        """Forget all."""
-        self._cells, self._first, self._last = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)
-
     def see(self, scan: Scan, pose: Array) -> None:
         """A scan taken at a pose (3,) that can be trusted, base_link in map."""
         laser = se2.compose(pose, scan.mount.array())

@@ -32,7 +32,6 @@ REPLAN = 400_000_000  # ns between two plans for another picture of what stands 
 STUCK = 3_000_000_000  # ns without progress until it backs off
 BACK_OFF = 3_000_000_000  # ns of it
 RANGE = 3.0  # m about the robot within which what the map does not know matters to its next second
-ASIDE = 0.25  # m of clearance that backing off aims at more than there is
 
 
 class Pilot:
@@ -52,10 +51,9 @@ class Pilot:
         self._goal: Array | None = None
         self._component: int | None = None  # of the roads, where the robot was last known to be
         self._scan: Scan | None = None
-        self._planned: tuple[int, npt.NDArray[Any]] = (
-            -REPLAN,
-            np.zeros(0, int),
-        )  # ns, and the cells that were blocked then
+        # When the field was made, ns, and the cells that were blocked then.
+        self._planned: tuple[int, npt.NDArray[Any]] = (-REPLAN, np.zeros(0, int))
+        self._vetted_from: int | None = None  # the component from which the goal was found reachable
         self._view = np.pi
         self._stuck_since: int | None = None
         self._backing_until: int | None = None
@@ -82,7 +80,7 @@ class Pilot:
 
     def aim(self, goal: Array | None) -> None:
         """Prefer a place (2,) m in map; None: none."""
-        self._goal, self.field = goal, None
+        self._goal, self.field, self._vetted_from = goal, None, None
         self.seeker.forget()
         self.interrupt()
 
@@ -109,20 +107,23 @@ class Pilot:
     def decide(self, belief: Belief, velocity: Array) -> Decision:
         """The action of least expected free energy, going with ``velocity`` (3,) in base_link."""
         pose, stamp_ns = belief.pose.array(), belief.stamp_ns
-        self._plan(pose[:2], stamp_ns)
+        if self._goal is not None and self._component != self._vetted_from:
+            if (refusal := self.refusal(self._goal)) is not None:
+                return Decision(reason=refusal, state="blocked", refused=True)
+            self._vetted_from = self._component
+        points, moving = self.obstacles.points(), self.obstacles.moving(stamp_ns)
+        self._plan(pose[:2], points[~moving], stamp_ns)  # whoever walks will have gone on
         way = self.field.path(pose[:2]) if self.field is not None else np.zeros((0, 2))
         if not len(way):
             return Decision(reason="no way to the goal from here", state="blocked")
-        around = self._around(pose, stamp_ns)
+        around = self._around(pose, points, moving)
         if self._backing_until is not None and stamp_ns < self._backing_until:
             return self._back_off(pose, velocity, around, way)
         assert self.field is not None  # noqa: S101 - there is a way
-        point, _ = self.field.attractor(pose[:2], way)
+        point = self.field.attractor(pose[:2], way)
         attractor = se2.rotate(-pose[2], point - pose[:2])
         choice = choose(velocity, attractor, around, self.robot)
-        action = choice.action.copy()
-        if self.robot.drive == "holonomic" and not self.keep_heading:
-            action = facing(action, attractor, self.robot)
+        action = facing(choice.action, attractor, self.robot, turns=around.turns)
         self._watch(stamp_ns, moves=bool(np.hypot(*action[:2]) > 0 or abs(action[2]) > 0))
         reason = ""
         if choice.held:
@@ -155,13 +156,11 @@ class Pilot:
         decision.reason = decision.reason or f"the belief is {belief.state}: going by its best guess"
         return decision
 
-    def _plan(self, here: Array, stamp_ns: int) -> None:
-        """The field anew where goal or obstacles changed."""
+    def _plan(self, here: Array, points: Array, stamp_ns: int) -> None:
+        """The field anew where the goal, or the ``points`` (K, 2) m of what stands about, changed."""
         if self._goal is None:
             self.field = None
             return
-        points = self.obstacles.points()
-        points = points[~self.obstacles.moving(stamp_ns)]  # whoever walks will have gone on
         cells = np.unique(self.free.grid.cell_of(points)) if len(points) else np.zeros(0, int)
         when, before = self._planned
         changed = not np.array_equal(cells, before)
@@ -177,9 +176,8 @@ class Pilot:
             self.field, self.closed = self.roads.from_(self._goal, near), bool(len(points))
         self._planned = (stamp_ns, cells)
 
-    def _around(self, pose: Array, stamp_ns: int) -> Around:
-        points, moving = self.obstacles.points(), self.obstacles.moving(stamp_ns)
-        near = np.hypot(*(points - pose[:2]).T) < RANGE if len(points) else np.zeros(0, bool)
+    def _around(self, pose: Array, points: Array, moving: npt.NDArray[np.bool_]) -> Around:
+        near = np.hypot(*(points - pose[:2]).T) < RANGE
         radius = self.robot.radius
 
         def known(places: Array) -> Array:
@@ -204,27 +202,27 @@ class Pilot:
         places = 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         best = int(np.argmax(around.gaps(places[:, None, :], np.zeros(1))[:, 0]))
         choice = choose(velocity, places[best], around, self.robot)
-        action = choice.action
-        if self.robot.drive == "holonomic" and not self.keep_heading:
-            action = facing(action, places[best], self.robot)
+        action = facing(choice.action, places[best], self.robot, turns=around.turns)
         return Decision(action, "stuck: backing off", path=way, motion=_in_map(pose, choice.way))
 
     def _what_holds(self, pose: Array, around: Around, *, stood: bool) -> str:
         does = "waiting" if stood else "slowing"
         if not len(around.points):
             return f"{does}: a wall is near"
-        away = np.hypot(*around.points.T)
-        nearest = int(np.argmin(away))
-        x, y = pose[:2] + se2.rotate(pose[2], around.points[nearest])
+        nearest, where = _nearest(pose, around)
         what = "something that moves" if around.moving[nearest] else "something the map does not know"
-        return f"{does}: {what}, {away[nearest]:.1f} m away at ({x:.1f}, {y:.1f})"
+        return f"{does}: {what}, {np.hypot(*around.points[nearest]):.1f} m away at {where}"
 
     def _no_way(self, pose: Array, around: Around) -> str:
-        where = ""
-        if len(around.points):
-            x, y = pose[:2] + se2.rotate(pose[2], around.points[int(np.argmin(np.hypot(*around.points.T)))])
-            where = f" at ({x:.1f}, {y:.1f})"
-        return f"no way round what the map does not know{where}: waiting until it clears"
+        at = f" at {_nearest(pose, around)[1]}" if len(around.points) else ""
+        return f"no way round what the map does not know{at}: waiting until it clears"
+
+
+def _nearest(pose: Array, around: Around) -> tuple[int, str]:
+    """Index of the nearest of ``around.points``, of which there are some, and where it is in map."""
+    nearest = int(np.argmin(np.hypot(*around.points.T)))
+    x, y = pose[:2] + se2.rotate(pose[2], around.points[nearest])
+    return nearest, f"({x:.1f}, {y:.1f})"
 
 
 def _in_map(pose: Array, way: Array) -> Array:

@@ -123,7 +123,7 @@ class Seeker:
         if field is None or not len(way):
             self.explorer.forget()
             return Decision(reason="no way to where places could be told apart", state="blocked")
-        point, _ = field.attractor(pose[:2], way)
+        point = field.attractor(pose[:2], way)
         attractor = se2.rotate(-pose[2], point - pose[:2])
         return self._towards(attractor, around, velocity, reason, way)
 
@@ -144,9 +144,7 @@ class Seeker:
 
     def _towards(self, attractor: Array, around: Around, velocity: Array, reason: str, way: Array) -> Decision:
         choice = choose(velocity, attractor, around, self.robot)
-        action = choice.action.copy()
-        if self.robot.drive == "holonomic" and self.turns:
-            action = facing(action, attractor, self.robot)
+        action = facing(choice.action, attractor, self.robot, turns=self.turns)
         if not action.any() and self.turns:  # nothing ahead is free: look elsewhere
             action[2] = 0.5 if attractor[1] >= 0 else -0.5
         return Decision(action, reason, "exploring", way)

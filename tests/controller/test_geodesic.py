@@ -85,7 +85,7 @@ def test_following_the_attractor_leads_to_the_goal_along_free_lines(name):
         for _ in range(200):
             if first is None or np.hypot(*(here - field.goal)) < 0.01:
                 break
-            point, _ = field.attractor(here, field.path(here))
+            point = field.attractor(here, field.path(here))
             ok, _ = roads.clear_line(here, point[None])
             assert ok[0], (start, goal, here, point)
             step = min(0.3, float(np.hypot(*(point - here))))

@@ -127,7 +127,7 @@ def test_where_the_scanner_does_not_look_it_turns_first_or_goes_slowly():
     behind, view = np.array([-3.0, 0.0]), np.deg2rad(135)
     choice = choose(np.zeros(3), behind, around(view=view), Robot())
     assert abs(np.arctan2(choice.action[1], choice.action[0])) <= np.pi / 2 + 1e-9  # the body is wide
-    assert abs(facing(choice.action, behind, Robot())[2]) > 1.0
+    assert abs(facing(choice.action, behind, Robot(), turns=True)[2]) > 1.0
     kept = choose(np.zeros(3), behind, around(view=view, turns=False), Robot())
     assert 0 < np.hypot(*kept.action[:2]) <= 0.25 + 1e-9
 
