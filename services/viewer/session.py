@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
+from typing import TypeVar
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.utils import ClientDisconnected
@@ -14,6 +16,7 @@ from services.viewer.control import Answer
 from services.viewer.desk import Desk
 from services.viewer.visitors import TooSlowError, Visitor
 
+T = TypeVar("T")
 MAX_QUEUED = 32  # actions of one visitor that wait for their turn
 RATE, BURST = 60.0, 120.0  # messages a second of one visitor; more are read later
 TOO_SLOW = 1008  # close code: policy violation
@@ -26,7 +29,7 @@ class Session:
         """Not yet accepted."""
         self._websocket, self._desk = websocket, desk
         self._counters = desk.office.hub.counters
-        self._visitor = Visitor(websocket.send_text, websocket.send_bytes)
+        self._visitor = Visitor(_sender(websocket.send_text), _sender(websocket.send_bytes))
         self._queue: asyncio.Queue[tuple[int | None, a.Action]] = asyncio.Queue(MAX_QUEUED)
         self._allowed, self._allowed_at = BURST, asyncio.get_running_loop().time()
 
@@ -96,6 +99,18 @@ class Session:
         self._allowed_at = now
         if self._allowed < 0:
             await asyncio.sleep(-self._allowed / RATE)
+
+
+def _sender(send: Callable[[T], Awaitable[None]]) -> Callable[[T], Awaitable[None]]:
+    """``send``, where a socket that the server has closed already (a frame too long) is one that is gone."""
+
+    async def checked(data: T) -> None:
+        try:
+            await send(data)
+        except RuntimeError as error:  # the server's word for it: "after sending 'websocket.close'"
+            raise WebSocketDisconnect(1006, str(error)) from None
+
+    return checked
 
 
 def _refuse_bytes() -> tuple[int | None, a.Action]:

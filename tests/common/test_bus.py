@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import signal
 import threading
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import zenoh
 
 from common.bus import Link, open_bus, wait_until
 from common.errors import UserError
@@ -243,6 +244,23 @@ def test_life_and_death_are_seen(bus, link):
         assert wait_until(lambda: set(late) == {("estimator", True)}, PATIENCE)
     assert wait_until(lambda: changes[-1] == ("estimator", False), PATIENCE)
     assert bus.alive() == set()
+
+
+def test_a_session_closes_while_other_threads_use_it(link):
+    ended = threading.Event()
+
+    def ask(bus):
+        with suppress(zenoh.ZError):  # that it is closed
+            while True:
+                with suppress(UserError):
+                    bus.ask(CONFIG, Request(), Reply, timeout=0.01)
+        ended.set()
+
+    for _ in range(10):
+        ended.clear()
+        with open_bus(link) as bus:
+            threading.Thread(target=ask, args=(bus,), daemon=True).start()
+        assert ended.wait(PATIENCE)
 
 
 def test_sessions_wait_for_a_late_router_outlive_it_and_greet_its_return(processes, free_port):
