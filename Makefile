@@ -59,7 +59,9 @@ demo: install ## localise and drive in the corridor: every service, a live page,
 	$(BIN)/presage demo --open $(ARGS)
 
 test: install ## all tests, the fast ones first
-	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
+	@# Hundreds of processes are started: each would compile all modules anew where Python is told to write none (PYTHONDONTWRITEBYTECODE).
+	@$(BIN)/python -m compileall -q common services presage worlds models tests
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 bless: install ## show what services answer differently than their references, and accept it
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.process_replay.bless $(ARGS)

@@ -9,7 +9,7 @@ import numpy as np
 
 from common import se2
 from services.estimator.interface import Hypothesis, Observation, Posterior, Predicted, State
-from services.estimator.precise import mixture
+from services.estimator.precise import mixture, obstruction
 from services.estimator.precise.gauss_newton import Prior, View, descend, polish
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.mixture import Mode
@@ -33,6 +33,9 @@ class Settings:
     beams: int = 150  # of the descent from seeds; the last steps take all
     satisfied: float = 0.9  # share of beams explained that ends a search
     believable: float = 0.45  # least share of beams that a belief must explain
+    glimpse: float = 0.15  # the same, of one that was tracked, while what it does not explain stands in the way
+    contradicted: float = 0.05  # share of the beams that may end behind what such a belief expects
+    holding: float = 0.004  # share of the beams on surfaces turned that way that hold a place along a direction
     drop: float = 0.1  # fall of the share explained that calls for a search
     evidence_error: float = 20.0  # nats by which a model's error may set two places apart
     ambiguous: float = 0.05  # weight of a second hypothesis from which the belief is ambiguous
@@ -85,7 +88,7 @@ class PreciseEstimator:
         )
         if self.modes:
             self._track(view, observation)
-        if not self.modes or self._suspicious():
+        if not self.modes or self._suspicious(view):
             self._relocalise(view)
         self._stamp, self._odom = observation.stamp, observation.odom
         best = self.modes[0]
@@ -123,7 +126,10 @@ class PreciseEstimator:
         modes = []
         for k, (mode, each) in enumerate(zip(self.modes, options, strict=True)):
             # Once blind, a ripple a little larger than the others must not be taken for a feature.
-            keep, blind = mixture.seen(evidence.curvature[k], self.model.ripple * (3 if mode.blind else 1))
+            doubt = 3 if mode.blind else 1
+            keep, blind = mixture.seen(evidence.curvature[k], self.model.ripple * doubt)
+            if blind is not None and self._held(view, poses[k], blind) > doubt * self.settings.holding:
+                keep, blind = np.eye(3), None
             mixture.project(evidence, k, keep)
             if blind is not None and odom is None:
                 each = [self._unseen(option, blind, mode.blind, period) for option in each]  # noqa: PLW2901
@@ -132,23 +138,36 @@ class PreciseEstimator:
             modes.append(mixture.moved(mode, fused, evidence, k, period, blind=blind is not None))
         self.modes = mixture.weigh(modes, self.settings.evidence_error, self.settings.hypotheses)
 
+    def _held(self, view: View, pose: Array, direction: Array) -> float:
+        return obstruction.held(view, pose, direction) / max(len(view.angles), 1)
+
     def _unseen(self, option: Candidate, blind: Array, scans: int, period: float) -> Candidate:
         """Along a direction no scan sees, the robot may have gone at full speed: the deviation grows with time."""
         covariance = option.covariance.copy()
         covariance[:2, :2] += np.outer(blind, blind) * (self.settings.motion.speed * period) ** 2 * (2 * scans + 1)
         return replace(option, covariance=covariance)
 
-    def _suspicious(self) -> bool:
+    def _suspicious(self, view: View) -> bool:
         """The scan fits worse at once, or has fitted badly for long, or not as a belief must."""
         best, settings = self.modes[0], self.settings
         fell = best.explained < self._usual - settings.drop or best.accuracy > self._energy + settings.rise
-        if fell or best.explained < settings.believable:
+        if fell or not self._believable(view):
             return True
         if best.explained >= settings.satisfied:
             self._since, self._wait = 0, FIRST_WAIT
             return False
         self._since += 1
         return self._since >= self._wait
+
+    def _believable(self, view: View) -> bool:
+        """Whether enough of the scan is explained; of a place that was tracked, whether little contradicts it."""
+        best, settings = self.modes[0], self.settings
+        if best.explained >= settings.believable:
+            return True
+        if best.explained < settings.glimpse or not best.trusted:
+            return False
+        expected = self.model.expect(se2.compose(best.pose, self.mount)[None], view.angles)
+        return obstruction.contradicted(view, expected) <= settings.contradicted
 
     def _relocalise(self, view: View) -> None:
         """Search from nothing; keep what is tracked where nothing better is found."""
@@ -157,8 +176,10 @@ class PreciseEstimator:
         else:
             found = self._search(view)
         if self.modes:
-            margin = 3 * self.settings.evidence_error
-            if found[0].energy > self.modes[0].energy - margin:
+            before, margin = self.modes[0], 3 * self.settings.evidence_error
+            if len(mixture.distinct(np.array([before.pose, found[0].pose]), np.zeros(2), 2)) == 1:
+                found[0] = replace(found[0], age=before.age, velocity=before.velocity, trusted=before.trusted)
+            if found[0].energy > before.energy - margin:
                 found = self.modes  # nothing better: this is how it looks here now; search again later
                 self._since, self._wait = 0, min(2 * self._wait, LONGEST_WAIT)
         self.modes = found
@@ -203,8 +224,9 @@ class PreciseEstimator:
 
     def _posterior(self, view: View, best: Mode) -> Posterior:
         expected = self.predict(best.pose[None], view.angles)
-        state = self._state(best)
-        unknown = self.seeds.spread * (best.explained < self.settings.believable)
+        believable = self._believable(view)
+        state = self._state(best, believable=believable)
+        unknown = self.seeds.spread * (not believable)
         hypotheses = tuple(
             Hypothesis(mode.pose, mode.covariance(self.settings.inflation) + unknown, mode.weight)
             for mode in self.modes
@@ -220,14 +242,15 @@ class PreciseEstimator:
             expected.sigma[0],
         )
 
-    def _state(self, best: Mode) -> State:
+    def _state(self, best: Mode, *, believable: bool) -> State:
         settings = self.settings
-        if best.explained < settings.believable:
+        if not believable:
             return "lost" if self._was_tracking else "localising"
         if len(self.modes) > 1 and self.modes[1].weight > settings.ambiguous:
             return "ambiguous"
         vague = np.linalg.eigvalsh(best.covariance(settings.inflation)[:2, :2])[-1] > settings.vague**2
-        if vague or (best.explained < settings.sure and best.age < settings.patience):
+        if vague or (best.explained < settings.sure and best.age < settings.patience and not best.trusted):
             return "localising"
         self._was_tracking = True
+        self.modes[0] = replace(best, trusted=True)
         return "tracking"

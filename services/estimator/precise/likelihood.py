@@ -59,7 +59,18 @@ class Likelihood:
         """p(o | g) in 1/m at measured (K,) m; with the probability of no return it sums to one."""
         if expected >= range_max:
             return np.full(len(measured), self.unseen / range_max)
+        core, flat = self._parts(measured, expected, scale, range_max)
+        return np.asarray((1 - self.unseen) * (core + flat))
+
+    def inlier(self, measured: Array, expected: Array, scale: Array, range_max: float) -> Array:
+        """(K,) probability that the surface expected ended the beam, and nothing else; finite ranges (K,) m."""
+        core, flat = self._parts(measured, expected, scale, range_max)
+        return np.asarray(core / (core + flat))
+
+    def _parts(
+        self, measured: Array, expected: Array | float, scale: Array | float, range_max: float
+    ) -> tuple[Array, Array]:
         variance = self.sigma**2 + scale**2
         core = np.exp(-0.5 * (measured - expected) ** 2 / variance) / np.sqrt(2 * np.pi * variance)
-        flat = self.short / expected * (measured < expected) + self.random / range_max
-        return np.asarray((1 - self.unseen) * ((1 - self.short - self.random) * core + flat))
+        flat = self.short / np.maximum(expected, 1e-3) * (measured < expected) + self.random / range_max
+        return (1 - self.short - self.random) * core, flat

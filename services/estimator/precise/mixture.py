@@ -38,6 +38,7 @@ class Mode:
     weight: float = 1.0
     blind: int = 0  # scans in a row that say nothing along some direction
     age: int = 0  # scans since it was found
+    trusted: bool = False  # it was the one tracked
 
     def covariance(self, inflation: float) -> Array:
         """(3, 3) of x, y, yaw in map."""
@@ -109,7 +110,7 @@ def moved(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: float, *
     return Mode(
         fused.mean, noise, alone @ evidence.of_model[k] @ alone, float(evidence.explained[k]), accuracy,
         fused.complexity, energy, evidence.xi[k], evidence.curvature[k], velocity,
-        blind=mode.blind + 1 if blind else 0, age=mode.age + 1,
+        blind=mode.blind + 1 if blind else 0, age=mode.age + 1, trusted=mode.trusted,
     )  # fmt: skip
 
 

@@ -1,0 +1,76 @@
+"""People around the scanner: what they hide is no reason to doubt, and being elsewhere still is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.world import World, load_world
+from services.estimator.generative import RayCaster
+from services.estimator.precise import obstruction
+from services.estimator.precise.gauss_newton import View
+from services.estimator.precise.likelihood import Likelihood
+from tests.estimator.precise.test_estimator import ROOM, estimator
+
+RNG = np.random.default_rng(5)
+
+
+def crowd(clean, share, first=0):
+    """Ranges (B,) of which ``share``, side by side from beam ``first``, ends at somebody a metre away or less."""
+    ranges = clean.copy()
+    hidden = (first + np.arange(int(share * len(clean)))) % len(clean)
+    ranges[hidden] = np.minimum(ranges[hidden], RNG.uniform(0.5, 1.0, len(hidden)))
+    return ranges
+
+
+def view_of(made, scene, ranges):
+    return View(made.model, Likelihood(), made.mount, scene.scanner.angles(), ranges, scene.scanner.range_max)
+
+
+def expected_at(view, pose):
+    return view.model.expect(np.array([[*pose]]), view.angles)
+
+
+def test_people_contradict_nothing_and_another_place_does():
+    made, scene = estimator(ROOM)
+    made.mount = np.zeros(3)
+    here, there = np.array([2.5, 2.0, 0.3]), np.array([5.0, 3.0, -1.0])
+    clean = RayCaster(ROOM).expect(here[None], scene.scanner.angles()).ranges[0]
+    view = view_of(made, scene, crowd(clean, 0.7) + RNG.normal(0, 0.02, len(clean)))
+    assert obstruction.contradicted(view, expected_at(view, here)) < 0.01
+    whole = view_of(made, scene, clean)
+    assert obstruction.contradicted(whole, expected_at(whole, there)) > 0.2
+
+
+def test_what_holds_a_place_along_a_hall_is_what_stands_across():
+    hall = World(name="hall", boundary=[(0, 0), (20, 0), (20, 2), (0, 2)])
+    made, scene = estimator(hall, 361)
+    made.mount = np.zeros(3)
+    pose = np.array([10.0, 1.0, 0.0])
+    clean = RayCaster(hall).expect(pose[None], scene.scanner.angles()).ranges[0]
+    along, across = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    ends = np.flatnonzero(np.abs(np.sin(scene.scanner.angles())) * clean < 0.99)  # beams that reach the wall at x = 20
+    view = view_of(made, scene, clean)
+    assert obstruction.held(view, pose, along) == pytest.approx(len(ends), rel=0.1)
+    assert obstruction.held(view, pose, across) > 10 * len(ends)
+    hidden = clean.copy()
+    hidden[ends] = 0.8
+    assert obstruction.held(view_of(made, scene, hidden), pose, along) < 0.1
+
+
+def test_in_a_crowd_a_tracked_robot_keeps_its_place_and_carried_off_it_is_found():
+    made, scene = estimator(load_world("maze"))
+    here, there = scene.poses(2)
+    made.restart(here, np.diag([1e-4, 1e-4, 1e-4]))
+    searches = []
+    search = made._search
+    made._search = lambda view: searches.append(1) or search(view)
+    clean = scene.clean(here[None])[0]
+    for k in range(45):
+        share = min(0.75, 0.05 * k)
+        posterior = made.update(scene.observe(crowd(clean, share, 3 * k), k / 15))
+        assert posterior.state == "tracking", k
+        assert np.hypot(*(posterior.pose - here)[:2]) < 0.03, k
+    assert len(searches) < 20
+    posterior = made.update(scene.observe(scene.clean(there[None])[0], 3.0))
+    assert np.hypot(*(posterior.pose - there)[:2]) < 0.02
