@@ -78,7 +78,11 @@ class Roads:
 
         ``by_map``: whatever stands there now.
         """
-        free = (self.free.clearance if by_map else self.clearance).ravel() >= self.least
+        clearance = (self.free.clearance if by_map else self.clearance).ravel()
+        here = int(self.grid.cell_of(np.asarray(point, float)))
+        if clearance[here] >= self.least and component in (None, self.component[here]) and self.grid.inside(point):
+            return here  # nearest to a point in a cell is that cell's centre
+        free = clearance >= self.least
         if component is not None:
             free &= self.component == component
         cells = np.flatnonzero(free)
