@@ -27,8 +27,8 @@ GAP = 0.03  # m between footprint and walls that the shortest way keeps
 SPARE = 0.05  # m, and what start and goal have around the footprint
 APART = 2.0  # m by the shortest way
 TRIES = 500
-# Where starts are drawn, of worlds that are about one part of them: x0, y0, x1, y1 in m. In the corridor of `twins` a
-# scan tells where it is.
+# Where starts and goals are drawn, of worlds that are about one part of them: x0, y0, x1, y1 in m. In the corridor of
+# `twins` a scan tells where it is, so whoever has a goal there finds out on the way.
 ROOMS = {"twins": ((0.0, 0.0, 5.9, 4.4), (6.1, 0.0, 12.0, 4.4))}
 
 
@@ -128,7 +128,7 @@ def draw_trip(world: str, rng: np.random.Generator, robot: Robot, apart: float =
     rooms = ROOMS.get(world)
     for redrawn in range(TRIES):
         start, goal = np.round(known.sample_free(2, rng, robot.radius + SPARE), 3)
-        if rooms and not any(x0 <= start[0] <= x1 and y0 <= start[1] <= y1 for x0, y0, x1, y1 in rooms):
+        if rooms and not all(any(_inside(place, room) for room in rooms) for place in (start, goal)):
             continue
         way = ways.way(start, goal)
         if len(way) and length(way) >= apart:
@@ -137,6 +137,11 @@ def draw_trip(world: str, rng: np.random.Generator, robot: Robot, apart: float =
             corners = tuple((float(x), float(y)) for x, y in np.round(way, 4))
             return Trip((float(start[0]), float(start[1]), heading), there, corners, redrawn)
     raise UserError(f"world {known.name!r}: no two places {apart:g} m apart between which the robot could drive")
+
+
+def _inside(place: Array, room: tuple[float, float, float, float]) -> bool:
+    x0, y0, x1, y1 = room
+    return bool(x0 <= place[0] <= x1 and y0 <= place[1] <= y1)
 
 
 def least_turn(angle: float, robot: Robot) -> float:

@@ -401,3 +401,8 @@ def test_worlds_with_rooms_are_there():
         free = load_world(name).free_space
         for room in rooms:
             assert shapely.intersection(free, shapely.box(*room)).area > 10
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        trip = shortest.draw_trip("twins", rng, Robot())
+        places = shapely.points([trip.start[:2], trip.goal])
+        assert all(any(shapely.box(*room).covers(place) for room in shortest.ROOMS["twins"]) for place in places)
