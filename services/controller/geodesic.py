@@ -48,28 +48,35 @@ class Roads:
         self._length = self._graph.data.copy()
         self._to = self._graph.indices
         self._from = np.repeat(np.arange(self.grid.cells), np.diff(self._graph.indptr))
-        self._weigh()
+        self._opposite = np.empty_like(self._from)  # of each edge, the number of the one that leads back
+        self._opposite[np.lexsort((self._to, self._from))] = np.lexsort((self._from, self._to))
+        self._near = np.zeros(self.grid.cells, bool)  # cells that temporary obstacles are near to
+        self.slowness = np.zeros(self.grid.shape)
+        self._weigh(~self._near)
         _, self.component = connected_components(self._graph, directed=False)  # of the map alone
         self._centres = self.grid.centres()
 
     def block(self, points: Array) -> None:
         """From now on with obstacles at ``points`` (K, 2) m in map, and no others."""
-        self.clearance = self.free.clearance
+        far, before = self.least + SOFT, self._near
+        self.clearance, self._near = self.free.clearance, np.zeros(self.grid.cells, bool)
         if len(points):
-            far = self.least + SOFT
-            low, high = points.min(axis=0) - far, points.max(axis=0) + far
-            near = np.flatnonzero(np.all((self._centres > low) & (self._centres < high), axis=1))
-            apart, _ = cKDTree(points).query(self._centres[near], distance_upper_bound=far)
+            self._near[self.grid.cell_of(points)] = True
+            self._near = _grown(self._near.reshape(self.grid.shape), int(far / self.grid.resolution) + 1).ravel()
+            apart, _ = cKDTree(points).query(self._centres[self._near], distance_upper_bound=far)
             clearance = self.free.clearance.ravel().copy()
-            clearance[near] = np.minimum(clearance[near], apart)
+            clearance[self._near] = np.minimum(clearance[self._near], apart)
             self.clearance = clearance.reshape(self.grid.shape)
-        self._weigh()
+        self._weigh(before | self._near)
 
-    def _weigh(self) -> None:
-        clearance = self.clearance.ravel()
-        self.slowness = slowness(clearance, self.least).reshape(self.grid.shape)
-        s = np.where(clearance >= self.least, self.slowness.ravel(), np.inf)
-        self._graph.data[:] = self._length * (s[self._from] + s[self._to]) / 2
+    def _weigh(self, changed: npt.NDArray[np.bool_]) -> None:
+        """The edges of cells (cells,) that changed."""
+        clearance, slow = self.clearance.ravel(), self.slowness.ravel()
+        slow[changed] = slowness(clearance[changed], self.least)
+        from_here = np.flatnonzero(changed[self._from])
+        edges = np.concatenate([from_here, self._opposite[from_here]])
+        s = np.where(clearance >= self.least, slow, np.inf)
+        self._graph.data[edges] = self._length[edges] * (s[self._from[edges]] + s[self._to[edges]]) / 2
 
     def nearest_free(
         self, point: Array, within: float = np.inf, component: int | None = None, *, by_map: bool = False
@@ -173,6 +180,17 @@ def slowness(clearance: Array, least: float) -> Array:
     """What a metre costs at a clearance (N,) m: 1 far from walls, 1 + NEAR_WALL at the least one."""
     short = np.clip(1 - (clearance - least) / SOFT, 0, 1)
     return np.asarray(1 + NEAR_WALL * short**2)
+
+
+def _grown(cells: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:
+    """(rows, columns) bool, and all ``by`` cells or less beside them."""
+    for _ in range(2):
+        wide = cells.copy()
+        for step in range(1, by + 1):
+            wide[step:] |= cells[:-step]
+            wide[:-step] |= cells[step:]
+        cells = wide.T
+    return cells
 
 
 def _edges(free: npt.NDArray[np.bool_], resolution: float) -> csr_matrix:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.world import World, load_world
-from services.controller.geodesic import GAP, NEAR_WALL, Roads
+from services.controller.geodesic import GAP, NEAR_WALL, SOFT, Roads, slowness
 from services.controller.grid import FreeSpace, Grid
 
 RADIUS = 0.27
@@ -112,6 +112,26 @@ def test_an_obstacle_is_gone_round_and_forgotten_again():
     assert len(closed.path(start)) == 0
     roads.block(np.zeros((0, 2)))
     assert length(roads.from_(goal).path(start)) == pytest.approx(free)
+
+
+@pytest.mark.parametrize("world", ROADS)
+def test_whatever_stood_about_before_the_roads_are_those_of_what_stands_now(world):
+    roads, rng = Roads(ROADS[world].free, RADIUS), np.random.default_rng(2)
+    x0, y0, x1, y1 = load_world(world).bounds
+    for count in (40, 3, 200, 1, 0):
+        points = rng.uniform((x0 - 1, y0 - 1), (x1 + 1, y1 + 1), (count, 2))  # some beyond the map
+        roads.block(points)
+        anew = Roads(roads.free, RADIUS)
+        anew.block(points)
+        apart = np.hypot(*(roads.grid.centres()[:, None] - points).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
+        exact = np.minimum(roads.free.clearance.ravel(), apart)
+        relevant = exact < roads.least + SOFT
+        assert np.allclose(roads.clearance.ravel()[relevant], exact[relevant], rtol=0, atol=1e-12)
+        assert (roads.clearance.ravel()[~relevant] >= roads.least + SOFT).all()
+        assert np.allclose(roads.slowness.ravel(), slowness(exact, roads.least), rtol=0, atol=1e-12)
+        goal = roads.nearest_free(np.array([(x0 + x1) / 2, (y0 + y1) / 2]))
+        place = roads.grid.centres([goal])[0]
+        assert np.array_equal(roads.from_(place).cost, anew.from_(place).cost)
 
 
 def test_a_metre_near_a_wall_costs_more_and_none_costs_less():
