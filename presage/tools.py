@@ -11,13 +11,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from common.bus import Bus, Link
+from common.bus import Link
 from common.errors import UserError
 from common.inbox import Inbox, Sample
 from common.messages import Goal, Pose, Status
-from common.requests import LocaliseRequest, PoseRequest, Reply, Request, WorldReply
-from common.robot import Robot
-from common.topics import GOAL, LOCALISE, QUERIES, STATUS, TELEPORT, TOPICS, WORLD, Topic
+from common.requests import LocaliseRequest, PoseRequest, Reply
+from common.topics import GOAL, LOCALISE, QUERIES, STATUS, TELEPORT, TOPICS, Topic
 from common.wire import DecodeError, Message
 from presage.watch import Watch, session
 
@@ -34,8 +33,6 @@ def give_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
     """Send the robot somewhere (or cancel); 0 when accepted, or with ``wait`` when reached."""
     with session(link) as bus:
         watch = Watch(bus, STATUS)
-        if not goal.cancel:
-            _check_goal(bus, goal.pose)
         if not bus.wait_matching(GOAL, 3.0):
             raise UserError("nobody listens for goals: is the controller running?")
         status = watch.until(Status, lambda _: True, 3.0)
@@ -54,36 +51,24 @@ def give_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
         return _follow(watch, goal, console) if wait else 0
 
 
-def _check_goal(bus: Bus, pose: Pose) -> None:
-    try:
-        here = bus.ask(WORLD, Request(), WorldReply, timeout=2.0)
-    except UserError:
-        return  # a robot that does not know its world: the controller has the say
-    robot = here.robot or Robot()
-    if here.world is None:
-        return
-    clearance = float(here.world.clearance([[pose.x, pose.y]])[0])
-    if clearance < robot.radius:
-        what = "is inside a wall or outside" if clearance < 0 else f"is {clearance:.2f} m from a wall in"
-        raise UserError(
-            f"goal ({pose.x:g}, {pose.y:g}) {what} {here.world.name!r}; the robot needs {robot.radius:g} m around it"
-        )
-
-
 BLOCKED_FOR = 30.0  # s of stamps; who stands in the way goes on sooner, and the robot with them
+NEARER = 0.3  # m; what is less is no progress
 
 
 def _follow(watch: Watch, goal: Goal, console: Console) -> int:
-    moved_ns: int | None = None
+    least, blocked_ns, before_ns = np.inf, 0, None  # m to go at least; how long it has been blocked since
     with console.status("navigating") as line:
         while (status := watch.until(Status, lambda _: True, 3.0)) is not None:
             if status.goal_seq != goal.seq:
                 raise UserError("another goal took its place" if status.goal else "the goal was cancelled")
             away = f"{status.distance:.2f} m to go" if status.distance is not None else ""
             line.update(f"{status.state} {away} {status.reason}")
-            if status.state != "blocked" or moved_ns is None or status.stamp_ns < moved_ns:
-                moved_ns = status.stamp_ns
-            if status.state == "reached" or status.refused or status.stamp_ns - moved_ns > BLOCKED_FOR * 1e9:
+            if status.distance is not None and status.distance < least - NEARER:
+                least, blocked_ns = status.distance, 0
+            if before_ns is not None and status.state == "blocked":
+                blocked_ns += max(0, status.stamp_ns - before_ns)
+            before_ns = status.stamp_ns
+            if status.state == "reached" or status.refused or blocked_ns > BLOCKED_FOR * 1e9:
                 console.print(f"{status.state}: {status.reason}")
                 return 0 if status.state == "reached" else 1
     raise UserError("the controller fell silent")

@@ -28,6 +28,7 @@ class Decision:
     state: State = "navigating"
     path: Array = field(default_factory=_none)  # (K, 2) m in map
     motion: Array = field(default_factory=_none)  # (T, 2) m in map
+    recovering: bool = False  # it moves to get free, not on
     refused: bool = False  # the goal cannot be, as is known by now
 
 

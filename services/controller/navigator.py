@@ -178,6 +178,9 @@ class Navigator:
             self._standing_since = None
             return
         self.reason = self.decision.reason or ("slowed by the scan" if held_back else "")
+        if self.decision.recovering:
+            self.state = "blocked"
+            return
         waits = held_back or self.decision.state == "blocked"
         if float(np.hypot(*self._velocity[:2])) + abs(float(self._velocity[2])) > CREEP or not waits:
             self._standing_since = None

@@ -31,6 +31,7 @@ KEEP = 0.06  # m between footprint and what the map does not know: the scanner's
 REPLAN = 400_000_000  # ns between two plans for another picture of what stands in the way
 STUCK = 3_000_000_000  # ns without progress until it backs off
 BACK_OFF = 3_000_000_000  # ns of it
+CREEP = 0.02  # m/s, rad/s; slower is standing
 RANGE = 3.0  # m about the robot within which what the map does not know matters to its next second
 
 
@@ -124,7 +125,8 @@ class Pilot:
         attractor = se2.rotate(-pose[2], point - pose[:2])
         choice = choose(velocity, attractor, around, self.robot)
         action = facing(choice.action, attractor, self.robot, turns=around.turns)
-        self._watch(stamp_ns, moves=bool(np.hypot(*action[:2]) > 0 or abs(action[2]) > 0))
+        # What was driven, not what is wished: the limits may have held it.
+        self._watch(stamp_ns, moves=float(np.hypot(*velocity[:2])) + abs(float(velocity[2])) > CREEP)
         reason = ""
         if choice.held:
             reason = self._what_holds(pose, around, stood=not choice.action.any())
@@ -203,7 +205,7 @@ class Pilot:
         best = int(np.argmax(around.gaps(places[:, None, :], np.zeros(1))[:, 0]))
         choice = choose(velocity, places[best], around, self.robot)
         action = facing(choice.action, places[best], self.robot, turns=around.turns)
-        return Decision(action, "stuck: backing off", path=way, motion=_in_map(pose, choice.way))
+        return Decision(action, "stuck: backing off", path=way, motion=_in_map(pose, choice.way), recovering=True)
 
     def _what_holds(self, pose: Array, around: Around, *, stood: bool) -> str:
         does = "waiting" if stood else "slowing"

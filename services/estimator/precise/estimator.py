@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from services.estimator.precise.seeding import Seeds
 
 FIRST_WAIT, LONGEST_WAIT = 5, 150  # scans between searches while the scan fits badly
+FAR = 16.0  # squared standard deviations
 WIDEST, WIDE, NARROW = 0.3, 0.1, 0.03  # m, added to every beam's deviation on the way down from a seed
 
 
@@ -166,8 +167,11 @@ class PreciseEstimator:
             return True
         if best.explained < settings.glimpse or not best.trusted:
             return False
-        expected = self.model.expect(se2.compose(best.pose, self.mount)[None], view.angles)
-        return obstruction.contradicted(view, expected) <= settings.contradicted
+        return self._contradicted(view) <= settings.contradicted
+
+    def _contradicted(self, view: View) -> float:
+        expected = self.model.expect(se2.compose(self.modes[0].pose, self.mount)[None], view.angles)
+        return obstruction.contradicted(view, expected)
 
     def _relocalise(self, view: View) -> None:
         """Search from nothing; keep what is tracked where nothing better is found."""
@@ -179,11 +183,20 @@ class PreciseEstimator:
             before, margin = self.modes[0], 3 * self.settings.evidence_error
             if len(mixture.distinct(np.array([before.pose, found[0].pose]), np.zeros(2), 2)) == 1:
                 found[0] = replace(found[0], age=before.age, velocity=before.velocity, trusted=before.trusted)
-            if found[0].energy > before.energy - margin:
+            if found[0].energy > before.energy - margin or self._unlikely(view, found[0]):
                 found = self.modes  # nothing better: this is how it looks here now; search again later
                 self._since, self._wait = 0, min(2 * self._wait, LONGEST_WAIT)
         self.modes = found
         self._usual, self._energy = found[0].explained, found[0].accuracy
+
+    def _unlikely(self, view: View, found: Mode) -> bool:
+        """Elsewhere, though nothing contradicts the place that was tracked: a door has closed, a crowd has gathered."""
+        best, settings = self.modes[0], self.settings
+        if not best.trusted or best.explained < settings.glimpse or self._contradicted(view) > settings.contradicted:
+            return False
+        spread = best.covariance(settings.inflation)[:2, :2] + np.eye(2) * mixture.SAME_PLACE**2
+        off = found.pose[:2] - best.pose[:2]
+        return bool(off @ np.linalg.solve(spread, off) > FAR)
 
     def _search(self, view: View) -> list[Mode]:
         modes: list[Mode] = []
