@@ -19,6 +19,7 @@ from presage.health_board import WATCHED, Board, Rate, Row
 from presage.watch import session
 
 PERIOD = 0.5  # s between two looks
+PATIENCE = 5.0  # s for the router to say who is there; it answers at once unless the machine is busy
 LISTEN = (1.5, 4.0)  # s, at least and at most, for a single table
 COLOURS = {"alive": "green", "begins": "cyan", "silent": "red", "gone": "red", "missing": "bold red", "off": "dim"}
 LEFT = ("service", "state", "sends, Hz", "hears, Hz", "note")
@@ -66,7 +67,7 @@ class Feed:
         """Listen for so long."""
         deadline = time.monotonic() + seconds
         for robot, board in self.boards.items():
-            board.see_alive(self.bus.alive(timeout=PERIOD, robot=robot), time.monotonic())
+            board.see_alive(self.bus.alive(timeout=PATIENCE, robot=robot), time.monotonic())
         while True:
             sample = self._inbox.get(max(0.0, deadline - time.monotonic()))
             if isinstance(sample, Sample):
