@@ -142,6 +142,13 @@ def test_a_metre_near_a_wall_costs_more_and_none_costs_less():
         assert (roads.slowness[far] == 1).all()
 
 
+def test_where_there_is_room_the_way_keeps_away_from_the_wall():
+    roads = Roads(FreeSpace.of(EMPTY), RADIUS)
+    path = roads.from_(np.array([9.0, 0.35])).path(np.array([1.0, 0.35]))
+    assert path[len(path) // 2, 1] > 0.5
+    assert length(path) < 8.3
+
+
 def test_rooms_without_a_door_are_two_components():
     wall = [{"box": {"center": (5, 3), "size": (0.2, 6)}}]
     roads = Roads(FreeSpace.of(World(name="two", boundary=EMPTY.boundary, obstacles=wall)), RADIUS)

@@ -88,3 +88,15 @@ def test_out_of_sight_it_is_forgotten_after_a_while_and_when_time_goes_back():
     layer.see(scan_of(with_box(world, 3.2, 3.0), pose, 31 * SECOND), pose)
     layer.see(scan_of(world, away, 0), away)
     assert len(layer.points()) == 0
+
+
+def test_furniture_out_of_sight_is_kept_for_a_while_and_not_for_ever():
+    world = load_world("maze")
+    pose, away = np.array([1.5, 3.0, 0.0]), np.array([1.5, 3.0, np.pi])
+    layer = TemporaryObstacles(FreeSpace.of(world))
+    for half in range(9):
+        layer.see(scan_of(with_box(world, 3.2, 3.0), pose, half * SECOND // 2), pose)
+    layer.see(scan_of(world, away, 14 * SECOND), away)
+    assert len(layer.points()) >= 4
+    layer.see(scan_of(world, away, 29 * SECOND), away)
+    assert len(layer.points()) == 0

@@ -182,3 +182,24 @@ def test_who_is_held_by_the_limits_alone_is_stuck_too():
     ]
     assert reasons[0] == ""
     assert reasons[-1] == "stuck: backing off"
+
+
+@pytest.mark.parametrize("kind", DRIVES)
+def test_who_does_not_know_where_it_is_goes_slowly(kind):
+    world, robot = load_world("office"), Robot(drive=kind)
+    simulation = Simulation(Setup(world, SCANNER, robot, (6.0, 4.0, 0.0), 0))
+    navigator = Navigator(robot, world=world, preset=Pilot(robot, world))
+    navigator.hear_goal(Goal(stamp_ns=0, pose=Pose(x=15.0, y=4.0)))
+    speeds = []
+    try:
+        for _ in range(120):
+            scan = simulation.observe()[2]
+            navigator.hear_scan(scan)
+            command, status = navigator.step(belief_at(np.array([6.0, 4.0, 0.0]), scan.stamp_ns, "localising"))
+            speeds.append(float(np.hypot(command.twist.vx, command.twist.vy)))
+            simulation.command(scan.stamp_ns, command.twist)
+            simulation.advance()
+    finally:
+        simulation.close()
+    assert status.state == "exploring"
+    assert 0.2 < max(speeds) <= 0.5 + 1e-6
