@@ -20,7 +20,7 @@ from common.messages import Goal, Pose, Truth
 from common.robot import Robot
 from common.se2 import Array
 from common.world import World
-from presage.experiments.lockstep import REFUSED, Track
+from presage.experiments.lockstep import Track
 from presage.experiments.shortest import Trip, least_trip, length
 from services.simulator.people import RADIUS as PERSON
 
@@ -74,7 +74,7 @@ def _outcome(track: Track, left: float) -> str:
         return "failed"
     if last is not None and last.state == "reached":
         return "reached" if left <= TRULY else "claimed elsewhere"
-    return "refused" if last is not None and last.reason.startswith(REFUSED) else "too late"
+    return "refused" if last is not None and last.refused else "too late"
 
 
 def _why(track: Track, outcome: str, left: float) -> str:

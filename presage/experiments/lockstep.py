@@ -26,7 +26,6 @@ from presage.workers import ONE_CORE
 
 OURS = "experiment"  # our liveliness token: the simulator waits for it, so the goal is there before the first scan
 PATIENCE = 120.0  # s of wall time without a message
-REFUSED = "goal refused"  # how the controller's reason begins then
 ROUTERS = 5  # tries: between finding a free port and listening on it somebody else may take it
 
 
@@ -189,7 +188,7 @@ def _over(message: Stamped, track: Track, errand: Errand) -> bool:
         away = float(np.hypot(*(message.pose.array()[:2] - np.array(errand.journey.goal))))
         return len(track.truths) > errand.limit or (not errand.told and away <= CLOSE)
     if isinstance(message, Status) and errand.told and message.goal_seq:
-        return message.state == "reached" or message.reason.startswith(REFUSED)
+        return message.state == "reached" or message.refused
     return False
 
 

@@ -20,6 +20,7 @@ HOLD = 0.4  # s that an action is held in the prediction; the next scan asks ane
 STEP = 1 / 15  # s
 TURNING = 0.4  # share of the acceleration that a turn on the way may take
 NEAR = 0.5  # m
+CREEP = 0.02  # m/s, rad/s; slower is standing
 
 
 def rollouts(current: Array, actions: Array, robot: Robot, hold: float = HOLD) -> tuple[Array, Array, Array]:
@@ -54,6 +55,11 @@ def rollouts(current: Array, actions: Array, robot: Robot, hold: float = HOLD) -
     poses = np.concatenate([np.cumsum(way, axis=1) * STEP, yaw[..., None]], axis=-1)
     fastest = np.hypot(*(current[:2] + change[:, :2] * np.minimum(1.0, robot.acceleration * hold / linear)).T)
     return poses, times + STEP / 2, hold + fastest / robot.acceleration
+
+
+def moves(velocity: Array) -> bool:
+    """Whether a velocity (3,) is more than standing."""
+    return float(np.hypot(velocity[0], velocity[1])) + abs(float(velocity[2])) > CREEP
 
 
 def longest_brake(robot: Robot) -> float:

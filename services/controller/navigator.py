@@ -13,14 +13,13 @@ from common.robot import Robot
 from services.controller.action import Preference
 from services.controller.decision import Decision, Preset
 from services.controller.hand import Hand
-from services.controller.motion import turn_rate
+from services.controller.motion import moves, turn_rate
 from services.controller.straight import Straight
 
 if TYPE_CHECKING:
     from common.se2 import Array
     from common.world import World
 
-CREEP = 0.02  # m/s, slower than this is standing
 BLOCKED_AFTER = 2.0  # s of standing on the way
 
 
@@ -182,7 +181,7 @@ class Navigator:
             self.state = "blocked"
             return
         waits = held_back or self.decision.state == "blocked"
-        if float(np.hypot(*self._velocity[:2])) + abs(float(self._velocity[2])) > CREEP or not waits:
+        if moves(self._velocity) or not waits:
             self._standing_since = None
             self.state = "navigating"
             return

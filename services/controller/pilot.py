@@ -14,7 +14,7 @@ from common import safety, se2
 from services.controller.decision import Decision
 from services.controller.geodesic import Field, Roads
 from services.controller.grid import FreeSpace
-from services.controller.motion import facing
+from services.controller.motion import facing, moves
 from services.controller.obstacles import TemporaryObstacles
 from services.controller.policy import Around, choose
 from services.controller.seeking import Seeker
@@ -31,7 +31,6 @@ KEEP = 0.06  # m between footprint and what the map does not know: the scanner's
 REPLAN = 400_000_000  # ns between two plans for another picture of what stands in the way
 STUCK = 3_000_000_000  # ns without progress until it backs off
 BACK_OFF = 3_000_000_000  # ns of it
-CREEP = 0.02  # m/s, rad/s; slower is standing
 RANGE = 3.0  # m about the robot within which what the map does not know matters to its next second
 
 
@@ -126,7 +125,7 @@ class Pilot:
         choice = choose(velocity, attractor, around, self.robot)
         action = facing(choice.action, attractor, self.robot, turns=around.turns)
         # What was driven, not what is wished: the limits may have held it.
-        self._watch(stamp_ns, moves=float(np.hypot(*velocity[:2])) + abs(float(velocity[2])) > CREEP)
+        self._watch(stamp_ns, driven=moves(velocity))
         reason = ""
         if choice.held:
             reason = self._what_holds(pose, around, stood=not choice.action.any())
@@ -190,8 +189,8 @@ class Pilot:
             view=self._view, turns=not self.keep_heading,
         )  # fmt: skip
 
-    def _watch(self, stamp_ns: int, *, moves: bool) -> None:
-        if moves:
+    def _watch(self, stamp_ns: int, *, driven: bool) -> None:
+        if driven:
             self._stuck_since = None
         elif self._stuck_since is None or stamp_ns < self._stuck_since:
             self._stuck_since = stamp_ns

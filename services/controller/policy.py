@@ -20,7 +20,6 @@ COMFORT = 0.25  # m beside the footprint, below which progress counts for less
 DISCOMFORT = 0.5  # by how much less, at the least gap
 CLOSE = 0.3  # m, nearer to the attractor than this the heading towards it matters less and less
 BLIND_SPEED = 0.25  # m/s, where the scanner does not look, for a base that may not turn; others turn first
-SLOW = 0.02  # m/s, slower is standing
 ASIDE = np.pi / 4  # rad by which the scanner must look further than where the body goes, for it is wide
 LEAST_PROGRESS = 0.004  # m; what gains less is as good as standing
 STEADY = 0.02  # m per m/s, for going on as before
@@ -110,7 +109,7 @@ def _seen(actions: Array, around: Around) -> Array:
     if around.view >= np.pi:
         return actions
     speed = np.hypot(actions[:, 0], actions[:, 1])
-    moves = speed > BLIND_SPEED if not around.turns else speed > SLOW
+    moves = speed > BLIND_SPEED if not around.turns else speed > motion.CREEP
     blind = (np.abs(np.arctan2(actions[:, 1], actions[:, 0])) > around.view - ASIDE) & moves
     if around.turns:
         return actions[~blind]

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from common.se2 import Array
     from common.world import World
 
+CORNER = 0.3  # rad, beyond which a surface is tilted by design and not by the ripples of learning
 EXACT_SCALE = 1e-4  # m, what floating point and circles may leave
 
 

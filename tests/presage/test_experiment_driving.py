@@ -156,8 +156,8 @@ def belief(number, x, state="tracking"):
     )
 
 
-def status(number, state, reason="", goal_seq=1):
-    return Status(stamp_ns=number * 100_000_000, state=state, reason=reason, goal_seq=goal_seq)
+def status(number, state, reason="", goal_seq=1, *, refused=False):
+    return Status(stamp_ns=number * 100_000_000, state=state, reason=reason, goal_seq=goal_seq, refused=refused)
 
 
 TRIP = Trip((1.0, 1.0, 0.0), (5.0, 1.0), ((1.0, 1.0), (5.0, 1.0)))
@@ -247,7 +247,8 @@ def test_what_is_claimed_refused_late_or_broken_is_not_reached():
     broken = driven.measure(track, TRIP, HALL, ROBOT)
     assert (broken["outcome"], broken["why"]) == ("failed", track.failure)
     track = a_track()
-    track.statuses[400_000_000] = status(4, "blocked", "goal refused: (5.00, 1.00) in hall is inside something")
+    why = "goal refused: (5.00, 1.00) in hall is inside something"
+    track.statuses[400_000_000] = status(4, "blocked", why, refused=True)
     assert driven.measure(track, TRIP, HALL, ROBOT)["outcome"] == "refused"
     track.health = None
     assert driven.measure(track, TRIP, HALL, ROBOT)["step_mean_ms"] is None
@@ -290,7 +291,7 @@ def test_the_drive_ends_when_the_controller_says_so_and_that_scan_is_its_last():
     assert len(track.truths) == len(track.beliefs) == len(track.statuses) == 2
     assert not _over(truth(1, 5.0), Track(), errand)  # being there is not enough
     assert _over(truth(1, 5.0), Track(), replace(errand, told=False))
-    assert _over(status(0, "blocked", "goal refused: no"), Track(), errand)
+    assert _over(status(0, "blocked", "goal refused: no", refused=True), Track(), errand)
     assert not _over(status(0, "reached", goal_seq=0), Track(), errand)
 
 

@@ -129,7 +129,8 @@ class PreciseEstimator:
             # Once blind, a ripple a little larger than the others must not be taken for a feature.
             doubt = 3 if mode.blind else 1
             keep, blind = mixture.seen(evidence.curvature[k], self.model.ripple * doubt)
-            if blind is not None and self._held(view, poses[k], blind) > doubt * self.settings.holding:
+            holding = doubt * self.settings.holding * len(view.angles)
+            if blind is not None and obstruction.held(view, poses[k], blind) > holding:
                 keep, blind = np.eye(3), None
             mixture.project(evidence, k, keep)
             if blind is not None and odom is None:
@@ -138,9 +139,6 @@ class PreciseEstimator:
             fused = min(parts, key=lambda part: part.surprise)
             modes.append(mixture.moved(mode, fused, evidence, k, period, blind=blind is not None))
         self.modes = mixture.weigh(modes, self.settings.evidence_error, self.settings.hypotheses)
-
-    def _held(self, view: View, pose: Array, direction: Array) -> float:
-        return obstruction.held(view, pose, direction) / max(len(view.angles), 1)
 
     def _unseen(self, option: Candidate, blind: Array, scans: int, period: float) -> Candidate:
         """Along a direction no scan sees, the robot may have gone at full speed: the deviation grows with time."""
@@ -161,17 +159,16 @@ class PreciseEstimator:
         return self._since >= self._wait
 
     def _believable(self, view: View) -> bool:
-        """Whether enough of the scan is explained; of a place that was tracked, whether little contradicts it."""
+        """Whether enough of the scan is explained, or the rest may be hidden."""
+        return self.modes[0].explained >= self.settings.believable or self._hidden(view)
+
+    def _hidden(self, view: View) -> bool:
+        """Whether the place was tracked, shows a glimpse of itself still, and little contradicts it."""
         best, settings = self.modes[0], self.settings
-        if best.explained >= settings.believable:
-            return True
         if best.explained < settings.glimpse or not best.trusted:
             return False
-        return self._contradicted(view) <= settings.contradicted
-
-    def _contradicted(self, view: View) -> float:
-        expected = self.model.expect(se2.compose(self.modes[0].pose, self.mount)[None], view.angles)
-        return obstruction.contradicted(view, expected)
+        expected = self.model.expect(se2.compose(best.pose, self.mount)[None], view.angles)
+        return obstruction.contradicted(view, expected) <= settings.contradicted
 
     def _relocalise(self, view: View) -> None:
         """Search from nothing; keep what is tracked where nothing better is found."""
@@ -181,7 +178,7 @@ class PreciseEstimator:
             found = self._search(view)
         if self.modes:
             before, margin = self.modes[0], 3 * self.settings.evidence_error
-            if len(mixture.distinct(np.array([before.pose, found[0].pose]), np.zeros(2), 2)) == 1:
+            if mixture.same(found[0].pose[None], before.pose)[0]:
                 found[0] = replace(found[0], age=before.age, velocity=before.velocity, trusted=before.trusted)
             if found[0].energy > before.energy - margin or self._unlikely(view, found[0]):
                 found = self.modes  # nothing better: this is how it looks here now; search again later
@@ -191,10 +188,10 @@ class PreciseEstimator:
 
     def _unlikely(self, view: View, found: Mode) -> bool:
         """Elsewhere, though nothing contradicts the place that was tracked: a door has closed, a crowd has gathered."""
-        best, settings = self.modes[0], self.settings
-        if not best.trusted or best.explained < settings.glimpse or self._contradicted(view) > settings.contradicted:
+        if not self._hidden(view):
             return False
-        spread = best.covariance(settings.inflation)[:2, :2] + np.eye(2) * mixture.SAME_PLACE**2
+        best = self.modes[0]
+        spread = best.covariance(self.settings.inflation)[:2, :2] + np.eye(2) * mixture.SAME_PLACE**2
         off = found.pose[:2] - best.pose[:2]
         return bool(off @ np.linalg.solve(spread, off) > FAR)
 

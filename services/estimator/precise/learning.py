@@ -16,6 +16,7 @@ import numpy as np
 import shapely
 
 from common.se2 import Array, compose, wrap
+from services.estimator.generative import CORNER
 from services.estimator.precise.field import CLASSES, DistanceField, Floats
 
 POOL = 1  # cells to each side that share their points to find a normal
@@ -26,7 +27,6 @@ CLIP = 0.1  # m, a larger error is another surface's
 GRAZING = 0.15  # least |n . u| of a beam that shapes the field
 RARE, RARE_SCALE = 20, 0.05  # a class seen seldom: as if it had been seen so often, with this error (m), besides
 LEAST_SCALE = 1e-3  # m
-CORNER = 0.3  # rad
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from common import se2
 from services.estimator.precise.gauss_newton import Prior, difference
@@ -114,13 +115,17 @@ def moved(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: float, *
     )  # fmt: skip
 
 
+def same(poses: Array, pose: Array) -> npt.NDArray[np.bool_]:
+    """(N,) which of poses (N, 3) are the place that ``pose`` (3,) is."""
+    off = np.abs(difference(poses, pose))
+    return np.asarray((off[:, :2] < SAME_PLACE).all(axis=1) & (off[:, 2] < SAME_YAW))
+
+
 def distinct(poses: Array, energy: Array, count: int) -> list[int]:
     """Indices of the ``count`` least energies, no two at the same place."""
     kept: list[int] = []
     for k in np.argsort(energy, kind="stable"):
-        off = np.abs(poses[kept] - poses[k])
-        off[:, 2] = np.abs(se2.wrap(poses[kept, 2] - poses[k, 2]))
-        if not ((off[:, :2] < SAME_PLACE).all(axis=1) & (off[:, 2] < SAME_YAW)).any():
+        if not same(poses[kept], poses[k]).any():
             kept.append(int(k))
         if len(kept) == count:
             break

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common import se2
+from services.estimator.generative import CORNER
 
 if TYPE_CHECKING:
     from common.se2 import Array
     from services.estimator.generative import Expected
     from services.estimator.precise.gauss_newton import View
 
-CORNER = 0.3  # rad, beyond which a surface is tilted by design and not by the ripples of learning
 CLEARLY = 4.0  # standard deviations
 
 
