@@ -74,9 +74,10 @@ class TemporaryObstacles:
         return np.asarray(where[:, 1] * self._columns + where[:, 0])
 
     def _add(self, cells: npt.NDArray[np.int64], stamp_ns: int) -> None:
-        known = np.isin(cells, self._cells)
-        old = np.searchsorted(self._cells, cells[known])
-        self._last[old] = stamp_ns
+        where = np.searchsorted(self._cells, cells)
+        known = where < len(self._cells)
+        known[known] = self._cells[where[known]] == cells[known]
+        self._last[where[known]] = stamp_ns
         new = cells[~known]
         order = np.argsort(merged := np.concatenate([self._cells, new]), kind="stable")
         stamps = np.full(len(new), stamp_ns, np.int64)

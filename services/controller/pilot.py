@@ -12,11 +12,11 @@ import numpy.typing as npt
 
 from common import safety, se2
 from services.controller.decision import Decision
-from services.controller.geodesic import Field, Roads
+from services.controller.geodesic import SOFT, Field, Roads
 from services.controller.grid import FreeSpace
 from services.controller.motion import facing, moves
 from services.controller.obstacles import TemporaryObstacles
-from services.controller.policy import Around, choose
+from services.controller.policy import Around, choose, least_distance
 from services.controller.seeking import Seeker
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 KEEP = 0.06  # m between footprint and what the map does not know: the scanner's noise, and half a cell
 REPLAN = 400_000_000  # ns between two plans for another picture of what stands in the way
+REPLAN_AFAR = 1_500_000_000  # ns where it changed elsewhere
 STUCK = 3_000_000_000  # ns without progress until it backs off
 BACK_OFF = 3_000_000_000  # ns of it
 RANGE = 3.0  # m about the robot within which what the map does not know matters to its next second
@@ -51,8 +52,9 @@ class Pilot:
         self._goal: Array | None = None
         self._component: int | None = None  # of the roads, where the robot was last known to be
         self._scan: Scan | None = None
-        # When the field was made, ns, and the cells that were blocked then.
+        # When roads were last blocked, ns, and the cells that were; whether the field does not know of it yet.
         self._planned: tuple[int, npt.NDArray[Any]] = (-REPLAN, np.zeros(0, int))
+        self._outdated = False
         self._vetted_from: int | None = None  # the component from which the goal was found reachable
         self._view = np.pi
         self._stuck_since: int | None = None
@@ -164,18 +166,32 @@ class Pilot:
             return
         cells = np.unique(self.free.grid.cell_of(points)) if len(points) else np.zeros(0, int)
         when, before = self._planned
-        changed = not np.array_equal(cells, before)
-        if self.field is not None and (not changed or 0 <= stamp_ns - when < REPLAN):
-            return
-        near = self.robot.radius + 2 * self.free.grid.resolution
-        if changed:
+        others = np.setxor1d(cells, before, assume_unique=True)
+        age = stamp_ns - when
+        due = age < 0 or age >= REPLAN_AFAR or (age >= REPLAN and self._on_the_way(here, others))
+        if self.field is None or (len(others) and due):
             self.roads.block(points)
+            self._planned, self._outdated = (stamp_ns, cells), True
+            if self.field is not None and not self.closed:
+                return  # the field itself with the next scan: each takes milliseconds
+        if self.field is not None and not self._outdated:
+            return
+        self._outdated = False
+        near = self.robot.radius + 2 * self.free.grid.resolution
         self.field, self.changed, self.closed = self.roads.from_(self._goal, near), True, False
         if self.field is None or not self.field.reaches(here):
             # By the map alone: up to what closes the way, and there until it opens.
             self.roads.block(np.zeros((0, 2)))
             self.field, self.closed = self.roads.from_(self._goal, near), bool(len(points))
-        self._planned = (stamp_ns, cells)
+
+    def _on_the_way(self, here: Array, cells: npt.NDArray[Any]) -> bool:
+        """Whether any of these cells, which came or went, lies near the way from ``here``."""
+        if self.field is None or not len(cells) or self.closed:
+            return True
+        way = self.field.path(here)
+        return bool(len(way)) and bool(
+            least_distance(self.free.grid.centres(cells), way).min() < self.roads.least + SOFT
+        )
 
     def _around(self, pose: Array, points: Array, moving: npt.NDArray[np.bool_]) -> Around:
         near = np.hypot(*(points - pose[:2]).T) < RANGE

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from common import se2
 from services.controller import motion
@@ -38,22 +37,39 @@ class Around:
     view: float = np.pi  # rad to either side of x that the scanner sees
     turns: bool = True  # the base may turn, so nothing need be done unseen
 
-    def gaps(self, poses: Array, times: Array, stands: Array | float = np.inf) -> Array:
+    def gaps(self, poses: Array, times: Array, stands: Array | float = np.inf, enough: float = np.inf) -> Array:
         """(N, T) m left between footprint and anything at poses (N, T, 3); less where somebody may be by then.
 
-        Once the robot stands, after ``stands`` (N,) s, whoever walks does not walk into it: passive safety.
+        Once the robot stands, after ``stands`` (N,) s, whoever walks does not walk into it: passive safety. Gaps of
+        more than ``enough`` m are not told apart, which saves most of the work.
         """
-        places = poses[..., :2]
-        gap = self.known(places) - self.least
-        for moves in (False, True):
-            these = self.points[self.moving == moves]
-            if len(these):
-                apart, _ = cKDTree(these).query(places)
-                left = apart - self.keep
-                if moves:
-                    left = np.where(times <= np.asarray(stands)[..., None], left - self.walking * times, np.inf)
-                gap = np.minimum(gap, left)
-        return np.asarray(gap)
+        shape = poses.shape[:-1]
+        times, until = np.broadcast_to(times, shape), np.broadcast_to(np.asarray(stands)[..., None], shape)
+        moved = times <= until + motion.STEP  # later places are the last of these
+        places, times, awake = poses[moved][:, :2], times[moved], (times <= until)[moved]
+        gap = np.minimum(self.known(places) - self.least, enough)
+        reach = float(np.hypot(*places.T).max(initial=0.0)) + self.keep + enough
+        away = np.hypot(*self.points.T)
+        still = self.points[(away < reach) & np.logical_not(self.moving)]
+        if len(still):
+            gap = np.minimum(gap, least_distance(places, still) - self.keep)
+        come = self.walking * times[awake]
+        walkers = self.points[self.moving & (away < reach + come.max(initial=0.0))]
+        if len(walkers):
+            gap[awake] = np.minimum(gap[awake], least_distance(places[awake], walkers) - self.keep - come)
+        gaps = np.full(shape, enough)
+        gaps[moved] = gap
+        return gaps
+
+
+def least_distance(places: Array, points: Array) -> Array:
+    """(N,) m from each of ``places`` (N, 2) to the nearest of ``points`` (K, 2), all of them near the origin.
+
+    As one product of matrices, which for some hundred points is several times faster than a tree.
+    """
+    p = np.vstack([places.T, np.ones(len(places))])
+    q = np.column_stack([-2 * points, np.sum(points**2, axis=1)])
+    return np.asarray(np.sqrt(np.maximum((q @ p).min(axis=0) + np.sum(places**2, axis=1), 0.0)))
 
 
 @dataclass(frozen=True)
@@ -76,8 +92,8 @@ def choose(current: Array, attractor: Array, around: Around, robot: Robot) -> Ch
     actions = motion.candidates(current, attractor, robot)
     actions = _seen(actions, around)
     poses, times, stands = motion.rollouts(current, actions, robot)
-    gaps = around.gaps(poses, times, stands)
-    now = float(around.gaps(np.zeros((1, 1, 3)), np.zeros(1))[0, 0])
+    gaps = around.gaps(poses, times, stands, COMFORT)
+    now = float(around.gaps(np.zeros((1, 1, 3)), np.zeros(1), enough=COMFORT)[0, 0])
     # From where it is too near already, any way is free that leads away.
     free = np.all(gaps >= min(0.0, now) - 1e-3, axis=1)
     gain = to_go(poses[0, -1], attractor, robot) - to_go(poses[:, -1], attractor, robot)
