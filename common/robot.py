@@ -21,4 +21,6 @@ class Robot(BaseModel):
     acceleration: Positive = 1.0  # m/s²
     turn_acceleration: Positive = 3.0  # rad/s²
     margin: Positive = 0.05  # m, the obstacle stop keeps this gap
-    command_timeout: Positive = 0.5  # s, without a command the robot brakes
+    command_timeout: Positive = 0.2  # s, without a newer command the robot brakes hard
+    command_age: Positive = 0.5  # s, a command that answers an older scan is not obeyed
+    braking: Positive = 5.0  # m/s², where it brakes hard: nobody plans with it

@@ -37,12 +37,15 @@ def clip_twist(twist: Array, robot: Robot) -> Array:
     return np.array([*linear, np.clip(twist[2], -robot.max_turn, robot.max_turn)])
 
 
-def ramp(current: Array, wanted: Array, robot: Robot, dt: float) -> Array:
-    """(3,) the velocity after ``dt`` s of changing ``current`` to ``wanted`` as fast as the limits allow."""
-    change = wanted - current
-    linear, most = float(np.hypot(change[0], change[1])), robot.acceleration * dt
+def ramp(current: Array, wanted: Array, robot: Robot, dt: float, *, hard: bool = False) -> Array:
+    """(3,) the velocity after ``dt`` s of changing ``current`` to ``wanted`` as fast as the limits allow.
+
+    ``hard``: as fast as the base can, which is meant for standing.
+    """
+    change, harder = wanted - current, robot.braking / robot.acceleration if hard else 1.0
+    linear, most = float(np.hypot(change[0], change[1])), robot.acceleration * harder * dt
     scale = min(1.0, most / linear) if linear > 0 else 1.0
-    turn = robot.turn_acceleration * dt
+    turn = robot.turn_acceleration * harder * dt
     return np.array([*(current[:2] + change[:2] * scale), current[2] + np.clip(change[2], -turn, turn)])
 
 

@@ -111,7 +111,7 @@ class Navigator:
         """As before an interruption, where no time has passed since by the stamps: a simulation that was paused."""
         if self._interrupted is None:
             return
-        if self._last_stamp is not None and 0 < stamp_ns - self._last_stamp <= self.robot.command_timeout * 1e9:
+        if self._last_stamp is not None and 0 < stamp_ns - self._last_stamp <= self.robot.command_age * 1e9:
             self._velocity = self._interrupted
             self.mind.go_on()
         self._interrupted = None

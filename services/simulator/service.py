@@ -87,7 +87,7 @@ class SimulatorService(Service):
             load_world(options.world), scanner, robot, options.start_pose(), options.seed, drift,
             options.obstacle_stop, options.people, options.people_speed,
         )  # fmt: skip
-        self.simulation = Simulation(self.setup)
+        self._begin()
         if not options.obstacle_stop:
             self.log.warning("the obstacle stop is off, for fault injection: nothing keeps the robot from contact")
         self._next = time.monotonic()
@@ -95,6 +95,16 @@ class SimulatorService(Service):
             self._say_how_time_goes()
             self.log.info(self.note)
             self.loop.bus.watch_alive(self._changed)
+
+    def _begin(self) -> None:
+        self.simulation = Simulation(self.setup)
+        self._set_hurry()
+
+    def _set_hurry(self) -> None:
+        """As fast as it goes: as long as a command is obeyed at all."""
+        robot = self.setup.robot
+        fast = robot.command_age / robot.command_timeout
+        self.simulation.hurry = fast if self.options.pace == "fast" else max(1.0, self.speed)
 
     def _changed(self, service: str, there: bool) -> None:  # noqa: FBT001 - zenoh's thread; the set alone is shared
         if there:
@@ -226,6 +236,7 @@ class SimulatorService(Service):
             why = "each scan waits for its command" if self.lockstep else "it goes as fast as it can"
             return Reply(ok=False, reason=f"the pace is {self.options.pace}: {why}; a speed needs --pace realtime")
         self.speed = factor
+        self._set_hurry()
         self._next = min(self._next, time.monotonic() + self._period)  # the next scan may have been far off
         self._say_how_time_goes()
         self.log.info("speed", factor=factor)
@@ -234,7 +245,7 @@ class SimulatorService(Service):
     def _reset(self, seed: int | None) -> None:
         self.setup = replace(self.setup, seed=self.setup.seed if seed is None else seed)
         self.simulation.close()
-        self.simulation = Simulation(self.setup)
+        self._begin()
         self._sent, self._next = None, time.monotonic()
 
     def _sample(self, request: SampleRequest) -> SampleReply:

@@ -70,6 +70,8 @@ class Simulation:
         self.steps = 0
         self._velocity = np.zeros(3)  # what the wheels are told, after ramp
         self._command: tuple[int, Array] | None = None  # stamp and twist
+        self._heard = 0  # steps when the last newer command came
+        self.hurry = 1.0  # how much faster than a controller's clock time runs here: it may take that much longer
         self._contact = self._stopped = False
         self._points = np.zeros((0, 2))
 
@@ -93,21 +95,24 @@ class Simulation:
         return self._command is not None and self._command[0] == self.stamp_ns
 
     def command(self, stamp_ns: int, twist: Twist) -> bool:
-        """Take a command; False where it answers a scan too old, or one that never was."""
-        age = self.stamp_ns - stamp_ns
-        if age < 0 or age > self.setup.robot.command_timeout * 1e9:
+        """Take a command; False where it answers a scan too old, one before the last one's, or one that never was."""
+        age, before = self.stamp_ns - stamp_ns, -1 if self._command is None else self._command[0]
+        if age < 0 or age > self.setup.robot.command_age * 1e9 or stamp_ns < before:
             return False
+        if stamp_ns > before:  # one said again keeps nothing going
+            self._heard = self.steps
         self._command = (stamp_ns, safety.clip_twist(twist.array(), self.setup.robot))
         return True
 
     def advance(self) -> None:
         """One scan period."""
-        wanted = self._wanted()
+        silent = (self.steps - self._heard) * self.period_ns * 1e-9 >= self.setup.robot.command_timeout * self.hurry
+        wanted = np.zeros(3) if silent else self._wanted()
         before = self.physics.pose()
         self._walk(before)
         self._contact = False
         for _ in range(self.substeps):
-            self._velocity = safety.ramp(self._velocity, wanted, self.setup.robot, SUBSTEP)
+            self._velocity = safety.ramp(self._velocity, wanted, self.setup.robot, SUBSTEP, hard=silent)
             self._contact |= self.physics.drive(self._velocity)
         self.odometer.move(before, self.physics.pose())
         self.steps += 1
@@ -122,7 +127,7 @@ class Simulation:
     def _wanted(self) -> Array:
         """The velocity to aim at: the command while it is fresh, no faster than what the last scan shows allows."""
         self._stopped = False
-        if self._command is None or self.stamp_ns - self._command[0] > self.setup.robot.command_timeout * 1e9:
+        if self._command is None or self.stamp_ns - self._command[0] > self.setup.robot.command_age * 1e9:
             return np.zeros(3)
         if not self.setup.obstacle_stop:
             return self._command[1]

@@ -81,16 +81,44 @@ def test_holonomic_goes_sideways_and_differential_does_not(make):
     assert differential.pose.x > 2.1
 
 
-def test_brakes_when_commands_end(make):
+def silence(simulation, again=None) -> float:
+    """Simulated s until the robot stands, without a new command."""
+    for steps in range(1, 30):
+        if again is not None:
+            simulation.command(*again)
+        simulation.advance()
+        if speed(simulation.observe()[1]) < 1e-3:
+            return steps / 15
+    return np.inf
+
+
+@pytest.mark.parametrize("kind", ["holonomic", "differential"])
+def test_stands_within_half_a_second_of_the_last_command(make, kind):
+    simulation = make(start=(1.0, 3.0, 0.0), robot=Robot(drive=kind))
+    assert speed(drive(simulation, Twist(vx=1.0, wz=0.3), 1.5)[-1]) > 0.98
+    for _ in range(2):  # one that comes a scan or two late is nothing to brake hard for
+        simulation.advance()
+        assert speed(simulation.observe()[1]) > 0.98
+    assert drive(simulation, Twist(vx=1.0, wz=0.3), 0.3)
+    assert silence(simulation) < 0.5 - 1 / 15  # whoever stops talking does so within a scan's period of its last word
+
+
+def test_a_command_said_again_keeps_nothing_going(make):
     simulation = make(start=(1.0, 3.0, 0.0))
-    drive(simulation, Twist(vx=0.8), 1.5)
-    for _ in range(8):  # 0.53 s: the command is still good for 0.5 s of it
-        simulation.advance()
-        truth = simulation.observe()[1]
-    assert speed(truth) < 0.8
-    for _ in range(15):
-        simulation.advance()
-    assert speed(simulation.observe()[1]) < 1e-3
+    drive(simulation, Twist(vx=1.0), 1.5)
+    last = simulation.stamp_ns, Twist(vx=1.0)
+    assert simulation.command(*last)
+    assert silence(simulation, last) < 0.5
+
+
+def test_a_command_older_than_the_last_one_is_refused(make):
+    simulation = make(start=(1.0, 3.0, 0.0))
+    drive(simulation, Twist(vx=0.5), 0.4)
+    now = simulation.stamp_ns
+    assert simulation.command(now, Twist())
+    assert not simulation.command(now - simulation.period_ns, Twist(vx=1.0))
+    simulation.advance()
+    assert simulation.command(simulation.stamp_ns, Twist())
 
 
 def test_commands_too_old_or_from_the_future_are_refused(make):
