@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,9 +16,10 @@ import zenoh
 
 from common.errors import UserError
 from common.inbox import Answer, Call, Inbox, Sample
+from common.instances import Instance, Instances
 from common.messages import Stamped
 from common.requests import Reply, Request
-from common.topics import Query, Topic, alive_key, topic_of
+from common.topics import Query, Topic, alive_key, standby_key, topic_of
 from common.wire import ENCODING, DecodeError, Message
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -34,6 +37,7 @@ class Link:
     listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
     router: bool = False
     multicast: bool = False
+    lossless: bool = True  # who cannot keep up holds the publisher back; else it loses what is too much for it
 
 
 def _config(link: Link) -> zenoh.Config:
@@ -48,6 +52,9 @@ def _config(link: Link) -> zenoh.Config:
         "scouting/multicast/enabled": link.multicast,
         "transport/shared_memory/enabled": False,  # drops silently when a receiver stalls (zenoh issue 2628)
         "timestamping/enabled": True,
+        # Who is gone without a word (frozen, cut off) is known to be gone after this; zenoh's own is 10 s.
+        "transport/link/tx/lease": 3000,
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 5000,  # us
     }
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
@@ -57,17 +64,22 @@ def _config(link: Link) -> zenoh.Config:
 class Bus:
     """One session, bound to one robot's keys."""
 
-    def __init__(self, session: zenoh.Session, robot: str) -> None:
+    def __init__(self, session: zenoh.Session, robot: str, *, lossless: bool = True) -> None:
         """Use `open_bus`."""
         self.robot = robot
+        self._congestion = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
+        self.zid = str(session.zid())
+        self.instance = Instance(time.time_ns() // 10**6, socket.gethostname(), os.getpid(), self.zid).name
         self._session = session
         self._publishers: dict[str, zenoh.Publisher] = {}
+        self._kept: dict[str, tuple[bytes, zenoh.Timestamp | None]] = {}  # by key, the last payload of kept topics
         self._declared: list[object] = []  # zenoh undeclares what nobody holds
         self._lock = threading.Lock()
 
     def put(self, topic: Topic, payload: bytes, service: str = "*", key: str | None = None) -> None:
         """Publish bytes on the topic's key, or on ``key`` where a replay names it."""
-        self.publisher(topic, service, key).put(payload)
+        publisher = self.publisher(topic, service, key)
+        publisher.put(payload, source_info=zenoh.SourceInfo(publisher.id, 0))
 
     def publisher(self, topic: Topic, service: str = "*", key: str | None = None) -> zenoh.Publisher:
         """The publisher of a key, declared once."""
@@ -77,7 +89,7 @@ class Bus:
                 self._publishers[key] = self._session.declare_publisher(
                     key,
                     encoding=zenoh.Encoding(ENCODING).with_schema(topic.message.__name__),
-                    congestion_control=zenoh.CongestionControl.BLOCK,
+                    congestion_control=self._congestion,
                 )
             return self._publishers[key]
 
@@ -93,9 +105,9 @@ class Bus:
         newest = topic.queue == "newest" and not keep_all
 
         def move(sample: zenoh.Sample) -> None:
-            stamp = sample.timestamp
-            published = int(stamp.get_time().timestamp() * 1e9) if stamp is not None else 0
-            entry = Sample(topic, str(sample.key_expr), sample.payload.to_bytes(), published, time.time_ns())
+            published = _published_ns(sample)
+            source = _source(sample)
+            entry = Sample(topic, str(sample.key_expr), sample.payload.to_bytes(), published, time.time_ns(), source)
             inbox.put(entry, newest_only=newest)
 
         subscriber = self._session.declare_subscriber(topic.key(robot or self.robot), move)
@@ -173,36 +185,121 @@ class Bus:
         handler = zenoh.handlers.Callback(move, end)
         self._session.get(key, handler, payload=request.encode(), encoding=ENCODING, timeout=timeout)
 
+    def keep(self, topic: Topic) -> None:
+        """From now on hear a kept topic, and tell the last payload to whoever asks with `kept`."""
+        key = topic.key(self.robot)
+
+        def move(sample: zenoh.Sample) -> None:
+            self._kept[key] = (sample.payload.to_bytes(), sample.timestamp)
+
+        def tell(call: zenoh.Query) -> None:
+            if (last := self._kept.get(key)) is not None:
+                with suppress(zenoh.ZError):  # the asker may be gone
+                    call.reply(key, last[0], encoding=ENCODING, timestamp=last[1])
+            call.drop()  # type: ignore[no-untyped-call]
+
+        self._declared += [self._session.declare_subscriber(key, move), self._session.declare_queryable(key, tell)]
+
+    def kept(self, topic: Topic, timeout: float = 0.5) -> bytes | None:
+        """The last payload that anybody still knows of a kept topic."""
+        answers = self._session.get(
+            topic.key(self.robot), target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout,
+        )  # fmt: skip
+        found = [(_published_ns(a.ok), a.ok.payload.to_bytes()) for a in answers if a.ok is not None]
+        return max(found, default=(0, None), key=lambda each: each[0])[1]
+
     def declare_alive(self, service: str) -> None:
         """Say that the service is there, until the session ends. Declare it last: order is kept."""
-        self._declared.append(self._session.liveliness().declare_token(alive_key(self.robot, service)))
+        self._token(alive_key(self.robot, service, self.instance))
+
+    def _token(self, key: str) -> None:
+        self._declared.append(self._session.liveliness().declare_token(key))
+
+    def stand_by(self, service: str) -> Callable[[], None]:
+        """Say that this instance waits until no other leads; a call ends it."""
+        token = self._session.liveliness().declare_token(standby_key(self.robot, service, self.instance))
+        self._declared.append(token)
+
+        def end() -> None:
+            self._declared.remove(token)
+            token.undeclare()  # type: ignore[no-untyped-call]
+
+        return end
+
+    def instances(self, service: str, changed: Callable[[], None], timeout: float = 0.5) -> Instances:
+        """Who else does what ``service`` does, kept up to date; ``changed`` is called from another thread."""
+        found = Instances(self.instance)
+
+        def move(sample: zenoh.Sample) -> None:
+            *_, kind, _, name = str(sample.key_expr).split("/")
+            found.change(name, leads=kind == "alive", there=sample.kind == zenoh.SampleKind.PUT)
+            changed()
+
+        liveliness, keys = (
+            self._session.liveliness(),
+            [alive_key(self.robot, service), standby_key(self.robot, service)],
+        )
+        self._declared += [liveliness.declare_subscriber(key, move, history=True) for key in keys]
+        for key in keys:  # an answer, where the subscriber's history may still be on its way
+            for reply in liveliness.get(key, timeout=timeout):
+                if reply.ok is not None:
+                    move(reply.ok)
+        return found
 
     def alive(self, timeout: float = 1.0, robot: str | None = None) -> set[str]:
         """Services of this robot, or another, that are there now."""
-        replies = self._session.liveliness().get(alive_key(robot or self.robot), timeout=timeout)
-        return {str(r.ok.key_expr).rsplit("/", 1)[-1] for r in replies if r.ok is not None}
+        return set(self.alive_instances(timeout, robot))
+
+    def alive_instances(
+        self, timeout: float = 1.0, robot: str | None = None, *, standby: bool = False
+    ) -> dict[str, list[str]]:
+        """Instances by service, by age; those that lead, or those that stand by."""
+        key = (standby_key if standby else alive_key)(robot or self.robot)
+        found: dict[str, list[str]] = {}
+        for reply in self._session.liveliness().get(key, timeout=timeout):
+            if reply.ok is not None:
+                *_, service, name = str(reply.ok.key_expr).split("/")
+                found.setdefault(service, []).append(name)
+        return {service: sorted(names) for service, names in found.items()}
 
     def watch_alive(self, changed: Callable[[str, bool], None]) -> None:
         """Call ``changed(service, is_there)`` for those there now and at every change, from another thread."""
-
-        def move(sample: zenoh.Sample) -> None:
-            changed(str(sample.key_expr).rsplit("/", 1)[-1], sample.kind == zenoh.SampleKind.PUT)
-
-        subscriber = self._session.liveliness().declare_subscriber(alive_key(self.robot), move, history=True)
-        self._declared.append(subscriber)
+        self._watch(self.robot, lambda _, service, there: changed(service, there))
 
     def watch_robots(self, changed: Callable[[str, str, bool], None]) -> None:
         """The same for every robot: ``changed(robot, service, is_there)``."""
+        self._watch("*", changed)
+
+    def _watch(self, robots: str, changed: Callable[[str, str, bool], None]) -> None:
+        """A service is gone with its last instance; one that comes beside another is told of as well."""
+        instances: dict[tuple[str, str], set[str]] = {}
 
         def move(sample: zenoh.Sample) -> None:
-            _, robot, _, service = str(sample.key_expr).split("/")
-            changed(robot, service, sample.kind == zenoh.SampleKind.PUT)
+            _, robot, _, service, name = str(sample.key_expr).split("/")
+            there, known = sample.kind == zenoh.SampleKind.PUT, instances.setdefault((robot, service), set())
+            (known.add if there else known.discard)(name)
+            if there or not known:
+                changed(robot, service, there)
 
-        self._declared.append(self._session.liveliness().declare_subscriber(alive_key("*"), move, history=True))
+        self._declared.append(self._session.liveliness().declare_subscriber(alive_key(robots), move, history=True))
 
     def linked(self) -> bool:
         """Whether any other session is reached."""
         return bool(list(self._session.info.routers_zid()) or list(self._session.info.peers_zid()))
+
+
+def _published_ns(sample: zenoh.Sample) -> int:
+    """Wall time at the publisher, 0 if unknown."""
+    stamp = sample.timestamp
+    return int(stamp.get_time().timestamp() * 1e9) if stamp is not None else 0
+
+
+def _source(sample: zenoh.Sample) -> str:
+    """Whoever published it: by its own word, else by the clock that stamped it."""
+    if (info := sample.source_info) is not None:
+        return str(info.source_id.zid)
+    return str(sample.timestamp.get_id()) if sample.timestamp is not None else ""
 
 
 def _decode_reply(key: str, reply: type[R], payload: bytes) -> R:
@@ -227,7 +324,7 @@ def open_bus(link: Link) -> Iterator[Bus]:
         asked = f"connect {', '.join(link.connect) or 'none'}, listen {', '.join(link.listen) or 'none'}"
         raise UserError(f"no session with {asked}: {why}; an endpoint is written like {DEFAULT_ENDPOINT}") from None
     with closing(session):  # its own __exit__ fails while another thread is inside one of its calls; close() does not
-        yield Bus(session, link.robot)
+        yield Bus(session, link.robot, lossless=link.lossless)
 
 
 def wait_until(condition: Callable[[], bool], timeout: float, period: float = 0.02) -> bool:

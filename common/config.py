@@ -61,6 +61,9 @@ class ServiceSettings(BaseSettings):
         "tcp/127.0.0.1:0"
     )
     multicast: Annotated[bool, Field(description="also find other sessions by multicast")] = False
+    lossless: Annotated[
+        bool, Field(description="who cannot keep up holds this service back; for replays, not for a robot")
+    ] = False
     log_level: Annotated[
         str, Field(pattern="^(debug|info|warning|error)$", description="debug, info, warning, error")
     ] = "info"
@@ -70,7 +73,8 @@ class ServiceSettings(BaseSettings):
 
     def link(self) -> Link:
         """The session these settings ask for."""
-        return Link(self.robot, split_endpoints(self.connect), split_endpoints(self.listen), multicast=self.multicast)
+        connect, listen = split_endpoints(self.connect), split_endpoints(self.listen)
+        return Link(self.robot, connect, listen, multicast=self.multicast, lossless=self.lossless)
 
     def effective(self) -> dict[str, Any]:
         """Every setting as it holds, plain types."""

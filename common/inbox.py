@@ -24,6 +24,7 @@ class Sample:
     payload: bytes
     published_ns: int  # wall time at the publisher, 0 if unknown
     received_ns: int  # wall time here
+    source: str = ""  # zenoh session that published it; empty if unknown
 
 
 @dataclass(frozen=True)

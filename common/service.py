@@ -11,10 +11,11 @@ from collections import Counter
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-from common.bus import Bus, open_bus
+from common.bus import Bus, open_bus, wait_until
 from common.config import ServiceSettings, load_settings
 from common.errors import UserError
 from common.inbox import Answer, Call, Inbox, Sample
+from common.instances import Instances, OneSource, spoken
 from common.log import Logger, OncePerSecond, logger, set_up_logging
 from common.messages import Health, Stamped, TopicHealth
 from common.requests import ConfigReply, Reply, Request
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound=ServiceSettings)
 HEALTH_PERIOD = 1.0  # s
+LINKED_WITHIN = 0.5  # s that a service waits for its first link before it looks who else is there
+SOURCE_SILENT = 0.3  # s after which another source of a topic is heard
 
 
 class Service(ABC):
@@ -36,6 +39,9 @@ class Service(ABC):
     inputs: ClassVar[tuple[Topic, ...]] = ()
     queries: ClassVar[tuple[Query, ...]] = ()
     keep_all: ClassVar[bool] = False  # every payload of every input, whatever the queue policy
+    single: ClassVar[bool] = False  # one instance leads; others wait until it is gone
+    keeps: ClassVar[tuple[Topic, ...]] = ()  # kept topics it remembers for those who come later
+    recalls: ClassVar[tuple[Topic, ...]] = ()  # kept topics whose last message it wants before anything else
 
     def __init__(self, settings: ServiceSettings) -> None:
         """Keep the settings; whatever may fail belongs in `open`."""
@@ -70,6 +76,9 @@ class Service(ABC):
 
     def on_message(self, topic: Topic, message: Stamped) -> None:
         """A valid message came."""
+
+    def on_kept(self, last: dict[Topic, Stamped]) -> None:
+        """What others remember of the topics it ``recalls``, once, before anything else comes."""
 
     def on_request(self, query: Query, request: Request) -> Reply:
         """A valid request came; the answer."""
@@ -111,12 +120,31 @@ class Loop:
         self._stopping = False
         self._began = self._health_at = self._counted_at = time.monotonic()
         self._before: Counter[str] = Counter()
+        self._sources = OneSource(SOURCE_SILENT)
+        self._rivals: Instances | None = None
         service._loop = self  # noqa: SLF001 - the two halves of one thing
 
     def run(self) -> None:
         """Until `stop`."""
-        service, bus = self.service, self.bus
+        service = self.service
         service.open()
+        try:
+            if service.single:
+                self._wait_to_lead()
+            if not self._stopping:
+                self._begin()
+            while not self._stopping:
+                self._turn()
+        finally:
+            service.close()
+
+    def _begin(self) -> None:
+        """Be there: hear, answer, and say so last."""
+        service, bus = self.service, self.bus
+        for kept in service.keeps:
+            bus.keep(kept)
+        if service.recalls:
+            self._guard(lambda: service.on_kept(self._recalled()))
         for topic in service.inputs:
             bus.subscribe(topic, self.inbox, keep_all=service.keep_all)
         for query in service.queries:
@@ -124,11 +152,33 @@ class Loop:
         bus.serve(CONFIG, self.inbox, service.name)
         bus.declare_alive(service.name)
         service.log.info("ready", robot=bus.robot)
-        try:
-            while not self._stopping:
-                self._turn()
-        finally:
-            service.close()
+
+    def _recalled(self) -> dict[Topic, Stamped]:
+        found: dict[Topic, Stamped] = {}
+        for topic in self.service.recalls:
+            if (payload := self.bus.kept(topic)) is not None:
+                try:
+                    found[topic] = topic.message.decode(payload)
+                except DecodeError as error:
+                    self.reject(topic.key(self.bus.robot), str(error))
+        return found
+
+    def _wait_to_lead(self) -> None:
+        """Until no other instance of the service leads, which at a first start is at once."""
+        service, bus = self.service, self.bus
+        wait_until(bus.linked, LINKED_WITHIN)  # who is linked to nobody hears of nobody
+        self._rivals = rivals = bus.instances(service.name, self.inbox.wake)
+        if rivals.may_lead():
+            return
+        end = bus.stand_by(service.name)
+        leads = [spoken(name) for name in rivals.leaders()]
+        service.log.warning("standing by: another was there first; this one takes over when it is gone", leads=leads)
+        while not self._stopping and not rivals.may_lead():
+            self.inbox.get(0.5)
+        end()
+        if not self._stopping:
+            service.log.warning("taking over: the one that led is gone")
+            self._began = self._health_at = time.monotonic()
 
     def stop(self) -> None:
         """End after the current step; safe from a signal handler."""
@@ -159,7 +209,12 @@ class Loop:
         due = self.service.due()
         until_health = self._health_at - time.monotonic()
         event = self.inbox.get(max(0.0, min(until_health, 0.5 if due is None else due)))
-        if isinstance(event, Sample):
+        if self._rivals is not None and self._rivals.must_yield():
+            raise UserError(
+                f"another {self.service.name} of {self.bus.robot!r}, {spoken(self._rivals.leaders()[0])}, was started "
+                f"before this one and leads: this one ends. Started again, it stands by"
+            )
+        if isinstance(event, Sample) and self._counts(event):
             self._guard(lambda: self.service.on_sample(event))
         elif isinstance(event, Call):
             self._answer(event)
@@ -172,6 +227,20 @@ class Loop:
             late = now - self._health_at > HEALTH_PERIOD  # after a long step one pulse, not all that were missed
             self._health_at = (now if late else self._health_at) + HEALTH_PERIOD
             self.publish(HEALTH, self._health(now))
+
+    def _counts(self, sample: Sample) -> bool:
+        """Not where a second source publishes beside the one that is heard."""
+        if sample.topic.many or self.service.keep_all:
+            return True
+        if self._sources.takes(sample.key, sample.source, time.monotonic()):
+            return True
+        self.service.counters["other_sources"] += 1
+        if self._may_log(f"other {sample.key}"):
+            self.service.log.warning(
+                "ignored: a second source of what only one should publish; `presage doctor` names them",
+                key=sample.key, session=sample.source, heard=self._sources.heard(sample.key),
+            )  # fmt: skip
+        return False
 
     def _guard(self, step: Callable[[], None]) -> None:
         """No input stops a service: what a step raises is counted and logged with its traceback."""

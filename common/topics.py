@@ -23,6 +23,8 @@ class Topic:
     queue: Literal["newest", "all"]  # what a receiver keeps that falls behind; the recorder keeps all of everything
     recorded: bool = True
     per_service: bool = False  # one key a service, beneath the topic's own
+    many: bool = False  # several may publish it at once; else the first counts until it is silent
+    kept: bool = False  # whoever hears it tells the last one to services that come later
     about: str = ""
 
     def key(self, robot: str, service: str = "*") -> str:
@@ -52,9 +54,9 @@ TRUTH = Topic("truth", m.Truth, "simulator", 15, "newest", about="where the robo
 BELIEF = Topic("belief", m.Belief, "estimator", 15, "newest", about="where the estimator believes it is, and F")
 PREDICTION = Topic("prediction", m.Prediction, "estimator", 15, "newest", about="the scan expected at the belief")
 CMD_VEL = Topic("cmd_vel", m.CmdVel, "controller", 15, "newest", about="velocity command")
-GOAL = Topic("goal", m.Goal, "presage goal, viewer", 0, "newest", about="where to go")
-DRIVE = Topic("drive", m.Drive, "viewer", 0, "newest", about="velocity by hand, before any goal")
-STATUS = Topic("status", m.Status, "controller", 15, "newest", about="what the controller does, and why")
+GOAL = Topic("goal", m.Goal, "presage goal, viewer", 0, "newest", many=True, kept=True, about="where to go")
+DRIVE = Topic("drive", m.Drive, "viewer", 0, "newest", many=True, about="velocity by hand, before any goal")
+STATUS = Topic("status", m.Status, "controller", 15, "newest", kept=True, about="what the controller does, and why")
 PLAN = Topic("plan", m.Plan, "controller", 0, "newest", about="the way ahead, and what the map does not know")
 PREFERENCE = Topic(
     "preference",
@@ -64,7 +66,9 @@ PREFERENCE = Topic(
     "newest",
     about="the goal prior, on change and every 5 s",
 )
-HEALTH = Topic("health", m.Health, "every service", 1, "all", per_service=True, about="counters of a service")
+HEALTH = Topic(
+    "health", m.Health, "every service", 1, "all", per_service=True, many=True, about="counters of a service"
+)
 
 TOPICS: tuple[Topic, ...] = (
     SCAN,
@@ -103,9 +107,14 @@ QUERIES: tuple[Query, ...] = (
 )  # fmt: skip
 
 
-def alive_key(robot: str, service: str = "*") -> str:
-    """Liveliness token of a service."""
-    return f"{ROOT}/{robot}/alive/{service}"
+def alive_key(robot: str, service: str = "*", instance: str = "*") -> str:
+    """Liveliness token of a service's instance that leads."""
+    return f"{ROOT}/{robot}/alive/{service}/{instance}"
+
+
+def standby_key(robot: str, service: str = "*", instance: str = "*") -> str:
+    """Liveliness token of one that waits until no other leads."""
+    return f"{ROOT}/{robot}/standby/{service}/{instance}"
 
 
 def topic_of(key: str) -> Topic | None:

@@ -71,6 +71,7 @@ def run_again(how: Again, console: Console) -> Outcome:
     why = why_not_exact(recording, how)
     outcome = Outcome(not why, why, scans=scans)
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PRESAGE_")}
+    clean["PRESAGE_LOSSLESS"] = "1"
     with tempfile.TemporaryDirectory(prefix="presage-") as folder, Stack(robot, quiet=True, environment=clean) as stack:
         config = configure(recording, names, Path(folder), outcome.notes)
         stack.start_router()

@@ -43,6 +43,8 @@ class ControllerService(Service):
     """Action as a process."""
 
     name: ClassVar[str] = "controller"
+    single: ClassVar[bool] = True
+    recalls: ClassVar[tuple[Topic, ...]] = (GOAL, STATUS)
     inputs: ClassVar[tuple[Topic, ...]] = (SCAN, BELIEF, GOAL, DRIVE)
 
     def __init__(self, settings: ControllerSettings) -> None:
@@ -80,6 +82,16 @@ class ControllerService(Service):
         # Declared before anybody asks: the first message on a key just declared may be lost.
         for topic in (STATUS, CMD_VEL, PLAN, PREFERENCE):
             self.loop.bus.publisher(topic, self.name)
+
+    def on_kept(self, last: dict[Topic, Stamped]) -> None:
+        """The goal that a controller before this one was on its way to, unless told to begin with none."""
+        goal, status = last.get(GOAL), last.get(STATUS)
+        if not self.options.resume or not isinstance(goal, Goal) or not isinstance(status, Status) or goal.cancel:
+            return
+        under_way = status.state not in {"idle", "reached"} and not status.refused
+        if under_way and status.goal == goal.pose and status.goal_seq == goal.seq:
+            self.navigator.hear_goal(goal)
+            self.log.warning("going on to the goal of the controller before this one", x=goal.pose.x, y=goal.pose.y)
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
         """A belief is answered by a command of the same stamp; a goal by a status, at once."""

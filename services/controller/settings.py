@@ -40,6 +40,7 @@ class ControllerSettings(ServiceSettings):
     epistemic: Annotated[
         bool, Field(description="with a goal and several possible places, drive to where they can be told apart")
     ] = True
+    resume: Annotated[bool, Field(description="started again, go on to the goal it was on the way to")] = True
     gamma: Annotated[float, Field(gt=0, lt=1, description="paper: action step size a scan (eq. 4)")] = 0.3
     reach: Annotated[float, Field(gt=0, le=100, description="paper: m by which the goal attracts at most")] = 2.0
     belief_timeout: Annotated[float, Field(gt=0, le=60, description="s without a belief until the robot stands")] = 0.5

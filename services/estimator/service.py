@@ -11,7 +11,7 @@ from common.messages import Belief, CmdVel, Goal, Hypothesis, Odom, Pose, Predic
 from common.requests import LocaliseRequest, ModelReply, ModelRequest, PredictRequest, Reply, Request
 from common.se2 import Array
 from common.service import Service
-from common.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, MODEL, ODOM, PREDICT, PREDICTION, SCAN, Query, Topic
+from common.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, MODEL, ODOM, PREDICT, PREDICTION, SCAN, STATUS, Query, Topic
 from services.estimator import predicting
 from services.estimator.building import Choice, Factory, Geometry, prepare
 from services.estimator.interface import Estimator, Observation, Posterior
@@ -24,6 +24,8 @@ class EstimatorService(Service):
     """Perception as a process."""
 
     name: ClassVar[str] = "estimator"
+    single: ClassVar[bool] = True
+    keeps: ClassVar[tuple[Topic, ...]] = (GOAL, STATUS)
     inputs: ClassVar[tuple[Topic, ...]] = (SCAN, GOAL)
     queries: ClassVar[tuple[Query, ...]] = (LOCALISE, MODEL, PREDICT)
 

@@ -25,6 +25,7 @@ from common.robot import Robot
 from common.service import Service
 from common.topics import (
     CMD_VEL,
+    GOAL,
     OBSTACLE,
     ODOM,
     PAUSE,
@@ -33,6 +34,7 @@ from common.topics import (
     SAMPLE,
     SCAN,
     SPEED,
+    STATUS,
     STEP,
     TELEPORT,
     TRUTH,
@@ -53,6 +55,8 @@ class SimulatorService(Service):
     """The world as a process."""
 
     name: ClassVar[str] = "simulator"
+    single: ClassVar[bool] = True
+    keeps: ClassVar[tuple[Topic, ...]] = (GOAL, STATUS)
     inputs: ClassVar[tuple[Topic, ...]] = (CMD_VEL,)
     queries: ClassVar[tuple[Query, ...]] = (TELEPORT, RESET, PAUSE, RESUME, STEP, SPEED, OBSTACLE, SAMPLE, WORLD)
 

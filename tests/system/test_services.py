@@ -92,8 +92,9 @@ def test_a_part_that_dies_stops_the_robot_and_one_that_returns_goes_on(process, 
 
     running["controller"].kill()  # at speed: the simulator's own time-out stops the wheels
     fresh(bus, TRUTH, lambda t: abs(t.twist.vx) + abs(t.twist.vy) < 1e-3)
-    process("controller")
-    fresh(bus, STATUS, lambda s: s.state == "idle")  # a new controller has no goal, and does not guess one
+    process("controller")  # simulator and estimator remember the goal, and that it was not reached
+    fresh(bus, STATUS, lambda s: s.state == "navigating" and s.goal is not None and s.goal.x == 15.5)
+    fresh(bus, TRUTH, lambda t: t.twist.vx**2 + t.twist.vy**2 > 0.09)
 
     running["simulator"].kill()
     fresh(bus, STATUS, lambda s: "no belief" in s.reason)

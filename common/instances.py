@@ -1,0 +1,94 @@
+"""One service, several processes: their names, and the rule which of them leads. Pure.
+
+The instance that was started first leads; others stand by and say nothing, until it is gone. Names begin with the time
+of the start, so that names in order are instances by age (where clocks differ, at least all agree on the order).
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Instance:
+    """What a name says."""
+
+    started_ms: int  # wall time of the instance's host
+    host: str
+    pid: int
+    zid: str  # beginning of its zenoh session's id
+
+    @classmethod
+    def parse(cls, name: str) -> Instance | None:
+        """None: no name of ours."""
+        match = re.fullmatch(r"([0-9a-f]{12})~(.+)~(\d+)~([0-9a-f]*)", name)
+        return cls(int(match[1], 16), match[2], int(match[3]), match[4]) if match else None
+
+    @property
+    def name(self) -> str:
+        """One chunk of a key."""
+        host = re.sub(r"[^A-Za-z0-9_.-]", "-", self.host)[:64] or "host"
+        return f"{self.started_ms:012x}~{host}~{self.pid}~{self.zid[:8]}"
+
+
+def spoken(name: str) -> str:
+    """For people."""
+    instance = Instance.parse(name)
+    return name if instance is None else f"process {instance.pid} on {instance.host}"
+
+
+class Instances:
+    """Which instances of one service are there; zenoh's threads tell, a loop asks."""
+
+    def __init__(self, me: str) -> None:
+        """Nobody but ``me``, who does not count."""
+        self.me = me
+        self._leading: set[str] = set()
+        self._waiting: set[str] = set()
+        self._lock = threading.Lock()
+
+    def change(self, name: str, *, leads: bool, there: bool) -> None:
+        """An instance leads or waits from now on, or does so no more."""
+        if name == self.me:
+            return
+        with self._lock:
+            group = self._leading if leads else self._waiting
+            (group.add if there else group.discard)(name)
+
+    def leaders(self) -> list[str]:
+        """Others that lead, by age."""
+        with self._lock:
+            return sorted(self._leading)
+
+    def may_lead(self) -> bool:
+        """Nobody leads, and none who waits is older."""
+        with self._lock:
+            return not self._leading and self.me <= min(self._waiting, default=self.me)
+
+    def must_yield(self) -> bool:
+        """Another leads that was started before: two halves of a network have met."""
+        leaders = self.leaders()
+        return bool(leaders) and leaders[0] < self.me
+
+
+class OneSource:
+    """Of several that publish what one should, the first is heard until it has been silent for a while."""
+
+    def __init__(self, patience: float) -> None:
+        """``patience``: s of silence."""
+        self.patience = patience
+        self._heard: dict[str, tuple[str, float]] = {}  # by key: who, and when last
+
+    def takes(self, key: str, source: str, now: float) -> bool:
+        """Whether a message of ``source`` that came at ``now`` s counts."""
+        who, when = self._heard.get(key, (source, now))
+        if who != source and now - when < self.patience:
+            return False
+        self._heard[key] = (source, now)
+        return True
+
+    def heard(self, key: str) -> str:
+        """Who counts."""
+        return self._heard.get(key, ("", 0.0))[0]

@@ -1,0 +1,93 @@
+"""Two of what should be one, by mistake or on purpose: one leads, the other is named and waits."""
+
+from __future__ import annotations
+
+import signal
+
+import numpy as np
+import pytest
+
+from common.bus import open_bus, wait_until
+from common.inbox import Inbox
+from common.messages import CmdVel, Goal, Health, Pose, Status, Truth, Twist
+from common.topics import CMD_VEL, GOAL, HEALTH, STATUS, TRUTH
+from tests.conftest import next_of
+
+PATIENCE = 60.0
+
+
+def speed(truth):
+    return float(np.hypot(truth.twist.vx, truth.twist.vy))
+
+
+@pytest.fixture
+def heard(bus):
+    """What of a topic arrives from now on."""
+
+    def begin(topic):
+        inbox = Inbox()
+        bus.subscribe(topic, inbox, keep_all=True)
+        return inbox
+
+    return begin
+
+
+def test_the_second_controller_stands_by_and_takes_the_goal_over(process, bus, heard):
+    first = process("controller")
+    assert wait_until(lambda: "controller" in bus.alive(), PATIENCE), first.output
+    second = process("controller")
+    second.wait_for("standing by", PATIENCE)
+    assert f"process {first.child.pid} on" in second.output
+    process("simulator")
+    process("estimator", "--initial-pose", "3,1.5")
+    assert wait_until(lambda: {"simulator", "estimator", "controller"} <= bus.alive(), PATIENCE)
+    assert [len(names) for names in bus.alive_instances().values()] == [1, 1, 1]
+    assert list(bus.alive_instances(standby=True)) == ["controller"]
+
+    truths, commands, states = heard(TRUTH), heard(CMD_VEL), heard(STATUS)
+    assert bus.wait_matching(GOAL, PATIENCE)
+    bus.put(GOAL, Goal(stamp_ns=0, seq=7, pose=Pose(x=16.5, y=1.5)).encode())
+    next_of(truths, Truth, lambda t: speed(t) > 0.5)
+    drivers = set()
+    while (sample := commands.get(0)) is not None:
+        drivers.add(sample.source)
+    assert len(drivers) == 1
+
+    # Frozen, it loses the lead; the other goes on to the same goal.
+    first.send(signal.SIGSTOP)
+    next_of(truths, Truth, lambda t: speed(t) < 1e-3)
+    second.wait_for("taking over", PATIENCE)
+    assert "going on to the goal of the controller before this one" in second.output
+    next_of(states, Status, lambda s: s.goal_seq == 7 and s.state == "navigating")
+    next_of(truths, Truth, lambda t: speed(t) > 0.3)
+
+    # Back again, the older one leads; never are both heard.
+    first.send(signal.SIGCONT)
+    assert second.wait(PATIENCE) == 2
+    assert "was started before this one and leads: this one ends" in second.output
+    assert wait_until(lambda: list(bus.alive_instances().get("controller", [])) != [], PATIENCE)
+    next_of(states, Status, lambda s: s.state == "reached", 120)
+    assert first.running
+
+
+def test_of_two_that_publish_one_topic_the_first_is_obeyed_and_the_other_counted(process, bus, heard, link):
+    simulator = process("simulator")
+    truths, health = heard(TRUTH), heard(HEALTH)
+    assert bus.wait_matching(CMD_VEL, PATIENCE)
+    with open_bus(link) as stranger:
+        assert stranger.wait_matching(CMD_VEL, PATIENCE)
+        for _ in range(30):
+            now = next_of(truths, Truth, lambda _: True).stamp_ns
+            bus.put(CMD_VEL, CmdVel(stamp_ns=now, twist=Twist(wz=0.5)).encode())
+            stranger.put(CMD_VEL, CmdVel(stamp_ns=now, twist=Twist(vx=1.0)).encode())
+        truth = next_of(truths, Truth, lambda t: t.stamp_ns > now)
+        assert speed(truth) < 1e-3
+        assert truth.twist.wz == pytest.approx(0.5, abs=0.05)
+        pulse = next_of(health, Health, lambda h: h.service == "simulator" and h.counters.get("other_sources", 0) > 20)
+        assert pulse.counters.get("stale_commands", 0) < 10
+        assert stranger.zid in simulator.output  # named
+        # Once the first is silent, the other is heard: no message of an hour ago locks anybody out.
+        for _ in range(30):
+            now = next_of(truths, Truth, lambda _: True).stamp_ns
+            stranger.put(CMD_VEL, CmdVel(stamp_ns=now, twist=Twist(vx=0.3)).encode())
+        next_of(truths, Truth, lambda t: speed(t) > 0.2)
