@@ -8,20 +8,20 @@ import signal
 from collections.abc import Callable
 
 
-def die_with(parent: int) -> None:
-    """Linux: end this process when its parent ends, even by SIGKILL.
+def die_with(parent: int, how: int = signal.SIGTERM) -> None:
+    """Linux: end this process by the signal ``how`` when its parent ends, even by SIGKILL.
 
     The kernel looks at the thread that made the child: it has to live as long as the parent.
     """
     pr_set_pdeathsig = 1
     libc = ctypes.CDLL(None, use_errno=True)
     if hasattr(libc, "prctl"):
-        libc.prctl(pr_set_pdeathsig, signal.SIGTERM)
+        libc.prctl(pr_set_pdeathsig, how)
         if os.getppid() != parent:  # it ended before we asked
             os._exit(1)
 
 
-def dying_with_us() -> Callable[[], None]:
+def dying_with_us(how: int = signal.SIGTERM) -> Callable[[], None]:
     """For a child's ``preexec_fn``."""
     parent = os.getpid()
-    return lambda: die_with(parent)
+    return lambda: die_with(parent, how)

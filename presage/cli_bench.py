@@ -143,3 +143,23 @@ def bench_recorder(
     from presage.bench_recorder import bench_recorder as run  # noqa: PLC0415
 
     raise typer.Exit(run(Load(rate, seconds, beams), out, json_file, console))
+
+
+@app.command("chaos")
+def bench_chaos(
+    faults: Annotated[list[str] | None, typer.Argument(help="Names of faults, such as 'killed*'; none: all.")] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="Of each fault.")] = 1,
+    one_host: Annotated[bool, typer.Option("--one-host", help="No network namespaces: fewer faults.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="With the lines of all processes.")] = False,
+    json_file: Json = None,
+) -> None:
+    """What happens when a part dies, freezes, is cut off, is doubled, or when somebody sends noise.
+
+    A real system drives to and fro; each fault comes at full speed. Robot, estimator and the rest are on three hosts
+    of their own where this machine allows network namespaces (Linux; as root, or with user namespaces).
+
+    Examples: `presage bench chaos`, `presage bench chaos 'killed*' --repeats 3 --json chaos.json`.
+    """
+    from presage.chaos.bench import bench_chaos as run  # noqa: PLC0415
+
+    raise typer.Exit(run(faults or [], repeats, json_file, console, one_host=one_host, quiet=not verbose))

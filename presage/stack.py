@@ -56,6 +56,8 @@ def controller_arguments(
 class Stack:
     """Child processes of one session; a context manager that leaves none behind."""
 
+    orphans_get = signal.SIGTERM  # what ends the children where we end without a word
+
     def __init__(
         self, robot: str, port: int | None = None, *, quiet: bool = False, environment: Mapping[str, str] | None = None
     ) -> None:
@@ -70,6 +72,21 @@ class Stack:
         """Where the router listens."""
         return f"tcp/127.0.0.1:{self.port}"
 
+    def command(self, name: str, args: list[str]) -> list[str]:  # noqa: ARG002 - for who runs some of them elsewhere
+        """What is executed for a child with these arguments of Python."""
+        return [sys.executable, *args]
+
+    def variables(self, name: str) -> Mapping[str, str]:  # noqa: ARG002
+        """More of a child's environment."""
+        return {}
+
+    def router_listens(self) -> str:
+        """Endpoints of the router, comma-separated; loopback is among them."""
+        return self.endpoint
+
+    def heard(self, name: str, line: str) -> None:
+        """A child said something; called from its reader's thread."""
+
     def link(self) -> Link:
         """For a session of our own beside the children."""
         return Link(robot=self.robot, connect=(self.endpoint,))
@@ -77,7 +94,7 @@ class Stack:
     def start_router(self) -> None:
         """The router first; raises UserError where the port is taken."""
         check_port(self.port)
-        self._spawn("router", ["-m", "common.router", "--listen", self.endpoint])
+        self._spawn("router", ["-m", "common.router", "--listen", self.router_listens()])
         deadline = time.monotonic() + 20
         while not accepts(self.port):
             self.check()
@@ -133,9 +150,10 @@ class Stack:
             "PRESAGE_CONNECT": self.endpoint,
             "PRESAGE_ROBOT": self.robot,
             "PYTHONUNBUFFERED": "1",
+            **self.variables(name),
         }
         child = subprocess.Popen(  # noqa: S603 - our own modules
-            [sys.executable, *args],
+            self.command(name, args),
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -143,7 +161,7 @@ class Stack:
             text=True,
             errors="replace",
             start_new_session=True,  # Ctrl-C is ours to pass on, in order
-            preexec_fn=dying_with_us(),  # noqa: PLW1509 - one call, before any thread of the child
+            preexec_fn=dying_with_us(self.orphans_get),  # noqa: PLW1509 - one call, before any thread of the child
         )
         process = Process(name, child, threading.Thread(target=lambda: self._pass_on(process), daemon=True))
         process.args = args
@@ -155,7 +173,8 @@ class Stack:
         colour = f"\033[{COLOURS.get(process.name, 0)}m" if sys.stderr.isatty() else ""
         for line in process.child.stdout:
             process.lines = [*process.lines[-20:], line.rstrip()]
-            if not self.quiet:
+            self.heard(process.name, line.rstrip())
+            if not self.quiet and process.name != "observer":
                 print(
                     f"{colour}{process.name:>10} |{chr(27) + '[0m' if colour else ''} {line.rstrip()}", file=sys.stderr
                 )
@@ -181,6 +200,7 @@ class Stack:
 
 
 def _end(process: Process) -> int:
+    """Its status; one that ended already is tidied up."""
     child = process.child
     if child.poll() is None:
         child.terminate()

@@ -43,7 +43,7 @@ def file(tmp_path):
 def test_defaults():
     settings = load_settings(Settings, [])
     assert (settings.size, settings.label, settings.ratio) == (1, "plain", None)
-    assert settings.link() == Link("robot", (DEFAULT_ENDPOINT,), ("tcp/127.0.0.1:0",))
+    assert settings.link() == Link("robot", (DEFAULT_ENDPOINT,), ("tcp/127.0.0.1:0",), lossless=False)
 
 
 def test_command_line_over_environment_over_file_over_default(file, monkeypatch):

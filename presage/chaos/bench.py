@@ -1,0 +1,102 @@
+"""`presage bench chaos`: every fault of the table into a system that drives, and the times that follow."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack
+from fnmatch import fnmatch
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from common.errors import UserError
+from common.versions import commit, versions
+from presage.chaos.faults import FAULTS, Fault
+from presage.chaos.hosts import INSIDE, Network, enter_own_namespaces, why_no_hosts
+from presage.chaos.measure import AGAIN_WITHIN, STOP_WITHIN, Outcome, measure
+from presage.chaos.system import System
+from presage.output import check_file, write_json
+from services.recorder.reader import read_recording
+
+
+def chosen(names: Sequence[str]) -> list[Fault]:
+    """Rows whose names match, such as ``killed*``; raises UserError where none does."""
+    rows = [fault for fault in FAULTS if not names or any(fnmatch(fault.name, name) for name in names)]
+    if not rows:
+        raise UserError(f"no fault is called {', '.join(names)}; there are: {', '.join(f.name for f in FAULTS)}")
+    return rows
+
+
+def bench_chaos(
+    names: Sequence[str],
+    repeats: int,
+    json_file: Path | None,
+    console: Console,
+    *,
+    one_host: bool = False,
+    quiet: bool = True,
+) -> int:
+    """Print the table; 0 where everything is as expected."""
+    faults = chosen(names)
+    check_file(json_file, "--json")
+    missing = "asked for" if one_host else why_no_hosts()
+    if not missing and not os.environ.get(INSIDE):
+        enter_own_namespaces(["-m", "presage", *sys.argv[1:]])
+    outcomes: list[Outcome] = []
+    skipped: dict[str, str] = {}
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("PRESAGE_")}
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="presage-chaos-")))
+        network = None if missing else stack.enter_context(Network())
+        with console.status("starting the system"):
+            system = stack.enter_context(System(folder, network, clean, quiet=quiet))
+        for fault in faults:
+            why = (f"one host alone: {missing}" if fault.hosts and missing else "") or fault.why_not()
+            if why:
+                skipped[fault.name] = why
+                console.print(f"[yellow]not tried[/] {fault.name}: {why}", highlight=False)
+                continue
+            for number in range(repeats):
+                with console.status(f"{fault.name} ({number + 1} of {repeats}): {fault.about}"):
+                    outcomes.append(measure(system, fault))
+                said = outcomes[-1].why
+                console.print(f"{'[red]no[/]' if said else '[green]ok[/]'} {fault.name} {said}", highlight=False)
+    console.print(table(outcomes))
+    data = {
+        "command": "presage bench chaos", "arguments": {"faults": list(names), "repeats": repeats},
+        "hosts": not missing, "rows": [outcome.row() for outcome in outcomes], "skipped": skipped,
+        "limits": {"stopped_s": STOP_WITHIN, "again_s": AGAIN_WITHIN},
+        "versions": versions(), "commit": commit(), "machine": platform.processor() or platform.machine(),
+    }  # fmt: skip
+    write_json(json_file, data)
+    return 1 if any(outcome.why for outcome in outcomes) else 0
+
+
+def table(outcomes: Sequence[Outcome]) -> Table:
+    """The worst of each fault's repeats."""
+    shown = Table("fault", "detected", "stands", "new process", "at work again", "least speed", "as expected")
+    for name in dict.fromkeys(outcome.fault for outcome in outcomes):
+        rows = [outcome for outcome in outcomes if outcome.fault == name]
+
+        def worst(what: str, rows: Sequence[Outcome] = rows) -> str:
+            values = [getattr(row, what) for row in rows]
+            known = [value for value in values if value is not None]
+            return f"{max(known):.2f} s" if known else ""
+
+        slow = [row.least_speed for row in rows if row.least_speed is not None]
+        good = sum(not row.why for row in rows)
+        shown.add_row(
+            name, worst("detected_s"), worst("stopped_s"), worst("start_s"), worst("again_s"),
+            f"{min(slow):.2f} m/s" if slow else "", f"{good} of {len(rows)}",
+        )  # fmt: skip
+    return shown
+
+
+def recorded(folder: Path) -> dict[str, int]:
+    """Messages in each recording that is complete."""
+    return {path.name: sum(read_recording(path).counts().values()) for path in sorted(folder.glob("*.mcap"))}
