@@ -24,7 +24,10 @@ from common.wire import ENCODING, DecodeError, Message
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 # Both call it an error when something arrives while a session opens or closes.
-LOG_FILTER = "error,zenoh::api::session=off,zenoh::net::protocol::gossip=off"
+# The third says at every message that a host's clock is ahead; `presage doctor` says it once.
+LOG_FILTER = (
+    "error,zenoh::api::session=off,zenoh::net::protocol::gossip=off,zenoh::net::routing::dispatcher::pubsub=off"
+)
 R = TypeVar("R", bound=Reply)
 
 
@@ -275,14 +278,23 @@ class Bus:
         """A service is gone with its last instance; one that comes beside another is told of as well."""
         instances: dict[tuple[str, str], set[str]] = {}
 
-        def move(sample: zenoh.Sample) -> None:
-            _, robot, _, service, name = str(sample.key_expr).split("/")
-            there, known = sample.kind == zenoh.SampleKind.PUT, instances.setdefault((robot, service), set())
+        def move(robot: str, service: str, name: str, there: bool) -> None:  # noqa: FBT001
+            known = instances.setdefault((robot, service), set())
             (known.add if there else known.discard)(name)
             if there or not known:
                 changed(robot, service, there)
 
-        self._declared.append(self._session.liveliness().declare_subscriber(alive_key(robots), move, history=True))
+        self.watch_instances(move, robots)
+
+    def watch_instances(self, changed: Callable[[str, str, str, bool], None], robots: str | None = None) -> None:
+        """Call ``changed(robot, service, instance, is_there)`` for all that lead now, and at every change."""
+
+        def move(sample: zenoh.Sample) -> None:
+            _, robot, _, service, name = str(sample.key_expr).split("/")
+            changed(robot, service, name, sample.kind == zenoh.SampleKind.PUT)
+
+        key = alive_key(robots or self.robot)
+        self._declared.append(self._session.liveliness().declare_subscriber(key, move, history=True))
 
     def linked(self) -> bool:
         """Whether any other session is reached."""

@@ -74,21 +74,31 @@ class Instances:
 
 
 class OneSource:
-    """Of several that publish what one should, the first is heard until it has been silent for a while."""
+    """Of several that publish what one should, only one is heard.
+
+    That is the service's own instance, where one says that it leads; where none does (a replay, a robot's own driver),
+    the first, until it has been silent for a while.
+    """
 
     def __init__(self, patience: float) -> None:
         """``patience``: s of silence."""
         self.patience = patience
         self._heard: dict[str, tuple[str, float]] = {}  # by key: who, and when last
+        self._owners: dict[tuple[str, str], frozenset[str]] = {}  # by robot and service: beginnings of session ids
 
-    def takes(self, key: str, source: str, now: float) -> bool:
-        """Whether a message of ``source`` that came at ``now`` s counts."""
+    def change(self, robot: str, service: str, name: str, there: bool) -> None:  # noqa: FBT001 - zenoh's thread
+        """An instance leads from now on, or no more."""
+        if (instance := Instance.parse(name)) is not None:
+            before = self._owners.get((robot, service), frozenset())
+            self._owners[robot, service] = before | {instance.zid} if there else before - {instance.zid}
+
+    def takes(self, key: str, service: str, source: str, now: float) -> bool:
+        """Whether a message of ``source`` that came at ``now`` s counts on a key that ``service`` publishes."""
+        owners = self._owners.get((key.split("/")[1], service))
+        if owners:
+            return any(source.startswith(zid) for zid in owners)
         who, when = self._heard.get(key, (source, now))
         if who != source and now - when < self.patience:
             return False
         self._heard[key] = (source, now)
         return True
-
-    def heard(self, key: str) -> str:
-        """Who counts."""
-        return self._heard.get(key, ("", 0.0))[0]

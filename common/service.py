@@ -39,6 +39,7 @@ class Service(ABC):
     inputs: ClassVar[tuple[Topic, ...]] = ()
     queries: ClassVar[tuple[Query, ...]] = ()
     keep_all: ClassVar[bool] = False  # every payload of every input, whatever the queue policy
+    all_robots: ClassVar[bool] = False  # it hears more than its own robot
     single: ClassVar[bool] = False  # one instance leads; others wait until it is gone
     keeps: ClassVar[tuple[Topic, ...]] = ()  # kept topics it remembers for those who come later
     recalls: ClassVar[tuple[Topic, ...]] = ()  # kept topics whose last message it wants before anything else
@@ -141,6 +142,8 @@ class Loop:
     def _begin(self) -> None:
         """Be there: hear, answer, and say so last."""
         service, bus = self.service, self.bus
+        if not service.keep_all:
+            bus.watch_instances(self._sources.change, "*" if service.all_robots else None)
         for kept in service.keeps:
             bus.keep(kept)
         if service.recalls:
@@ -232,13 +235,13 @@ class Loop:
         """Not where a second source publishes beside the one that is heard."""
         if sample.topic.many or self.service.keep_all:
             return True
-        if self._sources.takes(sample.key, sample.source, time.monotonic()):
+        if self._sources.takes(sample.key, sample.topic.publisher, sample.source, time.monotonic()):
             return True
         self.service.counters["other_sources"] += 1
         if self._may_log(f"other {sample.key}"):
             self.service.log.warning(
                 "ignored: a second source of what only one should publish; `presage doctor` names them",
-                key=sample.key, session=sample.source, heard=self._sources.heard(sample.key),
+                key=sample.key, session=sample.source,
             )  # fmt: skip
         return False
 

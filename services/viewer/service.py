@@ -53,6 +53,7 @@ class ViewerService(Service):
     """The page as a process."""
 
     name: ClassVar[str] = "viewer"
+    all_robots: ClassVar[bool] = True
 
     def __init__(self, settings: ViewerSettings) -> None:
         """Sockets are opened in `open`."""

@@ -50,13 +50,28 @@ def test_of_all_who_see_the_same_at_most_one_takes_the_lead(events):
     assert stay == ([min(leading)] if leading else [])
 
 
-def test_the_first_source_is_heard_until_it_is_silent():
+def test_where_nobody_leads_the_first_source_is_heard_until_it_is_silent():
     sources = OneSource(0.3)
-    assert sources.takes("k", "a", 0.0)
-    assert not sources.takes("k", "b", 0.1)
-    assert sources.takes("other key", "b", 0.1)
-    assert sources.takes("k", "a", 0.3)
-    assert not sources.takes("k", "b", 0.55)  # what was refused does not count as heard
-    assert sources.takes("k", "b", 0.6)
-    assert not sources.takes("k", "a", 0.7)
-    assert sources.heard("k") == "b"
+
+    def takes(source, now, robot="robot"):
+        return sources.takes(f"presage/{robot}/scan", "simulator", source, now)
+
+    assert takes("a", 0.0)
+    assert not takes("b", 0.1)
+    assert takes("b", 0.1, "other")
+    assert takes("a", 0.3)
+    assert not takes("b", 0.55)  # what was refused does not count as heard
+    assert takes("b", 0.6)
+    assert not takes("a", 0.7)
+
+
+def test_the_instance_that_leads_is_heard_and_nobody_else_however_silent_it_is():
+    sources = OneSource(0.3)
+    leader = Instance(1, "host", 2, "0123456789ab")
+    sources.change("robot", "simulator", leader.name, True)
+    assert not sources.takes("presage/robot/scan", "simulator", "repeater", 0.0)
+    assert sources.takes("presage/robot/scan", "simulator", "0123456789abcdef", 5.0)
+    assert not sources.takes("presage/robot/scan", "simulator", "repeater", 50.0)
+    assert sources.takes("presage/robot/belief", "estimator", "anybody", 50.0)  # nobody leads there
+    sources.change("robot", "simulator", leader.name, False)
+    assert sources.takes("presage/robot/scan", "simulator", "repeater", 50.0)

@@ -70,24 +70,31 @@ def test_the_second_controller_stands_by_and_takes_the_goal_over(process, bus, h
     assert first.running
 
 
-def test_of_two_that_publish_one_topic_the_first_is_obeyed_and_the_other_counted(process, bus, heard, link):
+def test_the_one_that_leads_is_obeyed_and_another_source_is_counted_and_named(process, bus, heard, link):
     simulator = process("simulator")
     truths, health = heard(TRUTH), heard(HEALTH)
-    assert bus.wait_matching(CMD_VEL, PATIENCE)
-    with open_bus(link) as stranger:
-        assert stranger.wait_matching(CMD_VEL, PATIENCE)
-        for _ in range(30):
-            now = next_of(truths, Truth, lambda _: True).stamp_ns
-            bus.put(CMD_VEL, CmdVel(stamp_ns=now, twist=Twist(wz=0.5)).encode())
-            stranger.put(CMD_VEL, CmdVel(stamp_ns=now, twist=Twist(vx=1.0)).encode())
-        truth = next_of(truths, Truth, lambda t: t.stamp_ns > now)
+    assert bus.wait_matching(CMD_VEL, PATIENCE), simulator.output
+
+    def command(driver, **twist):
+        now = next_of(truths, Truth, lambda _: True).stamp_ns
+        driver.put(CMD_VEL, CmdVel(stamp_ns=now, twist=Twist(**twist)).encode())
+
+    with open_bus(link) as leader:
+        leader.declare_alive("controller")
+        assert leader.wait_matching(CMD_VEL, PATIENCE)
+        for _ in range(10):
+            command(leader, wz=0.5)
+        assert wait_until(lambda: "controller" in bus.alive(), PATIENCE)
+        before = next_of(health, Health, lambda h: h.service == "simulator").counters.get("other_sources", 0)
+        for _ in range(20):
+            command(leader, wz=0.5)
+            command(bus, vx=1.0)
+        next_of(health, Health, lambda h: h.counters.get("other_sources", 0) >= before + 20)
+        truth = next_of(truths, Truth, lambda _: True)
         assert speed(truth) < 1e-3
-        assert truth.twist.wz == pytest.approx(0.5, abs=0.05)
-        pulse = next_of(health, Health, lambda h: h.service == "simulator" and h.counters.get("other_sources", 0) > 20)
-        assert pulse.counters.get("stale_commands", 0) < 10
-        assert stranger.zid in simulator.output  # named
-        # Once the first is silent, the other is heard: no message of an hour ago locks anybody out.
-        for _ in range(30):
-            now = next_of(truths, Truth, lambda _: True).stamp_ns
-            stranger.put(CMD_VEL, CmdVel(stamp_ns=now, twist=Twist(vx=0.3)).encode())
-        next_of(truths, Truth, lambda t: speed(t) > 0.2)
+        assert bus.zid in simulator.output
+    assert wait_until(lambda: "controller" not in bus.alive(), PATIENCE)
+    # Nobody leads now: a driver of the robot's own is heard.
+    for _ in range(30):
+        command(bus, vx=0.5)
+    next_of(truths, Truth, lambda t: speed(t) > 0.1)
