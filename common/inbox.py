@@ -86,7 +86,8 @@ class Inbox:
                     return
                 entry, size = replace(entry, payload=b"", refusal=f"the answer's {size} bytes are too many"), 0
             self._serial += 1
-            slot: object = full_key if newest_only else self._serial
+            # Of each source: nobody's newest takes the place of somebody else's.
+            slot: object = (full_key, entry.source) if newest_only and isinstance(entry, Sample) else self._serial
             old = self._entries.get(slot)
             if old is not None:
                 self._bytes -= len(old.payload)

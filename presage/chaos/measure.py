@@ -71,12 +71,8 @@ def _look_again(system: System, fault: Fault, returned: float, outcome: Outcome)
         if works and None not in works:
             outcome.again_s = max(row["t"] for row in works if row is not None) - returned
         return
-    if fault.expect == "stops":
-        row = _seen(timeline, returned, moving, PATIENCE)
-        outcome.again_s = None if row is None else row["t"] - returned
-    else:
-        system.drive()
-        outcome.again_s = time.monotonic() - returned
+    row = _seen(timeline, returned, moving, PATIENCE)
+    outcome.again_s = None if row is None else row["t"] - returned
 
 
 def _pulse(service: str) -> Any:

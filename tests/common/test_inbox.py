@@ -176,3 +176,12 @@ def test_many_threads_put_and_every_entry_is_accounted_for():
         thread.join()
     assert sum(inbox.received.values()) == 8000
     assert got + sum(inbox.dropped.values()) == 8000
+
+
+def test_the_newest_of_one_source_does_not_take_the_place_of_another_s():
+    inbox = Inbox()
+    for number in range(3):
+        for source in ("robot", "repeater"):
+            inbox.put(Sample(SCAN, "k", f"{source} {number}".encode(), 0, 0, source), newest_only=True)
+    assert [inbox.get(0).payload for _ in range(2)] == [b"robot 2", b"repeater 2"]
+    assert inbox.get(0) is None
