@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -152,7 +152,7 @@ class Credentials:
 
     folder: Path
     member: Member
-    password: str
+    password: str = field(repr=False)
     members: tuple[Member, ...] = ()  # a router's
 
     def zenoh(self) -> dict[str, Any]:
