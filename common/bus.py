@@ -55,7 +55,7 @@ def _config(link: Link) -> zenoh.Config:
         "timestamping/enabled": True,
     }
     if link.security is not None:
-        settings |= link.security.zenoh()
+        settings |= {**link.security.zenoh(), "mode": "router" if link.router else "client"}
         settings["connect/endpoints"] = [over_tls(each) for each in link.connect]
         settings["listen/endpoints"] = [over_tls(each) for each in link.listen] if link.router else []
         if not link.router:  # opening waits for the router: in pieces, so that it can be given up

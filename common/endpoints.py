@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 from common.errors import UserError
 
+NETWORKS = frozenset({"tcp", "udp", "tls", "quic", "ws", "vsock"})  # zenoh itself refuses what it does not know
+
 
 def over_tls(endpoint: str) -> str:
     """With credentials nothing goes over the wire in the clear, however the endpoint is written."""
@@ -26,7 +28,7 @@ def on_loopback(endpoint: str) -> bool:
     """Whether only this machine reaches it; a name other than localhost may be anything."""
     protocol, _, rest = endpoint.partition("/")
     host = rest.rsplit(":", 1)[0].strip("[]")
-    if protocol.startswith("unix"):
+    if protocol not in NETWORKS:
         return True
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback

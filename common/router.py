@@ -1,6 +1,7 @@
 """`python -m common.router`: the meeting point of sessions on several hosts, or of many on one; it keeps nothing.
 
-Data flows directly between services once they know each other through the router, and outlives it.
+Data flows directly between services once they know each other through the router, and outlives it. In secure mode all
+data flows through it, and it decides what each may send.
 """
 
 from __future__ import annotations

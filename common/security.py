@@ -31,6 +31,7 @@ ROLES: dict[str, str] = {
     "viewer-control": "the live page, whose visitors may drive",
     "operator": "people and tools that may drive, teleport, reset, record",
     "observer": "people and tools that look on",
+    "remote": "waits for the scans of a robot elsewhere, and says whether they come",
     "replay": "puts a recording back on its keys: in place of the whole robot",
 }
 EVERY_ROBOT = ("*",)
@@ -156,14 +157,13 @@ class Credentials:
     members: tuple[Member, ...] = ()  # a router's
 
     def zenoh(self) -> dict[str, Any]:
-        """Settings of a zenoh session, by key; the rest of its configuration stays as it is."""
+        """Settings of a zenoh session, by key; the rest of its configuration stays as it is, but for its mode."""
         own = {"certificate": str(self.folder / CERTIFICATE), "private_key": str(self.folder / KEY)}
         user = {"user": self.member.name, "password": self.password}
         router = self.member.role == ROUTER
         if router:
             user["dictionary_file"] = str(self.folder / PASSWORDS)
         return {
-            "mode": "router" if router else "client",
             "scouting/multicast/enabled": False,
             "transport/link/tls": {
                 "root_ca_certificate": str(self.folder / AUTHORITY),

@@ -13,7 +13,7 @@ ROOT = "presage"
 CONTROL = ("operator", "viewer-control")  # may move the robot, delete, or change what runs
 SERVICES = ("simulator", "estimator", "controller", "recorder", "viewer", "viewer-control")
 WORKING = (*SERVICES, "operator")  # may ask for work that costs time
-ANYBODY = (*SERVICES, "operator", "observer", "replay")
+ANYBODY = (*SERVICES, "operator", "observer", "replay", "remote")
 MAX_BYTES = 1 << 20  # a larger payload is not even queued
 
 

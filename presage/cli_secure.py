@@ -134,7 +134,9 @@ def show(
     from presage.secure_tables import members_table, rights_table  # noqa: PLC0415
 
     if zenoh:
-        typer.echo(json.dumps(_nested(credentials(folder, (zenoh,)).zenoh()), indent=2))
+        mine = credentials(folder, (zenoh,))
+        mode = "router" if mine.member.role == ROUTER else "client"
+        typer.echo(json.dumps(_nested({"mode": mode, **mine.zenoh()}), indent=2))
         return
     members, now = read_members(credentials(folder, (ROUTER,)).folder), dt.datetime.now(dt.timezone.utc)
     ends = {member.name: _until(folder, member.name) for member in members if (folder / member.name).is_dir()}
