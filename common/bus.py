@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import socket
 import threading
@@ -14,11 +15,13 @@ from typing import Any, TypeVar
 
 import zenoh
 
+from common.endpoints import not_let_in, over_tls, refuse_exposure
 from common.errors import UserError
 from common.inbox import Answer, Call, Inbox, Sample
 from common.instances import Instance, Instances
 from common.messages import Stamped
 from common.requests import Reply, Request
+from common.security import Credentials, may_ask, may_put
 from common.topics import Query, Topic, alive_key, standby_key, topic_of
 from common.wire import ENCODING, DecodeError, Message
 
@@ -41,11 +44,13 @@ class Link:
     router: bool = False
     multicast: bool = False
     lossless: bool = True  # who cannot keep up holds the publisher back; else it loses what is too much for it
+    security: Credentials | None = None  # then it listens nowhere, unless it is a router
+    insecure: bool = False  # may listen beyond loopback without credentials
 
 
 def _config(link: Link) -> zenoh.Config:
     config: zenoh.Config = zenoh.Config()
-    settings = {
+    settings: dict[str, Any] = {
         "mode": "router" if link.router else "peer",
         "connect/endpoints": link.connect,
         "connect/timeout_ms": -1,  # a router that is not there yet is waited for, in the background
@@ -59,6 +64,12 @@ def _config(link: Link) -> zenoh.Config:
         "transport/link/tx/lease": 3000,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 5000,  # us
     }
+    if link.security is not None:
+        settings |= {**link.security.zenoh(), "mode": "router" if link.router else "client"}
+        settings["connect/endpoints"] = [over_tls(each) for each in link.connect]
+        settings["listen/endpoints"] = [over_tls(each) for each in link.listen] if link.router else []
+        if not link.router:  # opening waits for the router: in pieces, so that it can be given up
+            settings |= {"connect/timeout_ms": 1000, "connect/exit_on_failure": True}
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
@@ -67,9 +78,12 @@ def _config(link: Link) -> zenoh.Config:
 class Bus:
     """One session, bound to one robot's keys."""
 
-    def __init__(self, session: zenoh.Session, robot: str, *, lossless: bool = True) -> None:
+    def __init__(
+        self, session: zenoh.Session, robot: str, security: Credentials | None = None, *, lossless: bool = True
+    ) -> None:
         """Use `open_bus`."""
         self.robot = robot
+        self._security = security
         self._congestion = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
         self.zid = str(session.zid())
         self.instance = Instance(time.time_ns() // 10**6, socket.gethostname(), os.getpid(), self.zid).name
@@ -87,6 +101,8 @@ class Bus:
     def publisher(self, topic: Topic, service: str = "*", key: str | None = None) -> zenoh.Publisher:
         """The publisher of a key, declared once."""
         key = key or topic.key(self.robot, service)
+        if self._security is not None:
+            self._security.check(may_put, topic, key.split("/")[1])
         with self._lock:
             if key not in self._publishers:
                 self._publishers[key] = self._session.declare_publisher(
@@ -149,6 +165,8 @@ class Bus:
     ) -> R:  # fmt: skip
         """The first answer; raises UserError where nobody answers, the answer is an error, or makes no sense."""
         key = query.key(robot or self.robot, service)
+        if self._security is not None:
+            self._security.check(may_ask, query, robot or self.robot)
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
             answers = list(self._session.get(key, payload=request.encode(), encoding=ENCODING, timeout=left))
@@ -322,21 +340,46 @@ def _decode_reply(key: str, reply: type[R], payload: bytes) -> R:
 
 
 @contextmanager
-def open_bus(link: Link) -> Iterator[Bus]:
-    """A session for the block; raises UserError where the endpoints cannot be used."""
-    zenoh.init_log_from_env_or(LOG_FILTER)
+def open_bus(
+    link: Link, *, patience: float | None = None, give_up: Callable[[], bool] = lambda: False,
+    log_filter: str = LOG_FILTER,
+) -> Iterator[Bus]:  # fmt: skip
+    """A session for the block; raises UserError where the endpoints cannot be used, or are open to everybody.
+
+    With credentials it begins once a router has let us in: waited for until ``give_up``, or for ``patience`` s.
+    """
+    if link.security is None and not link.insecure:
+        refuse_exposure(link.listen)
+    zenoh.init_log_from_env_or(log_filter)
+    began, waiting = time.monotonic(), False
+    while (session := _open(link)) is None:
+        assert link.security is not None  # noqa: S101 - others do not wait
+        why = not_let_in(link.security.member.name, link.connect)
+        if give_up():
+            raise SystemExit(0)
+        if patience is not None and time.monotonic() - began > patience:
+            raise UserError(why)
+        if patience is None and not waiting:
+            logging.getLogger(__name__).warning("%s; waiting", why)
+        waiting = True
+    with closing(session):  # its own __exit__ fails while another thread is inside one of its calls; close() does not
+        yield Bus(session, link.robot, link.security, lossless=link.lossless)
+
+
+def _open(link: Link) -> zenoh.Session | None:
+    """None where a router did not let us in yet."""
     try:
-        session = zenoh.open(_config(link))
+        return zenoh.open(_config(link))
     except zenoh.ZError as error:
         text = str(error)
+        if link.security is not None and "Unable to connect" in text:
+            return None
         if "in use" in text:
             raise UserError(f"port in use: {' '.join(link.listen)}; choose another with --listen") from None
         # Zenoh appends its own source line, and wraps some messages in the name of a Rust enum.
         why = " ".join(text.split(" at /", maxsplit=1)[0].split()).removeprefix('Json5Err(Message { msg: "')
         asked = f"connect {', '.join(link.connect) or 'none'}, listen {', '.join(link.listen) or 'none'}"
         raise UserError(f"no session with {asked}: {why}; an endpoint is written like {DEFAULT_ENDPOINT}") from None
-    with closing(session):  # its own __exit__ fails while another thread is inside one of its calls; close() does not
-        yield Bus(session, link.robot, lossless=link.lossless)
 
 
 def wait_until(condition: Callable[[], bool], timeout: float, period: float = 0.02) -> bool:

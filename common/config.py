@@ -28,6 +28,7 @@ from pydantic_settings import (
 
 from common.bus import DEFAULT_ENDPOINT, Link
 from common.errors import UserError
+from common.security import Credentials, credentials
 
 _file_values: ContextVar[dict[str, Any]] = ContextVar("_file_values")
 S = TypeVar("S", bound="ServiceSettings")
@@ -64,6 +65,11 @@ class ServiceSettings(BaseSettings):
     lossless: Annotated[
         bool, Field(description="who cannot keep up holds this service back; for replays, not for a robot")
     ] = False
+    security: Annotated[
+        Path | None, Field(description="folder of credentials (presage secure init): TLS, access by role")
+    ] = None
+    role: Annotated[str, Field(description="whose credentials of that folder; none: those named like the service")] = ""
+    insecure: Annotated[bool, Field(description="without --security: listen beyond loopback all the same")] = False
     log_level: Annotated[
         str, Field(pattern="^(debug|info|warning|error)$", description="debug, info, warning, error")
     ] = "info"
@@ -73,8 +79,14 @@ class ServiceSettings(BaseSettings):
 
     def link(self) -> Link:
         """The session these settings ask for."""
-        connect, listen = split_endpoints(self.connect), split_endpoints(self.listen)
-        return Link(self.robot, connect, listen, multicast=self.multicast, lossless=self.lossless)
+        return Link(
+            self.robot, split_endpoints(self.connect), split_endpoints(self.listen), multicast=self.multicast,
+            lossless=self.lossless, security=self.credentials(), insecure=self.insecure,
+        )  # fmt: skip
+
+    def credentials(self) -> Credentials | None:
+        """Those of the folder, if one is named; raises UserError where they are not there."""
+        return credentials(self.security, (self.role or self.service,), self.robot) if self.security else None
 
     def effective(self) -> dict[str, Any]:
         """Every setting as it holds, plain types."""

@@ -21,7 +21,7 @@ Keys are `{ROOT}/<robot>/<topic>`. A payload is one MessagePack map with the fie
 default may be left out, an unknown one is ignored. *Binary* fields are MessagePack `bin`: little-endian numbers of the
 type shown (`<f4` is float32, `<f8` float64, `u1` a byte), row after row. Payloads above {MAX_BYTES >> 20} MiB
 ({64 * MAX_BYTES >> 20} MiB for requests) are not read. zenoh's encoding is `application/msgpack` with the message's
-name as schema. While a service runs, the liveliness token `{alive_key("<robot>", "<service>")}` stands.
+name as schema. While a service runs, the liveliness token `{alive_key("<robot>", "<service>", "<instance>")}` stands.
 
 Units are SI. Frames: `map` is the world, `odom` drifts, `base_link` is the robot's centre, `laser` the scanner.
 Times are ns of simulation or sensor time, except in health.

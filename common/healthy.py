@@ -8,11 +8,13 @@ from __future__ import annotations
 import os
 import socket
 import sys
+from pathlib import Path
 
 from common.bus import DEFAULT_ENDPOINT, Link, open_bus
 from common.config import split_endpoints
 from common.errors import UserError
 from common.inbox import Inbox, Sample
+from common.security import credentials
 from common.topics import HEALTH
 
 PATIENCE = 4.0  # s; a pulse comes each second
@@ -25,7 +27,10 @@ def healthy(service: str) -> bool:
             return True
     connect = split_endpoints(os.environ.get("PRESAGE_CONNECT") or DEFAULT_ENDPOINT)
     inbox = Inbox()
-    with open_bus(Link(robot=os.environ.get("PRESAGE_ROBOT") or "robot", connect=connect)) as bus:
+    robot, folder = os.environ.get("PRESAGE_ROBOT") or "robot", os.environ.get("PRESAGE_SECURITY")
+    role = os.environ.get("PRESAGE_ROLE") or service
+    security = credentials(Path(folder), (role,), robot) if folder else None
+    with open_bus(Link(robot=robot, connect=connect, security=security), patience=PATIENCE) as bus:
         bus.subscribe(HEALTH, inbox)
         wanted = HEALTH.key(bus.robot, service)
         for _ in range(100):

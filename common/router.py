@@ -1,6 +1,7 @@
 """`python -m common.router`: the meeting point of sessions on several hosts, or of many on one; it keeps nothing.
 
-Data flows directly between services once they know each other through the router, and outlives it.
+Data flows directly between services once they know each other through the router, and outlives it. In secure mode all
+data flows through it, and it decides what each may send.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from pydantic_settings import CliSuppress
 from common.bus import DEFAULT_ENDPOINT, Link, open_bus
 from common.config import ServiceSettings, load_settings, split_endpoints
 from common.errors import UserError
-from common.log import logger, set_up_logging
+from common.log import Logger, logger, set_up_logging
+from common.refusals import LOG_FILTER, Refusals, listening_to_zenoh
 
 ENDING = (signal.SIGTERM, signal.SIGINT)
 
@@ -28,7 +30,8 @@ class RouterSettings(ServiceSettings):
 
     Examples:
       python -m common.router                                          for services on this machine
-      python -m common.router --listen tcp/0.0.0.0:7447                for other machines too
+      python -m common.router --listen tls/0.0.0.0:7447 --security DIR for other machines too: whom DIR names
+      python -m common.router --listen tcp/0.0.0.0:7447 --insecure     for anybody on a network that is private
       python -m common.router --connect tcp/192.168.0.10:7447          joined to a router elsewhere
 
     """
@@ -46,7 +49,13 @@ class RouterSettings(ServiceSettings):
     def link(self) -> Link:
         """A session in router mode."""
         connect, listen = split_endpoints(self.connect), split_endpoints(self.listen)
-        return Link(self.robot, connect, listen, router=True, multicast=self.multicast)
+        security = self.credentials()
+        if security is not None and security.member.role != self.service:
+            raise UserError(f"{security.folder}: role {security.member.role!r} cannot route: it takes {self.service!r}")
+        return Link(
+            self.robot, connect, listen, router=True, multicast=self.multicast, security=security,
+            insecure=self.insecure,
+        )  # fmt: skip
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -57,13 +66,26 @@ def main(argv: list[str] | None = None) -> None:
         settings = load_settings(RouterSettings, argv)
         set_up_logging(settings.log_level, as_json=settings.log_json)
         log = logger(RouterSettings.service)
-        with open_bus(settings.link()):
-            log.info("router listens", endpoints=settings.listen)
-            signal.sigwait(ENDING)
-        log.info("ended")
+        route(settings.link(), log)
     except UserError as error:
         print(f"{RouterSettings.service}: {error}", file=sys.stderr)
         sys.exit(2)
+
+
+def route(link: Link, log: Logger) -> None:
+    """Until a signal ends it."""
+    listen = ", ".join(link.listen)
+    if link.security is None:
+        with open_bus(link):
+            log.info("router listens", endpoints=listen)
+            signal.sigwait(ENDING)
+        log.info("ended")
+        return
+    refusals = Refusals(log)
+    with listening_to_zenoh(refusals), open_bus(link, log_filter=LOG_FILTER):
+        log.info("router listens", endpoints=listen, lets_in=[member.name for member in link.security.members])
+        signal.sigwait(ENDING)
+    log.info("ended", refused=dict(refusals.counts))
 
 
 if __name__ == "__main__":

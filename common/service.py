@@ -335,7 +335,7 @@ def main(settings_class: type[S], make: Callable[[S], Service], argv: list[str] 
         settings = load_settings(settings_class, argv)
         set_up_logging(settings.log_level, as_json=settings.log_json)
         service = make(settings)
-        with open_bus(settings.link()) as bus:
+        with open_bus(settings.link(), give_up=lambda: ending.asked) as bus:
             ending.run(Loop(service, bus, Inbox()))
         service.log.info("ended")
     except UserError as error:

@@ -9,6 +9,11 @@ from common import messages as m
 from common import requests as r
 
 ROOT = "presage"
+# Roles, as they stand in certificates; what each is for: common/security.py. Services have the role of their name.
+CONTROL = ("operator", "viewer-control")  # may move the robot, delete, or change what runs
+SERVICES = ("simulator", "estimator", "controller", "recorder", "viewer", "viewer-control")
+WORKING = (*SERVICES, "operator")  # may ask for work that costs time
+ANYBODY = (*SERVICES, "operator", "observer", "replay", "remote")
 MAX_BYTES = 1 << 20  # a larger payload is not even queued
 
 
@@ -25,6 +30,7 @@ class Topic:
     per_service: bool = False  # one key a service, beneath the topic's own
     many: bool = False  # several may publish it at once; else the first counts until it is silent
     kept: bool = False  # whoever hears it tells the last one to services that come later
+    put_by: tuple[str, ...] = ()  # roles; none: the publisher's, and of a per-service topic each service its own
     about: str = ""
 
     def key(self, robot: str, service: str = "*") -> str:
@@ -41,6 +47,7 @@ class Query:
     reply: type[r.Reply]
     server: str
     per_service: bool = False
+    asked_by: tuple[str, ...] = CONTROL  # roles
     about: str = ""
 
     def key(self, robot: str, service: str = "*") -> str:
@@ -54,8 +61,12 @@ TRUTH = Topic("truth", m.Truth, "simulator", 15, "newest", about="where the robo
 BELIEF = Topic("belief", m.Belief, "estimator", 15, "newest", about="where the estimator believes it is, and F")
 PREDICTION = Topic("prediction", m.Prediction, "estimator", 15, "newest", about="the scan expected at the belief")
 CMD_VEL = Topic("cmd_vel", m.CmdVel, "controller", 15, "newest", about="velocity command")
-GOAL = Topic("goal", m.Goal, "presage goal, viewer", 0, "newest", many=True, kept=True, about="where to go")
-DRIVE = Topic("drive", m.Drive, "viewer", 0, "newest", many=True, about="velocity by hand, before any goal")
+GOAL = Topic(
+    "goal", m.Goal, "presage goal, viewer", 0, "newest", many=True, kept=True, put_by=CONTROL, about="where to go"
+)
+DRIVE = Topic(
+    "drive", m.Drive, "viewer", 0, "newest", many=True, put_by=CONTROL, about="velocity by hand, before any goal"
+)
 STATUS = Topic("status", m.Status, "controller", 15, "newest", kept=True, about="what the controller does, and why")
 PLAN = Topic("plan", m.Plan, "controller", 0, "newest", about="the way ahead, and what the map does not know")
 PREFERENCE = Topic(
@@ -92,14 +103,38 @@ RESUME = Query("resume", r.Request, r.Reply, "simulator", about="let it run on")
 STEP = Query("step", r.Request, r.Reply, "simulator", about="while paused, one scan further")
 SPEED = Query("speed", r.SpeedRequest, r.Reply, "simulator", about="how fast the simulation's clock runs")
 OBSTACLE = Query("obstacle", r.ObstacleRequest, r.Reply, "simulator", about="add, move or remove furniture")
-SAMPLE = Query("sample", r.SampleRequest, r.SampleReply, "simulator", about="the scans seen from a batch of poses")
-WORLD = Query("world", r.Request, r.WorldReply, "simulator", about="world, scanner and robot as data")
+SAMPLE = Query(
+    "sample",
+    r.SampleRequest,
+    r.SampleReply,
+    "simulator",
+    asked_by=WORKING,
+    about="the scans seen from a batch of poses",
+)
+WORLD = Query("world", r.Request, r.WorldReply, "simulator", asked_by=ANYBODY, about="world, scanner and robot as data")
 LOCALISE = Query("localise", r.LocaliseRequest, r.Reply, "estimator", about="begin localisation anew")
 PLAYER = Query("player", r.PlayerRequest, r.PlayerReply, "replay", about="pause, step, seek a replay")
 RECORDING = Query("recording", r.RecordRequest, r.RecordReply, "recorder", about="begin or end a recording")
-MODEL = Query("model", r.ModelRequest, r.ModelReply, "estimator", about="the model in use: card, map, weights")
-PREDICT = Query("predict", r.PredictRequest, r.PredictReply, "estimator", about="the scans expected from poses")
-CONFIG = Query("config", r.Request, r.ConfigReply, "every service", per_service=True, about="effective configuration")
+MODEL = Query(
+    "model", r.ModelRequest, r.ModelReply, "estimator", asked_by=ANYBODY, about="the model in use: card, map, weights"
+)
+PREDICT = Query(
+    "predict",
+    r.PredictRequest,
+    r.PredictReply,
+    "estimator",
+    asked_by=WORKING,
+    about="the scans expected from poses",
+)
+CONFIG = Query(
+    "config",
+    r.Request,
+    r.ConfigReply,
+    "every service",
+    per_service=True,
+    asked_by=ANYBODY,
+    about="effective configuration",
+)
 
 QUERIES: tuple[Query, ...] = (
     TELEPORT, RESET, PAUSE, RESUME, STEP, SPEED, OBSTACLE, SAMPLE, WORLD, LOCALISE, PLAYER, RECORDING, MODEL, PREDICT,

@@ -22,24 +22,28 @@ from common.inbox import Inbox, Sample
 from common.messages import CmdVel, Pose, Scan
 from common.robot import Robot
 from common.scanner import SCANNERS
+from common.security import credentials
 from common.topics import CMD_VEL, ODOM, SCAN, TRUTH
 from common.versions import commit, versions
 from common.world import load_world
+from presage.options import credentials_for
 from presage.output import check_file, write_json
 from presage.stack import Stack
 
 # The echo process speaks on keys of a robot of its own: payload out on `odom`, back on `truth`, any bytes.
-ECHO_ROBOT = "echo"
+ECHO_ROBOT, ECHO = "echo", "simulator"
 WARM_UP = 30  # scans not counted
 
 
 def echo_main() -> None:
     """Child process: every payload that comes goes back, in zenoh's own callback thread's order."""
     inbox = Inbox()
-    with open_bus(Link(robot=ECHO_ROBOT, connect=(os.environ["PRESAGE_CONNECT"],))) as bus:
+    folder, connect = os.environ.get("PRESAGE_SECURITY"), (os.environ["PRESAGE_CONNECT"],)
+    security = credentials(Path(folder), ("simulator",), ECHO_ROBOT) if folder else None
+    with open_bus(Link(robot=ECHO_ROBOT, connect=connect, security=security)) as bus:
         bus.subscribe(ODOM, inbox, keep_all=True)
         bus.publisher(TRUTH)
-        bus.declare_alive("echo")
+        bus.declare_alive(ECHO)
         while True:
             sample = inbox.get(1.0)
             if isinstance(sample, Sample):
@@ -52,7 +56,8 @@ def latency(scans: int, rate: float, beams: int, console: Console) -> dict[str, 
     start = world.start_pose(Robot().radius)
     clean = world.ray_distances(se2.compose(start[None], scanner.mount), scanner.angles())[0]
     rng = np.random.default_rng(0)
-    with Stack("bench", quiet=True) as stack:
+    # We are the scanner, and the echo speaks on a scanner's keys.
+    with Stack("bench", quiet=True, security=credentials_for("bench", "simulator")) as stack:
         stack.start_router()
         stack.start("controller")
         stack.start("estimator", "--initial-pose", f"{start[0]},{start[1]}")
@@ -65,7 +70,7 @@ def latency(scans: int, rate: float, beams: int, console: Console) -> dict[str, 
 
 def _wait_echo(raw: Bus, stack: Stack) -> None:
     deadline = time.monotonic() + 30
-    while "echo" not in raw.alive(timeout=0.5):
+    while ECHO not in raw.alive(timeout=0.5):
         stack.check()
         if time.monotonic() > deadline:
             raise UserError("the echo process did not start within 30 s")

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from common.bus import DEFAULT_ENDPOINT
 from common.errors import UserError, first_fault
-from presage import cli_bench, cli_experiment, cli_inspect, cli_recording, cli_replay, cli_tools
+from presage import cli_bench, cli_experiment, cli_inspect, cli_recording, cli_replay, cli_secure, cli_tools
 from presage.options import (
     Connect,
     EstimatorName,
@@ -193,6 +193,8 @@ app.add_typer(cli_inspect.app)
 app.add_typer(cli_tools.app)
 app.add_typer(cli_bench.app, name="bench")
 app.add_typer(cli_experiment.app, name="experiment")
+app.add_typer(cli_secure.app, name="secure")
+cli_secure.with_security(app, cli_recording.app, cli_replay.app, cli_inspect.app, cli_tools.app)
 
 
 def main() -> None:

@@ -7,12 +7,14 @@ from typing import Annotated
 
 import typer
 
+from presage.cli_secure import secured
 from presage.options import Json, WorldName, console
 
 app = typer.Typer(help="Measure, with a peer or a limit in the same run.", no_args_is_help=True)
 
 
 @app.command("latency")
+@secured
 def bench_latency(
     scans: Annotated[int, typer.Option(min=10)] = 300,
     rate: Annotated[float, typer.Option(min=1, max=1000, help="Scans a second.")] = 15.0,
@@ -21,7 +23,7 @@ def bench_latency(
 ) -> None:
     """From scan to command through the real services, beside zenoh's own round trip of the same bytes.
 
-    Example: `presage bench latency --json latency.json`.
+    Examples: `presage bench latency --json latency.json`; `presage bench latency --security keys` (TLS, roles).
     """
     from presage.bench import bench_latency as run  # noqa: PLC0415
 

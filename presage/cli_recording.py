@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from common.bus import DEFAULT_ENDPOINT
-from presage.options import Connect, RobotName, console
+from presage.options import Connect, RobotName, asked, console
 
 app = typer.Typer()
 
@@ -35,6 +35,8 @@ def record(
     args = ["--directory", str(out), "--robot", robot, "--connect", connect]
     args += ["--split-minutes", str(split_minutes), "--split-size", str(split_size)]
     args += ["--weights" if weights else "--no-weights", *(["--topics", topics] if topics else [])]
+    if (here := asked.get()).security is not None:
+        args += ["--security", str(here.security), "--role", here.role]
     serve(RecorderSettings, RecorderService, args)
 
 

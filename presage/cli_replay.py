@@ -59,7 +59,7 @@ def replay(
     if not with_services:
         if json_file is not None or every_scan:
             raise UserError("--json and --every-scan go with --with: a plain replay compares nothing")
-        run_replay(file, link_of(connect, "robot"), choice, console)
+        run_replay(file, link_of(connect, "robot", "replay"), choice, console)
         return
     if only or leave_out or robot or force or loop or paused or stay or start is not None or end is not None:
         raise UserError("--with replays the whole of what those services heard: it takes no other choice than --rate")

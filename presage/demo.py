@@ -21,6 +21,7 @@ from common.topics import BELIEF, GOAL, HEALTH, STATUS, TRUTH
 from common.versions import commit
 from common.world import World, load_world
 from presage.figure import draw_session
+from presage.options import credentials_for
 from presage.output import check_file, make_folder, write_json
 from presage.page import say_page, start_page
 from presage.session import SessionSummary, summarise
@@ -190,7 +191,7 @@ def demo_command(demo: Demo, json_file: Path | None, *, quiet: bool) -> int:
     check_file(json_file, "--json")
     if quiet:  # nobody looks
         demo = replace(demo, viewer=False)
-    with Stack("robot", demo.port, quiet=quiet) as stack:
+    with Stack("robot", demo.port, quiet=quiet, security=credentials_for("robot")) as stack:
         recording, reached = run_demo(demo, stack, console)
     figure = recording.with_suffix(".png")
     with console.status("drawing"):

@@ -59,7 +59,7 @@ def installation() -> Iterator[Finding]:
 def running(link: Link, seconds: float) -> Iterator[Finding]:
     """What runs at the endpoint."""
     where = ", ".join(link.connect)
-    with open_bus(link) as bus:
+    with open_bus(link, patience=3.0) as bus:
         if not wait_until(bus.linked, 3.0):
             yield Finding(
                 False, f"no session at {where}", "start one with `presage up`, or name its endpoint with --connect"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
+from contextvars import ContextVar
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,7 @@ from rich.console import Console
 
 from common.bus import Link
 from common.config import split_endpoints
+from common.security import Credentials, credentials
 
 # Nobody's terminal is 80 columns wide when it is a pipe.
 console = Console(width=None if sys.stdout.isatty() else 150)
@@ -41,6 +43,39 @@ Viewer = Annotated[bool, typer.Option(help="Serve the live page.")]
 OpenPage = Annotated[bool, typer.Option("--open/--no-open", help="Open the page, where there is a display.")]
 
 
-def link_of(connect: str, robot: str) -> Link:
-    """The session these options name."""
-    return replace(Link(), robot=robot, connect=split_endpoints(connect))
+Security = Annotated[
+    Path | None, typer.Option(envvar="PRESAGE_SECURITY", help="Folder of credentials (`presage secure init`).")
+]
+RoleName = Annotated[
+    str,
+    typer.Option(envvar="PRESAGE_ROLE", help="Whose credentials of that folder; none: those that suit the command."),
+]
+LOOKING_ON = frozenset({"echo", "hz", "top", "doctor"})  # commands for which an observer's credentials do
+
+
+@dataclass(frozen=True)
+class Asked:
+    """The running command and its `--security` and `--role`."""
+
+    command: str
+    security: Path | None = None
+    role: str = ""
+
+
+asked: ContextVar[Asked] = ContextVar("asked", default=Asked(""))  # noqa: B039 - frozen
+
+
+def link_of(connect: str, robot: str, *suiting: str) -> Link:
+    """The session these options name; ``suiting`` as in `credentials_for`."""
+    return replace(Link(), robot=robot, connect=split_endpoints(connect), security=credentials_for(robot, *suiting))
+
+
+def credentials_for(robot: str, *suiting: str) -> Credentials | None:
+    """Of the running command: those named with `--role`, else the first of ``suiting``, or of those that suit it."""
+    now = asked.get()
+    if now.security is None:
+        return None
+    if now.role:
+        return credentials(now.security, (now.role,), robot)
+    usual = ("observer", "operator") if now.command in LOOKING_ON else ("operator",)
+    return credentials(now.security, suiting or usual, robot)

@@ -20,8 +20,10 @@ from typing_extensions import Self
 from common.bus import Bus, Link
 from common.errors import UserError
 from common.processes import dying_with_us
+from common.security import Credentials
 
 COLOURS = {"router": 37, "simulator": 36, "estimator": 35, "controller": 33, "recorder": 32, "viewer": 34}
+ACCESS = {"PRESAGE_SECURITY", "PRESAGE_ROLE"}  # meant for us, not for our children
 GRACE = 5.0  # s between asking a process to end and ending it
 # Who is asked first: the robot stops before its eyes close, and the recorder sees all of it.
 ENDING = ("controller", "estimator", "simulator", "viewer", "recorder", "router")
@@ -59,9 +61,14 @@ class Stack:
     orphans_get = signal.SIGTERM  # what ends the children where we end without a word
 
     def __init__(
-        self, robot: str, port: int | None = None, *, quiet: bool = False, environment: Mapping[str, str] | None = None
-    ) -> None:
-        """``port`` on loopback for the router, or a free one; ``environment`` of the children, or ours."""
+        self, robot: str, port: int | None = None, *, quiet: bool = False,
+        environment: Mapping[str, str] | None = None, security: Credentials | None = None,
+    ) -> None:  # fmt: skip
+        """``port`` on loopback for the router, or a free one; ``environment`` of the children, or ours.
+
+        With ``security``, ours, the children take theirs from the same folder; else they run without.
+        """
+        self.security = security
         self.port = port if port is not None else free_port()
         self.robot, self.quiet = robot, quiet
         self.environment = os.environ if environment is None else environment
@@ -89,7 +96,7 @@ class Stack:
 
     def link(self) -> Link:
         """For a session of our own beside the children."""
-        return Link(robot=self.robot, connect=(self.endpoint,))
+        return Link(robot=self.robot, connect=(self.endpoint,), security=self.security)
 
     def start_router(self) -> None:
         """The router first; raises UserError where the port is taken."""
@@ -146,7 +153,8 @@ class Stack:
 
     def _spawn(self, name: str, args: list[str]) -> None:
         environment = {
-            **self.environment,
+            **{name: value for name, value in self.environment.items() if name not in ACCESS},
+            **({} if self.security is None else {"PRESAGE_SECURITY": str(self.security.folder.parent)}),
             "PRESAGE_CONNECT": self.endpoint,
             "PRESAGE_ROBOT": self.robot,
             "PYTHONUNBUFFERED": "1",

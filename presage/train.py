@@ -91,7 +91,7 @@ def scanner_on_bus(
     link: Link, world_name: str, scanner_name: str, beams: int | None, world: World, scanner: Scanner, console: Console
 ) -> Iterator[Bus]:
     """A bus on which this scanner in this world answers `sample`: the one that is there, or a simulator of our own."""
-    with open_bus(link) as bus:
+    with open_bus(link, patience=3.0) as bus:
         if wait_until(bus.linked, 1.0) and _answers(bus, world, scanner, console):
             yield bus
             return

@@ -9,6 +9,7 @@ from rich.console import Console
 
 from common.bus import open_bus
 from common.world import load_world
+from presage.options import credentials_for
 from presage.page import say_page, start_page
 from presage.stack import Stack, controller_arguments
 
@@ -33,7 +34,7 @@ def run_up(
 ) -> None:
     """Start, wait until all are alive, say what can be done, and watch; a service that ends is named, not restarted."""
     load_world(world)  # one clear line now rather than three from the children
-    with Stack(robot, port or None) as stack:
+    with Stack(robot, port or None, security=credentials_for(robot)) as stack:
         stack.start_router()
         lockstep = pace == "lockstep"
         page = viewer and start_page(stack, record or RECORDINGS, console)
@@ -50,6 +51,7 @@ def run_up(
         if page:
             say_page(stack, console, open_it=open_page)
         where = "" if port == 7447 else f" --connect {stack.endpoint}"
+        where += f" --security {stack.security.folder.parent}" if stack.security is not None else ""
         console.print(
             f"[bold green]all alive[/] at {stack.endpoint}. In another terminal: "
             f"presage goal 15 1.5 --wait{where} | presage echo belief{where} | presage hz{where}. Ctrl-C ends all.",
