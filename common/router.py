@@ -15,7 +15,7 @@ from pydantic_settings import CliSuppress
 from common.bus import DEFAULT_ENDPOINT, Link, open_bus
 from common.config import ServiceSettings, load_settings, split_endpoints
 from common.errors import UserError
-from common.log import logger, set_up_logging
+from common.log import begin_logging, logger, say_failure, set_up_logging
 
 ENDING = (signal.SIGTERM, signal.SIGINT)
 
@@ -53,16 +53,17 @@ def main(argv: list[str] | None = None) -> None:
     """Route until SIGTERM or Ctrl-C; status 0 then, 2 and one line where the endpoints cannot be used."""
     # Blocked from the first line on, so that a signal is kept until sigwait takes it, however early it comes.
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    begin_logging(RouterSettings.service, argv)
     try:
         settings = load_settings(RouterSettings, argv)
-        set_up_logging(settings.log_level, as_json=settings.log_json)
+        set_up_logging(settings.log_level, as_json=settings.log_json, service=RouterSettings.service)
         log = logger(RouterSettings.service)
         with open_bus(settings.link()):
             log.info("router listens", endpoints=settings.listen)
             signal.sigwait(ENDING)
         log.info("ended")
     except UserError as error:
-        print(f"{RouterSettings.service}: {error}", file=sys.stderr)
+        say_failure(RouterSettings.service, error)
         sys.exit(2)
 
 

@@ -9,13 +9,13 @@ import time
 from abc import ABC
 from collections import Counter
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 from common.bus import Bus, open_bus
 from common.config import ServiceSettings, load_settings
 from common.errors import UserError
 from common.inbox import Answer, Call, Inbox, Sample
-from common.log import Logger, OncePerSecond, logger, set_up_logging
+from common.log import Logger, OncePerSecond, begin_logging, logger, say_failure, set_up_logging
 from common.messages import Health, Stamped, TopicHealth
 from common.requests import ConfigReply, Reply, Request
 from common.topics import CONFIG, HEALTH, Query, Topic
@@ -259,17 +259,16 @@ def main(settings_class: type[S], make: Callable[[S], Service], argv: list[str] 
     ending = _Ending()
     signal.signal(signal.SIGTERM, ending)
     signal.signal(signal.SIGINT, ending)
+    begin_logging(settings_class.service, argv)
     try:
         settings = load_settings(settings_class, argv)
-        set_up_logging(settings.log_level, as_json=settings.log_json)
+        set_up_logging(
+            settings.log_level, as_json=settings.log_json, service=settings_class.service, robot=settings.robot
+        )
         service = make(settings)
         with open_bus(settings.link()) as bus:
             ending.run(Loop(service, bus, Inbox()))
         service.log.info("ended")
     except UserError as error:
-        sys.exit(_fail(settings_class.service, error))
-
-
-def _fail(service: str, error: Any) -> int:
-    print(f"{service}: {error}", file=sys.stderr)
-    return 2
+        say_failure(settings_class.service, error)
+        sys.exit(2)
