@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import threading
 import time
@@ -172,6 +173,24 @@ class Bus:
 
         handler = zenoh.handlers.Callback(move, end)
         self._session.get(key, handler, payload=request.encode(), encoding=ENCODING, timeout=timeout)
+
+    def ask_each(
+        self, query: Query, request: Request, inbox: Inbox, timeout: float = 5.0, service: str = "*",
+        robot: str | None = None,
+    ) -> threading.Event:  # fmt: skip
+        """Ask all who serve the query, also several of one name: an `Answer` each. Set once no more will come."""
+        done, number = threading.Event(), itertools.count()
+
+        def move(answer: zenoh.Reply) -> None:
+            if answer.ok is not None:
+                inbox.put(Answer(query, next(number), answer.ok.payload.to_bytes(), who=str(answer.replier_id)))
+
+        self._session.get(
+            query.key(robot or self.robot, service), zenoh.handlers.Callback(move, done.set),
+            payload=request.encode(), encoding=ENCODING, timeout=timeout,
+            target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE,
+        )  # fmt: skip
+        return done
 
     def declare_alive(self, service: str) -> None:
         """Say that the service is there, until the session ends. Declare it last: order is kept."""

@@ -44,6 +44,7 @@ class Answer:
     number: int  # of the request
     payload: bytes
     refusal: str = ""  # why there is no payload
+    who: str = ""  # the session that answered, where each was asked
 
     def reply(self) -> Reply:
         """The answer decoded; where there is none that makes sense, one with ok false that says why."""

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 from common.bus import Bus, open_bus
+from common.compatibility import Compatibility, this_service
 from common.config import ServiceSettings, load_settings
 from common.errors import UserError
 from common.inbox import Answer, Call, Inbox, Sample
@@ -19,7 +20,6 @@ from common.log import Logger, OncePerSecond, begin_logging, logger, say_failure
 from common.messages import Health, Stamped, TopicHealth
 from common.requests import ConfigReply, Reply, Request
 from common.topics import CONFIG, HEALTH, Query, Topic
-from common.versions import versions
 from common.wire import DecodeError
 
 if TYPE_CHECKING:
@@ -111,19 +111,23 @@ class Loop:
         self._stopping = False
         self._began = self._health_at = self._counted_at = time.monotonic()
         self._before: Counter[str] = Counter()
+        self._others = Compatibility(bus, service.name, service.log)
         service._loop = self  # noqa: SLF001 - the two halves of one thing
 
     def run(self) -> None:
         """Until `stop`."""
         service, bus = self.service, self.bus
         service.open()
+        self._others.at_start(self._config())
         for topic in service.inputs:
             bus.subscribe(topic, self.inbox, keep_all=service.keep_all)
         for query in service.queries:
             bus.serve(query, self.inbox)
         bus.serve(CONFIG, self.inbox, service.name)
         bus.declare_alive(service.name)
+        self._others.watch()
         service.log.info("ready", robot=bus.robot)
+        self._health_at = self._counted_at = time.monotonic()  # the first pulse now, and each after it a second on
         try:
             while not self._stopping:
                 self._turn()
@@ -172,6 +176,7 @@ class Loop:
             late = now - self._health_at > HEALTH_PERIOD  # after a long step one pulse, not all that were missed
             self._health_at = (now if late else self._health_at) + HEALTH_PERIOD
             self.publish(HEALTH, self._health(now))
+            self._others.look(self._config)
 
     def _guard(self, step: Callable[[], None]) -> None:
         """No input stops a service: what a step raises is counted and logged with its traceback."""
@@ -204,7 +209,7 @@ class Loop:
 
     def _config(self) -> ConfigReply:
         config = json.dumps(self.service.settings.effective())
-        return ConfigReply(service=self.service.name, config=config, versions=versions())
+        return this_service(self.service.name, config, time.monotonic() - self._began)
 
     def _health(self, now: float) -> Health:
         inbox, total = self.inbox, Counter[str]()
