@@ -221,7 +221,11 @@ class Bus:
 
     def linked(self) -> bool:
         """Whether any other session is reached."""
-        return bool(list(self._session.info.routers_zid()) or list(self._session.info.peers_zid()))
+        return self.links() > 0
+
+    def links(self) -> int:
+        """How many other sessions are reached directly."""
+        return len(list(self._session.info.routers_zid())) + len(list(self._session.info.peers_zid()))
 
 
 def _decode_reply(key: str, reply: type[R], payload: bytes) -> R:

@@ -116,6 +116,11 @@ class Inbox:
             taken.subtract(self.counted_as(entry.key) for entry in self._entries.values() if isinstance(entry, Sample))
             return taken, self.dropped.copy(), self.oversized.copy()
 
+    def arrivals(self) -> tuple[Counter[str], Counter[str], Counter[str]]:
+        """By key and as of one moment: received, those that wait included, dropped, oversized."""
+        with self._changed:
+            return self.received.copy(), self.dropped.copy(), self.oversized.copy()
+
     def get(self, timeout: float) -> Sample | Call | Answer | None:
         """The oldest entry, waiting at most ``timeout`` s for one; None when none came."""
         with self._changed:

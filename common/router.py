@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from contextlib import ExitStack
 from typing import Annotated, ClassVar
 
 from pydantic import Field
@@ -58,7 +59,12 @@ def main(argv: list[str] | None = None) -> None:
         settings = load_settings(RouterSettings, argv)
         set_up_logging(settings.log_level, as_json=settings.log_json, service=RouterSettings.service)
         log = logger(RouterSettings.service)
-        with open_bus(settings.link()):
+        with open_bus(settings.link()) as bus, ExitStack() as stack:
+            if settings.metrics:
+                from common.metrics_endpoint import serve  # noqa: PLC0415
+                from common.metrics_router import RouterMetrics  # noqa: PLC0415
+
+                log.info("metrics", address=stack.enter_context(serve(RouterMetrics(bus).registry, settings.metrics)))
             log.info("router listens", endpoints=settings.listen)
             signal.sigwait(ENDING)
         log.info("ended")

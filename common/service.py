@@ -9,7 +9,8 @@ import time
 from abc import ABC
 from collections import Counter
 from collections.abc import Callable
-from typing import TYPE_CHECKING, ClassVar, TypeVar
+from contextlib import ExitStack, nullcontext
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from common.bus import Bus, open_bus
 from common.compatibility import Compatibility, this_service
@@ -24,6 +25,8 @@ from common.wire import DecodeError
 
 if TYPE_CHECKING:
     from types import FrameType
+
+    from common.metrics import ServiceMetrics
 
 S = TypeVar("S", bound=ServiceSettings)
 HEALTH_PERIOD = 1.0  # s
@@ -111,11 +114,33 @@ class Loop:
         self._stopping = False
         self._began = self._health_at = self._counted_at = time.monotonic()
         self._before: Counter[str] = Counter()
+        self._metrics: ServiceMetrics | None = None
         self._others = Compatibility(bus, service.name, service.log)
         service._loop = self  # noqa: SLF001 - the two halves of one thing
 
     def run(self) -> None:
-        """Until `stop`."""
+        """Until `stop`; with an endpoint for metrics where one is asked for."""
+        with ExitStack() as stack:
+            if wanted := self.service.settings.metrics:
+                self._measure(stack, wanted)
+            self._run()
+
+    def _measure(self, stack: ExitStack, wanted: str) -> None:
+        """Imports Prometheus's client only where it is used."""
+        from common.metrics import ServiceMetrics  # noqa: PLC0415
+        from common.metrics_endpoint import serve  # noqa: PLC0415
+
+        self._metrics = ServiceMetrics(self.bus.robot, self.service.name, self.inbox, self._counts)
+        self.service.log.info("metrics", address=stack.enter_context(serve(self._metrics.registry, wanted)))
+
+    def _counts(self) -> dict[str, Any]:
+        """Copies: a scrape reads them from a thread of its own."""
+        return {
+            "published": self.published.copy(), "undecodable": self.undecodable.copy(), "failed": self.failed,
+            "events": dict(self.service.counters), "began": self._began,
+        }  # fmt: skip
+
+    def _run(self) -> None:
         service, bus = self.service, self.bus
         service.open()
         self._others.at_start(self._config())
@@ -145,6 +170,8 @@ class Loop:
         numbered = message.model_copy(update={"seq": self.published[key]})
         self.bus.put(topic, numbered.encode(), self.service.name)
         self.published[key] += 1
+        if self._metrics is not None:
+            self._metrics.published(key, numbered)
 
     def request(self, query: Query, request: Request, timeout: float) -> int:
         """Ask; the answer comes through the inbox like everything else."""
@@ -164,7 +191,8 @@ class Loop:
         until_health = self._health_at - time.monotonic()
         event = self.inbox.get(max(0.0, min(until_health, 0.5 if due is None else due)))
         if isinstance(event, Sample):
-            self._guard(lambda: self.service.on_sample(event))
+            with nullcontext() if self._metrics is None else self._metrics.step(event):
+                self._guard(lambda: self.service.on_sample(event))
         elif isinstance(event, Call):
             self._answer(event)
         elif isinstance(event, Answer):
