@@ -109,7 +109,8 @@ def bench_metrics(seconds: float, rounds: int, json_file: Path | None, console: 
     result: dict[str, Any] = {
         **{f"{name}_cpu_share_without": without.share(name) for name in SERVICES},
         **{f"{name}_cpu_share_with": having.share(name) for name in SERVICES},
-        "scrape_median_ms": float(np.median(having.scrape_ms)), "scrape_p99_ms": float(np.percentile(having.scrape_ms, 99)),
+        "scrape_median_ms": float(np.median(having.scrape_ms)),
+        "scrape_p99_ms": float(np.percentile(having.scrape_ms, 99)),
         "scrape_bytes": having.scrape_bytes, "observation_us": observation_us(),
         "seconds": seconds, "rounds": rounds, "commit": commit(), "versions": versions(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores", "arguments": sys.argv[1:],
