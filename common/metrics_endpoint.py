@@ -5,10 +5,15 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
 from prometheus_client import CollectorRegistry, start_http_server
 
 from common.errors import UserError
+from common.metrics import ServiceMetrics
+
+if TYPE_CHECKING:
+    from common.service import Loop
 
 LOOPBACK = "127.0.0.1"
 
@@ -38,3 +43,21 @@ def serve(registry: CollectorRegistry, setting: str) -> Iterator[str]:
         server.shutdown()
         server.server_close()
         thread.join()
+
+
+@contextmanager
+def measure(loop: Loop, setting: str) -> Iterator[ServiceMetrics]:
+    """The metrics of a loop, served until the block ends."""
+    service = loop.service
+
+    def counts() -> dict[str, Any]:
+        """Copies: a scrape reads them from a thread of its own."""
+        return {
+            "published": loop.published.copy(), "undecodable": loop.undecodable.copy(), "failed": loop.failed,
+            "events": dict(service.counters), "began": loop.began,
+        }  # fmt: skip
+
+    metrics = ServiceMetrics(loop.bus.robot, service.name, loop.inbox, counts)
+    with serve(metrics.registry, setting) as address:
+        service.log.info("metrics", address=address)
+        yield metrics

@@ -9,8 +9,8 @@ import time
 from abc import ABC
 from collections import Counter
 from collections.abc import Callable
-from contextlib import ExitStack, nullcontext
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from contextlib import nullcontext
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 from common.bus import Bus, open_bus
 from common.compatibility import Compatibility, this_service
@@ -112,7 +112,7 @@ class Loop:
         self._asked = 0
         self._may_log = OncePerSecond()
         self._stopping = False
-        self._began = self._health_at = self._counted_at = time.monotonic()
+        self.began = self._health_at = self._counted_at = time.monotonic()
         self._before: Counter[str] = Counter()
         self._metrics: ServiceMetrics | None = None
         self._others = Compatibility(bus, service.name, service.log)
@@ -120,30 +120,18 @@ class Loop:
 
     def run(self) -> None:
         """Until `stop`; with an endpoint for metrics where one is asked for."""
-        with ExitStack() as stack:
-            if wanted := self.service.settings.metrics:
-                self._measure(stack, wanted)
+        if not (address := self.service.settings.metrics):
             self._run()
+            return
+        from common.metrics_endpoint import measure  # noqa: PLC0415 - Prometheus's client only where it is used
 
-    def _measure(self, stack: ExitStack, wanted: str) -> None:
-        """Imports Prometheus's client only where it is used."""
-        from common.metrics import ServiceMetrics  # noqa: PLC0415
-        from common.metrics_endpoint import serve  # noqa: PLC0415
-
-        self._metrics = ServiceMetrics(self.bus.robot, self.service.name, self.inbox, self._counts)
-        self.service.log.info("metrics", address=stack.enter_context(serve(self._metrics.registry, wanted)))
-
-    def _counts(self) -> dict[str, Any]:
-        """Copies: a scrape reads them from a thread of its own."""
-        return {
-            "published": self.published.copy(), "undecodable": self.undecodable.copy(), "failed": self.failed,
-            "events": dict(self.service.counters), "began": self._began,
-        }  # fmt: skip
+        with measure(self, address) as self._metrics:
+            self._run()
 
     def _run(self) -> None:
         service, bus = self.service, self.bus
-        service.open()
         self._others.at_start(self._config())
+        service.open()
         for topic in service.inputs:
             bus.subscribe(topic, self.inbox, keep_all=service.keep_all)
         for query in service.queries:
@@ -237,7 +225,7 @@ class Loop:
 
     def _config(self) -> ConfigReply:
         config = json.dumps(self.service.settings.effective())
-        return this_service(self.service.name, config, time.monotonic() - self._began)
+        return this_service(self.service.name, config, time.monotonic() - self.began)
 
     def _health(self, now: float) -> Health:
         inbox, total = self.inbox, Counter[str]()
@@ -261,7 +249,7 @@ class Loop:
         return Health(
             stamp_ns=time.time_ns(),
             service=self.service.name,
-            uptime=now - self._began,
+            uptime=now - self.began,
             topics=rows,
             counters=counters,
             note=self.service.note,
