@@ -18,7 +18,7 @@ from presage.doctoring.findings import Finding
 from presage.doctoring.installation import look_at_installation
 from presage.doctoring.judging import judge
 from presage.doctoring.listening import Observed, listen
-from presage.doctoring.machine import look_at_machine
+from presage.doctoring.machine import look_at_machine, look_for_stopped
 from presage.output import check_file, write_json
 
 MARKS = {True: "[green]ok[/]", False: "[bold red]no[/]", None: "[yellow]-[/]"}
@@ -30,7 +30,10 @@ def running(link: Link, seconds: float) -> Iterator[Finding]:
     if isinstance(seen, Observed):
         where = ", ".join(link.connect)
         yield Finding("no_router", True, f"session at {where}", where)
-        yield from judge(seen, this_service("doctor", "{}"))
+        for finding in judge(seen, this_service("doctor", "{}")):
+            yield finding
+            if finding.code == "missing" and not finding.ok:
+                yield from look_for_stopped(finding.where)
     else:
         yield from seen
 

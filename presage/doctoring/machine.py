@@ -8,6 +8,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
+
 from presage.doctoring.findings import Finding
 
 LEAST_FREE = 500e6  # bytes; a disk fuller than that is nearly full
@@ -37,6 +39,15 @@ def _caches() -> Iterator[Finding]:
     if MEMORY_FILES.is_dir() and (why := why_not_writable(MEMORY_FILES)):
         advice = "experiments on several cores fail; the services do not use it"
         yield Finding("not_writable", None, f"{MEMORY_FILES} cannot be used: {why}", str(MEMORY_FILES), advice)
+
+
+def look_for_stopped(service: str) -> Iterator[Finding]:
+    """Processes of the service on this machine that are stopped: who comes to a session later does not hear of them."""
+    for process in psutil.process_iter(["cmdline", "status"]):
+        words = process.info["cmdline"] or []
+        if f"services.{service}" in words and process.info["status"] == psutil.STATUS_STOPPED:
+            what = f"{service}: process {process.pid} of this machine is stopped"
+            yield Finding("frozen", False, what, f"process {process.pid}", f"kill -CONT {process.pid} lets it go on")
 
 
 def why_not_writable(folder: Path) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -123,6 +124,18 @@ def test_a_sick_session(process, bus, sick, tmp_path):
     fault(found, "weights", "estimator says: no weights of this world")
     assert "Traceback" not in running.output
     assert "install the same version of presage" in " ".join(running.output.split())
+
+
+def test_a_stopped_process_is_told_from_one_that_is_not_there(process, bus, tmp_path):
+    controller = process("controller")
+    assert wait_until(lambda: "controller" in bus.alive(), PATIENCE), controller.output
+    controller.send(signal.SIGSTOP)
+    running = doctor(process, tmp_path)
+    assert running.wait(90) == 1, running.output
+    found = read(tmp_path)
+    frozen = [f for f in found if f["code"] == "frozen" and f["ok"] is False]
+    assert frozen, running.output
+    assert any(str(controller.child.pid) in f["what"] or f["where"].startswith("controller") for f in frozen)
 
 
 def test_no_session_says_why(processes, free_port, tmp_path):
