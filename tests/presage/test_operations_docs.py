@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import pytest
 import yaml
@@ -45,7 +46,7 @@ def test_promtool_takes_configuration_and_rules():
 
 
 def test_the_page_explains_every_finding():
-    sources = [module.__file__ for module in (installation, judging, listening, machine)]
-    codes = {code for path in sources for code in re.findall(r'Finding\(\s*"(\w+)"', open(path).read())}  # noqa: PTH123, SIM115
+    sources = [Path(module.__file__).read_text() for module in (installation, judging, listening, machine)]
+    codes = {code for text in sources for code in re.findall(r'Finding\(\s*"(\w+)"', text)}
     assert len(codes) > 15
     assert {code for code in codes if f"`{code}`" not in PAGE} <= {"note"}
