@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import logging
 import os
@@ -230,6 +231,24 @@ class Bus:
         found = [(_published_ns(a.ok), a.ok.payload.to_bytes()) for a in answers if a.ok is not None]
         return max(found, default=(0, None), key=lambda each: each[0])[1]
 
+    def ask_each(
+        self, query: Query, request: Request, inbox: Inbox, timeout: float = 5.0, service: str = "*",
+        robot: str | None = None,
+    ) -> threading.Event:  # fmt: skip
+        """Ask all who serve the query, also several of one name: an `Answer` each. Set once no more will come."""
+        done, number = threading.Event(), itertools.count()
+
+        def move(answer: zenoh.Reply) -> None:
+            if answer.ok is not None:
+                inbox.put(Answer(query, next(number), answer.ok.payload.to_bytes(), who=str(answer.replier_id)))
+
+        self._session.get(
+            query.key(robot or self.robot, service), zenoh.handlers.Callback(move, done.set),
+            payload=request.encode(), encoding=ENCODING, timeout=timeout,
+            target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE,
+        )  # fmt: skip
+        return done
+
     def declare_alive(self, service: str) -> None:
         """Say that the service is there, until the session ends. Declare it last: order is kept."""
         self._token(alive_key(self.robot, service, self.instance))
@@ -316,7 +335,11 @@ class Bus:
 
     def linked(self) -> bool:
         """Whether any other session is reached."""
-        return bool(list(self._session.info.routers_zid()) or list(self._session.info.peers_zid()))
+        return self.links() > 0
+
+    def links(self) -> int:
+        """How many other sessions are reached directly."""
+        return len(list(self._session.info.routers_zid())) + len(list(self._session.info.peers_zid()))
 
 
 def _published_ns(sample: zenoh.Sample) -> int:

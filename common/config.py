@@ -32,6 +32,7 @@ from common.security import Credentials, credentials
 
 _file_values: ContextVar[dict[str, Any]] = ContextVar("_file_values")
 S = TypeVar("S", bound="ServiceSettings")
+METRICS_TEXT = r"^$|^(\[[0-9A-Fa-f:.]+\]:|[^\s:\[\]]+:)?\d{1,5}$"  # PORT, HOST:PORT, [IPv6]:PORT, or nothing
 NUMBER = r"-?(\d{1,9}\.?\d*|\.\d+)"
 POSE_TEXT = rf"^$|^{NUMBER},{NUMBER}(,{NUMBER})?$"  # x,y[,yaw_deg], or nothing
 
@@ -74,6 +75,10 @@ class ServiceSettings(BaseSettings):
         str, Field(pattern="^(debug|info|warning|error)$", description="debug, info, warning, error")
     ] = "info"
     log_json: Annotated[bool, Field(description="log lines as JSON")] = False
+    metrics: Annotated[
+        str,
+        Field(pattern=METRICS_TEXT, description="PORT or HOST:PORT for Prometheus, 0: any free port; empty: none"),
+    ] = ""
     config: Annotated[Path | None, Field(description="YAML file of settings, with a section for each service")] = None
     print_config: Annotated[bool, Field(description="print the effective settings as YAML and end")] = False
 

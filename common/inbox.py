@@ -45,6 +45,7 @@ class Answer:
     number: int  # of the request
     payload: bytes
     refusal: str = ""  # why there is no payload
+    who: str = ""  # the session that answered, where each was asked
 
     def reply(self) -> Reply:
         """The answer decoded; where there is none that makes sense, one with ok false that says why."""
@@ -116,6 +117,11 @@ class Inbox:
             taken = self.received.copy()
             taken.subtract(self.counted_as(entry.key) for entry in self._entries.values() if isinstance(entry, Sample))
             return taken, self.dropped.copy(), self.oversized.copy()
+
+    def arrivals(self) -> tuple[Counter[str], Counter[str], Counter[str]]:
+        """By key and as of one moment: received, those that wait included, dropped, oversized."""
+        with self._changed:
+            return self.received.copy(), self.dropped.copy(), self.oversized.copy()
 
     def get(self, timeout: float) -> Sample | Call | Answer | None:
         """The oldest entry, waiting at most ``timeout`` s for one; None when none came."""

@@ -138,6 +138,9 @@ class ConfigReply(Reply):
     service: Name = ""
     config: Text = ""  # JSON
     versions: dict[str, str] = {}  # noqa: RUF012
+    protocol: Count = 0  # of its messages, `PROTOCOL` in common/versions.py; 0: not said
+    host: Name = ""  # where it runs
+    uptime: NotNegative = 0.0  # s, wall time, since its start
 
 
 class ModelRequest(Request):

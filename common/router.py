@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from contextlib import ExitStack
 from typing import Annotated, ClassVar
 
 from pydantic import Field
@@ -16,7 +17,7 @@ from pydantic_settings import CliSuppress
 from common.bus import DEFAULT_ENDPOINT, Link, open_bus
 from common.config import ServiceSettings, load_settings, split_endpoints
 from common.errors import UserError
-from common.log import Logger, logger, set_up_logging
+from common.log import Logger, begin_logging, logger, say_failure, set_up_logging
 from common.refusals import LOG_FILTER, Refusals, listening_to_zenoh
 
 ENDING = (signal.SIGTERM, signal.SIGINT)
@@ -62,30 +63,35 @@ def main(argv: list[str] | None = None) -> None:
     """Route until SIGTERM or Ctrl-C; status 0 then, 2 and one line where the endpoints cannot be used."""
     # Blocked from the first line on, so that a signal is kept until sigwait takes it, however early it comes.
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    begin_logging(RouterSettings.service, argv)
     try:
         settings = load_settings(RouterSettings, argv)
-        set_up_logging(settings.log_level, as_json=settings.log_json)
+        set_up_logging(settings.log_level, as_json=settings.log_json, service=RouterSettings.service)
         log = logger(RouterSettings.service)
-        route(settings.link(), log)
+        route(settings.link(), log, settings.metrics)
     except UserError as error:
-        print(f"{RouterSettings.service}: {error}", file=sys.stderr)
+        say_failure(RouterSettings.service, error)
         sys.exit(2)
 
 
-def route(link: Link, log: Logger) -> None:
-    """Until a signal ends it."""
-    listen = ", ".join(link.listen)
-    if link.security is None:
-        with open_bus(link):
-            log.info("router listens", endpoints=listen)
-            signal.sigwait(ENDING)
-        log.info("ended")
-        return
-    refusals = Refusals(log)
-    with listening_to_zenoh(refusals), open_bus(link, log_filter=LOG_FILTER):
-        log.info("router listens", endpoints=listen, lets_in=[member.name for member in link.security.members])
+def route(link: Link, log: Logger, metrics: str = "") -> None:
+    """Until a signal ends it; ``metrics``: where Prometheus may ask, empty: nowhere."""
+    refusals, facts = Refusals(log), {}
+    with ExitStack() as stack:
+        if link.security is None:
+            bus = stack.enter_context(open_bus(link))
+        else:
+            stack.enter_context(listening_to_zenoh(refusals))
+            bus = stack.enter_context(open_bus(link, log_filter=LOG_FILTER))
+            facts["lets_in"] = [member.name for member in link.security.members]
+        if metrics:
+            from common.metrics_endpoint import serve  # noqa: PLC0415
+            from common.metrics_router import RouterMetrics  # noqa: PLC0415
+
+            log.info("metrics", address=stack.enter_context(serve(RouterMetrics(bus).registry, metrics)))
+        log.info("router listens", endpoints=", ".join(link.listen), **facts)
         signal.sigwait(ENDING)
-    log.info("ended", refused=dict(refusals.counts))
+    log.info("ended", **({"refused": dict(refusals.counts)} if link.security is not None else {}))
 
 
 if __name__ == "__main__":

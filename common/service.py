@@ -9,22 +9,25 @@ import time
 from abc import ABC
 from collections import Counter
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from contextlib import nullcontext
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 from common.bus import Bus, open_bus, wait_until
+from common.compatibility import Compatibility, this_service
 from common.config import ServiceSettings, load_settings
 from common.errors import UserError
 from common.inbox import Answer, Call, Inbox, Sample
 from common.instances import Instances, OneSource, spoken
-from common.log import Logger, OncePerSecond, logger, set_up_logging
+from common.log import Logger, OncePerSecond, begin_logging, logger, say_failure, set_up_logging
 from common.messages import Health, Stamped, TopicHealth
 from common.requests import ConfigReply, Reply, Request
 from common.topics import CONFIG, HEALTH, Query, Topic
-from common.versions import versions
 from common.wire import DecodeError
 
 if TYPE_CHECKING:
     from types import FrameType
+
+    from common.metrics import ServiceMetrics
 
 S = TypeVar("S", bound=ServiceSettings)
 HEALTH_PERIOD = 1.0  # s
@@ -119,15 +122,27 @@ class Loop:
         self._asked = 0
         self._may_log = OncePerSecond()
         self._stopping = False
-        self._began = self._health_at = self._counted_at = time.monotonic()
+        self.began = self._health_at = self._counted_at = time.monotonic()
         self._before: Counter[str] = Counter()
         self._sources = OneSource(SOURCE_SILENT)
         self._rivals: Instances | None = None
+        self._metrics: ServiceMetrics | None = None
+        self._others = Compatibility(bus, service.name, service.log)
         service._loop = self  # noqa: SLF001 - the two halves of one thing
 
     def run(self) -> None:
-        """Until `stop`."""
+        """Until `stop`; with an endpoint for metrics where one is asked for."""
+        if not (address := self.service.settings.metrics):
+            self._run()
+            return
+        from common.metrics_endpoint import measure  # noqa: PLC0415 - Prometheus's client only where it is used
+
+        with measure(self, address) as self._metrics:
+            self._run()
+
+    def _run(self) -> None:
         service = self.service
+        self._others.at_start(self._config())
         service.open()
         try:
             if service.single:
@@ -154,7 +169,9 @@ class Loop:
             bus.serve(query, self.inbox)
         bus.serve(CONFIG, self.inbox, service.name)
         bus.declare_alive(service.name)
+        self._others.watch()
         service.log.info("ready", robot=bus.robot)
+        self._health_at = self._counted_at = time.monotonic()  # the first pulse now, and each after it a second on
 
     def _recalled(self) -> dict[Topic, Stamped]:
         found: dict[Topic, Stamped] = {}
@@ -181,7 +198,7 @@ class Loop:
         end()
         if not self._stopping:
             service.log.warning("taking over: the one that led is gone")
-            self._began = self._health_at = time.monotonic()
+            self.began = time.monotonic()
 
     def stop(self) -> None:
         """End after the current step; safe from a signal handler."""
@@ -194,6 +211,8 @@ class Loop:
         numbered = message.model_copy(update={"seq": self.published[key]})
         self.bus.put(topic, numbered.encode(), self.service.name)
         self.published[key] += 1
+        if self._metrics is not None:
+            self._metrics.published(key, numbered)
 
     def request(self, query: Query, request: Request, timeout: float) -> int:
         """Ask; the answer comes through the inbox like everything else."""
@@ -218,7 +237,8 @@ class Loop:
                 f"before this one and leads: this one ends. Started again, it stands by"
             )
         if isinstance(event, Sample) and self._counts(event):
-            self._guard(lambda: self.service.on_sample(event))
+            with nullcontext() if self._metrics is None else self._metrics.step(event):
+                self._guard(lambda: self.service.on_sample(event))
         elif isinstance(event, Call):
             self._answer(event)
         elif isinstance(event, Answer):
@@ -230,6 +250,7 @@ class Loop:
             late = now - self._health_at > HEALTH_PERIOD  # after a long step one pulse, not all that were missed
             self._health_at = (now if late else self._health_at) + HEALTH_PERIOD
             self.publish(HEALTH, self._health(now))
+            self._others.look(self._config)
 
     def _counts(self, sample: Sample) -> bool:
         """Not where a second source publishes beside the one that is heard."""
@@ -276,7 +297,7 @@ class Loop:
 
     def _config(self) -> ConfigReply:
         config = json.dumps(self.service.settings.effective())
-        return ConfigReply(service=self.service.name, config=config, versions=versions())
+        return this_service(self.service.name, config, time.monotonic() - self.began)
 
     def _health(self, now: float) -> Health:
         inbox, total = self.inbox, Counter[str]()
@@ -300,7 +321,7 @@ class Loop:
         return Health(
             stamp_ns=time.time_ns(),
             service=self.service.name,
-            uptime=now - self._began,
+            uptime=now - self.began,
             topics=rows,
             counters=counters,
             note=self.service.note,
@@ -331,17 +352,16 @@ def main(settings_class: type[S], make: Callable[[S], Service], argv: list[str] 
     ending = _Ending()
     signal.signal(signal.SIGTERM, ending)
     signal.signal(signal.SIGINT, ending)
+    begin_logging(settings_class.service, argv)
     try:
         settings = load_settings(settings_class, argv)
-        set_up_logging(settings.log_level, as_json=settings.log_json)
+        set_up_logging(
+            settings.log_level, as_json=settings.log_json, service=settings_class.service, robot=settings.robot
+        )
         service = make(settings)
         with open_bus(settings.link(), give_up=lambda: ending.asked) as bus:
             ending.run(Loop(service, bus, Inbox()))
         service.log.info("ended")
     except UserError as error:
-        sys.exit(_fail(settings_class.service, error))
-
-
-def _fail(service: str, error: Any) -> int:
-    print(f"{service}: {error}", file=sys.stderr)
-    return 2
+        say_failure(settings_class.service, error)
+        sys.exit(2)

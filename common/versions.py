@@ -8,6 +8,10 @@ import platform
 import subprocess
 from pathlib import Path
 
+# Of messages, requests and keys. Raised when an older service would misread a newer one's; a new field with a default,
+# a new topic or a new queryable is no reason. Services of different protocols refuse one another (compatibility.py).
+PROTOCOL = 1
+
 PACKAGES = ("presage", "eclipse-zenoh", "msgpack", "numpy", "pydantic", "mcap", "torch", "pybullet")
 
 

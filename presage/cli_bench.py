@@ -46,6 +46,21 @@ def bench_viewer(
     raise typer.Exit(run(seconds, rounds, beams, json_file, console))
 
 
+@app.command("metrics")
+def bench_metrics(
+    seconds: Annotated[float, typer.Option(min=1.0, help="Of one round.")] = 20.0,
+    rounds: Annotated[int, typer.Option(min=1, help="Without and with scrapes, so often.")] = 3,
+    json_file: Json = None,
+) -> None:
+    """What Prometheus costs each service: scraped once a second or not at all, in turn, in one session.
+
+    Examples: `presage bench metrics`; `presage bench metrics --seconds 5 --rounds 1 --json metrics.json`.
+    """
+    from presage.bench_metrics import bench_metrics as run  # noqa: PLC0415
+
+    raise typer.Exit(run(seconds, rounds, json_file, console))
+
+
 @app.command("localisation")
 def bench_localisation(
     world: WorldName = "corridor",

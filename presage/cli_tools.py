@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -10,7 +11,7 @@ import typer
 
 from common.bus import DEFAULT_ENDPOINT
 from common.errors import UserError
-from presage.options import Connect, RobotName, console, link_of
+from presage.options import Connect, Json, RobotName, WorldName, console, link_of
 
 if TYPE_CHECKING:
     from common.messages import Pose
@@ -144,14 +145,19 @@ def top(
 
 @app.command()
 def doctor(
-    seconds: Annotated[float, typer.Option(min=0.5, help="How long to listen.")] = 3.0,
+    seconds: Annotated[float, typer.Option(min=0.5, help="How long to listen; frozen services show from 2.5 s.")] = 3.0,
     robot: RobotName = "robot",
     connect: Connect = DEFAULT_ENDPOINT,
+    world: WorldName = "corridor",
+    recordings: Annotated[Path, typer.Option(help="Folder that recordings go to.")] = Path("recordings"),
+    json_file: Json = None,
 ) -> None:
-    """Find what is wrong with the installation or the running session.
+    """Find what is wrong with the installation, this machine, or the running session; status 1 where something is.
 
-    Example: `presage doctor`.
+    Examples: `presage doctor`; `presage doctor --seconds 10 --json findings.json`; `presage doctor --world my.yaml`;
+    `presage doctor --connect tcp/192.168.0.10:7447 --robot two`.
     """
     from presage.doctor import examine  # noqa: PLC0415
 
-    raise typer.Exit(examine(link_of(connect, robot), seconds, console))
+    link = link_of(connect, robot)
+    raise typer.Exit(examine(link, seconds, console, world=world, recordings=recordings, json_file=json_file))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import signal
@@ -11,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from types import FrameType, TracebackType
 
@@ -132,8 +133,8 @@ class Stack:
         deadline = time.monotonic() + timeout
         while True:
             for line in self.processes[name].lines:
-                if line.startswith(beginning):
-                    return line.removeprefix(beginning)
+                if (text := _text_of(line)).startswith(beginning):
+                    return text.removeprefix(beginning)
             self.check()
             if time.monotonic() > deadline:
                 raise UserError(f"{name} did not say {beginning!r} within {timeout:g} s; its lines are above")
@@ -182,7 +183,11 @@ class Stack:
         for line in process.child.stdout:
             process.lines = [*process.lines[-20:], line.rstrip()]
             self.heard(process.name, line.rstrip())
-            if not self.quiet and process.name != "observer":
+            if self.quiet or process.name == "observer":
+                continue
+            if line.startswith("{"):  # a log line as JSON says itself whose it is
+                print(line.rstrip(), file=sys.stderr)
+            else:
                 print(
                     f"{colour}{process.name:>10} |{chr(27) + '[0m' if colour else ''} {line.rstrip()}", file=sys.stderr
                 )
@@ -205,6 +210,13 @@ class Stack:
     ) -> None:
         with ignoring_interrupts():
             self.close()
+
+
+def _text_of(line: str) -> str:
+    """What a line says, also one of a log in JSON."""
+    with suppress(ValueError, AttributeError):
+        return str(json.loads(line).get("event", line))
+    return line
 
 
 def _end(process: Process) -> int:

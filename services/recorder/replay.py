@@ -18,11 +18,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from common.bus import Bus, Link, open_bus, wait_until
+from common.compatibility import this_service
 from common.errors import UserError
 from common.inbox import Call, Inbox
-from common.requests import ConfigReply, PlayerReply, PlayerRequest, WorldReply
+from common.requests import PlayerReply, PlayerRequest, WorldReply
 from common.topics import CONFIG, PLAYER, SCAN, WORLD, Topic
-from common.versions import versions
 from common.wire import DecodeError
 from services.recorder.player import Player, conflicts, renamed, robots, selected, span
 from services.recorder.reader import Raw, Recording, read_recording
@@ -169,7 +169,7 @@ class Replay:
         if call.query is CONFIG:
             config = {"file": str(self.recording.path), **asdict(self.choice)}
             plain = json.dumps(config, default=sorted)
-            call.reply(ConfigReply(service=NAME, config=plain, versions=versions()).encode())
+            call.reply(this_service(NAME, plain).encode())
             return
         if call.query is WORLD:
             call.reply(self._world().encode())

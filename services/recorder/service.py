@@ -66,6 +66,7 @@ class RecorderService(Service):
             return
         self.recording.write(sample)
         self.counters["written"] += 1
+        self.counters["written_bytes"] += len(sample.payload)
 
     def on_request(self, query: Query, request: Request) -> Reply:
         """Begin, end, or say how it stands."""

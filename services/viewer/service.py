@@ -86,7 +86,11 @@ class ViewerService(Service):
         )  # fmt: skip
         self._web = WebServer(create_app(self.desk, options.token, self.hub.run_in), listener)
         self._web.start()
-        print(f"page: {link(options, listener)}", flush=True)
+        where = f"page: {link(options, listener)}"
+        if options.log_json:
+            self.log.info(where)
+        else:
+            print(where, flush=True)
         if not options.on_loopback and not options.token:
             self.log.warning("whoever reaches this machine sees the page", advice="PRESAGE_VIEWER_TOKEN asks for one")
 

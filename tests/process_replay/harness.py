@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -49,6 +50,12 @@ class FakeBus:
     ) -> None:
         reply = self.replies.get((query.server, query.name))
         inbox.put(Answer(query, number, reply.encode() if reply else b"", "" if reply else "nobody answers"))
+
+    def ask_each(self, *args: Any, **rest: Any) -> threading.Event:
+        """Nobody answers, at once."""
+        done = threading.Event()
+        done.set()
+        return done
 
     def linked(self) -> bool:
         return True

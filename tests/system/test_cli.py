@@ -49,6 +49,7 @@ WRONG = [
     (("plot", "{tmp}/foreign.mcap"), "foreign.mcap"),
     (("train", "--preset", "better"), "no preset 'better'"),
     (("train", "--scanner", "sonar", "--out", "{tmp}/m"), "no scanner 'sonar': choose one of tim571"),
+    (("doctor", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
     (("record", "--topics", "smell", "--out", "{tmp}/r"), "smell"),
 ]
 

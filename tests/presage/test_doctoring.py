@@ -1,0 +1,99 @@
+"""What the doctor makes of what it saw: nothing where all is well, a fault just past each limit."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+
+from common.compatibility import this_service
+from common.messages import Health, TopicHealth
+from common.topics import CMD_VEL, SCAN, TOPICS
+from presage.doctoring.judging import CLOCKS, SILENT, judge
+from presage.doctoring.listening import Observed, reach
+from services.recorder.accounting import Sequence
+
+SECOND = 1_000_000_000
+NAMES = ("simulator", "estimator", "controller")
+
+
+def pulse(service: str, at: int, *, late: float = 0.001, note: str = "", counters=None, **row) -> tuple[int, Health]:
+    rows = [TopicHealth(key=SCAN.key("robot"), **row)]
+    health = Health(stamp_ns=at, service=service, uptime=9, topics=rows, note=note, counters=counters or {})
+    return at + int(late * 1e9), health
+
+
+def well() -> Observed:
+    seen = Observed("robot", 3.0, alive={*NAMES}, robots={"robot"})
+    seen.arrivals = Counter({t.key("robot"): int(t.rate * 3) for t in TOPICS if t.rate and not t.per_service})
+    for name in NAMES:
+        seen.replies[name] = [this_service(name, "{}", 5.0)]
+        seen.pulses[name] = [pulse(name, n * SECOND, received=100 + 15 * n) for n in (1, 2, 3)]
+    numbers = seen.sequences[SCAN.key("robot")] = Sequence()
+    for number in (7, 8, 9, 0, 1, 2):  # it began anew
+        numbers.see(number)
+    return seen
+
+
+def faults(seen: Observed) -> set[str]:
+    return {finding.code for finding in judge(seen, this_service("doctor", "{}")) if finding.ok is False}
+
+
+def test_where_all_is_well_nothing_is_found():
+    assert not faults(well())
+
+
+@pytest.mark.parametrize(("late", "wrong"), [(CLOCKS * 0.9, False), (CLOCKS * 1.1, True), (-CLOCKS * 1.1, True)])
+def test_clocks_may_differ_so_much(late, wrong):
+    seen = well()
+    seen.pulses["estimator"] = [pulse("estimator", n * SECOND, late=late + slow) for n, slow in ((1, 9.0), (2, 0.0))]
+    assert faults(seen) == ({"clocks"} if wrong else set())
+
+
+def test_a_short_look_finds_nobody_frozen():
+    seen = well()
+    del seen.pulses["controller"]
+    assert faults(seen) == {"frozen"}
+    seen.seconds = SILENT - 0.1
+    assert "frozen" not in faults(seen)
+
+
+def test_few_drops_are_worth_knowing_many_are_a_fault_a_viewer_s_are_none():
+    for dropped, wrong in ((1, False), (9, True)):
+        seen = well()
+        rows = [pulse("estimator", n * SECOND, received=30 * n, dropped=dropped * n) for n in (1, 2)]
+        seen.pulses["estimator"] = rows
+        assert faults(seen) == ({"dropped_rising"} if wrong else set())
+    viewer = well()
+    viewer.pulses["viewer"] = [pulse("viewer", n * SECOND, received=30 * n, dropped=9 * n) for n in (1, 2)]
+    assert not faults(viewer)
+
+
+def test_counts_of_long_ago_do_not_rise():
+    seen = well()
+    seen.pulses["estimator"] = [pulse("estimator", n * SECOND, undecodable=50, counters={"failed": 3}) for n in (1, 2)]
+    assert not faults(seen)
+
+
+def test_twice_as_many_commands_are_two_drivers_and_few_are_too_few():
+    for factor in (0.5, 2.0):
+        seen = well()
+        seen.arrivals[CMD_VEL.key("robot")] = int(45 * factor)
+        assert faults(seen) == {"rate"}
+
+
+def test_a_replay_stands_for_the_others():
+    seen = well()
+    seen.alive, seen.pulses = {"replay"}, {}
+    assert not faults(seen)
+
+
+def test_another_robot_s_name_is_said():
+    seen = Observed("robot", 3.0, robots={"two"})
+    found = [finding for finding in judge(seen, this_service("doctor", "{}")) if finding.code == "no_such_robot"]
+    assert "two" in found[0].what
+
+
+@pytest.mark.parametrize("endpoint", ["udp/127.0.0.1:1", "serial//dev/ttyS0"])
+def test_what_is_no_tcp_port_is_left_to_zenoh(endpoint):
+    assert reach(endpoint) is None

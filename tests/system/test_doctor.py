@@ -1,0 +1,181 @@
+"""`presage doctor` finds each fault, produced for real: other processes, sessions that misbehave, a small full disk."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from common.bus import open_bus, wait_until
+from common.compatibility import this_service
+from common.inbox import Call, Inbox
+from common.messages import Health, Scan, TopicHealth
+from common.topics import CONFIG, HEALTH, ODOM, SCAN
+from common.versions import PROTOCOL
+from tests.conftest import PATIENCE, ROOT
+
+
+class Participant:
+    """A service of a session of its own: answers what it is, pulses four times a second, all as a test wishes."""
+
+    def __init__(self, link, name: str, *, said=None, ahead_s=0.0, scans=False, frozen=False) -> None:
+        self.link, self.name, self.ahead_s, self.scans, self.frozen = link, name, ahead_s, scans, frozen
+        self.said = {"uptime": 9.0, **(said or {})}
+        self.ready, self.stopping = threading.Event(), threading.Event()
+        self.thread = threading.Thread(target=self.run, daemon=True)
+        self.thread.start()
+
+    def run(self) -> None:
+        with open_bus(self.link) as bus:
+            wait_until(bus.linked, PATIENCE)
+            calls, number = Inbox(), 0
+            bus.serve(CONFIG, calls, self.name)
+            bus.declare_alive(self.name)
+            self.ready.set()
+            while not self.stopping.wait(0.25 if self.frozen else 0.0):
+                if self.frozen:
+                    continue
+                if isinstance(call := calls.get(0.25), Call):
+                    call.reply(this_service(self.name, "{}").model_copy(update=self.said).encode())
+                number += 1
+                bus.put(HEALTH, self.health(number).encode(), self.name)
+                if self.scans:
+                    ranges = np.ones(3)
+                    scan = Scan(
+                        stamp_ns=number, seq=number, angle_min=0, angle_increment=0.1, range_min=0, range_max=9,
+                        ranges=ranges,
+                    )  # fmt: skip
+                    bus.put(SCAN, scan.encode())
+                    bus.put(ODOM, b"\xc1")
+
+    def health(self, number: int) -> Health:
+        row = TopicHealth(key=SCAN.key(self.link.robot), received=9 * number, dropped=5 * number, undecodable=number)
+        return Health(
+            stamp_ns=time.time_ns() + int(self.ahead_s * 1e9), service=self.name, uptime=9.0, topics=[row],
+            counters={"failed": number, "unfit_scans": number}, note="no weights of this world",
+        )  # fmt: skip
+
+    def stop(self) -> None:
+        self.stopping.set()
+        self.thread.join(PATIENCE)
+
+
+def doctor(process, folder: Path, *args: str):
+    return process("presage.__main__", "doctor", "--json", str(folder / "found.json"), *args)
+
+
+def read(folder: Path) -> list[dict]:
+    return json.loads((folder / "found.json").read_text())["findings"]
+
+
+def fault(found: list[dict], code: str, words: str) -> dict:
+    fits = [f for f in found if f["code"] == code and f["ok"] is False and words in f["what"]]
+    assert fits, (code, [f["what"] for f in found if f["ok"] is False])
+    assert fits[0]["where"]
+    return fits[0]
+
+
+@pytest.fixture
+def sick(link):
+    """An estimator that runs twice, of other versions, its clock wrong; a scanner that runs twice."""
+    made = [
+        Participant(link, "estimator", said={"protocol": PROTOCOL + 1, "host": "far"}, ahead_s=60.0),
+        Participant(link, "estimator", said={"versions": {"presage": "9.9"}, "host": "near"}, ahead_s=60.0),
+        Participant(link, "simulator", scans=True),
+        Participant(link, "simulator", scans=True),
+        Participant(link, "viewer", frozen=True),
+    ]
+    for each in made:
+        assert each.ready.wait(PATIENCE)
+    yield made
+    for each in made:
+        each.stop()
+
+
+def test_a_sick_session(process, bus, sick, tmp_path):
+    assert wait_until(lambda: {"viewer", "estimator", "simulator"} <= bus.alive(), PATIENCE)
+    running = doctor(process, tmp_path, "--seconds", "4")
+    assert running.wait(90) == 1, running.output
+    found = read(tmp_path)
+    assert "far for 9 s" in fault(found, "doubled", "estimator of")["what"]
+    assert "stop" in fault(found, "doubled", "simulator of")["advice"]
+    assert "scan" in fault(found, "two_publishers", "back and forth")["where"]
+    assert fault(found, "protocol", f"protocol {PROTOCOL + 1}")["where"] == "estimator on far"
+    assert fault(found, "versions", "presage")["where"] == "estimator on near"
+    assert "ahead of" in fault(found, "clocks", "estimator on far, near: its clock is 60.0 s")["what"]
+    assert fault(found, "frozen", "no pulse came")["where"] == "viewer"
+    assert "python -m services.controller" in fault(found, "missing", "controller")["advice"]
+    fault(found, "rate", "scan: ")
+    fault(found, "rate", "cmd_vel: 0.0 of 15 Hz")
+    assert fault(found, "undecodable", "odom")["where"] == ODOM.key(bus.robot)
+    fault(found, "undecodable_rising", "estimator: ")
+    fault(found, "dropped_rising", "estimator: ")
+    fault(found, "failed", "simulator: ")
+    fault(found, "weights", "estimator says: no weights of this world")
+    assert "Traceback" not in running.output
+    assert "install the same version of presage" in " ".join(running.output.split())
+
+
+def test_a_stopped_process_is_told_from_one_that_is_not_there(process, bus, tmp_path):
+    controller = process("controller")
+    assert wait_until(lambda: "controller" in bus.alive(), PATIENCE), controller.output
+    controller.send(signal.SIGSTOP)
+    running = doctor(process, tmp_path)
+    assert running.wait(90) == 1, running.output
+    found = read(tmp_path)
+    frozen = [f for f in found if f["code"] == "frozen" and f["ok"] is False]
+    assert frozen, running.output
+    assert any(str(controller.child.pid) in f["what"] or f["where"].startswith("controller") for f in frozen)
+
+
+def test_no_session_says_why(processes, free_port, tmp_path):
+    with socket.socket() as silent, socket.socket() as full, socket.socket() as first, socket.socket() as second:
+        for listener, backlog in ((silent, 5), (full, 0)):
+            listener.bind(("127.0.0.1", 0))
+            listener.listen(backlog)
+        for filler in (first, second):  # a full queue drops what comes next, as a firewall does
+            filler.setblocking(False)
+            filler.connect_ex(full.getsockname())
+        ports = [silent.getsockname()[1], full.getsockname()[1], free_port()]
+        started = []
+        for number, port in enumerate(ports):
+            folder = tmp_path / str(number)
+            folder.mkdir()
+            started.append(doctor(processes.start, folder, "--connect", f"tcp/127.0.0.1:{port}"))
+        for running in started:
+            assert running.wait(120) == 1, running.output
+    said = [read(tmp_path / str(number)) for number in range(3)]
+    assert "TLS" in fault(said[0], "no_router", "something listens there")["advice"]
+    assert "firewall" in fault(said[1], "blocked", "no answer")["advice"]
+    assert "presage up" in fault(said[2], "no_router", "nothing listens there")["advice"]
+
+
+def test_a_full_disk_that_cannot_be_written_to_and_a_world_nobody_learned(tmp_path, free_port):
+    if shutil.which("unshare") is None or subprocess.run(["unshare", "-m", "true"], capture_output=True).returncode:
+        pytest.skip("needs `unshare -m` (root): a small disk is mounted for this test alone")
+    disk, world = tmp_path / "disk", tmp_path / "shed.yaml"
+    disk.mkdir()
+    world.write_text("name: shed\nboundary: [[0, 0], [4, 0], [4, 3], [0, 3]]\nstart: {x: 2, y: 1, yaw_deg: 0}\n")
+    ask = (
+        f"mount -t tmpfs -o size=1m,ro tmpfs {disk} && exec {sys.executable} -m presage doctor --seconds 1 "
+        f"--recordings {disk} --world {world} --json {tmp_path}/found.json --connect tcp/127.0.0.1:{free_port()}"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        ["unshare", "-m", "sh", "-c", ask], env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 1, done.stderr
+    found = read(tmp_path)
+    assert "Read-only file system" in fault(found, "not_writable", "recordings cannot be written to")["what"]
+    assert fault(found, "disk", "MB free")["where"] == str(disk)
+    assert f"presage train --world {world}" in fault(found, "weights", "no field of world 'shed'")["advice"]
