@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from common.log import Logger, OncePerSecond
+from common.topics import QUERIES, TOPICS
 
 # Level error, as everywhere, and those lines that tell of refusals.
 LOG_FILTER = (
@@ -38,6 +39,7 @@ HANDSHAKES = (  # of zenoh's and rustls' words
     ("invalid peer certificate", "certificate of another authority, or expired"),
     ("InvalidContentType", "no TLS"),
 )
+NAMES = frozenset(topic.name for topic in TOPICS) | frozenset(query.name for query in QUERIES)
 MOST_NAMES = 1000  # a stranger who comes again and again must not fill memory
 
 
@@ -97,7 +99,7 @@ class Reader:
 
 
 class Refusals:
-    """Counts, and a line a second at most of each kind and name."""
+    """Counts, and a line a second at most of each kind, name and topic."""
 
     def __init__(self, log: Logger) -> None:
         """Nothing yet."""
@@ -111,7 +113,10 @@ class Refusals:
             self._log.warning("zenoh", said=found)
         elif found is not None:
             self.counts[found.why] += 1
-            if self._may_log(f"{found.why} {found.who}"):
+            topic = next(
+                (name for name in found.key.split("/")[2:3] if name in NAMES), ""
+            )  # keys are anybody's to invent
+            if self._may_log(f"{found.why} {found.who} {topic}"):
                 named = {name: value for name, value in (("who", found.who), ("key", found.key)) if value}
                 self._log.warning("refused", why=found.why, **named, so_far=self.counts[found.why])
 
