@@ -65,6 +65,9 @@ class ServiceSettings(BaseSettings):
         str, Field(pattern="^(debug|info|warning|error)$", description="debug, info, warning, error")
     ] = "info"
     log_json: Annotated[bool, Field(description="log lines as JSON")] = False
+    heartbeat: Annotated[
+        Path | None, Field(description="folder for a file that says each second how it stands; none: no file")
+    ] = None
     config: Annotated[Path | None, Field(description="YAML file of settings, with a section for each service")] = None
     print_config: Annotated[bool, Field(description="print the effective settings as YAML and end")] = False
 
@@ -73,8 +76,8 @@ class ServiceSettings(BaseSettings):
         return Link(self.robot, split_endpoints(self.connect), split_endpoints(self.listen), multicast=self.multicast)
 
     def effective(self) -> dict[str, Any]:
-        """Every setting as it holds, plain types."""
-        return self.model_dump(mode="json", exclude={"config", "print_config"})
+        """Every setting as it holds, plain types; not what belongs to this machine alone."""
+        return self.model_dump(mode="json", exclude={"config", "print_config", "heartbeat"})
 
     @classmethod
     def settings_customise_sources(
