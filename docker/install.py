@@ -22,7 +22,7 @@ HERE = Path(__file__).resolve().parent
 # Robots to play with, headers, programs of torch's own tests: half of what the two largest packages weigh.
 UNUSED = (
     "pybullet_data", "pybullet_envs", "pybullet_examples", "pybullet_robots", "pybullet_utils", "eglRenderer*.so",
-    "torch/bin", "torch/include", "torch/test", "torch/share",
+    "torch/bin/test_*", "torch/bin/*Test", "torch/bin/protoc*", "torch/include", "torch/test", "torch/share",
 )  # fmt: skip
 
 
