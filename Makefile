@@ -77,13 +77,13 @@ bench: install ## latency from scan to command beside the raw zenoh round trip
 screenshots: install ## docs/page.png and docs/page.webp of the live page; needs Chromium
 	$(BIN)/python -m tests.viewer.screenshots $(ARGS)
 
-images: ## build every container image, and say what each weighs beside its base; needs a Docker engine
+images: ## build every container image, and say what each adds to its base, python:3.11-slim
 	docker compose build $(if $(WHEEL_INDEX),--build-arg WHEEL_INDEX='$(WHEEL_INDEX)')
 	for scanner in replay none; do PRESAGE_SCANNER=$$scanner docker compose build simulator || exit 1; done
 	@base=$$(docker image inspect --format '{{.Size}}' python:3.11-slim); \
 	for name in router none recorder replay controller simulator viewer cli estimator; do \
 	  size=$$(docker image inspect --format '{{.Size}}' presage-$$name) || exit 1; \
-	  echo "presage-$$name: $$(( ($$size - $$base) / 1000000 )) MB on top of the base's $$(( $$base / 1000000 )) MB"; \
+	  echo "presage-$$name: $$(( ($$size - $$base) / 1000000 )) MB"; \
 	done
 
 clean: ## remove .venv and what tools leave behind; recordings stay

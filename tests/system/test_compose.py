@@ -10,7 +10,7 @@ import pytest
 
 from common.bus import Link, open_bus, wait_until
 from common.messages import Belief, Scan, Truth
-from common.topics import BELIEF, SCAN, STATUS, TRUTH
+from common.topics import BELIEF, CMD_VEL, SCAN, STATUS, TRUTH
 from presage.watch import Watch
 from services.recorder.reader import read_recording
 from tests.conftest import free_tcp_port
@@ -97,13 +97,13 @@ def gaps(messages):
 
 
 def the_pause(recording):
-    """Stamps, s, of the last belief of the first estimator and the first belief of the second."""
-    beliefs = [message for _, message, _ in recording.messages(BELIEF)]
-    first = [each for each in beliefs if each.estimator == beliefs[0].estimator]
-    second = [each for each in beliefs if each.estimator != beliefs[0].estimator]
-    assert {each.estimator for each in second} == {"particle-filter"}
-    assert first[-1].stamp_ns < second[0].stamp_ns  # never two at once
-    return first[-1].stamp_ns * 1e-9, second[0].stamp_ns * 1e-9
+    """The last belief of the first estimator and the first of the second: message and payload as recorded."""
+    beliefs = [(message, raw) for _, message, raw in recording.messages(BELIEF)]
+    first = [each for each in beliefs if each[0].estimator == beliefs[0][0].estimator]
+    second = [each for each in beliefs if each[0].estimator != beliefs[0][0].estimator]
+    assert {message.estimator for message, _ in second} == {"particle-filter"}
+    assert first[-1][0].stamp_ns < second[0][0].stamp_ns  # never two at once
+    return first[-1], second[0]
 
 
 def test_services_are_exchanged_while_the_others_go_on(compose):
@@ -140,7 +140,12 @@ def test_services_are_exchanged_while_the_others_go_on(compose):
     recording = read_recording(file)
     scans = [message for _, message, _ in recording.messages(SCAN)]
     assert gaps(scans) == []
-    before, after = the_pause(recording)
+    (last, last_raw), (first, first_raw) = the_pause(recording)
+    before, after = last.stamp_ns * 1e-9, first.stamp_ns * 1e-9
+    moving = [raw.logged_ns for _, command, raw in recording.messages(CMD_VEL) if np.any(command.twist.array())]
+    assert moving[0] < last_raw.logged_ns
+    assert not [at for at in moving if last_raw.logged_ns + 0.7e9 < at < first_raw.logged_ns]
+    assert moving[-1] > first_raw.logged_ns
     truths = [message for _, message, _ in recording.messages(TRUTH)]
     assert gaps(truths) == []
     stands = [each for each in truths if before + 1.5 < each.stamp_ns * 1e-9 <= after]
