@@ -1,33 +1,102 @@
-# One image for all services: they share all but two packages, and one build is one thing to trust.
-FROM python:3.11-slim
-
+# An image a service, each with the packages that are its own: `docker compose build` makes those compose uses,
+# `make images` all of them, and says what they weigh.
+FROM python:3.11-slim AS base
 # Where else pip may look, such as PyTorch's index of small CPU builds; empty: the default index alone.
 ARG WHEEL_INDEX=""
-
-ENV PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
-WORKDIR /app
-
+ENV PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore
+WORKDIR /install
+COPY docker/install.py pyproject.toml constraints.txt ./
 # Packages first: a change of code does not fetch them again.
-COPY pyproject.toml constraints.txt README.md ./
-RUN mkdir common services presage worlds models \
- && touch common/__init__.py services/__init__.py presage/__init__.py worlds/.keep models/.keep \
- && pip install ${WHEEL_INDEX:+--extra-index-url "$WHEEL_INDEX"} -c constraints.txt '.[all]' \
- && pip uninstall --yes presage
+RUN python install.py
+# What follows needs no writable place but /tmp: the root file system may be read-only.
+RUN useradd --uid 1000 --no-create-home presage && mkdir -m 1777 /recordings && chown presage /recordings
+ENV PYTHONPATH=/app PATH=/app/bin:$PATH HOME=/tmp MPLCONFIGDIR=/tmp PRESAGE_HEARTBEAT=/tmp
 
+# The program, compiled: on a read-only file system nothing can be compiled later.
+FROM base AS program
+COPY pyproject.toml README.md ./
 COPY common common
 COPY services services
 COPY presage presage
 COPY worlds worlds
 COPY models models
-ENV NUMBA_CACHE_DIR=/var/cache/numba
-# The compiled loops are kept in the image; on another processor they are compiled again.
-RUN pip install --no-deps . && rm -rf /app/* \
- && useradd --create-home presage && mkdir /recordings && chown presage /recordings \
- && mkdir -m 1777 $NUMBA_CACHE_DIR && cd / \
- && python -c 'from services.estimator.building import *; [prepare(Choice(model=m)) for m in ("learned", "exact")]' \
- && chmod -R a+rwX $NUMBA_CACHE_DIR
+RUN pip install --no-cache-dir --no-deps --target /app .
 
+FROM base AS router
+COPY --from=program /app /app
+WORKDIR /tmp
 USER presage
-WORKDIR /home/presage
-ENV MPLCONFIGDIR=/tmp
+HEALTHCHECK --interval=10s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "router"]
+CMD ["python", "-m", "common.router", "--listen", "tcp/0.0.0.0:7447"]
+
+# Where the robot is elsewhere: waits for its scans.
+FROM router AS none
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "remote"]
+CMD ["python", "-m", "common.fleet", "each", "common.remote"]
+
+FROM base AS recorder-packages
+RUN python install.py recorder
+
+FROM recorder-packages AS recorder
+COPY --from=program /app /app
+WORKDIR /tmp
+USER presage
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "recorder"]
+CMD ["python", "-m", "common.fleet", "each", "services.recorder", "--directory", "/recordings"]
+
+# A recording in the scanner's place.
+FROM recorder AS replay
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "replay"]
+CMD ["python", "-m", "common.fleet", "each", "services.recorder.playing", "--directory", "/recordings"]
+
+FROM recorder-packages AS terminal-packages
+RUN python install.py terminal
+
+# A recording that a visitor opens is played by the command line.
+FROM terminal-packages AS viewer
+RUN python install.py viewer
+COPY --from=program /app /app
+WORKDIR /tmp
+USER presage
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "viewer"]
+CMD ["python", "-m", "common.fleet", "together", "services.viewer", "--host", "0.0.0.0", "--port", "8080", \
+     "--allow-control", "--recordings", "/recordings"]
+
+FROM terminal-packages AS cli
+RUN python install.py cli
+COPY --from=program /app /app
+WORKDIR /tmp
+USER presage
 CMD ["presage", "--help"]
+
+FROM base AS controller-packages
+RUN python install.py controller
+
+FROM controller-packages AS controller
+COPY --from=program /app /app
+WORKDIR /tmp
+USER presage
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "controller"]
+CMD ["python", "-m", "common.fleet", "each", "services.controller"]
+
+FROM controller-packages AS simulator
+RUN python install.py simulator
+COPY --from=program /app /app
+WORKDIR /tmp
+USER presage
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "simulator"]
+CMD ["python", "-m", "common.fleet", "each", "services.simulator"]
+
+FROM base AS estimator
+ARG WHEEL_INDEX=""
+RUN python install.py estimator
+COPY --from=program /app /app
+# The compiled loops are kept in the image; on another processor they are compiled again. Numba insists on a folder it
+# can write to: each container takes a copy.
+RUN NUMBA_CACHE_DIR=/numba python -c \
+    'from services.estimator.building import *; [prepare(Choice(model=m)) for m in ("learned", "exact")]'
+ENV NUMBA_CACHE_DIR=/tmp/numba
+WORKDIR /tmp
+USER presage
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "estimator"]
+CMD ["sh", "-c", "cp -r /numba /tmp && exec python -m common.fleet each services.estimator"]

@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
 
-.PHONY: help install demo test bless check bench screenshots clean FORCE
+.PHONY: help install demo test bless check bench screenshots images clean FORCE
 .DELETE_ON_ERROR:
 
 help: ## this list
@@ -76,6 +76,15 @@ bench: install ## latency from scan to command beside the raw zenoh round trip
 
 screenshots: install ## docs/page.png and docs/page.webp of the live page; needs Chromium
 	$(BIN)/python -m tests.viewer.screenshots $(ARGS)
+
+images: ## build every container image, and say what each adds to its base, python:3.11-slim
+	docker compose build $(if $(WHEEL_INDEX),--build-arg WHEEL_INDEX='$(WHEEL_INDEX)')
+	for scanner in replay none; do PRESAGE_SCANNER=$$scanner docker compose build simulator || exit 1; done
+	@base=$$(docker image inspect --format '{{.Size}}' python:3.11-slim); \
+	for name in router none recorder replay controller simulator viewer cli estimator; do \
+	  size=$$(docker image inspect --format '{{.Size}}' presage-$$name) || exit 1; \
+	  echo "presage-$$name: $$(( ($$size - $$base) / 1000000 )) MB"; \
+	done
 
 clean: ## remove .venv and what tools leave behind; recordings stay
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist

@@ -79,6 +79,9 @@ class ServiceSettings(BaseSettings):
         str,
         Field(pattern=METRICS_TEXT, description="PORT or HOST:PORT for Prometheus, 0: any free port; empty: none"),
     ] = ""
+    heartbeat: Annotated[
+        Path | None, Field(description="folder for a file that says each second how it stands; none: no file")
+    ] = None
     config: Annotated[Path | None, Field(description="YAML file of settings, with a section for each service")] = None
     print_config: Annotated[bool, Field(description="print the effective settings as YAML and end")] = False
 
@@ -94,8 +97,8 @@ class ServiceSettings(BaseSettings):
         return credentials(self.security, (self.role or self.service,), self.robot) if self.security else None
 
     def effective(self) -> dict[str, Any]:
-        """Every setting as it holds, plain types."""
-        return self.model_dump(mode="json", exclude={"config", "print_config"})
+        """Every setting as it holds, plain types; not what belongs to this machine alone."""
+        return self.model_dump(mode="json", exclude={"config", "print_config", "heartbeat"})
 
     @classmethod
     def settings_customise_sources(

@@ -16,6 +16,7 @@ from common.bus import Bus, open_bus, wait_until
 from common.compatibility import Compatibility, this_service
 from common.config import ServiceSettings, load_settings
 from common.errors import UserError
+from common.heartbeat import Heartbeat
 from common.inbox import Answer, Call, Inbox, Sample
 from common.instances import Instances, OneSource, spoken
 from common.log import Logger, OncePerSecond, begin_logging, logger, say_failure, set_up_logging
@@ -121,6 +122,7 @@ class Loop:
         self.failed = 0
         self._asked = 0
         self._may_log = OncePerSecond()
+        self._heart = Heartbeat(service.settings.heartbeat, service.name, bus.robot)
         self._stopping = False
         self.began = self._health_at = self._counted_at = time.monotonic()
         self._before: Counter[str] = Counter()
@@ -249,7 +251,10 @@ class Loop:
         if (now := time.monotonic()) >= self._health_at:
             late = now - self._health_at > HEALTH_PERIOD  # after a long step one pulse, not all that were missed
             self._health_at = (now if late else self._health_at) + HEALTH_PERIOD
-            self.publish(HEALTH, self._health(now))
+            health = self._health(now)
+            self.publish(HEALTH, health)
+            counts = {row.key: row.model_dump(include={"received", "published", "written"}) for row in health.topics}
+            self._heart.beat(counts, linked=self.bus.linked(), note=health.note)
             self._others.look(self._config)
 
     def _counts(self, sample: Sample) -> bool:

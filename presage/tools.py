@@ -52,13 +52,14 @@ def give_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
 
 
 BLOCKED_FOR = 30.0  # s of stamps; who stands in the way goes on sooner, and the robot with them
+QUIET, EXCHANGED_IN = 3.0, 30.0  # s without a status until that is said, and until it is over
 NEARER = 0.3  # m; what is less is no progress
 
 
 def _follow(watch: Watch, goal: Goal, console: Console) -> int:
     least, blocked_ns, before_ns = np.inf, 0, None  # m to go at least; how long it has been blocked since
     with console.status("navigating") as line:
-        while (status := watch.until(Status, lambda _: True, 3.0)) is not None:
+        while (status := _heard(watch, console)) is not None:
             if status.goal_seq != goal.seq:
                 raise UserError("another goal took its place" if status.goal else "the goal was cancelled")
             away = f"{status.distance:.2f} m to go" if status.distance is not None else ""
@@ -71,7 +72,15 @@ def _follow(watch: Watch, goal: Goal, console: Console) -> int:
             if status.state == "reached" or status.refused or blocked_ns > BLOCKED_FOR * 1e9:
                 console.print(f"{status.state}: {status.reason}")
                 return 0 if status.state == "reached" else 1
-    raise UserError("the controller fell silent")
+    raise UserError(f"the controller fell silent for {EXCHANGED_IN:g} s")
+
+
+def _heard(watch: Watch, console: Console) -> Status | None:
+    """The next status, though a service is exchanged meanwhile: without beliefs the controller says nothing."""
+    if (status := watch.until(Status, lambda _: True, QUIET)) is None:
+        console.print(f"the controller says nothing; the goal waits for it, {EXCHANGED_IN:g} s at most")
+        status = watch.until(Status, lambda _: True, EXCHANGED_IN - QUIET)
+    return status
 
 
 def teleport(link: Link, pose: Pose, console: Console) -> None:

@@ -52,9 +52,10 @@ class Choice:
 class Remote:
     """For who steers from this process: a keyboard's thread, a test."""
 
-    def __init__(self, player: Player, inbox: Inbox) -> None:
-        """Requests wait in the inbox as those of the bus do."""
+    def __init__(self, player: Player, inbox: Inbox, counts: Counter[str]) -> None:
+        """Requests wait in the inbox as those of the bus do; ``counts`` is what was sent so far, by key."""
         self._player, self._inbox = player, inbox
+        self.counts = counts
         self.quitting = False
 
     def send(self, request: PlayerRequest) -> None:
@@ -88,8 +89,8 @@ class Replay:
         begin, end = span(duration, choice.start, choice.end)
         self.inbox = Inbox()
         self.player = Player(begin, end, choice.rate, loop=choice.loop)
-        self.remote = Remote(self.player, self.inbox)
         self.counts: Counter[str] = Counter()  # by key as published
+        self.remote = Remote(self.player, self.inbox, self.counts)
         self._stepwise = SCAN if SCAN in self.topics.values() else None
 
     def announce(self) -> None:

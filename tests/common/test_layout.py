@@ -22,7 +22,8 @@ ALSO_SHELL = {
     "services/estimator/model_card.py",  # reads the files a recording is to hold
     "services/viewer/web.py", "services/viewer/session.py", "services/viewer/desk.py",  # a web server
     "services/viewer/visitors.py", "services/viewer/control.py", "services/viewer/playback.py",
-    "services/recorder/reader.py", "services/recorder/replay.py", "services/recorder/writer.py",
+    "services/recorder/reader.py", "services/recorder/replay.py", "services/recorder/playing.py",
+    "services/recorder/writer.py",
     "services/recorder/parts.py", "services/recorder/recording.py", "services/recorder/recover.py",
     "services/recorder/describing.py",  # a thread that asks
     "services/simulator/physics.py",  # pybullet reads the robot's URDF from a file

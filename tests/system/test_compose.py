@@ -1,61 +1,197 @@
-"""`docker compose up` with a real engine: ends in a robot that has reached its goal, and a recording."""
+"""`docker compose` with a real engine: what images hold, the goal reached, services exchanged while others go on."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import uuid
-from pathlib import Path
+from itertools import pairwise
 
+import numpy as np
 import pytest
 
+from common.bus import Link, open_bus, wait_until
+from common.messages import Belief, Scan, Truth
+from common.topics import BELIEF, CMD_VEL, SCAN, STATUS, TRUTH
+from presage.watch import Watch
 from services.recorder.reader import read_recording
+from tests.conftest import free_tcp_port
+from tests.system.compose import PATIENCE, SERVICES, Compose, docker, engine, say_that_nothing_was_tested
 
-ROOT = Path(__file__).resolve().parents[2]
-
-
-def engine() -> bool:
-    try:
-        return all(
-            subprocess.run(["docker", *args], capture_output=True, timeout=30).returncode == 0
-            for args in (["info"], ["compose", "version"])
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return False
+pytestmark = [pytest.mark.docker, pytest.mark.timeout(1500)]
+HEAVY = ("pybullet", "torch", "numba", "scipy", "mcap", "starlette", "typer", "matplotlib")
+HOLDS = {
+    "router": set(), "none": set(), "recorder": {"mcap"}, "replay": {"mcap"}, "controller": {"scipy"},
+    "simulator": {"pybullet", "scipy"}, "estimator": {"torch", "numba"}, "viewer": {"mcap", "starlette", "typer"},
+    "cli": {"mcap", "typer", "matplotlib"},
+}  # fmt: skip
 
 
-@pytest.mark.docker
-@pytest.mark.timeout(900)
-def test_compose_up_ends_in_a_robot_at_its_goal(tmp_path, free_port):
+@pytest.fixture(scope="module")
+def image(tmp_path_factory):
+    """The beginning of the names of images built for these tests; removed afterwards."""
     if not engine():
-        print("\n==== NO DOCKER ENGINE HERE: docker compose was NOT tested ====", file=sys.__stderr__)
-        pytest.skip("NO DOCKER ENGINE: docker compose was NOT tested")
-    name = f"presage-test-{uuid.uuid4().hex[:8]}"
-    environment = {
-        **os.environ, "COMPOSE_PROJECT_NAME": name, "PRESAGE_IMAGE": name, "PRESAGE_PORT": str(free_port()),
-        "PRESAGE_PAGE_PORT": str(free_port()),
-        "PRESAGE_RECORDINGS": str(tmp_path / "recordings"), "COMPOSE_PROGRESS": "plain",
-    }  # fmt: skip
-
-    def compose(*args, timeout):
-        command = ["docker", "compose", *args]
-        return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=timeout)
-
+        pytest.skip(say_that_nothing_was_tested())
+    tag = f"presage-test-{uuid.uuid4().hex[:8]}"
+    builder = Compose(tag, tmp_path_factory.mktemp("build"), (0, 0))
     try:
-        built = compose("build", timeout=600)
-        assert built.returncode == 0, built.stdout[-3000:] + built.stderr[-3000:]
-        up = compose("up", "--exit-code-from", "goal", timeout=240)
-        assert up.returncode == 0, up.stdout[-5000:] + up.stderr[-2000:]
-        assert "reached: within 0.2 m of the goal" in up.stdout
-        for service in ("simulator", "estimator", "controller", "recorder", "viewer", "router"):
-            assert f"{service}-1 exited with code 0" in up.stdout + up.stderr
+        builder.do("build", timeout=1200)
+        for scanner in ("replay", "none"):
+            builder.do("build", "simulator", timeout=300, PRESAGE_SCANNER=scanner)
+        yield tag
     finally:
-        compose("down", "--volumes", timeout=60)
-        subprocess.run(["docker", "image", "rm", "--force", name], capture_output=True, timeout=60)
-    (file,) = (tmp_path / "recordings").glob("*.mcap")
+        docker("image", "rm", "--force", *(f"{tag}-{target}" for target in HOLDS))
+
+
+@pytest.fixture
+def compose(image, tmp_path):
+    """Calls make a project; all are taken down afterwards."""
+    made = []
+
+    def make(**settings):
+        made.append(Compose(image, tmp_path / "recordings", (free_tcp_port(), free_tcp_port()), **settings))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.down()
+
+
+LOOK = f"""
+import importlib, importlib.util, os
+found = [name for name in {HEAVY} if importlib.util.find_spec(name)]
+for name in found:
+    importlib.import_module(name)
+print()
+print(f"user{{os.getuid()}}", *found)
+"""
+
+
+@pytest.mark.parametrize("target", HOLDS)
+def test_an_image_holds_what_is_its_own_and_no_more(image, target):
+    how = ("--rm", "--read-only", "--tmpfs", "/tmp", "--network", "none")
+    done = docker("run", *how, f"{image}-{target}", "python", "-c", LOOK)
+    assert done.returncode == 0, done.stderr
+    words = set(done.stdout.split())  # pybullet has more to say
+    assert "user1000" in words
+    assert words & set(HEAVY) == HOLDS[target]
+
+
+def test_up_ends_in_a_robot_at_its_goal(compose):
+    project = compose()
+    up = project("up", "--exit-code-from", "goal", timeout=300)
+    assert up.returncode == 0, up.stdout[-5000:] + up.stderr[-2000:]
+    assert "reached: within 0.2 m of the goal" in up.stdout
+    for service in (*SERVICES, "viewer"):
+        assert f"{service}-1 exited with code 0" in up.stdout + up.stderr
+    project.down()
+    (file,) = project.recordings()
     recording = read_recording(file)
     counts = {key.split("/")[-1]: count for key, count in recording.counts().items()}
     assert counts["scan"] > 100
     assert counts["belief"] > 100
     assert recording.world().name == "corridor"
+
+
+def gaps(messages):
+    """Where the sequence numbers jump."""
+    return [(before.seq, later.seq) for before, later in pairwise(messages) if later.seq != before.seq + 1]
+
+
+def the_pause(recording):
+    """The last belief of the first estimator and the first of the second: message and payload as recorded."""
+    beliefs = [(message, raw) for _, message, raw in recording.messages(BELIEF)]
+    first = [each for each in beliefs if each[0].estimator == beliefs[0][0].estimator]
+    second = [each for each in beliefs if each[0].estimator != beliefs[0][0].estimator]
+    assert {message.estimator for message, _ in second} == {"particle-filter"}
+    assert first[-1][0].stamp_ns < second[0][0].stamp_ns  # never two at once
+    return first[-1], second[0]
+
+
+def test_services_are_exchanged_while_the_others_go_on(compose):
+    project = compose(PRESAGE_VIEWER="0", PRESAGE_MAX_SPEED="0.5")
+    project.do("up", "--detach")
+    assert project.do("ps", "--all", "--quiet", "viewer") == ""
+    with open_bus(Link(connect=(f"tcp/127.0.0.1:{project.router}",))) as bus:
+        watch = Watch(bus, TRUTH, STATUS, BELIEF, SCAN)
+        assert watch.until(Truth, lambda truth: truth.pose.x > 5.0, PATIENCE), project.explain("goal")
+
+        # Another estimator, while it drives: it stands meanwhile, then goes on to its goal.
+        project.do("up", "--detach", "--no-deps", "estimator", PRESAGE_ESTIMATOR="particle-filter")
+        assert project.ends("goal") == 0
+        assert "reached: within 0.2 m of the goal" in project.do("logs", "goal")
+
+        # Another controller: the robot stands, and takes the next goal.
+        project.do("up", "--detach", "--no-deps", "controller", PRESAGE_MAX_SPEED="0.8")
+        project.becomes("controller", "healthy")
+        project.do("run", "--rm", "--no-deps", "goal", "presage", "goal", "13", "1.5", "--wait")
+
+        # What was recorded so far in the simulator's place: the same estimator and controller take it.
+        project.do("stop", "recorder")
+        (file,) = project.recordings()
+        project.do("start", "recorder")
+        replayed = {"PRESAGE_SCANNER": "replay", "PRESAGE_REPLAY": file.name}
+        project.do("up", "--detach", "--no-deps", "simulator", **replayed)
+        project.becomes("simulator", "healthy")
+        again = watch.until(Scan, lambda scan: scan.seq < 100, PATIENCE)
+        assert again is not None
+        assert watch.until(Belief, lambda belief: belief.stamp_ns >= again.stamp_ns, PATIENCE) is not None
+        assert bus.alive() >= {"replay", "estimator", "controller", "recorder"}
+    project.down()
+
+    recording = read_recording(file)
+    scans = [message for _, message, _ in recording.messages(SCAN)]
+    assert gaps(scans) == []
+    (last, last_raw), (first, first_raw) = the_pause(recording)
+    before, after = last.stamp_ns * 1e-9, first.stamp_ns * 1e-9
+    moving = [raw.logged_ns for _, command, raw in recording.messages(CMD_VEL) if np.any(command.twist.array())]
+    assert moving[0] < last_raw.logged_ns
+    assert not [at for at in moving if last_raw.logged_ns + 0.7e9 < at < first_raw.logged_ns]
+    assert moving[-1] > first_raw.logged_ns
+    truths = [message for _, message, _ in recording.messages(TRUTH)]
+    assert gaps(truths) == []
+    stands = [each for each in truths if before + 1.5 < each.stamp_ns * 1e-9 <= after]
+    assert len(stands) > 5
+    assert np.ptp([(each.pose.x, each.pose.y) for each in stands], axis=0).max() < 0.01  # m
+    assert max(each.pose.x for each in truths) > 15.0
+    assert not any(each.contact for each in truths)
+    reasons = [m.reason for _, m, _ in recording.messages(STATUS) if before < m.stamp_ns * 1e-9 + 1 < after + 1]
+    assert any("no belief for" in reason for reason in reasons)
+
+
+def signal_it(project, number):
+    """To the service itself: the engine's init, process 1, passes no such signal on."""
+    find = "for p in /proc/[0-9]*; do [ $p = /proc/1 ] || [ $p = /proc/$$ ] || "
+    find += "! grep -qs services.estimator $p/cmdline || "
+    project.do("exec", "-T", "estimator", "sh", "-c", f"{find} kill -{number} ${{p#/proc/}}; done")
+
+
+def test_a_frozen_service_is_unhealthy_until_it_goes_on(compose):
+    project = compose(PRESAGE_VIEWER="0")
+    project.do("up", "--detach", "router", "simulator", "estimator")
+    for service in ("router", "simulator", "estimator"):
+        project.becomes(service, "healthy")
+    signal_it(project, "STOP")
+    project.becomes("estimator", "unhealthy")
+    said = project.state("estimator")["Health"]["Log"][-1]["Output"]
+    assert "its loop has not turned for" in said
+    assert project.health("simulator") == "healthy"
+    signal_it(project, "CONT")
+    project.becomes("estimator", "healthy")
+
+    # One that is killed comes back by itself.
+    began = project.state("estimator")["StartedAt"]
+    signal_it(project, "KILL")
+    assert wait_until(lambda: project.state("estimator")["StartedAt"] > began, PATIENCE, 0.5)
+    project.becomes("estimator", "healthy")
+
+
+def test_two_robots(compose):
+    project = compose(ROBOTS="2", GOAL_X="6", PRESAGE_VIEWER="0")
+    project.do("up", "--detach")
+    assert project.ends("goal", 2 * PATIENCE) == 0, project.explain("goal")
+    log = project.do("logs", "--no-log-prefix", "goal")
+    for robot in ("robot-1", "robot-2"):
+        assert f"{robot} | reached: within 0.2 m of the goal" in log
+    project.down()
+    assert sorted(file.name.rsplit("-", 1)[0][:15] for file in project.recordings()) == [
+        "presage-robot-1", "presage-robot-2",
+    ]  # fmt: skip

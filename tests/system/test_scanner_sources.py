@@ -1,0 +1,91 @@
+"""What stands in the scanner's place: a recording that is played, or nothing but an ear for a robot elsewhere."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from common.bus import wait_until
+from common.healthy import fault_of
+from common.heartbeat import read_beats
+from common.inbox import Inbox
+from common.messages import Scan
+from common.topics import SCAN, TOPICS, TRUTH
+from services.recorder.writer import RecordingWriter
+from tests.conftest import next_of
+
+SCANS = 4
+PATIENCE = 30.0
+
+
+def scan(number):
+    return Scan(
+        stamp_ns=1_000_000_000 + number * 66_000_000, seq=number, ranges=np.full(5, 2.0, np.float32),
+        angle_min=-1.0, angle_increment=0.5, range_min=0.05, range_max=25.0,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Of another robot; with a command, which must not go out again."""
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    writer = RecordingWriter(folder / "drive.mcap")
+    kinds = {topic.name: topic for topic in TOPICS}
+    for number in range(SCANS):
+        at, message = scan(number).stamp_ns, scan(number)
+        writer.write(kinds["scan"], "presage/other/scan", message.encode(), at, at)
+        writer.write(kinds["belief"], "presage/other/belief", b"x", at, at)
+    writer.finish()
+    return folder
+
+
+def test_a_recording_takes_the_simulator_s_place(bus, process, recording, tmp_path):
+    scans, all_else = Inbox(), Inbox()
+    bus.subscribe(SCAN, scans, keep_all=True)
+    for topic in set(TOPICS) - {SCAN}:
+        bus.subscribe(topic, all_else, keep_all=True)
+    running = process(
+        "services.recorder.playing", "--directory", str(recording), "--replay", "drive.mcap", "--heartbeat",
+        str(tmp_path),
+    )  # fmt: skip
+    for _ in range(2):  # again and again
+        for number in range(SCANS):
+            assert next_of(scans, Scan, lambda message: True).seq == number, running.output
+    healthy = lambda: fault_of("replay", read_beats(tmp_path, "replay"), [bus.robot], time.monotonic()) == ""  # noqa: E731
+    assert wait_until(healthy, PATIENCE), read_beats(tmp_path, "replay")
+    assert running.stop()[0] == 0
+    assert not all_else.received
+
+
+@pytest.mark.parametrize(("name", "said"), [("", "no recording ''"), ("other.mcap", "no recording 'other.mcap'")])
+def test_a_recording_that_is_not_there_is_named_with_those_that_are(process, recording, name, said):
+    running = process("services.recorder.playing", "--directory", str(recording), "--replay", name)
+    assert running.wait() == 2
+    assert f"replay: {said} in {recording}" in running.output
+    assert "there are drive.mcap" in running.output
+
+
+def test_a_recording_without_scans_is_refused(process, tmp_path):
+    writer = RecordingWriter(tmp_path / "drive.mcap")
+    writer.write(TRUTH, "presage/other/truth", b"x", 1, 1)
+    writer.finish()
+    running = process("services.recorder.playing", "--directory", str(tmp_path), "--replay", "drive.mcap")
+    assert running.wait() == 2
+    assert "no scans in this recording" in running.output
+
+
+def test_one_who_waits_for_a_robot_elsewhere_says_when_its_scans_come_and_stop(bus, process, tmp_path):
+    running = process("common.remote", "--heartbeat", str(tmp_path))
+    fault = lambda: fault_of("remote", read_beats(tmp_path, "remote"), [bus.robot], time.monotonic())  # noqa: E731
+    wanted = f"{bus.robot}: no scan was received so far (no scan so far)"
+    assert wait_until(lambda: fault() == wanted, PATIENCE), fault()
+    assert bus.wait_matching(SCAN, PATIENCE)
+    sent = scan(0).encode()
+    assert wait_until(lambda: bus.put(SCAN, sent) or fault() == "", PATIENCE), fault()
+    running.wait_for("scans come")
+    running.wait_for("no scan for 5 s")
+    assert wait_until(lambda: "scan was not received for" in fault(), PATIENCE), fault()
+    assert running.stop()[0] == 0
