@@ -65,6 +65,18 @@ class Bus:
         self._declared: list[object] = []  # zenoh undeclares what nobody holds
         self._lock = threading.Lock()
 
+    def beside(self, robot: str) -> Bus:
+        """Another robot's keys on the same session."""
+        return Bus(self._session, robot)
+
+    def withdraw(self) -> None:
+        """Undeclare all that was declared here: this robot is served no more."""
+        declared: list[Any] = [*self._declared, *self._publishers.values()]
+        self._declared.clear()
+        self._publishers.clear()
+        for each in reversed(declared):  # the liveliness token, which came last, first
+            each.undeclare()
+
     def put(self, topic: Topic, payload: bytes, service: str = "*", key: str | None = None) -> None:
         """Publish bytes on the topic's key, or on ``key`` where a replay names it."""
         self.publisher(topic, service, key).put(payload)

@@ -9,7 +9,7 @@ import time
 from abc import ABC
 from collections import Counter
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 from common.bus import Bus, open_bus
 from common.config import ServiceSettings, load_settings
@@ -27,6 +27,18 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound=ServiceSettings)
 HEALTH_PERIOD = 1.0  # s
+
+
+class Runs(Protocol):
+    """Whatever runs until it is told to stop."""
+
+    def run(self) -> None:
+        """Until `stop`."""
+        ...
+
+    def stop(self) -> None:
+        """End after the current step; safe from a signal handler."""
+        ...
 
 
 class Service(ABC):
@@ -92,6 +104,10 @@ class Service(ABC):
         """Send a message with the next sequence number of its key."""
         self.loop.publish(topic, message)
 
+    def loop_on(self, bus: Bus) -> Runs:
+        """What runs this service on a session."""
+        return Loop(self, bus, Inbox())
+
     def request(self, query: Query, request: Request, timeout: float = 5.0) -> int:
         """Ask without waiting: the number under which `on_reply` is called, within ``timeout`` s or so."""
         return self.loop.request(query, request, timeout)
@@ -115,6 +131,15 @@ class Loop:
 
     def run(self) -> None:
         """Until `stop`."""
+        self.begin()
+        try:
+            while not self._stopping:
+                self._turn()
+        finally:
+            self.service.close()
+
+    def begin(self) -> None:
+        """Open, subscribe, serve, and say that the service is there."""
         service, bus = self.service, self.bus
         service.open()
         for topic in service.inputs:
@@ -124,11 +149,6 @@ class Loop:
         bus.serve(CONFIG, self.inbox, service.name)
         bus.declare_alive(service.name)
         service.log.info("ready", robot=bus.robot)
-        try:
-            while not self._stopping:
-                self._turn()
-        finally:
-            service.close()
 
     def stop(self) -> None:
         """End after the current step; safe from a signal handler."""
@@ -158,22 +178,29 @@ class Loop:
     def _turn(self) -> None:
         due = self.service.due()
         until_health = self._health_at - time.monotonic()
-        event = self.inbox.get(max(0.0, min(until_health, 0.5 if due is None else due)))
+        self.handle(self.inbox.get(max(0.0, min(until_health, 0.5 if due is None else due))))
+        due = self.service.due()
+        if due is not None and due <= 0:
+            self.guard(self.service.on_timer)
+        self.pulse()
+
+    def handle(self, event: Sample | Call | Answer | None) -> None:
+        """What one entry of the inbox asks for."""
         if isinstance(event, Sample):
-            self._guard(lambda: self.service.on_sample(event))
+            self.guard(lambda: self.service.on_sample(event))
         elif isinstance(event, Call):
             self._answer(event)
         elif isinstance(event, Answer):
-            self._guard(lambda: self.service.on_reply(event.query, event.number, event.reply()))
-        due = self.service.due()
-        if due is not None and due <= 0:
-            self._guard(self.service.on_timer)
+            self.guard(lambda: self.service.on_reply(event.query, event.number, event.reply()))
+
+    def pulse(self) -> None:
+        """Health, once a second."""
         if (now := time.monotonic()) >= self._health_at:
             late = now - self._health_at > HEALTH_PERIOD  # after a long step one pulse, not all that were missed
             self._health_at = (now if late else self._health_at) + HEALTH_PERIOD
             self.publish(HEALTH, self._health(now))
 
-    def _guard(self, step: Callable[[], None]) -> None:
+    def guard(self, step: Callable[[], None]) -> None:
         """No input stops a service: what a step raises is counted and logged with its traceback."""
         try:
             step()
@@ -240,14 +267,14 @@ class _Ending:
 
     def __init__(self) -> None:
         self.asked = False
-        self.loop: Loop | None = None
+        self.loop: Runs | None = None
 
     def __call__(self, _signal: int, _frame: FrameType | None) -> None:
         self.asked = True
         if self.loop is not None:
             self.loop.stop()
 
-    def run(self, loop: Loop) -> None:
+    def run(self, loop: Runs) -> None:
         self.loop = loop
         if self.asked:
             loop.stop()
@@ -264,7 +291,7 @@ def main(settings_class: type[S], make: Callable[[S], Service], argv: list[str] 
         set_up_logging(settings.log_level, as_json=settings.log_json)
         service = make(settings)
         with open_bus(settings.link()) as bus:
-            ending.run(Loop(service, bus, Inbox()))
+            ending.run(service.loop_on(bus))
         service.log.info("ended")
     except UserError as error:
         sys.exit(_fail(settings_class.service, error))

@@ -13,6 +13,10 @@ if TYPE_CHECKING:
 
 def make(settings: EstimatorSettings) -> Service:
     """Torch is imported here, so that --help answers at once."""
+    if settings.robots:
+        from services.estimator.fleet_service import FleetService  # noqa: PLC0415
+
+        return FleetService(settings)
     from services.estimator.service import EstimatorService  # noqa: PLC0415
 
     return EstimatorService(settings)

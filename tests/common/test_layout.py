@@ -19,6 +19,7 @@ ALSO_SHELL = {
     "services/estimator/checkpoint.py", "services/estimator/weights.py",
     "services/estimator/precise/weights.py",
     "services/estimator/building.py",  # opens what the names name
+    "services/estimator/fleet_service.py",  # the loop of many robots
     "services/estimator/model_card.py",  # reads the files a recording is to hold
     "services/viewer/web.py", "services/viewer/session.py", "services/viewer/desk.py",  # a web server
     "services/viewer/visitors.py", "services/viewer/control.py", "services/viewer/playback.py",
