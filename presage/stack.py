@@ -89,6 +89,10 @@ class Stack:
         """A service, connected to this session's router."""
         self._spawn(service, ["-m", f"services.{service}", *args])
 
+    def start_as(self, name: str, service: str, *args: str) -> None:
+        """One of several of a kind, under a name of its own."""
+        self._spawn(name, ["-m", f"services.{service}", *args])
+
     def start_code(self, name: str, code: str) -> None:
         """A child of our own making that is no service, connected to this session's router."""
         self._spawn(name, ["-c", code])
