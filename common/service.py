@@ -9,7 +9,7 @@ import time
 from abc import ABC
 from collections import Counter
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from common.bus import Bus, open_bus
 from common.config import ServiceSettings, load_settings
@@ -18,6 +18,7 @@ from common.inbox import Answer, Call, Inbox, Sample
 from common.log import Logger, OncePerSecond, logger, set_up_logging
 from common.messages import Health, Stamped, TopicHealth
 from common.requests import ConfigReply, Reply, Request
+from common.running import Runs
 from common.topics import CONFIG, HEALTH, Query, Topic
 from common.versions import versions
 from common.wire import DecodeError
@@ -27,18 +28,6 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound=ServiceSettings)
 HEALTH_PERIOD = 1.0  # s
-
-
-class Runs(Protocol):
-    """Whatever runs until it is told to stop."""
-
-    def run(self) -> None:
-        """Until `stop`."""
-        ...
-
-    def stop(self) -> None:
-        """End after the current step; safe from a signal handler."""
-        ...
 
 
 class Service(ABC):

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 from common.errors import UserError
 from common.inbox import Inbox, Sample
 from common.log import OncePerSecond, logger
-from common.service import Loop, Runs, Service
+from common.running import Runs
+from common.service import Loop, Service
 from common.topics import SCAN
 from services.estimator.fleet import Fleet, Outcome
 from services.estimator.service import EstimatorService, Models
