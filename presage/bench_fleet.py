@@ -49,13 +49,17 @@ class Found:
 
     estimator: str
     way: str
+    rate: float  # Hz
     windows: list[dict[str, Any]] = field(default_factory=list)
     served: int = 0  # robots
+    searching: dict[str, Any] | None = None  # half as many robots, one of which begins from nothing each second
+    bytes: dict[str, int] = field(default_factory=dict)  # of each message, by topic
     memory_mb: dict[int, float] = field(default_factory=dict)  # unique to the estimators, by robots that were served
 
     def row(self) -> dict[str, Any]:
         """For table and file."""
         best = next((w for w in reversed(self.windows) if w["robots"] == self.served and w["served"]), None)
+        cpu_ms = max(self.windows, key=lambda w: w["robots"])["cpu_ms_per_scan"]
         fewest, most = min(self.memory_mb), max(self.memory_mb)
         per_robot = self.memory_mb[most] / most
         if self.way == WAYS[0]:
@@ -64,7 +68,8 @@ class Found:
             "estimator": self.estimator, "way": self.way, "robots_served": self.served,
             "at_most_tried": most, "memory_per_robot_mb": per_robot, "memory_mb": self.memory_mb[most],
             "p50_ms": best and best["p50_ms"], "p99_ms": best and best["p99_ms"],
-            "cpu_ms_per_scan": best and best["cpu_ms_per_scan"], "windows": self.windows,
+            "cpu_ms_per_scan": cpu_ms, "robots_by_cpu": 1e3 / self.rate / cpu_ms, "windows": self.windows,
+            "while_one_searches": self.searching, "message_bytes": self.bytes,
         }  # fmt: skip
 
 
@@ -116,6 +121,15 @@ class Side:
                 return True
         return False
 
+    def search(self) -> None:
+        """What a robot that searches does to the others; preset paper does not search."""
+        count = max(2, self.found.served // 2)
+        if self.found.estimator != "paper" and count <= self.plan.most:
+            self.prepare(count)
+            before = self._cpu()
+            window = self.load.play(count, self.plan.seconds, searching=True)
+            self.found.searching = _row(window, self._cpu() - before, self.plan)
+
     def _cpu(self) -> float:
         return sum(t.user + t.system for t in (process.cpu_times() for process in self.processes()))
 
@@ -145,13 +159,16 @@ def most_served(served: Callable[[int], bool], most: int) -> int:
 
 def measure(estimator: str, way: str, plan: Plan, console: Console) -> Found:
     """One way, on a router of its own."""
-    found, cores = Found(estimator, way), sorted(os.sched_getaffinity(0))
+    found, cores = Found(estimator, way, plan.rate), sorted(os.sched_getaffinity(0))
     with Stack("bench", quiet=True) as stack:
         stack.start_router()
         with open_bus(stack.link()) as bus:
             load = Load(bus, load_world(plan.world), plan.beams, plan.rate, plan.most, plan.seed)
             side = Side(stack, load, plan, found, cores[-1])
             side.prepare(1)
+            if way == WAYS[0]:
+                side.prepare(plan.most)  # what each costs in memory; who is not played costs no time
+            found.bytes = load.sizes()
             with _elsewhere(cores), console.status(f"{estimator}, {way}") as status:
 
                 def served(count: int) -> bool:
@@ -165,6 +182,7 @@ def measure(estimator: str, way: str, plan: Plan, console: Console) -> Found:
                     return answer
 
                 found.served = most_served(served, plan.most)
+                side.search()
     return found
 
 
@@ -189,28 +207,7 @@ def bench_fleet(estimators: str, plan: Plan, json_file: Path | None, console: Co
     """Print, and write as JSON where asked."""
     check_file(json_file, "--json")
     rows = [measure(name, way, plan, console).row() for name in estimators.split(",") for way in WAYS]
-    table = Table(
-        title=f"{plan.world}, {plan.beams} beams at {plan.rate:g} Hz, one core, "
-        f"{100 * plan.share:g} % of the scans answered within {1e3 / plan.rate:.1f} ms",
-        title_justify="left",
-    )
-    for column in ("estimator", "way", "robots", "p50 ms", "p99 ms", "CPU ms a scan", "MB a robot", "MB in all"):
-        table.add_column(column, justify="left" if column in {"estimator", "way"} else "right")
-    for row in rows:
-        table.add_row(
-            row["estimator"], row["way"], f"{row['robots_served']}",
-            *(f"{row[name]:.1f}" if row[name] is not None else "" for name in ("p50_ms", "p99_ms", "cpu_ms_per_scan")),
-            f"{row['memory_per_robot_mb']:.1f}", f"{row['memory_mb']:.0f}",
-        )  # fmt: skip
-    console.print(table)
-    ratios = {}
-    for name in estimators.split(","):
-        one, each = (next(r for r in rows if r["estimator"] == name and r["way"] == way) for way in WAYS)
-        ratios[name] = one["robots_served"] / each["robots_served"] if each["robots_served"] else None
-        if ratios[name] is not None:
-            console.print(
-                f"{name}: one process serves {ratios[name]:.2f} times the robots of one each", highlight=False
-            )
+    ratios = _show(rows, plan, console)
     load_average = os.getloadavg()[0]
     console.print(f"load of the machine at the end: {load_average:.1f} on {os.cpu_count()} cores", highlight=False)
     write_json(json_file, {
@@ -219,3 +216,63 @@ def bench_fleet(estimators: str, plan: Plan, json_file: Path | None, console: Co
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
     })  # fmt: skip
     return 0
+
+
+def _show(rows: list[dict[str, Any]], plan: Plan, console: Console) -> dict[str, dict[str, float | None]]:
+    """The table and what follows from it; by estimator the robots of one process to those of one each."""
+    table = Table(
+        title=f"{plan.world}, {plan.beams} beams at {plan.rate:g} Hz, one core, "
+        f"{100 * plan.share:g} % of the scans answered within {1e3 / plan.rate:.1f} ms",
+        title_justify="left",
+    )
+    for column in (
+        "estimator",
+        "way",
+        "robots",
+        "p50 ms",
+        "p99 ms",
+        "CPU ms a scan",
+        "robots by CPU",
+        "MB a robot",
+        "MB in all",
+    ):
+        table.add_column(column, justify="left" if column in {"estimator", "way"} else "right")
+    for row in rows:
+        table.add_row(
+            row["estimator"], row["way"], f"{row['robots_served']}",
+            *(f"{row[name]:.1f}" if row[name] is not None else "" for name in ("p50_ms", "p99_ms")),
+            f"{row['cpu_ms_per_scan']:.2f}",
+            f"{row['robots_by_cpu']:.1f}",
+            f"{row['memory_per_robot_mb']:.1f}", f"{row['memory_mb']:.0f}",
+        )  # fmt: skip
+    console.print(table)
+    for row in rows:
+        if (other := row["while_one_searches"]) is not None and other["p99_ms"] is not None:
+            console.print(
+                f"{row['estimator']}, {row['way']}: of {other['robots']} robots one searches each second; the others: "
+                f"{100 * other['in_time_share']:.1f} % in time, "
+                f"p50 {other['p50_ms']:.1f}, p99 {other['p99_ms']:.1f} ms",
+                highlight=False,
+            )
+    size = rows[0]["message_bytes"]
+    console.print(
+        "bytes a message: "
+        + ", ".join(f"{name} {count}" for name, count in size.items())
+        + f"; scans to the estimator: {size['scan'] * plan.rate / 1e3:.1f} kB/s a robot",
+        highlight=False,
+    )
+    ratios: dict[str, dict[str, float | None]] = {}
+    for name in dict.fromkeys(row["estimator"] for row in rows):
+        one, each = (next(r for r in rows if r["estimator"] == name and r["way"] == way) for way in WAYS)
+        ratios[name] = {
+            "robots_served": one["robots_served"] / each["robots_served"] if each["robots_served"] else None,
+            "robots_by_cpu": one["robots_by_cpu"] / each["robots_by_cpu"],
+            "memory_per_robot": each["memory_per_robot_mb"] / max(one["memory_per_robot_mb"], 0.1),
+        }
+        served = f"{ratios[name]['robots_served']:.2f}" if each["robots_served"] else "no number of"
+        console.print(
+            f"{name}: one process serves {served} times the robots of one each; "
+            f"by processor time {ratios[name]['robots_by_cpu']:.2f} times",
+            highlight=False,
+        )
+    return ratios

@@ -11,9 +11,10 @@ from common import se2
 from common.bus import Bus
 from common.inbox import Inbox, Sample
 from common.messages import Belief, Pose, Scan
+from common.requests import LocaliseRequest
 from common.scanner import SCANNERS, Scanner
 from common.se2 import Array
-from common.topics import BELIEF, SCAN
+from common.topics import BELIEF, HEALTH, LOCALISE, PREDICTION, SCAN
 from common.wire import DecodeError
 from common.world import World
 
@@ -80,8 +81,25 @@ class Load:
             self._buses[robot.name].wait_matching(SCAN, deadline - time.monotonic()) for robot in self.robots[:count]
         )
 
-    def play(self, count: int, seconds: float, rate: float | None = None) -> Window:
-        """Send the first robots' scans at their times, ``rate`` Hz or the usual, each robot at its own phase."""
+    def sizes(self) -> dict[str, int]:
+        """Bytes of each message that goes between one robot and its estimator, at most, without zenoh's own."""
+        robot, inbox = self.robots[0], Inbox()
+        ends = [
+            self._buses[robot.name].subscribe(topic, inbox, keep_all=True) for topic in (BELIEF, PREDICTION, HEALTH)
+        ]
+        self.play(1, 2.5)
+        for end in ends:
+            end()
+        found = {"scan": len(self._payload(robot, robot.scans))}
+        while isinstance(sample := inbox.get(0), Sample):
+            found[sample.topic.name] = max(found.get(sample.topic.name, 0), len(sample.payload))
+        return found
+
+    def play(self, count: int, seconds: float, rate: float | None = None, *, searching: bool = False) -> Window:
+        """Send the first robots' scans at their times, ``rate`` Hz or the usual, each robot at its own phase.
+
+        ``searching``: the first one is asked to begin from nothing each second, and the others are what is reported.
+        """
         rate = rate or self.rate
         schedule = sorted(
             (((k + robot.phase) / rate, robot, robot.scans + k) for robot in self.robots[:count]
@@ -91,10 +109,14 @@ class Load:
         while self._inbox.get(0) is not None:
             pass  # late answers to an earlier window
         sent: dict[tuple[str, int], int] = {}
+        lost = self.robots[0] if searching else None
         began = time.monotonic()
         for (due, robot, k), payload in zip(schedule, payloads, strict=True):
             time.sleep(max(0.0, began + due - time.monotonic()))
-            sent[BELIEF.key(robot.name), self._stamp(k)] = time.time_ns()
+            if robot is not lost:
+                sent[BELIEF.key(robot.name), self._stamp(k)] = time.time_ns()
+            elif k % round(rate) == 0:
+                self._buses[robot.name].request(LOCALISE, LocaliseRequest(), k, Inbox())
             self._buses[robot.name].put(SCAN, payload)
             robot.scans = k + 1
         return self._window(count, sent)
