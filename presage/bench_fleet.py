@@ -89,10 +89,10 @@ class Side:
         if self.found.way == WAYS[0]:
             if not self.ready:
                 names = ",".join(robot.name for robot in self.load.robots)
-                self.stack.start_as("fleet", "estimator", *arguments, "--robots", names)
+                self.stack.start("estimator", *arguments, "--robots", names)
         else:
             for robot in self.load.robots[self.ready : count]:
-                self.stack.start_as(robot.name, "estimator", *arguments, "--robot", robot.name)
+                self.stack.start_as(robot.name, "estimator", robot.name, *arguments)
         if not self.load.wait_matching(count, PATIENCE):
             self.stack.check()
             raise UserError(f"not all estimators were ready within {PATIENCE:g} s")

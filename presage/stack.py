@@ -36,6 +36,8 @@ class Process:
     reader: threading.Thread
     lines: list[str] = field(default_factory=list)  # the last few, to explain an end
     args: list[str] = field(default_factory=list)  # of Python
+    service: str = ""  # the token that says it is there; empty: its name
+    robot: str = ""  # whose; empty: the stack's
 
     def again(self, stack: Stack) -> str:
         """The command that starts another like it, for a shell."""
@@ -89,9 +91,10 @@ class Stack:
         """A service, connected to this session's router."""
         self._spawn(service, ["-m", f"services.{service}", *args])
 
-    def start_as(self, name: str, service: str, *args: str) -> None:
-        """One of several of a kind, under a name of its own."""
-        self._spawn(name, ["-m", f"services.{service}", *args])
+    def start_as(self, name: str, service: str, robot: str, *args: str) -> None:
+        """One of several of a kind, under a name of its own, for a robot of its own."""
+        self._spawn(name, ["-m", f"services.{service}", "--robot", robot, *args])
+        self.processes[name].service, self.processes[name].robot = service, robot
 
     def start_code(self, name: str, code: str) -> None:
         """A child of our own making that is no service, connected to this session's router."""
@@ -99,13 +102,21 @@ class Stack:
 
     def wait_alive(self, bus: Bus, timeout: float = 60.0) -> None:
         """Until every started service has its liveliness token; raises UserError naming who is missing or ended."""
-        wanted = set(self.processes) - {"router"}
         deadline = time.monotonic() + timeout
-        while missing := wanted - bus.alive(timeout=0.5):
+        while missing := self._missing(bus):
             self.check()
             if time.monotonic() > deadline:
                 raise UserError(f"not alive within {timeout:g} s: {', '.join(sorted(missing))}; their lines are above")
             time.sleep(0.05)
+
+    def _missing(self, bus: Bus) -> set[str]:
+        robots = {process.robot or self.robot for process in self.processes.values()}
+        alive = {robot: bus.alive(timeout=0.5, robot=robot) for robot in robots}
+        return {
+            name
+            for name, process in self.processes.items()
+            if name != "router" and (process.service or name) not in alive[process.robot or self.robot]
+        }
 
     def said(self, name: str, beginning: str, timeout: float = 30.0) -> str:
         """What a child's line says after ``beginning``; raises UserError where it ends, or does not say it in time."""

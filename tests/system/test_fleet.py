@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import signal
+
 import numpy as np
 import pytest
 
-from common.bus import wait_until
+from common.bus import Link, open_bus, wait_until
 from common.inbox import Inbox, Sample
 from common.messages import Belief, Health, Truth
 from common.requests import ConfigReply, ModelReply, ModelRequest, Request
@@ -152,3 +154,18 @@ def test_what_cannot_be_served_is_said_in_one_line(process, arguments, words):
     assert refused.wait(60) == 2
     assert len(refused.output.strip().splitlines()) == 1
     assert words in refused.output
+
+
+def test_up_with_two_robots(process, free_port):
+    port = free_port()
+    up = process(
+        "presage.__main__", "up", "--robots", "2", "--robot", "r", "--beams", "64", "--no-viewer", "--port", str(port)
+    )
+    up.wait_for("all alive", 120)
+    with open_bus(Link(robot="r-1", connect=(f"tcp/127.0.0.1:{port}",))) as bus:
+        for robot in ("r-1", "r-2"):
+            ear = Ear(bus, robot)
+            ear.wait(ear.localised, "localised")
+            assert bus.alive(robot=robot) == {"estimator", "simulator", "controller"}
+    assert up.output.count("estimator | ") > 0
+    assert up.stop(signal.SIGINT, 60)[0] == 130
