@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
+
+# Before numpy is there: products as small as these gain nothing from a second thread, which spins while it waits.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from common.service import main
 from services.estimator.settings import EstimatorSettings

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections import defaultdict, deque
@@ -83,6 +84,12 @@ class FleetService(Service):
         return FleetLoop(self.options, bus)
 
 
+def key_expression(pattern: str) -> str:
+    """A pattern of names as zenoh writes it: the same names or more, so that other sites' scans stay where they are."""
+    written = re.sub(r"[*?]+", "$*", pattern)
+    return "*" if written == "$*" else written
+
+
 @dataclass
 class Member:
     """A robot that is served."""
@@ -122,8 +129,8 @@ class FleetLoop:
         for name in self.names:
             self._take_on(name, named=True)
         self.bus.watch_robots(lambda robot, service, there: self._news.put((robot, service, there)))
-        if self.patterns:
-            self.bus.subscribe(SCAN, self._strangers, robot="*")
+        for pattern in self.patterns:
+            self.bus.subscribe(SCAN, self._strangers, robot=key_expression(pattern))
         self.log.info("ready for robots", named=len(self.names), patterns=",".join(self.patterns) or "none")
         while not self._stopping:
             self._turn()

@@ -12,6 +12,7 @@ from common.inbox import Inbox, Sample
 from common.messages import Belief, Health, Truth
 from common.requests import ConfigReply, ModelReply, ModelRequest, Request
 from common.topics import BELIEF, CONFIG, HEALTH, MODEL, SCAN, TRUTH
+from services.estimator.fleet_service import key_expression
 
 NUMBERS = (1, 2, 3)
 STARTS = {1: "3,1.5,90", 2: "9,1.5,0", 3: "14,1.5,180"}
@@ -169,3 +170,22 @@ def test_up_with_two_robots(process, free_port):
             assert bus.alive(robot=robot) == {"estimator", "simulator", "controller"}
     assert up.output.count("estimator | ") > 0
     assert up.stop(signal.SIGINT, 60)[0] == 130
+
+
+@pytest.mark.parametrize(
+    ("pattern", "hears", "not_heard"),
+    [("*", "a-1", ""), ("a-*", "a-1", "b-1"), ("a-?", "a-1", "b-1"), ("*-1", "b-1", "b-2"), ("??", "ab", "")],
+)
+def test_a_pattern_hears_of_a_robot_by_its_scans_alone(bus, link, pattern, hears, not_heard):
+    prefix = "" if pattern in {"*", "??"} else link.robot
+    inbox = Inbox()
+    bus.subscribe(SCAN, inbox, keep_all=True, robot=key_expression(prefix + pattern))
+    with open_bus(link) as other:
+        for robot in filter(None, (not_heard, hears)):
+            there = other.beside(prefix + robot)
+            if robot == hears:
+                assert there.wait_matching(SCAN, 10)
+            there.put(SCAN, b"x")
+    heard = []
+    assert wait_until(lambda: heard.append(inbox.get(0)) or heard[-1] is not None, 10)
+    assert heard[-1].key == SCAN.key(prefix + hears)
