@@ -1,98 +1,59 @@
-"""The only file that imports zenoh: sessions, keys, bytes in and out. It computes nothing."""
+"""Messages and requests as bytes, in and out of zenoh. It computes nothing.
+
+With session.py and presence.py the only file that imports zenoh.
+"""
 
 from __future__ import annotations
 
 import itertools
-import json
 import logging
-import os
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import zenoh
 
-from common.endpoints import not_let_in, over_tls, refuse_exposure
+from common.endpoints import not_let_in, refuse_exposure
 from common.errors import UserError
 from common.inbox import Answer, Call, Inbox, Sample
-from common.instances import Instance, Instances
 from common.messages import Stamped
+from common.presence import Presence, published_ns
 from common.requests import Reply, Request
 from common.security import Credentials, may_ask, may_put
-from common.topics import Query, Topic, alive_key, standby_key, topic_of
+from common.session import DEFAULT_ENDPOINT, LOG_FILTER, Link, open_session, wait_until
+from common.topics import Query, Topic, topic_of
 from common.wire import ENCODING, DecodeError, Message
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-# Both call it an error when something arrives while a session opens or closes.
-# The third says at every message that a host's clock is ahead; `presage doctor` says it once.
-LOG_FILTER = (
-    "error,zenoh::api::session=off,zenoh::net::protocol::gossip=off,zenoh::net::routing::dispatcher::pubsub=off"
-)
 R = TypeVar("R", bound=Reply)
 
 
-@dataclass(frozen=True)
-class Link:
-    """Where a session connects and listens; endpoints as zenoh writes them, such as tcp/127.0.0.1:7447."""
-
-    robot: str = "robot"
-    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
-    listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
-    router: bool = False
-    multicast: bool = False
-    lossless: bool = True  # who cannot keep up holds the publisher back; else it loses what is too much for it
-    security: Credentials | None = None  # then it listens nowhere, unless it is a router
-    insecure: bool = False  # may listen beyond loopback without credentials
-
-
-def _config(link: Link) -> zenoh.Config:
-    config: zenoh.Config = zenoh.Config()
-    settings: dict[str, Any] = {
-        "mode": "router" if link.router else "peer",
-        "connect/endpoints": link.connect,
-        "connect/timeout_ms": -1,  # a router that is not there yet is waited for, in the background
-        "connect/exit_on_failure": False,
-        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
-        "listen/endpoints": link.listen,
-        "scouting/multicast/enabled": link.multicast,
-        "transport/shared_memory/enabled": False,  # drops silently when a receiver stalls (zenoh issue 2628)
-        "timestamping/enabled": True,
-        # Who is gone without a word (frozen, cut off) is known to be gone after this; zenoh's own is 10 s.
-        "transport/link/tx/lease": 3000,
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 5000,  # us
-    }
-    if link.security is not None:
-        settings |= {**link.security.zenoh(), "mode": "router" if link.router else "client"}
-        settings["connect/endpoints"] = [over_tls(each) for each in link.connect]
-        settings["listen/endpoints"] = [over_tls(each) for each in link.listen] if link.router else []
-        if not link.router:  # opening waits for the router: in pieces, so that it can be given up
-            settings |= {"connect/timeout_ms": 1000, "connect/exit_on_failure": True}
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
-    return config
-
-
-class Bus:
+class Bus(Presence):
     """One session, bound to one robot's keys."""
 
     def __init__(
         self, session: zenoh.Session, robot: str, security: Credentials | None = None, *, lossless: bool = True
     ) -> None:
         """Use `open_bus`."""
-        self.robot = robot
+        super().__init__(session, robot)
         self._security = security
         self._congestion = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
-        self.zid = str(session.zid())
-        self.instance = Instance(time.time_ns() // 10**6, socket.gethostname(), os.getpid(), self.zid).name
-        self._session = session
         self._publishers: dict[str, zenoh.Publisher] = {}
-        self._kept: dict[str, tuple[bytes, zenoh.Timestamp | None]] = {}  # by key, the last payload of kept topics
-        self._declared: list[object] = []  # zenoh undeclares what nobody holds
         self._lock = threading.Lock()
+
+    def beside(self, robot: str) -> Bus:
+        """Another robot's keys on the same session."""
+        lossless = self._congestion == zenoh.CongestionControl.BLOCK
+        return Bus(self._session, robot, self._security, lossless=lossless)
+
+    def withdraw(self) -> None:
+        """Undeclare all that was declared here: this robot is served no more."""
+        declared: list[Any] = [*self._declared, *self._publishers.values()]
+        self._declared.clear()
+        self._publishers.clear()
+        for each in reversed(declared):  # the liveliness token, which came last, first
+            each.undeclare()
 
     def put(self, topic: Topic, payload: bytes, service: str = "*", key: str | None = None) -> None:
         """Publish bytes on the topic's key, or on ``key`` where a replay names it."""
@@ -125,7 +86,7 @@ class Bus:
         newest = topic.queue == "newest" and not keep_all
 
         def move(sample: zenoh.Sample) -> None:
-            published = _published_ns(sample)
+            published = published_ns(sample)
             source = _source(sample)
             entry = Sample(topic, str(sample.key_expr), sample.payload.to_bytes(), published, time.time_ns(), source)
             inbox.put(entry, newest_only=newest)
@@ -207,30 +168,6 @@ class Bus:
         handler = zenoh.handlers.Callback(move, end)
         self._session.get(key, handler, payload=request.encode(), encoding=ENCODING, timeout=timeout)
 
-    def keep(self, topic: Topic) -> None:
-        """From now on hear a kept topic, and tell the last payload to whoever asks with `kept`."""
-        key = topic.key(self.robot)
-
-        def move(sample: zenoh.Sample) -> None:
-            self._kept[key] = (sample.payload.to_bytes(), sample.timestamp)
-
-        def tell(call: zenoh.Query) -> None:
-            if (last := self._kept.get(key)) is not None:
-                with suppress(zenoh.ZError):  # the asker may be gone
-                    call.reply(key, last[0], encoding=ENCODING, timestamp=last[1])
-            call.drop()  # type: ignore[no-untyped-call]
-
-        self._declared += [self._session.declare_subscriber(key, move), self._session.declare_queryable(key, tell)]
-
-    def kept(self, topic: Topic, timeout: float = 0.5) -> bytes | None:
-        """The last payload that anybody still knows of a kept topic."""
-        answers = self._session.get(
-            topic.key(self.robot), target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=timeout,
-        )  # fmt: skip
-        found = [(_published_ns(a.ok), a.ok.payload.to_bytes()) for a in answers if a.ok is not None]
-        return max(found, default=(0, None), key=lambda each: each[0])[1]
-
     def ask_each(
         self, query: Query, request: Request, inbox: Inbox, timeout: float = 5.0, service: str = "*",
         robot: str | None = None,
@@ -248,104 +185,6 @@ class Bus:
             target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE,
         )  # fmt: skip
         return done
-
-    def declare_alive(self, service: str) -> None:
-        """Say that the service is there, until the session ends. Declare it last: order is kept."""
-        self._token(alive_key(self.robot, service, self.instance))
-
-    def _token(self, key: str) -> None:
-        self._declared.append(self._session.liveliness().declare_token(key))
-
-    def stand_by(self, service: str) -> Callable[[], None]:
-        """Say that this instance waits until no other leads; a call ends it."""
-        token = self._session.liveliness().declare_token(standby_key(self.robot, service, self.instance))
-        self._declared.append(token)
-
-        def end() -> None:
-            self._declared.remove(token)
-            token.undeclare()  # type: ignore[no-untyped-call]
-
-        return end
-
-    def instances(self, service: str, changed: Callable[[], None], timeout: float = 0.5) -> Instances:
-        """Who else does what ``service`` does, kept up to date; ``changed`` is called from another thread."""
-        found = Instances(self.instance)
-
-        def move(sample: zenoh.Sample) -> None:
-            *_, kind, _, name = str(sample.key_expr).split("/")
-            found.change(name, leads=kind == "alive", there=sample.kind == zenoh.SampleKind.PUT)
-            changed()
-
-        liveliness, keys = (
-            self._session.liveliness(),
-            [alive_key(self.robot, service), standby_key(self.robot, service)],
-        )
-        self._declared += [liveliness.declare_subscriber(key, move, history=True) for key in keys]
-        for key in keys:  # an answer, where the subscriber's history may still be on its way
-            for reply in liveliness.get(key, timeout=timeout):
-                if reply.ok is not None:
-                    move(reply.ok)
-        return found
-
-    def alive(self, timeout: float = 1.0, robot: str | None = None) -> set[str]:
-        """Services of this robot, or another, that are there now."""
-        return set(self.alive_instances(timeout, robot))
-
-    def alive_instances(
-        self, timeout: float = 1.0, robot: str | None = None, *, standby: bool = False
-    ) -> dict[str, list[str]]:
-        """Instances by service, by age; those that lead, or those that stand by."""
-        key = (standby_key if standby else alive_key)(robot or self.robot)
-        found: dict[str, list[str]] = {}
-        for reply in self._session.liveliness().get(key, timeout=timeout):
-            if reply.ok is not None:
-                *_, service, name = str(reply.ok.key_expr).split("/")
-                found.setdefault(service, []).append(name)
-        return {service: sorted(names) for service, names in found.items()}
-
-    def watch_alive(self, changed: Callable[[str, bool], None]) -> None:
-        """Call ``changed(service, is_there)`` for those there now and at every change, from another thread."""
-        self._watch(self.robot, lambda _, service, there: changed(service, there))
-
-    def watch_robots(self, changed: Callable[[str, str, bool], None]) -> None:
-        """The same for every robot: ``changed(robot, service, is_there)``."""
-        self._watch("*", changed)
-
-    def _watch(self, robots: str, changed: Callable[[str, str, bool], None]) -> None:
-        """A service is gone with its last instance; one that comes beside another is told of as well."""
-        instances: dict[tuple[str, str], set[str]] = {}
-
-        def move(robot: str, service: str, name: str, there: bool) -> None:  # noqa: FBT001
-            known = instances.setdefault((robot, service), set())
-            (known.add if there else known.discard)(name)
-            if there or not known:
-                changed(robot, service, there)
-
-        self.watch_instances(move, robots)
-
-    def watch_instances(self, changed: Callable[[str, str, str, bool], None], robots: str | None = None) -> None:
-        """Call ``changed(robot, service, instance, is_there)`` for all that lead now, and at every change."""
-
-        def move(sample: zenoh.Sample) -> None:
-            _, robot, _, service, name = str(sample.key_expr).split("/")
-            changed(robot, service, name, sample.kind == zenoh.SampleKind.PUT)
-
-        key = alive_key(robots or self.robot)
-        self._declared.append(self._session.liveliness().declare_subscriber(key, move, history=True))
-
-    def linked(self) -> bool:
-        """Whether any other session is reached."""
-        return self.links() > 0
-
-    def links(self) -> int:
-        """How many other sessions are reached directly."""
-        return len(list(self._session.info.routers_zid())) + len(list(self._session.info.peers_zid()))
-
-
-def _published_ns(sample: zenoh.Sample) -> int:
-    """Wall time at the publisher, 0 if unknown."""
-    stamp = sample.timestamp
-    return int(stamp.get_time().timestamp() * 1e9) if stamp is not None else 0
 
 
 def _source(sample: zenoh.Sample) -> str:
@@ -375,7 +214,7 @@ def open_bus(
         refuse_exposure(link.listen)
     zenoh.init_log_from_env_or(log_filter)
     began, waiting = time.monotonic(), False
-    while (session := _open(link)) is None:
+    while (session := open_session(link)) is None:
         assert link.security is not None  # noqa: S101 - others do not wait
         why = not_let_in(link.security.member.name, link.connect)
         if give_up():
@@ -387,32 +226,6 @@ def open_bus(
         waiting = True
     with closing(session):  # its own __exit__ fails while another thread is inside one of its calls; close() does not
         yield Bus(session, link.robot, link.security, lossless=link.lossless)
-
-
-def _open(link: Link) -> zenoh.Session | None:
-    """None where a router did not let us in yet."""
-    try:
-        return zenoh.open(_config(link))
-    except zenoh.ZError as error:
-        text = str(error)
-        if link.security is not None and "Unable to connect" in text:
-            return None
-        if "in use" in text:
-            raise UserError(f"port in use: {' '.join(link.listen)}; choose another with --listen") from None
-        # Zenoh appends its own source line, and wraps some messages in the name of a Rust enum.
-        why = " ".join(text.split(" at /", maxsplit=1)[0].split()).removeprefix('Json5Err(Message { msg: "')
-        asked = f"connect {', '.join(link.connect) or 'none'}, listen {', '.join(link.listen) or 'none'}"
-        raise UserError(f"no session with {asked}: {why}; an endpoint is written like {DEFAULT_ENDPOINT}") from None
-
-
-def wait_until(condition: Callable[[], bool], timeout: float, period: float = 0.02) -> bool:
-    """Whether ``condition`` comes true within ``timeout`` s."""
-    deadline = time.monotonic() + timeout
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(period)
-    return True
 
 
 __all__ = ["DEFAULT_ENDPOINT", "Bus", "Link", "Message", "Stamped", "open_bus", "topic_of", "wait_until"]

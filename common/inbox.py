@@ -60,8 +60,13 @@ class Answer:
 class Inbox:
     """A bounded queue in which a newest-only key takes one place, and every drop is counted."""
 
-    def __init__(self, capacity: int = 10_000, max_bytes: int = 1 << 28) -> None:
-        """Hold at most ``capacity`` entries and ``max_bytes`` bytes of payload."""
+    def __init__(
+        self, capacity: int = 10_000, max_bytes: int = 1 << 28, changed: threading.Condition | None = None
+    ) -> None:
+        """Hold at most ``capacity`` entries and ``max_bytes`` bytes of payload.
+
+        ``changed`` is notified of each entry: one for several inboxes lets one loop wait for all of them.
+        """
         self.capacity, self.max_bytes = capacity, max_bytes
         self.received: Counter[str] = Counter()  # by key
         self.dropped: Counter[str] = Counter()
@@ -70,7 +75,7 @@ class Inbox:
         self._bytes = 0
         self._serial = 0
         self._counted: set[str] = set()
-        self._changed = threading.Condition()  # reentrant: a signal handler may wake us inside wait
+        self._changed = changed or threading.Condition()  # reentrant: a signal handler may wake us inside wait
 
     def put(self, entry: Sample | Call | Answer, *, newest_only: bool = False) -> None:
         """Add an entry; where a newest-only key still waits, the new one takes the old one's place."""

@@ -13,7 +13,7 @@ from common.errors import UserError
 from common.metrics import ServiceMetrics
 
 if TYPE_CHECKING:
-    from common.service import Loop
+    from common.loop import Loop
 
 LOOPBACK = "127.0.0.1"
 

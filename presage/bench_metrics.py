@@ -25,7 +25,8 @@ from common.metrics import ServiceMetrics
 from common.topics import SCAN
 from common.versions import commit, versions
 from presage.output import check_file, write_json
-from presage.stack import Stack, free_port
+from presage.ports import free_port
+from presage.stack import Stack
 
 SERVICES = ("simulator", "estimator", "controller")
 WARM_UP = 3.0  # s not counted, before the first round

@@ -27,7 +27,8 @@ from common.inbox import Inbox, Sample
 from common.topics import CMD_VEL, SCAN
 from common.versions import commit, versions
 from presage.output import check_file, write_json
-from presage.stack import Stack, free_port
+from presage.ports import free_port
+from presage.stack import Stack
 
 WARM_UP = 3.0  # s not counted, of every round
 PATIENCE = 60.0  # s

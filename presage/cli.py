@@ -58,13 +58,16 @@ def up(
     viewer: Viewer = True,
     open_page: OpenPage = False,
     people: People = 0,
+    robots: Annotated[
+        int, typer.Option(min=1, max=20, help="Several: ROBOT-1, ROBOT-2 ..., each simulated by itself, one estimator.")
+    ] = 1,
 ) -> None:
     """Start router, simulator, estimator, controller and the live page here, until Ctrl-C.
 
     The page's link is printed; PRESAGE_VIEWER_PORT and PRESAGE_VIEWER_TOKEN choose its port and who may see it.
     Examples: `presage up`, then elsewhere `presage goal 15 1.5 --wait`; `presage up --estimator particle-filter`;
     `presage up --record recordings --seed 7`; `presage up --world my.yaml --port 7500`; `presage up --no-viewer`;
-    `presage up --world office --people 10`.
+    `presage up --world office --people 10`; `presage up --robots 3`, then `presage goal 15 1.5 --robot robot-2`.
     """
     from presage.up import run_up  # noqa: PLC0415
 
@@ -82,6 +85,7 @@ def up(
         viewer=viewer,
         open_page=open_page,
         people=people,
+        robots=robots,
     )
 
 

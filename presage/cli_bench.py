@@ -180,3 +180,35 @@ def bench_chaos(
     from presage.chaos.bench import bench_chaos as run  # noqa: PLC0415
 
     raise typer.Exit(run(faults or [], repeats, json_file, console, one_host=one_host, quiet=not verbose))
+
+
+@app.command("fleet")
+def bench_fleet(
+    estimators: Annotated[str, typer.Option(help="Of precise, paper; comma-separated.")] = "precise,paper",
+    world: WorldName = "corridor",
+    beams: Annotated[int, typer.Option(min=1, help="Of a scan.")] = 622,
+    rate: Annotated[float, typer.Option(min=1, max=100, help="Scans a second of each robot.")] = 15.0,
+    seconds: Annotated[float, typer.Option(min=1, help="That each number of robots is tried.")] = 6.0,
+    most: Annotated[int, typer.Option(min=1, max=200, help="Robots that are tried at most.")] = 32,
+    share: Annotated[
+        float, typer.Option(min=0.5, max=1.0, help="Of the scans, to be answered within a period: counts as served.")
+    ] = 0.999,
+    quick: Annotated[bool, typer.Option("--quick", help="Precise alone, 3 s each, 8 robots at most.")] = False,
+    seed: Annotated[int, typer.Option(min=0, max=2**31)] = 1,
+    json_file: Json = None,
+) -> None:
+    """How many robots one core serves with every scan answered in time: one estimator process, and one process each.
+
+    The estimators share one core; scans are cast beforehand and played from the other cores. Both ways run in turn on
+    the same machine: compare them with one another, for the numbers themselves are this machine's.
+
+    Examples: `presage bench fleet`; `presage bench fleet --quick`;
+    `presage bench fleet --estimators precise --most 64 --json fleet.json`.
+    """
+    from presage.bench_fleet import Plan  # noqa: PLC0415
+    from presage.bench_fleet import bench_fleet as run  # noqa: PLC0415
+
+    plan = Plan(world, beams, rate, seconds, most, share, seed)
+    if quick:
+        estimators, plan = "precise", Plan(world, beams, rate, 3.0, min(most, 8), share, seed)
+    raise typer.Exit(run(estimators, plan, json_file, console))

@@ -6,7 +6,6 @@ import json
 import os
 import shlex
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -22,6 +21,7 @@ from common.bus import Bus, Link
 from common.errors import UserError
 from common.processes import dying_with_us
 from common.security import Credentials
+from presage.ports import accepts, check_port, free_port
 
 COLOURS = {"router": 37, "simulator": 36, "estimator": 35, "controller": 33, "recorder": 32, "viewer": 34}
 ACCESS = {"PRESAGE_SECURITY", "PRESAGE_ROLE"}  # meant for us, not for our children
@@ -39,6 +39,8 @@ class Process:
     reader: threading.Thread
     lines: list[str] = field(default_factory=list)  # the last few, to explain an end
     args: list[str] = field(default_factory=list)  # of Python
+    service: str = ""  # the token that says it is there; empty: its name
+    robot: str = ""  # whose; empty: the stack's
 
     def again(self, stack: Stack) -> str:
         """The command that starts another like it, for a shell."""
@@ -114,19 +116,32 @@ class Stack:
         """A service, connected to this session's router."""
         self._spawn(service, ["-m", f"services.{service}", *args])
 
+    def start_as(self, name: str, service: str, robot: str, *args: str) -> None:
+        """One of several of a kind, under a name of its own, for a robot of its own."""
+        self._spawn(name, ["-m", f"services.{service}", "--robot", robot, *args])
+        self.processes[name].service, self.processes[name].robot = service, robot
+
     def start_code(self, name: str, code: str) -> None:
         """A child of our own making that is no service, connected to this session's router."""
         self._spawn(name, ["-c", code])
 
     def wait_alive(self, bus: Bus, timeout: float = 60.0) -> None:
         """Until every started service has its liveliness token; raises UserError naming who is missing or ended."""
-        wanted = set(self.processes) - {"router"}
         deadline = time.monotonic() + timeout
-        while missing := wanted - bus.alive(timeout=0.5):
+        while missing := self._missing(bus):
             self.check()
             if time.monotonic() > deadline:
                 raise UserError(f"not alive within {timeout:g} s: {', '.join(sorted(missing))}; their lines are above")
             time.sleep(0.05)
+
+    def _missing(self, bus: Bus) -> set[str]:
+        robots = {process.robot or self.robot for process in self.processes.values()}
+        alive = {robot: bus.alive(timeout=0.5, robot=robot) for robot in robots}
+        return {
+            name
+            for name, process in self.processes.items()
+            if name != "router" and (process.service or name) not in alive[process.robot or self.robot]
+        }
 
     def said(self, name: str, beginning: str, timeout: float = 30.0) -> str:
         """What a child's line says after ``beginning``; raises UserError where it ends, or does not say it in time."""
@@ -264,30 +279,3 @@ def ignoring_interrupts() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def free_port() -> int:
-    """A TCP port on loopback that is free now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def accepts(port: int) -> bool:
-    """Whether somebody listens on the loopback port."""
-    with socket.socket() as probe:
-        probe.settimeout(0.5)
-        return probe.connect_ex(("127.0.0.1", port)) == 0
-
-
-def check_port(port: int) -> None:
-    """Raises UserError where the loopback port is taken."""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError as error:
-            raise UserError(
-                f"port {port} on 127.0.0.1 cannot be used ({error.strerror}): is another session running? "
-                f"Choose another with --port, or 0 for any free one"
-            ) from None

@@ -8,6 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from common.bus import open_bus
+from common.errors import UserError
 from common.world import load_world
 from presage.options import credentials_for
 from presage.page import say_page, start_page
@@ -31,27 +32,39 @@ def run_up(
     viewer: bool = True,
     open_page: bool = False,
     people: int = 0,
+    robots: int = 1,
 ) -> None:
     """Start, wait until all are alive, say what can be done, and watch; a service that ends is named, not restarted."""
     load_world(world)  # one clear line now rather than three from the children
-    with Stack(robot, port or None, security=credentials_for(robot)) as stack:
+    names = [robot] if robots == 1 else [f"{robot}-{k}" for k in range(1, robots + 1)]
+    if robots > 1 and record is not None:
+        raise UserError(f"--record records one robot: leave it out, and `presage record --robot {names[0]}` beside it")
+    with Stack(names[0], port or None, security=credentials_for(names[0])) as stack:
         stack.start_router()
         lockstep = pace == "lockstep"
         page = viewer and start_page(stack, record or RECORDINGS, console)
-        if page or record is not None:  # idle, it waits for the page's button
+        if (page or record is not None) and robots == 1:  # idle, it waits for the page's button
             stack.start("recorder", "--directory", str(record or RECORDINGS), *(["--idle"] if record is None else []))
-        stack.start("estimator", "--world", world, *estimator)
-        stack.start("controller", *controller_arguments(world, estimator, drive, lockstep=lockstep))
+        together = ["--robots", ",".join(names)] if robots > 1 else []
+        stack.start("estimator", "--world", world, *estimator, *together)
+        driving = controller_arguments(world, estimator, drive, lockstep=lockstep)
+        stack.start("controller", *driving)
         waits = ",".join(sorted(set(stack.processes) - {"router", "viewer"}))
-        simulator = ["--world", world, "--beams", str(beams), "--drive", drive, "--pace", pace, "--seed", str(seed)]
-        simulator += ["--people", str(people)]
-        stack.start("simulator", *simulator, *(["--wait-for", waits] if pace != "realtime" else []))
+        simulator = ["--world", world, "--beams", str(beams), "--drive", drive, "--pace", pace]
+        simulator += ["--people", str(people), *(["--wait-for", waits] if pace != "realtime" else [])]
+        stack.start("simulator", *simulator, "--seed", str(seed))
+        for k, name in enumerate(names[1:], 1):  # each in a simulation of its own
+            stack.start_as(f"controller-{k + 1}", "controller", name, *driving)
+            stack.start_as(f"simulator-{k + 1}", "simulator", name, *simulator, "--seed", str(seed + k))
         with open_bus(stack.link()) as bus:
             stack.wait_alive(bus)
         if page:
             say_page(stack, console, open_it=open_page)
         where = "" if port == 7447 else f" --connect {stack.endpoint}"
         where += f" --security {stack.security.folder.parent}" if stack.security is not None else ""
+        where += "" if names == ["robot"] else f" --robot {names[0]}"
+        if robots > 1:
+            console.print(f"robots: {', '.join(names)}, one estimator for all", soft_wrap=True)
         console.print(
             f"[bold green]all alive[/] at {stack.endpoint}. In another terminal: "
             f"presage goal 15 1.5 --wait{where} | presage echo belief{where} | presage hz{where}. Ctrl-C ends all.",

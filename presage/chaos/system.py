@@ -19,7 +19,8 @@ from common.messages import Goal, Pose
 from common.topics import GOAL
 from presage.chaos.hosts import Network
 from presage.chaos.timeline import Row, Timeline, back
-from presage.stack import Stack, free_port
+from presage.ports import free_port
+from presage.stack import Stack
 
 ROBOT = "chaos"
 WORLD = "corridor"

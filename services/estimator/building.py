@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from common.world import World, load_world
 from services.estimator.generative import GenerativeModel, RayCaster
 from services.estimator.interface import Estimator
 from services.estimator.particle_filter.filter import ParticleFilter
+from services.estimator.particle_filter.sensor import Sensor
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
 from services.estimator.perception import Descent
 from services.estimator.precise import weights
@@ -76,12 +78,13 @@ def prepare(choice: Choice) -> Factory:
         return _precise(choice, world)
     tuned = choice.estimator == "particle-filter"
     RayCaster(world).expect(np.zeros((1, 3)), np.zeros(1))  # compiled now, no request waits for it
+    sensor = functools.cache(functools.partial(Sensor, world))  # one field, however many filters are made
 
     def make(geometry: Geometry) -> Estimator:
         settings = ParticleSettings.tuned() if tuned else ParticleSettings()
         if tuned:
             settings = replace(settings, robot_model_type="omni")  # covers a differential base as well
-        made = ParticleFilter(world, settings, (*map(float, geometry.mount),), choice.seed)  # type: ignore[arg-type]
+        made = ParticleFilter(world, settings, (*map(float, geometry.mount),), choice.seed, sensor=sensor(settings))  # type: ignore[arg-type]
         made.name = choice.estimator
         if choice.initial_pose is not None:
             made.restart(choice.initial_pose)
@@ -153,10 +156,10 @@ def _paper(choice: Choice, world: World) -> Factory:
                 f"world a name of its own and train for it: {remedy}"
             )
         model.predict(np.array([*card.world.center(), card.heading]))
+    load = functools.cache(paper_weights.load)  # one network, however many estimators are made
 
     def make(geometry: Geometry) -> Estimator:
-        found = paper_weights.find(folder, world.name, "paper", len(geometry.angles))
-        model, card = paper_weights.load(found)
+        model, card = load(paper_weights.find(folder, world.name, "paper", len(geometry.angles)))
         check_geometry(card.scanner, geometry.angles, geometry.mount, remedy)
         return PaperPerception(model, card, choice.descent, choice.initial_pose)
 

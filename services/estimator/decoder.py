@@ -28,6 +28,10 @@ class GenerativeModel(Protocol):
         """Ranges g (B,) m expected at base_link pose (3,) in map, and dg (B, 3) by x, y (m/m) and yaw (m/rad)."""
         ...
 
+    def predict_all(self, poses: Array) -> tuple[Array, Array]:
+        """The same of N poses (N, 3) at once: (N, B) and (N, B, 3)."""
+        ...
+
 
 @dataclass(frozen=True)
 class Shape:
@@ -107,10 +111,15 @@ class PaperModel:
 
     def predict(self, pose: Array) -> tuple[Array, Array]:
         """See GenerativeModel; the derivative by yaw is zero, for the paper freezes it."""
-        position = self.norm.position(pose[None], self.dtype).numpy()[0]
-        ranges, tangents = (rows[..., : self.decoder.shape.beams] for rows in self._forward(position))
-        full = np.zeros((len(ranges), 3))
-        full[:, :2] = tangents.T * self.norm.range_scale / np.array(self.norm.half_size)
+        ranges, jacobians = self.predict_all(pose[None])
+        return ranges[0], jacobians[0]
+
+    def predict_all(self, poses: Array) -> tuple[Array, Array]:
+        """See GenerativeModel."""
+        positions = self.norm.position(poses, self.dtype).numpy()
+        ranges, tangents = (rows[..., : self.decoder.shape.beams] for rows in self._forward(positions))
+        full = np.zeros((*ranges.shape, 3))
+        full[..., :2] = tangents.transpose(0, 2, 1) * self.norm.range_scale / np.array(self.norm.half_size)
         return ranges.astype(np.float64) * self.norm.range_scale, full
 
     def ranges(self, poses: Array) -> Array:

@@ -25,21 +25,25 @@ class ForwardMode:
         """Copy the weights; raises TypeError for a layer that it does not know."""
         self._steps = [_step(layer) for layer in layers]
 
-    def __call__(self, position: Array) -> tuple[Array, Array]:
-        """Output (L,) of the last layer's only channel at ``position`` (2,), and its derivatives (2, L)."""
-        rows = np.concatenate([position[:, None], np.eye(2, dtype=position.dtype)], axis=1)[..., None]
+    def __call__(self, positions: Array) -> tuple[Array, Array]:
+        """Output (N, L) of the last layer's only channel at ``positions`` (N, 2), and its derivatives (N, 2, L).
+
+        Each position's numbers are the same to the bit, whoever goes with it.
+        """
+        rows = np.zeros((len(positions), 2, 3, 1), positions.dtype)
+        rows[:, :, 0, 0], rows[:, :, 1:, 0] = positions, np.eye(2)
         for step in self._steps:
             rows = step(rows)
-        return rows[0, 0], rows[0, 1:]
+        return rows[:, 0, 0], rows[:, 0, 1:]
 
 
 def _step(layer: nn.Module) -> Step:
-    """From (C, 3, L), value and two tangents of each channel, to the same of the next layer."""
+    """From (N, C, 3, L), value and two tangents of each channel, to the same of the next layer."""
     if isinstance(layer, nn.ReLU):
-        return lambda rows: np.asarray(rows * (rows[:, :1] > 0))
+        return lambda rows: np.asarray(rows * (rows[:, :, :1] > 0))
     if isinstance(layer, nn.Unflatten):
         channels, length = layer.unflattened_size
-        return lambda rows: np.asarray(rows[..., 0].reshape(channels, length, 3).transpose(0, 2, 1))
+        return lambda rows: np.asarray(rows[..., 0].reshape(-1, channels, length, 3).transpose(0, 1, 3, 2))
     if isinstance(layer, nn.Linear | nn.Conv1d | nn.ConvTranspose1d):
         assert layer.bias is not None  # noqa: S101 - the decoder asks for none without
         weight, bias = layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy()
@@ -53,10 +57,11 @@ def _step(layer: nn.Module) -> Step:
 
 
 def _mapped(weight: Array, bias: Array, rows: Array) -> Array:
-    """(O, C) on (C, 3, L)."""
-    channels, kinds, length = rows.shape
-    out = (weight @ rows.reshape(channels, kinds * length)).reshape(len(weight), kinds, length)
-    out[:, 0] += bias[:, None]
+    """(O, C) on (N, C, 3, L)."""
+    count, channels, kinds, length = rows.shape
+    # One product for each of the N: the library that multiplies rounds by the shapes of what it is given.
+    out = (weight @ rows.reshape(count, channels, kinds * length)).reshape(count, len(weight), kinds, length)
+    out[:, :, 0] += bias[:, None]
     return np.asarray(out)
 
 
@@ -64,7 +69,9 @@ def _convolution(weight: Array, bias: Array) -> Step:
     """Stride 1, as long as before: one product with the shifted rows below one another."""
     taps = weight.shape[2]
     flat = weight.transpose(0, 2, 1).reshape(len(weight), -1)
-    return lambda rows: _mapped(flat, bias, np.concatenate([_shifted(rows, k - taps // 2) for k in range(taps)]))
+    return lambda rows: _mapped(
+        flat, bias, np.concatenate([_shifted(rows, k - taps // 2) for k in range(taps)], axis=1)
+    )
 
 
 def _doubling(weight: Array, bias: Array) -> Step:
@@ -73,9 +80,9 @@ def _doubling(weight: Array, bias: Array) -> Step:
     odd = np.concatenate([weight[:, :, 2], weight[:, :, 0]]).T.copy()
 
     def step(rows: Array) -> Array:
-        out = np.empty((len(bias), rows.shape[1], 2 * rows.shape[2]), rows.dtype)
-        out[..., 0::2] = _mapped(even, bias, np.concatenate([rows, _shifted(rows, -1)]))
-        out[..., 1::2] = _mapped(odd, bias, np.concatenate([rows, _shifted(rows, 1)]))
+        out = np.empty((len(rows), len(bias), rows.shape[2], 2 * rows.shape[3]), rows.dtype)
+        out[..., 0::2] = _mapped(even, bias, np.concatenate([rows, _shifted(rows, -1)], axis=1))
+        out[..., 1::2] = _mapped(odd, bias, np.concatenate([rows, _shifted(rows, 1)], axis=1))
         return out
 
     return step

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -12,6 +13,7 @@ from services.estimator import kernels
 if TYPE_CHECKING:
     from common.se2 import Array
     from common.world import World
+    from services.estimator.asking import Pieces
 
 CORNER = 0.3  # rad, beyond which a surface is tilted by design and not by the ripples of learning
 EXACT_SCALE = 1e-4  # m, what floating point and circles may leave
@@ -24,6 +26,19 @@ class Expected:
     ranges: Array  # (N, B) m; +inf: no return expected
     scale: Array  # (N, B) m, standard deviation of the model's own error; log precision = -2 ln scale
     jacobian: Array  # (N, B, 3) derivative of the ranges by x, y (m/m) and yaw (m/rad) of the laser in map
+
+    def part(self, rows: slice) -> Expected:
+        """Of some of the poses."""
+        return Expected(self.ranges[rows], self.scale[rows], self.jacobian[rows])
+
+    @classmethod
+    def joined(cls, parts: Sequence[Expected]) -> Expected:
+        """Several below one another."""
+        return cls(
+            np.concatenate([part.ranges for part in parts]),
+            np.concatenate([part.scale for part in parts]),
+            np.concatenate([part.jacobian for part in parts]),
+        )
 
 
 class GenerativeModel(Protocol):
@@ -53,3 +68,42 @@ class RayCaster:
         ranges, jacobian = np.empty(shape), np.empty((*shape, 3))
         kernels.cast(self.world.segments, self.world.circles, lasers, angles, ranges, jacobian)
         return Expected(ranges, np.full(shape, EXACT_SCALE), jacobian)
+
+
+@dataclass(frozen=True)
+class Expect:
+    """The question an estimator asks most (see `asking`): the scans expected from N poses. Answered by Expected."""
+
+    model: GenerativeModel
+    lasers: Array  # (N, 3)
+    angles: Array  # (B,)
+
+    @property
+    def alike(self) -> Hashable:
+        """One model, the same beams."""
+        return id(self.model), self.angles.tobytes()
+
+    @property
+    def beams(self) -> int:
+        """N B."""
+        return len(self.lasers) * len(self.angles)
+
+    def answer(self) -> Expected:
+        """Now."""
+        return self.model.expect(self.lasers, self.angles)
+
+    def answer_all(self, questions: Sequence[Expect]) -> list[Expected]:
+        """All poses in one call of the model."""
+        seen = self.model.expect(np.concatenate([question.lasers for question in questions]), self.angles)
+        ends = np.cumsum([len(question.lasers) for question in questions])
+        return [seen.part(slice(end - len(q.lasers), end)) for q, end in zip(questions, ends, strict=True)]
+
+    def in_pieces(self, beams: int) -> Pieces[Expected]:
+        """A few poses at a time."""
+        rows = max(1, beams // max(1, len(self.angles)))
+        parts = []
+        for begin in range(0, len(self.lasers), rows):
+            if begin:
+                yield
+            parts.append(self.model.expect(self.lasers[begin : begin + rows], self.angles))
+        return Expected.joined(parts)

@@ -8,6 +8,7 @@ import numpy as np
 
 from common import se2
 from common.errors import UserError
+from services.estimator.asking import Conversation, alone
 from services.estimator.generative import Expected
 from services.estimator.interface import Hypothesis, Observation, Posterior, Predicted
 from services.estimator.perception import Descent, PaperEstimator
@@ -57,8 +58,12 @@ class PaperPerception:
 
     def update(self, observation: Observation) -> Posterior:
         """Descend on one scan."""
+        return alone(self.updating(observation))
+
+    def updating(self, observation: Observation) -> Conversation[Posterior]:
+        """The same as a conversation: see `asking`."""
         ranges = usable_ranges(observation.ranges, observation.range_max)
-        estimate = self.estimator.update(ranges, observation.goal)
+        estimate = yield from self.estimator.updating(ranges, observation.goal)
         found = estimate.gradient
         return Posterior(
             estimate.state,

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from services.estimator.asking import Conversation, alone
 from services.estimator.free_energy import Gradient, gradient
 
 if TYPE_CHECKING:
     from common.se2 import Array
+    from services.estimator.asking import Pieces
     from services.estimator.decoder import GenerativeModel
 
 State = Literal["localising", "tracking", "lost"]
@@ -39,6 +42,34 @@ class Estimate:
     state: State
 
 
+@dataclass(frozen=True)
+class Decode:
+    """The question preset `paper` asks (see `asking`): what is expected at a pose, and its derivative."""
+
+    model: GenerativeModel
+    pose: Array  # (3,)
+    beams: int = 0
+
+    @property
+    def alike(self) -> Hashable:
+        """One network."""
+        return id(self.model)
+
+    def answer(self) -> tuple[Array, Array]:
+        """Now."""
+        return self.model.predict(self.pose)
+
+    def answer_all(self, questions: Sequence[Decode]) -> list[tuple[Array, Array]]:
+        """All poses through the network at once."""
+        ranges, jacobians = self.model.predict_all(np.array([question.pose for question in questions]))
+        return list(zip(ranges, jacobians, strict=True))
+
+    def in_pieces(self, beams: int) -> Pieces[tuple[Array, Array]]:  # noqa: ARG002
+        """There is but one."""
+        yield from ()
+        return self.answer()
+
+
 @dataclass
 class PaperEstimator:
     """Belief about (x, y); the heading is known and frozen, there is no covariance and no prior in time."""
@@ -64,16 +95,22 @@ class PaperEstimator:
 
     def update(self, ranges: Array, goal: Array | None = None) -> Estimate:
         """Descend F for a scan of usable ranges (B,) m; ``goal`` (3,) attracts the belief where beta > 0."""
+        return alone(self.updating(ranges, goal))
+
+    def updating(self, ranges: Array, goal: Array | None = None) -> Conversation[Estimate]:
+        """The same as a conversation: see `asking`."""
         precision = np.ones(len(ranges))
         before = self.pose
         metric = np.append(self.metric, 1.0)
-        g_goal = self.model.predict(goal)[0] if goal is not None and self.settings.beta > 0 else None
+        g_goal = None
+        if goal is not None and self.settings.beta > 0:
+            g_goal, _ = yield Decode(self.model, goal)
         for _ in range(self.settings.iterations):
-            g, dg = self.model.predict(self.pose)
+            g, dg = yield Decode(self.model, self.pose)
             step = self.settings.alpha * metric * gradient(ranges, g, dg, precision, g_goal, self.settings.beta).descent
             length = float(np.hypot(step[0], step[1]))
             self.pose = self._inside(self.pose + step * min(1.0, self.settings.max_step / max(length, 1e-12)))
-        g, dg = self.model.predict(self.pose)
+        g, dg = yield Decode(self.model, self.pose)
         final = gradient(ranges, g, dg, precision, g_goal, self.settings.beta)
         state = self._judge(float(np.hypot(*(self.pose - before)[:2])), float(np.mean(np.abs(ranges - g))))
         return Estimate(self.pose.copy(), g, final, state)

@@ -20,6 +20,29 @@ from services.estimator.perception import Descent
 from services.estimator.settings import EstimatorSettings
 
 
+class Models:
+    """What is loaded once, for however many robots."""
+
+    def __init__(self, settings: EstimatorSettings) -> None:
+        """Raises UserError where a world has no weights."""
+        self.choice = Choice(
+            settings.world, settings.estimator, settings.model, settings.models, settings.sigma, settings.seed,
+            initial_pose=_pose(settings.initial_pose),
+            descent=Descent(alpha=settings.alpha, beta=settings.beta, iterations=settings.iterations),
+        )  # fmt: skip
+        self.factory: Factory = prepare(self.choice)
+        self._described: dict[int | None, ModelInUse | str] = {}
+
+    def in_use(self, beams: int | None) -> ModelInUse | str:
+        """What was loaded for scans of so many beams, before somebody writes other files; or why it is not known."""
+        if beams not in self._described:
+            try:
+                self._described[beams] = model_in_use(self.choice, beams)
+            except UserError as error:
+                self._described[beams] = str(error)
+        return self._described[beams]
+
+
 class EstimatorService(Service):
     """Perception as a process."""
 
@@ -29,18 +52,13 @@ class EstimatorService(Service):
     inputs: ClassVar[tuple[Topic, ...]] = (SCAN, GOAL)
     queries: ClassVar[tuple[Query, ...]] = (LOCALISE, MODEL, PREDICT)
 
-    def __init__(self, settings: EstimatorSettings) -> None:
-        """Models are loaded in `open`; the estimator is made for the beams of the first scan."""
+    def __init__(self, settings: EstimatorSettings, models: Models | None = None) -> None:
+        """Models are loaded in `open`, or are ``models`` of several robots; the estimator is made at the first scan."""
         super().__init__(settings)
         self.options = settings
-        self.choice = Choice(
-            settings.world, settings.estimator, settings.model, settings.models, settings.sigma, settings.seed,
-            initial_pose=_pose(settings.initial_pose),
-            descent=Descent(alpha=settings.alpha, beta=settings.beta, iterations=settings.iterations),
-        )  # fmt: skip
         more = {"odometry": (ODOM,), "command": (CMD_VEL,)}.get(settings.prior, ())
         self.inputs = (SCAN, GOAL, *more)  # type: ignore[misc]
-        self.factory: Factory | None = None
+        self.models = models
         self.geometry: Geometry | None = None
         self.estimator: Estimator | None = None
         self.model: ModelInUse | str = "no scan has come yet"  # or why it is not known
@@ -53,8 +71,9 @@ class EstimatorService(Service):
     def open(self) -> None:
         """Fail now, not at the first scan, where a world has no weights."""
         options = self.options
-        self.factory = prepare(self.choice)
-        self._look_at_model(None)
+        if self.models is None:
+            self.models = Models(options)
+        self.model = self.models.in_use(None)
         self.log.info("estimator", name=options.estimator, world=options.world, prior=options.prior)
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
@@ -99,24 +118,35 @@ class EstimatorService(Service):
             _, belief, prediction = self.last  # a scan sent again is answered again, not used again
         else:
             estimator = self._estimator_for(scan)
-            if estimator is None:
-                return
-            posterior = estimator.update(self._observation(scan))
-            belief, prediction = _belief(scan, posterior, estimator.name), _prediction(scan, posterior)
-            self.last = (scan.stamp_ns, belief, prediction)
+            if estimator is not None:
+                self.infer(scan, estimator, self._observation(scan))
+            return
+        self._answer(belief, prediction)
+
+    def infer(self, scan: Scan, estimator: Estimator, observation: Observation) -> None:
+        """Update, and `conclude`: at once."""
+        self.conclude(scan, estimator.update(observation), estimator.name)
+
+    def conclude(self, scan: Scan, posterior: Posterior, estimator: str) -> None:
+        """Say what came of a scan."""
+        belief, prediction = _belief(scan, posterior, estimator), _prediction(scan, posterior)
+        self.last = (scan.stamp_ns, belief, prediction)
+        self._answer(belief, prediction)
+
+    def _answer(self, belief: Belief, prediction: Prediction) -> None:
         self.publish(PREDICTION, prediction)
         self.publish(BELIEF, belief)
 
     def _estimator_for(self, scan: Scan) -> Estimator | None:
         """The one at hand, or a new one for another scanner; None, and it is said, where there is no model for it."""
-        assert self.factory is not None  # noqa: S101 - set in open
+        assert self.models is not None  # noqa: S101 - set in open
         geometry = Geometry(scan.angles(), scan.mount.array(), scan.range_max)
         try:
             if self.geometry is None or not self.geometry.same(geometry):
-                made = self.factory(geometry)
+                made = self.models.factory(geometry)
                 self.estimator, self.geometry = made, geometry
                 if self.options.estimator == "paper":  # whose weights were chosen by the beams just now
-                    self._look_at_model(len(geometry.angles))
+                    self.model = self.models.in_use(len(geometry.angles))
         except UserError as error:
             self.counters["unfit_scans"] += 1
             if self.note != str(error):
@@ -125,13 +155,6 @@ class EstimatorService(Service):
             return None
         self.note = ""
         return self.estimator
-
-    def _look_at_model(self, beams: int | None) -> None:
-        """What was just loaded, before somebody writes other files; no scan is refused where that fails."""
-        try:
-            self.model = model_in_use(self.choice, beams)
-        except UserError as error:
-            self.model = str(error)
 
     def _observation(self, scan: Scan) -> Observation:
         prior = self.options.prior

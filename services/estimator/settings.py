@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
 from common.config import POSE_TEXT, ServiceSettings
+
+ROBOT_NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+_PATTERN = r"[A-Za-z0-9_.*?-]{1,64}"
 
 
 class EstimatorSettings(ServiceSettings):
@@ -19,11 +23,26 @@ class EstimatorSettings(ServiceSettings):
       python -m services.estimator --world office --model exact       rays cast in the world itself, nothing learned
       python -m services.estimator --world my.yaml --models trained   your world, your weights
       python -m services.estimator --initial-pose 3,1.5,90            start from a known pose (m, m, deg)
+      python -m services.estimator --robots robot-1,robot-2           one process for several robots
+      python -m services.estimator --robots 'robot-*' --max-robots 20 for each that appears, 20 at most
       PRESAGE_ESTIMATOR=paper python -m services.estimator --print-config
 
     """
 
     service: ClassVar[str] = "estimator"
+    private: ClassVar[frozenset[str]] = frozenset({"max_robots", "forget"})
+
+    robots: Annotated[
+        str,
+        Field(
+            pattern=rf"^$|^{_PATTERN}(,{_PATTERN})*$",
+            description="names or patterns (* and ?), comma-separated: robots that this process serves; none: --robot",
+        ),
+    ] = ""
+    max_robots: Annotated[int, Field(ge=1, le=1000, description="that one process serves")] = 100
+    forget: Annotated[
+        float, Field(gt=0, le=1e6, description="s without scan or simulator, after which one of several is forgotten")
+    ] = 60.0
 
     world: Annotated[str, Field(description="shipped world or world file the model was trained for")] = "corridor"
     estimator: Annotated[

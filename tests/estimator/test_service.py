@@ -50,7 +50,7 @@ def opened_precise():
 @pytest.fixture
 def precise(opened_precise):
     made = Heard(EstimatorSettings())
-    made.factory = opened_precise.factory
+    made.models = opened_precise.models
     return made
 
 

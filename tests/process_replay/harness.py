@@ -116,9 +116,9 @@ def drive(service: Service, events: Iterable[Event]) -> list[Row]:
 
 def _happen(loop: Loop, event: Event, number: int, rows: list[Row]) -> None:
     if event.what is None:
-        loop._guard(loop.service.on_timer)
+        loop.guard(loop.service.on_timer)
     elif isinstance(event.what, Topic):
-        loop._guard(lambda: loop.service.on_sample(sample(event.what, event.payload)))
+        loop.guard(lambda: loop.service.on_sample(sample(event.what, event.payload)))
     else:
         query = event.what
 

@@ -45,15 +45,17 @@ class ParticleFilter:
         mount: tuple[float, float, float] = (0, 0, 0),
         seed: int = 0,
         heading: float | None = None,
+        sensor: Sensor | None = None,
     ) -> None:
         """Spread over free space of ``world``; ``mount`` (3,) is laser in base_link, m, m, rad.
 
-        ``heading`` rad: known and frozen, as the paper's robot has it; none: estimated.
+        ``heading`` rad: known and frozen, as the paper's robot has it; none: estimated. ``sensor``: one of this world
+        and these settings, for several filters; none: one of its own.
         Raises UserError where the world is too large for the settings' resolution.
         """
         self.world, self.settings = world, settings or Settings()
         self.mount, self.heading = np.array(mount, float), heading
-        self.sensor = Sensor(world, self.settings)
+        self.sensor = sensor or Sensor(world, self.settings)
         self._rng = np.random.default_rng(seed)
         self._places = np.zeros((0, 2))
         self.restart()

@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common import se2
+from services.estimator.asking import Conversation, Search, alone
+from services.estimator.generative import Expect, Expected
 from services.estimator.interface import Hypothesis, Observation, Posterior, Predicted, State
 from services.estimator.precise import mixture, obstruction
-from services.estimator.precise.gauss_newton import Prior, View, descend, polish
+from services.estimator.precise.gauss_newton import Prior, View, descending, polishing
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.mixture import Mode
 from services.estimator.precise.motion import Candidate, MotionNoise, candidates, fuse
+from services.estimator.precise.seeding import Ranking
 
 if TYPE_CHECKING:
     from common.se2 import Array
@@ -84,25 +87,32 @@ class PreciseEstimator:
 
     def update(self, observation: Observation) -> Posterior:
         """One more scan."""
+        return alone(self.updating(observation))
+
+    def updating(self, observation: Observation) -> Conversation[Posterior]:
+        """The same as a conversation: see `asking`."""
         view = View(
             self.model, self.likelihood, self.mount, observation.angles, observation.ranges, observation.range_max
         )
         if self.modes:
-            self._track(view, observation)
+            yield from self._track(view, observation)
         if not self.modes or self._suspicious(view):
-            self._relocalise(view)
+            yield Search()
+            yield from self._relocalise(view)
         self._stamp, self._odom = observation.stamp, observation.odom
         best = self.modes[0]
         self._usual += 0.1 * (best.explained - self._usual)
         self._energy += 0.1 * (best.accuracy - self._energy)
-        return self._posterior(view, best)
+        return (yield from self._posterior(view, best))
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
         """See Estimator; sigma is the scanner's noise and the model's stated error together."""
-        expected = self.model.expect(se2.compose(poses, self.mount), angles)
+        return self._with_noise(self.model.expect(se2.compose(poses, self.mount), angles))
+
+    def _with_noise(self, expected: Expected) -> Predicted:
         return Predicted(expected.ranges, np.sqrt(expected.scale**2 + self.likelihood.sigma**2))
 
-    def _track(self, view: View, observation: Observation) -> None:
+    def _track(self, view: View, observation: Observation) -> Conversation[None]:
         """Each hypothesis on: where it may have moved, where the scan says it is, both fused."""
         period = self._period(observation.stamp)
         odom = None
@@ -117,11 +127,11 @@ class PreciseEstimator:
             np.array([each[-1].mean for each in options]),
             np.array([np.linalg.inv(each[-1].covariance) for each in options]),
         )
-        poses, evidence = polish(view, starts, wide)
+        poses, evidence = yield from polishing(view, starts, wide)
         if evidence.explained[0] < self._usual - self.settings.drop:
             for widen in (WIDEST, WIDE, NARROW):
-                starts, _ = descend(view, starts, wide, widen, 5)
-            retried = polish(view, starts, wide)
+                starts, _ = yield from descending(view, starts, wide, widen, 5)
+            retried = yield from polishing(view, starts, wide)
             if retried[1].explained[0] > evidence.explained[0]:
                 poses, evidence = retried
         modes = []
@@ -170,12 +180,13 @@ class PreciseEstimator:
         expected = self.model.expect(se2.compose(best.pose, self.mount)[None], view.angles)
         return obstruction.contradicted(view, expected) <= settings.contradicted
 
-    def _relocalise(self, view: View) -> None:
+    def _relocalise(self, view: View) -> Conversation[None]:
         """Search from nothing; keep what is tracked where nothing better is found."""
         if self._near is not None:
-            found, self._near = self._search_near(view, *self._near), None
+            near, self._near = self._near, None
+            found = yield from self._search_near(view, *near)
         else:
-            found = self._search(view)
+            found = yield from self._search(view)
         if self.modes:
             before, margin = self.modes[0], 3 * self.settings.evidence_error
             if mixture.same(found[0].pose[None], before.pose)[0]:
@@ -195,31 +206,31 @@ class PreciseEstimator:
         off = found.pose[:2] - best.pose[:2]
         return bool(off @ np.linalg.solve(spread, off) > FAR)
 
-    def _search(self, view: View) -> list[Mode]:
+    def _search(self, view: View) -> Conversation[list[Mode]]:
         modes: list[Mode] = []
         for count in (self.settings.seeds, self.settings.more_seeds):
-            modes = self._refine(view, self.seeds.rank(view, count), None)
+            starts = yield Ranking(self.seeds, view, count)
+            modes = yield from self._refine(view, starts, None)
             if modes[0].explained >= self.settings.satisfied:
                 break
         return modes
 
-    def _search_near(self, view: View, pose: Array, covariance: Array) -> list[Mode]:
+    def _search_near(self, view: View, pose: Array, covariance: Array) -> Conversation[list[Mode]]:
         starts = self._rng.multivariate_normal(pose, covariance, self.settings.seeds)
         starts[0] = pose
         information = np.linalg.inv(covariance)
-        return self._refine(
-            view, starts, Prior(np.tile(pose, (len(starts), 1)), np.tile(information, (len(starts), 1, 1)))
-        )
+        prior = Prior(np.tile(pose, (len(starts), 1)), np.tile(information, (len(starts), 1, 1)))
+        return (yield from self._refine(view, starts, prior))
 
-    def _refine(self, view: View, starts: Array, prior: Prior | None) -> list[Mode]:
+    def _refine(self, view: View, starts: Array, prior: Prior | None) -> Conversation[list[Mode]]:
         """Descend from all starts with few beams and wide deviations, then from the best with all and none."""
         few = view.thinned(self.settings.beams)
-        poses, evidence = descend(few, starts, prior, WIDEST, 5)
-        poses, evidence = descend(few, poses, prior, WIDE, 4)
+        poses, evidence = yield from descending(few, starts, prior, WIDEST, 5)
+        poses, evidence = yield from descending(few, poses, prior, WIDE, 4)
         keep = mixture.distinct(poses, evidence.accuracy, 2 * self.settings.hypotheses)
         part = Prior(prior.mean[keep], prior.information[keep]) if prior else None
-        poses, evidence = descend(view, poses[keep], part, NARROW, 4)
-        poses, evidence = polish(view, poses, part)
+        poses, evidence = yield from descending(view, poses[keep], part, NARROW, 4)
+        poses, evidence = yield from polishing(view, poses, part)
         keep = mixture.distinct(poses, evidence.accuracy, self.settings.hypotheses)
         modes = [
             mixture.found(poses[k], evidence, k, part, self.seeds.volume, self.seeds.spread, self.model.ripple)
@@ -232,8 +243,9 @@ class PreciseEstimator:
             return self.settings.motion.period
         return stamp - self._stamp
 
-    def _posterior(self, view: View, best: Mode) -> Posterior:
-        expected = self.predict(best.pose[None], view.angles)
+    def _posterior(self, view: View, best: Mode) -> Conversation[Posterior]:
+        seen: Expected = yield Expect(self.model, se2.compose(best.pose[None], self.mount), view.angles)
+        expected = self._with_noise(seen)
         believable = self._believable(view)
         state = self._state(best, believable=believable)
         unknown = self.seeds.spread * (not believable)

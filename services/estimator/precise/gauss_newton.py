@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common import se2
+from services.estimator.asking import Conversation, alone
+from services.estimator.generative import Expect, Expected
 from services.estimator.precise.likelihood import Evidence
 
 if TYPE_CHECKING:
@@ -45,8 +47,13 @@ class View:
 
     def evidence(self, poses: Array, widen: float = 0.0) -> Evidence:
         """What the scan says about base_link poses (N, 3), derivatives by these."""
+        return alone(self.looking(poses, widen))
+
+    def looking(self, poses: Array, widen: float = 0.0) -> Conversation[Evidence]:
+        """The same; the scans expected are asked for."""
         lasers = se2.compose(poses, self.mount)
-        found = self.likelihood.evaluate(self.ranges, self.range_max, self.model.expect(lasers, self.angles), widen)
+        expected: Expected = yield Expect(self.model, lasers, self.angles)
+        found = self.likelihood.evaluate(self.ranges, self.range_max, expected, widen)
         # A turn of base_link moves the laser sideways: J_base = J_laser T.
         T = np.tile(np.eye(3), (len(poses), 1, 1))
         T[:, 0, 2], T[:, 1, 2] = poses[:, 1] - lasers[:, 1], lasers[:, 0] - poses[:, 0]
@@ -83,8 +90,15 @@ def descend(
     view: View, poses: Array, prior: Prior | None = None, widen: float = 0.0, iterations: int = 10
 ) -> tuple[Array, Evidence]:
     """Poses (N, 3) after the descent from ``poses``, and the evidence there."""
+    return alone(descending(view, poses, prior, widen, iterations))
+
+
+def descending(
+    view: View, poses: Array, prior: Prior | None = None, widen: float = 0.0, iterations: int = 10
+) -> Conversation[tuple[Array, Evidence]]:
+    """What `descend` does, as a conversation."""
     best = np.array(poses, float)
-    evidence = view.evidence(best, widen)
+    evidence = yield from view.looking(best, widen)
     energy = evidence.accuracy + (prior.energy(best) if prior else 0.0)
     damping, live = np.full(len(best), 1e-3), np.ones(len(best), bool)
     for _ in range(iterations):
@@ -94,7 +108,7 @@ def descend(
             break
         trial = best[live] + step[live]
         trial[:, 2] = se2.wrap(trial[:, 2])
-        tried = view.evidence(trial, widen)
+        tried = yield from view.looking(trial, widen)
         part = Prior(prior.mean[live], prior.information[live]) if prior else None
         new = tried.accuracy + (part.energy(trial) if part else 0.0)
         better = new < energy[live]
@@ -123,13 +137,20 @@ def polish(view: View, poses: Array, prior: Prior | None = None, iterations: int
     Each step minimises F with the beams' weights held (iteratively reweighted least squares). Returns the last poses
     that were evaluated, at most ``SETTLED`` from the minimum, and the evidence there.
     """
+    return alone(polishing(view, poses, prior, iterations))
+
+
+def polishing(
+    view: View, poses: Array, prior: Prior | None = None, iterations: int = 5
+) -> Conversation[tuple[Array, Evidence]]:
+    """What `polish` does, as a conversation."""
     poses = np.array(poses, float)
-    evidence = view.evidence(poses)
+    evidence = yield from view.looking(poses)
     for _ in range(iterations - 1):
         step = _steps(poses, evidence, prior, np.zeros(len(poses)))
         if (np.abs(step) < SETTLED).all():
             break
         poses = poses + step
         poses[:, 2] = se2.wrap(poses[:, 2])
-        evidence = view.evidence(poses)
+        evidence = yield from view.looking(poses)
     return poses, evidence

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -9,14 +10,17 @@ import numpy as np
 
 from common import se2
 from services.estimator import kernels
+from services.estimator.asking import without_pause
 
 if TYPE_CHECKING:
     from common.se2 import Array
+    from services.estimator.asking import Pieces
     from services.estimator.generative import GenerativeModel
     from services.estimator.precise.gauss_newton import View
 
 BINS = 360  # of a cached panorama
 SPACING = 0.3  # m between the places a search begins at
+LOOKS = 40  # into a panorama take as long as the prediction of one beam
 TOLERANCE = 0.35  # m, misfit of a beam that still speaks for a place about as far from the truth
 
 
@@ -46,22 +50,57 @@ class Seeds:
         extent = np.ptp(self.places, axis=0) if len(self.places) else np.ones(2)
         return np.diag([*np.maximum(extent, SPACING) ** 2 / 12, np.pi**2 / 3])
 
-    def rank(self, view: View, count: int, headings: int = 120, beams: int = 72) -> Array:
+    def rank(self, view: View, count: int) -> Array:
         """(count, 3) base_link poses that fit the scan best, best first; a place gives at most two headings."""
-        thin = view.thinned(beams)
+        return Ranking(self, view, count).answer()
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The question a search begins with (see `asking`), answered by the starts of a descent: `Seeds.rank`."""
+
+    seeds: Seeds
+    view: View
+    count: int
+    headings: int = 120
+    thinned: int = 72  # beams that are compared
+
+    @property
+    def alike(self) -> Hashable:
+        """Each on its own: there is nothing to share."""
+        return id(self)
+
+    @property
+    def beams(self) -> int:
+        """Of predictions that take as long as these looks into a table."""
+        return len(self.seeds.places) * self.headings * self.thinned // LOOKS
+
+    def answer(self) -> Array:
+        """Now."""
+        return without_pause(self.in_pieces(self.beams + 1))
+
+    def answer_all(self, questions: Sequence[Ranking]) -> list[Array]:
+        """One after the other."""
+        return [question.answer() for question in questions]
+
+    def in_pieces(self, beams: int) -> Pieces[Array]:
+        """A few places at a time."""
+        seeds, thin = self.seeds, self.view.thinned(self.thinned)
         bins = np.round(thin.angles / (2 * np.pi / BINS)).astype(np.int64)
-        costs = np.empty((len(self.places), headings), np.float32)
-        kernels.rank(
-            self.panoramas,
-            bins,
-            thin.ranges.astype(np.float32),
-            np.float32(TOLERANCE),
-            np.float32(view.range_max),
-            costs,
-        )
-        place, heading = _least(costs, count)
-        lasers = np.column_stack([self.places[place], se2.wrap(heading * (2 * np.pi / headings))])
-        return se2.compose(lasers, se2.inverse(view.mount))
+        measured = thin.ranges.astype(np.float32)
+        costs = np.empty((len(seeds.places), self.headings), np.float32)
+        rows = max(1, beams * LOOKS // (self.headings * self.thinned))
+        for begin in range(0, len(costs), rows):
+            if begin:
+                yield
+            part = slice(begin, begin + rows)
+            kernels.rank(
+                seeds.panoramas[part], bins, measured, np.float32(TOLERANCE), np.float32(self.view.range_max),
+                costs[part],
+            )  # fmt: skip
+        place, heading = _least(costs, self.count)
+        lasers = np.column_stack([seeds.places[place], se2.wrap(heading * (2 * np.pi / self.headings))])
+        return se2.compose(lasers, se2.inverse(self.view.mount))
 
 
 def _least(costs: np.ndarray[tuple[int, ...], np.dtype[np.float32]], count: int) -> tuple[Array, Array]:

@@ -1,0 +1,191 @@
+"""One estimator process for several robots, with real simulators on a real bus."""
+
+from __future__ import annotations
+
+import signal
+
+import numpy as np
+import pytest
+
+from common.bus import Link, open_bus, wait_until
+from common.inbox import Inbox, Sample
+from common.messages import Belief, Health, Truth
+from common.requests import ConfigReply, ModelReply, ModelRequest, Request
+from common.topics import BELIEF, CONFIG, HEALTH, MODEL, SCAN, TRUTH
+from services.estimator.fleet_service import key_expression
+
+NUMBERS = (1, 2, 3)
+STARTS = {1: "3,1.5,90", 2: "9,1.5,0", 3: "14,1.5,180"}
+NEAR = 0.15  # m, with 64 beams
+
+
+class Ear:
+    """What is said of one robot, newest last."""
+
+    def __init__(self, bus, robot):
+        self.robot, self._inbox, self._truths = robot, Inbox(), {}
+        for topic in (BELIEF, TRUTH, HEALTH):
+            bus.subscribe(topic, self._inbox, keep_all=True, robot=robot)
+
+    def hear(self, condition):
+        """Whether a message that came meanwhile meets the condition."""
+        while isinstance(sample := self._inbox.get(0), Sample):
+            message = sample.topic.message.decode(sample.payload)
+            if isinstance(message, Truth):
+                self._truths[message.stamp_ns] = message
+            if condition(message):
+                return True
+        return False
+
+    def forget_what_was(self):
+        while self._inbox.get(0) is not None:
+            pass
+        self._truths.clear()
+
+    def localised(self, message):
+        truth = self._truths.get(message.stamp_ns)
+        if not isinstance(message, Belief) or message.state != "tracking" or truth is None:
+            return False
+        return np.hypot(message.pose.x - truth.pose.x, message.pose.y - truth.pose.y) < NEAR
+
+    def wait(self, condition, what, timeout=60.0):
+        assert wait_until(lambda: self.hear(condition), timeout), f"{self.robot}: not {what}"
+
+
+@pytest.fixture
+def names(link):
+    return {k: f"{link.robot}-{k}" for k in NUMBERS}
+
+
+@pytest.fixture
+def simulate(process, names):
+    def start(k, where=None):
+        return process(
+            "simulator", "--beams", "64", "--start", where or STARTS[k], "--seed", str(k),
+            env={"PRESAGE_ROBOT": names[k]},
+        )  # fmt: skip
+
+    return start
+
+
+def test_three_robots_one_estimator(process, bus, link, names, simulate):
+    estimator = process("estimator", "--robots", f"{names[1]},{link.robot}-?", "--forget", "1.5")
+    ears = {k: Ear(bus, name) for k, name in names.items()}
+    simulators = {k: simulate(k) for k in NUMBERS}
+    for ear in ears.values():
+        ear.wait(ear.localised, "localised")
+
+    # Each robot has an estimator of its own, as far as anybody can tell.
+    for ear in ears.values():
+        assert "estimator" in bus.alive(robot=ear.robot)
+        ear.wait(
+            lambda m, r=ear.robot: (
+                isinstance(m, Health)
+                and m.service == "estimator"
+                and {row.key for row in m.topics if row.published} >= {BELIEF.key(r)}
+                and all(row.key.startswith(f"presage/{r}/") for row in m.topics)
+            ),
+            "healthy",
+        )
+        config = bus.ask(CONFIG, Request(), ConfigReply, service="estimator", robot=ear.robot)
+        assert f'"robot": "{ear.robot}"' in config.config
+        assert bus.ask(MODEL, ModelRequest(), ModelReply, robot=ear.robot).ok
+
+    # What one robot's scanner gets wrong is counted there, and the others do not notice.
+    garbage, before = bus.beside(names[2]), Inbox()
+    assert garbage.wait_matching(SCAN, 10)
+    bus.subscribe(BELIEF, before, keep_all=True, robot=names[1])
+    for k in range(1000):
+        garbage.put(SCAN, bytes([k % 256]) * (k % 300))
+    ears[2].wait(
+        lambda m: (
+            isinstance(m, Health)
+            and m.service == "estimator"
+            and sum(row.undecodable for row in m.topics if row.key == SCAN.key(names[2])) > 0
+        ),
+        "told of what could not be decoded",
+    )
+    for ear in ears.values():
+        ear.forget_what_was()
+        ear.wait(ear.localised, "localised after the malformed scans")
+    stamps = [BELIEF.message.decode(s.payload).stamp_ns for s in iter(lambda: before.get(0), None)]
+    assert len(stamps) == len(set(stamps)) > 0
+
+    # Who was found by a pattern is forgotten when gone, and found again elsewhere; a named one keeps its keys.
+    simulators[1].stop()
+    simulators[2].stop()
+    assert wait_until(lambda: "estimator" not in bus.alive(robot=names[2]), 30)
+    estimator.wait_for(f"robot={names[1]} seconds=1.5")
+    assert "estimator" in bus.alive(robot=names[1])
+    for k in (1, 2):
+        ears[k].forget_what_was()
+        simulate(k, "6,2,45")
+    for ear in (ears[1], ears[2]):
+        ear.wait(ear.localised, "localised after it came back")
+    ears[3].forget_what_was()
+    ears[3].wait(ears[3].localised, "served all the time")
+    assert "Traceback" not in estimator.output
+    assert estimator.stop()[0] == 0
+
+
+def test_no_more_robots_than_asked_and_none_that_has_an_estimator(process, bus, link, names, simulate):
+    own = process("estimator", env={"PRESAGE_ROBOT": names[1]})
+    assert wait_until(lambda: "estimator" in bus.alive(robot=names[1]), 60)
+    simulators = [simulate(k) for k in NUMBERS]
+    assert wait_until(lambda: all("simulator" in bus.alive(robot=name) for name in names.values()), 60)
+    fleet = process("estimator", "--robots", f"{link.robot}-*", "--max-robots", "1")
+    fleet.wait_for("too many robots", 60)
+    served = [k for k in (2, 3) if f"ready robot={names[k]}" in " ".join(fleet.output.split())]
+    assert len(served) == 1
+    assert f"robot={names[1]}" not in fleet.output
+    own.stop()
+    simulators[served[0] - 1].stop()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--robots", "a b"), "robots"),
+        (("--robots", "a,b", "--initial-pose", "3,1.5"), "--initial-pose"),
+        (("--robots", "a,b,c", "--max-robots", "2"), "--max-robots"),
+    ],
+)
+def test_what_cannot_be_served_is_said_in_one_line(process, arguments, words):
+    refused = process("estimator", *arguments)
+    assert refused.wait(60) == 2
+    assert len(refused.output.strip().splitlines()) == 1
+    assert words in refused.output
+
+
+def test_up_with_two_robots(process, free_port):
+    port = free_port()
+    up = process(
+        "presage.__main__", "up", "--robots", "2", "--robot", "r", "--beams", "64", "--no-viewer", "--port", str(port)
+    )
+    up.wait_for("all alive", 120)
+    with open_bus(Link(robot="r-1", connect=(f"tcp/127.0.0.1:{port}",))) as bus:
+        for robot in ("r-1", "r-2"):
+            ear = Ear(bus, robot)
+            ear.wait(ear.localised, "localised")
+            assert bus.alive(robot=robot) == {"estimator", "simulator", "controller"}
+    assert up.output.count("estimator | ") > 0
+    assert up.stop(signal.SIGINT, 60)[0] == 130
+
+
+@pytest.mark.parametrize(
+    ("pattern", "hears", "not_heard"),
+    [("*", "a-1", ""), ("a-*", "a-1", "b-1"), ("a-?", "a-1", "b-1"), ("*-1", "b-1", "b-2"), ("??", "ab", "")],
+)
+def test_a_pattern_hears_of_a_robot_by_its_scans_alone(bus, link, pattern, hears, not_heard):
+    prefix = "" if pattern in {"*", "??"} else link.robot
+    inbox = Inbox()
+    bus.subscribe(SCAN, inbox, keep_all=True, robot=key_expression(prefix + pattern))
+    with open_bus(link) as other:
+        for robot in filter(None, (not_heard, hears)):
+            there = other.beside(prefix + robot)
+            if robot == hears:
+                assert there.wait_matching(SCAN, 10)
+            there.put(SCAN, b"x")
+    heard = []
+    assert wait_until(lambda: heard.append(inbox.get(0)) or heard[-1] is not None, 10)
+    assert heard[-1].key == SCAN.key(prefix + hears)
