@@ -30,7 +30,8 @@ ALSO_SHELL = {
     "services/simulator/physics.py",  # pybullet reads the robot's URDF from a file
 }  # fmt: skip
 OUTSIDE = {
-    "common.bus", "common.session", "common.presence", "common.loop", "common.leading", "common.service", "common.inbox", "common.config", "common.log", "zenoh",
+    "common.bus", "common.session", "common.presence", "common.loop", "common.leading",
+    "common.service", "common.inbox", "common.config", "common.log", "zenoh",
     "time", "datetime", "os", "io", "pathlib", "shutil", "tempfile", "socket", "subprocess", "threading", "asyncio",
     "signal",
 }  # fmt: skip
