@@ -13,18 +13,17 @@ from typing import Any
 
 import psutil
 from rich.console import Console
-from rich.table import Table
 
 from common.bus import open_bus
 from common.errors import UserError
 from common.versions import commit, versions
 from common.world import load_world
 from presage.fleet_load import Load, Window
+from presage.fleet_table import WAYS, show
 from presage.output import check_file, write_json
 from presage.stack import Stack
 
 PATIENCE = 120.0  # s
-WAYS = ("one process", "one each")
 SETTLING = 4.0  # s of slow scans in which robots find their places, and again where some have not
 SLOWLY = 3.0  # Hz, those scans
 ROUNDS = 5  # of settling
@@ -114,10 +113,12 @@ class Side:
         """Whether so many robots are answered in time; asked twice before a no, for a machine has hiccups."""
         self.prepare(count)
         for _ in range(2):
-            before = self._cpu()
+            before, others = self._cpu(), self._busy()
             window = self.load.play(count, self.plan.seconds)
             self.stack.check()
-            row = _row(window, self._cpu() - before, self.plan)
+            used = self._cpu() - before
+            row = _row(window, used, self.plan)
+            row["others_share"] = max(0.0, self._busy() - others - used) / self.plan.seconds
             self.found.windows.append(row)
             if row["served"]:
                 return True
@@ -131,6 +132,11 @@ class Side:
             before = self._cpu()
             window = self.load.play(count, self.plan.seconds, searching=True)
             self.found.searching = _row(window, self._cpu() - before, self.plan)
+
+    def _busy(self) -> float:
+        """S that the core has worked, for whomever."""
+        times = psutil.cpu_times(percpu=True)[self.core]
+        return float(sum(times) - times.idle - getattr(times, "iowait", 0.0))
 
     def _cpu(self) -> float:
         return sum(t.user + t.system for t in (process.cpu_times() for process in self.processes()))
@@ -209,7 +215,7 @@ def bench_fleet(estimators: str, plan: Plan, json_file: Path | None, console: Co
     """Print, and write as JSON where asked."""
     check_file(json_file, "--json")
     rows = [measure(name, way, plan, console).row() for name in estimators.split(",") for way in WAYS]
-    ratios = _show(rows, plan, console)
+    ratios = show(rows, plan, console)
     load_average = os.getloadavg()[0]
     console.print(f"load of the machine at the end: {load_average:.1f} on {os.cpu_count()} cores", highlight=False)
     write_json(json_file, {
@@ -218,63 +224,3 @@ def bench_fleet(estimators: str, plan: Plan, json_file: Path | None, console: Co
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
     })  # fmt: skip
     return 0
-
-
-def _show(rows: list[dict[str, Any]], plan: Plan, console: Console) -> dict[str, dict[str, float | None]]:
-    """The table and what follows from it; by estimator the robots of one process to those of one each."""
-    table = Table(
-        title=f"{plan.world}, {plan.beams} beams at {plan.rate:g} Hz, one core, "
-        f"{100 * plan.share:g} % of the scans answered within {1e3 / plan.rate:.1f} ms",
-        title_justify="left",
-    )
-    for column in (
-        "estimator",
-        "way",
-        "robots",
-        "p50 ms",
-        "p99 ms",
-        "CPU ms a scan",
-        "robots by CPU",
-        "MB a robot",
-        "MB in all",
-    ):
-        table.add_column(column, justify="left" if column in {"estimator", "way"} else "right")
-    for row in rows:
-        table.add_row(
-            row["estimator"], row["way"], f"{row['robots_served']}",
-            *(f"{row[name]:.1f}" if row[name] is not None else "" for name in ("p50_ms", "p99_ms")),
-            f"{row['cpu_ms_per_scan']:.2f}",
-            f"{row['robots_by_cpu']:.1f}",
-            f"{row['memory_per_robot_mb']:.1f}", f"{row['memory_mb']:.0f}",
-        )  # fmt: skip
-    console.print(table)
-    for row in rows:
-        if (other := row["while_one_searches"]) is not None and other["p99_ms"] is not None:
-            console.print(
-                f"{row['estimator']}, {row['way']}: of {other['robots']} robots one searches each second; the others: "
-                f"{100 * other['in_time_share']:.1f} % in time, "
-                f"p50 {other['p50_ms']:.1f}, p99 {other['p99_ms']:.1f} ms",
-                highlight=False,
-            )
-    size = rows[0]["message_bytes"]
-    console.print(
-        "bytes a message: "
-        + ", ".join(f"{name} {count}" for name, count in size.items())
-        + f"; scans to the estimator: {size['scan'] * plan.rate / 1e3:.1f} kB/s a robot",
-        highlight=False,
-    )
-    ratios: dict[str, dict[str, float | None]] = {}
-    for name in dict.fromkeys(row["estimator"] for row in rows):
-        one, each = (next(r for r in rows if r["estimator"] == name and r["way"] == way) for way in WAYS)
-        ratios[name] = {
-            "robots_served": one["robots_served"] / each["robots_served"] if each["robots_served"] else None,
-            "robots_by_cpu": one["robots_by_cpu"] / each["robots_by_cpu"],
-            "memory_per_robot": each["memory_per_robot_mb"] / max(one["memory_per_robot_mb"], 0.1),
-        }
-        served = f"{ratios[name]['robots_served']:.2f}" if each["robots_served"] else "no number of"
-        console.print(
-            f"{name}: one process serves {served} times the robots of one each; "
-            f"by processor time {ratios[name]['robots_by_cpu']:.2f} times",
-            highlight=False,
-        )
-    return ratios
