@@ -99,4 +99,4 @@ ENV NUMBA_CACHE_DIR=/tmp/numba
 WORKDIR /tmp
 USER presage
 HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "estimator"]
-CMD ["sh", "-c", "cp -r /numba /tmp && exec python -m common.fleet each services.estimator"]
+CMD ["sh", "-c", "cp -r /numba /tmp && exec python -m common.fleet together services.estimator"]

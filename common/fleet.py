@@ -57,7 +57,7 @@ def main(argv: list[str]) -> int:
     command = [sys.executable, "-m", *module]
     if mode == "together" or len(robots) == 1:
         environment = {**os.environ, "PRESAGE_ROBOT": robots[0]}
-        if mode == "together":
+        if mode == "together" and len(robots) > 1:
             environment["PRESAGE_ROBOTS"] = ",".join(robots)
         os.execve(sys.executable, command, environment)  # noqa: S606 - becomes it: signals and status are its own
     return Fleet(command, robots, again=mode == "each").run()
