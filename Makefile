@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
 
-.PHONY: help install demo test bless check bench screenshots images clean FORCE
+.PHONY: help install demo test bless check bench chaos screenshots images clean FORCE
 .DELETE_ON_ERROR:
 
 help: ## this list
@@ -73,6 +73,9 @@ check: install ## style, format and types
 
 bench: install ## latency from scan to command beside the raw zenoh round trip
 	$(BIN)/presage bench latency $(ARGS)
+
+chaos: install ## every fault into a driving system on three hosts of its own: detected, stands, at work again
+	$(BIN)/presage bench chaos $(ARGS)
 
 screenshots: install ## docs/page.png and docs/page.webp of the live page; needs Chromium
 	$(BIN)/python -m tests.viewer.screenshots $(ARGS)

@@ -212,3 +212,20 @@ def bench_fleet(
     if quick:
         estimators, plan = "precise", Plan(world, beams, rate, 3.0, min(most, 8), share, seed)
     raise typer.Exit(run(estimators, plan, json_file, console))
+
+
+@app.command("hosts")
+def bench_hosts(
+    seconds: Annotated[float, typer.Option(min=5.0, help="That are measured.")] = 30.0,
+    beams: Annotated[int, typer.Option(min=2, help="Beams of a scan.")] = 622,
+    json_file: Json = None,
+) -> None:
+    """What the links between robot, estimator and the rest carry, and how late things come, on three hosts.
+
+    The hosts are network namespaces on this machine (Linux; as root, or with user namespaces).
+
+    Example: `presage bench hosts --json hosts.json`.
+    """
+    from presage.chaos.links import bench_hosts as run  # noqa: PLC0415
+
+    raise typer.Exit(run(seconds, beams, json_file, console))

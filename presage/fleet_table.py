@@ -78,7 +78,7 @@ def show(rows: list[dict[str, Any]], plan: Plan, console: Console) -> dict[str, 
     others = max(window["others_share"] for row in rows for window in row["windows"])
     if others > QUIET:
         console.print(
-            f"[bold]Other processes used up to {100 * others:.0f} % of that core meanwhile[/]: of a shared core, "
+            f"[bold]Other processes used up to {100 * others:.0f} % of that core meanwhile[/]: of a shared core "
             f"one process gets a smaller part than several do. Compare processor time, or run it on a quiet machine",
             highlight=False,
         )

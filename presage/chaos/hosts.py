@@ -47,11 +47,12 @@ def enter_own_namespaces(arguments: list[str]) -> None:
     os.execvp("unshare", [*_unshare(), sys.executable, *arguments])  # noqa: S606, S607 - found by why_no_hosts
 
 
-def run(*command: str) -> None:
-    """A tool of the system; raises UserError with its own words where it fails."""
+def run(*command: str) -> str:
+    """What a tool of the system says; raises UserError with its own words where it fails."""
     done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own words
     if done.returncode:
         raise UserError(f"{' '.join(command)}: {done.stderr.strip() or done.returncode}")
+    return done.stdout
 
 
 @dataclass
@@ -106,13 +107,13 @@ class Network:
 
     def cut(self, name: str) -> None:
         """Nothing passes any more; nobody is told."""
-        run("ip", "link", "set", _port(name), "down")
+        run("ip", "link", "set", port_of(name), "down")
 
     def mend(self, name: str) -> None:
         """As at first."""
         host = self.hosts[name]
         if host.relay is None:
-            run("ip", "link", "set", _port(name), "up")
+            run("ip", "link", "set", port_of(name), "up")
             return
         host.relay.kill()  # its two ends go with it
         host.relay.wait()
@@ -125,11 +126,11 @@ class Network:
         A process of ours passes the packets on: not every kernel has netem.
         """
         host = self.hosts[name]
-        run("ip", "link", "delete", _port(name))
+        run("ip", "link", "delete", port_of(name))
         numbers = [str(delay_ms / 1000), str(jitter_ms / 1000), str(loss)]
-        host.relay = _child(sys.executable, "-m", "presage.chaos.relay", _port(name), "far0", *numbers)
+        host.relay = _child(sys.executable, "-m", "presage.chaos.relay", port_of(name), "far0", *numbers)
         devices = Path("/sys/class/net")
-        there = [devices / _port(name), devices / "far0"]
+        there = [devices / port_of(name), devices / "far0"]
 
         def ready() -> bool:
             listed = subprocess.run(["ip", "-br", "link"], capture_output=True, text=True, check=True).stdout  # noqa: S607
@@ -137,14 +138,14 @@ class Network:
 
         if not wait_until(ready, 10):
             raise UserError("the bad link did not come up: is /dev/net/tun there?")
-        run("ip", "link", "set", _port(name), "master", SWITCH, "up")
+        run("ip", "link", "set", port_of(name), "master", SWITCH, "up")
         run("ip", "link", "set", "far0", "netns", str(host.holder.pid), "name", "eth0")
         self._address(host)
 
     def _wire(self, host: Host) -> None:
         far = ["peer", "name", "eth0", "netns", str(host.holder.pid)]
-        run("ip", "link", "add", _port(host.name), "type", "veth", *far)
-        run("ip", "link", "set", _port(host.name), "master", SWITCH, "up")
+        run("ip", "link", "add", port_of(host.name), "type", "veth", *far)
+        run("ip", "link", "set", port_of(host.name), "master", SWITCH, "up")
         self._address(host)
 
     def _address(self, host: Host) -> None:
@@ -155,7 +156,8 @@ class Network:
         run(*host.entering, "ip", "link", "set", "eth0", "up")
 
 
-def _port(name: str) -> str:
+def port_of(name: str) -> str:
+    """The switch's end of a host's link."""
     return f"to-{name}"[:15]
 
 

@@ -36,9 +36,18 @@ def told(message: Message) -> dict[str, Any]:
             "distance": message.distance,
         }  # fmt: skip
     if isinstance(message, Belief):
-        return {"what": "belief", "state": message.state, "place": [message.pose.x, message.pose.y]}
+        return {
+            "what": "belief",
+            "stamp": message.stamp_ns,
+            "state": message.state,
+            "place": [message.pose.x, message.pose.y],
+        }
     if isinstance(message, CmdVel):
-        return {"what": "cmd_vel", "speed": float(np.hypot(message.twist.vx, message.twist.vy))}
+        return {
+            "what": "cmd_vel",
+            "stamp": message.stamp_ns,
+            "speed": float(np.hypot(message.twist.vx, message.twist.vy)),
+        }
     if isinstance(message, Health):
         return {"what": "health", "service": message.service, "counters": message.counters, "note": message.note}
     if isinstance(message, Scan):
@@ -58,7 +67,7 @@ def main() -> None:
         with alone:
             print(json.dumps({"t": time.monotonic(), **row}), flush=True)
 
-    with open_bus(Link(robot=robot, connect=(connect,), listen=(listen,), lossless=False)) as bus:
+    with open_bus(Link(robot=robot, connect=(connect,), listen=(listen,), lossless=False, insecure=True)) as bus:
         bus.watch_alive(lambda service, there: say(what="alive", service=service, there=there))
         for topic in SEEN:
             bus.subscribe(topic, inbox, keep_all=True)

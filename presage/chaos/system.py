@@ -78,11 +78,11 @@ class System(Stack):
 
     def variables(self, name: str) -> Mapping[str, str]:
         """Services listen where the other hosts reach them."""
-        more = self.extra.get(name, {})
+        more = {"PRESAGE_INSECURE": "1", **self.extra.get(name, {})}
         if self.network is None or name == "router":
             return more
         host = self.network.hosts[WHERE[name]].address if name in WHERE else self.network.here
-        return {"PRESAGE_LISTEN": f"tcp/{host}:0", "PRESAGE_INSECURE": "1", **more}
+        return {"PRESAGE_LISTEN": f"tcp/{host}:0", **more}
 
     def __enter__(self) -> Self:
         self.start_router()

@@ -22,7 +22,7 @@ def main(words: list[str]) -> None:
     what, *rest = words
     robot, connect = os.environ["PRESAGE_ROBOT"], os.environ["PRESAGE_CONNECT"]
     listen = os.environ.get("PRESAGE_LISTEN") or "tcp/127.0.0.1:0"
-    with open_bus(Link(robot=robot, connect=(connect,), listen=(listen,))) as bus:
+    with open_bus(Link(robot=robot, connect=(connect,), listen=(listen,), insecure=True)) as bus:
         if what == "repeater":
             repeat(bus)
         elif what == "slow subscriber":

@@ -1,0 +1,50 @@
+"""Faults into a driving system, as `presage bench chaos` has them; here what must happen, there how quickly.
+
+On machines that are shared, times say little: what is asserted is that it happens. All rows: `make chaos`.
+"""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from presage.chaos.faults import FAULTS
+from tests.conftest import Processes
+
+ROWS = (
+    "killed: estimator", "killed: controller", "killed: router", "killed: recorder", "frozen 1 s: controller",
+    "network cut 1 s", "duplicates, late", "malformed",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def outcomes(tmp_path_factory):
+    """One system for all of them."""
+    folder = tmp_path_factory.mktemp("chaos")
+    processes, file = Processes(folder), folder / "chaos.json"
+    try:
+        running = processes.start("presage.__main__", "bench", "chaos", *ROWS, "--json", str(file))
+        running.wait(170)
+        assert file.exists(), running.output
+        return json.loads(file.read_text())
+    finally:
+        processes.close()
+
+
+def test_the_rows_are_of_the_table():
+    assert set(ROWS) <= {fault.name for fault in FAULTS}
+    assert len({fault.name for fault in FAULTS}) == len(FAULTS)
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_the_robot_stops_where_it_must_and_all_work_again(outcomes, name):
+    if name in outcomes["skipped"]:
+        pytest.skip(f"NOT TRIED: {outcomes['skipped'][name]}")
+    (row,) = [row for row in outcomes["rows"] if row["fault"] == name]
+    assert not row["contact"], row
+    if row["expect"] == "stops":
+        assert row["stopped_s"] is not None, row
+        assert row["detected_s"] is not None, row
+    if row["expect"] != "goes on" or row["start_s"] is not None:
+        assert row["again_s"] is not None, row
