@@ -168,6 +168,7 @@ def bench_chaos(
     repeats: Annotated[int, typer.Option(min=1, help="Of each fault.")] = 1,
     one_host: Annotated[bool, typer.Option("--one-host", help="No network namespaces: fewer faults.")] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="With the lines of all processes.")] = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="The table as docs/faults.md has it.")] = False,
     json_file: Json = None,
 ) -> None:
     """What happens when a part dies, freezes, is cut off, is doubled, or when somebody sends noise.
@@ -179,7 +180,9 @@ def bench_chaos(
     """
     from presage.chaos.bench import bench_chaos as run  # noqa: PLC0415
 
-    raise typer.Exit(run(faults or [], repeats, json_file, console, one_host=one_host, quiet=not verbose))
+    raise typer.Exit(
+        run(faults or [], repeats, json_file, console, one_host=one_host, quiet=not verbose, in_markdown=markdown)
+    )
 
 
 @app.command("fleet")

@@ -21,7 +21,6 @@ from presage.chaos.hosts import INSIDE, Network, enter_own_namespaces, why_no_ho
 from presage.chaos.measure import AGAIN_WITHIN, STOP_WITHIN, Outcome, measure
 from presage.chaos.system import System
 from presage.output import check_file, write_json
-from services.recorder.reader import read_recording
 
 
 def chosen(names: Sequence[str]) -> list[Fault]:
@@ -40,6 +39,7 @@ def bench_chaos(
     *,
     one_host: bool = False,
     quiet: bool = True,
+    in_markdown: bool = False,
 ) -> int:
     """Print the table; 0 where everything is as expected."""
     faults = chosen(names)
@@ -66,7 +66,10 @@ def bench_chaos(
                     outcomes.append(measure(system, fault))
                 said = outcomes[-1].why
                 console.print(f"{'[red]no[/]' if said else '[green]ok[/]'} {fault.name} {said}", highlight=False)
-    console.print(table(outcomes))
+    if in_markdown:
+        print(markdown(outcomes))
+    else:
+        console.print(table(outcomes))
     data = {
         "command": "presage bench chaos", "arguments": {"faults": list(names), "repeats": repeats},
         "hosts": not missing, "rows": [outcome.row() for outcome in outcomes], "skipped": skipped,
@@ -77,26 +80,36 @@ def bench_chaos(
     return 1 if any(outcome.why for outcome in outcomes) else 0
 
 
-def table(outcomes: Sequence[Outcome]) -> Table:
+HEAD = ("fault", "detected", "robot stands", "new process", "at work again", "least speed meanwhile", "as expected")
+
+
+def rows_of(outcomes: Sequence[Outcome]) -> list[tuple[str, ...]]:
     """The worst of each fault's repeats."""
-    shown = Table("fault", "detected", "stands", "new process", "at work again", "least speed", "as expected")
+    found = []
     for name in dict.fromkeys(outcome.fault for outcome in outcomes):
         rows = [outcome for outcome in outcomes if outcome.fault == name]
 
         def worst(what: str, rows: Sequence[Outcome] = rows) -> str:
-            values = [getattr(row, what) for row in rows]
-            known = [value for value in values if value is not None]
+            known = [value for row in rows if (value := getattr(row, what)) is not None]
             return f"{max(known):.2f} s" if known else ""
 
         slow = [row.least_speed for row in rows if row.least_speed is not None]
         good = sum(not row.why for row in rows)
-        shown.add_row(
-            name, worst("detected_s"), worst("stopped_s"), worst("start_s"), worst("again_s"),
-            f"{min(slow):.2f} m/s" if slow else "", f"{good} of {len(rows)}",
-        )  # fmt: skip
+        speed = f"{min(slow):.2f} m/s" if slow else ""
+        times = [worst(what) for what in ("detected_s", "stopped_s", "start_s", "again_s")]
+        found.append((name, *times, speed, f"{good} of {len(rows)}"))
+    return found
+
+
+def table(outcomes: Sequence[Outcome]) -> Table:
+    """For a terminal."""
+    shown = Table(*HEAD)
+    for row in rows_of(outcomes):
+        shown.add_row(*row)
     return shown
 
 
-def recorded(folder: Path) -> dict[str, int]:
-    """Messages in each recording that is complete."""
-    return {path.name: sum(read_recording(path).counts().values()) for path in sorted(folder.glob("*.mcap"))}
+def markdown(outcomes: Sequence[Outcome]) -> str:
+    """For a page."""
+    lines = [HEAD, ("---",) * len(HEAD), *rows_of(outcomes)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

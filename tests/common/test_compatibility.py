@@ -12,10 +12,11 @@ from common.bus import open_bus, wait_until
 from common.compatibility import TOGETHER, came_later, difference, fits, this_service
 from common.errors import UserError
 from common.inbox import Call, Inbox
+from common.messages import Health
 from common.requests import ConfigReply, Request
-from common.topics import CONFIG
+from common.topics import CONFIG, HEALTH
 from common.versions import PROTOCOL
-from tests.conftest import PATIENCE
+from tests.conftest import PATIENCE, next_of
 
 SMALL = Path(__file__).with_name("small_service.py")
 FOREIGN = Path(__file__).with_name("foreign_service.py")
@@ -46,6 +47,9 @@ def test_a_newcomer_of_another_protocol_does_not_start_and_says_why_in_one_line(
 def test_who_comes_while_the_other_is_too_busy_to_answer_ends_once_it_does(process, bus):
     small = process(SMALL)
     assert wait_until(lambda: "small" in bus.alive(), PATIENCE), small.output
+    pulses = Inbox()
+    bus.subscribe(HEALTH, pulses, keep_all=True)
+    next_of(pulses, Health, lambda h: h.uptime > 1.5 * TOGETHER)  # so that nobody doubts who came later
     small.send(signal.SIGSTOP)  # it answers nobody
     foreign = process(FOREIGN, env={"FOREIGN_PROTOCOL": str(OTHER)})
     foreign.wait_for("ready")

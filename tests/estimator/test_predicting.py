@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import msgpack
 import numpy as np
 import pytest
@@ -164,7 +166,7 @@ class Answering:
     """A service's loop without a bus: bytes in, bytes or a refusal out."""
 
     def __init__(self, service):
-        self.loop = Loop(service, None, Inbox())
+        self.loop = Loop(service, SimpleNamespace(robot="robot"), Inbox())
 
     def ask(self, payload: bytes):
         found = []
