@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 
 
@@ -45,6 +46,7 @@ class Instances:
     def __init__(self, me: str) -> None:
         """Nobody but ``me``, who does not count."""
         self.me = me
+        self.look: Callable[[], None] = lambda: None  # asks who leads, without waiting
         self._leading: set[str] = set()
         self._waiting: set[str] = set()
         self._lock = threading.Lock()
@@ -76,27 +78,27 @@ class Instances:
 class OneSource:
     """Of several that publish what one should, only one is heard.
 
-    That is the service's own instance, where one says that it leads; where none does (a replay, a robot's own driver),
-    the first, until it has been silent for a while.
+    That is the service's own instance, where one says that it leads, of two the elder; where none does (a replay, a
+    robot's own driver), the first, until it has been silent for a while.
     """
 
     def __init__(self, patience: float) -> None:
         """``patience``: s of silence."""
         self.patience = patience
         self._heard: dict[str, tuple[str, float]] = {}  # by key: who, and when last
-        self._owners: dict[tuple[str, str], frozenset[str]] = {}  # by robot and service: beginnings of session ids
+        self._owners: dict[tuple[str, str], frozenset[str]] = {}  # by robot and service
 
     def change(self, robot: str, service: str, name: str, there: bool) -> None:  # noqa: FBT001 - zenoh's thread
         """An instance leads from now on, or no more."""
-        if (instance := Instance.parse(name)) is not None:
+        if Instance.parse(name) is not None:
             before = self._owners.get((robot, service), frozenset())
-            self._owners[robot, service] = before | {instance.zid} if there else before - {instance.zid}
+            self._owners[robot, service] = before | {name} if there else before - {name}
 
     def takes(self, key: str, service: str, source: str, now: float) -> bool:
         """Whether a message of ``source`` that came at ``now`` s counts on a key that ``service`` publishes."""
         owners = self._owners.get((key.split("/")[1], service))
-        if owners:
-            return any(source.startswith(zid) for zid in owners)
+        if owners and (eldest := Instance.parse(min(owners))) is not None:
+            return source.startswith(eldest.zid)
         who, when = self._heard.get(key, (source, now))
         if who != source and now - when < self.patience:
             return False

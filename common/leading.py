@@ -40,6 +40,11 @@ class Lead:
             self._log.warning("taking over: the one that led is gone")
         return True
 
+    def look(self) -> None:
+        """Ask who else leads: now and then, for a word of one who comes back may get lost."""
+        if self._others is not None:
+            self._others.look()
+
     def check(self) -> None:
         """Raises UserError where an elder instance leads as well: two halves of a network have met."""
         if self._others is not None and self._others.must_yield():

@@ -168,6 +168,8 @@ class Loop:
             counts = {row.key: row.model_dump(include={"received", "published", "written"}) for row in health.topics}
             self._heart.beat(counts, linked=self.bus.linked(), note=health.note)
             self._others.look(self._config)
+            if self._lead is not None:
+                self._lead.look()
 
     def _counts(self, sample: Sample) -> bool:
         """Not where a second source publishes beside the one that is heard."""

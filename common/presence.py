@@ -87,6 +87,15 @@ class Presence:
             for reply in liveliness.get(key, timeout=timeout):
                 if reply.ok is not None:
                     move(reply.ok)
+
+        def heard(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                move(reply.ok)
+
+        def look() -> None:
+            liveliness.get(keys[0], zenoh.handlers.Callback(heard), timeout=timeout)
+
+        found.look = look
         return found
 
     def alive(self, timeout: float = 1.0, robot: str | None = None) -> set[str]:

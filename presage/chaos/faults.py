@@ -151,6 +151,7 @@ def _linux() -> str:
 REPEATS, SLOW, NOISE = _helper("repeater"), _helper("slow subscriber"), _helper("malformed", "100000")
 
 FAULTS: tuple[Fault, ...] = (
+    Fault("nothing", "to compare with", lambda _: None, lambda _: None, "goes on", 8.0),
     killed("estimator"),
     killed("controller"),
     killed("simulator"),
@@ -175,10 +176,10 @@ FAULTS: tuple[Fault, ...] = (
     Fault("clock a minute ahead", "of the estimator's host; killed, and started again with it", _skew, _unskew, "stops",
           services=("estimator",), again=True, why_not=_no_faketime),
     Fault("duplicates, late", "every scan, belief and command once more at once, and once more a second later",
-          *REPEATS, "survives", 6.0),
+          *REPEATS, "goes on", 6.0),
     _second("estimator"),
     _second("controller"),
     Fault("full disk", "of a recorder; what it wrote before can be read", _fill, _empty, "goes on", 8.0, hosts=True),
     Fault("slow subscriber", "takes 0.2 s over every message of every topic", *SLOW, "goes on", 8.0),
-    Fault("malformed", "100 000 payloads of noise, as fast as they go, over all topics", *NOISE, "goes on", 8.0),
+    Fault("malformed", "100 000 payloads of noise, as fast as they go, over all topics", *NOISE, "survives", 8.0),
 )  # fmt: skip

@@ -73,5 +73,9 @@ def test_the_instance_that_leads_is_heard_and_nobody_else_however_silent_it_is()
     assert sources.takes("presage/robot/scan", "simulator", "0123456789abcdef", 5.0)
     assert not sources.takes("presage/robot/scan", "simulator", "repeater", 50.0)
     assert sources.takes("presage/robot/belief", "estimator", "anybody", 50.0)  # nobody leads there
+    younger = Instance(2, "host", 1, "ba9876543210")
+    sources.change("robot", "simulator", younger.name, True)  # two halves of a network have met
+    assert not sources.takes("presage/robot/scan", "simulator", "ba9876543210", 50.0)
+    sources.change("robot", "simulator", younger.name, False)
     sources.change("robot", "simulator", leader.name, False)
     assert sources.takes("presage/robot/scan", "simulator", "repeater", 50.0)
