@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from common.service import Service
 
 HEALTH_PERIOD = 1.0  # s
+RECALL_WITHIN = 5.0  # s after its start in which a service asks what others remember
 SOURCE_SILENT = 0.3  # s after which another source of a topic is heard
 
 
@@ -46,6 +47,7 @@ class Loop:
         self.began = self._health_at = self._counted_at = time.monotonic()
         self._before: Counter[str] = Counter()
         self._sources = OneSource(SOURCE_SILENT)
+        self._recall_until = 0.0
         self._lead = Lead(bus, service.name, service.log, inbox.wake) if service.single else None
         self._metrics: ServiceMetrics | None = None
         self._others = Compatibility(bus, service.name, service.log)
@@ -86,8 +88,8 @@ class Loop:
             bus.watch_instances(self._sources.change, "*" if service.all_robots else None)
         for kept in service.keeps:
             bus.keep(kept)
-        if service.recalls:
-            self.guard(lambda: service.on_kept(self._recalled()))
+        self._recall_until = time.monotonic() + RECALL_WITHIN
+        self._recall()
         for topic in service.inputs:
             bus.subscribe(topic, self.inbox, keep_all=service.keep_all)
         for query in service.queries:
@@ -98,6 +100,12 @@ class Loop:
         service.log.info("ready", robot=bus.robot)
         self._health_at = self._counted_at = time.monotonic()  # the first pulse now, and each after it a second on
         return True
+
+    def _recall(self) -> None:
+        """Once somebody knows: after a router's death all have to find one another first."""
+        if self.service.recalls and time.monotonic() < self._recall_until and (found := self._recalled()):
+            self._recall_until = 0.0
+            self.guard(lambda: self.service.on_kept(found))
 
     def _recalled(self) -> dict[Topic, Stamped]:
         found: dict[Topic, Stamped] = {}
@@ -170,6 +178,7 @@ class Loop:
             self._others.look(self._config)
             if self._lead is not None:
                 self._lead.look()
+            self._recall()
 
     def _counts(self, sample: Sample) -> bool:
         """Not where a second source publishes beside the one that is heard."""

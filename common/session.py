@@ -46,6 +46,8 @@ def _config(link: Link) -> zenoh.Config:
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
         "listen/endpoints": link.listen,
         "scouting/multicast/enabled": link.multicast,
+        # Of two that hear of each other one dials: where both do, both may be refused, and neither tries again.
+        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}},
         "transport/shared_memory/enabled": False,  # drops silently when a receiver stalls (zenoh issue 2628)
         "timestamping/enabled": True,
         # Who is gone without a word (frozen, cut off) is known to be gone after this; zenoh's own is 10 s.

@@ -88,6 +88,8 @@ class ControllerService(Service):
         goal, status = last.get(GOAL), last.get(STATUS)
         if not self.options.resume or not isinstance(goal, Goal) or not isinstance(status, Status) or goal.cancel:
             return
+        if self.navigator.goal is not None:
+            return  # somebody was quicker
         under_way = status.state not in {"idle", "reached"} and not status.refused
         if under_way and status.goal == goal.pose and status.goal_seq == goal.seq:
             self.navigator.hear_goal(goal)
