@@ -10,7 +10,7 @@ from typing import Any
 
 import zenoh
 
-from common.endpoints import over_tls
+from common.endpoints import on_loopback, over_tls
 from common.errors import UserError
 from common.security import Credentials
 
@@ -46,14 +46,16 @@ def _config(link: Link) -> zenoh.Config:
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
         "listen/endpoints": link.listen,
         "scouting/multicast/enabled": link.multicast,
-        # Of two that hear of each other one dials: where both do, both may be refused, and neither tries again.
-        "scouting/gossip/autoconnect_strategy": {"peer": {"to_router": "always", "to_peer": "greater-zid"}},
         "transport/shared_memory/enabled": False,  # drops silently when a receiver stalls (zenoh issue 2628)
         "timestamping/enabled": True,
         # Who is gone without a word (frozen, cut off) is known to be gone after this; zenoh's own is 10 s.
         "transport/link/tx/lease": 3000,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 5000,  # us
     }
+    if not all(map(on_loopback, link.listen)):
+        # Of two that hear of each other one dials: where both do, both may be refused, and neither tries again.
+        # Who listens on loopback alone is not to be reached by other hosts, and always dials.
+        settings["scouting/gossip/autoconnect_strategy"] = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
     if link.security is not None:
         settings |= {**link.security.zenoh(), "mode": "router" if link.router else "client"}
         settings["connect/endpoints"] = [over_tls(each) for each in link.connect]
