@@ -15,6 +15,7 @@ NEEDED = ("simulator", "estimator", "controller")
 OPTIONAL = ("recorder", "viewer")
 SOURCE = "replay"  # plays what the others would say
 SILENT = 2.5  # s without a pulse; one comes each second
+BREATH = 1.5  # s; who sent a pulse so lately is there, whatever liveliness says: links are made anew now and then
 MOST = 50  # services; somebody may invent names
 KEPT = 45  # answers of which a latency is the median: 3 s
 SLOW = 0.8  # of the nominal rate
@@ -111,7 +112,8 @@ class Board:
         if at is None or health is None:
             begins = now - self._alive[name] <= SILENT
             return Row(name, "begins" if begins else "silent", note="" if begins else "alive, but its pulse is missing")
-        state: State = "gone" if name not in self._alive else "alive" if now - at <= SILENT else "silent"
+        gone = name not in self._alive and now - at > BREATH
+        state: State = "gone" if gone else "alive" if now - at <= SILENT else "silent"
         rates = [(row, rate) for row in health.topics if (rate := _rate(row.key, row.rate)) is not None]
         stale = state != "alive"
         return Row(

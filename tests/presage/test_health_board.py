@@ -74,6 +74,9 @@ def test_a_service_comes_falls_silent_and_goes():
     row = rows(board, 20.4)["controller"]
     assert (row.state, row.age, row.uptime, row.note) == ("alive", pytest.approx(0.4), 65.0, "waits")
     assert rows(board, 20.1 + SILENT)["controller"].state == "silent"
+    board.see_alive(set(), 20.5)
+    assert rows(board, 20.5)["controller"].state == "alive"  # liveliness alone may be wrong while a link is made anew
+    assert rows(board, 20.1 + BREATH)["controller"].state == "gone"
     board.see_alive(set(), 24.0)
     gone = rows(board, 24.0)["controller"]
     assert gone.state == "gone"
