@@ -120,7 +120,9 @@ def _start(job: Job, scans: Scans) -> Array | None:
         return scans.initial_pose
     if scans.truth is not None and np.isfinite(scans.truth[0]).all():
         return np.asarray(scans.truth[0])
-    raise UserError(f"{job.file}: mode track needs where to begin: initial_pose in the file, or --initial-pose x,y,deg")
+    raise UserError(
+        f"{job.file}: mode track needs where to begin: initial_pose or reference in the file, or --initial-pose x,y,deg"
+    )
 
 
 def _row(scans: Scans, k: int, posterior: Posterior, update_ms: float, *, laser: bool) -> dict[str, Any]:
@@ -171,6 +173,6 @@ def _summarise(scans: Scans, rows: list[dict[str, Any]], console: Console, *, la
     error = error[np.isfinite(error)]
     if len(error):
         console.print(
-            f"against the recorded truth: {np.median(error) * 1e3:.1f} mm median, "
+            f"against {scans.truth_is}: {np.median(error) * 1e3:.1f} mm median, "
             f"{np.sqrt(np.mean(error**2)) * 1e3:.1f} mm RMS, {error.max() * 1e3:.1f} mm at most"
         )

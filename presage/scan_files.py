@@ -16,7 +16,7 @@ from services.estimator.building import Geometry
 from services.estimator.interface import Observation
 from services.recorder.reader import read_recording
 
-NAMES = {"ranges", "angles", "range_max", "stamps", "odom", "initial_pose"}
+NAMES = {"ranges", "angles", "range_max", "stamps", "odom", "initial_pose", "reference"}
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ class Scans:
     initial_pose: Array | None = None  # (3,) in map
     truth: Array | None = None  # (N, 3) base_link in map; NaN where not recorded
     world: str | None = None  # name of the world it was recorded in
+    truth_is: str = "the recorded truth"  # or the log's reference, which is none
 
     def observation(self, k: int, *, odometry: bool = True) -> Observation:
         """The k-th scan for an estimator."""
@@ -39,7 +40,11 @@ class Scans:
 
 
 def read_scans(path: Path, mount: Array) -> Scans:
-    """Of an .npz (``mount`` (3,): its laser in base_link) or a recording; raises UserError saying what is wrong."""
+    """Of an .npz or a recording; raises UserError saying what is wrong.
+
+    ``mount`` (3,): an .npz's laser in base_link, of which its poses (odom, initial_pose, reference) are; zero where
+    they are the laser's own. An .npz's ``reference`` is `Scans.truth`.
+    """
     if path.suffix == ".npz":
         return _read_npz(path, mount)
     if path.suffix in {".mcap", ".active"}:
@@ -54,13 +59,13 @@ def _read_npz(path: Path, mount: Array) -> Scans:
         raise UserError(f"{path}: lacks {', '.join(missing)}; needed are ranges (N, B), angles (B,) and range_max")
     ranges = np.atleast_2d(data["ranges"])
     count, beams = ranges.shape[0], ranges.shape[-1]
-    shapes = {"angles": (beams,), "stamps": (count,), "odom": (count, 3), "initial_pose": (3,)}
+    shapes = {"angles": (beams,), "stamps": (count,), "odom": (count, 3), "initial_pose": (3,), "reference": (count, 3)}
     if ranges.ndim != 2 or beams < 3 or not count:
         raise UserError(f"{path}: ranges has the shape {data['ranges'].shape}, not (N, B) of 3 beams or more")
     for name, shape in shapes.items():
         if name in data and data[name].shape != shape:
             raise UserError(f"{path}: {name} has the shape {data[name].shape}; for these ranges it must be {shape}")
-        if name in data and not np.isfinite(data[name]).all():
+        if name in data and name != "reference" and not np.isfinite(data[name]).all():
             raise UserError(f"{path}: {name} has numbers that are not finite")
     if data["range_max"].size != 1 or not 0 < (range_max := float(data["range_max"].reshape(-1)[0])) < np.inf:
         raise UserError(f"{path}: range_max must be one number of metres greater than 0")
@@ -68,7 +73,8 @@ def _read_npz(path: Path, mount: Array) -> Scans:
         raise UserError(f"{path}: stamps are not sorted")
     return Scans(
         Geometry(data["angles"], mount, range_max), clean(ranges, range_max),
-        data.get("stamps"), data.get("odom"), data.get("initial_pose"),
+        data.get("stamps"), data.get("odom"), data.get("initial_pose"), data.get("reference"),
+        truth_is="the file's reference",
     )  # fmt: skip
 
 

@@ -86,6 +86,16 @@ def test_only_what_is_needed(tmp_path):
     assert errors(localize(job(file, mode="track", initial_pose="4,1.5,57"), CONSOLE)).max() < 0.02
 
 
+def test_a_reference_is_what_errors_are_against_and_where_tracking_begins(tmp_path, capsys):
+    reference = PATH.copy()
+    reference[5:] = np.nan  # not known throughout
+    file = npz(tmp_path, mount=(0, 0, 0), reference=reference, initial_pose=None)
+    np.testing.assert_array_equal(read_scans(file, np.zeros(3)).truth, reference)
+    rows = localize(job(file, mode="track", frame="laser"), Console(width=150))
+    assert errors(rows).max() < 0.02
+    assert "against the file's reference: " in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("estimator", ["particle-filter", "amcl-defaults"])
 def test_the_particle_filter_over_the_same_file(tmp_path, estimator):
     rows = localize(job(npz(tmp_path), mode="track", estimator=estimator), CONSOLE)
@@ -105,6 +115,7 @@ def test_the_standard_output_is_csv_alone(tmp_path, capsys):
         ({"ranges": None}, "lacks ranges"),
         ({"angles": np.zeros(3)}, "angles has the shape"),
         ({"odom": np.zeros((3, 3))}, "odom has the shape"),
+        ({"reference": np.zeros((9, 3))}, "reference has the shape"),
         ({"stamps": -np.arange(10.0)}, "not sorted"),
         ({"range_max": -1.0}, "range_max"),
         ({"initial_pose": np.full(3, np.nan)}, "not finite"),
