@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from common.bus import DEFAULT_ENDPOINT
 from common.errors import UserError, first_fault
-from presage import cli_bench, cli_experiment, cli_inspect, cli_recording, cli_replay, cli_secure, cli_tools
+from presage import cli_bench, cli_experiment, cli_inspect, cli_logs, cli_recording, cli_replay, cli_secure, cli_tools
 from presage.options import (
     Connect,
     EstimatorName,
@@ -120,8 +120,10 @@ def demo(
 
 @app.command()
 def localize(
-    file: Annotated[Path, typer.Argument(help=".npz (ranges, angles, range_max) or a recording (.mcap).")],
-    world: Annotated[str, typer.Option(help="A shipped world or a world file; none: the recording's.")] = "",
+    file: Annotated[Path, typer.Argument(help="A recording, CARMEN log, ROS 1 or 2 bag (a file, or a folder), .npz.")],
+    world: Annotated[
+        str, typer.Option("--world", "--map", help="A shipped world or a world file; none: the recording's.")
+    ] = "",
     estimator: EstimatorName = "precise",
     model: ModelName = "learned",
     models: Annotated[Path | None, typer.Option(help="Folder of weights; none: the shipped ones.")] = None,
@@ -129,26 +131,43 @@ def localize(
     frame: Annotated[
         str, typer.Option(help="base_link or laser: whose pose; of an .npz also its own poses'.")
     ] = "base_link",
-    mount: Annotated[str, typer.Option(help="Of an .npz's laser in base_link: x,y,yaw_deg (m, m, deg).")] = "0.2,0,0",
-    mode: Annotated[str, typer.Option(help="global: nothing is known; track: from initial_pose.")] = "global",
+    mode: Annotated[
+        str, typer.Option(help="global: nothing is known; track: from initial_pose, or the reference.")
+    ] = "global",
     fresh: Annotated[bool, typer.Option("--fresh", help="Each scan on its own.")] = False,
     odometry: Annotated[bool, typer.Option(help="Use the file's odometry, where there is any.")] = True,
     initial_pose: Annotated[str, typer.Option(help="x,y,yaw_deg; for mode track.")] = "",
     sigma: Annotated[float, typer.Option(min=1e-4, max=10, help="The scanner's noise, m.")] = 0.02,
     seed: Seed = 0,
+    mount: cli_logs.Mount = "",
+    upside_down: cli_logs.UpsideDown = None,
+    scan_topic: cli_logs.ScanTopic = "",
+    odom_topic: cli_logs.OdomTopic = "",
+    base_frame: cli_logs.BaseFrame = "",
+    reference: cli_logs.Reference = None,
+    reference_topic: cli_logs.ReferenceTopic = "",
+    angles: cli_logs.Angles = "",
+    range_max: cli_logs.RangeMax = None,
+    clock: cli_logs.Clock = "sensor",
 ) -> None:
-    """Run an estimator over a file of scans, as fast as it goes; one row a scan.
+    """Run an estimator over a recording or a log, as fast as it goes; one row a scan.
 
     Columns: stamp (s), x, y (m), yaw (rad), covariance (cov_xx ... cov_yawyaw), free_energy (nats), state, update_ms.
     Examples: `presage localize scans.npz --world office --out poses.csv`;
     `presage localize run.mcap --estimator particle-filter --out poses.json`;
-    `presage localize scans.npz --world office --fresh --frame laser`.
+    `presage localize scans.npz --world office --fresh --frame laser`;
+    `presage localize drive.bag --world office --mode track --initial-pose 3,1.5,90`.
     """
     from presage.localize import Job, choice_of  # noqa: PLC0415
     from presage.localize import localize as run  # noqa: PLC0415
+    from presage.logs.words import reading_of  # noqa: PLC0415
 
+    reading = reading_of(
+        mount, scan_topic, odom_topic, reference_topic, base_frame, angles, clock,
+        reference=reference, range_max=range_max, upside_down=upside_down,
+    )  # fmt: skip
     choice = choice_of(file, world, estimator, model, models, sigma, seed, initial_pose)
-    run(Job.of(file, choice, mode, frame, mount, fresh=fresh, odometry=odometry, out=out), err_console)
+    run(Job.of(file, choice, mode, frame, reading, fresh=fresh, odometry=odometry, out=out), err_console)
 
 
 @app.command()
@@ -194,6 +213,7 @@ def train(
 app.add_typer(cli_recording.app)
 app.add_typer(cli_replay.app)
 app.add_typer(cli_inspect.app)
+app.add_typer(cli_logs.app)
 app.add_typer(cli_tools.app)
 app.add_typer(cli_bench.app, name="bench")
 app.add_typer(cli_experiment.app, name="experiment")

@@ -15,7 +15,8 @@ from common.errors import UserError
 from common.scanner import SCANNERS
 from common.world import load_world
 from presage.localize import COLUMNS, Job, choice_of, localize
-from presage.scan_files import clean, read_scans
+from presage.logs.log import Reading, clean
+from presage.scan_files import read_scans
 from tests.recorder.sessions import write
 
 SCANNER = SCANNERS["tim571"].with_beams(200)
@@ -42,7 +43,7 @@ def job(file, mode="global", frame="base_link", estimator="precise", model="lear
     out = more.pop("out", None)
     choice = choice_of(file, world, estimator, model, None, 0.02, 0, more.pop("initial_pose", ""))
     given = {"fresh": False, "odometry": True, "out": out, **more}
-    return Job.of(file, choice, mode, frame, "0.2,0,0", **given)
+    return Job.of(file, choice, mode, frame, Reading(), **given)
 
 
 def errors(rows, path=PATH):
@@ -131,10 +132,12 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path, changes, why):
 def test_files_that_are_none(tmp_path):
     garbage = tmp_path / "x.npz"
     garbage.write_bytes(b"PK\x03\x04 not really")
+    foreign = tmp_path / "x.npz.txt"
+    foreign.write_text("ranges, angles\n")
     for file, why in (
         (garbage, "not an .npz"),
         (tmp_path / "no.npz", "no such file"),
-        (tmp_path / "x.txt", "read from"),
+        (foreign, "not a presage recording, a CARMEN log"),
     ):
         with pytest.raises(UserError, match=why):
             read_scans(file, np.zeros(3))
