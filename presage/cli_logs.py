@@ -11,22 +11,39 @@ from presage.options import Json, console
 
 app = typer.Typer()
 
-LOG = "Of a log: "
-Mount = Annotated[str, typer.Option(help=LOG + "the laser in base_link, x,y,yaw_deg (m, m, deg); none: as it says.")]
-UpsideDown = Annotated[
-    bool | None, typer.Option(help=LOG + "the scanner hangs upside down; none: as tf says, else not.")
+PANEL = "What a log does not say itself"
+Mount = Annotated[
+    str, typer.Option(rich_help_panel=PANEL, help="The laser in base_link, x,y,yaw_deg (m, m, deg); none: as it says.")
 ]
-ScanTopic = Annotated[str, typer.Option(help=LOG + "which of several scanners; of CARMEN the line, such as RLASER.")]
-OdomTopic = Annotated[str, typer.Option(help=LOG + "which of several odometries; of CARMEN ODOM, not the scan's own.")]
-BaseFrame = Annotated[str, typer.Option(help=LOG + "the robot's frame in tf; none: odometry's, or base_link.")]
+UpsideDown = Annotated[
+    bool | None, typer.Option(rich_help_panel=PANEL, help="The scanner hangs upside down; none: as tf says, else not.")
+]
+ScanTopic = Annotated[
+    str, typer.Option(rich_help_panel=PANEL, help="Which of several scanners; of CARMEN the line, such as RLASER.")
+]
+OdomTopic = Annotated[
+    str, typer.Option(rich_help_panel=PANEL, help="Which of several odometries; of CARMEN ODOM, not the scan's own.")
+]
+BaseFrame = Annotated[
+    str, typer.Option(rich_help_panel=PANEL, help="The robot's frame in tf; none: odometry's, or base_link.")
+]
 Reference = Annotated[
     bool | None,
-    typer.Option(help=LOG + "its own poses in the map; none: where it states them; yes: corrected CARMEN poses too."),
+    typer.Option(
+        rich_help_panel=PANEL,
+        help="Its own poses in the map; none: where it states them; yes: corrected CARMEN poses too.",
+    ),
 ]
-ReferenceTopic = Annotated[str, typer.Option(help=LOG + "poses in the map: Odometry or Pose(WithCovariance)Stamped.")]
-Angles = Annotated[str, typer.Option(help=LOG + "first and last beam in deg, such as -90,90, where it does not say.")]
-RangeMax = Annotated[float | None, typer.Option(min=0.1, max=1000, help=LOG + "m, from which on a range is no return.")]
-Clock = Annotated[str, typer.Option(help=LOG + "stamps of the sensor, or of the logger.")]
+ReferenceTopic = Annotated[
+    str, typer.Option(rich_help_panel=PANEL, help="Poses in the map: Odometry or Pose(WithCovariance)Stamped.")
+]
+Angles = Annotated[
+    str, typer.Option(rich_help_panel=PANEL, help="First and last beam in deg, such as -90,90, where it does not say.")
+]
+RangeMax = Annotated[
+    float | None, typer.Option(min=0.1, max=1000, rich_help_panel=PANEL, help="M, from which on a range is no return.")
+]
+Clock = Annotated[str, typer.Option(rich_help_panel=PANEL, help="Stamps of the sensor, or of the logger.")]
 
 
 @app.command("import")

@@ -59,7 +59,7 @@ def open_carmen(path: Path, reading: Reading) -> Log:
         raise UserError(f"{path}: every {name} line is garbled")
     notes: list[str] = []
     first = survey.firsts[name][0]
-    angles, range_max = _beams(path, survey, name, reading, notes)
+    angles, range_max = _angles(path, name, first, reading, notes), _range_max(survey, name, reading, notes)
     clock = _clock(survey.firsts[name], reading, notes)
     mount, corrected = _mount(survey, name, reading, notes)
     log = Log(
@@ -85,37 +85,39 @@ def _choose(path: Path, there: Counter[str], wanted: str) -> str:
     return wanted or next((name for name in PREFERRED if name in there), min(there))
 
 
-def _beams(path: Path, survey: _Survey, name: str, reading: Reading, notes: list[str]) -> tuple[Array, float]:
-    """(B,) rad, and the longest range in m: by the line's header, --angles, PARAM, or what this number of beams is."""
-    first = survey.firsts[name][0]
-    said, count = first.beams, len(first.ranges)
-    angles: Array
+def _angles(path: Path, name: str, first: LaserLine, reading: Reading, notes: list[str]) -> Array:
+    """(B,) rad, by --angles, the line's header, or what a scanner of so many beams usually is."""
+    count, said = len(first.ranges), first.beams
     if reading.angles is not None:
-        angles = np.linspace(*reading.angles, count)
-    elif said is not None:
-        angles = said.start + said.step * np.arange(count)
-    elif count in SPANS:
-        first_deg, last_deg = SPANS[count]
-        angles = np.deg2rad(np.linspace(first_deg, last_deg, count))
-        notes.append(f"{count} beams are taken to look from {SPANS[count][0]:g} to {SPANS[count][1]:g} deg (--angles)")
-    else:
+        return np.linspace(*reading.angles, count)
+    if said is not None:
+        return said.start + said.step * np.arange(count, dtype=np.float64)
+    if count not in SPANS:
         raise UserError(
             f"{path}: {name} does not say where its {count} beams look: say it, such as --angles -90,90 (first, last)"
         )
+    first_deg, last_deg = SPANS[count]
+    notes.append(f"{count} beams are taken to look from {first_deg:g} to {last_deg:g} deg (--angles)")
+    return np.deg2rad(np.linspace(first_deg, last_deg, count))
+
+
+def _range_max(survey: _Survey, name: str, reading: Reading, notes: list[str]) -> float:
+    """From which on a range is no return, m: by --range-max, the line's header, PARAM, or as an LMS has it."""
+    lines = survey.firsts[name]
     if reading.range_max is not None:
-        return angles, reading.range_max
-    if said is not None:
-        return angles, said.range_max
+        return reading.range_max
+    if (said := lines[0].beams) is not None:
+        return said.range_max
     param = survey.params.get("robot_front_laser_max" if name == "FLASER" else "robot_rear_laser_max", "")
     try:
         stated = float(param)
     except ValueError:
         stated = 0.0
-    longest = max(float(np.max(line.ranges)) for line in survey.firsts[name])
-    range_max = LMS_NEAR if CODES[0] <= longest <= CODES[1] else stated if stated > 0 else LMS_FAR
+    longest = max(float(np.max(line.ranges)) for line in lines)
+    range_max = LMS_NEAR if CODES[0] <= longest <= CODES[1] else stated if 0 < stated < np.inf else LMS_FAR
     if range_max != stated:
         notes.append(f"ranges from {range_max:g} m on are taken for no return (--range-max)")
-    return angles, range_max
+    return range_max
 
 
 def _clock(lines: list[LaserLine], reading: Reading, notes: list[str]) -> int:
