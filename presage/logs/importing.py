@@ -24,7 +24,7 @@ from common.topics import ODOM, SCAN, TRUTH, Topic
 from common.versions import commit, versions
 from common.world import World, load_world
 from presage.logs.log import Log, Reading, Sweep
-from presage.logs.opening import kind_of, open_log
+from presage.logs.opening import RECORDING, kind_of, open_log
 from presage.output import check_file, write_json
 from services.recorder.accounting import Ledger, as_metadata
 from services.recorder.recording import write_answer
@@ -52,6 +52,8 @@ class Import:
 def import_command(job: Import, json_file: Path | None, console: Console) -> None:
     """Everything; raises UserError in one line, and leaves no file then."""
     check_file(json_file, "--json")
+    if kind_of(job.file) == "recording":
+        raise UserError(f"{job.file}: {RECORDING}")
     if job.out.suffix != ".mcap":
         raise UserError(f"{job.out}: a recording is named NAME.mcap")
     if job.out.exists():

@@ -70,11 +70,11 @@ class Log:
             yield sweep
         lost = self.left_out.total()
         if lost > used:
-            raise UserError(f"{self.path}: {self.lost()}, {used} of use: too little to go on with")
+            raise UserError(f"{self.path}: too little of use: {used} scans; {self.lost()}")
 
     def lost(self) -> str:
         """What was left out, in words; empty: nothing."""
-        return ", ".join(f"{count} {what}" for what, count in self.left_out.items())
+        return ", ".join(f"{what}: {count}" for what, count in self.left_out.items())
 
 
 def clean(ranges: Array, range_max: float, range_min: float = 0.0) -> Array:

@@ -18,6 +18,7 @@ from services.recorder.writer import PROFILE
 
 Kind = Literal["recording", "npz", "carmen", "ros1", "ros2"]
 KNOWN = "a presage recording, a CARMEN log, a ROS 1 or 2 bag, or an .npz of scans"
+RECORDING = "is a presage recording already: replay, localize and the others take it as it is"
 PEEK = 1 << 16  # bytes in which a CARMEN log must show itself
 CARMEN = ("PARAM", "SYNC", "ODOM", "TRUEPOS", "#")
 
@@ -53,7 +54,7 @@ def open_log(path: Path, reading: Reading) -> Log:
     """A log of another program; raises UserError saying what is wrong, also where it is a recording of presage."""
     kind = kind_of(path)
     if kind == "recording":
-        raise UserError(f"{path}: is a presage recording already: replay, localize and the others take it as it is")
+        raise UserError(f"{path}: {RECORDING}")
     if kind == "ros1" or kind == "ros2":  # noqa: PLR1714 - mypy follows
         try:
             from presage.logs.rosbag import open_rosbag  # noqa: PLC0415 - its types take a moment

@@ -143,7 +143,7 @@ def test_what_cannot_be_used_is_counted(tmp_path):
 
 def test_hardly_anything_of_use(tmp_path):
     lines = [line[:80] if line.startswith("ROBOT") and k > 8 else line for k, line in enumerate(carmen())]
-    with pytest.raises(UserError, match="garbled lines, 3 of use: too little"):
+    with pytest.raises(UserError, match="too little of use: 3 scans; garbled lines: 9"):
         read(write(tmp_path, lines))
     with pytest.raises(UserError, match="without a scan"):
         read(write(tmp_path, ["ODOM 0 0 0 0 0 0 1 h 1"]))

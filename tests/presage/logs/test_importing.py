@@ -154,7 +154,7 @@ def test_reference_poses_that_are_not_known_throughout(tmp_path):
     [
         ({"angles": ANGLES**3}, "not evenly spaced"),
         ({"stamps": STAMPS * 1e-9 - 2e9}, "below 0 s"),
-        ({"stamps": np.zeros(SCANS)}, "11 scans twice, 1 of use"),
+        ({"stamps": np.zeros(SCANS)}, "1 scans; scans twice: 11"),
     ],
 )
 def test_what_no_recording_can_be_made_of_leaves_no_file(tmp_path, changes, why):
