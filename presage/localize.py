@@ -44,12 +44,13 @@ class Job:
     odometry: bool = True
     frame: Literal["base_link", "laser"] = "base_link"
     mount: tuple[float, float, float] = (0.2, 0.0, 0.0)
+    upside_down: bool = False
     out: Path | None = None
 
     @classmethod
     def of(
         cls, file: Path, choice: Choice, mode: str, frame: str, mount: str, *, fresh: bool, odometry: bool,
-        out: Path | None,
+        out: Path | None, upside_down: bool = False,
     ) -> Job:  # fmt: skip
         """From the command line's words; raises UserError on one that is not known."""
         if mode not in ("global", "track"):
@@ -59,7 +60,7 @@ class Job:
         if out is not None and out.suffix not in (".csv", ".json"):
             raise UserError(f"{out}: the result is written as .csv or .json")
         x, y, yaw = map(float, pose_of(mount, "--mount"))
-        return cls(file, choice, mode, fresh, odometry, frame, (x, y, yaw), out)  # type: ignore[arg-type]
+        return cls(file, choice, mode, fresh, odometry, frame, (x, y, yaw), upside_down, out)  # type: ignore[arg-type]
 
 
 def pose_of(text: str, option: str) -> Array:
@@ -71,7 +72,14 @@ def pose_of(text: str, option: str) -> Array:
 
 
 def choice_of(
-    file: Path, world: str, estimator: str, model: str, models: Path | None, sigma: float, seed: int, initial_pose: str
+    file: Path,
+    world: str,
+    estimator: str,
+    model: str,
+    models: Path | None,
+    sigma: float | None,
+    seed: int,
+    initial_pose: str,
 ) -> Choice:
     """From the command line's words; the world is the recording's where none is named."""
     if estimator not in get_args(Name):
@@ -92,6 +100,10 @@ def localize(job: Job, console: Console) -> list[dict[str, Any]]:
     check_file(job.out, "--out")
     laser = job.frame == "laser"
     scans = read_scans(job.file, np.zeros(3) if laser else np.array(job.mount))
+    if job.upside_down:
+        if job.file.suffix == ".mcap":
+            raise UserError(f"{job.file}: --upside-down is of an .npz; a recording says how its laser hangs")
+        scans = replace(scans, geometry=scans.geometry.upside_down())
     start = _start(job, scans)
     estimator = prepare(replace(job.choice, initial_pose=None))(scans.geometry)
     rows = []

@@ -45,10 +45,10 @@ class Scene:
 
     def observe(self, clean: Array, stamp: float, odom: Array | None = None) -> Observation:
         """One scan (B,) with fresh noise."""
-        noisy = clean + self.scanner.sigma * self.rng.standard_normal(len(clean))
+        scanner = self.scanner
         return Observation(
-            self.scanner.limit(noisy), self.scanner.angles(), self.scanner.range_max, stamp, odom
-        )  # fmt: skip
+            scanner.limit(scanner.noisy(clean, self.rng)), scanner.angles(), scanner.range_max, stamp, odom
+        )
 
     def blocked(self, clean: Array, share: float) -> Array:
         """What no model knows, people say: sectors of (B,) cut short at 0.3 to 4 m, at least ``share`` of the beams."""
