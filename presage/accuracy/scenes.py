@@ -17,6 +17,7 @@ from common.world import World
 from services.estimator.interface import Observation
 
 ROBOT = Robot()
+TIM571 = SCANNERS["tim571"]
 TURN = 1.0  # rad/s at most on the paths
 
 
@@ -29,9 +30,9 @@ class Scene:
     rng: np.random.Generator
 
     @classmethod
-    def of(cls, world: World, beams: int, seed: int | Sequence[int]) -> Scene:
-        """With the shipped scanner."""
-        return cls(world, SCANNERS["tim571"].with_beams(beams), np.random.default_rng(seed))
+    def of(cls, world: World, beams: int | None, seed: int | Sequence[int], scanner: Scanner = TIM571) -> Scene:
+        """With so many beams (None: its own) of a scanner."""
+        return cls(world, scanner.with_beams(beams), np.random.default_rng(seed))
 
     def poses(self, count: int) -> Array:
         """(count, 3) uniform over where the robot fits, any heading."""
