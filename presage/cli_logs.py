@@ -1,4 +1,4 @@
-"""The command import, and the options about logs that localize shares with it."""
+"""Commands on logs of other programs: localize, import."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from presage.options import Json, console
+from presage.options import EstimatorName, Json, ModelName, Seed, console, err_console
 
 app = typer.Typer()
 
@@ -46,6 +46,60 @@ RangeMax = Annotated[
 Clock = Annotated[str, typer.Option(rich_help_panel=PANEL, help="Stamps of the sensor, or of the logger.")]
 
 
+@app.command()
+def localize(
+    file: Annotated[Path, typer.Argument(help="A recording, CARMEN log, ROS 1 or 2 bag (a file, or a folder), .npz.")],
+    world: Annotated[
+        str, typer.Option("--world", "--map", help="A shipped world or a world file; none: the recording's.")
+    ] = "",
+    estimator: EstimatorName = "precise",
+    model: ModelName = "learned",
+    models: Annotated[Path | None, typer.Option(help="Folder of weights; none: the shipped ones.")] = None,
+    out: Annotated[Path | None, typer.Option(help="NAME.csv or NAME.json; none: CSV to standard output.")] = None,
+    frame: Annotated[
+        str, typer.Option(help="base_link or laser: whose pose; of an .npz also its own poses'.")
+    ] = "base_link",
+    mode: Annotated[
+        str, typer.Option(help="global: nothing is known; track: from initial_pose, or the reference.")
+    ] = "global",
+    fresh: Annotated[bool, typer.Option("--fresh", help="Each scan on its own.")] = False,
+    odometry: Annotated[bool, typer.Option(help="Use the file's odometry, where there is any.")] = True,
+    initial_pose: Annotated[str, typer.Option(help="x,y,yaw_deg; for mode track.")] = "",
+    sigma: Annotated[
+        float | None, typer.Option(min=1e-4, max=10, help="The scanner's noise, m; none: as recorded, else 0.02.")
+    ] = None,
+    seed: Seed = 0,
+    mount: Mount = "",
+    upside_down: UpsideDown = None,
+    scan_topic: ScanTopic = "",
+    odom_topic: OdomTopic = "",
+    base_frame: BaseFrame = "",
+    reference: Reference = None,
+    reference_topic: ReferenceTopic = "",
+    angles: Angles = "",
+    range_max: RangeMax = None,
+    clock: Clock = "sensor",
+) -> None:
+    """Run an estimator over a recording or a log, as fast as it goes; one row a scan.
+
+    Columns: stamp (s), x, y (m), yaw (rad), covariance (cov_xx ... cov_yawyaw), free_energy (nats), state, update_ms.
+    Examples: `presage localize scans.npz --world office --out poses.csv`;
+    `presage localize run.mcap --estimator particle-filter --out poses.json`;
+    `presage localize scans.npz --world office --fresh --frame laser`;
+    `presage localize drive.bag --world office --mode track --initial-pose 3,1.5,90`.
+    """
+    from presage.localize import Job, choice_of  # noqa: PLC0415
+    from presage.localize import localize as run  # noqa: PLC0415
+    from presage.logs.words import reading_of  # noqa: PLC0415
+
+    reading = reading_of(
+        mount, scan_topic, odom_topic, reference_topic, base_frame, angles, clock,
+        reference=reference, range_max=range_max, upside_down=upside_down,
+    )  # fmt: skip
+    choice = choice_of(file, world, estimator, model, models, sigma, seed, initial_pose)
+    run(Job.of(file, choice, mode, frame, reading, fresh=fresh, odometry=odometry, out=out), err_console)
+
+
 @app.command("import")
 def import_(
     file: Annotated[Path, typer.Argument(help="CARMEN log, ROS 1 or 2 bag (a file, or a folder), or .npz.")],
@@ -64,7 +118,9 @@ def import_(
     range_max: RangeMax = None,
     clock: Clock = "sensor",
     rate: Annotated[float | None, typer.Option(min=0.01, max=1000, help="Hz, of an .npz without stamps.")] = None,
-    sigma: Annotated[float, typer.Option(min=0, max=10, help="The scanner's noise, m, for its description.")] = 0.02,
+    sigma: Annotated[
+        float | None, typer.Option(min=1e-4, max=10, help="The scanner's noise, m; none: unknown.")
+    ] = None,
     json_file: Json = None,
 ) -> None:
     """Make a recording of a log of another program: scans, odometry, and where it has them reference poses.

@@ -98,7 +98,7 @@ def _read_recording(path: Path) -> Scans:
     nothing = np.full(3, np.nan)
     world = recording.world()
     return Scans(
-        Geometry(first.angles(), first.mount.array(), first.range_max),
+        Geometry.of_scan(first),
         np.array([s.ranges for s in scans], np.float64),
         np.array([s.stamp_ns for s in scans]) * 1e-9,
         np.array([odoms.get(s.stamp_ns, nothing) for s in scans]) if odoms else None,

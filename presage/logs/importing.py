@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 from rich.console import Console
 from rich.progress import track
 
@@ -26,6 +27,7 @@ from common.world import World, load_world
 from presage.logs.log import Log, Reading, Sweep
 from presage.logs.opening import RECORDING, kind_of, open_log
 from presage.output import check_file, write_json
+from services.estimator.building import SIGMA
 from services.recorder.accounting import Ledger, as_metadata
 from services.recorder.recording import write_answer
 from services.recorder.writer import RecordingWriter
@@ -46,7 +48,7 @@ class Import:
     robot: str = "robot"
     laser: bool = False  # poses in the recording are the laser's, which then sits at 0, 0, 0
     rate: float | None = None  # Hz, of a log without times
-    sigma: float = 0.02  # m, the scanner's noise, for its description
+    sigma: float | None = None  # m, the scanner's noise; None: the recording does not state it
 
 
 def import_command(job: Import, json_file: Path | None, console: Console) -> None:
@@ -125,6 +127,7 @@ def write_recording(job: Import, log: Log, world: World | None, sweeps: Iterator
         template = Scan(
             stamp_ns=0, angle_min=start, angle_increment=step, range_min=log.range_min, range_max=log.range_max,
             ranges=np.zeros(0, np.float32), mount=Pose.of(log.mount), scan_time=period,
+            sigma=job.sigma or 0.0,
         )  # fmt: skip
         for stamp_ns, sweep in itertools.chain(begun, stamped):
             sender.send(stamp_ns, sweep, template)
@@ -147,16 +150,17 @@ def evenly(log: Log) -> tuple[float, float]:
     return start, step
 
 
-def scanner_of(log: Log, start: float, step: float, period: float, sigma: float) -> Scanner | None:
-    """What the recording says of the scanner; None for one that does not look ahead as a `Scanner` does."""
-    fov = step * (len(log.angles) - 1)
-    if step < 0 or abs(2 * start + fov) > 2 * EVEN or period <= 0 or fov > 2 * np.pi:
-        return None
+def scanner_of(log: Log, start: float, step: float, period: float, sigma: float | None) -> Scanner | None:
+    """What the recording says of the scanner; None where its rate is not known, or a `Scanner` cannot be so."""
     x, y, yaw = map(float, log.mount)
-    return Scanner(
-        name="log", beams=len(log.angles), fov=fov, rate=min(1000.0, 1 / period), range_min=log.range_min,
-        range_max=log.range_max, sigma=sigma, mount=(x, y, yaw),
-    )  # fmt: skip
+    try:
+        return Scanner(
+            name="log", beams=len(log.angles), fov=step * (len(log.angles) - 1), rate=1 / period if period else 0.0,
+            range_min=log.range_min, range_max=log.range_max, sigma=SIGMA if sigma is None else sigma,
+            mount=(x, y, yaw), first=start,
+        )  # fmt: skip
+    except ValidationError:
+        return None
 
 
 def _stamped(log: Log, sweeps: Iterator[Sweep], rate: float | None) -> Iterator[tuple[int, Sweep]]:

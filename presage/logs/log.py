@@ -29,6 +29,11 @@ class Reading:
     range_max: float | None = None  # m
     clock: Literal["sensor", "logger"] = "sensor"  # whose stamps
 
+    @property
+    def plain(self) -> bool:
+        """Whether nothing was said."""
+        return self.mount is None and self == Reading()
+
 
 @dataclass(frozen=True)
 class Sweep:
