@@ -171,9 +171,11 @@ def _survey(path: Path) -> _Survey:
 
 
 def _note_laser(survey: _Survey, words: list[str]) -> None:
-    line, name = laser_line(words), words[0]
+    name = words[0]
     firsts = survey.firsts.setdefault(name, [])
-    if len(firsts) < LOOKED_AT:
+    looked_at = len(firsts) < LOOKED_AT
+    line = laser_line(words, ranges=looked_at)
+    if looked_at:
         firsts.append(line)
     if line.laser is not None and line.robot is not None:
         mount = se2.between(line.robot, line.laser)

@@ -53,24 +53,25 @@ def is_laser(word: str) -> bool:
     return any(pattern.match(word) for pattern in (OLD, ROBOT, RAW))
 
 
-def laser_line(words: list[str]) -> LaserLine:
-    """Of the words of a line; raises ValueError where it is garbled."""
+def laser_line(words: list[str], *, ranges: bool = True) -> LaserLine:
+    """Of the words of a line; raises ValueError where it is garbled. Without ``ranges`` these are not looked at."""
     if OLD.match(words[0]):
-        ranges, tail = _readings(words, 1)
+        seen, tail = _readings(words, 1, wanted=ranges)
         ipc, logger = _times(tail[6:])
-        return LaserLine(ranges, None, _pose(tail), _pose(tail[3:]), ipc, logger)
-    ranges, tail = _readings(words, HEADER)
+        return LaserLine(seen, None, _pose(tail), _pose(tail[3:]), ipc, logger)
+    seen, tail = _readings(words, HEADER, wanted=ranges)
+    count = _count(words[HEADER])
     _, start, fov, step, range_max = (float(word) for word in words[1:6])
-    step = step if step > 0 else fov / max(1, len(ranges) - 1)
-    if not (abs(start) <= 2 * np.pi and 0 < step * (len(ranges) - 1) <= 2 * np.pi + step and 0 < range_max < np.inf):
+    step = step if step > 0 else fov / max(1, count - 1)
+    if not (abs(start) <= 2 * np.pi and 0 < step * (count - 1) <= 2 * np.pi + step and 0 < range_max < np.inf):
         raise ValueError("an impossible header")
-    beams = Beams(start, step, len(ranges), range_max)
+    beams = Beams(start, step, count, range_max)
     remissions = len(tail) != 13 or RAW.match(words[0]) is not None
     if remissions:
         tail = tail[1 + _count(tail[0]) :]
     if RAW.match(words[0]):
-        return LaserLine(ranges, beams, None, None, *_times(tail))
-    return LaserLine(ranges, beams, _pose(tail), _pose(tail[3:]), *_times(tail[11 if remissions else 10 :]))
+        return LaserLine(seen, beams, None, None, *_times(tail))
+    return LaserLine(seen, beams, _pose(tail), _pose(tail[3:]), *_times(tail[11 if remissions else 10 :]))
 
 
 def pose_line(words: list[str]) -> tuple[Array, float, float]:
@@ -78,12 +79,12 @@ def pose_line(words: list[str]) -> tuple[Array, float, float]:
     return _pose(words[1:]), *_times(words[7:])
 
 
-def _readings(words: list[str], at: int) -> tuple[Array, list[str]]:
+def _readings(words: list[str], at: int, *, wanted: bool) -> tuple[Array, list[str]]:
     """(B,) m, and the words behind them."""
     count = _count(words[at])
-    ranges = np.array(words[at + 1 : at + 1 + count], np.float64)
-    if len(ranges) != count or count < 3:
+    if len(words) < at + 1 + count or count < 3:
         raise ValueError("readings are missing")
+    ranges = np.array(words[at + 1 : at + 1 + count] if wanted else (), np.float64)
     return ranges, words[at + 1 + count :]
 
 

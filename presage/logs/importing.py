@@ -34,7 +34,7 @@ from services.recorder.writer import RecordingWriter
 
 EVEN = 1e-4  # rad, by which a beam may lie beside its place
 HEAD = 50  # scans by which the rate is known
-STANDSTILL = 1.0  # s; over a longer gap nothing is said of the velocity
+STANDSTILL = 3.0  # s; over a longer gap nothing is said of the velocity
 
 
 @dataclass(frozen=True)
