@@ -34,7 +34,7 @@ def planar(transform: Array) -> Array:
     return np.array([transform[0, 3], transform[1, 3], np.arctan2(transform[1, 0], transform[0, 0])])
 
 
-@dataclass
+@dataclass(eq=False)
 class Edge:
     """A frame in its parent."""
 

@@ -43,7 +43,7 @@ def job(file, mode="global", frame="base_link", estimator="precise", model="lear
     out = more.pop("out", None)
     choice = choice_of(file, world, estimator, model, None, 0.02, 0, more.pop("initial_pose", ""))
     given = {"fresh": False, "odometry": True, "out": out, **more}
-    return Job.of(file, choice, mode, frame, Reading(), **given)
+    return Job.of(file, choice, mode, frame, given.pop("reading", Reading()), **given)
 
 
 def errors(rows, path=PATH):
@@ -172,5 +172,7 @@ def test_a_recording_says_its_world_and_its_truth(tmp_path):
     assert len(scans.stamps) == len(scans.ranges) == len(scans.truth)
     rows = localize(job(file, world="", model="exact"), CONSOLE)
     assert errors(rows, scans.truth).max() < 0.03
+    with pytest.raises(UserError, match="those options are about logs"):
+        localize(job(file, world="", reading=Reading(mount=np.zeros(3))), CONSOLE)
     with pytest.raises(UserError, match="presage train --world hall"):  # no field was learned of that world
         localize(job(file, world=""), CONSOLE)
