@@ -30,7 +30,7 @@ MOUNTED = {
 }
 EVERY = {**SCANNERS, **MOUNTED}
 PLACES = 6
-TRACKED = 60  # scans
+TRACKED = 40  # scans
 LEARNED = 100_000  # beams to learn from
 
 
