@@ -41,7 +41,7 @@ Angles = Annotated[
     str, typer.Option(rich_help_panel=PANEL, help="First and last beam in deg, such as -90,90, where it does not say.")
 ]
 RangeMax = Annotated[
-    float | None, typer.Option(min=0.1, max=1000, rich_help_panel=PANEL, help="M, from which on a range is no return.")
+    float | None, typer.Option(min=0.1, max=1000, rich_help_panel=PANEL, help="A range from here on, m, is no return.")
 ]
 Clock = Annotated[str, typer.Option(rich_help_panel=PANEL, help="Stamps of the sensor, or of the logger.")]
 
