@@ -121,7 +121,9 @@ def _scanner(seen: Observed) -> Iterator[Finding]:
         f"{', clockwise, as upside down' if sweep.increment < 0 else ''}"
     )
     where = SCAN.key(seen.robot)
-    if not sweep.increment or sweep.beams < 2:
+    if sweep.spacing * (sweep.beams - 1) > np.deg2rad(360.1):
+        yield Finding("scanner", False, what, where, "its beams go round more than once: angle_increment is not that")
+    elif not sweep.increment or sweep.beams < 2:
         yield Finding(
             "scanner", False, what, where, "its beams have no directions: angle_increment is 0, or there is but one"
         )

@@ -59,6 +59,7 @@ def test_a_slow_scanner_is_no_fault_and_one_slower_than_it_says_is():
         ({"angle_min": 1.5, "angle_increment": -0.01}, True, "clockwise, as upside down"),
         ({"mount": Pose(x=-0.2, y=0.0, yaw=3.0)}, None, "mounted at (-0.2, 0) m, 171.9 deg"),
         ({"angle_increment": 0.0}, False, "0 deg apart"),
+        ({"angle_increment": 0.05}, False, "2.86 deg apart"),
     ],
 )
 def test_the_scanner_is_described_and_judged(changes, ok, words):
