@@ -13,7 +13,16 @@ from pydantic import ValidationError
 from common.bus import DEFAULT_ENDPOINT
 from common.errors import UserError, first_fault
 from common.scanner_choice import chosen_scanner, scanner_arguments
-from presage import cli_bench, cli_experiment, cli_inspect, cli_recording, cli_replay, cli_secure, cli_tools
+from presage import (
+    cli_bench,
+    cli_experiment,
+    cli_inspect,
+    cli_obstacle,
+    cli_recording,
+    cli_replay,
+    cli_secure,
+    cli_tools,
+)
 from presage.options import (
     Beams,
     Connect,
@@ -23,11 +32,13 @@ from presage.options import (
     MountText,
     OpenPage,
     People,
+    PeopleSpeed,
     Port,
     PriorName,
     RobotName,
     ScannerName,
     Seed,
+    StartPose,
     UpsideDown,
     Viewer,
     WorldName,
@@ -63,6 +74,8 @@ def up(
     viewer: Viewer = True,
     open_page: OpenPage = False,
     people: People = 0,
+    people_speed: PeopleSpeed = 1.0,
+    start: StartPose = "",
     robots: Annotated[
         int, typer.Option(min=1, max=20, help="Several: ROBOT-1, ROBOT-2 ..., each simulated by itself, one estimator.")
     ] = 1,
@@ -75,8 +88,9 @@ def up(
     The page's link is printed; PRESAGE_VIEWER_PORT and PRESAGE_VIEWER_TOKEN choose its port and who may see it.
     Examples: `presage up`, then elsewhere `presage goal 15 1.5 --wait`; `presage up --estimator particle-filter`;
     `presage up --record recordings --seed 7`; `presage up --world my.yaml --port 7500`; `presage up --no-viewer`;
-    `presage up --world office --people 10`; `presage up --robots 3`, then `presage goal 15 1.5 --robot robot-2`;
-    `presage up --scanner rplidar-a1 --mount=-0.1,0,180 --upside-down`; `presage up --scanner my-laser.yaml`.
+    `presage up --world office --people 10 --start 9,3.5,90`; `presage up --robots 3`, then
+    `presage goal 15 1.5 --robot robot-2`; `presage up --scanner my-laser.yaml`;
+    `presage up --scanner rplidar-a1 --mount=-0.1,0,180 --upside-down`.
     """
     from presage.up import run_up  # noqa: PLC0415
 
@@ -93,7 +107,8 @@ def up(
         estimator=("--estimator", estimator, "--model", model, "--prior", prior),
         viewer=viewer,
         open_page=open_page,
-        people=people,
+        people=("--people", str(people), "--people-speed", str(people_speed)),
+        start=start,
         robots=robots,
     )
 
@@ -218,7 +233,8 @@ app.add_typer(cli_tools.app)
 app.add_typer(cli_bench.app, name="bench")
 app.add_typer(cli_experiment.app, name="experiment")
 app.add_typer(cli_secure.app, name="secure")
-cli_secure.with_security(app, cli_recording.app, cli_replay.app, cli_inspect.app, cli_tools.app)
+app.add_typer(cli_obstacle.app, name="obstacle")
+cli_secure.with_security(app, cli_recording.app, cli_replay.app, cli_inspect.app, cli_tools.app, cli_obstacle.app)
 
 
 def main() -> None:
