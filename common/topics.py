@@ -160,3 +160,8 @@ def topic_of(key: str) -> Topic | None:
         if len(parts) == depth and parts[0] == ROOT and parts[2] == topic.name:
             return topic
     return None
+
+
+def expected_rate(topic: Topic, scan_time: float) -> float:
+    """Hz of a topic where a scan comes each ``scan_time`` s (0: not said): the table has those of a 15 Hz scanner."""
+    return 1 / scan_time if scan_time > 0 and topic.rate == SCAN.rate else topic.rate

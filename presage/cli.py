@@ -89,8 +89,8 @@ def up(
     Examples: `presage up`, then elsewhere `presage goal 15 1.5 --wait`; `presage up --estimator particle-filter`;
     `presage up --record recordings --seed 7`; `presage up --world my.yaml --port 7500`; `presage up --no-viewer`;
     `presage up --world office --people 10 --start 9,3.5,90`; `presage up --robots 3`, then
-    `presage goal 15 1.5 --robot robot-2`;
-    `presage up --scanner rplidar-a1 --mount -0.1,0,180 --upside-down`; `presage up --scanner my-laser.yaml`.
+    `presage goal 15 1.5 --robot robot-2`; `presage up --scanner my-laser.yaml`;
+    `presage up --scanner rplidar-a1 --mount=-0.1,0,180 --upside-down`.
     """
     from presage.up import run_up  # noqa: PLC0415
 

@@ -180,6 +180,7 @@ def _paper(choice: Choice, world: World) -> Factory:
     folder = choice.models or paper_weights.FOLDER
     known = paper_weights.available(folder, world.name, "paper")
     remedy = paper_weights.train_command(choice.asked, "paper")
+    without = remedy.rpartition(" --scanner")[0]
     if not known:
         raise UserError(f"no weights of preset paper for world {world.name!r} in {folder}; make them with: {remedy}")
     for path in known.values():  # a broken file is found now, and torch is warm for the first scan
@@ -194,12 +195,21 @@ def _paper(choice: Choice, world: World) -> Factory:
 
     def make(geometry: Geometry) -> Estimator:
         model, card = load(paper_weights.nearest(folder, world.name, "paper", len(geometry.angles)))
-        x, y, yaw = geometry.mount
-        other = f" --beams {len(geometry.angles)} --mount {x:g},{y:g},{np.rad2deg(yaw):g}"
-        found = fit(card.scanner, geometry.angles, geometry.mount, remedy + other)
+        found = fit(card.scanner, geometry.angles, geometry.mount, f"{without} {_options(geometry)}")
         return PaperPerception(model, card, choice.descent, choice.initial_pose, found)
 
     return make
+
+
+def _options(geometry: Geometry) -> str:
+    """Of `presage train`, for the scanner that gave these scans."""
+    beams, (x, y, yaw) = len(geometry.angles), geometry.mount
+    known = (
+        name
+        for name, one in SCANNERS.items()
+        if np.allclose(one.with_beams(beams).angles(), geometry.angles, atol=1e-3)
+    )
+    return f"--scanner {next(known, 'FILE')} --beams {beams} --mount {x:g},{y:g},{np.rad2deg(yaw):g}"
 
 
 def default_geometry(beams: int | None = None) -> Geometry:

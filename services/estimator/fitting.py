@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from common.se2 import Array
 
 TOLERANCE = 1e-4  # rad and m; nearer is the same
+ROUND = 360.1  # deg, from the first beam to the last; some drivers measure the first direction twice
 COARSEST = 4.0  # times the model's spacing
 
 
@@ -68,6 +69,8 @@ def fit(scanner: Scanner, angles: Array, mount: Array, remedy: str) -> Fit:
     if off > TOLERANCE:
         here, there = (f"({x:g}, {y:g}) m" for x, y in (mount[:2], scanner.mount[:2]))
         raise refuse(f"its laser is mounted at {here}, theirs at {there}")
+    if (round_deg := float(np.rad2deg(np.ptp(angles)))) > ROUND:
+        raise refuse(f"its beams go round more than once, {round_deg:.0f} deg from the first to the last")
     turned = float(mount[2]) - scanner.mount[2]
     middle = scanner.angle_min + scanner.angle_increment * (scanner.beams - 1) / 2
     own = scanner.angles() - middle

@@ -21,7 +21,7 @@ class SimulatorSettings(ServiceSettings):
       python -m services.simulator --world my.yaml --start 2,1,90    x m, y m, yaw deg
       python -m services.simulator --beams 622 --pace lockstep --seed 7
       python -m services.simulator --world office --people 10        who walk about
-      python -m services.simulator --scanner rplidar-a1 --mount -0.1,0,180 --upside-down
+      python -m services.simulator --scanner rplidar-a1 --mount=-0.1,0,180 --upside-down
       python -m services.simulator --scanner my-laser.yaml           docs/scanners.md shows such a file
 
     """

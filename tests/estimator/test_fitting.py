@@ -69,6 +69,7 @@ def test_between_beams_it_is_linear_and_round_the_back_too():
     [
         (SCANNERS["lms200"], "does not look towards -135 deg of base_link"),
         (like_tim571(mount=(0.2, 0.0, 0.2)), "does not look towards -135 deg"),
+        (like_tim571(fov=7.0), "its beams go round more than once, 401 deg from"),
         (like_tim571(beams=61), r"beams are 4.50 deg apart, theirs 1.00, and 4 times"),
         (like_tim571(mount=(0.2, 0.1, 0.0)), r"mounted at \(0.2, 0.1\) m, theirs at \(0.2, 0\) m"),
     ],
