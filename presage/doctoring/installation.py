@@ -15,7 +15,6 @@ NEEDED = {
     "simulator": ("pybullet",),
     "estimator": ("torch", "safetensors", "numba"),
     "controller": ("scipy",),
-    "bridge_ros2": ("rosbags", "xxhash"),
     "recorder": ("mcap", "zstandard", "lz4"),
 }
 

@@ -11,7 +11,7 @@ from common.topics import CMD_VEL, TOPICS, topic_of
 from presage.doctoring.findings import Finding
 from presage.doctoring.installation import NEEDED
 from presage.doctoring.listening import Observed
-from presage.health_board import SLOW, SOURCE
+from presage.health_board import SLOW, SOURCE, replaced
 
 OPTIONAL = {"recorder": "needed only to record, with"}  # a healthy session can do without
 NO_PULSE = {SOURCE}  # alive, and publishes no health
@@ -37,7 +37,7 @@ def _presence(seen: Observed) -> Iterator[Finding]:
         what = f"nobody is {seen.robot!r}; there are {', '.join(sorted(others))}"
         yield Finding("no_such_robot", False, what, seen.robot, "name the robot with --robot")
     for service in NEEDED:
-        there, source = service in seen.alive, SOURCE in seen.alive
+        there, source = service in seen.alive, replaced(service, seen.alive)
         what = f"{service} of {seen.robot!r}: {'alive' if there else 'not there'}"
         advice = "" if there else f"{OPTIONAL.get(service, 'start it with')}: python -m services.{service}"
         yield Finding("missing", there or (None if service in OPTIONAL or source else False), what, service, advice)

@@ -10,6 +10,10 @@ from common import se2
 from services.bridge_ros2.frames import Dead, Frames, Mount, Odometer, Transform, mount_of
 
 
+class NoMountError(ValueError):
+    """Where the scanner sits is not in tf, or not yet."""
+
+
 class Motion:
     """Of one robot."""
 
@@ -27,14 +31,14 @@ class Motion:
         return self._found
 
     def mount_for(self, frame: str) -> Mount:
-        """Of a scanner whose scans name ``frame``; raises ValueError where tf does not say, or says it is inclined."""
+        """Of a scanner whose scans name ``frame``; raises NoMountError, or ValueError where it is inclined."""
         if self._told is not None:
             return self._told
         frame = frame.strip("/")
         transform = self.frames.find(frame, self.base)
         if transform is None:
             there = ", ".join(self.frames.names()[:12]) or "none"
-            raise ValueError(
+            raise NoMountError(
                 f"tf does not connect {frame or 'their empty frame'} with {self.base} (--base-frame); frames: {there}; "
                 "--mount x,y,yaw says it without tf"
             )

@@ -16,7 +16,7 @@ from services.bridge_ros2 import outward
 from services.bridge_ros2.graph import Graph
 from services.bridge_ros2.inward import dead_of, odom_of, pose_of, scan_of
 from services.bridge_ros2.keys import KEPT, LATEST, SENSOR, TF, TF_STATIC, Qos
-from services.bridge_ros2.motion import Motion
+from services.bridge_ros2.motion import Motion, NoMountError
 from services.bridge_ros2.ros_session import RosPublisher, RosSession, open_ros_session
 from services.bridge_ros2.ros_types import (
     LASER_SCAN,
@@ -180,6 +180,9 @@ class BridgeRos2Service(Service):
         try:
             self.options.names().refuse_foreign(sample.key, kind)
             hear(decode(kind, sample.payload))
+        except NoMountError as error:  # tf may still be on its way: after a while it is said
+            self._problem = str(error)
+            self.counters["scans_without_mount"] += 1
         except (CdrError, ValueError, OverflowError) as error:
             self._problem = str(error) if sample.topic == _row(self.options.scan_topic, newest=True) else self._problem
             self.loop.reject(sample.key, str(error))

@@ -12,6 +12,7 @@ from common.messages import CmdVel, Scan
 from common.robot import Robot
 from common.se2 import Array
 
+SLOWEST = 1e-3  # m/s and rad/s; less is none
 STANDING = 0.5  # s for which a stop is said again; then the topic is left to others (a joystick, nav2)
 
 
@@ -66,6 +67,7 @@ class Wheels:
             current = self._velocity[0] if self._velocity and now - self._velocity[1] < 0.5 else None
             hold = max(safety.LATENCY, 2 * self._period)
             twist, self.stopped = safety.limit_velocity(twist, self._points, self.robot, current, hold)
+        twist = np.where(np.abs(twist) < SLOWEST, 0.0, twist)
         if twist.any():
             if self.due(now) <= 0:  # said again after the time was up
                 return self.silence()

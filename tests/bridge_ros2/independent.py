@@ -1,4 +1,4 @@
-"""ROS 2's messages by another implementation of CDR than the bridge's: Foxglove's. Definitions are the published ones."""
+"""ROS 2's messages by Foxglove's implementation of CDR, not the bridge's; definitions are the published ones."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""A stand-in for a robot in ROS 2: a base and a scanner in the corridor that speak as rmw_zenoh, or zenoh-bridge-ros2dds.
+"""A stand-in for a robot in ROS 2: base and scanner in the corridor, speaking as rmw_zenoh or zenoh-bridge-ros2dds.
 
-Nothing of the bridge is in it: keys, tokens and attachments are written out here, and its CDR is another's. Once a second
-it says on stdout, as JSON, where it is and what it heard.
+Nothing of the bridge is in it: keys, tokens and attachments are written out here, and its CDR is another's. Five times
+a second it says on stdout, as JSON, where it is and what it heard.
 """
 
 from __future__ import annotations
@@ -10,14 +10,13 @@ import argparse
 import json
 import signal
 import struct
-import sys
 import threading
 import time
-from dataclasses import replace
 
 import numpy as np
 import zenoh
 import zenoh.ext
+from typing_extensions import Self
 
 from common.messages import Twist
 from common.robot import Robot
@@ -31,7 +30,10 @@ HASHES = {
     "nav_msgs::msg::dds_::Odometry_": "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
     "tf2_msgs::msg::dds_::TFMessage_": "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
     "geometry_msgs::msg::dds_::Twist_": "RIHS01_9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a",
-    "geometry_msgs::msg::dds_::TwistStamped_": "RIHS01_5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64",
+    "geometry_msgs::msg::dds_::TwistStamped_": (
+        "RIHS01_5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64"
+    ),
+    "geometry_msgs::msg::dds_::PoseStamped_": "RIHS01_10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
     "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_": (
         "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e"
     ),
@@ -57,6 +59,12 @@ class Ros:
         self.kept, self.sequence = [], 0
         if self.rmw:
             self.token(f"@ros2_lv/0/{self.zid}/0/0/NN/%/%/robot")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.session.close()
 
     def token(self, key: str) -> None:
         self.kept.append(self.session.liveliness().declare_token(key))
@@ -112,82 +120,98 @@ class Ros:
         self.kept.append(self.session.declare_subscriber(self.declare("MS", topic, dds), move))
 
 
-def main() -> None:
-    options = argparse.ArgumentParser()
-    options.add_argument("--port", type=int, required=True)
-    options.add_argument("--flavor", default="rmw_zenoh")
-    options.add_argument("--distro", default="jazzy")
-    options.add_argument("--stamped", action="store_true")
-    options = options.parse_args()
-    done = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: done.set())
-    robot = Robot()  # whose simulation has a watchdog of its own: 0.2 s
-    scanner = SCANNERS["tim571"].with_beams(622)
-    scanner = scanner.model_copy(update={"mount": MOUNT})
-    setup = Setup(load_world("corridor"), scanner, robot, None, 3)
-    simulation = Simulation(replace(setup, obstacle_stop=False))  # that is the bridge's here
-    ros = Ros(options.port, options.flavor, options.distro)
-    heard, lock = {"commands": 0, "zeros": 0, "transforms": 0, "pose": None, "odom_in_map": None}, threading.Lock()
+class StandIn:
+    """The base, its scanner, and what it hears. Its own watchdog, 0.2 s, is the simulation's."""
 
-    def drive(message) -> None:
+    def __init__(self, ros: Ros, *, stamped: bool) -> None:
+        scanner = SCANNERS["tim571"].with_beams(622).model_copy(update={"mount": MOUNT})
+        # No obstacle stop: that is the bridge's here.
+        self.simulation = Simulation(Setup(load_world("corridor"), scanner, Robot(), None, 3, obstacle_stop=False))
+        self.lock = threading.Lock()
+        self.heard = {"commands": 0, "zeros": 0, "transforms": 0, "pose": None, "odom_in_map": None}
+        twist = "geometry_msgs::msg::dds_::TwistStamped_" if stamped else "geometry_msgs::msg::dds_::Twist_"
+        ros.subscribe("cmd_vel", twist, self.drive)
+        ros.subscribe("amcl_pose", "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_", self.hear_pose)
+        ros.subscribe("tf", "tf2_msgs::msg::dds_::TFMessage_", self.hear_tf)
+        put_static = ros.publisher("tf_static", "tf2_msgs::msg::dds_::TFMessage_")
+        self.put_tf = ros.publisher("tf", "tf2_msgs::msg::dds_::TFMessage_")
+        self.put_odom = ros.publisher("odom", "nav_msgs::msg::dds_::Odometry_")
+        self.put_scan = ros.publisher("scan", "sensor_msgs::msg::dds_::LaserScan_")
+        put_static(
+            transforms(
+                transform("base_footprint", "base_link", 0, 0, 0.1, quaternion(), BEGIN),
+                transform("base_link", "laser", MOUNT[0], MOUNT[1], 0.2, quaternion(1, 0, 0, 0), BEGIN),
+            )
+        )
+
+    def drive(self, message) -> None:
         twist = getattr(message, "twist", message)
         x, y, turn = float(twist.linear.x), float(twist.linear.y), float(twist.angular.z)
-        with lock:
-            heard["commands"] += 1
-            heard["zeros"] += not (x or y or turn)
-            simulation.command(simulation.stamp_ns, Twist(vx=x, vy=y, wz=turn))
+        with self.lock:
+            self.heard["commands"] += 1
+            self.heard["zeros"] += not (x or y or turn)
+            self.simulation.command(self.simulation.stamp_ns, Twist(vx=x, vy=y, wz=turn))
 
-    def hear_pose(message) -> None:
+    def hear_pose(self, message) -> None:
         pose = message.pose.pose
-        heard["pose"] = [pose.position.x, pose.position.y, 2 * np.arctan2(pose.orientation.z, pose.orientation.w)]
+        yaw = 2 * np.arctan2(pose.orientation.z, pose.orientation.w)
+        self.heard["pose"] = [pose.position.x, pose.position.y, yaw]
 
-    def hear_tf(message) -> None:
+    def hear_tf(self, message) -> None:
         for each in message.transforms:
             if (each.header.frame_id, each.child_frame_id) == ("map", "odom"):
-                heard["transforms"] += 1
-                heard["odom_in_map"] = [each.transform.translation.x, each.transform.translation.y]
+                at, turn = each.transform.translation, each.transform.rotation
+                self.heard["transforms"] += 1
+                self.heard["odom_in_map"] = [at.x, at.y, 2 * np.arctan2(turn.z, turn.w)]
 
-    twist = "geometry_msgs::msg::dds_::TwistStamped_" if options.stamped else "geometry_msgs::msg::dds_::Twist_"
-    ros.subscribe("cmd_vel", twist, drive)
-    ros.subscribe("amcl_pose", "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_", hear_pose)
-    ros.subscribe("tf", "tf2_msgs::msg::dds_::TFMessage_", hear_tf)
-    put_static = ros.publisher("tf_static", "tf2_msgs::msg::dds_::TFMessage_")
-    put_tf = ros.publisher("tf", "tf2_msgs::msg::dds_::TFMessage_")
-    put_odom = ros.publisher("odom", "nav_msgs::msg::dds_::Odometry_")
-    put_scan = ros.publisher("scan", "sensor_msgs::msg::dds_::LaserScan_")
-    put_static(transforms(
-        transform("base_footprint", "base_link", 0, 0, 0.1, quaternion(), BEGIN),
-        transform("base_link", "laser", MOUNT[0], MOUNT[1], 0.2, quaternion(1, 0, 0, 0), BEGIN),
-    ))  # fmt: skip
-    due, said = time.monotonic(), 0.0
-    while not done.wait(max(0.0, due - time.monotonic())):
-        with lock:
-            simulation.advance()
-            odom, truth, scan = simulation.observe()
-        stamp = BEGIN + scan.stamp_ns
+    def step(self) -> dict:
+        """One scan further: say in ROS what is measured. What is true, for the test."""
+        with self.lock:
+            self.simulation.advance()
+            odom, truth, scan = self.simulation.observe()
+        stamp, still = BEGIN + scan.stamp_ns, [0.0] * 36
         yaw = quaternion(0, 0, np.sin(odom.pose.yaw / 2), np.cos(odom.pose.yaw / 2))
-        put_tf(transforms(transform("odom", "base_footprint", odom.pose.x, odom.pose.y, 0, yaw, stamp)))
-        put_odom(encode("nav_msgs/msg/Odometry", {
+        self.put_tf(transforms(transform("odom", "base_footprint", odom.pose.x, odom.pose.y, 0, yaw, stamp)))
+        pose = {"position": vector(odom.pose.x, odom.pose.y), "orientation": yaw}
+        twist = {"linear": vector(odom.twist.vx, odom.twist.vy), "angular": vector(0, 0, odom.twist.wz)}
+        odometry = {
             "header": header(stamp, "odom"), "child_frame_id": "base_footprint",
-            "pose": {"pose": {"position": vector(odom.pose.x, odom.pose.y), "orientation": yaw}, "covariance": [0.0] * 36},
-            "twist": {"twist": {"linear": vector(odom.twist.vx, odom.twist.vy), "angular": vector(0, 0, odom.twist.wz)},
-                      "covariance": [0.0] * 36},
-        }))  # fmt: skip
-        put_scan(encode("sensor_msgs/msg/LaserScan", {
-            # Upside down: the beams come from the right to the left of the world, and +inf as 0.
+            "pose": {"pose": pose, "covariance": still}, "twist": {"twist": twist, "covariance": still},
+        }  # fmt: skip
+        self.put_odom(encode("nav_msgs/msg/Odometry", odometry))
+        # Upside down the first beam is the leftmost; nothing is said as 0.
+        ranges = np.where(np.isposinf(scan.ranges), 0, scan.ranges)[::-1]
+        sweep = {
             "header": header(stamp, "laser"), "angle_min": scan.angle_min, "angle_max": -scan.angle_min,
             "angle_increment": scan.angle_increment, "time_increment": 0.0, "scan_time": 1 / 15,
-            "range_min": scan.range_min, "range_max": scan.range_max, "intensities": [],
-            "ranges": np.where(np.isposinf(scan.ranges), 0, scan.ranges)[::-1].tolist(),
-        }))  # fmt: skip
-        due = max(due + 1 / 15, time.monotonic() - 0.2)
-        if time.monotonic() >= said + 0.2:
-            said = time.monotonic()
-            speed = float(np.hypot(truth.twist.vx, truth.twist.vy))
-            now = {"truth": truth.pose.array().tolist(), "speed": speed, "contact": truth.contact, **heard}
-            print(json.dumps(now), flush=True)
-    ros.session.close()
-    simulation.close()
+            "range_min": scan.range_min, "range_max": scan.range_max, "ranges": ranges.tolist(), "intensities": [],
+        }  # fmt: skip
+        self.put_scan(encode("sensor_msgs/msg/LaserScan", sweep))
+        speed = float(np.hypot(truth.twist.vx, truth.twist.vy))
+        odom_pose = odom.pose.array().tolist()
+        true = {"truth": truth.pose.array().tolist(), "speed": speed, "contact": truth.contact, "odom": odom_pose}
+        return {**true, **self.heard}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--port", type=int, required=True)
+    parser.add_argument("--flavor", default="rmw_zenoh")
+    parser.add_argument("--distro", default="jazzy")
+    parser.add_argument("--stamped", action="store_true")
+    options = parser.parse_args()
+    done = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: done.set())
+    with Ros(options.port, options.flavor, options.distro) as ros:
+        robot = StandIn(ros, stamped=options.stamped)
+        due, said = time.monotonic(), 0.0
+        while not done.wait(max(0.0, due - time.monotonic())):
+            now = robot.step()
+            due = max(due + 1 / 15, time.monotonic() - 0.2)
+            if time.monotonic() >= said + 0.2:
+                said = time.monotonic()
+                print(json.dumps(now), flush=True)
+    robot.simulation.close()
 
 
 def transform(parent: str, child: str, x: float, y: float, z: float, rotation: dict, stamp: int) -> dict:
@@ -202,4 +226,4 @@ def transforms(*each: dict) -> bytes:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

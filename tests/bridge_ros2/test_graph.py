@@ -1,0 +1,53 @@
+"""What is said where messages do not come."""
+
+from __future__ import annotations
+
+from services.bridge_ros2.graph import Graph
+from services.bridge_ros2.keys import Names, Node, Qos
+from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, TWIST, TWIST_STAMPED, type_hash
+
+ROBOT = Node(Names(), "ab", "", "driver")
+
+
+def token(kind, topic, message, number=1):
+    return ROBOT.endpoint_token(kind, number, topic, message, Qos())
+
+
+def why(*tokens):
+    graph = Graph()
+    for each in tokens:
+        graph.change(each, there=True)
+    return graph.why_silent("/scan", LASER_SCAN, "--scan-topic", nobody="NOBODY")
+
+
+def test_nobody_another_topic_another_type_another_hash_or_just_silence():
+    assert why() == "NOBODY"
+    assert why(ROBOT.token()) == "NOBODY"
+    text = why(token("MP", "/scan_raw", LASER_SCAN), token("MP", "/odom", ODOMETRY))
+    assert "/scan_raw" in text
+    assert "--scan-topic" in text
+    assert "nor any other" in why(token("MP", "/odom", ODOMETRY))
+    assert "of type nav_msgs/msg/Odometry" in why(token("MP", "/scan", ODOMETRY))
+    foreign = token("MP", "/scan", LASER_SCAN).replace(type_hash(LASER_SCAN), "RIHS01_1234")
+    text = why(foreign)
+    assert "RIHS01_1234" in text
+    assert type_hash(LASER_SCAN) in text
+    assert "nothing arrives" in why(token("MP", "/scan", LASER_SCAN))
+    assert "/driver" in why(token("MP", "/scan", LASER_SCAN))
+    assert "nobody publishes it" in why(token("MS", "/scan", LASER_SCAN))
+
+
+def test_whoever_goes_is_forgotten():
+    graph = Graph()
+    graph.change(token("MP", "/scan", LASER_SCAN), there=True)
+    graph.change(token("MP", "/scan", LASER_SCAN), there=False)
+    assert graph.endpoints() == []
+
+
+def test_the_kind_of_command_that_the_robot_listens_for():
+    graph = Graph()
+    assert graph.twist_wanted("/cmd_vel") == ""
+    graph.change(token("MS", "/cmd_vel", TWIST_STAMPED), there=True)
+    assert graph.twist_wanted("/cmd_vel") == TWIST_STAMPED
+    graph.change(token("MS", "/cmd_vel", TWIST, 2), there=True)
+    assert graph.twist_wanted("/cmd_vel") == ""  # either will do
