@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from common.compatibility import difference, fits
 from common.messages import Health, TopicHealth
 from common.requests import ConfigReply
-from common.topics import CMD_VEL, TOPICS, topic_of
+from common.topics import CMD_VEL, SCAN, TOPICS, TRUTH, topic_of
 from presage.doctoring.findings import Finding
 from presage.doctoring.installation import NEEDED
 from presage.doctoring.listening import Observed
-from presage.health_board import SLOW, SOURCE, replaced
+from presage.health_board import SLOW, SOURCE, STANDS_IN, replaced
 
 OPTIONAL = {"recorder": "needed only to record, with"}  # a healthy session can do without
 NO_PULSE = {SOURCE}  # alive, and publishes no health
@@ -87,16 +87,19 @@ def _clocks(seen: Observed) -> Iterator[Finding]:
 
 
 def _rates(seen: Observed) -> Iterator[Finding]:
+    foreign = STANDS_IN["simulator"] in seen.alive  # a real scanner has a rate of its own, and nobody knows the truth
+    scans = seen.arrivals[SCAN.key(seen.robot)] / seen.seconds
     for topic in TOPICS:
-        if not topic.rate or topic.per_service:
+        if not topic.rate or topic.per_service or (foreign and topic is TRUTH):
             continue
         key = topic.key(seen.robot)
         rate = seen.arrivals[key] / seen.seconds
-        ok = rate >= SLOW * topic.rate
+        nominal = scans if foreign else topic.rate
+        ok = rate > 0 and rate >= SLOW * nominal
         advice = f"from the {topic.publisher}: is it alive, paused, or are its inputs missing? see its log"
-        if topic is CMD_VEL and rate > 1.5 * topic.rate:
+        if topic is CMD_VEL and rate > 1.5 * nominal:
             ok, advice = False, "more than one driver? stop all controllers but one"
-        yield Finding("rate", ok, f"{topic.name}: {rate:.1f} of {topic.rate:g} Hz", key, "" if ok else advice)
+        yield Finding("rate", ok, f"{topic.name}: {rate:.1f} of {nominal:.3g} Hz", key, "" if ok else advice)
     for key, why in sorted(seen.undecodable.items()):
         advice = "another program or another version publishes there; `presage echo` shows what comes"
         yield Finding("undecodable", False, f"{key}: {why}", key, advice)

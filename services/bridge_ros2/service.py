@@ -13,6 +13,7 @@ from common.se2 import Array
 from common.service import Service
 from common.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, ODOM, SCAN, STATUS, Query, Topic
 from services.bridge_ros2 import outward
+from services.bridge_ros2.complaints import complaint
 from services.bridge_ros2.graph import Graph
 from services.bridge_ros2.inward import dead_of, odom_of, pose_of, scan_of
 from services.bridge_ros2.keys import KEPT, LATEST, SENSOR, TF, TF_STATIC, Qos
@@ -35,7 +36,6 @@ from services.bridge_ros2.settings import BridgeRos2Settings
 from services.bridge_ros2.wheels import Wheels
 
 AGAIN = 1.0  # s between two looks at how things stand, and between two tries to reach the router
-SILENT = 3.0  # s without a scan, then it is said why
 YAW_TOLERANCE = 0.25  # rad, of rviz's goals, as nav2 has it
 
 
@@ -62,14 +62,13 @@ class BridgeRos2Service(Service):
         self._scan_at: float | None = None  # when the last scan was passed on
         self._began = time.monotonic()
         self._clock: tuple[int, float] | None = None  # the robot's, and ours, when its last scan came
-        self._said_waiting = False
+        self._waiting_said = False
         self._problem = ""  # why the last message could not be used
 
     def open(self) -> None:
         """Declared before anybody asks: the first message on a key just declared may be lost."""
         for topic in (ODOM, SCAN):
             self.loop.bus.publisher(topic, self.name)
-        self._connect()
 
     def close(self) -> None:
         """A robot under way is stopped."""
@@ -82,9 +81,9 @@ class BridgeRos2Service(Service):
         options = self.options
         session = open_ros_session(options.ros_connect, options.ros_config)
         if session is None:
-            if not self._said_waiting:
+            if not self._waiting_said:
                 self.log.warning(self.note)
-            self._said_waiting = True
+            self._waiting_said = True
             return
         ros = self._ros = RosSession(session, options.names(), options.namespace, options.node, self.graph)
         self._began = time.monotonic()
@@ -139,37 +138,15 @@ class BridgeRos2Service(Service):
             static = self.options.topic(self.options.tf_topic + "_static")
             if self.motion.mount() is None:
                 self._ros.fetch(_row(self.options.tf_topic + "_static"), static, self.loop.inbox)
-            self.note = self._standing(self._ros, now)
+            since = self._scan_at if self._scan_at is not None else self._began
+            self.note = complaint(
+                self.options, self.graph, self._problem,
+                linked=self._ros.linked(), quiet=now - since, heard=self._scan_at is not None,
+            )  # fmt: skip
         if self.note and self.note != before:
             self.log.warning(self.note)
-
-    def _standing(self, ros: RosSession, now: float) -> str:
-        """What is wrong; empty: scans come and go."""
-        options = self.options
-        if not ros.linked():
-            return f"waits for the zenoh router at {options.ros_connect}: it is gone"
-        since = self._scan_at if self._scan_at is not None else self._began
-        if now - since > SILENT:
-            topic = options.topic(options.scan_topic)
-            if self._problem:
-                return f"scans on {topic} cannot be used: {self._problem}"
-            other = "another" if options.flavor == "rmw_zenoh" else "a wrong"
-            nobody = (
-                f"nobody is seen in ROS domain {options.domain}: {other} ROS_DOMAIN_ID (--domain), or no rmw_zenoh?"
-            )
-            if options.flavor == "ros2dds":
-                nobody = (
-                    "zenoh-bridge-ros2dds says of no topic: does it run there, and the robot's nodes in its domain?"
-                )
-            why = self.graph.why_silent(topic, LASER_SCAN, "--scan-topic", nobody=nobody)
-            return f"no scan on {topic} for {SILENT:g} s: {why}"
-        if self._scan_at is None:
-            return f"no scan on {options.topic(options.scan_topic)} yet"
-        wanted = self.graph.twist_wanted(options.topic(options.cmd_topic)) if options.commands else ""
-        if wanted and (wanted == TWIST_STAMPED) != options.stamped:
-            option = "--stamped" if wanted == TWIST_STAMPED else "--no-stamped"
-            return f"{options.topic(options.cmd_topic)}: the robot listens for {wanted}: {option}"
-        return ""
+        elif before and not self.note:
+            self.log.info("scans come", mount=self.motion.mount())
 
     def on_sample(self, sample: Sample) -> None:
         """Ours as ever; one of ROS is decoded, and handed to what is done with its topic."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from services.bridge_ros2.complaints import complaint
 from services.bridge_ros2.graph import Graph
 from services.bridge_ros2.keys import Names, Node, Qos
 from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, TWIST, TWIST_STAMPED, type_hash
+from services.bridge_ros2.settings import BridgeRos2Settings
 
 ROBOT = Node(Names(), "ab", "", "driver")
 
@@ -51,3 +53,20 @@ def test_the_kind_of_command_that_the_robot_listens_for():
     assert graph.twist_wanted("/cmd_vel") == TWIST_STAMPED
     graph.change(token("MS", "/cmd_vel", TWIST, 2), there=True)
     assert graph.twist_wanted("/cmd_vel") == ""  # either will do
+
+
+def test_a_complaint_names_the_option_that_mends_it():
+    def said(graph, problem="", *, linked=True, quiet=0.0, heard=True, **options):
+        return complaint(BridgeRos2Settings(**options), graph, problem, linked=linked, quiet=quiet, heard=heard)
+
+    graph = Graph()
+    assert said(graph) == ""
+    assert "it is gone" in said(graph, linked=False)
+    assert said(graph, heard=False) == "no scan on /scan yet"
+    assert "ROS domain 4" in said(graph, quiet=4.0, domain=4)
+    assert "zenoh-bridge-ros2dds says of no topic" in said(graph, quiet=4.0, flavor="ros2dds")
+    assert "on /r1/scan for 3 s" in said(graph, quiet=4.0, namespace="r1")
+    assert said(graph, "too odd", quiet=4.0) == "scans on /scan cannot be used: too odd"
+    graph.change(token("MS", "/cmd_vel", TWIST_STAMPED), there=True)
+    assert said(graph) == "/cmd_vel: the robot listens for geometry_msgs/msg/TwistStamped: --stamped"
+    assert said(graph, stamped=True) == said(graph, commands=False) == ""
