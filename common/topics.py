@@ -114,9 +114,7 @@ SAMPLE = Query(
     about="the scans seen from a batch of poses",
 )
 WORLD = Query("world", r.Request, r.WorldReply, "simulator", asked_by=ANYBODY, about="world, scanner and robot as data")
-LOCALISE = Query(
-    "localise", r.LocaliseRequest, r.Reply, "estimator", asked_by=ASKS, about="begin localisation anew"
-)
+LOCALISE = Query("localise", r.LocaliseRequest, r.Reply, "estimator", asked_by=ASKS, about="begin localisation anew")
 PLAYER = Query("player", r.PlayerRequest, r.PlayerReply, "replay", about="pause, step, seek a replay")
 RECORDING = Query("recording", r.RecordRequest, r.RecordReply, "recorder", about="begin or end a recording")
 MODEL = Query(
