@@ -14,19 +14,31 @@ SILENT = 3.0  # s without a scan, then it is said why
 
 
 def complaint(
-    options: BridgeRos2Settings, graph: Graph, problem: str, *, linked: bool, quiet: float, heard: bool
+    options: BridgeRos2Settings, graph: Graph, problem: str, *, linked: bool, quiet: float, heard: bool, reckoned: bool
 ) -> str:
-    """Empty where scans come. ``quiet``: s since the last; ``problem``: why the last could not be used."""
+    """Empty where all is well.
+
+    ``problem``: why the last scan could not be used; ``quiet``: s since the last that could, if one was ``heard``;
+    ``reckoned``: it came with odometry of its moment.
+    """
     topic = options.topic(options.scan_topic)
     if not linked:
         return f"waits for the zenoh router at {options.ros_connect}: it is gone"
-    if quiet > SILENT and problem:
-        return f"scans on {topic} cannot be used: {problem}"
     if quiet > SILENT:
+        if problem:
+            return f"scans on {topic} cannot be used: {problem}"
         why = graph.why_silent(topic, LASER_SCAN, "--scan-topic", nobody=_nobody(options))
         return f"no scan on {topic} for {SILENT:g} s: {why}"
-    if not heard:
-        return f"no scan on {topic} yet"
+    return _with_scans(options, graph, reckoned=reckoned) if heard else f"no scan on {topic} yet"
+
+
+def _with_scans(options: BridgeRos2Settings, graph: Graph, *, reckoned: bool) -> str:
+    """What else may be wrong while scans come."""
+    if options.tf == "map-odom" and not reckoned:
+        where = f"on {options.topic(options.odom_topic)} or in tf" if options.odom_topic else "in tf"
+        return (
+            f"no odometry of the scans' moments {where}, so no transform from map to odom: --odom-topic, --tf map-base"
+        )
     command = options.topic(options.cmd_topic)
     wanted = graph.twist_wanted(command) if options.commands else ""
     if wanted and (wanted == TWIST_STAMPED) != options.stamped:

@@ -42,8 +42,10 @@ def open_ros_session(endpoint: str, config: Path | None = None) -> zenoh.Session
         text = str(error)
         if "Unable to connect" in text:
             return None
-        why = " ".join(text.split(" at /", maxsplit=1)[0].split())
-        raise UserError(f"no session with {config or endpoint}: {why} (--ros-config, --ros-connect)") from None
+        # Zenoh appends its own source line, and wraps some messages in the name of a Rust enum.
+        why = " ".join(text.split(" at /", maxsplit=1)[0].split()).removeprefix('Json5Err(Message { msg: "')
+        advice = "--ros-config: a zenoh configuration" if config else "--ros-connect is written like tcp/ROBOT:7447"
+        raise UserError(f"no session with {config or endpoint}: {why}; {advice}") from None
 
 
 def _settings(endpoint: str) -> dict[str, Any]:

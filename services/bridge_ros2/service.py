@@ -63,6 +63,7 @@ class BridgeRos2Service(Service):
         self._began = time.monotonic()
         self._clock: tuple[int, float] | None = None  # the robot's, and ours, when its last scan came
         self._waiting_said = False
+        self._reckoned = False  # the last scan came with odometry
         self._problem = ""  # why the last message could not be used
 
     def open(self) -> None:
@@ -130,10 +131,10 @@ class BridgeRos2Service(Service):
 
     def _look(self, now: float) -> None:
         """Say in health, and once in the log, what is missing."""
-        before = self.note
         if self._ros is None:
             self._connect()
             self._look_at = time.monotonic() + AGAIN
+        before = self.note
         if self._ros is not None:
             static = self.options.topic(self.options.tf_topic + "_static")
             if self.motion.mount() is None:
@@ -142,6 +143,7 @@ class BridgeRos2Service(Service):
             self.note = complaint(
                 self.options, self.graph, self._problem,
                 linked=self._ros.linked(), quiet=now - since, heard=self._scan_at is not None,
+                reckoned=self._reckoned,
             )  # fmt: skip
         if self.note and self.note != before:
             self.log.warning(self.note)
@@ -183,7 +185,9 @@ class BridgeRos2Service(Service):
         mount = self.motion.mount_for(message.header.frame_id)
         scan = scan_of(message, mount, stamp_ns)
         self._clock = (stamp_ns, now)
-        if (dead := self.motion.at(stamp_ns)) is not None:
+        dead = self.motion.at(stamp_ns)
+        self._reckoned = dead is not None
+        if dead is not None:
             self.publish(ODOM, odom_of(dead))
         else:
             self.counters["scans_without_odometry"] += 1

@@ -14,6 +14,7 @@ from services.bridge_ros2.frames import Mount
 from services.bridge_ros2.keys import NAME, Names, full_name
 
 TOPIC = rf"^$|^{NAME}$"
+ENDPOINTS = r"^[a-z]+/[^\s,]+(,[a-z]+/[^\s,]+)*$"
 FRAME = r"^[A-Za-z0-9_./-]{1,64}$"
 
 
@@ -52,7 +53,8 @@ class BridgeRos2Settings(ServiceSettings):
     )
 
     ros_connect: Annotated[
-        str, Field(description="endpoint of the robot's zenoh router, or of zenoh-bridge-ros2dds")
+        str,
+        Field(pattern=ENDPOINTS, description="tcp/HOST:PORT of the robot's zenoh router, or of zenoh-bridge-ros2dds"),
     ] = "tcp/127.0.0.1:7447"
     ros_config: Annotated[
         Path | None, Field(description="zenoh configuration of that session (TLS, say), a JSON5 file; none: our own")
@@ -65,15 +67,25 @@ class BridgeRos2Settings(ServiceSettings):
         Field(description="humble: types have no hashes; jazzy: as Iron, Kilted and later (rmw_zenoh alone minds)"),
     ] = "jazzy"
     domain: Annotated[int, Field(ge=0, le=232, description="ROS_DOMAIN_ID")] = 0
-    namespace: Annotated[str, Field(pattern=TOPIC, description="of relative topic names")] = ""
-    node: Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="our name in the ROS graph")] = (
-        "presage"
-    )
+    namespace: Annotated[
+        str, Field(pattern=rf"^$|^{NAME}/?$", description="before relative topic names, such as robot1")
+    ] = ""
+    node: Annotated[
+        str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="our name in the ROS graph; letters, digits, _")
+    ] = "presage"
 
-    scan_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="sensor_msgs/LaserScan")] = "scan"
-    odom_topic: Annotated[str, Field(pattern=TOPIC, description="nav_msgs/Odometry; empty: odometry from tf")] = "odom"
-    tf_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="tf2_msgs/TFMessage, and it with _static")] = "tf"
-    cmd_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="velocity commands")] = "cmd_vel"
+    scan_topic: Annotated[
+        str, Field(pattern=rf"^{NAME}$", description="name of the topic with sensor_msgs/LaserScan")
+    ] = "scan"
+    odom_topic: Annotated[
+        str, Field(pattern=TOPIC, description="name of that with nav_msgs/Odometry; empty: odometry from tf")
+    ] = "odom"
+    tf_topic: Annotated[
+        str, Field(pattern=rf"^{NAME}$", description="name of that with tf2_msgs/TFMessage, and of it with _static")
+    ] = "tf"
+    cmd_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="name of the topic for velocity commands")] = (
+        "cmd_vel"
+    )
     stamped: Annotated[bool, Field(description="commands as TwistStamped, else Twist")] = False
     pose_topic: Annotated[
         str, Field(pattern=TOPIC, description="PoseWithCovarianceStamped of the belief; empty: none")
@@ -101,7 +113,7 @@ class BridgeRos2Settings(ServiceSettings):
         str,
         Field(
             pattern=rf"^$|^{NUMBER},{NUMBER},{NUMBER}$",
-            description="x,y,yaw_deg of the laser in the base frame; none: tf says",
+            description="x,y,yaw_deg (m, m, degrees) of the laser in the base frame; none: tf says",
         ),
     ] = ""
     upside_down: Annotated[bool, Field(description="with --mount: its z axis points down")] = False

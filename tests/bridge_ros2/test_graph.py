@@ -56,8 +56,9 @@ def test_the_kind_of_command_that_the_robot_listens_for():
 
 
 def test_a_complaint_names_the_option_that_mends_it():
-    def said(graph, problem="", *, linked=True, quiet=0.0, heard=True, **options):
-        return complaint(BridgeRos2Settings(**options), graph, problem, linked=linked, quiet=quiet, heard=heard)
+    def said(graph, problem="", *, linked=True, quiet=0.0, heard=True, reckoned=True, **options):
+        settings = BridgeRos2Settings(**options)
+        return complaint(settings, graph, problem, linked=linked, quiet=quiet, heard=heard, reckoned=reckoned)
 
     graph = Graph()
     assert said(graph) == ""
@@ -67,6 +68,8 @@ def test_a_complaint_names_the_option_that_mends_it():
     assert "zenoh-bridge-ros2dds says of no topic" in said(graph, quiet=4.0, flavor="ros2dds")
     assert "on /r1/scan for 3 s" in said(graph, quiet=4.0, namespace="r1")
     assert said(graph, "too odd", quiet=4.0) == "scans on /scan cannot be used: too odd"
+    assert "on /odom or in tf" in said(graph, reckoned=False)
+    assert said(graph, reckoned=False, tf="map-base") == ""
     graph.change(token("MS", "/cmd_vel", TWIST_STAMPED), there=True)
     assert said(graph) == "/cmd_vel: the robot listens for geometry_msgs/msg/TwistStamped: --stamped"
     assert said(graph, stamped=True) == said(graph, commands=False) == ""

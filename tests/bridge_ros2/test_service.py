@@ -95,15 +95,15 @@ class Beside:
 
 
 @pytest.fixture(scope="module")
-def beside(tmp_path_factory):
+def beside(tmp_path_factory, router):
+    """One router for both sides, which may be."""
     processes = Processes(tmp_path_factory.mktemp("beside"))
     try:
-        port, ros = processes.start_router()[1], processes.start_router()[1]
-        link = Link(robot="rover", connect=(f"tcp/127.0.0.1:{port}",))
-        with open_bus(link) as bus, Ros(ros, "rmw_zenoh", "jazzy") as node:
+        link = Link(robot="rover", connect=(f"tcp/127.0.0.1:{router}",))
+        with open_bus(link) as bus, Ros(router, "rmw_zenoh", "jazzy") as node:
             found = Beside(bus, node)
             environment = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": "rover"}
-            bridge = processes.start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{ros}", env=environment)
+            bridge = processes.start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{router}", env=environment)
             bridge.wait_for("ready")
             assert bus.wait_matching(BELIEF, PATIENCE)
             assert bus.wait_matching(CMD_VEL, PATIENCE)
