@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Container
 from dataclasses import dataclass, field
 from statistics import median
 from typing import Literal
@@ -14,6 +15,7 @@ from common.topics import BELIEF, CMD_VEL, HEALTH, SCAN, Topic, expected_rate, t
 NEEDED = ("simulator", "estimator", "controller")
 OPTIONAL = ("recorder", "viewer")
 SOURCE = "replay"  # plays what the others would say
+STANDS_IN = {"simulator": "bridge_ros2"}  # a robot in ROS takes the simulator's place
 SILENT = 2.5  # s without a pulse; one comes each second
 BREATH = 1.5  # s; who sent a pulse so lately is there, whatever liveliness says: links are made anew now and then
 MOST = 50  # services; somebody may invent names
@@ -59,6 +61,11 @@ class Row:
     def well(self) -> bool:
         """Whether nothing needs to be done about it."""
         return self.state in {"alive", "begins", "off"}
+
+
+def replaced(name: str, alive: Container[str]) -> bool:
+    """Whether somebody else who is there does what a service would do."""
+    return SOURCE in alive or STANDS_IN.get(name, "") in alive
 
 
 @dataclass
@@ -109,7 +116,7 @@ class Board:
 
     def _row(self, name: str, now: float) -> Row:
         if name not in self._alive and name not in self._pulses:
-            required = name in NEEDED and SOURCE not in self._alive
+            required = name in NEEDED and not replaced(name, self._alive)
             return Row(name, "missing" if required else "off", note=f"start it: {self.start_command(name)}")
         at, health = self._pulses.get(name, (None, None))
         if at is None or health is None:

@@ -11,11 +11,11 @@ from common.compatibility import difference, fits
 from common.messages import Health, TopicHealth
 from common.requests import ConfigReply
 from common.sweep import Sweep
-from common.topics import CMD_VEL, SCAN, TOPICS, expected_rate, topic_of
+from common.topics import CMD_VEL, SCAN, TOPICS, TRUTH, expected_rate, topic_of
 from presage.doctoring.findings import Finding
 from presage.doctoring.installation import NEEDED
 from presage.doctoring.listening import Observed
-from presage.health_board import SLOW, SOURCE
+from presage.health_board import SLOW, SOURCE, STANDS_IN, replaced
 
 OPTIONAL = {"recorder": "needed only to record, with"}  # a healthy session can do without
 NO_PULSE = {SOURCE}  # alive, and publishes no health
@@ -42,7 +42,7 @@ def _presence(seen: Observed) -> Iterator[Finding]:
         what = f"nobody is {seen.robot!r}; there are {', '.join(sorted(others))}"
         yield Finding("no_such_robot", False, what, seen.robot, "name the robot with --robot")
     for service in NEEDED:
-        there, source = service in seen.alive, SOURCE in seen.alive
+        there, source = service in seen.alive, replaced(service, seen.alive)
         what = f"{service} of {seen.robot!r}: {'alive' if there else 'not there'}"
         advice = "" if there else f"{OPTIONAL.get(service, 'start it with')}: python -m services.{service}"
         yield Finding("missing", there or (None if service in OPTIONAL or source else False), what, service, advice)
@@ -92,13 +92,17 @@ def _clocks(seen: Observed) -> Iterator[Finding]:
 
 
 def _rates(seen: Observed) -> Iterator[Finding]:
+    foreign = STANDS_IN["simulator"] in seen.alive  # a real scanner has a rate of its own, and nobody knows the truth
+    period = seen.scan.scan_time if seen.scan is not None else 0.0
+    if foreign and not period and (scans := seen.arrivals[SCAN.key(seen.robot)]):
+        period = seen.seconds / scans  # drivers may leave it out
     for topic in TOPICS:
-        if not topic.rate or topic.per_service:
+        if not topic.rate or topic.per_service or (foreign and topic is TRUTH):
             continue
         key = topic.key(seen.robot)
         rate = seen.arrivals[key] / seen.seconds
-        meant = expected_rate(topic, seen.scan.scan_time if seen.scan is not None else 0.0)
-        ok = rate >= SLOW * meant
+        meant = expected_rate(topic, period)
+        ok = rate > 0 and rate >= SLOW * meant
         advice = f"from the {topic.publisher}: is it alive, paused, or are its inputs missing? see its log"
         if topic is CMD_VEL and rate > 1.5 * meant:
             ok, advice = False, "more than one driver? stop all controllers but one"

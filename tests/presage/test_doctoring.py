@@ -9,7 +9,7 @@ import pytest
 
 from common.compatibility import this_service
 from common.messages import Health, Pose, Scan, TopicHealth
-from common.topics import CMD_VEL, SCAN, TOPICS
+from common.topics import BELIEF, CMD_VEL, SCAN, TOPICS, TRUTH
 from presage.doctoring.judging import CLOCKS, SILENT, judge
 from presage.doctoring.listening import Observed, reach
 from services.recorder.accounting import Sequence
@@ -133,3 +133,16 @@ def test_another_robot_s_name_is_said():
 @pytest.mark.parametrize("endpoint", ["udp/127.0.0.1:1", "serial//dev/ttyS0"])
 def test_what_is_no_tcp_port_is_left_to_zenoh(endpoint):
     assert reach(endpoint) is None
+
+
+def test_a_robot_in_ros_stands_for_the_simulator_with_a_rate_of_its_own_and_no_truth():
+    seen = well()
+    seen.alive = {*NAMES, "bridge_ros2"} - {"simulator"}
+    for store in (seen.replies, seen.pulses):
+        store["bridge_ros2"] = store.pop("simulator")
+    seen.arrivals = Counter({key: int(number / 3) for key, number in seen.arrivals.items()})  # 5 Hz
+    seen.arrivals[TRUTH.key("robot")] = 0
+    assert "missing" not in faults(seen)
+    assert "rate" not in faults(seen)
+    seen.arrivals[BELIEF.key("robot")] = 3
+    assert "rate" in faults(seen)
