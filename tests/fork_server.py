@@ -1,7 +1,7 @@
-"""Processes without the cost of their imports: a server that has imported the services forks one for each start.
+"""Processes without the cost of their imports: a server that has imported what the services use forks one a start.
 
-What runs is the same module in a process of its own, by `runpy` as `python -m` does; hundreds of starts, each 0.7 s of
-imports, are most of what the tests would cost. What depends on a fresh interpreter is started with ``fresh=True``.
+What runs is the same module in a process of its own, by `runpy` as `python -m` does; hundreds of starts, each 0.6 s of
+others' packages, are much of what the tests would cost. What needs a new interpreter is started with ``fresh=True``.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ PRELOADED = (
     "common.router", "presage.cli", "services.controller.service", "services.estimator.service",
     "services.recorder.service", "services.simulator.service", "services.viewer.service",
 )  # fmt: skip
+OURS = {"common", "presage", "services", "worlds", "models"}
 LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 
 
@@ -115,6 +116,8 @@ def serve() -> dict | None:
     sys.path[0] = str(Path(__file__).parent.parent)  # not tests/, with its folders of the same names
     for name in PRELOADED:
         importlib.import_module(name)
+    for name in [name for name in sys.modules if name.partition(".")[0] in OURS]:
+        del sys.modules[name]  # what they import from others stays; they themselves begin anew in each process
     died, wake = os.pipe()
     os.set_blocking(wake, False)
     signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
@@ -171,8 +174,6 @@ def become(request: dict) -> None:
         stream.reconfigure(line_buffering=True, write_through=True)
     if hasattr(time, "tzset"):
         time.tzset()
-    for name in [name for name in sys.modules if name.partition(".")[0] == "presage"]:
-        del sys.modules[name]  # the command line looks at the terminal's variables as it is imported
     kind, *rest = request["what"]
     if kind == "-m":
         name, *sys.argv[1:] = rest
