@@ -112,7 +112,7 @@ def _among_twins(job: Job, geometry: Geometry) -> Estimator:
 def quick_field(
     world: World, geometry: Geometry, rng: np.random.Generator, samples: int = 2000, *, limited: bool = False
 ) -> FieldModel:
-    """A field learned from exact rays with the scanner's noise, and no simulator; ``limited``: and its longest range."""
+    """A field learned from exact rays with the scanner's noise, ``limited`` to its longest range, and no simulator."""
     poses = np.column_stack([world.sample_free(samples, rng, 0.27), rng.uniform(-np.pi, np.pi, samples)])
     clean = world.ray_distances(se2.compose(poses, geometry.mount), geometry.angles)
     split = samples // 10
