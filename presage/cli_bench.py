@@ -113,11 +113,10 @@ def bench_accuracy(
     `presage bench accuracy --scanner lms200,rplidar-a1 --tasks standing,tracking --markdown`.
     """
     from presage.accuracy.report import bench_accuracy as run  # noqa: PLC0415
-    from presage.accuracy.report import scanners_of  # noqa: PLC0415
 
     code = run(
-        worlds, scanners_of(scanner, beams), estimators, tasks, trials, minutes, seed, workers, json_file, figure,
-        console, markdown=markdown,
+        worlds, beams, estimators, tasks, trials, minutes, seed, workers, json_file, figure,
+        console, markdown=markdown, scanner=scanner,
     )  # fmt: skip
     raise typer.Exit(code)
 

@@ -26,14 +26,16 @@ MARKS = {
 
 
 def bench_accuracy(
-    worlds: str, scanners: list[Scanner], estimators: str, tasks: str, trials: int, minutes: float, seed: int,
+    worlds: str, beams: str, estimators: str, tasks: str, trials: int, minutes: float, seed: int,
     workers: int, json_file: Path | None, figure: Path | None, console: Console, *, markdown: bool = False,
+    scanner: str = "tim571",
 ) -> int:  # fmt: skip
     """Measure, print, and write where asked."""
     chosen = estimators.split(",")
     unknown = [name for name in chosen if name not in CHOICES]
     if unknown:
         raise UserError(f"no estimator {unknown[0]!r}: choose from {', '.join(CHOICES)}")
+    scanners = scanners_of(scanner, beams)
     wanted = tuple(tasks.split(",")) if tasks else TASKS
     if missing := [name for name in wanted if name not in TASKS]:
         raise UserError(f"no task {missing[0]!r}: choose from {', '.join(TASKS)}")
@@ -43,8 +45,8 @@ def bench_accuracy(
     check_file(json_file, "--json")
     check_file(figure, "--figure")
     jobs = [
-        Job(estimator, world, scanner, trials, minutes * 60, seed, wanted)
-        for world in names for scanner in scanners for estimator in chosen
+        Job(estimator, world, each, trials, minutes * 60, seed, wanted)
+        for world in names for each in scanners for estimator in chosen
     ]  # fmt: skip
     rows = run_all(jobs, workers, console)
     for title, own in _by_title(rows).items():

@@ -105,17 +105,20 @@ def _among_twins(job: Job, geometry: Geometry) -> Estimator:
     if model == "exact":
         exact = RayCaster(TWINS)
         return PreciseEstimator(exact, Seeds.at(exact, places), geometry.mount, geometry.likelihood())
-    learned = quick_field(TWINS, geometry, rng)
+    learned = quick_field(TWINS, geometry, rng, limited=True)
     return PreciseEstimator(learned, Seeds.at(learned, places), geometry.mount, geometry.likelihood())
 
 
-def quick_field(world: World, geometry: Geometry, rng: np.random.Generator, samples: int = 2000) -> FieldModel:
-    """A field learned from exact rays with the scanner's noise, and no simulator."""
+def quick_field(
+    world: World, geometry: Geometry, rng: np.random.Generator, samples: int = 2000, *, limited: bool = False
+) -> FieldModel:
+    """A field learned from exact rays with the scanner's noise, ``limited`` to its longest range, and no simulator."""
     poses = np.column_stack([world.sample_free(samples, rng, 0.27), rng.uniform(-np.pi, np.pi, samples)])
     clean = world.ray_distances(se2.compose(poses, geometry.mount), geometry.angles)
     split = samples // 10
     noisy = clean[split:] + geometry.likelihood().deviation(clean[split:]) * rng.standard_normal(clean[split:].shape)
-    clean, noisy = (np.where(ranges > geometry.range_max, np.inf, ranges) for ranges in (clean, noisy))
+    if limited:
+        clean, noisy = (np.where(ranges > geometry.range_max, np.inf, ranges) for ranges in (clean, noisy))
     field = learn_field(Beams.of(poses[split:], geometry.mount, geometry.angles, noisy), Recipe(sweeps=6))
     scales = learn_scales(field, poses[:split], geometry.mount, geometry.angles, clean[:split], 0.0)
     ripple = learn_ripple(field, se2.compose(poses[:split], geometry.mount), geometry.angles)

@@ -37,7 +37,7 @@ LEARNED = 100_000  # beams to learn from
 @cache
 def learned(name: str) -> FieldModel:
     scanner = SCANNERS[name]
-    return quick_field(ROOM, Geometry.of(scanner), np.random.default_rng(0), LEARNED // scanner.beams)
+    return quick_field(ROOM, Geometry.of(scanner), np.random.default_rng(0), LEARNED // scanner.beams, limited=True)
 
 
 def precise(model: FieldModel, scanner: Scanner) -> PreciseEstimator:

@@ -13,7 +13,7 @@ from common.errors import UserError
 from common.robot import Robot
 from common.world import load_world
 from presage.accuracy import bound
-from presage.accuracy.report import bench_accuracy
+from presage.accuracy.report import bench_accuracy, scanners_of
 from presage.accuracy.scenes import TWINS, Scene, alike, twin_path
 from services.simulator.odometry import Drift
 
@@ -119,3 +119,11 @@ def test_rows_say_what_was_measured(tmp_path):
 def test_words_that_are_not_known(words, why):
     with pytest.raises(UserError, match=why):
         bench_accuracy(*words, 2, 0.1, 0, 1, None, None, CONSOLE)
+
+
+def test_scanners_are_named_with_their_beams():
+    named = [(one.name, one.beams) for one in scanners_of("tim571,lms200", "")]
+    assert named == [("tim571", 622), ("lms200", 181)]
+    assert [one.beams for one in scanners_of("tim571", "622,811")] == [622, 811]
+    with pytest.raises(UserError, match="no scanner 'sonar'"):
+        scanners_of("sonar", "")
