@@ -80,7 +80,7 @@ class OccupancyGrid(BaseModel):
     def to_map(self, points: Array) -> Array:
         """(N, 2) m in map of points (N, 2) m from the map's lower left corner, along its edges."""
         x, y, yaw = self.origin
-        return (rotate(yaw, points) if yaw else np.asarray(points, float)) + np.array([x, y])
+        return np.asarray((rotate(yaw, points) if yaw else points) + np.array([x, y]), float)
 
     def from_map(self, points: Array) -> Array:
         """The inverse of `to_map`."""
@@ -137,7 +137,8 @@ class GridShapes:
         faces = shapely.get_parts(shapely.polygonize(_lines(outline(free).astype(float))))
         column, row = np.floor(shapely.get_coordinates(shapely.point_on_surface(faces))).astype(int).T.reshape(2, -1)
         local = shapely.multipolygons(faces[free[row, column]])
-        return shapely.transform(local, lambda points: self.grid.to_map(points * self.grid.resolution))
+        turned: shapely.Geometry = shapely.transform(local, lambda at: self.grid.to_map(at * self.grid.resolution))
+        return turned
 
     @functools.cached_property
     def rays(self) -> CellRays:
@@ -174,17 +175,17 @@ class GridShapes:
         x, y = (x - grid.origin[0]) / grid.resolution, (y - grid.origin[1]) / grid.resolution
         return signed_distance(grid.values == kind, x, y, most / grid.resolution) * grid.resolution
 
-    def roomy(self, clearance: float) -> tuple[npt.NDArray[np.int_], npt.NDArray[np.int_]]:
-        """Row and column of the free cells from whose middle the edge of free space is ``clearance`` m or more away."""
+    def roomy(self, clearance: float) -> npt.NDArray[np.int_]:
+        """(K, 2) column and row of the free cells from whose middle the edge of free space is ``clearance`` m or more away."""
         free, size = self.grid.values == FREE, self.grid.resolution
         if clearance <= size / 2:
-            return np.nonzero(free)
-        x, y = np.arange(self.grid.width) + 0.5, np.arange(self.grid.height) + 0.5
-        return np.nonzero(-signed_distance(free, x, y, clearance / size + 1) * size >= clearance)
+            return np.argwhere(free)[:, ::-1]
+        x, y = (np.arange(side, dtype=float) + 0.5 for side in (self.grid.width, self.grid.height))
+        return np.argwhere(-signed_distance(free, x, y, clearance / size + 1) * size >= clearance)[:, ::-1]
 
-    def middles(self, row: npt.NDArray[np.int_], column: npt.NDArray[np.int_]) -> Array:
-        """(N, 2) m in map of cells."""
-        return self.grid.to_map((np.column_stack([column, row]) + 0.5) * self.grid.resolution)
+    def within(self, cells: npt.NDArray[np.int_], shares: npt.ArrayLike) -> Array:
+        """(N, 2) m in map, at ``shares`` (N, 2) of the edges of cells (N, 2) column, row."""
+        return self.grid.to_map((cells + np.asarray(shares, float)) * self.grid.resolution)
 
     def _in_map(self, runs: npt.NDArray[np.int_]) -> Array:
         return self.grid.to_map(runs.reshape(-1, 2) * self.grid.resolution).reshape(-1, 4)

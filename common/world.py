@@ -156,12 +156,12 @@ class World(Model):
     def _sample_cells(self, count: int, rng: np.random.Generator, clearance: float) -> Array:
         """`sample_free` on a grid: places in cells that may be far enough from everything, those that are."""
         assert self.grid is not None  # noqa: S101 - asked for grids alone
-        size = self.grid.resolution
-        row, column = self.grid.shapes.roomy(clearance - size)  # half a diagonal and more: no place is forgotten
+        shapes = self.grid.shapes
+        cells = shapes.roomy(clearance - self.grid.resolution)  # half a diagonal and more: no place is forgotten
         found, left = [np.zeros((0, 2))], LOOKS
-        while left and len(row) and sum(map(len, found)) < count:
-            chosen = rng.integers(len(row), size=max(count, 256))
-            points = self.grid.to_map((np.column_stack([column, row])[chosen] + rng.random((len(chosen), 2))) * size)
+        while left and len(cells) and sum(map(len, found)) < count:
+            chosen = rng.integers(len(cells), size=max(count, 256))
+            points = shapes.within(cells[chosen], rng.random((len(chosen), 2)))
             found.append(points[self.clearance(points) >= clearance])
             left = left if len(found[-1]) else left - 1
         if sum(map(len, found)) < count:
@@ -176,7 +176,8 @@ class World(Model):
         if self.start is not None:
             return np.array([self.start.x, self.start.y, np.deg2rad(self.start.yaw_deg)])
         if self.grid is not None:
-            places = self.grid.shapes.middles(*self.grid.shapes.roomy(clearance))
+            shapes = self.grid.shapes
+            places = shapes.within(shapes.roomy(clearance), 0.5)
             places = places[self._off_furniture(places, np.full(len(places), np.inf)) >= clearance]
             if not len(places):
                 raise self._no_room(clearance)

@@ -34,8 +34,8 @@ def cast_cells(occupied, clear, frame, lasers, angles, ranges, jacobian):
                 at, last = max(at, min(near, far)), min(last, max(near, far))
             if at >= last:
                 continue
-            column = min(max(int(math.floor(px + at * ux)), 0), columns - 1)
-            row = min(max(int(math.floor(py + at * uy)), 0), rows - 1)
+            column = min(max(math.floor(px + at * ux), 0), columns - 1)
+            row = min(max(math.floor(py + at * uy), 0), rows - 1)
             began, hit, most = occupied[row, column], False, ranges[k, b] / size
             while at < most:
                 radius = np.int64(clear[row, column])  # int() would keep it unsigned
@@ -46,12 +46,12 @@ def cast_cells(occupied, clear, frame, lasers, angles, ranges, jacobian):
                     at = to_x
                     column += radius + 1 if ux > 0 else -radius - 1
                     low, high = (row, row + radius) if uy >= 0 else (row - radius, row)
-                    row = min(max(int(math.floor(py + at * uy)), low), high)
+                    row = min(max(math.floor(py + at * uy), low), high)
                 else:
                     at = to_y
                     row += radius + 1 if uy > 0 else -radius - 1
                     low, high = (column, column + radius) if ux >= 0 else (column - radius, column)
-                    column = min(max(int(math.floor(px + at * ux)), low), high)
+                    column = min(max(math.floor(px + at * ux), low), high)
                 if column < 0 or column >= columns or row < 0 or row >= rows:
                     break
                 if occupied[row, column] != began:
