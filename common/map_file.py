@@ -65,7 +65,7 @@ def is_map(data: object) -> bool:
 
 
 def read_map(path: Path, data: dict[str, Any]) -> dict[str, Any]:
-    """The fields of the World that map.yaml at ``path`` describes, its keys in ``data``; UserError where it does not."""
+    """The fields of the World that map.yaml at ``path``, its keys in ``data``, describes; or UserError."""
     try:
         described = MapFile.model_validate(data)
     except ValidationError as error:

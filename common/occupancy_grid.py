@@ -77,10 +77,11 @@ class OccupancyGrid(BaseModel):
         x, y = self.to_map(np.array([[0, 0], [wide, 0], [wide, high], [0, high]])).T.tolist()
         return list(zip(x, y, strict=True))
 
-    def to_map(self, points: Array) -> Array:
+    def to_map(self, points: npt.ArrayLike) -> Array:
         """(N, 2) m in map of points (N, 2) m from the map's lower left corner, along its edges."""
         x, y, yaw = self.origin
-        return np.asarray((rotate(yaw, points) if yaw else points) + np.array([x, y]), float)
+        moved: Array = (rotate(yaw, points) if yaw else np.asarray(points, float)) + np.array([x, y])
+        return moved
 
     def from_map(self, points: Array) -> Array:
         """The inverse of `to_map`."""
@@ -176,7 +177,7 @@ class GridShapes:
         return signed_distance(grid.values == kind, x, y, most / grid.resolution) * grid.resolution
 
     def roomy(self, clearance: float) -> npt.NDArray[np.int_]:
-        """(K, 2) column and row of the free cells from whose middle the edge of free space is ``clearance`` m or more away."""
+        """(K, 2) column and row of the free cells with ``clearance`` m or more from middle to edge of free space."""
         free, size = self.grid.values == FREE, self.grid.resolution
         if clearance <= size / 2:
             return np.argwhere(free)[:, ::-1]
@@ -185,7 +186,7 @@ class GridShapes:
 
     def within(self, cells: npt.NDArray[np.int_], shares: npt.ArrayLike) -> Array:
         """(N, 2) m in map, at ``shares`` (N, 2) of the edges of cells (N, 2) column, row."""
-        return self.grid.to_map((cells + np.asarray(shares, float)) * self.grid.resolution)
+        return self.grid.to_map((cells + np.asarray(shares)) * self.grid.resolution)
 
     def _in_map(self, runs: npt.NDArray[np.int_]) -> Array:
         return self.grid.to_map(runs.reshape(-1, 2) * self.grid.resolution).reshape(-1, 4)
