@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from common.se2 import Array
 
     Mask = npt.NDArray[np.bool_]
-    Cells = npt.NDArray[np.uint8]
+
+Cells = npt.NDArray[np.uint8]
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, 255  # as in nav_msgs/OccupancyGrid, whose -1 is 255 in a byte without a sign
 MOST_CELLS = 16_000_000  # 4000 by 4000

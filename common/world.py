@@ -45,8 +45,8 @@ class World(Model):
     boundary: Ring  # m, the walls; with a grid its edge, which need not be given
     obstacles: Annotated[list[Obstacle], Field(max_length=10_000)] = []  # noqa: RUF012 - pydantic copies it
     start: Start | None = None
-    # Left out where there is none, for those who know worlds without.
     grid: Annotated[OccupancyGrid | None, Field(exclude_if=lambda grid: grid is None)] = None
+    # a ROS map; a world without one is sent without this field
 
     @model_validator(mode="before")
     @classmethod
@@ -114,14 +114,14 @@ class World(Model):
         points = np.asarray(points, float).reshape(-1, 2)
         if self.grid is None:
             return _signed(points, self.free_space)
-        return self._off_furniture(points, -self.grid.shapes.distance(FREE, points))
+        return self._off_furniture(points, 0.0 - self.grid.shapes.distance(FREE, points))
 
     def clearances(self, x: Array, y: Array) -> Array:
         """(len(y), len(x)) m: `clearance` of the nodes of a lattice in map, ascending."""
         nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         if self.grid is None:
             return self.clearance(nodes).reshape(len(y), len(x))
-        away = -self.grid.shapes.lattice(FREE, x, y)
+        away = 0.0 - self.grid.shapes.lattice(FREE, x, y)  # never -0.0
         return self._off_furniture(nodes, away.ravel()).reshape(len(y), len(x))
 
     def surface_distances(self, x: Array, y: Array, most: float) -> Array:

@@ -136,7 +136,9 @@ def demo(
 @app.command()
 def localize(
     file: Annotated[Path, typer.Argument(help=".npz (ranges, angles, range_max) or a recording (.mcap).")],
-    world: Annotated[str, typer.Option(help="A shipped world or a world file; none: the recording's.")] = "",
+    world: Annotated[
+        str, typer.Option(help="A shipped world, a world file, or a ROS map.yaml; none: the recording's.")
+    ] = "",
     estimator: EstimatorName = "precise",
     model: ModelName = "learned",
     models: Annotated[Path | None, typer.Option(help="Folder of weights; none: the shipped ones.")] = None,

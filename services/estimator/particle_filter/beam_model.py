@@ -71,7 +71,7 @@ class RangeTable:
         self._limit = np.array([nx - 1, ny - 1])
         self._row = np.full(nx * ny, -1, np.int32)
         self._ranges: npt.NDArray[np.float32] = np.zeros((0, HEADINGS), np.float32)
-        self._angles = 2 * np.pi / HEADINGS * np.arange(HEADINGS)
+        self._angles: Array = 2 * np.pi / HEADINGS * np.arange(HEADINGS, dtype=float)
 
     def ranges(self, poses: Array, angles: Array) -> Array:
         """(N, B) m, about, from scanner poses (N, 3) in map along ``angles`` (B,): as from the cell's middle."""
