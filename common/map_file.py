@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from common.se2 import Array
 
 SAVED = (0, 205, 254)  # what map_saver paints in mode trinary: occupied, unknown, free
+IMAGES = {".pgm", ".png", ".bmp"}
 OWN = ("name", "start", "obstacles")  # keys map_server does not know; presage's own, as in its world files
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -61,7 +62,7 @@ class MapFile(BaseModel):
 
 def is_map(data: object) -> bool:
     """Whether YAML's ``data`` are meant as a ROS map and no world."""
-    return isinstance(data, dict) and "image" in data and "boundary" not in data
+    return isinstance(data, dict) and bool({"image", "resolution"} & data.keys()) and "boundary" not in data
 
 
 def read_map(path: Path, data: dict[str, Any]) -> dict[str, Any]:

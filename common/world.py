@@ -14,13 +14,13 @@ from pydantic import Field, ValidationError, model_validator
 
 from common import map_file, segment_rays
 from common.errors import UserError
-from common.furniture import Model, Number, Obstacle, Ring, check_ring
+from common.furniture import Box, Circle, Model, Number, Obstacle, Ring, check_ring
 from common.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 
 if TYPE_CHECKING:
     from common.se2 import Array
 
-__all__ = ["NOT_YAML", "Obstacle", "Start", "World", "known_worlds", "load_world", "save_world"]
+__all__ = ["NOT_YAML", "Box", "Circle", "Obstacle", "Start", "World", "known_worlds", "load_world", "save_world"]
 
 FOLDER = Path(__file__).resolve().parent.parent / "worlds"
 
@@ -222,7 +222,11 @@ def load_world(name: str) -> World:
         return World.model_validate(map_file.read_map(path, data) if map_file.is_map(data) else data)
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"no world {name!r}: give a file or one of {', '.join(known_worlds())}") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError:
+        image = path.suffix.lower() in map_file.IMAGES
+        hint = f"an image: give the map.yaml that names it, such as {path.with_suffix('.yaml')}" if image else "no text"
+        raise UserError(f"world {path}: {hint}") from None
+    except OSError as error:
         raise UserError(f"world {path}: cannot be read ({error})") from None
     except ValidationError as error:
         first = error.errors(include_url=False)[0]

@@ -149,3 +149,11 @@ def test_a_wrong_map_says_what_is_wrong(tmp_path, keys, why):
     path = write_yaml(tmp_path, **({"image": "map.pgm"} | keys))
     with pytest.raises(UserError, match=why):
         load_world(str(path))
+
+
+def test_the_image_itself_is_no_world(tmp_path):
+    write_map(tmp_path, values_of("#.? ..."))
+    with pytest.raises(UserError, match=r"map.pgm: an image: give the map.yaml that names it, such as .*map.yaml"):
+        load_world(str(tmp_path / "map.pgm"))
+    with pytest.raises(UserError, match="image: Field required"):
+        load_world(str(write_yaml(tmp_path)))
