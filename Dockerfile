@@ -34,6 +34,15 @@ FROM router AS none
 HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "remote"]
 CMD ["python", "-m", "common.fleet", "each", "common.remote"]
 
+# A robot in ROS 2 in the simulator's place.
+FROM base AS bridge_ros2
+RUN python install.py bridge_ros2
+COPY --from=program /app /app
+WORKDIR /tmp
+USER presage
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "bridge_ros2"]
+CMD ["python", "-m", "common.fleet", "each", "services.bridge_ros2"]
+
 FROM base AS recorder-packages
 RUN python install.py recorder
 

@@ -82,9 +82,9 @@ screenshots: install ## docs/page.png and docs/page.webp of the live page; needs
 
 images: ## build every container image, and say what each adds to its base, python:3.11-slim
 	docker compose build $(if $(WHEEL_INDEX),--build-arg WHEEL_INDEX='$(WHEEL_INDEX)')
-	for scanner in replay none; do PRESAGE_SCANNER=$$scanner docker compose build simulator || exit 1; done
+	for scanner in replay none bridge_ros2; do PRESAGE_SCANNER=$$scanner docker compose build simulator || exit 1; done
 	@base=$$(docker image inspect --format '{{.Size}}' python:3.11-slim); \
-	for name in router none recorder replay controller simulator viewer cli estimator; do \
+	for name in router none bridge_ros2 recorder replay controller simulator viewer cli estimator; do \
 	  size=$$(docker image inspect --format '{{.Size}}' presage-$$name) || exit 1; \
 	  echo "presage-$$name: $$(( ($$size - $$base) / 1000000 )) MB"; \
 	done

@@ -29,6 +29,7 @@ PAGE = ("127.0.0.1", 8080)
 # What comes in, and what comes out then; of each key's last chunks and kinds.
 DUTIES = {
     "simulator": (None, ("scan", "published")),
+    "bridge_ros2": (None, ("scan", "published")),
     "replay": (None, ("scan", "published")),
     "remote": (None, ("scan", "received")),
     "estimator": (("scan", "received"), ("belief", "published")),

@@ -24,6 +24,7 @@ NAME = r"^[a-z0-9][a-z0-9_-]{0,62}$"  # no dot: no public authority certifies it
 ROLES: dict[str, str] = {
     ROUTER: "passes on what the others may send; trusted with all of it",
     "simulator": "the robot: scanner, odometry, wheels",
+    "bridge_ros2": "a robot in ROS 2, and who sits at its rviz: scanner, odometry, wheels, goals",
     "estimator": "says where the robot is",
     "controller": "drives the robot",
     "recorder": "hears everything, keeps it",

@@ -11,7 +11,9 @@ from common import requests as r
 ROOT = "presage"
 # Roles, as they stand in certificates; what each is for: common/security.py. Services have the role of their name.
 CONTROL = ("operator", "viewer-control")  # may move the robot, delete, or change what runs
-SERVICES = ("simulator", "estimator", "controller", "recorder", "viewer", "viewer-control")
+SERVICES = ("simulator", "bridge_ros2", "estimator", "controller", "recorder", "viewer", "viewer-control")
+ROBOT = ("simulator", "bridge_ros2")  # speaks for the robot
+ASKS = (*CONTROL, "bridge_ros2")  # whoever sits at rviz
 WORKING = (*SERVICES, "operator")  # may ask for work that costs time
 ANYBODY = (*SERVICES, "operator", "observer", "replay", "remote")
 MAX_BYTES = 1 << 20  # a larger payload is not even queued
@@ -55,14 +57,14 @@ class Query:
         return f"{ROOT}/{robot}/{self.name}" + (f"/{service}" if self.per_service else "")
 
 
-SCAN = Topic("scan", m.Scan, "simulator", 15, "newest", about="what the laser sees")
-ODOM = Topic("odom", m.Odom, "simulator", 15, "newest", about="dead reckoning, drifts")
+SCAN = Topic("scan", m.Scan, "simulator", 15, "newest", put_by=ROBOT, about="what the laser sees")
+ODOM = Topic("odom", m.Odom, "simulator", 15, "newest", put_by=ROBOT, about="dead reckoning, drifts")
 TRUTH = Topic("truth", m.Truth, "simulator", 15, "newest", about="where the robot really is")
 BELIEF = Topic("belief", m.Belief, "estimator", 15, "newest", about="where the estimator believes it is, and F")
 PREDICTION = Topic("prediction", m.Prediction, "estimator", 15, "newest", about="the scan expected at the belief")
 CMD_VEL = Topic("cmd_vel", m.CmdVel, "controller", 15, "newest", about="velocity command")
 GOAL = Topic(
-    "goal", m.Goal, "presage goal, viewer", 0, "newest", many=True, kept=True, put_by=CONTROL, about="where to go"
+    "goal", m.Goal, "presage goal, viewer", 0, "newest", many=True, kept=True, put_by=ASKS, about="where to go"
 )
 DRIVE = Topic(
     "drive", m.Drive, "viewer", 0, "newest", many=True, put_by=CONTROL, about="velocity by hand, before any goal"
@@ -112,7 +114,7 @@ SAMPLE = Query(
     about="the scans seen from a batch of poses",
 )
 WORLD = Query("world", r.Request, r.WorldReply, "simulator", asked_by=ANYBODY, about="world, scanner and robot as data")
-LOCALISE = Query("localise", r.LocaliseRequest, r.Reply, "estimator", about="begin localisation anew")
+LOCALISE = Query("localise", r.LocaliseRequest, r.Reply, "estimator", asked_by=ASKS, about="begin localisation anew")
 PLAYER = Query("player", r.PlayerRequest, r.PlayerReply, "replay", about="pause, step, seek a replay")
 RECORDING = Query("recording", r.RecordRequest, r.RecordReply, "recorder", about="begin or end a recording")
 MODEL = Query(
@@ -160,3 +162,8 @@ def topic_of(key: str) -> Topic | None:
         if len(parts) == depth and parts[0] == ROOT and parts[2] == topic.name:
             return topic
     return None
+
+
+def expected_rate(topic: Topic, scan_time: float) -> float:
+    """Hz of a topic where a scan comes each ``scan_time`` s (0: not said): the table has those of a 15 Hz scanner."""
+    return 1 / scan_time if scan_time > 0 and topic.rate == SCAN.rate else topic.rate

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Container
 from dataclasses import dataclass, field
 from statistics import median
 from typing import Literal
 
 from common.bus import DEFAULT_ENDPOINT
-from common.messages import Health, Stamped
-from common.topics import BELIEF, CMD_VEL, HEALTH, SCAN, Topic, topic_of
+from common.messages import Health, Scan, Stamped
+from common.topics import BELIEF, CMD_VEL, HEALTH, SCAN, Topic, expected_rate, topic_of
 
 NEEDED = ("simulator", "estimator", "controller")
 OPTIONAL = ("recorder", "viewer")
 SOURCE = "replay"  # plays what the others would say
+STANDS_IN = {"simulator": "bridge_ros2"}  # a robot in ROS takes the simulator's place
 SILENT = 2.5  # s without a pulse; one comes each second
 BREATH = 1.5  # s; who sent a pulse so lately is there, whatever liveliness says: links are made anew now and then
 MOST = 50  # services; somebody may invent names
@@ -35,7 +37,7 @@ class Rate:
 
     @property
     def slow(self) -> bool:
-        """Whether it falls behind the table of topics."""
+        """Whether it falls behind the scanner, or the table of topics."""
         return self.hz < SLOW * self.nominal
 
 
@@ -61,6 +63,11 @@ class Row:
         return self.state in {"alive", "begins", "off"}
 
 
+def replaced(name: str, alive: Container[str]) -> bool:
+    """Whether somebody else who is there does what a service would do."""
+    return SOURCE in alive or STANDS_IN.get(name, "") in alive
+
+
 @dataclass
 class Board:
     """One robot's services. ``now`` is s of any clock that does not go back."""
@@ -71,6 +78,7 @@ class Board:
     _pulses: dict[str, tuple[float, Health]] = field(default_factory=dict)
     _published: dict[str, dict[int, int]] = field(default_factory=dict)  # topic: stamp to ns of wall time
     _latencies: dict[str, deque[float]] = field(default_factory=dict)
+    _scan_time: float = 0.0  # s, as the last scan says
 
     def see_alive(self, names: set[str], now: float) -> None:
         """Who is there."""
@@ -83,6 +91,8 @@ class Board:
                 return
             self._pulses[message.service] = (now, message)
             return
+        if isinstance(message, Scan):
+            self._scan_time = message.scan_time
         seen = self._published.setdefault(topic.name, {})
         first = message.stamp_ns not in seen
         seen.setdefault(message.stamp_ns, published_ns)
@@ -106,7 +116,7 @@ class Board:
 
     def _row(self, name: str, now: float) -> Row:
         if name not in self._alive and name not in self._pulses:
-            required = name in NEEDED and SOURCE not in self._alive
+            required = name in NEEDED and not replaced(name, self._alive)
             return Row(name, "missing" if required else "off", note=f"start it: {self.start_command(name)}")
         at, health = self._pulses.get(name, (None, None))
         if at is None or health is None:
@@ -114,7 +124,7 @@ class Board:
             return Row(name, "begins" if begins else "silent", note="" if begins else "alive, but its pulse is missing")
         gone = name not in self._alive and now - at > BREATH
         state: State = "gone" if gone else "alive" if now - at <= SILENT else "silent"
-        rates = [(row, rate) for row in health.topics if (rate := _rate(row.key, row.rate)) is not None]
+        rates = [(row, rate) for row in health.topics if (rate := self._rate(row.key, row.rate)) is not None]
         stale = state != "alive"
         return Row(
             name, state, now - at, health.uptime,
@@ -127,16 +137,15 @@ class Board:
             note=f"start it again: {self.start_command(name)}" if state == "gone" else health.note,
         )  # fmt: skip
 
+    def _rate(self, key: str, hz: float) -> Rate | None:
+        """Of a row of health; None where nothing is to be said of it."""
+        topic = topic_of(key)
+        if topic is None or topic is HEALTH or (not topic.rate and not hz):
+            return None
+        return Rate(topic.name, hz, expected_rate(topic, self._scan_time))
+
     def start_command(self, name: str) -> str:
         """What to type so that it comes."""
         robot = "" if self.robot == "robot" else f" --robot {self.robot}"
         connect = "" if self.connect == (DEFAULT_ENDPOINT,) else f" --connect {','.join(self.connect)}"
         return f"python -m services.{name}{robot}{connect}"
-
-
-def _rate(key: str, hz: float) -> Rate | None:
-    """Of a row of health; None where nothing is to be said of it."""
-    topic = topic_of(key)
-    if topic is None or topic is HEALTH or (not topic.rate and not hz):
-        return None
-    return Rate(topic.name, hz, topic.rate)

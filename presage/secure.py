@@ -41,7 +41,8 @@ from common.security import (
 )
 
 AUTHORITY_FOLDER, AUTHORITY_KEY = "authority", "ca.key"
-ON_REQUEST = frozenset({"replay", "remote"})  # stand in for a robot, one with all its rights: made where asked for
+# Stand in for a robot, one with all its rights: made where asked for.
+ON_REQUEST = frozenset({"replay", "remote", "bridge_ros2"})
 PER_ROBOT = ("simulator", "estimator", "controller")
 HOSTS = ("localhost", "127.0.0.1", "router")  # a router's, for programs that look at names; ours look at roles
 Key = ec.EllipticCurvePrivateKey

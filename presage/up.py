@@ -20,12 +20,13 @@ RECORDINGS = Path("recordings")  # where the page finds them, and puts those it 
 def run_up(
     *,
     world: str,
-    beams: int,
+    scanner: tuple[str, ...],
     drive: str,
     pace: str,
     seed: int,
     record: Path | None,
     robot: str,
+    simulated: bool = True,
     port: int,
     console: Console,
     estimator: tuple[str, ...] = (),
@@ -40,6 +41,8 @@ def run_up(
     names = [robot] if robots == 1 else [f"{robot}-{k}" for k in range(1, robots + 1)]
     if robots > 1 and record is not None:
         raise UserError(f"--record records one robot: leave it out, and `presage record --robot {names[0]}` beside it")
+    if not simulated and (robots > 1 or pace != "realtime"):
+        raise UserError("--no-simulator goes with one robot, and with time as it passes: leave out --robots and --pace")
     with Stack(names[0], port or None, security=credentials_for(names[0])) as stack:
         stack.start_router()
         lockstep = pace == "lockstep"
@@ -51,9 +54,10 @@ def run_up(
         driving = controller_arguments(world, estimator, drive, lockstep=lockstep)
         stack.start("controller", *driving)
         waits = ",".join(sorted(set(stack.processes) - {"router", "viewer"}))
-        simulator = ["--world", world, "--beams", str(beams), "--drive", drive, "--pace", pace]
+        simulator = ["--world", world, *scanner, "--drive", drive, "--pace", pace]
         simulator += [*people, "--start", start, *(["--wait-for", waits] if pace != "realtime" else [])]
-        stack.start("simulator", *simulator, "--seed", str(seed))
+        if simulated:
+            stack.start("simulator", *simulator, "--seed", str(seed))
         for k, name in enumerate(names[1:], 1):  # each in a simulation of its own
             stack.start_as(f"controller-{k + 1}", "controller", name, *driving)
             stack.start_as(f"simulator-{k + 1}", "simulator", name, *simulator, "--seed", str(seed + k))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import itertools
 import os
 import signal
@@ -18,11 +17,12 @@ import pytest
 
 from common.bus import Link, open_bus, wait_until
 from common.inbox import Sample
+from tests.fork_server import Child, ForkServer, die_with
 
 ROOT = Path(__file__).resolve().parent.parent
 PATIENCE = 30.0  # s, deadline of a wait for what takes well under a second on an idle machine
-LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 numbers = itertools.count(1)
+fork_servers: list[ForkServer] = []  # one, once it is needed, for each of xdist's workers
 
 # No database: nothing is written into the checkout. In CI the examples are the same every time.
 # `pytest --hypothesis-profile thorough` looks longer than every run can.
@@ -40,13 +40,16 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if (ROOT / "tests" / "system") in item.path.parents:
             item.add_marker(pytest.mark.system)
-    items.sort(key=lambda item: (item.get_closest_marker("docker") is not None, "system" in item.keywords))
+    # Of these the engine's first: they take longest, and wait for it rather than for a core.
+    items.sort(key=lambda item: ("system" in item.keywords, item.get_closest_marker("docker") is None))
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _nothing_left_behind():
     """No test run leaves a process behind; asked for first, so torn down last, in each of xdist's workers."""
     yield
+    while fork_servers:
+        fork_servers.pop().close()
     # Python's own resource tracker, once a pool was spawned, ends with us.
     left = [c for c in psutil.Process().children(recursive=True) if "resource_tracker" not in " ".join(c.cmdline())]
     for child in left:
@@ -98,21 +101,8 @@ def next_of(inbox, kind, condition, timeout=60.0):
 class Running:
     """A child process and the file with all it said."""
 
-    def __init__(self, name: str, command: list[str], environment: dict[str, str], log: Path, cwd: Path) -> None:
-        self.name, self.log = name, log
-        parent = os.getpid()
-
-        def die_with_parent():  # pytest-timeout ends the process without a teardown
-            if LIBC is not None and hasattr(LIBC, "prctl"):
-                LIBC.prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
-                if os.getppid() != parent:
-                    os._exit(1)
-
-        with log.open("wb") as file:
-            self.child = subprocess.Popen(
-                command, env=environment, cwd=cwd, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
-                preexec_fn=die_with_parent,  # noqa: PLW1509 - no lock, no allocation in it
-            )  # fmt: skip
+    def __init__(self, name: str, child: Child | subprocess.Popen, log: Path) -> None:
+        self.name, self.child, self.log = name, child, log
 
     @property
     def output(self) -> str:
@@ -154,17 +144,32 @@ class Processes:
     def __init__(self, folder: Path) -> None:
         self.folder, self.started = folder, []
 
-    def start(self, name: str | Path, *args: str, env: dict[str, str] | None = None) -> Running:
-        """``simulator`` is services.simulator; a dotted name is a module, a path a script."""
+    def start(self, name: str | Path, *args: str, env: dict[str, str] | None = None, fresh: bool = False) -> Running:
+        """``simulator`` is services.simulator; a dotted name is a module, a path a script.
+
+        ``fresh``: by an interpreter that begins anew, not by the fork server.
+        """
         what = [str(name)] if isinstance(name, Path) else ["-m", name if "." in name else f"services.{name}"]
         # The checkout's modules, though the child runs in a folder of its own.
         path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
         clean = {k: v for k, v in os.environ.items() if not k.startswith("PRESAGE_")}
         environment = {**clean, "PYTHONUNBUFFERED": "1", "PYTHONPATH": path, **(env or {})}
         log = self.folder / f"{len(self.started)}-{Path(str(name)).name}.log"
-        running = Running(str(name), [sys.executable, *what, *args], environment, log, self.folder)
+        running = Running(str(name), self._child([*what, *args], environment, log, fresh=fresh), log)
         self.started.append(running)
         return running
+
+    def _child(self, what: list[str], environment: dict[str, str], log: Path, *, fresh: bool):
+        if not fresh and sys.platform == "linux":
+            if not fork_servers:
+                fork_servers.append(ForkServer())
+            return fork_servers[0].start(what, environment, log, self.folder)
+        parent = os.getpid()  # pytest-timeout ends the process without a teardown
+        with log.open("wb") as file:
+            return subprocess.Popen(
+                [sys.executable, *what], env=environment, cwd=self.folder, stdin=subprocess.DEVNULL, stdout=file,
+                stderr=subprocess.STDOUT, preexec_fn=lambda: die_with(parent),  # noqa: PLW1509 - as in the server
+            )  # fmt: skip
 
     def start_router(self) -> tuple[Running, int]:
         """A router that listens, and its port; another port where somebody was quicker."""
@@ -220,9 +225,9 @@ def process(tmp_path, link):
     """Calls start processes that talk to this test's robot over its router; all are ended after the test."""
     processes = Processes(tmp_path)
 
-    def start(name, *args, env=None):
+    def start(name, *args, env=None, fresh=False):
         talk = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": link.robot}
-        return processes.start(name, *args, env={**talk, **(env or {})})
+        return processes.start(name, *args, env={**talk, **(env or {})}, fresh=fresh)
 
     try:
         yield start

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
+from common import se2
 from common.compatibility import difference, fits
 from common.messages import Health, TopicHealth
 from common.requests import ConfigReply
-from common.topics import CMD_VEL, TOPICS, topic_of
+from common.sweep import Sweep
+from common.topics import CMD_VEL, SCAN, TOPICS, TRUTH, expected_rate, topic_of
 from presage.doctoring.findings import Finding
 from presage.doctoring.installation import NEEDED
 from presage.doctoring.listening import Observed
-from presage.health_board import SLOW, SOURCE
+from presage.health_board import SLOW, SOURCE, STANDS_IN, replaced
 
 OPTIONAL = {"recorder": "needed only to record, with"}  # a healthy session can do without
 NO_PULSE = {SOURCE}  # alive, and publishes no health
@@ -28,6 +32,7 @@ def judge(seen: Observed, mine: ConfigReply) -> Iterator[Finding]:
     yield from _versions(seen, mine)
     yield from _clocks(seen)
     yield from _rates(seen)
+    yield from _scanner(seen)
     yield from _counts(seen)
 
 
@@ -37,7 +42,7 @@ def _presence(seen: Observed) -> Iterator[Finding]:
         what = f"nobody is {seen.robot!r}; there are {', '.join(sorted(others))}"
         yield Finding("no_such_robot", False, what, seen.robot, "name the robot with --robot")
     for service in NEEDED:
-        there, source = service in seen.alive, SOURCE in seen.alive
+        there, source = service in seen.alive, replaced(service, seen.alive)
         what = f"{service} of {seen.robot!r}: {'alive' if there else 'not there'}"
         advice = "" if there else f"{OPTIONAL.get(service, 'start it with')}: python -m services.{service}"
         yield Finding("missing", there or (None if service in OPTIONAL or source else False), what, service, advice)
@@ -87,19 +92,51 @@ def _clocks(seen: Observed) -> Iterator[Finding]:
 
 
 def _rates(seen: Observed) -> Iterator[Finding]:
+    foreign = STANDS_IN["simulator"] in seen.alive  # a real scanner has a rate of its own, and nobody knows the truth
+    period = seen.scan.scan_time if seen.scan is not None else 0.0
+    if foreign and not period and (scans := seen.arrivals[SCAN.key(seen.robot)]):
+        period = seen.seconds / scans  # drivers may leave it out
     for topic in TOPICS:
-        if not topic.rate or topic.per_service:
+        if not topic.rate or topic.per_service or (foreign and topic is TRUTH):
             continue
         key = topic.key(seen.robot)
         rate = seen.arrivals[key] / seen.seconds
-        ok = rate >= SLOW * topic.rate
+        meant = expected_rate(topic, period)
+        ok = rate > 0 and rate >= SLOW * meant
         advice = f"from the {topic.publisher}: is it alive, paused, or are its inputs missing? see its log"
-        if topic is CMD_VEL and rate > 1.5 * topic.rate:
+        if topic is CMD_VEL and rate > 1.5 * meant:
             ok, advice = False, "more than one driver? stop all controllers but one"
-        yield Finding("rate", ok, f"{topic.name}: {rate:.1f} of {topic.rate:g} Hz", key, "" if ok else advice)
+        yield Finding("rate", ok, f"{topic.name}: {rate:.1f} of {meant:.3g} Hz", key, "" if ok else advice)
     for key, why in sorted(seen.undecodable.items()):
         advice = "another program or another version publishes there; `presage echo` shows what comes"
         yield Finding("undecodable", False, f"{key}: {why}", key, advice)
+
+
+def _scanner(seen: Observed) -> Iterator[Finding]:
+    """What it looks at, and whether that serves to drive."""
+    if (scan := seen.scan) is None:
+        return
+    sweep, mount = Sweep.of(scan), scan.mount
+    view = sweep.sector(mount.yaw)
+    first, apart, turned = np.rad2deg([sweep.first, sweep.increment, mount.yaw])
+    what = (
+        f"scanner: {sweep.beams} beams from {first:.4g} deg on, {apart:.3g} deg apart, "
+        f"mounted at ({mount.x:g}, {mount.y:g}) m, {turned:.4g} deg"
+        f"{', clockwise, as upside down' if sweep.increment < 0 else ''}"
+    )
+    where = SCAN.key(seen.robot)
+    if sweep.spacing * (sweep.beams - 1) > np.deg2rad(360.1):
+        yield Finding("scanner", False, what, where, "its beams go round more than once: angle_increment is not that")
+    elif not sweep.increment or sweep.beams < 2:
+        yield Finding(
+            "scanner", False, what, where, "its beams have no directions: angle_increment is 0, or there is but one"
+        )
+    elif abs(se2.wrap(-view.centre)) > view.half:
+        yield Finding(
+            "scanner", None, what, where, "it does not look ahead: turn `mount` if that is wrong (docs/scanners.md)"
+        )
+    else:
+        yield Finding("scanner", True, what, where)
 
 
 def _counts(seen: Observed) -> Iterator[Finding]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from common.bus import Link, open_bus, wait_until
 from common.inbox import Answer, Inbox, Sample
-from common.messages import Health
+from common.messages import Health, Scan
 from common.requests import ConfigReply, Request
 from common.topics import CONFIG, TOPICS
 from common.wire import DecodeError
@@ -35,6 +35,7 @@ class Observed:
     arrivals: Counter[str] = field(default_factory=Counter)  # by key
     sequences: dict[str, Sequence] = field(default_factory=dict)  # by key that one service publishes
     undecodable: dict[str, str] = field(default_factory=dict)  # by key, why
+    scan: Scan | None = None  # the last one
 
 
 def reach(endpoint: str) -> Finding | None:
@@ -103,6 +104,8 @@ def _take(sample: Sample, seen: Observed) -> None:
         if sample.key == sample.topic.key(seen.robot, message.service):  # else it speaks for another
             seen.pulses.setdefault(message.service, []).append((sample.received_ns, message))
     elif sample.topic.rate:
+        if isinstance(message, Scan) and sample.key == sample.topic.key(seen.robot):
+            seen.scan = message
         seen.sequences.setdefault(sample.key, Sequence()).see(message.seq)
 
 

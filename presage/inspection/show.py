@@ -58,6 +58,7 @@ def _head(facts: Facts, recording: Recording, console: Console) -> None:
         ("began", f"{facts.started}, {facts.duration_s:.2f} s, {facts.messages} messages"),
         ("robot", ", ".join(facts.robots) or "unknown"),
         ("world", facts.world or "not recorded"),
+        ("scanner", str(recording.scanner() or "not recorded")),
         ("command", about.get("command", "unknown")),
         ("versions", ", ".join(f"{name} {text}" for name, text in facts.versions.items()) or "unknown"),
     ]

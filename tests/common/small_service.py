@@ -50,7 +50,11 @@ class Small(Service):
             self.publish(CMD_VEL, CmdVel(stamp_ns=message.stamp_ns, twist={"vx": 0.5}))
         elif isinstance(message, Goal) and message.cancel:
             # Of itself: who waited here would wait for ever.
-            self.request(TELEPORT if message.pose.y == 0 else PREDICT, PoseRequest(pose=message.pose), timeout=1.0)
+            self.request(
+                TELEPORT if message.pose.y == 0 else PREDICT,
+                PoseRequest(pose=message.pose),
+                timeout=10.0 if message.pose.x != 1.0 else 1.0,
+            )
         elif isinstance(message, Goal) and message.pose.x < 0:
             raise ValueError("a bug in on_message")
         elif isinstance(message, Goal) and message.pose.x > 100:

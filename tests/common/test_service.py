@@ -160,8 +160,8 @@ def test_requests_are_answered_refused_and_survived(small):
         ask(101.0)
     with pytest.raises(UserError, match=r"refused: PoseRequest\.pose"):
         small.bus.ask(TELEPORT, Request(), Reply)
-    assert small.until(lambda h: h.counters["failed"] == 1)
-    assert next(row for row in small.latest.topics if row.key == "teleport").undecodable == 1
+    assert small.until(lambda h: any(row.key == "teleport" and row.undecodable == 1 for row in h.topics))
+    assert small.latest.counters["failed"] == 1
     assert ask(4.0).ok
 
 
@@ -194,7 +194,7 @@ def test_a_timer_that_always_fails_does_not_silence_the_service(bus, process):
 def test_a_signal_ends_it_with_status_0(small, number):
     status, seconds = small.running.stop(number)
     assert status == 0, small.running.output
-    assert seconds < 2
+    assert seconds < PATIENCE / 3  # at once, but for a busy machine
     assert "closed" in small.running.output
     assert small.running.output.rstrip().endswith("ended")
     assert "Traceback" not in small.running.output
@@ -225,7 +225,7 @@ def test_without_a_router_it_runs_and_ends(process, free_port):
     running.wait_for("ready")
     status, seconds = running.stop()
     assert status == 0, running.output
-    assert seconds < 2
+    assert seconds < PATIENCE / 3  # at once, but for a busy machine
 
 
 def test_what_the_user_can_mend_in_open_is_one_line_and_status_2(process):

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 
+import numpy as np
 import pytest
 
 from common.compatibility import this_service
-from common.messages import Health, TopicHealth
-from common.topics import CMD_VEL, SCAN, TOPICS
+from common.messages import Health, Pose, Scan, TopicHealth
+from common.topics import BELIEF, CMD_VEL, SCAN, TOPICS, TRUTH
 from presage.doctoring.judging import CLOCKS, SILENT, judge
 from presage.doctoring.listening import Observed, reach
 from services.recorder.accounting import Sequence
@@ -33,6 +34,41 @@ def well() -> Observed:
     for number in (7, 8, 9, 0, 1, 2):  # it began anew
         numbers.see(number)
     return seen
+
+
+def a_scan(**changes) -> Scan:
+    fields = {"angle_min": -1.5, "angle_increment": 0.01, "range_min": 0.1, "range_max": 9.0, "ranges": np.ones(301)}
+    return Scan(stamp_ns=1, **{**fields, **changes})
+
+
+def test_a_slow_scanner_is_no_fault_and_one_slower_than_it_says_is():
+    seen = well()
+    for key in seen.arrivals:
+        seen.arrivals[key] = 17  # 5.7 Hz
+    assert faults(seen) == {"rate"}
+    seen.scan = a_scan(scan_time=1 / 5.5)
+    assert faults(seen) == set()
+    seen.scan = a_scan(scan_time=1 / 40)
+    assert faults(seen) == {"rate"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "ok", "words"),
+    [
+        ({}, True, "301 beams from -85.94 deg on, 0.573 deg apart, mounted at (0, 0) m, 0 deg"),
+        ({"angle_min": 1.5, "angle_increment": -0.01}, True, "clockwise, as upside down"),
+        ({"mount": Pose(x=-0.2, y=0.0, yaw=3.0)}, None, "mounted at (-0.2, 0) m, 171.9 deg"),
+        ({"angle_increment": 0.0}, False, "0 deg apart"),
+        ({"angle_increment": 0.05}, False, "2.86 deg apart"),
+    ],
+)
+def test_the_scanner_is_described_and_judged(changes, ok, words):
+    seen = well()
+    seen.scan = a_scan(**changes)
+    (finding,) = [f for f in judge(seen, this_service("doctor", "{}")) if f.code == "scanner"]
+    assert finding.ok is ok
+    assert words in finding.what
+    assert bool(finding.advice) == (ok is not True)
 
 
 def faults(seen: Observed) -> set[str]:
@@ -97,3 +133,16 @@ def test_another_robot_s_name_is_said():
 @pytest.mark.parametrize("endpoint", ["udp/127.0.0.1:1", "serial//dev/ttyS0"])
 def test_what_is_no_tcp_port_is_left_to_zenoh(endpoint):
     assert reach(endpoint) is None
+
+
+def test_a_robot_in_ros_stands_for_the_simulator_with_a_rate_of_its_own_and_no_truth():
+    seen = well()
+    seen.alive = {*NAMES, "bridge_ros2"} - {"simulator"}
+    for store in (seen.replies, seen.pulses):
+        store["bridge_ros2"] = store.pop("simulator")
+    seen.arrivals = Counter({key: int(number / 3) for key, number in seen.arrivals.items()})  # 5 Hz
+    seen.arrivals[TRUTH.key("robot")] = 0
+    assert "missing" not in faults(seen)
+    assert "rate" not in faults(seen)
+    seen.arrivals[BELIEF.key("robot")] = 3
+    assert "rate" in faults(seen)

@@ -63,6 +63,12 @@ def test_a_replay_stands_for_the_others():
     assert rows(board, 0.0)["replay"].state == "begins"
 
 
+def test_a_robot_in_ros_stands_for_the_simulator_alone():
+    board = Board("robot")
+    board.see_alive({"bridge_ros2"}, 0.0)
+    assert [rows(board, 0.0)[name].state for name in ("simulator", "estimator")] == ["off", "missing"]
+
+
 def test_a_service_comes_falls_silent_and_goes():
     board = Board("robot")
     board.see_alive({"controller"}, 10.0)

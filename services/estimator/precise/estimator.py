@@ -110,7 +110,7 @@ class PreciseEstimator:
         return self._with_noise(self.model.expect(se2.compose(poses, self.mount), angles))
 
     def _with_noise(self, expected: Expected) -> Predicted:
-        return Predicted(expected.ranges, np.sqrt(expected.scale**2 + self.likelihood.sigma**2))
+        return Predicted(expected.ranges, np.sqrt(expected.scale**2 + self.likelihood.deviation(expected.ranges) ** 2))
 
     def _track(self, view: View, observation: Observation) -> Conversation[None]:
         """Each hypothesis on: where it may have moved, where the scan says it is, both fused."""

@@ -64,6 +64,24 @@ def test_no_return_is_evidence_and_too_close_is_not():
     assert accuracy(3.0, -np.inf, -np.inf) < accuracy(np.inf, -np.inf, -np.inf)
 
 
+@pytest.mark.parametrize("relative", [0.0, 0.05])
+def test_the_slope_of_a_beam_is_that_of_its_energy(relative):
+    likelihood, step = Likelihood(relative=relative), 1e-6
+    g, m, o = np.array([1.0, 4.0, 9.0]), np.full(3, 0.01), np.array([1.02, 3.9, 9.3])
+
+    def energy(each, shift):
+        one = Expected((g + shift)[None, each], m[None, each], np.ones((1, 1, 3)))
+        return likelihood.evaluate(o[each], 25.0, one)
+
+    for k in range(3):
+        each = slice(k, k + 1)
+        slope = (energy(each, step).accuracy[0] - energy(each, -step).accuracy[0]) / (2 * step)
+        assert energy(each, 0.0).xi[0] == pytest.approx(-np.ones(3) * slope, rel=1e-4)
+        assert energy(each, 0.0).accuracy[0] == pytest.approx(
+            -np.log(likelihood.density(o[each], float(g[k]), float(m[k]), 25.0)[0])
+        )
+
+
 @given(st.integers(0, 10_000))
 @settings(max_examples=30, deadline=None)
 def test_xi_is_minus_the_gradient_of_accuracy_by_base_link(seed):

@@ -1,0 +1,55 @@
+"""What is wrong where no scan comes, in one line: what, where, what to do. Pure."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from services.bridge_ros2.ros_types import LASER_SCAN, TWIST_STAMPED
+
+if TYPE_CHECKING:
+    from services.bridge_ros2.graph import Graph
+    from services.bridge_ros2.settings import BridgeRos2Settings
+
+SILENT = 3.0  # s without a scan, then it is said why
+
+
+def complaint(
+    options: BridgeRos2Settings, graph: Graph, problem: str, *, linked: bool, quiet: float, heard: bool, reckoned: bool
+) -> str:
+    """Empty where all is well.
+
+    ``problem``: why the last scan could not be used; ``quiet``: s since the last that could, if one was ``heard``;
+    ``reckoned``: it came with odometry of its moment.
+    """
+    topic = options.topic(options.scan_topic)
+    if not linked:
+        return f"waits for the zenoh router at {options.ros_connect}: it is gone"
+    if quiet > SILENT:
+        if problem:
+            return f"scans on {topic} cannot be used: {problem}"
+        why = graph.why_silent(topic, LASER_SCAN, "--scan-topic", nobody=_nobody(options))
+        return f"no scan on {topic} for {SILENT:g} s: {why}"
+    return _with_scans(options, graph, reckoned=reckoned) if heard else f"no scan on {topic} yet"
+
+
+def _with_scans(options: BridgeRos2Settings, graph: Graph, *, reckoned: bool) -> str:
+    """What else may be wrong while scans come."""
+    if options.tf == "map-odom" and not reckoned:
+        where = f"on {options.topic(options.odom_topic)} or in tf" if options.odom_topic else "in tf"
+        return (
+            f"no odometry of the scans' moments {where}, so no transform from map to odom: --odom-topic, --tf map-base"
+        )
+    command = options.topic(options.cmd_topic)
+    wanted = graph.twist_wanted(command) if options.commands else ""
+    if wanted and (wanted == TWIST_STAMPED) != options.stamped:
+        return f"{command}: the robot listens for {wanted}: --{'' if wanted == TWIST_STAMPED else 'no-'}stamped"
+    return ""
+
+
+def _nobody(options: BridgeRos2Settings) -> str:
+    if options.flavor == "ros2dds":
+        return "zenoh-bridge-ros2dds says of no topic: does it run there, in the domain of the robot's nodes?"
+    return (
+        f"nobody is seen in ROS domain {options.domain}: does the robot run RMW_IMPLEMENTATION=rmw_zenoh_cpp, "
+        "and is its ROS_DOMAIN_ID this one (--domain)?"
+    )

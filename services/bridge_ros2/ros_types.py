@@ -1,0 +1,79 @@
+"""ROS 2 messages as bytes: CDR, the names and the hashes of types. rosbags computes both; no ROS is needed.
+
+The types used here have had the same fields in every distribution from Humble on, so one table serves all.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, Final
+
+from rosbags.typesys import Stores, get_typestore
+
+LASER_SCAN: Final = "sensor_msgs/msg/LaserScan"
+ODOMETRY: Final = "nav_msgs/msg/Odometry"
+TF_MESSAGE: Final = "tf2_msgs/msg/TFMessage"
+TWIST: Final = "geometry_msgs/msg/Twist"
+TWIST_STAMPED: Final = "geometry_msgs/msg/TwistStamped"
+POSE_STAMPED: Final = "geometry_msgs/msg/PoseStamped"
+POSE_WITH_COVARIANCE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
+POSE_ARRAY: Final = "geometry_msgs/msg/PoseArray"
+USED: Final = (
+    LASER_SCAN, ODOMETRY, TF_MESSAGE, TWIST, TWIST_STAMPED, POSE_STAMPED, POSE_WITH_COVARIANCE, POSE_ARRAY,
+)  # fmt: skip
+NO_HASH: Final = "TypeHashNotSupported"  # what Humble, which knows no hashes, writes in their place
+
+_STORE = get_typestore(Stores.ROS2_HUMBLE)
+
+
+class CdrError(ValueError):
+    """Bytes that are not the message they should be."""
+
+
+@cache
+def type_hash(name: str) -> str:
+    """RIHS01 of a type (REP-2016), as rmw_zenoh has it in its keys from Iron on."""
+    return str(_STORE.hash_rihs01(name))
+
+
+def dds_name(name: str) -> str:
+    """``a/msg/B`` as DDS and rmw_zenoh call it: ``a::msg::dds_::B_``."""
+    package, kind, short = name.split("/")
+    return f"{package}::{kind}::dds_::{short}_"
+
+
+def ros_name(dds: str) -> str:
+    """The other way round; what is no such name stays as it is."""
+    parts = dds.split("::")
+    return "/".join([*parts[:-2], parts[-1].removesuffix("_")]) if parts[-2:-1] == ["dds_"] else dds
+
+
+def make(name: str, **fields: Any) -> Any:
+    """A message; every field has to be given."""
+    return _STORE.types[name](**fields)
+
+
+def encode(name: str, message: Any) -> bytes:
+    """CDR, little-endian, with its four bytes of encapsulation."""
+    return bytes(_STORE.serialize_cdr(message, name))
+
+
+def decode(name: str, payload: bytes) -> Any:
+    """The message; raises CdrError where the bytes are none."""
+    if len(payload) < 4 or payload[0] != 0 or payload[1] not in (0, 1):
+        raise CdrError(f"{name}: {len(payload)} bytes that do not begin as plain CDR does")
+    try:
+        return _STORE.deserialize_cdr(payload, name)
+    except Exception as error:  # noqa: BLE001 - the library raises whatever the bytes lead it into
+        raise CdrError(f"{name}: {len(payload)} bytes that are none ({type(error).__name__})") from None
+
+
+def stamp_of(header: Any) -> int:
+    """Ns of a std_msgs/Header."""
+    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def header(stamp_ns: int, frame: str) -> Any:
+    """A std_msgs/Header."""
+    time = make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    return make("std_msgs/msg/Header", stamp=time, frame_id=frame)

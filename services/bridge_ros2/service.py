@@ -1,0 +1,266 @@
+"""The bridge's thin shell: two zenoh sessions, what comes from either, and what is said where something does not."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+from common.inbox import Sample
+from common.messages import Belief, CmdVel, Goal, Stamped
+from common.requests import LocaliseRequest, Reply
+from common.se2 import Array
+from common.service import Service
+from common.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, ODOM, SCAN, STATUS, Query, Topic
+from services.bridge_ros2 import outward
+from services.bridge_ros2.complaints import complaint
+from services.bridge_ros2.graph import Graph
+from services.bridge_ros2.inward import dead_of, odom_of, pose_of, scan_of
+from services.bridge_ros2.keys import KEPT, LATEST, SENSOR, TF, TF_STATIC, Qos
+from services.bridge_ros2.motion import Motion, NoMountError
+from services.bridge_ros2.ros_session import RosPublisher, RosSession, open_ros_session
+from services.bridge_ros2.ros_types import (
+    LASER_SCAN,
+    ODOMETRY,
+    POSE_ARRAY,
+    POSE_STAMPED,
+    POSE_WITH_COVARIANCE,
+    TF_MESSAGE,
+    TWIST,
+    TWIST_STAMPED,
+    CdrError,
+    decode,
+    stamp_of,
+)  # fmt: skip
+from services.bridge_ros2.settings import BridgeRos2Settings
+from services.bridge_ros2.wheels import Wheels
+
+AGAIN = 1.0  # s between two looks at how things stand, and between two tries to reach the router
+YAW_TOLERANCE = 0.25  # rad, of rviz's goals, as nav2 has it
+
+
+class BridgeRos2Service(Service):
+    """A robot in ROS as a process of ours."""
+
+    name: ClassVar[str] = "bridge_ros2"
+    single: ClassVar[bool] = True
+    keeps: ClassVar[tuple[Topic, ...]] = (GOAL, STATUS)
+    inputs: ClassVar[tuple[Topic, ...]] = (BELIEF, CMD_VEL)
+
+    def __init__(self, settings: BridgeRos2Settings) -> None:
+        """Nothing is reached yet."""
+        super().__init__(settings)
+        self.options = settings
+        self.graph = Graph()
+        self.motion = Motion(settings.base_frame, settings.odom_frame, settings.the_mount())
+        self.wheels = Wheels(settings.the_robot(), obstacle_stop=settings.obstacle_stop)
+        self.note = f"waits for the zenoh router at {settings.ros_connect}"
+        self._ros: RosSession | None = None
+        self._out: dict[str, RosPublisher] = {}
+        self._rows: dict[str, tuple[str, Callable[[Any], None]]] = {}  # by name of our row: type, what is done
+        self._look_at = 0.0
+        self._scan_at: float | None = None  # when the last scan was passed on
+        self._began = time.monotonic()
+        self._clock: tuple[int, float] | None = None  # the robot's, and ours, when its last scan came
+        self._waiting_said = False
+        self._reckoned = False  # the last scan came with odometry
+        self._problem = ""  # why the last message could not be used
+
+    def open(self) -> None:
+        """Declared before anybody asks: the first message on a key just declared may be lost."""
+        for topic in (ODOM, SCAN):
+            self.loop.bus.publisher(topic, self.name)
+
+    def close(self) -> None:
+        """A robot under way is stopped."""
+        self._drive(self.wheels.silence())
+        if self._ros is not None:
+            self._ros.close()
+
+    def _connect(self) -> None:
+        """Reach the robot's router, or try again a second later."""
+        options = self.options
+        session = open_ros_session(options.ros_connect, options.ros_config)
+        if session is None:
+            if not self._waiting_said:
+                self.log.warning(self.note)
+            self._waiting_said = True
+            return
+        ros = self._ros = RosSession(session, options.names(), options.namespace, options.node, self.graph)
+        self._began = time.monotonic()
+        heard: list[tuple[str, str, Qos, Callable[[Any], None]]] = [
+            (options.tf_topic + "_static", TF_MESSAGE, TF_STATIC, self._hear_tf),
+            (options.tf_topic, TF_MESSAGE, TF, self._hear_tf),
+            (options.odom_topic, ODOMETRY, Qos(), self._hear_odometry),
+            (options.scan_topic, LASER_SCAN, SENSOR, self._hear_scan),
+            (options.initial_pose_topic, POSE_WITH_COVARIANCE, Qos(), self._hear_initial_pose),
+        ]
+        said = [
+            (options.pose_topic, POSE_WITH_COVARIANCE, KEPT),
+            (options.hypotheses_topic, POSE_ARRAY, SENSOR),
+            (options.tf_topic if options.tf != "none" else "", TF_MESSAGE, TF),
+        ]
+        if options.commands:
+            heard.append((options.goal_topic, POSE_STAMPED, Qos(), self._hear_goal))
+            said.append((options.cmd_topic, TWIST_STAMPED if options.stamped else TWIST, LATEST))
+        self._out = {name: ros.publisher(options.topic(name), kind, qos) for name, kind, qos in said if name}
+        for name, kind, qos, hear in heard:
+            if name:
+                row = _row(name, newest=name == options.scan_topic)
+                self._rows[row.name] = (kind, hear)
+                ros.subscribe(row, options.topic(name), kind, qos, self.loop.inbox)
+        self.note = f"no scan on {options.topic(options.scan_topic)} yet"
+        self.log.info("reached the robot's side", endpoint=options.ros_connect, flavor=options.flavor)
+
+    def due(self) -> float | None:
+        """Until the next look, or until a robot whose commands have ended is stopped."""
+        now = time.monotonic()
+        look = self._look_at - now
+        return min(look, self.wheels.due(now)) if self.wheels.moving else look
+
+    def on_timer(self) -> None:
+        """Stop the robot; look how things stand."""
+        now = time.monotonic()
+        if self.wheels.moving and self.wheels.due(now) <= 0:
+            self.counters["stops_for_silence"] += 1
+            self.log.warning("stop: commands have ended", silent_s=round(self.wheels.patience, 2))
+            self._drive(self.wheels.silence())
+        if now >= self._look_at:
+            self._look_at = now + AGAIN
+            self._look(now)
+
+    def _look(self, now: float) -> None:
+        """Say in health, and once in the log, what is missing."""
+        if self._ros is None:
+            self._connect()
+            self._look_at = time.monotonic() + AGAIN
+        before = self.note
+        if self._ros is not None:
+            static = self.options.topic(self.options.tf_topic + "_static")
+            if self.motion.mount() is None:
+                self._ros.fetch(_row(self.options.tf_topic + "_static"), static, self.loop.inbox)
+            since = self._scan_at if self._scan_at is not None else self._began
+            self.note = complaint(
+                self.options, self.graph, self._problem,
+                linked=self._ros.linked(), quiet=now - since, heard=self._scan_at is not None,
+                reckoned=self._reckoned,
+            )  # fmt: skip
+        if self.note and self.note != before:
+            self.log.warning(self.note)
+        elif before and not self.note:
+            self.log.info("scans come", mount=self.motion.mount())
+
+    def on_sample(self, sample: Sample) -> None:
+        """Ours as ever; one of ROS is decoded, and handed to what is done with its topic."""
+        if sample.topic.name not in self._rows:
+            super().on_sample(sample)
+            return
+        kind, hear = self._rows[sample.topic.name]
+        try:
+            self.options.names().refuse_foreign(sample.key, kind)
+            hear(decode(kind, sample.payload))
+        except NoMountError as error:  # tf may still be on its way: after a while it is said
+            self._problem = str(error)
+            self.counters["scans_without_mount"] += 1
+        except (CdrError, ValueError, OverflowError) as error:
+            self._problem = str(error) if sample.topic == _row(self.options.scan_topic, newest=True) else self._problem
+            self.loop.reject(sample.key, str(error))
+
+    def _hear_tf(self, message: Any) -> None:
+        self.motion.hear_tf(message)
+
+    def _hear_odometry(self, message: Any) -> None:
+        child = self.motion.child_in_base(message.child_frame_id)
+        dead = dead_of(message, child)
+        self.motion.hear_odometry(dead)
+        self.wheels.hear_velocity(dead.twist, time.monotonic())
+
+    def _hear_scan(self, message: Any) -> None:
+        """The scan, after the odometry of its moment."""
+        now = time.monotonic()
+        stamp_ns = stamp_of(message.header)
+        if stamp_ns <= 0:
+            stamp_ns = time.time_ns()
+            self.counters["scans_without_stamp"] += 1
+        mount = self.motion.mount_for(message.header.frame_id)
+        scan = scan_of(message, mount, stamp_ns)
+        self._clock = (stamp_ns, now)
+        dead = self.motion.at(stamp_ns)
+        self._reckoned = dead is not None
+        if dead is not None:
+            self.publish(ODOM, odom_of(dead))
+        else:
+            self.counters["scans_without_odometry"] += 1
+        self.wheels.hear_scan(scan, now)
+        self.publish(SCAN, scan)
+        self._scan_at, self._problem = now, ""
+
+    def _hear_initial_pose(self, message: Any) -> None:
+        pose = pose_of(message, self.options.map_frame)
+        self.log.info("told where the robot is", x=pose.x, y=pose.y, yaw=pose.yaw)
+        self.request(LOCALISE, LocaliseRequest(pose=pose))
+
+    def _hear_goal(self, message: Any) -> None:
+        pose = pose_of(message, self.options.map_frame)
+        self.log.info("goal", x=pose.x, y=pose.y, yaw=pose.yaw)
+        stamp_ns = self._clock[0] if self._clock else 0
+        self.publish(GOAL, Goal(stamp_ns=stamp_ns, pose=pose, yaw_tolerance=YAW_TOLERANCE))
+
+    def on_reply(self, query: Query, number: int, reply: Reply) -> None:  # noqa: ARG002
+        """What became of rviz's pose."""
+        if not reply.ok:
+            self.log.warning("the estimator was not told where the robot is", why=reply.reason)
+
+    def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
+        """A belief or a command, for ROS."""
+        if isinstance(message, Belief):
+            self._say(message)
+        elif isinstance(message, CmdVel) and self.options.commands:
+            refused = self.wheels.refused
+            self._drive(self.wheels.command(message, time.monotonic()))
+            if self.wheels.refused > refused:
+                self.counters["stale_commands"] += 1
+
+    def _say(self, belief: Belief) -> None:
+        """Pose, transform and hypotheses."""
+        options = self.options
+        if (cloud := self._out.get(options.hypotheses_topic)) is not None:
+            cloud.put(outward.hypotheses_message(belief, options.map_frame))
+        if not outward.said(belief):
+            self.counters["beliefs_not_said"] += 1
+            return
+        if (pose := self._out.get(options.pose_topic)) is not None:
+            message = outward.pose_message(belief, options.map_frame)
+            if message is not None:
+                pose.put(message)
+        if (tf := self._out.get(options.tf_topic)) is not None:
+            self._say_transform(belief, tf)
+
+    def _say_transform(self, belief: Belief, tf: RosPublisher) -> None:
+        options, odometry, child = self.options, None, self.options.base_frame
+        if options.tf == "map-odom":
+            dead = self.motion.by_tf(belief.stamp_ns)
+            if dead is None:
+                self.counters["transforms_without_odometry"] += 1
+                return
+            odometry, child = dead.pose, options.odom_frame
+        ahead = belief.stamp_ns + round(options.transform_tolerance * 1e9)
+        pose = outward.correction(belief.pose, odometry)
+        tf.put(outward.transform_message(pose, ahead, options.map_frame, child))
+
+    def _drive(self, twist: Array | None) -> None:
+        """Send a velocity, dated by the robot's clock."""
+        publisher = self._out.get(self.options.cmd_topic)
+        if twist is None or publisher is None:
+            return
+        stamp = None
+        if self.options.stamped:
+            there, here = self._clock or (time.time_ns(), time.monotonic())
+            stamp = there + round((time.monotonic() - here) * 1e9)
+        kind, message = outward.twist_message(twist, stamp, self.options.base_frame)
+        publisher.put(message, kind)
+
+
+def _row(name: str, *, newest: bool = False) -> Topic:
+    """A topic of ROS as the inbox has it."""
+    return Topic(f"ros {name}", Stamped, "ros", 0, "newest" if newest else "all", recorded=False, many=True)

@@ -1,0 +1,146 @@
+"""What the bridge to ROS 2 can be told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from common.config import NUMBER, ServiceSettings
+from common.robot import Robot
+from services.bridge_ros2.frames import Mount
+from services.bridge_ros2.keys import NAME, Names, full_name
+
+TOPIC = rf"^$|^{NAME}$"
+ENDPOINTS = r"^[a-z]+/[^\s,]+(,[a-z]+/[^\s,]+)*$"
+FRAME = r"^[A-Za-z0-9_./-]{1,64}$"
+
+
+class BridgeRos2Settings(ServiceSettings):
+    """Bridge to ROS 2: a robot, or Gazebo, in the simulator's place; presage in AMCL's. Needs no ROS here.
+
+    On the robot: RMW_IMPLEMENTATION=rmw_zenoh_cpp and `ros2 run rmw_zenoh_cpp rmw_zenohd`, or zenoh-bridge-ros2dds.
+
+    Examples:
+      python -m services.bridge_ros2 --ros-connect tcp/ROBOT:7447         its scans, odometry and tf, and it drives
+      python -m services.bridge_ros2 --ros-connect tcp/ROBOT:7447 --no-commands      nav2 drives: localise it, no more
+      python -m services.bridge_ros2 --ros-connect tcp/ROBOT:7447 --flavor ros2dds   through zenoh-bridge-ros2dds
+      python -m services.bridge_ros2 --distro humble --cmd-topic cmd_vel --drive differential
+      python -m services.bridge_ros2 --namespace robot1 --scan-topic scan --stamped
+      python -m services.bridge_ros2 --mount 0.1,0,180 --upside-down      where tf does not say how the laser sits
+
+    More, with TurtleBot, TIAGo, rviz and nav2: docs/ros2.md.
+
+    """
+
+    service: ClassVar[str] = "bridge_ros2"
+    private: ClassVar[frozenset[str]] = frozenset(
+        {
+            "namespace",
+            "domain",
+            "distro",
+            "flavor",
+            "node",
+            "mount",
+            "upside_down",
+            "stamped",
+            "commands",
+            "radius",
+            "tf",
+        }
+    )
+
+    ros_connect: Annotated[
+        str,
+        Field(pattern=ENDPOINTS, description="tcp/HOST:PORT of the robot's zenoh router, or of zenoh-bridge-ros2dds"),
+    ] = "tcp/127.0.0.1:7447"
+    ros_config: Annotated[
+        Path | None, Field(description="zenoh configuration of that session (TLS, say), a JSON5 file; none: our own")
+    ] = None
+    flavor: Annotated[
+        Literal["rmw_zenoh", "ros2dds"], Field(description="rmw_zenoh; ros2dds: zenoh-bridge-ros2dds")
+    ] = "rmw_zenoh"
+    distro: Annotated[
+        Literal["humble", "jazzy"],
+        Field(description="humble: types have no hashes; jazzy: as Iron, Kilted and later (rmw_zenoh alone minds)"),
+    ] = "jazzy"
+    domain: Annotated[int, Field(ge=0, le=232, description="ROS_DOMAIN_ID")] = 0
+    namespace: Annotated[
+        str, Field(pattern=rf"^$|^{NAME}/?$", description="before relative topic names, such as robot1")
+    ] = ""
+    node: Annotated[
+        str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="our name in the ROS graph; letters, digits, _")
+    ] = "presage"
+
+    scan_topic: Annotated[
+        str, Field(pattern=rf"^{NAME}$", description="name of the topic with sensor_msgs/LaserScan")
+    ] = "scan"
+    odom_topic: Annotated[
+        str, Field(pattern=TOPIC, description="name of that with nav_msgs/Odometry; empty: odometry from tf")
+    ] = "odom"
+    tf_topic: Annotated[
+        str, Field(pattern=rf"^{NAME}$", description="name of that with tf2_msgs/TFMessage, and of it with _static")
+    ] = "tf"
+    cmd_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="name of the topic for velocity commands")] = (
+        "cmd_vel"
+    )
+    stamped: Annotated[bool, Field(description="commands as TwistStamped, else Twist")] = False
+    pose_topic: Annotated[
+        str, Field(pattern=TOPIC, description="PoseWithCovarianceStamped of the belief; empty: none")
+    ] = "amcl_pose"
+    hypotheses_topic: Annotated[str, Field(pattern=TOPIC, description="PoseArray of all possible places")] = (
+        "pose_hypotheses"
+    )
+    initial_pose_topic: Annotated[str, Field(pattern=TOPIC, description="rviz's 2D Pose Estimate")] = "initialpose"
+    goal_topic: Annotated[str, Field(pattern=TOPIC, description="rviz's 2D Goal Pose")] = "goal_pose"
+    commands: Annotated[
+        bool, Field(description="pass velocity commands and goals on; --no-commands: others drive, such as nav2")
+    ] = True
+
+    map_frame: Annotated[str, Field(pattern=FRAME, description="the world")] = "map"
+    odom_frame: Annotated[str, Field(pattern=FRAME, description="of dead reckoning")] = "odom"
+    base_frame: Annotated[str, Field(pattern=FRAME, description="of the robot's centre")] = "base_link"
+    tf: Annotated[
+        Literal["map-odom", "map-base", "none"],
+        Field(description="map-odom: as AMCL; map-base: of a robot without odometry; none: somebody else says it"),
+    ] = "map-odom"
+    transform_tolerance: Annotated[
+        float, Field(ge=0, le=60, description="s by which that transform is dated ahead, as AMCL's")
+    ] = 1.0
+    mount: Annotated[
+        str,
+        Field(
+            pattern=rf"^$|^{NUMBER},{NUMBER},{NUMBER}$",
+            description="x,y,yaw_deg (m, m, degrees) of the laser in the base frame; none: tf says",
+        ),
+    ] = ""
+    upside_down: Annotated[bool, Field(description="with --mount: its z axis points down")] = False
+
+    drive: Annotated[Literal["holonomic", "differential"], Field(description="of the robot")] = "holonomic"
+    radius: Annotated[float, Field(gt=0, le=5, description="of the robot, m, for the obstacle stop")] = 0.27
+    max_speed: Annotated[float, Field(gt=0, le=10, description="m/s, whatever is commanded")] = 1.0
+    acceleration: Annotated[float, Field(gt=0, le=20, description="m/s², with which it can brake")] = 1.0
+    obstacle_stop: Annotated[bool, Field(description="slow commands down before what the scan shows")] = True
+
+    def names(self) -> Names:
+        """How topics are called on zenoh."""
+        return Names(self.flavor, self.domain, hashes=self.distro != "humble")
+
+    def topic(self, name: str) -> str:
+        """A topic's absolute name."""
+        return full_name(name, self.namespace)
+
+    def the_robot(self) -> Robot:
+        """Its limits."""
+        return Robot(
+            drive=self.drive, radius=self.radius, max_speed=self.max_speed, acceleration=self.acceleration
+        )  # fmt: skip
+
+    def the_mount(self) -> Mount | None:
+        """How the laser sits, where it was said."""
+        if not self.mount:
+            return None
+        x, y, yaw = (float(part) for part in self.mount.split(","))
+        return Mount((x, y, float(np.deg2rad(yaw))), self.upside_down)

@@ -1,0 +1,115 @@
+"""tf and odometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common import se2
+from services.bridge_ros2.frames import Dead, Odometer
+from services.bridge_ros2.motion import Motion
+from services.bridge_ros2.ros_types import TF_MESSAGE, decode
+from tests.bridge_ros2 import independent as other
+
+SECOND = 10**9
+
+
+def turned(roll=0.0, pitch=0.0, yaw=0.0):
+    """Quaternion of fixed-axis angles, rad (REP-103)."""
+    (sr, sp, sy), (cr, cp, cy) = np.sin(np.array([roll, pitch, yaw]) / 2), np.cos(np.array([roll, pitch, yaw]) / 2)
+    return other.quaternion(
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )
+
+
+def tf(*each):
+    """Of (parent, child, (x, y, z), rotation, stamp)."""
+    transforms = [
+        {
+            "header": other.header(stamp, parent), "child_frame_id": child,
+            "transform": {"translation": other.vector(*at), "rotation": rotation},
+        }
+        for parent, child, at, rotation, stamp in each
+    ]  # fmt: skip
+    return decode(TF_MESSAGE, other.encode(TF_MESSAGE, {"transforms": transforms}))
+
+
+@pytest.mark.parametrize(("roll", "upside_down"), [(0.0, False), (np.pi, True)])
+def test_the_mounting_is_found_over_several_joints(roll, upside_down):
+    motion = Motion("base_link", "odom")
+    motion.hear_tf(tf(
+        ("base_footprint", "base_link", (0, 0, 0.1), turned(), 0),
+        ("base_link", "tower", (0.1, 0, 0.5), turned(yaw=np.pi / 2), 0),
+        ("/tower", "/laser", (0.2, 0, 0), turned(roll=roll), 0),
+    ))  # fmt: skip
+    mount = motion.mount_for("laser")
+    np.testing.assert_allclose(mount.pose, [0.1, 0.2, np.pi / 2], atol=1e-12)
+    assert mount.upside_down == upside_down
+    assert motion.mount() == mount
+
+
+def test_of_an_inclined_scanner_nothing_is_made():
+    motion = Motion("base_link", "odom")
+    motion.hear_tf(tf(("base_link", "laser", (0, 0, 0), turned(pitch=np.deg2rad(20)), 0)))
+    with pytest.raises(ValueError, match="inclined by 20"):
+        motion.mount_for("laser")
+
+
+def test_where_tf_does_not_say_it_is_said_what_there_is():
+    motion = Motion("base_link", "odom")
+    motion.hear_tf(tf(("base_footprint", "rplidar_link", (0, 0, 0), turned(), 0)))
+    with pytest.raises(
+        ValueError, match=r"does not connect laser with base_link.*base_footprint, rplidar_link.*--mount"
+    ):
+        motion.mount_for("laser")
+
+
+def test_nonsense_in_tf_is_left_out():
+    motion = Motion("base_link", "odom")
+    motion.hear_tf(tf(
+        ("base_link", "a", (np.nan, 0, 0), turned(), 0), ("base_link", "b", (0, 0, 0), other.quaternion(w=0.0), 0),
+        ("x", "y", (0, 0, 0), turned(), 0), ("y", "x", (0, 0, 0), turned(), 0),  # a ring
+    ))  # fmt: skip
+    for frame in ("a", "b", "x"):
+        with pytest.raises(ValueError, match="does not connect"):
+            motion.mount_for(frame)
+
+
+def dead(stamp, pose, twist=(0.0, 0.0, 0.0)):
+    return Dead(stamp, np.array(pose, float), np.array(twist, float), np.zeros((3, 3)))
+
+
+def test_odometry_between_two_and_a_little_beyond():
+    odometer = Odometer()
+    assert odometer.at(0) is None
+    odometer.hear(dead(0, [0, 0, 0]))
+    odometer.hear(dead(SECOND // 2, [1, 0, np.pi / 2], [1.0, 0.0, 0.5]))
+    middle = odometer.at(SECOND // 4)
+    np.testing.assert_allclose(middle.pose, [0.5, 0, np.pi / 4])
+    beyond = odometer.at(SECOND // 2 + SECOND // 10)
+    np.testing.assert_allclose(beyond.pose, [1, 0.1, np.pi / 2 + 0.05])  # forward is along y by now
+    assert odometer.at(SECOND) is None  # too far beyond
+    assert odometer.at(-1) is None
+    odometer.hear(dead(SECOND // 4, [9, 9, 9]))  # late: left out
+    np.testing.assert_allclose(odometer.at(SECOND // 4).pose, middle.pose)
+    odometer.hear(dead(60 * SECOND, [2, 0, 0]))
+    assert odometer.at(0) is None  # long ago
+    odometer.hear(dead(0, [3, 0, 0]))  # a simulation anew
+    np.testing.assert_allclose(odometer.at(0).pose, [3, 0, 0])
+
+
+def test_odometry_by_tf_with_its_velocity():
+    """The base is 0.5 m ahead of the frame that odometry is about."""
+    motion = Motion("base_link", "odom")
+    motion.hear_tf(tf(("wheels", "base_link", (0.5, 0, 0), turned(), 0)))
+    for k in range(3):
+        motion.hear_tf(tf(("odom", "wheels", (0.1 * k, 0, 0), turned(yaw=0.2 * k), k * SECOND // 10)))
+    found = motion.at(2 * SECOND // 10)
+    np.testing.assert_allclose(found.pose, se2.compose([0.2, 0, 0.4], [0.5, 0, 0]))
+    assert found.twist[2] == pytest.approx(2.0)
+    motion.hear_odometry(dead(2 * SECOND // 10, [7, 7, 0]))
+    assert motion.at(2 * SECOND // 10).pose[0] == 7  # the topic goes before it for the estimator
+    assert motion.by_tf(2 * SECOND // 10).pose[0] == found.pose[0]  # but what is said in tf has to fit tf

@@ -1,0 +1,121 @@
+"""Keys, tokens and attachments as rmw_zenoh and zenoh-bridge-ros2dds have them."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+from zenoh import KeyExpr
+
+from services.bridge_ros2.keys import (
+    KEPT,
+    SENSOR,
+    Endpoint,
+    Names,
+    Node,
+    Qos,
+    attachment,
+    full_name,
+    gid_of,
+    read_attachment,
+    read_token,
+)
+from services.bridge_ros2.ros_types import LASER_SCAN, TWIST, type_hash
+
+# From microcontrollers' firmware that speaks to rmw_zenoh of Jazzy, and from its documentation.
+TWIST_KEY = "0/nucleo/cmd_vel/geometry_msgs::msg::dds_::Twist_/" + type_hash(TWIST)
+TOKEN = (
+    "@ros2_lv/0/100f0e0d0c0b0a090807060504030201/0/16/MS/%/%/nucleo_h743zi2/%nucleo%cmd_vel/"
+    "geometry_msgs::msg::dds_::Twist_/" + type_hash(TWIST) + "/::,:,:,:,,"
+)
+NODE = Node(Names(), "100f0e0d0c0b0a090807060504030201", "", "nucleo_h743zi2")
+
+
+def test_keys_of_rmw_zenoh():
+    assert Names().publish("/nucleo/cmd_vel", TWIST) == TWIST_KEY
+    assert Names(domain=7, hashes=False).publish("/scan", LASER_SCAN) == (
+        "7/scan/sensor_msgs::msg::dds_::LaserScan_/TypeHashNotSupported"
+    )
+    heard = KeyExpr(Names().subscribe("/scan", LASER_SCAN))
+    for names in (Names(), Names(hashes=False)):
+        assert heard.includes(KeyExpr(names.publish("/scan", LASER_SCAN)))
+    assert not heard.intersects(KeyExpr(Names().publish("/scan_raw", LASER_SCAN)))
+
+
+def test_keys_of_zenoh_bridge_ros2dds_are_names():
+    names = Names("ros2dds", domain=3)
+    assert names.publish("/robot1/scan", LASER_SCAN) == names.subscribe("/robot1/scan", LASER_SCAN) == "robot1/scan"
+    assert KeyExpr(names.caches("/tf_static")[0]).includes(KeyExpr("@/a1/@ros2_pub_cache/tf_static"))
+    assert any(
+        KeyExpr(k).includes(KeyExpr("@/a1/@ros2_lv/MP/scan/sensor_msgs§msg§LaserScan/:::")) for k in names.tokens()
+    )
+
+
+def test_tokens_are_those_of_others():
+    qos = Qos(depth=42)  # what rmw_zenoh takes unless told
+    assert NODE.endpoint_token("MS", 16, "/nucleo/cmd_vel", TWIST, qos) == TOKEN
+    assert NODE.token() == "@ros2_lv/0/100f0e0d0c0b0a090807060504030201/0/0/NN/%/%/nucleo_h743zi2"
+    spaced = Node(Names(domain=5), "ab", "/robot1/", "presage").endpoint_token("MP", 1, "/robot1/x", TWIST, qos)
+    assert spaced.startswith("@ros2_lv/5/ab/0/1/MP/%/%robot1/presage/%robot1%x/")
+    KeyExpr(spaced)  # a key expression that zenoh takes
+    assert any(KeyExpr(k).includes(KeyExpr(TOKEN)) for k in Names().tokens())
+
+
+def test_quality_of_service_says_what_is_not_usual():
+    assert (SENSOR.text(), KEPT.text(), Qos().text()) == ("2::,5:,:,:,,", ":1:,1:,:,:,,", "::,10:,:,:,,")
+
+
+def test_tokens_are_read():
+    assert read_token(TOKEN) == Endpoint(False, "/nucleo/cmd_vel", TWIST, type_hash(TWIST), "/nucleo_h743zi2")
+    for key in ("@/a1/@ros2_lv/MP/robot1§scan/sensor_msgs§msg§LaserScan/:::", "@ros2_lv/a1/MP/robot1§scan/sensor_msgs§msg§LaserScan/:::"):  # fmt: skip  # noqa: E501
+        assert read_token(key) == Endpoint(True, "/robot1/scan", LASER_SCAN)
+    for key in (
+        NODE.token(),
+        "@/a1/@ros2_lv",
+        "@ros2_lv",
+        "a/b/c",
+        "@ros2_lv/0/z/0/1/SS/%/%/n/%s/t/h/q",
+        "@ros2_lv/a/MP",
+    ):
+        assert read_token(key) is None
+
+
+def test_an_attachment_is_33_bytes():
+    gid = bytes(range(16))
+    data = attachment(3, 1_700_000_000_123_456_789, gid)
+    assert data == struct.pack("<qq", 3, 1_700_000_000_123_456_789) + b"\x10" + gid
+    assert len(data) == 33
+    assert read_attachment(data) == (3, 1_700_000_000_123_456_789, gid)
+    named = b"\x0fsequence_number" + data[:8] + b"\x10source_timestamp" + data[8:16] + b"\x0asource_gid" + data[16:]
+    assert len(named) == 77
+    assert read_attachment(named) == read_attachment(data)  # Jazzy's first versions
+    for none in (b"", data[:-1], data + b"\0", b"\0" * 33):
+        assert read_attachment(none) is None
+
+
+def test_a_gid_is_the_hash_of_the_token():
+    """XXH3 of 128 bits: of nothing, by its specification, 99aa06d3014798d8 6001c324468d497f, the higher half first."""
+    assert gid_of("") == bytes.fromhex("99aa06d3014798d86001c324468d497f")[::-1]
+    assert gid_of(TOKEN) != gid_of(TOKEN + "x")
+
+
+@pytest.mark.parametrize(
+    ("topic", "namespace", "name"),
+    [
+        ("scan", "", "/scan"),
+        ("scan", "robot1", "/robot1/scan"),
+        ("scan", "/a/b/", "/a/b/scan"),
+        ("/tf", "robot1", "/tf"),
+    ],
+)
+def test_relative_names_are_in_the_namespace(topic, namespace, name):
+    assert full_name(topic, namespace) == name
+
+
+def test_another_definition_of_a_type_is_refused():
+    names = Names()
+    names.refuse_foreign(names.publish("/scan", LASER_SCAN), LASER_SCAN)
+    names.refuse_foreign(Names(hashes=False).publish("/scan", LASER_SCAN), LASER_SCAN)
+    with pytest.raises(ValueError, match=r"RIHS01_00.*another definition"):
+        names.refuse_foreign("0/scan/sensor_msgs::msg::dds_::LaserScan_/RIHS01_00", LASER_SCAN)
+    Names("ros2dds").refuse_foreign("scan", LASER_SCAN)

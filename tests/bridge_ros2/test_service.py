@@ -1,0 +1,203 @@
+"""The bridge as a process; the test is estimator and controller on one side, robot and rviz on the other."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+
+import numpy as np
+import pytest
+
+from common import se2
+from common.bus import Link, open_bus, wait_until
+from common.inbox import Inbox, Sample
+from common.messages import CmdVel, Goal, Health, Odom, Scan, Twist
+from common.requests import LocaliseRequest, Reply
+from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, LOCALISE, ODOM, SCAN
+from tests.bridge_ros2 import independent as other
+from tests.bridge_ros2.made import belief
+from tests.conftest import PATIENCE, Processes
+from tests.system.ros2_robot import BEGIN, Ros, transform, transforms
+
+LASER, ODOMETRY = "sensor_msgs::msg::dds_::LaserScan_", "nav_msgs::msg::dds_::Odometry_"
+POSED, TF = "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_", "tf2_msgs::msg::dds_::TFMessage_"
+TWIST, GOAL_POSE = "geometry_msgs::msg::dds_::Twist_", "geometry_msgs::msg::dds_::PoseStamped_"
+
+
+def laser(stamp_ns, frame="laser"):
+    return other.encode("sensor_msgs/msg/LaserScan", {
+        "header": other.header(stamp_ns, frame), "angle_min": -1.0, "angle_max": 1.0, "angle_increment": 0.5,
+        "time_increment": 0.0, "scan_time": 0.1, "range_min": 0.1, "range_max": 10.0, "ranges": [1.0, 2, 3, 0, 5],
+        "intensities": [],
+    })  # fmt: skip
+
+
+def odometry(stamp_ns, x):
+    pose = {"position": other.vector(x), "orientation": other.quaternion()}
+    twist = {"linear": other.vector(0.5), "angular": other.vector()}
+    return other.encode("nav_msgs/msg/Odometry", {
+        "header": other.header(stamp_ns, "odom"), "child_frame_id": "base_link",
+        "pose": {"pose": pose, "covariance": [0.0] * 36}, "twist": {"twist": twist, "covariance": [0.0] * 36},
+    })  # fmt: skip
+
+
+def posed(x, y, frame="map", *, covariance=False):
+    pose = {"position": other.vector(x, y), "orientation": other.quaternion()}
+    if covariance:
+        message = {"header": other.header(0, frame), "pose": {"pose": pose, "covariance": [0.0] * 36}}
+        return other.encode("geometry_msgs/msg/PoseWithCovarianceStamped", message)
+    return other.encode("geometry_msgs/msg/PoseStamped", {"header": other.header(0, frame), "pose": pose})
+
+
+class Beside:
+    """What the bridge joins, in the test's hands."""
+
+    def __init__(self, bus, node) -> None:
+        self.bus, self.stamp = bus, BEGIN
+        self.inbox, self.calls, self.kept = Inbox(), Inbox(), deque(maxlen=100)
+        self.heard = {"amcl_pose": [], "tf": [], "cmd_vel": []}
+        for topic in (SCAN, ODOM, GOAL, HEALTH):
+            bus.subscribe(topic, self.inbox, keep_all=True)
+        bus.serve(LOCALISE, self.calls)
+        for name, kind in (("amcl_pose", POSED), ("tf", TF), ("cmd_vel", TWIST)):
+            node.subscribe(name, kind, self.heard[name].append)
+        kinds = {"tf_static": TF, "scan": LASER, "odom": ODOMETRY, "initialpose": POSED, "goal_pose": GOAL_POSE}
+        self.put = {name: node.publisher(name, kind) for name, kind in kinds.items()}
+        # Said before the bridge is there.
+        self.put["tf_static"](transforms(transform("base_link", "laser", 0.3, 0, 0, other.quaternion(), 0)))
+
+    def sweep(self):
+        """A scan that comes 50 ms after odometry, at 0.5 m/s; what the bridge made of both."""
+        self.stamp += 10**8
+        self.put["odom"](odometry(self.stamp - 5 * 10**7, 2.0))
+        self.put["scan"](laser(self.stamp))
+        return tuple(self.next(kind, lambda each: each.stamp_ns == self.stamp) for kind in (Odom, Scan))
+
+    def next(self, kind, condition=lambda _: True):
+        """Each topic comes in order, but not one after another: what is not wanted yet is kept."""
+        found = []
+
+        def look():
+            while isinstance(sample := self.inbox.get(0), Sample):
+                self.kept.append(sample.topic.message.decode(sample.payload))
+            found.extend(each for each in self.kept if isinstance(each, kind) and condition(each))
+            return bool(found)
+
+        assert wait_until(look, PATIENCE), f"no such {kind.__name__}"
+        return found[-1]
+
+    def counts(self, counter, at_least):
+        self.next(Health, lambda each: each.service == "bridge_ros2" and each.counters.get(counter, 0) >= at_least)
+
+    def believe(self, state):
+        self.sweep()
+        self.bus.put(BELIEF, belief(state, stamp_ns=self.stamp).encode())
+
+
+@pytest.fixture(scope="module")
+def beside(tmp_path_factory, router):
+    """One router for both sides, which may be."""
+    processes = Processes(tmp_path_factory.mktemp("beside"))
+    try:
+        link = Link(robot="rover", connect=(f"tcp/127.0.0.1:{router}",))
+        with open_bus(link) as bus, Ros(router, "rmw_zenoh", "jazzy") as node:
+            found = Beside(bus, node)
+            environment = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": "rover"}
+            bridge = processes.start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{router}", env=environment)
+            bridge.wait_for("ready")
+            assert bus.wait_matching(BELIEF, PATIENCE)
+            assert bus.wait_matching(CMD_VEL, PATIENCE)
+            last = time.monotonic()
+
+            def heard():  # the first ones may come before the bridge's subscription is known
+                nonlocal last
+                if time.monotonic() - last > 0.2:
+                    last, found.stamp = time.monotonic(), found.stamp + 10**8
+                    found.put["scan"](laser(found.stamp))
+                return found.inbox.received[SCAN.key("rover")] > 0
+
+            assert wait_until(heard, PATIENCE), bridge.output
+            yield found
+            assert bridge.stop()[0] == 0
+    finally:
+        processes.close()
+
+
+def test_a_scan_comes_with_the_odometry_of_its_moment(beside):
+    odom, scan = beside.sweep()
+    np.testing.assert_array_equal(scan.ranges, np.array([1, 2, 3, np.inf, 5], np.float32))
+    assert scan.mount.x == pytest.approx(0.3)
+    assert odom.pose.x == pytest.approx(2.025)
+
+
+def test_the_belief_is_said_only_while_it_tracks(beside):
+    for state in ("localising", "ambiguous", "lost"):
+        beside.believe(state)
+    beside.counts("beliefs_not_said", 3)
+    assert not beside.heard["amcl_pose"]
+    assert not beside.heard["tf"]
+    beside.believe("tracking")
+    assert wait_until(lambda: bool(beside.heard["amcl_pose"] and beside.heard["tf"]), PATIENCE)
+    pose, (said,) = beside.heard["amcl_pose"][-1], beside.heard["tf"][-1].transforms
+    assert pose.pose.covariance[35] == 0.09
+    assert (said.header.frame_id, said.child_frame_id) == ("map", "odom")
+    at, turn = said.transform.translation, said.transform.rotation
+    odom_in_map = [at.x, at.y, 2 * np.arctan2(turn.z, turn.w)]
+    np.testing.assert_allclose(se2.compose(odom_in_map, [2.025, 0, 0]), [3.0, -1.5, 0.5], atol=1e-9)
+    stamps = [each.stamp.sec * 10**9 + each.stamp.nanosec for each in (pose.header, said.header)]
+    assert stamps == [beside.stamp, beside.stamp + 10**9]  # the second with AMCL's tolerance
+
+
+def test_commands_pass_and_are_followed_by_a_stop(beside):
+    heard, last = beside.heard["cmd_vel"], [0.0]
+
+    def driven():  # on a busy machine a command may come too late for its scan: the next
+        if not heard and time.monotonic() - last[0] > 0.5:
+            last[0] = time.monotonic()
+            beside.sweep()
+            beside.bus.put(CMD_VEL, CmdVel(stamp_ns=beside.stamp, twist=Twist(vx=0.2)).encode())
+        return bool(heard)
+
+    assert wait_until(driven, PATIENCE)
+    assert heard[0].linear.x == pytest.approx(0.2)
+    assert wait_until(lambda: heard[-1].linear.x == 0, PATIENCE)
+    beside.bus.put(CMD_VEL, CmdVel(stamp_ns=beside.stamp - 10**9, twist=Twist(vx=0.2)).encode())
+    beside.counts("stale_commands", 1)
+    assert heard[-1].linear.x == 0
+
+
+def test_rvizs_two_buttons(beside):
+    beside.put["initialpose"](posed(4, 2, covariance=True))
+    calls = []
+    assert wait_until(lambda: (call := beside.calls.get(0)) is not None and not calls.append(call), PATIENCE)
+    request = LocaliseRequest.decode(calls[0].payload)
+    assert (request.pose.x, request.pose.y) == (4, 2)
+    calls[0].reply(Reply().encode())
+    beside.put["goal_pose"](posed(9, 9, "odom"))  # in the wrong frame: not taken
+    beside.put["goal_pose"](posed(5, 1))
+    goal = beside.next(Goal)
+    assert (goal.pose.x, goal.pose.y, goal.seq) == (5, 1, 0)
+
+
+def test_it_says_what_it_waits_for_and_what_is_wrong(processes, router):
+    ours = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{router}", "PRESAGE_ROBOT": "lost"}
+    theirs, port = processes.start_router()
+    nowhere = processes.start("bridge_ros2", "--ros-connect", "tcp/127.0.0.1:1", env=ours)  # nobody ever listens there
+    wrong = {**ours, "PRESAGE_ROBOT": "wrong"}
+    bridge = processes.start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{port}", env=wrong)
+    with Ros(port, "rmw_zenoh", "jazzy") as node:
+        node.publisher("scan_raw", LASER)
+        nowhere.wait_for("waits for the zenoh router at tcp/127.0.0.1:1")
+        bridge.wait_for("nobody publishes it; sensor_msgs/msg/LaserScan is on /scan_raw: --scan-topic")
+        put, last = node.publisher("scan", LASER), [0.0]
+
+        def named():
+            if time.monotonic() - last[0] > 0.2:
+                last[0] = time.monotonic()
+                put(laser(BEGIN, "lidar"))
+            return "tf does not connect lidar with base_link" in bridge.output
+
+        assert wait_until(named, PATIENCE), bridge.output
+    theirs.kill()
+    bridge.wait_for("it is gone")
+    assert nowhere.stop()[0] == bridge.stop()[0] == 0

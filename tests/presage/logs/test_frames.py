@@ -1,0 +1,71 @@
+"""The tree of frames, and poses between those that were logged."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.errors import UserError
+from presage.logs.frames import Frames, matrix
+from presage.logs.poses import Track
+
+SECOND = 1_000_000_000
+
+
+def placed(x=0.0, y=0.0, yaw=0.0, roll=0.0):
+    a, b = yaw / 2, roll / 2
+    turn = [np.cos(a) * np.sin(b), np.sin(a) * np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)]
+    return matrix(np.array([x, y, 0.3]), np.array(turn))
+
+
+def test_a_mount_over_several_frames():
+    frames = Frames()
+    frames.add("base_link", "plate", 0, placed(0.2, 0.1, np.pi / 2))
+    frames.add("/plate", "/laser", 0, placed(0.1, 0.0, 0.0, np.pi))  # ROS 1 began names with a slash
+    mount, flipped = frames.mount("base_link", "laser")
+    np.testing.assert_allclose(mount, [0.2, 0.2, np.pi / 2], atol=1e-12)
+    assert flipped
+    assert frames.mount("base_link", "camera") is None
+    assert frames.mount("laser", "base_link") is None
+
+
+def test_what_is_no_mount_is_refused():
+    frames = Frames()
+    frames.add("base_link", "tilted", 0, placed(roll=np.deg2rad(15)))
+    with pytest.raises(UserError, match="not level"):
+        frames.mount("base_link", "tilted")
+    for k in range(3):
+        frames.add("base_link", "nodding", k, placed(yaw=0.1 * k))
+    with pytest.raises(UserError, match="moves against base_link"):
+        frames.mount("base_link", "nodding")
+
+
+def test_frames_that_bite_their_tail_hang_on_nothing():
+    frames = Frames()
+    for parent, child in (("a", "b"), ("b", "c"), ("c", "a"), ("d", "d")):
+        frames.add(parent, child, 0, placed())
+    frames.add("a", "e", 0, placed(x=np.nan))
+    assert frames.chain("map", "c") is None
+    assert frames.chain("a", "e") is None
+    assert frames.chain("d", "d") == []
+
+
+def test_between_two_poses_and_nowhere_else():
+    track = Track()
+    for seconds, yaw in ((2, -3.0), (1, 3.0), (4, 0.0)):  # in any order
+        track.add(seconds * SECOND, np.array([seconds, 0.0, yaw]))
+    track.add(3 * SECOND, np.array([np.nan, 0, 0]))
+    middle = track.at(SECOND + SECOND // 2)
+    assert middle[0] == 1.5
+    assert abs(middle[2]) == pytest.approx(np.pi)  # by the shorter turn
+    assert track.at(2 * SECOND).tolist() == [2, 0, -3]
+    assert [track.at(stamp * SECOND) for stamp in (0, 3, 5)] == [None, None, None]
+    assert Track().at(0) is None
+
+
+def test_what_stands_still_costs_nothing():
+    track, still = Track(), np.array([1.0, 2.0, 3.0])
+    for k in range(1000):
+        track.add(k * SECOND // 100, still)
+    assert len(track) < 25
+    assert all(track.at(k * SECOND // 100 + 7).tolist() == [1, 2, 3] for k in range(999))

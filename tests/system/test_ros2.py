@@ -1,0 +1,110 @@
+"""The bridge between real processes: a stand-in robot that speaks as ROS 2 does, estimator and controller of ours."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+
+from common import se2
+from common.bus import Link, open_bus, wait_until
+from common.messages import Goal, Pose
+from common.topics import GOAL
+from tests.bridge_ros2.independent import encode, header, quaternion, vector
+from tests.conftest import PATIENCE, Processes
+from tests.system.ros2_robot import Ros
+
+POSE = "geometry_msgs/msg/PoseStamped"
+GOAL_POSE = "geometry_msgs::msg::dds_::PoseStamped_"
+
+
+def said(robot):
+    """What the stand-in said last."""
+    lines = [line for line in robot.output.splitlines() if line.startswith("{") and line.endswith("}")]
+    return json.loads(lines[-1]) if lines else {}
+
+
+def until(robot, condition, what, *others):
+    if not wait_until(lambda: bool(now := said(robot)) and condition(now), PATIENCE):
+        pytest.fail(f"{what}: {said(robot)}\n" + "\n".join(each.output[-3000:] for each in (robot, *others)))
+
+
+def ends_well(robot):
+    """Nothing went wrong where zenoh would swallow it, such as an attachment of which rmw_zenoh dies."""
+    assert robot.running
+    assert "Error" not in robot.output
+    assert not said(robot)["contact"]
+
+
+def goal_message(x, y):
+    pose = {"position": vector(x, y), "orientation": quaternion()}
+    return encode(POSE, {"header": header(0, "map"), "pose": pose})
+
+
+def arrived(now):
+    """It stands at the goal; ROS is told so, and tf makes up for what odometry drifts."""
+    believed, by_tf = now["pose"][:2], se2.compose(now["odom_in_map"], now["odom"])[:2]
+    there = math.dist(now["truth"][:2], (4.2, 1.5)) < 0.25 and now["speed"] < 0.01
+    return there and math.dist(believed, now["truth"][:2]) < 0.05 and math.dist(by_tf, now["truth"][:2]) < 0.05
+
+
+@pytest.fixture(scope="module")
+def minds(tmp_path_factory):
+    """Estimator and controller, which take seconds to start, on a router of ours; a second router is the robot's."""
+    processes = Processes(tmp_path_factory.mktemp("ros2"))
+    try:
+        port, ros = processes.start_router()[1], processes.start_router()[1]
+        environment = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "rover", "OMP_NUM_THREADS": "1"}
+
+        def start(name, *args):
+            return processes.start(name, *args, env=environment)
+
+        start("estimator")
+        controller = start("controller")
+        link = Link(robot="rover", connect=(environment["PRESAGE_CONNECT"],))
+        with open_bus(link) as bus:
+            assert wait_until(lambda: {"estimator", "controller"} <= bus.alive(timeout=0.5), 60)
+            yield start, bus, ros, controller
+    finally:
+        processes.close()
+
+
+def test_over_rmw_zenoh_a_robot_is_localised_drives_to_rvizs_goal_and_stands_where_the_bridge_dies(minds):
+    start, _, port, _ = minds
+    bridge = start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{port}")
+    robot = start("tests.system.ros2_robot", "--port", str(port))
+    until(robot, lambda now: now["pose"] and now["transforms"] > 3, "no pose and transform", bridge)
+    with Ros(port, "rmw_zenoh", "jazzy") as rviz:
+        put = rviz.publisher("goal_pose", GOAL_POSE)
+        assert wait_until(lambda: bool(rviz.kept[-1].matching_status.matching), PATIENCE)
+        put(goal_message(4.2, 1.5))
+        until(robot, arrived, "no way", bridge)
+        put(goal_message(12.0, 1.5))
+        until(robot, lambda now: now["speed"] > 0.3, "it does not go on", bridge)
+    bridge.kill()
+    until(robot, lambda now: now["speed"] < 0.01, "it drives on without the bridge")
+    zeros = said(robot)["zeros"]
+    bridge = start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{port}")
+    until(robot, lambda now: now["speed"] > 0.3, "it does not go on with another bridge", bridge)
+    assert bridge.stop()[0] == 0
+    until(robot, lambda now: now["zeros"] > zeros, "a bridge that ends sends no stop", bridge)
+    ends_well(robot)
+    robot.stop()
+
+
+def test_over_zenoh_bridge_ros2dds_commands_that_end_are_followed_by_a_stop(minds):
+    start, bus, port, controller = minds
+    bridge = start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{port}", "--flavor", "ros2dds", "--stamped")
+    robot = start("tests.system.ros2_robot", "--port", str(port), "--flavor", "ros2dds", "--stamped")
+    until(robot, lambda now: now["pose"] and now["transforms"] > 3, "no pose and transform", bridge)
+    assert bus.wait_matching(GOAL, PATIENCE)
+    bus.put(GOAL, Goal(stamp_ns=0, pose=Pose(x=12.0, y=1.5)).encode())
+    until(robot, lambda now: now["speed"] > 0.3, "it does not go", bridge)
+    controller.kill()
+    until(robot, lambda now: now["zeros"] > 0, "no stop", bridge)
+    bridge.wait_for("stop: commands have ended")
+    until(robot, lambda now: now["speed"] < 0.01, "it does not stand")
+    ends_well(robot)
+    robot.stop()
+    assert bridge.stop()[0] == 0
