@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from common import messages, pose, requests, robot, scanner, world
+from common import furniture, messages, occupancy_grid, pose, requests, robot, scanner, world
 from common.topics import MAX_BYTES, QUERIES, ROOT, TOPICS, alive_key
 
 HEAD = f"""# Messages
@@ -57,9 +57,13 @@ def _queries() -> list[str]:
 
 def _models() -> list[type[BaseModel]]:
     found: list[type[BaseModel]] = []
-    for module in (pose, messages, requests, world, scanner, robot):
+    for module in (pose, messages, requests, furniture, world, occupancy_grid, scanner, robot):
         mine = [c for c in vars(module).values() if inspect.isclass(c) and issubclass(c, BaseModel)]
-        found += [c for c in mine if c.__module__ == module.__name__ and not c.__name__.startswith("_")]
+        found += [
+            c
+            for c in mine
+            if c.__module__ == module.__name__ and not c.__name__.startswith("_") and c is not furniture.Model
+        ]
     return found
 
 

@@ -19,10 +19,11 @@ from pathlib import Path
 import tomllib
 
 HERE = Path(__file__).resolve().parent
-# Robots to play with, headers, programs of torch's own tests: half of what the two largest packages weigh.
+# Robots to play with, headers, programs of torch's own tests: half of what the two largest packages weigh; and AVIF.
 UNUSED = (
     "pybullet_data", "pybullet_envs", "pybullet_examples", "pybullet_robots", "pybullet_utils", "eglRenderer*.so",
     "torch/bin/test_*", "torch/bin/*Test", "torch/bin/protoc*", "torch/include", "torch/test", "torch/share",
+    "PIL/_avif*", "pillow.libs/libavif*",
 )  # fmt: skip
 
 

@@ -47,6 +47,24 @@ def bench_viewer(
     raise typer.Exit(run(seconds, rounds, beams, json_file, console))
 
 
+@app.command("map")
+def bench_map(
+    world: Annotated[str, typer.Option(help="A map.yaml of yours, or any world; none: one that is made.")] = "",
+    size: Annotated[int, typer.Option(min=200, max=4000, help="Cells along each side of the one that is made.")] = 1000,
+    beams: Annotated[int, typer.Option(min=2, help="Beams of a scan.")] = 622,
+    out: Annotated[Path | None, typer.Option(help="Keep the map that is made in this folder.")] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    json_file: Json = None,
+) -> None:
+    """What a ROS map of many cells takes: to load, to send, to scan in, to plan on.
+
+    Examples: `presage bench map`; `presage bench map --world my/map.yaml`; `presage bench map --size 2000 --out made`.
+    """
+    from presage.bench_map import bench_map as run  # noqa: PLC0415
+
+    raise typer.Exit(run(world, size, beams, out, seed, json_file, console))
+
+
 @app.command("metrics")
 def bench_metrics(
     seconds: Annotated[float, typer.Option(min=1.0, help="Of one round.")] = 20.0,

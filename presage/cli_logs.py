@@ -50,7 +50,10 @@ Clock = Annotated[str, typer.Option(rich_help_panel=PANEL, help="Stamps of the s
 def localize(
     file: Annotated[Path, typer.Argument(help="A recording, CARMEN log, ROS 1 or 2 bag (a file, or a folder), .npz.")],
     world: Annotated[
-        str, typer.Option("--world", "--map", help="A shipped world or a world file; none: the recording's.")
+        str,
+        typer.Option(
+            "--world", "--map", help="A shipped world, a world file, or a ROS map.yaml; none: the recording's."
+        ),
     ] = "",
     estimator: EstimatorName = "precise",
     model: ModelName = "learned",

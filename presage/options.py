@@ -24,7 +24,9 @@ err_console = Console(stderr=True, width=None if sys.stderr.isatty() else 150)
 
 RobotName = Annotated[str, typer.Option(envvar="PRESAGE_ROBOT", help="Which robot.")]
 Connect = Annotated[str, typer.Option(envvar="PRESAGE_CONNECT", help="The session's zenoh endpoint(s).")]
-WorldName = Annotated[str, typer.Option(envvar="PRESAGE_WORLD", help="A shipped world or a world file.")]
+WorldName = Annotated[
+    str, typer.Option(envvar="PRESAGE_WORLD", help="A shipped world, a world file, or a ROS map.yaml.")
+]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="The router's port on 127.0.0.1; 0: any free one.")]
 Seed = Annotated[int, typer.Option(min=0, max=2**31, help="Of all that is drawn.")]
 Json = Annotated[Path | None, typer.Option("--json", help="Write the numbers there.")]

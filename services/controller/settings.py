@@ -24,7 +24,9 @@ class ControllerSettings(ServiceSettings):
 
     service: ClassVar[str] = "controller"
 
-    world: Annotated[str, Field(description="the map; empty, of preset paper alone: none")] = "corridor"
+    world: Annotated[
+        str, Field(description="the map: shipped world, world file or ROS map.yaml; empty, of preset paper alone: none")
+    ] = "corridor"
     preset: Annotated[
         Literal["geodesic", "paper"],
         Field(description="geodesic: round walls and what the scan shows; paper: equation 4, straight to the goal"),

@@ -44,7 +44,9 @@ class EstimatorSettings(ServiceSettings):
         float, Field(gt=0, le=1e6, description="s without scan or simulator, after which one of several is forgotten")
     ] = 60.0
 
-    world: Annotated[str, Field(description="shipped world or world file the model was trained for")] = "corridor"
+    world: Annotated[str, Field(description="shipped world, world file or ROS map.yaml the model was trained for")] = (
+        "corridor"
+    )
     estimator: Annotated[
         Literal["precise", "paper", "particle-filter", "amcl-defaults"],
         Field(description="precise; paper: Burghardt & Lanillos 2021; particle-filter: AMCL's design, tuned or not"),

@@ -28,7 +28,7 @@ class SimulatorSettings(ServiceSettings):
 
     service: ClassVar[str] = "simulator"
 
-    world: Annotated[str, Field(description="shipped world or world file")] = "corridor"
+    world: Annotated[str, Field(description="shipped world, world file or ROS map.yaml")] = "corridor"
     scanner: Annotated[str, Field(description=f"one of {', '.join(SCANNERS)}, or a file")] = "tim571"
     beams: Annotated[int | None, Field(ge=2, le=100_000, description="instead of the scanner's own number")] = None
     noise: Annotated[float | None, Field(ge=0, le=1, description="instead of the scanner's own sigma, m")] = None

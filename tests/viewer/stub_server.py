@@ -3,7 +3,7 @@
 python -m tests.viewer.stub_server --port 8123
 
 http://127.0.0.1:8123/planning/ is the scene of that name; there are: tracking, planning, blocked, exploring, ambiguous,
-lost, half-dead, empty, watching. Without a name it is `tracking`.
+lost, half-dead, empty, watching, mapped (a ROS map). Without a name it is `tracking`.
 """
 
 from __future__ import annotations
@@ -19,11 +19,15 @@ from starlette.routing import Mount, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from common.occupancy_grid import OccupancyGrid
 from common.robot import Robot
-from common.world import load_world
+from common.world import World, load_world
+from tests.common.maps import rooms
 from tests.viewer.stub_session import DT, SCANNER, SCENES, WORLDS, Session, pulses
 
 STATIC = Path(__file__).resolve().parents[2] / "services" / "viewer" / "static"
+
+MAPPED = World(name="rooms", grid=OccupancyGrid.of(rooms(260), 0.05, (2.0, -1.0, 0.3)))
 
 
 class Visitor:
@@ -98,7 +102,8 @@ def application(warm: float) -> Starlette:
 
     def session_of(scene: str) -> Session:
         if scene not in sessions:
-            sessions[scene] = Session(load_world(WORLDS.get(scene, "corridor")), scene)
+            world = MAPPED if scene == "mapped" else load_world(WORLDS.get(scene, "corridor"))
+            sessions[scene] = Session(world, scene)
             for _ in range(int(warm / DT)):
                 sessions[scene].step()
         return sessions[scene]

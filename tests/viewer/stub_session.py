@@ -11,7 +11,18 @@ from common.world import Obstacle, World
 from services.viewer.frames import encode
 from tests.viewer import stub_plan
 
-SCENES = ("tracking", "planning", "blocked", "exploring", "ambiguous", "lost", "half-dead", "empty", "watching")
+SCENES = (
+    "tracking",
+    "planning",
+    "blocked",
+    "exploring",
+    "ambiguous",
+    "lost",
+    "half-dead",
+    "empty",
+    "watching",
+    "mapped",
+)
 WORLDS = {"planning": "office", "blocked": "office", "exploring": "maze"}  # other scenes: corridor
 PLANNED = tuple(WORLDS)
 REASONS = {

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import signal
 
+import numpy as np
 import pytest
 
 from common.bus import wait_until
+from common.cell_distance import signed_distance
+from common.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from tests.conftest import PATIENCE, Processes, accepts, free_tcp_port
+from tests.viewer.stub_server import MAPPED
 
 browser_tools = pytest.importorskip("tests.viewer.browser", reason="NO PLAYWRIGHT: the page is not tested")
 SCENES = ("tracking", "planning", "blocked", "exploring", "ambiguous", "lost", "half-dead", "empty", "watching")
@@ -106,6 +110,23 @@ def test_what_the_controller_means_is_drawn_and_can_be_hidden(look):
         shown = seen.see(PIXEL, at)
         seen.page.locator(f'[data-layer="{layer}"]').click()
         seen.wait(f"{PIXEL} !== '{shown}'", 5, at)
+
+
+def test_a_ros_map_is_drawn_cell_by_cell(look):
+    seen = look("mapped", color_scheme="light")
+    for layer in ("measured", "predicted"):
+        seen.page.locator(f'[data-layer="{layer}"]').click()
+    colours = {OCCUPIED: "61,66,72,255", UNKNOWN: "233,233,229,255", FREE: "255,255,255,255"}  # base.css
+    for kind, colour in colours.items():
+        inner = signed_distance(MAPPED.grid.values != kind, np.arange(260) + 0.5, np.arange(260) + 0.5)
+        for row, column in np.argwhere(inner > 1)[[20, 200, -200, -20]]:  # deep enough that no edge is blended in
+            x, y = MAPPED.grid.shapes.within(np.array([[column, row]]), 0.5)[0].tolist()
+            at = seen.see("view.camera.toScreen(...arg)", [x, y])
+            if kind == OCCUPIED:
+                seen.wait(f"{PIXEL} === '{colour}'", 10, at)
+            else:  # lines of the metres run through all of them
+                shown = [seen.see(PIXEL, [at[0] + off, at[1] + off]) for off in (-2, 0, 2)]
+                assert colour in shown, (kind, x, y, shown)
 
 
 def test_a_phone_begins_without_the_field_and_a_desk_with_it(look):

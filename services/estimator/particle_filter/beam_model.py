@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.errors import UserError
+from services.estimator.generative import RayCaster
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -70,7 +71,7 @@ class RangeTable:
         self._limit = np.array([nx - 1, ny - 1])
         self._row = np.full(nx * ny, -1, np.int32)
         self._ranges: npt.NDArray[np.float32] = np.zeros((0, HEADINGS), np.float32)
-        self._angles = 2 * np.pi / HEADINGS * np.arange(HEADINGS)
+        self._angles: Array = 2 * np.pi / HEADINGS * np.arange(HEADINGS, dtype=float)
 
     def ranges(self, poses: Array, angles: Array) -> Array:
         """(N, B) m, about, from scanner poses (N, 3) in map along ``angles`` (B,): as from the cell's middle."""
@@ -92,5 +93,8 @@ class RangeTable:
         ij = np.stack(np.divmod(cells, self._limit[1] + 1), axis=-1)
         middles = np.column_stack([self.origin + (ij + 0.5) * self.resolution, np.zeros(len(cells))])
         self._row[cells] = len(self._ranges) + np.arange(len(cells), dtype=np.int32)
-        found = self.world.ray_distances(middles, self._angles).astype(np.float32)
-        self._ranges = np.concatenate([self._ranges, found])
+        if self.world.grid is None:
+            found = self.world.ray_distances(middles, self._angles)
+        else:  # compiled: several times as fast among cells, and here they are thousands
+            found = RayCaster(self.world).expect(middles, self._angles).ranges
+        self._ranges = np.concatenate([self._ranges, found.astype(np.float32)])

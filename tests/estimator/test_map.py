@@ -1,0 +1,75 @@
+"""Estimators on a ROS map: compiled rays and their derivatives, the likelihood field, a place found from one scan."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common import se2
+from common.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from common.scanner import SCANNERS
+from common.world import World
+from services.estimator.building import Choice, Geometry, prepare
+from services.estimator.generative import RayCaster
+from services.estimator.interface import Observation
+from services.estimator.particle_filter.beam_model import RangeTable
+from services.estimator.particle_filter.likelihood_field import DistanceField
+from tests.common.maps import rooms
+
+CRATE = {"circle": {"center": (4.0, 5.0), "radius": 0.3}}
+SCANNER = SCANNERS["tim571"].with_beams(200)
+
+
+@pytest.fixture(scope="module")
+def hall():
+    return World(name="rooms", grid=OccupancyGrid.of(rooms(260), 0.05, (0.0, 0.0, 0.0)))
+
+
+@settings(max_examples=10)
+@given(st.integers(0, 2**32 - 1))
+def test_compiled_rays_are_those_of_the_world(seed):
+    rng = np.random.default_rng(seed)
+    values = rng.choice([FREE, OCCUPIED, UNKNOWN], (20, 30), p=[0.8, 0.15, 0.05]).astype(np.uint8)
+    world = World(name="x", grid=OccupancyGrid.of(values, 0.5, (1.0, -2.0, 0.7)), obstacles=[CRATE])
+    lasers = np.column_stack([rng.uniform(-8, 18, (40, 2)), rng.uniform(-np.pi, np.pi, 40)])
+    angles = np.linspace(-3, 3, 23)
+    expected = RayCaster(world).expect(lasers, angles)
+    np.testing.assert_allclose(expected.ranges, world.ray_distances(lasers, angles), atol=1e-9)
+    small = 1e-6
+    for axis in range(3):
+        ahead, back = (
+            RayCaster(world).expect(lasers + side * small * np.eye(3)[axis], angles) for side in (1, -1)
+        )  # fmt: skip
+        with np.errstate(invalid="ignore"):
+            slope = (ahead.ranges - back.ranges) / (2 * small)
+        # Beams that change their cell, and those so flat that the derivative is held, have none to compare with.
+        same = np.isclose(ahead.jacobian, back.jacobian, atol=1e-3).all(axis=-1) & np.isfinite(slope)
+        flat = np.abs(expected.jacobian).max(axis=-1) > 40
+        fine = same & ~flat & (np.abs(slope) < 1e3)
+        np.testing.assert_allclose(slope[fine], expected.jacobian[..., axis][fine], atol=1e-2)
+        assert fine[np.isfinite(expected.ranges)].mean() > 0.5
+
+
+def test_tables_of_the_particle_filter(hall):
+    field = DistanceField(hall)
+    places = hall.sample_free(300, np.random.default_rng(0), 0.1)
+    exact = hall.grid.shapes.distance(OCCUPIED, places)
+    assert np.abs(field(places[:, 0], places[:, 1]) - np.minimum(exact, 2.0)).max() < 0.03  # half a cell, at corners
+    table, angles = RangeTable(hall), np.arange(0, 360, 10) * np.pi / 180
+    cell = np.floor(places[:20] / 0.05)
+    middles = np.column_stack([(cell + 0.5) * 0.05, np.zeros(20)])
+    assert table.ranges(middles, angles) == pytest.approx(hall.ray_distances(middles, angles), abs=1e-5)
+
+
+def test_the_robot_finds_itself_on_a_map(hall):
+    rng = np.random.default_rng(3)
+    geometry = Geometry(SCANNER.angles(), np.array(SCANNER.mount), SCANNER.range_max)
+    make = prepare(Choice(world=hall, model="exact"))
+    for place in hall.sample_free(3, rng, 0.4):
+        pose = np.array([*place, rng.uniform(-np.pi, np.pi)])
+        exact = hall.ray_distances(se2.compose(pose, geometry.mount), geometry.angles)[0]
+        ranges = SCANNER.limit(exact + 0.02 * rng.standard_normal(len(exact)))
+        found = make(geometry).update(Observation(ranges, geometry.angles, geometry.range_max))
+        assert np.hypot(*(found.pose[:2] - place)) < 0.02
