@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import uuid
 from itertools import pairwise
 
@@ -10,17 +11,19 @@ import pytest
 
 from common.bus import Link, open_bus, wait_until
 from common.messages import Belief, Scan, Truth
+from common.security import credentials
 from common.topics import BELIEF, CMD_VEL, SCAN, STATUS, TRUTH
+from presage import secure
 from presage.watch import Watch
 from services.recorder.reader import read_recording
 from tests.conftest import free_tcp_port
 from tests.system.compose import PATIENCE, SERVICES, Compose, docker, engine, say_that_nothing_was_tested
 
 pytestmark = [pytest.mark.docker, pytest.mark.timeout(1500)]
-HEAVY = ("pybullet", "torch", "numba", "scipy", "mcap", "starlette", "typer", "matplotlib")
+HEAVY = ("pybullet", "torch", "numba", "scipy", "mcap", "starlette", "typer", "matplotlib", "rosbags")
 HOLDS = {
     "router": set(), "none": set(), "recorder": {"mcap"}, "replay": {"mcap"}, "controller": {"scipy"},
-    "simulator": {"pybullet", "scipy"}, "estimator": {"torch", "numba"}, "viewer": {"mcap", "starlette", "typer"},
+    "bridge_ros2": {"rosbags"}, "simulator": {"pybullet", "scipy"}, "estimator": {"torch", "numba"}, "viewer": {"mcap", "starlette", "typer"},
     "cli": {"mcap", "typer", "matplotlib"},
 }  # fmt: skip
 
@@ -34,7 +37,7 @@ def image(tmp_path_factory):
     builder = Compose(tag, tmp_path_factory.mktemp("build"), (0, 0))
     try:
         builder.do("build", timeout=1200)
-        for scanner in ("replay", "none"):
+        for scanner in ("replay", "none", "bridge_ros2"):
             builder.do("build", "simulator", timeout=300, PRESAGE_SCANNER=scanner)
         yield tag
     finally:
@@ -89,6 +92,24 @@ def test_up_ends_in_a_robot_at_its_goal(compose):
     assert counts["scan"] > 100
     assert counts["belief"] > 100
     assert recording.world().name == "corridor"
+
+
+def test_in_secure_mode_the_goal_is_reached_and_a_stranger_hears_nothing(compose, tmp_path):
+    keys = tmp_path / "keys"
+    secure.init(keys)
+    both = os.pathsep.join(["docker-compose.yml", "docker-compose.secure.yml"])
+    project = compose(COMPOSE_FILE=both, PRESAGE_KEYS=str(keys), PRESAGE_UID=str(os.getuid()))
+    project.do("up", "--detach")
+    router = (f"tcp/127.0.0.1:{project.router}",)
+    with open_bus(Link(connect=router)) as stranger:
+        with open_bus(Link(connect=router, security=credentials(keys, ("observer",)))) as known:
+            watch = Watch(known, TRUTH, STATUS)
+            assert watch.until(Truth, lambda truth: truth.pose.x > 5.0, PATIENCE), project.explain("goal")
+            assert known.alive() >= {"simulator", "estimator", "controller", "recorder"}
+        assert project.ends("goal") == 0
+        assert "reached: within 0.2 m of the goal" in project.do("logs", "goal")
+        assert not stranger.linked()
+    assert "refused" in project.do("logs", "router")
 
 
 def gaps(messages):
