@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import zlib
+from contextlib import suppress
 
 import psutil
 import pytest
@@ -31,7 +32,12 @@ def test_no_process_outlives_bench_latency(process, number):
     def children():
         return psutil.Process(bench.child.pid).children(recursive=True)
 
-    assert wait_until(lambda: any("echo_main" in " ".join(child.cmdline()) for child in children()), 90), bench.output
+    def echoes(child):
+        with suppress(psutil.Error):  # it may be gone by now
+            return "echo_main" in " ".join(child.cmdline())
+        return False
+
+    assert wait_until(lambda: any(map(echoes, children())), 90), bench.output
     started = children()
     assert len(started) == 4
     bench.send(number)

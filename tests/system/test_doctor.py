@@ -127,7 +127,7 @@ def test_a_sick_session(process, bus, sick, tmp_path):
 
 
 def test_a_stopped_process_is_told_from_one_that_is_not_there(process, bus, tmp_path):
-    controller = process("controller")
+    controller = process("controller", fresh=True)  # found by its command line
     assert wait_until(lambda: "controller" in bus.alive(), PATIENCE), controller.output
     controller.send(signal.SIGSTOP)
     running = doctor(process, tmp_path)

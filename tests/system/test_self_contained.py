@@ -59,6 +59,7 @@ def extract(recording, folder):
 def rerun(process, bus, config, folder, scans):
     """An estimator with the recorded settings over the recorded scans; its beliefs."""
     kept = {name: config[name] for name in ("estimator", "model", "initial_pose", "seed", "sigma", "prior")}
+    kept = {name: value for name, value in kept.items() if value is not None}
     args = [part for name, value in kept.items() for part in (f"--{name.replace('_', '-')}", str(value))]
     beliefs = Inbox()
     bus.subscribe(BELIEF, beliefs, keep_all=True)
