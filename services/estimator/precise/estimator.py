@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from services.estimator.precise.seeding import Seeds
 
 FIRST_WAIT, LONGEST_WAIT = 5, 150  # scans between searches while the scan fits badly
+UNKNOWN = 100.0  # m, stated where nothing is known
 FAR = 16.0  # squared standard deviations
 WIDEST, WIDE, NARROW = 0.3, 0.1, 0.03  # m, added to every beam's deviation on the way down from a seed
 
@@ -110,7 +111,9 @@ class PreciseEstimator:
         return self._with_noise(self.model.expect(se2.compose(poses, self.mount), angles))
 
     def _with_noise(self, expected: Expected) -> Predicted:
-        return Predicted(expected.ranges, np.sqrt(expected.scale**2 + self.likelihood.sigma**2))
+        unknown = np.isinf(expected.scale)
+        sigma = np.where(unknown, UNKNOWN, np.hypot(expected.scale, self.likelihood.sigma))
+        return Predicted(np.where(unknown, np.inf, expected.ranges), sigma)
 
     def _track(self, view: View, observation: Observation) -> Conversation[None]:
         """Each hypothesis on: where it may have moved, where the scan says it is, both fused."""

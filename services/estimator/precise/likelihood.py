@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from services.estimator.generative import Expected
 
 
+KNOWN = 0.3  # share of the beams of which something must be expected
+
+
 @dataclass(frozen=True)
 class Evidence:
     """What the beams say about N poses; derivatives by the laser's pose."""
@@ -52,7 +55,9 @@ class Likelihood:
             measured, expected.ranges, expected.jacobian, expected.scale,
             self.sigma, widen, self.short, self.random, range_max, self.unseen, total, gradient, matrices,
         )  # fmt: skip
-        explained = total[:, 1] / np.maximum(total[:, 2], 1)
+        # A pose from which nearly nothing is known explains nearly nothing.
+        least = KNOWN * len(measured) if np.isinf(expected.scale).any() else 1.0
+        explained = total[:, 1] / np.maximum(total[:, 2], max(least, 1.0))
         return Evidence(total[:, 0], explained, gradient, matrices[:, 0], matrices[:, 1], matrices[:, 2])
 
     def density(self, measured: Array, expected: float, scale: float, range_max: float) -> Array:
