@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from services.estimator.generative import GenerativeModel
     from services.estimator.precise.seeding import Seeds
 
-FIRST_WAIT, LONGEST_WAIT = 5, 150  # scans between searches while the scan fits badly
+FIRST_WAIT, LOST_WAIT, LONGEST_WAIT = 5, 10, 150  # scans between searches while the scan fits badly
 UNKNOWN = 100.0  # m, stated where nothing is known
 FAR = 16.0  # squared standard deviations
 WIDEST, WIDE, NARROW = 0.3, 0.1, 0.03  # m, added to every beam's deviation on the way down from a seed
@@ -48,6 +48,7 @@ class Settings:
     inflation: float = 1.0  # of the covariance, for errors of the model that hang together
     sure: float = 0.75  # share of beams from which one scan is enough to say tracking
     patience: int = 30  # scans that a place must persist with less
+    probation: int = 10  # scans for which a place that explains less than that must persist to follow another
     rise: float = 150.0  # nats by which accuracy must worsen at once to call for a search
     vague: float = 0.5  # m, standard deviation of a position that is not known
     motion: MotionNoise = field(default_factory=MotionNoise)
@@ -85,6 +86,7 @@ class PreciseEstimator:
         self._odom: Array | None = None
         self._usual, self._energy = 1.0, 0.0  # share of beams explained, and accuracy, lately
         self._since, self._wait = 0, FIRST_WAIT  # scans that fitted badly, and after how many to search
+        self._believed = False  # the last scan
 
     def update(self, observation: Observation) -> Posterior:
         """One more scan."""
@@ -151,7 +153,18 @@ class PreciseEstimator:
             parts = [fuse(option, poses[k], evidence.xi[k], evidence.curvature[k]) for option in each]
             fused = min(parts, key=lambda part: part.surprise)
             modes.append(mixture.moved(mode, fused, evidence, k, period, blind=blind is not None))
-        self.modes = mixture.weigh(modes, self.settings.evidence_error, self.settings.hypotheses)
+        self.modes = self._weighed(modes)
+
+    def _weighed(self, modes: list[Mode]) -> list[Mode]:
+        """The hypotheses by weight; who was tracked leads until another has proven itself."""
+        settings = self.settings
+        holder = next((mode for mode in modes if mode.trusted), None)
+        margin = 3 * settings.evidence_error
+        if holder is not None and any(
+            mixture.succeeds(mode, holder, margin, settings.probation, settings.satisfied) for mode in modes
+        ):
+            modes = [replace(mode, trusted=False) for mode in modes]
+        return mixture.weigh(modes, settings.evidence_error, settings.hypotheses)
 
     def _unseen(self, option: Candidate, blind: Array, scans: int, period: float) -> Candidate:
         """Along a direction no scan sees, the robot may have gone at full speed: the deviation grows with time."""
@@ -163,13 +176,13 @@ class PreciseEstimator:
         """The scan fits worse at once, or has fitted badly for long, or not as a belief must."""
         best, settings = self.modes[0], self.settings
         fell = best.explained < self._usual - settings.drop or best.accuracy > self._energy + settings.rise
-        if fell or not self._believable(view):
-            return True
+        believable = self._believable(view)
+        gone, self._believed = self._believed and not believable, believable
         if best.explained >= settings.satisfied:
             self._since, self._wait = 0, FIRST_WAIT
-            return False
+            return fell
         self._since += 1
-        return self._since >= self._wait
+        return fell or gone or self._since >= (self._wait if believable else min(self._wait, LOST_WAIT))
 
     def _believable(self, view: View) -> bool:
         """Whether enough of the scan is explained, or the rest may be hidden."""
@@ -191,14 +204,17 @@ class PreciseEstimator:
         else:
             found = yield from self._search(view)
         if self.modes:
-            before, margin = self.modes[0], 3 * self.settings.evidence_error
-            if mixture.same(found[0].pose[None], before.pose)[0]:
-                found[0] = replace(found[0], age=before.age, velocity=before.velocity, trusted=before.trusted)
-            if found[0].energy > before.energy - margin or self._unlikely(view, found[0]):
+            before = self.modes[0]
+            worse = found[0].energy > before.energy - 3 * self.settings.evidence_error
+            if worse or self._unlikely(view, found[0]):
                 found = self.modes  # nothing better: this is how it looks here now; search again later
                 self._since, self._wait = 0, min(2 * self._wait, LONGEST_WAIT)
-        self.modes = found
-        self._usual, self._energy = found[0].explained, found[0].accuracy
+            elif mixture.same(found[0].pose[None], before.pose)[0]:
+                found[0] = replace(found[0], age=before.age, velocity=before.velocity, trusted=before.trusted)
+            elif before.trusted:
+                found = [*self.modes, *found]
+        self.modes = self._weighed(found)
+        self._usual, self._energy = self.modes[0].explained, self.modes[0].accuracy
 
     def _unlikely(self, view: View, found: Mode) -> bool:
         """Elsewhere, though nothing contradicts the place that was tracked: a door has closed, a crowd has gathered."""
