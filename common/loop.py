@@ -67,7 +67,7 @@ class Loop:
         self.open()
         try:
             while not self._stopping and not self.begins():
-                self.inbox.get(min(0.5, HEALTH_PERIOD))
+                self.inbox.get(HEALTH_PERIOD / 2)
                 self._heart.beat({}, linked=self.bus.linked(), note="standing by")
             while not self._stopping:
                 self._turn()

@@ -1,4 +1,4 @@
-"""A world as data: walls and furniture in metres, free space, and exact ray distances."""
+"""A world as data: walls and furniture in metres, or a ROS map; free space, and exact ray distances."""
 
 from __future__ import annotations
 
@@ -10,82 +10,27 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
+from common import map_file, segment_rays
 from common.errors import UserError
+from common.furniture import Model, Number, Obstacle, Ring, check_ring
+from common.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 
 if TYPE_CHECKING:
     from common.se2 import Array
 
-FOLDER = Path(__file__).resolve().parent.parent / "worlds"
+__all__ = ["NOT_YAML", "Obstacle", "Start", "World", "known_worlds", "load_world", "save_world"]
 
-Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e5, le=1e5)]
-Length = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e5)]
-Point = tuple[Number, Number]
-Ring = Annotated[list[Point], Field(min_length=3, max_length=10_000)]
+FOLDER = Path(__file__).resolve().parent.parent / "worlds"
 
 # What safe_load raises: a date like 2020-13-45 is a ValueError, 20 000 opening brackets end the recursion.
 NOT_YAML = (yaml.YAMLError, ValueError, RecursionError)
 
-CIRCLE_SEGMENTS = 64  # a quarter circle in free space: 0.04 mm off at a radius of 0.5 m
+LOOKS = 50  # in vain, before a place on a grid is taken to be nowhere
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Box(_Model):
-    """A rectangle."""
-
-    center: Point  # m
-    size: tuple[Length, Length]  # m, along its own x and y
-    yaw_deg: Number = 0.0
-
-    def corners(self) -> Array:
-        """(4, 2) m, counter-clockwise."""
-        half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array(self.size) / 2
-        yaw = np.deg2rad(self.yaw_deg)
-        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-        return np.asarray(half @ turn.T + np.array(self.center))
-
-
-class Circle(_Model):
-    """A disc."""
-
-    center: Point  # m
-    radius: Length  # m
-
-
-class Obstacle(_Model):
-    """One piece of furniture: exactly one of polygon, box, circle."""
-
-    name: Annotated[str, Field(max_length=200)] = ""
-    polygon: Ring | None = None  # m, corners in order
-    box: Box | None = None
-    circle: Circle | None = None
-
-    @model_validator(mode="after")
-    def _one_shape(self) -> Obstacle:
-        if sum(shape is not None for shape in (self.polygon, self.box, self.circle)) != 1:
-            raise ValueError("an obstacle is exactly one of polygon, box, circle")
-        if self.polygon is not None:
-            _check_ring(self.polygon)
-        return self
-
-    def ring(self) -> Array | None:
-        """(V, 2) corners in m, or None for a circle."""
-        if self.polygon is not None:
-            return np.array(self.polygon)
-        return self.box.corners() if self.box is not None else None
-
-    def shape(self) -> shapely.Geometry:
-        """The area it covers."""
-        if self.circle is not None:
-            return shapely.Point(self.circle.center).buffer(self.circle.radius, quad_segs=CIRCLE_SEGMENTS)
-        return shapely.Polygon(self.ring())
-
-
-class Start(_Model):
+class Start(Model):
     """Where the robot stands at first."""
 
     x: Number  # m
@@ -93,24 +38,48 @@ class Start(_Model):
     yaw_deg: Number = 0.0
 
 
-class World(_Model):
-    """The boundary's inside, less the obstacles, is free."""
+class World(Model):
+    """The boundary's inside, less the obstacles, is free; with a grid, its free cells are, and its edge is no wall."""
 
     name: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[\w.-]+$")]
-    boundary: Ring  # m, the walls
-    obstacles: Annotated[list[Obstacle], Field(max_length=10_000)] = []
+    boundary: Ring  # m, the walls; with a grid its edge, which need not be given
+    obstacles: Annotated[list[Obstacle], Field(max_length=10_000)] = []  # noqa: RUF012 - pydantic copies it
     start: Start | None = None
+    # Left out where there is none, for those who know worlds without.
+    grid: Annotated[OccupancyGrid | None, Field(exclude_if=lambda grid: grid is None)] = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _grid_has_an_edge(cls, data: Any) -> Any:
+        if isinstance(data, dict) and data.get("grid") is not None and "boundary" not in data:
+            grid = OccupancyGrid.model_validate(data["grid"])
+            return {**data, "grid": grid, "boundary": grid.corners()}
+        return data
 
     @model_validator(mode="after")
     def _boundary_is_simple(self) -> World:
-        _check_ring(self.boundary)
+        check_ring(self.boundary)
+        if self.grid is not None and not (
+            len(self.boundary) == 4 and np.allclose(self.boundary, self.grid.corners(), rtol=0, atol=1e-6)
+        ):
+            raise ValueError("with a grid the boundary is the grid's edge: leave it out")
         return self
+
+    def with_obstacles(self, obstacles: list[Obstacle]) -> World:
+        """The same walls with other furniture; built anew, for a copy would keep the old geometry."""
+        return World(name=self.name, boundary=self.boundary, obstacles=obstacles, start=self.start, grid=self.grid)
 
     @functools.cached_property
     def segments(self) -> Array:
         """(S, 4) x0, y0, x1, y1 in m of every straight edge."""
-        rings = [np.array(self.boundary)] + [ring for o in self.obstacles if (ring := o.ring()) is not None]
-        return np.concatenate([np.hstack([ring, np.roll(ring, -1, axis=0)]) for ring in rings])
+        return self.outlines if self.grid is None else np.concatenate([self.grid.shapes.walls, self.outlines])
+
+    @functools.cached_property
+    def outlines(self) -> Array:
+        """(S, 4) those of `segments` that are not the grid's cells'."""
+        rings = [] if self.grid is not None else [np.array(self.boundary)]
+        rings += [ring for o in self.obstacles if (ring := o.ring()) is not None]
+        return np.concatenate([np.zeros((0, 4)), *(np.hstack([ring, np.roll(ring, -1, axis=0)]) for ring in rings)])
 
     @functools.cached_property
     def circles(self) -> Array:
@@ -118,9 +87,15 @@ class World(_Model):
         return np.array([[*o.circle.center, o.circle.radius] for o in self.obstacles if o.circle]).reshape(-1, 3)
 
     @functools.cached_property
+    def furniture(self) -> shapely.Geometry:
+        """What the obstacles cover."""
+        return shapely.union_all([o.shape() for o in self.obstacles])
+
+    @functools.cached_property
     def free_space(self) -> shapely.Geometry:
         """Where a point may be."""
-        return shapely.Polygon(self.boundary).difference(shapely.union_all([o.shape() for o in self.obstacles]))
+        room = shapely.Polygon(self.boundary) if self.grid is None else self.grid.shapes.free_space
+        return shapely.difference(room, self.furniture)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -135,71 +110,103 @@ class World(_Model):
         return np.array([(x0 + x1) / 2, (y0 + y1) / 2])
 
     def clearance(self, points: npt.ArrayLike) -> Array:
-        """(N,) m from points (N, 2) to the nearest wall or obstacle; negative inside one or outside the world."""
-        where = shapely.points(np.asarray(points, float).reshape(-1, 2))
-        distance = shapely.distance(where, shapely.boundary(self.free_space))
-        return np.where(shapely.contains(self.free_space, where), distance, -distance)
+        """(N,) m from points (N, 2) to the nearest place that is not free; negative where it is not free itself."""
+        points = np.asarray(points, float).reshape(-1, 2)
+        if self.grid is None:
+            return _signed(points, self.free_space)
+        return self._off_furniture(points, -self.grid.shapes.distance(FREE, points))
+
+    def clearances(self, x: Array, y: Array) -> Array:
+        """(len(y), len(x)) m: `clearance` of the nodes of a lattice in map, ascending."""
+        nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        if self.grid is None:
+            return self.clearance(nodes).reshape(len(y), len(x))
+        away = -self.grid.shapes.lattice(FREE, x, y)
+        return self._off_furniture(nodes, away.ravel()).reshape(len(y), len(x))
+
+    def surface_distances(self, x: Array, y: Array, most: float) -> Array:
+        """(len(y), len(x)) m to what a laser sees, at most ``most``; negative behind it. It sees no unknown cells."""
+        if self.grid is not None:
+            nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+            away = self._off_furniture(nodes, self.grid.shapes.lattice(OCCUPIED, x, y, most).ravel())
+            return np.clip(away, -most, most).reshape(len(y), len(x))
+        shapely.prepare(self.free_space)
+        columns = [_signed(np.column_stack([np.full(len(y), at), y]), self.free_space) for at in x]
+        return np.clip(np.stack(columns, axis=1), -most, most)
+
+    def _off_furniture(self, points: Array, away: Array) -> Array:
+        """(N,) ``away``, or what the obstacles leave of it."""
+        return np.minimum(away, -_signed(points, self.furniture)) if self.obstacles else away
 
     def sample_free(self, count: int, rng: np.random.Generator, clearance: float = 0.0) -> Array:
         """(count, 2) points uniform over free space, at least ``clearance`` m from everything.
 
         Raises UserError where there is no such place.
         """
+        if self.grid is not None:
+            return self._sample_cells(count, rng, clearance)
         x0, y0, x1, y1 = self.bounds
-        room = shapely.buffer(self.free_space, -clearance)
-        if room.is_empty:
-            raise UserError(f"world {self.name!r} has no place {clearance} m clear of everything")
+        room = self._room(clearance)
         found: list[Array] = []
         while sum(map(len, found)) < count:
             points = rng.uniform([x0, y0], [x1, y1], (max(count, 256), 2))
             found.append(points[shapely.contains(room, shapely.points(points)) & (self.clearance(points) >= clearance)])
         return np.concatenate(found)[:count]
 
+    def _sample_cells(self, count: int, rng: np.random.Generator, clearance: float) -> Array:
+        """`sample_free` on a grid: places in cells that may be far enough from everything, those that are."""
+        assert self.grid is not None  # noqa: S101 - asked for grids alone
+        shapes = self.grid.shapes
+        cells = shapes.roomy(clearance - self.grid.resolution)  # half a diagonal and more: no place is forgotten
+        found, left = [np.zeros((0, 2))], LOOKS
+        while left and len(cells) and sum(map(len, found)) < count:
+            chosen = rng.integers(len(cells), size=max(count, 256))
+            points = shapes.within(cells[chosen], rng.random((len(chosen), 2)))
+            found.append(points[self.clearance(points) >= clearance])
+            left = left if len(found[-1]) else left - 1
+        if sum(map(len, found)) < count:
+            raise self._no_room(clearance)
+        return np.concatenate(found)[:count]
+
+    def _no_room(self, clearance: float) -> UserError:
+        return UserError(f"world {self.name!r} has no place {clearance} m clear of everything")
+
     def start_pose(self, clearance: float) -> Array:
         """(3,) the start, or where none is stated the free place nearest the centre."""
         if self.start is not None:
             return np.array([self.start.x, self.start.y, np.deg2rad(self.start.yaw_deg)])
+        if self.grid is not None:
+            shapes = self.grid.shapes
+            places = shapes.within(shapes.roomy(clearance), 0.5)
+            places = places[self._off_furniture(places, np.full(len(places), np.inf)) >= clearance]
+            if not len(places):
+                raise self._no_room(clearance)
+            return np.array([*places[np.argmin(np.hypot(*(places - self.center()).T))], 0.0])
+        nearest = shapely.shortest_line(self._room(clearance), shapely.Point(self.center()))
+        return np.array([*shapely.get_coordinates(nearest)[0], 0.0])
+
+    def _room(self, clearance: float) -> shapely.Geometry:
+        """Where a point is so far from everything; raises UserError where that is nowhere."""
         room = shapely.buffer(self.free_space, -clearance)
         if room.is_empty:
-            raise UserError(f"world {self.name!r} has no place {clearance} m clear of everything")
-        nearest = shapely.shortest_line(room, shapely.Point(self.center()))
-        return np.array([*shapely.get_coordinates(nearest)[0], 0.0])
+            raise self._no_room(clearance)
+        return room
 
     def ray_distances(self, poses: npt.ArrayLike, angles: npt.ArrayLike) -> Array:
         """(N, B) m from scanner poses (N, 3) in map along ``angles`` (B,) in laser; +inf where nothing is hit.
 
-        Exact: rays against segments and circles, no grid.
+        Exact: rays against segments and circles, or against the very cells of a grid.
         """
         poses, angles = np.asarray(poses, float).reshape(-1, 3), np.asarray(angles, float)
-        # Blocks of about 20 MB keep the temporaries in memory that is already there.
-        block = max(1, 2_500_000 // (len(angles) * max(len(self.segments), 1)))
-        parts = [self._ray_block(poses[i : i + block], angles) for i in range(0, len(poses), block)]
-        return np.concatenate(parts) if parts else np.zeros((0, len(angles)))
-
-    def _ray_block(self, poses: Array, angles: Array) -> Array:
-        heading = poses[:, 2:3] + angles
-        dx, dy = np.cos(heading)[..., None], np.sin(heading)[..., None]  # (N, B, 1)
-        ax, ay = (self.segments[:, k] - poses[:, k : k + 1] for k in (0, 1))  # (N, S)
-        ex, ey = self.segments[:, 2] - self.segments[:, 0], self.segments[:, 3] - self.segments[:, 1]  # (S,)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            det = dx * ey - dy * ex
-            along = (ax * ey - ay * ex)[:, None, :] / det
-            u = (ax[:, None, :] * dy - ay[:, None, :] * dx) / det
-        hit = (along >= 0) & (u >= 0) & (u <= 1)
-        best = np.where(hit, along, np.inf).min(axis=-1)
-        for cx, cy, radius in self.circles:
-            px, py = cx - poses[:, 0:1], cy - poses[:, 1:2]  # (N, 1)
-            middle = px * dx[..., 0] + py * dy[..., 0]
-            under = middle**2 - (px**2 + py**2 - radius**2)
-            near = middle - np.sqrt(np.where(under >= 0, under, np.nan))
-            best = np.fmin(best, np.where(near >= 0, near, np.inf))
-        return np.asarray(best)
+        found = segment_rays.distances(self.outlines, self.circles, poses, angles)
+        return found if self.grid is None else np.minimum(found, self.grid.shapes.ray_distances(poses, angles))
 
 
-def _check_ring(ring: list[tuple[float, float]]) -> None:
-    polygon = shapely.Polygon(ring)
-    if not polygon.is_valid or polygon.area <= 0:
-        raise ValueError(f"the polygon is not simple: {shapely.is_valid_reason(polygon)}")
+def _signed(points: Array, area: shapely.Geometry) -> Array:
+    """(N,) m from points (N, 2) to the edge of an area; positive within it."""
+    where = shapely.points(points)
+    distance = shapely.distance(where, shapely.boundary(area))
+    return np.where(shapely.contains(area, where), distance, -distance)
 
 
 def known_worlds() -> list[str]:
@@ -208,11 +215,11 @@ def known_worlds() -> list[str]:
 
 
 def load_world(name: str) -> World:
-    """The shipped world of that name, or the world in that file; raises UserError saying what is wrong and where."""
+    """The shipped world of that name, or the world or ROS map in that file; UserError says what is wrong, and where."""
     path = FOLDER / f"{name}.yaml" if name in known_worlds() else Path(name)
     try:
         data: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return World.model_validate(data)
+        return World.model_validate(map_file.read_map(path, data) if map_file.is_map(data) else data)
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"no world {name!r}: give a file or one of {', '.join(known_worlds())}") from None
     except (OSError, UnicodeDecodeError) as error:

@@ -12,7 +12,16 @@ from pydantic import ValidationError
 
 from common.bus import DEFAULT_ENDPOINT
 from common.errors import UserError, first_fault
-from presage import cli_bench, cli_experiment, cli_inspect, cli_recording, cli_replay, cli_secure, cli_tools
+from presage import (
+    cli_bench,
+    cli_experiment,
+    cli_inspect,
+    cli_obstacle,
+    cli_recording,
+    cli_replay,
+    cli_secure,
+    cli_tools,
+)
 from presage.options import (
     Connect,
     EstimatorName,
@@ -20,10 +29,12 @@ from presage.options import (
     ModelName,
     OpenPage,
     People,
+    PeopleSpeed,
     Port,
     PriorName,
     RobotName,
     Seed,
+    StartPose,
     Viewer,
     WorldName,
     console,
@@ -58,6 +69,8 @@ def up(
     viewer: Viewer = True,
     open_page: OpenPage = False,
     people: People = 0,
+    people_speed: PeopleSpeed = 1.0,
+    start: StartPose = "",
     robots: Annotated[
         int, typer.Option(min=1, max=20, help="Several: ROBOT-1, ROBOT-2 ..., each simulated by itself, one estimator.")
     ] = 1,
@@ -67,7 +80,8 @@ def up(
     The page's link is printed; PRESAGE_VIEWER_PORT and PRESAGE_VIEWER_TOKEN choose its port and who may see it.
     Examples: `presage up`, then elsewhere `presage goal 15 1.5 --wait`; `presage up --estimator particle-filter`;
     `presage up --record recordings --seed 7`; `presage up --world my.yaml --port 7500`; `presage up --no-viewer`;
-    `presage up --world office --people 10`; `presage up --robots 3`, then `presage goal 15 1.5 --robot robot-2`.
+    `presage up --world office --people 10 --start 9,3.5,90`; `presage up --robots 3`, then
+    `presage goal 15 1.5 --robot robot-2`.
     """
     from presage.up import run_up  # noqa: PLC0415
 
@@ -84,7 +98,8 @@ def up(
         estimator=("--estimator", estimator, "--model", model, "--prior", prior),
         viewer=viewer,
         open_page=open_page,
-        people=people,
+        people=("--people", str(people), "--people-speed", str(people_speed)),
+        start=start,
         robots=robots,
     )
 
@@ -198,7 +213,8 @@ app.add_typer(cli_tools.app)
 app.add_typer(cli_bench.app, name="bench")
 app.add_typer(cli_experiment.app, name="experiment")
 app.add_typer(cli_secure.app, name="secure")
-cli_secure.with_security(app, cli_recording.app, cli_replay.app, cli_inspect.app, cli_tools.app)
+app.add_typer(cli_obstacle.app, name="obstacle")
+cli_secure.with_security(app, cli_recording.app, cli_replay.app, cli_inspect.app, cli_tools.app, cli_obstacle.app)
 
 
 def main() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import shapely
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -20,12 +19,12 @@ from common.messages import Goal, Scan
 from common.se2 import Array, compose
 from common.world import World
 from presage.inspection.gathering import Session, load_session
+from presage.map_drawing import draw_walls
 from presage.session import summary_of
 
 # Okabe and Ito: told apart by the colour-blind.
 TRUTH, BELIEF, MEASURED, GOAL = "#000000", "#D55E00", "#0072B2", "#009E73"
 WALL, FURNITURE, INK = "#8C8C8C", "#C8C8C8", "#555555"
-WALL_THICKNESS = 0.12  # m, as drawn
 MOST_TIES = 200  # lines between belief and truth
 SMALLEST = 1e-3  # m, the least error a logarithmic axis shows
 
@@ -93,9 +92,7 @@ def _dress(axes: Axes, letter: str, title: str) -> None:
 
 
 def _draw_world(axes: Axes, world: World) -> None:
-    outside = shapely.Polygon(world.boundary).buffer(WALL_THICKNESS, join_style="mitre")
-    axes.add_patch(Patch(shapely.get_coordinates(outside.exterior), facecolor=WALL, edgecolor="none", zorder=0.1))
-    axes.add_patch(Patch(world.boundary, closed=True, facecolor="white", edgecolor="none", zorder=0.2))
+    draw_walls(axes, world, WALL)
     for obstacle in world.obstacles:
         style = {"facecolor": FURNITURE, "edgecolor": WALL, "linewidth": 0.8, "zorder": 1.0}
         if obstacle.circle is not None:

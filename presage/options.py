@@ -39,6 +39,13 @@ PriorName = Annotated[str, typer.Option(help="Of motion between scans: motion (s
 People = Annotated[
     int, typer.Option(min=0, max=100, envvar="PRESAGE_PEOPLE", help="How many walk about, unknown to the map.")
 ]
+PeopleSpeed = Annotated[
+    float, typer.Option(min=0.0, max=3.0, envvar="PRESAGE_PEOPLE_SPEED", help="Of their walk, m/s.")
+]
+StartPose = Annotated[
+    str,
+    typer.Option(envvar="PRESAGE_START", help="Where the robot stands at first: x,y[,yaw_deg]; none: the world's own."),
+]
 Viewer = Annotated[bool, typer.Option(help="Serve the live page.")]
 OpenPage = Annotated[bool, typer.Option("--open/--no-open", help="Open the page, where there is a display.")]
 

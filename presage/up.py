@@ -31,7 +31,8 @@ def run_up(
     estimator: tuple[str, ...] = (),
     viewer: bool = True,
     open_page: bool = False,
-    people: int = 0,
+    people: tuple[str, ...] = (),
+    start: str = "",
     robots: int = 1,
 ) -> None:
     """Start, wait until all are alive, say what can be done, and watch; a service that ends is named, not restarted."""
@@ -51,7 +52,7 @@ def run_up(
         stack.start("controller", *driving)
         waits = ",".join(sorted(set(stack.processes) - {"router", "viewer"}))
         simulator = ["--world", world, "--beams", str(beams), "--drive", drive, "--pace", pace]
-        simulator += ["--people", str(people), *(["--wait-for", waits] if pace != "realtime" else [])]
+        simulator += [*people, "--start", start, *(["--wait-for", waits] if pace != "realtime" else [])]
         stack.start("simulator", *simulator, "--seed", str(seed))
         for k, name in enumerate(names[1:], 1):  # each in a simulation of its own
             stack.start_as(f"controller-{k + 1}", "controller", name, *driving)

@@ -14,6 +14,7 @@ from matplotlib.ticker import FuncFormatter
 
 from common.se2 import Array
 from common.world import World
+from presage.map_drawing import draw_cells
 
 # Okabe and Ito; the same in every figure. Green is the paper's for the distance to the goal.
 COLOURS = {
@@ -84,7 +85,10 @@ def held(rows: Sequence[Sequence[float]], length: int) -> Array:
 
 def world_map(axes: Axes, world: World) -> None:
     """Walls and furniture, m."""
-    axes.add_patch(Polygon(np.array(world.boundary), fill=False, edgecolor="black", linewidth=1.2))
+    if world.grid is not None:
+        draw_cells(axes, world.grid, "black")
+    else:
+        axes.add_patch(Polygon(np.array(world.boundary), fill=False, edgecolor="black", linewidth=1.2))
     for obstacle in world.obstacles:
         outline = shapely.get_coordinates(obstacle.shape())
         axes.add_patch(Polygon(outline, facecolor="#BBBBBB", edgecolor="black", linewidth=0.6))

@@ -62,7 +62,9 @@ def read(path: Path) -> dict[str, Any]:
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError:
-        raise UserError(f"{path}: no such result; make it with: presage experiment {path.stem}") from None
+        raise UserError(
+            f"{path}: no such result; make it with: presage experiment {path.stem.split('-')[0]} (its --help says how)"
+        ) from None
     except ValueError as error:
         raise UserError(f"{path}: not a result of `presage experiment` ({error})") from None
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+import numpy.typing as npt
 import shapely
 from foxglove_schemas_protobuf.ArrowPrimitive_pb2 import ArrowPrimitive
 from foxglove_schemas_protobuf.Color_pb2 import Color
@@ -29,6 +30,8 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from common.messages import Belief, Hypothesis, Prediction, Scan
+from common.occupancy_grid import FREE as FREE_CELL
+from common.occupancy_grid import OCCUPIED as OCCUPIED_CELL
 from common.se2 import Array
 from common.world import World
 
@@ -156,7 +159,12 @@ def path_entity(name: str, path: Array, rgb: Sequence[float], ns: int) -> SceneE
 def world_entities(world: World, ns: int) -> list[SceneEntity]:
     """Walls and furniture in map; their visible faces stand where the world says."""
     walls = SceneEntity(timestamp=time_of(ns), frame_id="map", id="walls", frame_locked=True)
-    walls.cubes.extend(_slabs(np.array(world.boundary), WALL, outside=True))
+    if world.grid is None:
+        walls.cubes.extend(_slabs(np.array(world.boundary), WALL, outside=True))
+    else:  # thousands of faces: the top edges, as one shape
+        edges = line(world.grid.shapes.walls.reshape(-1, 2), WALL, z=WALL_HEIGHT)
+        edges.type = LinePrimitive.LINE_LIST
+        walls.lines.append(edges)
     found = [walls]
     for number, obstacle in enumerate(world.obstacles):
         name = f"obstacle {number} {obstacle.name}".rstrip()
@@ -193,6 +201,17 @@ def _slabs(ring: Array, rgb: Sequence[float], *, outside: bool) -> list[CubePrim
     return found
 
 
+def _cells(world: World, x: Array, y: Array, cell: float) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """Which places x, y (rows, columns) m are free, and which are drawn as walls and furniture."""
+    if world.grid is not None:
+        kinds = world.grid.at(np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(x.shape)
+        covered = shapely.contains_xy(world.furniture, x, y)
+        return (kinds == FREE_CELL) & ~covered, (kinds == OCCUPIED_CELL) | covered
+    free = shapely.contains_xy(world.free_space, x, y)
+    around = shapely.Polygon(world.boundary).buffer(1.5 * cell, join_style="mitre")
+    return free, shapely.contains_xy(around, x, y) & ~free
+
+
 def grid(world: World, ns: int) -> Grid:
     """The map: red, green, blue, alpha and occupancy (0 free, 100 occupied, 255 outside: unknown), a byte each."""
     x0, y0, x1, y1 = world.bounds
@@ -200,8 +219,7 @@ def grid(world: World, ns: int) -> Grid:
     x0, y0 = x0 - 2 * cell, y0 - 2 * cell
     columns, rows = int(np.ceil((x1 - x0) / cell)) + 2, int(np.ceil((y1 - y0) / cell)) + 2
     x, y = np.meshgrid(x0 + cell * (np.arange(columns) + 0.5), y0 + cell * (np.arange(rows) + 0.5))
-    free = shapely.contains_xy(world.free_space, x, y)
-    wall = shapely.contains_xy(shapely.Polygon(world.boundary).buffer(1.5 * cell, join_style="mitre"), x, y) & ~free
+    free, wall = _cells(world, x, y, cell)
     data = np.zeros((rows, columns, 5), np.uint8)
     data[..., 4] = 255
     data[free], data[wall] = (*FREE, 0), (*OCCUPIED, 100)

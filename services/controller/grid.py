@@ -81,7 +81,8 @@ class FreeSpace:
     def of(cls, world: World, resolution: float = RESOLUTION) -> FreeSpace:
         """Of a world, exactly at the cells' centres."""
         grid = Grid.over(world, resolution)
-        return cls(grid, world.clearance(grid.centres()).reshape(grid.shape))
+        middles = grid.centres().reshape(*grid.shape, 2)
+        return cls(grid, world.clearances(middles[0, :, 0], middles[:, 0, 1]))
 
     def clear(self, points: Array) -> Array:
         """(...,) m from points (..., 2) to the nearest wall, interpolated."""

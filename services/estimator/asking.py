@@ -60,14 +60,7 @@ class Conversing(Protocol):
 
 def alone(conversation: Conversation[T]) -> T:
     """Its result, every question answered at once."""
-    answer: Any = None
-    while True:
-        try:
-            question = conversation.send(answer)
-        except StopIteration as end:
-            result: T = end.value
-            return result
-        answer = None if isinstance(question, Search) else question.answer()
+    return without_pause(in_pieces(conversation, None))
 
 
 def without_pause(pieces: Pieces[T]) -> T:
@@ -80,8 +73,8 @@ def without_pause(pieces: Pieces[T]) -> T:
             return result
 
 
-def in_pieces(conversation: Conversation[T], beams: int) -> Pieces[T]:
-    """The same with a pause after about every so many beams; the conversation may have begun."""
+def in_pieces(conversation: Conversation[T], beams: int | None) -> Pieces[T]:
+    """The same with a pause after about every so many beams, or none; the conversation may have begun."""
     answer: Any = None
     while True:
         try:
@@ -91,6 +84,8 @@ def in_pieces(conversation: Conversation[T], beams: int) -> Pieces[T]:
             return result
         if isinstance(question, Search):
             answer = None
-            continue
-        answer = yield from question.in_pieces(beams)
-        yield
+        elif beams is None:
+            answer = question.answer()
+        else:
+            answer = yield from question.in_pieces(beams)
+            yield

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from services.estimator import kernels
+from services.estimator import cell_kernels, kernels
 
 if TYPE_CHECKING:
     from common.se2 import Array
@@ -66,7 +66,13 @@ class RayCaster:
         lasers, angles = np.asarray(lasers, float).reshape(-1, 3), np.asarray(angles, float)
         shape = (len(lasers), len(angles))
         ranges, jacobian = np.empty(shape), np.empty((*shape, 3))
-        kernels.cast(self.world.segments, self.world.circles, lasers, angles, ranges, jacobian)
+        world = self.world
+        kernels.cast(world.outlines, world.circles, lasers, angles, ranges, jacobian)
+        if (grid := world.grid) is not None:
+            rays, size = grid.shapes.rays, grid.resolution
+            first = grid.to_map(np.array([-size, -size]))  # rays have a frame of empty cells around the map
+            frame = np.array([*first, grid.origin[2], size])
+            cell_kernels.cast_cells(rays.occupied, rays.clear, frame, lasers, angles, ranges, jacobian)
         return Expected(ranges, np.full(shape, EXACT_SCALE), jacobian)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pybullet
 
 from common import se2
@@ -17,6 +18,8 @@ SUBSTEP = 1 / 240  # s
 LASER_HEIGHT = 0.1  # m
 WALL_HEIGHT = 0.5  # m, from below the floor, so that no ray sees an edge
 CIRCLE_CORNERS = 360  # 0.02 mm off at a radius of 0.5 m
+TILE = 10.0  # m; walls of one tile are in one body where they can be
+WALLS_A_BODY = 8000  # pybullet takes meshes of up to 131 072 points
 END = 0.1  # m, length of a wall's first and last piece
 RAYS_A_CALL = 16_000  # pybullet takes 16 384
 MOTOR_FORCE = (300.0, 300.0, 100.0)  # N, N, N m: ten times what the limits of acceleration need
@@ -40,7 +43,10 @@ class Physics:
             p.setCollisionFilterGroupMask(self.body, link, ROBOT_GROUP, touches, physicsClientId=self.client)
         self.shapes: dict[str, int] = {}
         self.people: list[int] = []
-        self._add_ring("boundary", np.array(world.boundary))
+        if world.grid is None:
+            self._add_ring("boundary", np.array(world.boundary))
+        else:
+            self._add_walls(world.grid.shapes.walls)
         self.place(pose)
 
     def close(self) -> None:
@@ -78,18 +84,36 @@ class Physics:
 
     def _add_ring(self, name: str, ring: Array) -> None:
         """Walls along a closed ring (V, 2) m."""
-        body = pybullet.createMultiBody(0, self._shape(ring), physicsClientId=self.client)
+        self.shapes[name] = self._body(self._shape(ring))
+
+    def _add_walls(self, segments: Array) -> None:
+        """Walls along (S, 4) x0, y0, x1, y1 m, which stay: some bodies, each of those near each other."""
+        pieces = _split_ends(segments)
+        tile = np.floor((pieces[:, :2] + pieces[:, 2:]) / 2 / TILE)
+        pieces = pieces[np.lexsort((tile[:, 0], tile[:, 1]))]
+        for begin in range(0, len(pieces), WALLS_A_BODY):
+            part = pieces[begin : begin + WALLS_A_BODY]
+            points, first = part.reshape(-1, 2), 2 * np.arange(len(part))
+            self._body(self._mesh(points, np.stack([first, first + 1], axis=-1)))
+
+    def _body(self, shape: int) -> int:
+        body: int = pybullet.createMultiBody(0, shape, physicsClientId=self.client)
         pybullet.setCollisionFilterGroupMask(
             body, -1, WORLD_GROUP, WORLD_GROUP | ROBOT_GROUP, physicsClientId=self.client
         )
-        self.shapes[name] = body
+        return body
 
     def _shape(self, ring: Array) -> int:
         """A closed ring (V, 2) m as triangles: rays and contacts are exact, concave rings too."""
         ring = _with_short_ends(ring)
-        count = len(ring)
-        low, high = (np.column_stack([ring, np.full(count, z)]) for z in (-WALL_HEIGHT, WALL_HEIGHT))
-        i, j = np.arange(count), np.roll(np.arange(count), -1)
+        number = np.arange(len(ring))
+        return self._mesh(ring, np.stack([number, np.roll(number, -1)], axis=-1))
+
+    def _mesh(self, points: Array, ends: npt.NDArray[np.int_]) -> int:
+        """Upright walls between points (V, 2) m of those numbers (W, 2)."""
+        count = len(points)
+        low, high = (np.column_stack([points, np.full(count, z)]) for z in (-WALL_HEIGHT, WALL_HEIGHT))
+        i, j = ends.T
         walls = np.concatenate([np.stack([i, j, j + count], -1), np.stack([i, j + count, i + count], -1)])
         shape: int = pybullet.createCollisionShape(
             pybullet.GEOM_MESH,
@@ -174,3 +198,15 @@ def _with_short_ends(ring: Array) -> Array:
         if length > 3 * END:
             points += [a + (b - a) * END / length, b - (b - a) * END / length]
     return np.array(points)
+
+
+def _split_ends(segments: Array) -> Array:
+    """(T, 4): `_with_short_ends` for segments (S, 4) m of their own."""
+    along = segments[:, 2:] - segments[:, :2]
+    length = np.hypot(*along.T)[:, None]
+    longer = length[:, 0] > 3 * END
+    first = (segments[:, :2] + along * END / length)[longer]
+    last = (segments[:, 2:] - along * END / length)[longer]
+    ends = segments[longer]
+    pieces = (np.hstack([ends[:, :2], first]), np.hstack([first, last]), np.hstack([last, ends[:, 2:]]))
+    return np.concatenate([segments[~longer], *pieces])

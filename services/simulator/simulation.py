@@ -237,7 +237,7 @@ class Simulation:
             obstacle = obstacle.model_copy(update={"name": name})
             kept.append(obstacle)
         # Built anew, for a copy would keep the old world's cached geometry; first, for it may refuse.
-        world = World(name=self.world.name, boundary=self.world.boundary, obstacles=kept, start=self.world.start)
+        world = self.world.with_obstacles(kept)
         self._make_room(self.physics.pose(), world)
         if action != "add":
             self.physics.remove(name)
@@ -264,4 +264,4 @@ def _named(world: World) -> World:
         )
     free = (name for number in itertools.count() if (name := f"obstacle-{number}") not in taken)
     named = [o if o.name else o.model_copy(update={"name": next(free)}) for o in world.obstacles]
-    return World(name=world.name, boundary=world.boundary, obstacles=named, start=world.start)
+    return world.with_obstacles(named)

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from common.messages import Belief, CmdVel, Health, Pose, Scan, TopicHealth, Twist
 from common.topics import BELIEF, CMD_VEL, HEALTH, SCAN
-from presage.health_board import KEPT, MOST, SILENT, Board
+from presage.health_board import BREATH, KEPT, MOST, SILENT, Board
 from presage.top import tables
 
 MS = 1_000_000

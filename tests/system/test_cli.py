@@ -27,6 +27,8 @@ WRONG = [
     (("goal", "1", "2", "--wiat"), "--wiat"),
     (("teleport", "inf", "1"), "inf 1 90: a place is finite numbers"),
     (("teleport", "-1", "-1.5", "-90", *NOWHERE), "start a session"),
+    (("obstacle", "add", "crate", "-1", "2", "--radius", "-1"), "the obstacle: circle.radius"),
+    (("obstacle", "add", "crate", "1", "2", *NOWHERE), "start a session"),
     (("localise", "nan", "1"), "a place is finite numbers"),
     (("localise", "-1", "-.5", *NOWHERE), "start a session"),
     (("localise", "1"), "a position is two numbers"),
@@ -135,6 +137,12 @@ def test_tools_on_a_running_session(process, bus, link):
     status, text = run("teleport", "0.1", "0.1")
     assert status == 2
     assert "from a wall of 'corridor'" in text
+    assert run("obstacle", "add", "crate", "12", "1.5", "--yaw", "30")[0] == 0
+    assert run("obstacle", "move", "crate", "13", "1.5", "--radius", "0.2")[0] == 0
+    status, text = run("obstacle", "add", "crate", "13", "1.5")
+    assert status == 2
+    assert "already an obstacle 'crate'" in text
+    assert run("obstacle", "remove", "crate")[0] == 0
     status, text = run("goal", "0.1", "0.1")
     assert status == 2
     assert "the nearest place that can be reached is" in text

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import shapely
 
 from common.errors import UserError
 
@@ -44,13 +43,7 @@ class DistanceField:
             )
         x = self.origin[0] + resolution * np.arange(self.shape[0])
         y = self.origin[1] + resolution * np.arange(self.shape[1])
-        surface, free = shapely.boundary(world.free_space), world.free_space
-        shapely.prepare(free)
-        nodes = np.empty(self.shape)
-        for i, xi in enumerate(x):
-            column = np.full(len(y), xi)
-            distance = np.minimum(shapely.distance(shapely.points(column, y), surface), max_dist)
-            nodes[i] = np.where(shapely.contains_xy(free, column, y), distance, -distance)
+        nodes = world.surface_distances(x, y, max_dist).T
         # d = a + b u + c v + e u v in a cell, u and v in [0, 1): four numbers side by side are one access to memory.
         a, right, up, both = nodes[:-1, :-1], nodes[1:, :-1], nodes[:-1, 1:], nodes[1:, 1:]
         self._cells: Single = np.stack([a, right - a, up - a, both - right - up + a], -1).astype(np.float32)

@@ -1,5 +1,6 @@
 // Walls, furniture, grid and scale: what holds still.
 
+import { drawFreeCells, drawOccupiedCells } from "./draw_grid.js";
 import { boundsOf, middle, ring } from "./geometry.js";
 
 /** A path of world points, closed. */
@@ -8,15 +9,16 @@ function trace(ctx, camera, points) {
   ctx.closePath();
 }
 
-/** The free floor with a grid of metres, clipped to the walls. */
-export function drawFloor(ctx, camera, world, colours) {
+/** The free floor with a grid of metres, clipped to the walls; `ready` is called when a ROS map's cells are there. */
+export function drawFloor(ctx, camera, world, colours, ready) {
   const step = [0.5, 1, 5, 10, 50].find((s) => s * camera.scale >= 26) ?? 100;
   ctx.save();
   ctx.beginPath();
   trace(ctx, camera, world.boundary);
   ctx.fillStyle = colours.free;
-  ctx.fill();
+  if (!world.grid) ctx.fill();
   ctx.clip();
+  if (world.grid) drawFreeCells(ctx, camera, world.grid, colours, ready);
   const [x0, y0, x1, y1] = boundsOf(world.boundary);
   ctx.beginPath();
   for (let x = Math.ceil(x0 / step) * step; x < x1; x += step) line(ctx, camera.toScreen(x, y0), camera.toScreen(x, y1));
@@ -33,13 +35,15 @@ function line(ctx, [ax, ay], [bx, by]) {
 }
 
 /** Walls and obstacles; `ghost` stands in for the obstacle of its name while it is dragged. */
-export function drawWalls(ctx, camera, world, colours, { selected, hovered, ghost }) {
+export function drawWalls(ctx, camera, world, colours, { selected, hovered, ghost }, ready) {
+  if (world.grid) drawOccupiedCells(ctx, camera, world.grid, colours, ready);
   for (const obstacle of world.obstacles) {
     drawObstacle(ctx, camera, ghost?.name && ghost.name === obstacle.name ? ghost : obstacle, colours, {
       selected: selected === obstacle.name && selected !== "",
       hovered: hovered === obstacle.name && hovered !== "",
     });
   }
+  if (world.grid) return; // its edge is no wall
   ctx.beginPath();
   trace(ctx, camera, world.boundary);
   ctx.strokeStyle = colours.wall;

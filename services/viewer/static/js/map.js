@@ -120,13 +120,13 @@ export class MapView {
     ctx.fillRect(0, 0, width, height);
     ctx.globalAlpha = store.connected ? 1 : 0.45;
     if (world) {
-      ground.drawFloor(ctx, camera, world, colours);
+      ground.drawFloor(ctx, camera, world, colours, () => this.invalidate());
       if (store.prior && shown.field) drawField(ctx, camera, store.prior, colours);
       ground.drawRulers(ctx, camera, world, colours);
     }
     const pose = frame ? scan.scannerPose(frame) : null;
     if (pose && shown.measured) scan.drawFan(ctx, camera, frame, pose, colours);
-    if (world) ground.drawWalls(ctx, camera, world, colours, gesture);
+    if (world) ground.drawWalls(ctx, camera, world, colours, gesture, () => this.invalidate());
     if (frame) this.drawRobot(ctx, frame, pose, colours);
     this.drawGesture(ctx, colours);
     ctx.globalAlpha = 1;
