@@ -27,14 +27,16 @@ class Stamped(Message):
 class Scan(Stamped):
     """One sweep of the scanner (sensor_msgs/LaserScan)."""
 
-    angle_min: Finite  # rad, first beam, laser
-    angle_increment: Finite  # rad, between beams
+    angle_min: Finite  # rad, first beam, laser: counter-clockwise seen from above, however the scanner is mounted
+    angle_increment: Finite  # rad, between beams; negative: they run clockwise, as of a scanner mounted upside down
     range_min: NotNegative  # m
     range_max: Positive  # m
     ranges: Ranges  # (B,) m; +inf no return, -inf too close (REP-117)
     mount: Pose = Pose(x=0.0, y=0.0)  # the scanner's pose in base_link
     scan_time: NotNegative = 0.0  # s, between scans
     frame_id: Name = "laser"
+    sigma: NotNegative = 0.0  # m, standard deviation of a range; 0 with the next: not stated
+    sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.0  # the part that grows with the range, in quadrature
 
     def angles(self) -> npt.NDArray[np.float64]:
         """(B,) rad, beam directions in laser."""

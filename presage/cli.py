@@ -12,10 +12,12 @@ from pydantic import ValidationError
 
 from common.bus import DEFAULT_ENDPOINT
 from common.errors import UserError, first_fault
+from common.scanner_choice import chosen_scanner, scanner_arguments
 from presage import (
     cli_bench,
     cli_experiment,
     cli_inspect,
+    cli_logs,
     cli_obstacle,
     cli_recording,
     cli_replay,
@@ -23,22 +25,25 @@ from presage import (
     cli_tools,
 )
 from presage.options import (
+    Beams,
     Connect,
     EstimatorName,
     Json,
     ModelName,
+    MountText,
     OpenPage,
     People,
     PeopleSpeed,
     Port,
     PriorName,
     RobotName,
+    ScannerName,
     Seed,
     StartPose,
+    UpsideDown,
     Viewer,
     WorldName,
     console,
-    err_console,
     link_of,
 )
 from presage.output import make_folder
@@ -56,7 +61,7 @@ app = typer.Typer(
 @app.command()
 def up(
     world: WorldName = "corridor",
-    beams: Annotated[int, typer.Option(help="Beams of the scanner; 622 are the paper's.")] = 811,
+    beams: Beams = None,
     drive: Annotated[str, typer.Option(help="holonomic or differential.")] = "holonomic",
     pace: Annotated[str, typer.Option(help="realtime, fast or lockstep.")] = "realtime",
     seed: Seed = 0,
@@ -74,6 +79,9 @@ def up(
     robots: Annotated[
         int, typer.Option(min=1, max=20, help="Several: ROBOT-1, ROBOT-2 ..., each simulated by itself, one estimator.")
     ] = 1,
+    scanner: ScannerName = "tim571",
+    mount: MountText = "",
+    upside_down: UpsideDown = False,
 ) -> None:
     """Start router, simulator, estimator, controller and the live page here, until Ctrl-C.
 
@@ -81,13 +89,14 @@ def up(
     Examples: `presage up`, then elsewhere `presage goal 15 1.5 --wait`; `presage up --estimator particle-filter`;
     `presage up --record recordings --seed 7`; `presage up --world my.yaml --port 7500`; `presage up --no-viewer`;
     `presage up --world office --people 10 --start 9,3.5,90`; `presage up --robots 3`, then
-    `presage goal 15 1.5 --robot robot-2`.
+    `presage goal 15 1.5 --robot robot-2`;
+    `presage up --scanner rplidar-a1 --mount -0.1,0,180 --upside-down`; `presage up --scanner my-laser.yaml`.
     """
     from presage.up import run_up  # noqa: PLC0415
 
     run_up(
         world=world,
-        beams=beams,
+        scanner=scanner_arguments(scanner, beams, mount, upside_down=upside_down),
         drive=drive,
         pace=pace,
         seed=seed,
@@ -134,45 +143,12 @@ def demo(
 
 
 @app.command()
-def localize(
-    file: Annotated[Path, typer.Argument(help=".npz (ranges, angles, range_max) or a recording (.mcap).")],
-    world: Annotated[str, typer.Option(help="A shipped world or a world file; none: the recording's.")] = "",
-    estimator: EstimatorName = "precise",
-    model: ModelName = "learned",
-    models: Annotated[Path | None, typer.Option(help="Folder of weights; none: the shipped ones.")] = None,
-    out: Annotated[Path | None, typer.Option(help="NAME.csv or NAME.json; none: CSV to standard output.")] = None,
-    frame: Annotated[
-        str, typer.Option(help="base_link or laser: whose pose; of an .npz also its own poses'.")
-    ] = "base_link",
-    mount: Annotated[str, typer.Option(help="Of an .npz's laser in base_link: x,y,yaw_deg (m, m, deg).")] = "0.2,0,0",
-    mode: Annotated[str, typer.Option(help="global: nothing is known; track: from initial_pose.")] = "global",
-    fresh: Annotated[bool, typer.Option("--fresh", help="Each scan on its own.")] = False,
-    odometry: Annotated[bool, typer.Option(help="Use the file's odometry, where there is any.")] = True,
-    initial_pose: Annotated[str, typer.Option(help="x,y,yaw_deg; for mode track.")] = "",
-    sigma: Annotated[float, typer.Option(min=1e-4, max=10, help="The scanner's noise, m.")] = 0.02,
-    seed: Seed = 0,
-) -> None:
-    """Run an estimator over a file of scans, as fast as it goes; one row a scan.
-
-    Columns: stamp (s), x, y (m), yaw (rad), covariance (cov_xx ... cov_yawyaw), free_energy (nats), state, update_ms.
-    Examples: `presage localize scans.npz --world office --out poses.csv`;
-    `presage localize run.mcap --estimator particle-filter --out poses.json`;
-    `presage localize scans.npz --world office --fresh --frame laser`.
-    """
-    from presage.localize import Job, choice_of  # noqa: PLC0415
-    from presage.localize import localize as run  # noqa: PLC0415
-
-    choice = choice_of(file, world, estimator, model, models, sigma, seed, initial_pose)
-    run(Job.of(file, choice, mode, frame, mount, fresh=fresh, odometry=odometry, out=out), err_console)
-
-
-@app.command()
 def train(
     world: WorldName = "corridor",
     preset: Annotated[str, typer.Option(help="precise or paper.")] = "precise",
-    scanner: Annotated[str, typer.Option(help="A known scanner.")] = "tim571",
+    scanner: ScannerName = "tim571",
     out: Annotated[Path | None, typer.Option(help="Folder for weights and card; none: where services look.")] = None,
-    beams: Annotated[int | None, typer.Option(min=2, help="Instead of the scanner's own number.")] = None,
+    beams: Beams = None,
     samples: Annotated[int | None, typer.Option(min=10, help="none: 5000, paper 13000.")] = None,
     resolution: Annotated[float, typer.Option(min=0.005, max=1.0, help="precise: m between nodes.")] = 0.04,
     epochs: Annotated[int, typer.Option(min=1, help="paper.")] = 60,
@@ -181,12 +157,15 @@ def train(
     seed: Seed = 0,
     robot: RobotName = "robot",
     connect: Connect = DEFAULT_ENDPOINT,
+    mount: MountText = "",
+    upside_down: UpsideDown = False,
 ) -> None:
     """Learn to predict a scanner in a world.
 
     Samples come from the scanner on the bus where it is in this world, else from a simulator of its own. An interrupted
     run of preset paper is taken up again by the same command.
-    Examples: `presage train --world my.yaml`; `presage train --world corridor --preset paper --beams 622 --out mine`.
+    Examples: `presage train --world my.yaml`; `presage train --world corridor --preset paper --beams 622 --out mine`;
+    `presage train --world my.yaml --scanner my-laser.yaml --mount 0.1,0,0`.
     """
     from presage import train as paper  # noqa: PLC0415
     from presage import train_precise as precise  # noqa: PLC0415
@@ -195,13 +174,15 @@ def train(
     from services.estimator.training import Recipe as PaperRecipe  # noqa: PLC0415
 
     link, folder = link_of(connect, robot), out or FOLDER
+    asked = scanner_arguments(scanner, beams, mount, upside_down=upside_down)
+    chosen = chosen_scanner(scanner, beams, mount=mount, upside_down=upside_down or None)
     make_folder(folder, "--out")
     if preset == "precise":
         recipe = Recipe(resolution=resolution, seed=seed)
-        precise.train_precise(precise.Job(world, scanner, beams, folder, samples or 5000, recipe), link, console)
+        precise.train_precise(precise.Job(world, chosen, asked, folder, samples or 5000, recipe), link, console)
     elif preset == "paper":
         descent = PaperRecipe(epochs=epochs, batch=batch, learning_rate=learning_rate, seed=seed)
-        paper.train(paper.Job(world, preset, scanner, beams, folder, samples or 13_000, descent), link, console)
+        paper.train(paper.Job(world, preset, chosen, asked, folder, samples or 13_000, descent), link, console)
     else:
         raise UserError(f"no preset {preset!r}: choose precise or paper")
 
@@ -209,6 +190,7 @@ def train(
 app.add_typer(cli_recording.app)
 app.add_typer(cli_replay.app)
 app.add_typer(cli_inspect.app)
+app.add_typer(cli_logs.app)
 app.add_typer(cli_tools.app)
 app.add_typer(cli_bench.app, name="bench")
 app.add_typer(cli_experiment.app, name="experiment")

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from common.scanner import SCANNERS
 from presage.cli_secure import secured
 from presage.options import Json, WorldName, console
 
@@ -82,7 +83,9 @@ def bench_localisation(
 @app.command("accuracy")
 def bench_accuracy(
     worlds: Annotated[str, typer.Option(help="Comma-separated.")] = "office",
-    beams: Annotated[str, typer.Option(help="Comma-separated.")] = "622",
+    beams: Annotated[
+        str, typer.Option(help="Comma-separated; none: the scanner's own, of tim571 the paper's 622.")
+    ] = "",
     estimators: Annotated[
         str, typer.Option(help="Of precise, precise-exact, particle-filter, amcl-defaults.")
     ] = "precise,precise-exact,particle-filter",
@@ -90,24 +93,32 @@ def bench_accuracy(
         str, typer.Option(help="Of standing, blocked, kidnapped, tracking, odometry, twins; empty: all.")
     ] = "",
     trials: Annotated[int, typer.Option(min=2, help="Places of each task.")] = 100,
-    minutes: Annotated[float, typer.Option(min=0.05, help="Of each path that is tracked, at 15 Hz.")] = 2.0,
+    minutes: Annotated[
+        float, typer.Option(min=0.05, help="Of each path that is tracked, at the scanner's rate.")
+    ] = 2.0,
     seed: Annotated[int, typer.Option(min=0, max=2**31)] = 1,
     workers: Annotated[int, typer.Option(min=1, help="Processes side by side.")] = 2,
     json_file: Json = None,
     figure: Annotated[Path | None, typer.Option(help="PNG, SVG or PDF.")] = None,
     markdown: Annotated[bool, typer.Option("--markdown", help="A short table as in README.")] = False,
+    scanner: Annotated[
+        str, typer.Option(help=f"Of {', '.join(SCANNERS)}, or files (docs/scanners.md); comma-separated.")
+    ] = "tim571",
 ) -> None:
     """Estimators and the Cramér-Rao bound side by side: from nothing, tracking, kidnapped, blocked, two rooms alike.
 
     Examples: `presage bench accuracy --trials 20 --minutes 0.5`;
     `presage bench accuracy --tasks standing --trials 1000 --estimators precise`;
-    `presage bench accuracy --worlds office,corridor,maze --beams 622,811 --json accuracy.json --figure accuracy.png`.
+    `presage bench accuracy --worlds office,corridor,maze --beams 622,811 --json accuracy.json --figure accuracy.png`;
+    `presage bench accuracy --scanner lms200,rplidar-a1 --tasks standing,tracking --markdown`.
     """
     from presage.accuracy.report import bench_accuracy as run  # noqa: PLC0415
+    from presage.accuracy.report import scanners_of  # noqa: PLC0415
 
     code = run(
-        worlds, beams, estimators, tasks, trials, minutes, seed, workers, json_file, figure, console, markdown=markdown
-    )
+        worlds, scanners_of(scanner, beams), estimators, tasks, trials, minutes, seed, workers, json_file, figure,
+        console, markdown=markdown,
+    )  # fmt: skip
     raise typer.Exit(code)
 
 

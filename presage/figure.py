@@ -183,7 +183,7 @@ def _draw_scan(axes: Axes, session: Session) -> None:
         axes.fill_between(angles, low, high, color=BELIEF, alpha=0.2, lw=0, label="± 2σ")
     _dress(axes, "b", f"scan and prediction at {scan.stamp_ns * 1e-9:.1f} s")
     axes.set(xlabel="beam angle (deg)", ylabel="range (m)", ylim=(0, None))
-    axes.set_xticks([t for t in range(-180, 181, 45) if angles.min() - 5 <= t <= angles.max() + 5])
+    axes.set_xticks([t for t in range(-360, 361, 45) if angles.min() - 5 <= t <= angles.max() + 5])
     axes.legend(fontsize=8.5, frameon=False)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import re
 import sys
 import time
 from dataclasses import dataclass, replace
@@ -16,10 +15,12 @@ from rich.console import Console
 from rich.progress import track
 
 from common import se2
-from common.config import POSE_TEXT
 from common.errors import UserError
 from common.se2 import Array
 from common.versions import commit, versions
+from presage.logs.log import Reading
+from presage.logs.opening import kind_of
+from presage.logs.words import pose_of
 from presage.output import check_file
 from presage.scan_files import Scans, read_scans
 from services.estimator.building import Choice, Name, prepare
@@ -43,12 +44,12 @@ class Job:
     fresh: bool = False
     odometry: bool = True
     frame: Literal["base_link", "laser"] = "base_link"
-    mount: tuple[float, float, float] = (0.2, 0.0, 0.0)
+    reading: Reading = Reading()  # noqa: RUF009 - frozen; what is said about a log
     out: Path | None = None
 
     @classmethod
     def of(
-        cls, file: Path, choice: Choice, mode: str, frame: str, mount: str, *, fresh: bool, odometry: bool,
+        cls, file: Path, choice: Choice, mode: str, frame: str, reading: Reading, *, fresh: bool, odometry: bool,
         out: Path | None,
     ) -> Job:  # fmt: skip
         """From the command line's words; raises UserError on one that is not known."""
@@ -58,28 +59,26 @@ class Job:
             raise UserError(f"no frame {frame!r}: choose base_link or laser")
         if out is not None and out.suffix not in (".csv", ".json"):
             raise UserError(f"{out}: the result is written as .csv or .json")
-        x, y, yaw = map(float, pose_of(mount, "--mount"))
-        return cls(file, choice, mode, fresh, odometry, frame, (x, y, yaw), out)  # type: ignore[arg-type]
-
-
-def pose_of(text: str, option: str) -> Array:
-    """(3,) m, m, rad from x,y[,yaw_deg]."""
-    if not re.fullmatch(POSE_TEXT, text) or not text:
-        raise UserError(f"{option} {text!r}: give x,y,yaw_deg, such as 3,1.5,90")
-    numbers = [float(part) for part in text.split(",")]
-    return np.array([*numbers[:2], np.deg2rad(numbers[2]) if len(numbers) > 2 else 0.0])
+        return cls(file, choice, mode, fresh, odometry, frame, reading, out)  # type: ignore[arg-type]
 
 
 def choice_of(
-    file: Path, world: str, estimator: str, model: str, models: Path | None, sigma: float, seed: int, initial_pose: str
+    file: Path,
+    world: str,
+    estimator: str,
+    model: str,
+    models: Path | None,
+    sigma: float | None,
+    seed: int,
+    initial_pose: str,
 ) -> Choice:
     """From the command line's words; the world is the recording's where none is named."""
     if estimator not in get_args(Name):
         raise UserError(f"no estimator {estimator!r}: choose one of {', '.join(get_args(Name))}")
     pose = pose_of(initial_pose, "--initial-pose") if initial_pose else None
     if not world:
-        if file.suffix == ".npz":
-            raise UserError("an .npz does not say which world it is of: name it with --world")
+        if kind_of(file) != "recording":
+            raise UserError(f"{file}: a log does not say which world it is of: name it with --world")
         recorded = read_recording(file).world()
         if recorded is None:
             raise UserError(f"{file}: no world was recorded: name it with --world")
@@ -91,7 +90,14 @@ def localize(job: Job, console: Console) -> list[dict[str, Any]]:
     """A row for each scan; raises UserError in one line."""
     check_file(job.out, "--out")
     laser = job.frame == "laser"
-    scans = read_scans(job.file, np.zeros(3) if laser else np.array(job.mount))
+    with console.status(f"reading {job.file.name}"):
+        # An .npz's poses are the laser's where that is asked for; of every other file it is known where the laser sits.
+        kind = kind_of(job.file)
+        if kind == "recording" and not job.reading.plain:
+            raise UserError(f"{job.file}: a recording says itself what its scanner is: those options are about logs")
+        itself = laser and kind == "npz"
+        scans = read_scans(job.file, np.zeros(3) if itself else None, job.reading)
+    console.print(*scans.notes, sep="\n", highlight=False, soft_wrap=True, end="\n" if scans.notes else "")
     start = _start(job, scans)
     estimator = prepare(replace(job.choice, initial_pose=None))(scans.geometry)
     rows = []
@@ -120,7 +126,9 @@ def _start(job: Job, scans: Scans) -> Array | None:
         return scans.initial_pose
     if scans.truth is not None and np.isfinite(scans.truth[0]).all():
         return np.asarray(scans.truth[0])
-    raise UserError(f"{job.file}: mode track needs where to begin: initial_pose in the file, or --initial-pose x,y,deg")
+    raise UserError(
+        f"{job.file}: mode track needs where to begin: initial_pose or reference in the file, or --initial-pose x,y,deg"
+    )
 
 
 def _row(scans: Scans, k: int, posterior: Posterior, update_ms: float, *, laser: bool) -> dict[str, Any]:
@@ -171,6 +179,6 @@ def _summarise(scans: Scans, rows: list[dict[str, Any]], console: Console, *, la
     error = error[np.isfinite(error)]
     if len(error):
         console.print(
-            f"against the recorded truth: {np.median(error) * 1e3:.1f} mm median, "
+            f"against {scans.truth_is}: {np.median(error) * 1e3:.1f} mm median, "
             f"{np.sqrt(np.mean(error**2)) * 1e3:.1f} mm RMS, {error.max() * 1e3:.1f} mm at most"
         )

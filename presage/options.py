@@ -13,6 +13,7 @@ from rich.console import Console
 
 from common.bus import Link
 from common.config import split_endpoints
+from common.scanner import SCANNERS
 from common.security import Credentials, credentials
 
 # Nobody's terminal is 80 columns wide when it is a pipe.
@@ -28,6 +29,13 @@ Port = Annotated[int, typer.Option(min=0, max=65535, help="The router's port on 
 Seed = Annotated[int, typer.Option(min=0, max=2**31, help="Of all that is drawn.")]
 Json = Annotated[Path | None, typer.Option("--json", help="Write the numbers there.")]
 
+
+ScannerName = Annotated[str, typer.Option(help=f"{', '.join(SCANNERS)}, or a file (docs/scanners.md).")]
+MountText = Annotated[
+    str, typer.Option("--mount", help="Of the laser in base_link: x,y[,yaw_deg] (m, deg); none: the scanner's own.")
+]
+UpsideDown = Annotated[bool, typer.Option("--upside-down", help="The laser hangs with a roll of 180 deg.")]
+Beams = Annotated[int | None, typer.Option(min=2, help="Instead of the scanner's own number; 622 are the paper's.")]
 
 EstimatorName = Annotated[
     str, typer.Option(envvar="PRESAGE_ESTIMATOR", help="precise, paper, particle-filter or amcl-defaults.")

@@ -53,12 +53,19 @@ def words(state: PlayerReply) -> str:
     return f"{state.position_s:.1f} of {state.duration_s:.1f} s{how}"
 
 
+def checked_robot(name: str) -> str:
+    """The same; raises UserError where no key can hold it."""
+    if not re.fullmatch(ROBOT, name):
+        raise UserError(f"--robot {name!r}: letters, digits and _ . - only, 64 at most")
+    return name
+
+
 def choice_of(
     only: str, leave_out: str, rate: float | None, start: float | None, end: float | None, robot: str, *,
     loop: bool, force: bool, paused: bool = False, stay: bool = False,
 ) -> Choice:  # fmt: skip
     """From the command line's words; raises UserError on a robot no key can hold."""
-    if robot and not re.fullmatch(ROBOT, robot):
-        raise UserError(f"--robot {robot!r}: letters, digits and _ . - only, 64 at most")
+    if robot:
+        checked_robot(robot)
     names, without = names_of(only), names_of(leave_out)
     return Choice(names or None, without, 1.0 if rate is None else rate, start, end, loop, robot, force, paused, stay)

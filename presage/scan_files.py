@@ -1,9 +1,8 @@
-"""Scans in a file, for `presage localize`: .npz, or a recording."""
+"""Scans in a file, all in memory: of a recording, or of any log that `presage import` reads."""
 
 from __future__ import annotations
 
-import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +11,13 @@ from common.errors import UserError
 from common.messages import Odom, Scan, Truth
 from common.se2 import Array
 from common.topics import ODOM, SCAN, TRUTH
+from presage.logs.log import Log, Reading
+from presage.logs.opening import kind_of, open_log
 from services.estimator.building import Geometry
 from services.estimator.interface import Observation
 from services.recorder.reader import read_recording
 
-NAMES = {"ranges", "angles", "range_max", "stamps", "odom", "initial_pose"}
+RECORDED = "the recorded truth"
 
 
 @dataclass(frozen=True)
@@ -26,10 +27,12 @@ class Scans:
     geometry: Geometry
     ranges: Array  # (N, B) m; +inf no return, -inf too close
     stamps: Array | None = None  # (N,) s
-    odom: Array | None = None  # (N, 3) base_link in odom
+    odom: Array | None = None  # (N, 3) base_link in odom; NaN where not known
     initial_pose: Array | None = None  # (3,) in map
-    truth: Array | None = None  # (N, 3) base_link in map; NaN where not recorded
+    truth: Array | None = None  # (N, 3) base_link in map; NaN where not known
     world: str | None = None  # name of the world it was recorded in
+    truth_is: str = RECORDED  # or the log's reference, which is none
+    notes: tuple[str, ...] = ()  # what was taken for granted, and left out
 
     def observation(self, k: int, *, odometry: bool = True) -> Observation:
         """The k-th scan for an estimator."""
@@ -38,59 +41,38 @@ class Scans:
         return Observation(self.ranges[k], self.geometry.angles, self.geometry.range_max, stamp, odom)
 
 
-def read_scans(path: Path, mount: Array) -> Scans:
-    """Of an .npz (``mount`` (3,): its laser in base_link) or a recording; raises UserError saying what is wrong."""
-    if path.suffix == ".npz":
-        return _read_npz(path, mount)
-    if path.suffix in {".mcap", ".active"}:
+def read_scans(path: Path, mount: Array | None = None, reading: Reading | None = None) -> Scans:
+    """Of a recording, an .npz, a CARMEN log or a ROS bag; raises UserError saying what is wrong.
+
+    ``mount`` (3,): the laser in base_link, instead of what the log says; a recording knows better. An .npz's poses
+    (odom, initial_pose, reference) are base_link's, with a mount of zero the laser's own. `Scans.truth` is the
+    recording's truth or the log's reference. ``reading``: what else is said about a log.
+    """
+    if kind_of(path) == "recording":
         return _read_recording(path)
-    raise UserError(f"{path}: scans are read from .npz (ranges, angles, range_max) or .mcap (a recording)")
+    reading = reading or Reading()
+    return scans_of(open_log(path, reading if mount is None else replace(reading, mount=mount)))
 
 
-def _read_npz(path: Path, mount: Array) -> Scans:
-    data = _arrays(path)
-    missing = [name for name in ("ranges", "angles", "range_max") if name not in data]
-    if missing:
-        raise UserError(f"{path}: lacks {', '.join(missing)}; needed are ranges (N, B), angles (B,) and range_max")
-    ranges = np.atleast_2d(data["ranges"])
-    count, beams = ranges.shape[0], ranges.shape[-1]
-    shapes = {"angles": (beams,), "stamps": (count,), "odom": (count, 3), "initial_pose": (3,)}
-    if ranges.ndim != 2 or beams < 3 or not count:
-        raise UserError(f"{path}: ranges has the shape {data['ranges'].shape}, not (N, B) of 3 beams or more")
-    for name, shape in shapes.items():
-        if name in data and data[name].shape != shape:
-            raise UserError(f"{path}: {name} has the shape {data[name].shape}; for these ranges it must be {shape}")
-        if name in data and not np.isfinite(data[name]).all():
-            raise UserError(f"{path}: {name} has numbers that are not finite")
-    if data["range_max"].size != 1 or not 0 < (range_max := float(data["range_max"].reshape(-1)[0])) < np.inf:
-        raise UserError(f"{path}: range_max must be one number of metres greater than 0")
-    if "stamps" in data and (np.diff(data["stamps"]) < 0).any():
-        raise UserError(f"{path}: stamps are not sorted")
+def scans_of(log: Log) -> Scans:
+    """All of a log; raises UserError where it has none of use."""
+    nothing = np.full(3, np.nan)
+    ranges, stamps, odoms, references = [], [], [], []
+    for sweep in log.sweeps():
+        ranges.append(sweep.ranges)
+        stamps.append(sweep.stamp_ns)
+        odoms.append(nothing if sweep.odom is None else sweep.odom)
+        references.append(nothing if sweep.reference is None else sweep.reference)
+    if not ranges:
+        raise UserError(f"{log.path}: no scan of use in it" + (f" ({log.lost()})" if log.left_out else ""))
+    times = [stamp for stamp in stamps if stamp is not None]
     return Scans(
-        Geometry(data["angles"], mount, range_max), clean(ranges, range_max),
-        data.get("stamps"), data.get("odom"), data.get("initial_pose"),
+        Geometry(log.angles, log.mount, log.range_max), np.array(ranges),
+        np.array(times) * 1e-9 if len(times) == len(ranges) else None,
+        np.array(odoms) if log.odometry else None, log.initial_pose,
+        np.array(references) if log.reference else None, truth_is=log.reference or RECORDED,
+        notes=(*log.notes, *([f"left out: {log.lost()}"] if log.left_out else [])),
     )  # fmt: skip
-
-
-def _arrays(path: Path) -> dict[str, Array]:
-    """The arrays we know, as numbers."""
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            kept = {name: file[name] for name in file.files if name in NAMES}
-            if wrong := [name for name, array in kept.items() if array.dtype.kind not in "fiu"]:
-                raise UserError(f"{path}: {wrong[0]} holds {kept[wrong[0]].dtype}, not real numbers")
-            data = {name: np.asarray(array, np.float64) for name, array in kept.items()}
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file") from None
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
-        raise UserError(f"{path}: not an .npz of plain arrays ({' '.join(str(error).split())[:120]})") from None
-    return data
-
-
-def clean(ranges: Array, range_max: float) -> Array:
-    """As REP-117 has it: at or beyond the longest range +inf; NaN and what is not positive -inf (not used)."""
-    far = np.where(ranges >= range_max, np.inf, ranges)
-    return np.where(np.isnan(far) | (far <= 0), -np.inf, far)
 
 
 def _read_recording(path: Path) -> Scans:
@@ -116,11 +98,12 @@ def _read_recording(path: Path) -> Scans:
     nothing = np.full(3, np.nan)
     world = recording.world()
     return Scans(
-        Geometry(first.angles(), first.mount.array(), first.range_max),
+        Geometry.of_scan(first),
         np.array([s.ranges for s in scans], np.float64),
         np.array([s.stamp_ns for s in scans]) * 1e-9,
         np.array([odoms.get(s.stamp_ns, nothing) for s in scans]) if odoms else None,
         None,
         np.array([truths.get(s.stamp_ns, nothing) for s in scans]) if truths else None,
         world.name if world is not None else None,
+        recording.metadata.get("log", {}).get("reference") or RECORDED,
     )

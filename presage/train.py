@@ -19,7 +19,7 @@ from common.bus import Bus, Link, open_bus, wait_until
 from common.errors import UserError
 from common.requests import Request, SampleReply, SampleRequest, WorldReply
 from common.robot import Robot
-from common.scanner import SCANNERS, Scanner
+from common.scanner import Scanner
 from common.se2 import Array
 from common.topics import SAMPLE, WORLD
 from common.versions import commit, versions
@@ -41,8 +41,8 @@ class Job:
 
     world: str
     preset: str
-    scanner: str
-    beams: int | None
+    scanner: Scanner
+    asked: tuple[str, ...]  # the simulator's options for it
     out: Path
     samples: int
     recipe: Recipe
@@ -52,9 +52,7 @@ class Job:
 
 def train(job: Job, link: Link, console: Console) -> Path:
     """The weights' path; raises UserError in one line."""
-    if job.scanner not in SCANNERS:
-        raise UserError(f"no scanner {job.scanner!r}: choose one of {', '.join(SCANNERS)}")
-    world, scanner = load_world(job.world), SCANNERS[job.scanner].with_beams(job.beams)
+    world, scanner = load_world(job.world), job.scanner
     path = weights.path_of(job.out, world.name, job.preset, scanner.beams)
     described = {"world": world.model_dump(mode="json"), "scanner": scanner.model_dump(mode="json"), "n": job.samples}
     checkpoint = Checkpoint(job.out / f".{path.stem}.unfinished", {**described, **asdict(job.recipe)})
@@ -68,7 +66,7 @@ def train(job: Job, link: Link, console: Console) -> Path:
             poses = np.column_stack([world.sample_free(count, rng, Robot().radius), np.full(count, heading)])
             kept = checkpoint.samples(name)
             if kept is None:
-                with scanner_on_bus(link, job.world, job.scanner, job.beams, world, scanner, console) as bus:
+                with scanner_on_bus(link, job.world, job.asked, world, scanner, console) as bus:
                     noise_seed = job.recipe.seed if name == "train" else None  # test against what is, not noise
                     ranges = collect(bus, poses, scanner, noise_seed, bar, f"{name} samples")
                 kept = Data(poses, usable_ranges(ranges, scanner.range_max))
@@ -88,7 +86,7 @@ def train(job: Job, link: Link, console: Console) -> Path:
 
 @contextmanager
 def scanner_on_bus(
-    link: Link, world_name: str, scanner_name: str, beams: int | None, world: World, scanner: Scanner, console: Console
+    link: Link, world_name: str, asked: tuple[str, ...], world: World, scanner: Scanner, console: Console
 ) -> Iterator[Bus]:
     """A bus on which this scanner in this world answers `sample`: the one that is there, or a simulator of our own."""
     with open_bus(link, patience=3.0) as bus:
@@ -97,8 +95,7 @@ def scanner_on_bus(
             return
     with Stack("training", quiet=True) as stack:
         stack.start_router()
-        asked = ["--beams", str(beams)] if beams is not None else []
-        stack.start("simulator", "--world", world_name, "--scanner", scanner_name, *asked, "--pace", "realtime")
+        stack.start("simulator", "--world", world_name, *asked, "--pace", "realtime")
         with open_bus(stack.link()) as bus:
             stack.wait_alive(bus)
             yield bus
@@ -111,8 +108,8 @@ def _answers(bus: Bus, world: World, scanner: Scanner, console: Console) -> bool
     except UserError:
         return False
     if here.world is not None and same_walls(here.world, world) and here.scanner is not None:
-        same = {"name", "fov", "mount", "range_max"}
-        if here.scanner.model_dump(include=same) == scanner.model_dump(include=same):
+        other = {"beams", "rate"}  # it is asked for so many beams, and time plays no part
+        if here.scanner.model_dump(exclude=other) == scanner.model_dump(exclude=other):
             console.print(f"samples come from the running scanner {here.scanner.name} in {world.name}")
             return True
     console.print("the running session has another world or scanner; a simulator of our own is started")

@@ -21,6 +21,7 @@ from common.scanner import SCANNERS, Scanner
 from common.versions import commit, versions
 from common.world import World, load_world
 from presage.train import collect, scanner_on_bus
+from services.estimator.building import LEAST_SIGMA
 from services.estimator.precise import weights
 from services.estimator.precise.evaluation import Quality, evaluate
 from services.estimator.precise.field import FieldModel
@@ -35,8 +36,8 @@ class Job:
     """What to learn."""
 
     world: str
-    scanner: str = "tim571"
-    beams: int | None = None
+    scanner: Scanner = SCANNERS["tim571"]
+    asked: tuple[str, ...] = ()  # the simulator's options for it
     out: Path = weights.FOLDER
     samples: int = 5000
     recipe: Recipe = Recipe()  # noqa: RUF009 - frozen
@@ -44,16 +45,14 @@ class Job:
 
 def train_precise(job: Job, link: Link, console: Console) -> Path:
     """The weights' path; raises UserError in one line."""
-    if job.scanner not in SCANNERS:
-        raise UserError(f"no scanner {job.scanner!r}: choose one of {', '.join(SCANNERS)}")
-    world, scanner = load_world(job.world), SCANNERS[job.scanner].with_beams(job.beams)
+    world, scanner = load_world(job.world), job.scanner
     path = weights.path_of(job.out, world.name)
     _refuse_to_overwrite(path, world)
     rng = np.random.default_rng(job.recipe.seed)
     poses = {name: _poses(world, count, rng) for name, count in (("train", job.samples), ("test", TEST_SAMPLES))}
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as bar:
-        with scanner_on_bus(link, job.world, job.scanner, job.beams, world, scanner, console) as bus:
+        with scanner_on_bus(link, job.world, job.asked, world, scanner, console) as bus:
             train = collect(bus, poses["train"], scanner, job.recipe.seed, bar, "scans to learn from")
             test = collect(bus, poses["test"], scanner, None, bar, "scans to test with")
         began = time.monotonic()
@@ -108,7 +107,14 @@ def _learn(
     ripple = learn_ripple(field, se2.compose(poses["test"][:half], mount), angles)
     model = FieldModel(field, scales, ripple)
     quality = evaluate(
-        model, poses["test"][half:], mount, angles, scans["test"][half:], scanner.range_max, scanner.sigma
+        model,
+        poses["test"][half:],
+        mount,
+        angles,
+        scans["test"][half:],
+        scanner.range_max,
+        max(scanner.sigma, LEAST_SIGMA),
+        scanner.sigma_relative,
     )
     bar.update(task, description="learned", completed=1.0)
     return model, quality

@@ -20,7 +20,7 @@ RECORDINGS = Path("recordings")  # where the page finds them, and puts those it 
 def run_up(
     *,
     world: str,
-    beams: int,
+    scanner: tuple[str, ...],
     drive: str,
     pace: str,
     seed: int,
@@ -51,7 +51,7 @@ def run_up(
         driving = controller_arguments(world, estimator, drive, lockstep=lockstep)
         stack.start("controller", *driving)
         waits = ",".join(sorted(set(stack.processes) - {"router", "viewer"}))
-        simulator = ["--world", world, "--beams", str(beams), "--drive", drive, "--pace", pace]
+        simulator = ["--world", world, *scanner, "--drive", drive, "--pace", pace]
         simulator += [*people, "--start", start, *(["--wait-for", waits] if pace != "realtime" else [])]
         stack.start("simulator", *simulator, "--seed", str(seed))
         for k, name in enumerate(names[1:], 1):  # each in a simulation of its own

@@ -14,13 +14,19 @@ TINY = 1e-9  # 1/m², so that a direction of which a scan says nothing has a bou
 
 
 def information(scene: Scene, poses: Array) -> Array:
-    """(N, 3, 3) Fisher information of one scan about base_link: sum of J'J / sigma² over beams, from exact rays."""
+    """(N, 3, 3) Fisher information of one scan about base_link: sum of J'J / sigma² over beams, from exact rays.
+
+    Beams that the scanner's longest range ends count for nothing, as what noise that grows with the range tells of the
+    range besides.
+    """
     mount = np.array(scene.scanner.mount)
     lasers = se2.compose(poses, mount)
     expected = RayCaster(scene.world).expect(lasers, scene.scanner.angles())
-    J = np.where(np.isfinite(expected.ranges)[..., None], expected.jacobian, 0)
+    seen = (expected.ranges >= scene.scanner.range_min) & (expected.ranges <= scene.scanner.range_max)
+    J = np.where(seen[..., None], expected.jacobian, 0)
     J[..., 2] += J[..., 0] * (poses[:, 1] - lasers[:, 1])[:, None] + J[..., 1] * (lasers[:, 0] - poses[:, 0])[:, None]
-    return np.asarray(np.einsum("nbi,nbj->nij", J, J) / scene.scanner.sigma**2 + TINY * np.eye(3))
+    weighed = J / scene.scanner.deviation(np.where(seen, expected.ranges, 0.0))[..., None] ** 2
+    return np.asarray(np.einsum("nbi,nbj->nij", weighed, J) + TINY * np.eye(3))
 
 
 def position(covariance: Array) -> Array:

@@ -12,6 +12,8 @@ from rich.console import Console
 from rich.table import Table
 
 from common.errors import UserError
+from common.scanner import Scanner
+from common.scanner_choice import chosen_scanner
 from common.world import load_world
 from presage.accuracy.running import CHOICES, TASKS, Job, about, run_all
 from presage.output import check_file, write_json
@@ -24,18 +26,14 @@ MARKS = {
 
 
 def bench_accuracy(
-    worlds: str, beams: str, estimators: str, tasks: str, trials: int, minutes: float, seed: int, workers: int,
-    json_file: Path | None, figure: Path | None, console: Console, *, markdown: bool = False,
+    worlds: str, scanners: list[Scanner], estimators: str, tasks: str, trials: int, minutes: float, seed: int,
+    workers: int, json_file: Path | None, figure: Path | None, console: Console, *, markdown: bool = False,
 ) -> int:  # fmt: skip
     """Measure, print, and write where asked."""
     chosen = estimators.split(",")
     unknown = [name for name in chosen if name not in CHOICES]
     if unknown:
         raise UserError(f"no estimator {unknown[0]!r}: choose from {', '.join(CHOICES)}")
-    try:
-        counts = [int(part) for part in beams.split(",")]
-    except ValueError:
-        raise UserError(f"--beams {beams!r}: give numbers, such as 622,811") from None
     wanted = tuple(tasks.split(",")) if tasks else TASKS
     if missing := [name for name in wanted if name not in TASKS]:
         raise UserError(f"no task {missing[0]!r}: choose from {', '.join(TASKS)}")
@@ -45,28 +43,48 @@ def bench_accuracy(
     check_file(json_file, "--json")
     check_file(figure, "--figure")
     jobs = [
-        Job(estimator, world, count, trials, minutes * 60, seed, wanted)
-        for world in names for count in counts for estimator in chosen
+        Job(estimator, world, scanner, trials, minutes * 60, seed, wanted)
+        for world in names for scanner in scanners for estimator in chosen
     ]  # fmt: skip
     rows = run_all(jobs, workers, console)
-    for world, count in dict.fromkeys((row["world"], row["beams"]) for row in rows):
-        own = [row for row in rows if (row["world"], row["beams"]) == (world, count)]
+    for title, own in _by_title(rows).items():
         if markdown:
-            print(_markdown(own, world, count))
+            print(_markdown(own, title))
         else:
-            console.print(_table(own, world, count))
+            console.print(_table(own, title))
     write_json(json_file, {"rows": rows, "trials": trials, "minutes": minutes, **about(seed)})
     if figure is not None:
         _draw(rows, figure)
     return 0
 
 
+def scanners_of(names: str, beams: str) -> list[Scanner]:
+    """Each scanner with each number of beams; none: its own, of tim571 the paper's 622. Raises UserError."""
+    try:
+        counts = [int(part) for part in beams.split(",") if part]
+    except ValueError:
+        raise UserError(f"--beams {beams!r}: give numbers, such as 622,811") from None
+    found = []
+    for name in names.split(","):
+        own: list[int | None] = [*counts] or [622 if name == "tim571" else None]
+        found += [chosen_scanner(name, count) for count in own]
+    return found
+
+
+def _by_title(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        scanner = "" if row["scanner"] == "tim571" else f"{row['scanner']}, "
+        found.setdefault(f"{row['world']}, {scanner}{row['beams']} beams", []).append(row)
+    return found
+
+
 def _number(value: float | None, scale: float = 1.0, digits: int = 2) -> str:
     return "" if value is None else f"{value * scale:.{digits}f}"
 
 
-def _table(rows: list[dict[str, Any]], world: str, beams: int) -> Table:
-    table = Table(title=f"{world}, {beams} beams, sigma 0.02 m; errors of what was found", title_justify="left")
+def _table(rows: list[dict[str, Any]], title: str) -> Table:
+    table = Table(title=f"{title}; errors of what was found", title_justify="left")
     heads = "task|estimator|found|wrong|median mm|RMS mm|95 % mm|yaw deg|bound mm|RMS/bound|NEES|band|update ms"
     for column in heads.split("|"):
         table.add_column(column, justify="left" if column in ("task", "estimator") else "right")
@@ -82,10 +100,10 @@ def _table(rows: list[dict[str, Any]], world: str, beams: int) -> Table:
     return table
 
 
-def _markdown(rows: list[dict[str, Any]], world: str, beams: int) -> str:
+def _markdown(rows: list[dict[str, Any]], title: str) -> str:
     """A line for each task: median and root mean square in mm, found of all; the bound; NEES and its band."""
     names = list(dict.fromkeys(row["estimator"] for row in rows))
-    lines = [f"| {world}, {beams} beams | " + " | ".join(names) + " | bound |", "|---" * (len(names) + 2) + "|"]
+    lines = [f"| {title} | " + " | ".join(names) + " | bound |", "|---" * (len(names) + 2) + "|"]
     for task in dict.fromkeys(row["task"] for row in rows):
         own = {row["estimator"]: row for row in rows if row["task"] == task}
         limit = next((row["bound_rms_m"] for row in own.values() if row["bound_rms_m"] is not None), None)
@@ -105,8 +123,8 @@ def _cell(row: dict[str, Any]) -> str:
 
 def _draw(rows: list[dict[str, Any]], file: Path) -> None:
     """Root mean square position error of each task; the bound as a bar beside."""
-    first = (rows[0]["world"], rows[0]["beams"])
-    rows = [r for r in rows if (r["world"], r["beams"]) == first and r["position_error_rms_m"] is not None]
+    title, rows = next(iter(_by_title(rows).items()))
+    rows = [row for row in rows if row["position_error_rms_m"] is not None]
     tasks = list(dict.fromkeys(row["task"] for row in rows))
     figure = Figure(figsize=(9, 0.55 * len(tasks) + 1.6), layout="constrained")
     FigureCanvasAgg(figure)
@@ -133,7 +151,7 @@ def _draw(rows: list[dict[str, Any]], file: Path) -> None:
     axes.invert_yaxis()
     axes.set(
         xscale="log", xlabel="position error, RMS (mm)",
-        title=f"{first[0]}, {first[1]} beams, sigma 20 mm; numbers: found of all, where not all",
+        title=f"{title}; numbers: found of all, where not all",
     )  # fmt: skip
     axes.grid(alpha=0.3, which="both", axis="x")
     axes.legend(loc="lower right")

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import track
 
 from common import se2
-from common.scanner import SCANNERS
+from common.scanner import Scanner
 from common.se2 import Array
 from common.versions import commit, versions
 from common.world import World, load_world
@@ -46,7 +46,7 @@ class Job:
 
     estimator: str
     world: str
-    beams: int
+    scanner: Scanner
     trials: int
     seconds: float
     seed: int
@@ -65,21 +65,21 @@ def run_all(jobs: list[Job], workers: int, console: Console) -> list[dict[str, A
 def run(job: Job) -> list[dict[str, Any]]:
     """The rows of one job."""
     world = load_world(job.world)
-    geometry = _geometry(job.beams)
+    geometry = Geometry.of(job.scanner)
     name, model = CHOICES[job.estimator]
     estimator = prepare(Choice(job.world, name, model, seed=job.seed))(geometry)
     outcomes: dict[str, tasks.Outcome] = {}
     for number, task in enumerate((tasks.standing, tasks.blocked, tasks.kidnapped)):
         if task.__name__ in job.tasks:
-            outcomes |= task(estimator, Scene.of(world, job.beams, job.seed * 100 + number), job.trials, _quiet)
+            outcomes |= task(estimator, _scene(job, world, number), job.trials, _quiet)
     for number, name_of_task in enumerate(("tracking", "odometry")):
         if name_of_task in job.tasks:
-            scene = Scene.of(world, job.beams, job.seed * 100 + 10 + number)
+            scene = _scene(job, world, 10 + number)
             outcomes |= tasks.tracking(estimator, scene, job.seconds, _quiet, odometry=name_of_task == "odometry")
     rows = [_row(job, job.world, task, outcome) for task, outcome in outcomes.items()]
     if "twins" not in job.tasks:
         return rows
-    scene = Scene.of(TWINS, job.beams, job.seed * 100 + 20)
+    scene = _scene(job, TWINS, 20)
     alike = tasks.twins(_among_twins(job, geometry), scene, job.trials, _quiet)
     return rows + [_row(job, TWINS.name, task, outcome) for task, outcome in alike.items()]
 
@@ -88,9 +88,8 @@ def _quiet(poses: Iterable[Array]) -> Iterator[Array]:
     return iter(poses)
 
 
-def _geometry(beams: int) -> Geometry:
-    scanner = SCANNERS["tim571"].with_beams(beams)
-    return Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max)
+def _scene(job: Job, world: World, number: int) -> Scene:
+    return Scene.of(world, None, job.seed * 100 + number, job.scanner)
 
 
 def _among_twins(job: Job, geometry: Geometry) -> Estimator:
@@ -104,17 +103,19 @@ def _among_twins(job: Job, geometry: Geometry) -> Estimator:
     rng = np.random.default_rng(job.seed)
     places = thin_places(TWINS.sample_free(6000, rng, 0.05), SPACING)
     if model == "exact":
-        return PreciseEstimator(RayCaster(TWINS), Seeds.at(RayCaster(TWINS), places), geometry.mount)
+        exact = RayCaster(TWINS)
+        return PreciseEstimator(exact, Seeds.at(exact, places), geometry.mount, geometry.likelihood())
     learned = quick_field(TWINS, geometry, rng)
-    return PreciseEstimator(learned, Seeds.at(learned, places), geometry.mount)
+    return PreciseEstimator(learned, Seeds.at(learned, places), geometry.mount, geometry.likelihood())
 
 
 def quick_field(world: World, geometry: Geometry, rng: np.random.Generator, samples: int = 2000) -> FieldModel:
-    """A field learned from exact rays with the shipped scanner's noise, and no simulator."""
+    """A field learned from exact rays with the scanner's noise, and no simulator."""
     poses = np.column_stack([world.sample_free(samples, rng, 0.27), rng.uniform(-np.pi, np.pi, samples)])
     clean = world.ray_distances(se2.compose(poses, geometry.mount), geometry.angles)
     split = samples // 10
-    noisy = clean[split:] + SCANNERS["tim571"].sigma * rng.standard_normal(clean[split:].shape)
+    noisy = clean[split:] + geometry.likelihood().deviation(clean[split:]) * rng.standard_normal(clean[split:].shape)
+    clean, noisy = (np.where(ranges > geometry.range_max, np.inf, ranges) for ranges in (clean, noisy))
     field = learn_field(Beams.of(poses[split:], geometry.mount, geometry.angles, noisy), Recipe(sweeps=6))
     scales = learn_scales(field, poses[:split], geometry.mount, geometry.angles, clean[:split], 0.0)
     ripple = learn_ripple(field, se2.compose(poses[:split], geometry.mount), geometry.angles)
@@ -131,7 +132,8 @@ def _row(job: Job, world: str, task: str, outcome: tasks.Outcome) -> dict[str, A
     half = 1.96 * np.sqrt(2 * DEGREES_OF_FREEDOM / max(len(misfits), 1))
     return {
         "world": world,
-        "beams": job.beams,
+        "scanner": job.scanner.name,
+        "beams": job.scanner.beams,
         "estimator": job.estimator,
         "task": task,
         "of": outcome.of,

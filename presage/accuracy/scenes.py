@@ -17,6 +17,7 @@ from common.world import World
 from services.estimator.interface import Observation
 
 ROBOT = Robot()
+TIM571 = SCANNERS["tim571"]
 TURN = 1.0  # rad/s at most on the paths
 
 
@@ -29,9 +30,9 @@ class Scene:
     rng: np.random.Generator
 
     @classmethod
-    def of(cls, world: World, beams: int, seed: int | Sequence[int]) -> Scene:
-        """With the shipped scanner."""
-        return cls(world, SCANNERS["tim571"].with_beams(beams), np.random.default_rng(seed))
+    def of(cls, world: World, beams: int | None, seed: int | Sequence[int], scanner: Scanner = TIM571) -> Scene:
+        """With so many beams (None: its own) of a scanner."""
+        return cls(world, scanner.with_beams(beams), np.random.default_rng(seed))
 
     def poses(self, count: int) -> Array:
         """(count, 3) uniform over where the robot fits, any heading."""
@@ -45,10 +46,10 @@ class Scene:
 
     def observe(self, clean: Array, stamp: float, odom: Array | None = None) -> Observation:
         """One scan (B,) with fresh noise."""
-        noisy = clean + self.scanner.sigma * self.rng.standard_normal(len(clean))
+        scanner = self.scanner
         return Observation(
-            self.scanner.limit(noisy), self.scanner.angles(), self.scanner.range_max, stamp, odom
-        )  # fmt: skip
+            scanner.limit(scanner.noisy(clean, self.rng)), scanner.angles(), scanner.range_max, stamp, odom
+        )
 
     def blocked(self, clean: Array, share: float) -> Array:
         """What no model knows, people say: sectors of (B,) cut short at 0.3 to 4 m, at least ``share`` of the beams."""

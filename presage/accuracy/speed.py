@@ -52,7 +52,7 @@ def measure(estimator: str, world_name: str, beams: int, seed: int) -> dict[str,
     name, model = CHOICES[estimator]
     scene = Scene.of(load_world(world_name), beams, seed)
     began = time.perf_counter()
-    geometry = Geometry(scene.scanner.angles(), np.array(scene.scanner.mount), scene.scanner.range_max)
+    geometry = Geometry.of(scene.scanner)
     made = prepare(Choice(world_name, name, model, seed=seed))(geometry)
     ready = time.perf_counter() - began
     searches = []

@@ -75,7 +75,7 @@ def uses_odometry(name: str) -> bool:
 def enter(name: str, field: Field, scene: Scene, seed: int, descent: Descent = PAPER) -> Estimator:
     """A new estimator that knows nothing but the world; the paper's begins at the map's centre, as there."""
     scanner, kind = scene.scanner, name.split(",", maxsplit=1)[0]
-    geometry = Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max)
+    geometry = Geometry.of(scanner)
     if kind == "paper":
         return _factory(field.world, "paper", Descent() if name.endswith(STEPS) else descent)(geometry)
     if kind == "precise":

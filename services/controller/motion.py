@@ -79,15 +79,17 @@ def turn_rate(angle: float, robot: Robot) -> float:
     return float(np.sign(angle) * min(robot.max_turn, rate))
 
 
-def facing(action: Array, attractor: Array, robot: Robot, *, turns: bool) -> Array:
+def facing(action: Array, attractor: Array, robot: Robot, *, turns: bool, front: float = 0.0) -> Array:
     """The action (3,) of a holonomic base with a turn towards the attractor (2,) m, so that it sees where it goes.
+
+    ``front`` rad is the side that is turned there.
 
     Near the attractor, and with it in front, the heading is kept. Any other base's action, and that of one that may not
     turn, is as it was.
     """
     if robot.drive != "holonomic" or not turns:
         return np.array(action)
-    bearing = float(np.arctan2(attractor[1], attractor[0]))
+    bearing = float(se2.wrap(np.arctan2(attractor[1], attractor[0]) - front))
     if np.hypot(*attractor) < NEAR and abs(bearing) < np.pi / 3:
         return np.array([action[0], action[1], 0.0])
     # A base that turns must change its velocity in base_link to keep it in map, for which it has an acceleration.

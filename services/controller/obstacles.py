@@ -9,6 +9,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from common import se2
+from common.sweep import Sweep
 
 if TYPE_CHECKING:
     from common.messages import Scan
@@ -92,11 +93,10 @@ class TemporaryObstacles:
         away = self.points() - laser[:2]
         distance = np.hypot(*away.T)
         bearing = se2.wrap(np.arctan2(away[:, 1], away[:, 0]) - laser[2])
-        beam = np.rint((bearing - scan.angle_min) / scan.angle_increment).astype(int)
-        seen = (beam >= 0) & (beam < len(scan.ranges))
-        measured = scan.ranges.astype(np.float64)[np.clip(beam, 0, len(scan.ranges) - 1)]
+        beam = Sweep.of(scan).beams_at(bearing)
+        measured = scan.ranges.astype(np.float64)[beam]
         # No return is no proof of free space: a dark or a slanting surface gives none either.
-        through = seen & np.isfinite(measured) & (measured > distance + BEYOND)
+        through = (beam >= 0) & np.isfinite(measured) & (measured > distance + BEYOND)
         long = np.where(self._last - self._first < 3 * STANDS, FORGET_YOUNG, FORGET)
         keep = ~through & (stamp_ns - self._last < long) & (stamp_ns >= self._last)
         self._cells, self._first, self._last = self._cells[keep], self._first[keep], self._last[keep]

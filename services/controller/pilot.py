@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common import safety, se2
+from common.sweep import ALL_ROUND, Sweep
 from services.controller.decision import Decision
 from services.controller.geodesic import SOFT, Field, Roads
 from services.controller.grid import FreeSpace
@@ -32,6 +33,7 @@ REPLAN = 400_000_000  # ns between two plans for another picture of what stands 
 REPLAN_AFAR = 1_500_000_000  # ns where it changed elsewhere
 STUCK = 3_000_000_000  # ns without progress until it backs off
 BACK_OFF = 3_000_000_000  # ns of it
+BLIND = "the scanner does not look ahead, and this base goes nowhere else: mount it so that it does"
 RANGE = 3.0  # m about the robot within which what the map does not know matters to its next second
 
 
@@ -56,7 +58,7 @@ class Pilot:
         self._planned: tuple[int, npt.NDArray[Any]] = (-REPLAN, np.zeros(0, int))
         self._outdated = False
         self._vetted_from: int | None = None  # the component from which the goal was found reachable
-        self._view = np.pi
+        self._view = ALL_ROUND
         self._stuck_since: int | None = None
         self._backing_until: int | None = None
 
@@ -95,8 +97,7 @@ class Pilot:
 
     def see(self, scan: Scan, belief: Belief) -> None:
         """What the map does not know, and how far the scanner looks."""
-        outermost = np.abs(scan.angles()[[0, -1]] + scan.mount.yaw)
-        self._view = float(min(np.pi, outermost.min()))
+        self._view = Sweep.of(scan).sector(scan.mount.yaw)
         self._scan = scan
         if belief.state != "tracking":
             return  # what was seen before stands where it stood
@@ -125,7 +126,7 @@ class Pilot:
         point = self.field.attractor(pose[:2], way)
         attractor = se2.rotate(-pose[2], point - pose[:2])
         choice = choose(velocity, attractor, around, self.robot)
-        action = facing(choice.action, attractor, self.robot, turns=around.turns)
+        action = facing(choice.action, attractor, self.robot, turns=around.turns, front=around.front)
         # What was driven, not what is wished: the limits may have held it.
         self._watch(stamp_ns, driven=moves(velocity))
         reason = ""
@@ -133,6 +134,8 @@ class Pilot:
             reason = self._what_holds(pose, around, stood=not choice.action.any())
         if self.closed:
             reason = self._no_way(pose, around)
+        if self.robot.drive == "differential" and not bool(around.sees(0.0)):
+            reason = BLIND
         stands = bool(reason) and not choice.action.any()
         return Decision(action, reason, "blocked" if stands else "navigating", way, _in_map(pose, choice.way))
 
@@ -219,7 +222,7 @@ class Pilot:
         places = 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         best = int(np.argmax(around.gaps(places[:, None, :], np.zeros(1))[:, 0]))
         choice = choose(velocity, places[best], around, self.robot)
-        action = facing(choice.action, places[best], self.robot, turns=around.turns)
+        action = facing(choice.action, places[best], self.robot, turns=around.turns, front=around.front)
         return Decision(action, "stuck: backing off", path=way, motion=_in_map(pose, choice.way), recovering=True)
 
     def _what_holds(self, pose: Array, around: Around, *, stood: bool) -> str:

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from common import se2
+from common.sweep import ALL_ROUND, Sector
 from services.controller import motion
 
 if TYPE_CHECKING:
@@ -20,6 +22,7 @@ DISCOMFORT = 0.5  # by how much less, at the least gap
 CLOSE = 0.3  # m, nearer to the attractor than this the heading towards it matters less and less
 BLIND_SPEED = 0.25  # m/s, where the scanner does not look, for a base that may not turn; others turn first
 ASIDE = np.pi / 4  # rad by which the scanner must look further than where the body goes, for it is wide
+NARROW = 3  # a scanner that sees little more than that still answers for the middle third of what it sees
 LEAST_PROGRESS = 0.004  # m; what gains less is as good as standing
 STEADY = 0.02  # m per m/s, for going on as before
 
@@ -34,8 +37,20 @@ class Around:
     least: float  # m to anything the map knows
     keep: float  # m to points
     walking: float = 1.0  # m/s, of those that move
-    view: float = np.pi  # rad to either side of x that the scanner sees
+    view: Sector = ALL_ROUND  # that the scanner sees
     turns: bool = True  # the base may turn, so nothing need be done unseen
+
+    def sees(self, bearings: Array | float) -> npt.NDArray[np.bool_]:
+        """(...,) bool: whether the scanner can answer for what a body meets that goes towards ``bearings`` rad."""
+        if self.view.half >= np.pi:
+            return np.ones(np.shape(bearings), bool)
+        off = np.abs(se2.wrap(bearings - self.view.centre))
+        return np.asarray(off <= max(self.view.half - ASIDE, self.view.half / NARROW) + 1e-9)
+
+    @property
+    def front(self) -> float:
+        """Rad, where to turn towards what lies ahead: x, where the scanner looks there, else the middle of its view."""
+        return 0.0 if bool(self.sees(0.0)) else self.view.centre
 
     def gaps(self, poses: Array, times: Array, stands: Array | float = np.inf, enough: float = np.inf) -> Array:
         """(N, T) m left between footprint and anything at poses (N, T, 3); less where somebody may be by then.
@@ -122,11 +137,9 @@ def to_go(poses: Array, attractor: Array, robot: Robot) -> Array:
 
 def _seen(actions: Array, around: Around) -> Array:
     """The actions (N, 3) that the scanner can answer for; where a base may not turn, the others too, but slow."""
-    if around.view >= np.pi:
-        return actions
     speed = np.hypot(actions[:, 0], actions[:, 1])
     moves = speed > BLIND_SPEED if not around.turns else speed > motion.CREEP
-    blind = (np.abs(np.arctan2(actions[:, 1], actions[:, 0])) > around.view - ASIDE) & moves
+    blind = ~around.sees(np.arctan2(actions[:, 1], actions[:, 0])) & moves
     if around.turns:
         return actions[~blind]
     scale = np.where(blind, BLIND_SPEED / np.maximum(speed, 1e-9), 1.0)

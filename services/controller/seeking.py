@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common import se2
+from common.sweep import Sweep
 from services.controller.decision import Decision
 from services.controller.epistemic import Explorer, Options
 from services.controller.motion import facing
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from common.requests import PredictReply
     from common.robot import Robot
     from common.se2 import Array
+    from common.sweep import Sector
     from services.controller.geodesic import Field, Roads
 
 LIKELY = 0.02  # weight of the hypotheses that count
@@ -81,8 +83,8 @@ class Seeker:
         sigma = reply.sigma.astype(np.float64).reshape(shape) if len(reply.sigma) else np.full_like(ranges, 0.05)
         self.explorer.choose(stamp, options, ranges, sigma, range_max)
 
-    def act(self, belief: Belief, scan: Scan, points: Array, velocity: Array, view: float) -> Decision:
-        """The action now; ``points`` (K, 2) m in base_link stand about, it sees ``view`` rad to either side."""
+    def act(self, belief: Belief, scan: Scan, points: Array, velocity: Array, view: Sector) -> Decision:
+        """The action now; ``points`` (K, 2) m in base_link stand about, it sees ``view``."""
         around = Around(_unknown, points, np.zeros(len(points), bool), 0.0, self.keep, view=view, turns=self.turns)
         likely = [h for h in belief.hypotheses if h.weight >= LIKELY][:MOST]
         if belief.state == "ambiguous" and likely:
@@ -131,10 +133,12 @@ class Seeker:
         """Towards the most room, rather ahead than aside."""
         ranges = np.minimum(np.where(np.isneginf(scan.ranges), 0.0, scan.ranges.astype(np.float64)), 5.0)
         angles = scan.angles() + scan.mount.yaw
-        half = max(1, round(WINDOW / scan.angle_increment))
-        padded = np.pad(ranges, half, constant_values=0.0)
+        sweep = Sweep.of(scan)
+        half = max(1, round(WINDOW / max(sweep.spacing, WINDOW / 1000)))
+        # Beyond the outermost beams nothing is known to be free; all round there is no outermost.
+        padded = np.pad(ranges, half, mode="wrap") if sweep.all_round else np.pad(ranges, half)
         free = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1).min(axis=1)
-        best = int(np.argmax(free + 0.5 * np.cos(angles)))
+        best = int(np.argmax(free + 0.5 * np.cos(angles - around.front)))
         reason = f"the belief is {belief.state}: going where there is room, to see more"
         if free[best] < ROOM:
             return Decision(np.array([0.0, 0.0, 0.5]), reason.replace("going", "turning to"), "exploring")
@@ -144,7 +148,7 @@ class Seeker:
 
     def _towards(self, attractor: Array, around: Around, velocity: Array, reason: str, way: Array) -> Decision:
         choice = choose(velocity, attractor, around, self.robot)
-        action = facing(choice.action, attractor, self.robot, turns=self.turns)
+        action = facing(choice.action, attractor, self.robot, turns=self.turns, front=around.front)
         if not action.any() and self.turns:  # nothing ahead is free: look elsewhere
             action[2] = 0.5 if attractor[1] >= 0 else -0.5
         return Decision(action, reason, "exploring", way)

@@ -12,7 +12,8 @@ import numpy as np
 import shapely
 
 from common.errors import UserError
-from common.scanner import SCANNERS
+from common.messages import Scan
+from common.scanner import SCANNERS, Scanner
 from common.se2 import Array
 from common.world import World, load_world
 from services.estimator.generative import GenerativeModel, RayCaster
@@ -27,6 +28,8 @@ from services.estimator.precise.gauss_newton import View, polish
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.seeding import SPACING, Seeds, thin_places
 
+SIGMA = 0.02  # m, the noise of a scanner that states none
+LEAST_SIGMA = 1e-3  # m, of one that states less: no surface is known better
 Name = Literal["precise", "paper", "particle-filter", "amcl-defaults"]
 
 
@@ -38,7 +41,7 @@ class Choice:
     estimator: Name = "precise"
     model: str = "learned"  # of precise: learned, exact, or a file of weights
     models: Path | None = None  # folder of weights; none: the shipped ones
-    sigma: float = 0.02  # m, the scanner's noise
+    sigma: float | None = None  # m, the scanner's noise; None: as the scan states it, or SIGMA
     seed: int = 0
     initial_pose: Array | None = None  # (3,); none: nothing is known (paper: the map's centre)
     descent: Descent = Descent()  # noqa: RUF009 - frozen; of paper
@@ -56,12 +59,43 @@ class Geometry:
     angles: Array  # (B,) rad in laser
     mount: Array  # (3,) laser in base_link
     range_max: float  # m
+    sigma: float = 0.0  # m, the scanner's noise, and
+    sigma_relative: float = 0.0  # its part that grows with the range; both 0: not stated
+
+    @classmethod
+    def of(cls, scanner: Scanner) -> Geometry:
+        """Of the scans of a scanner."""
+        return cls(
+            scanner.angles(), np.array(scanner.mount), scanner.range_max, scanner.sigma, scanner.sigma_relative
+        )  # fmt: skip
+
+    @classmethod
+    def of_scan(cls, scan: Scan) -> Geometry:
+        """Of scans like this one."""
+        return cls(scan.angles(), scan.mount.array(), scan.range_max, scan.sigma, scan.sigma_relative)
 
     def same(self, other: Geometry) -> bool:
         """Whether an estimator made for one takes the other."""
-        return len(self.angles) == len(other.angles) and bool(
-            np.allclose(self.angles, other.angles, atol=1e-4) and np.allclose(self.mount, other.mount, atol=1e-4)
+        noise = (self.sigma, self.sigma_relative) == (other.sigma, other.sigma_relative)
+        return (
+            noise
+            and len(self.angles) == len(other.angles)
+            and bool(
+                np.allclose(self.angles, other.angles, atol=1e-4) and np.allclose(self.mount, other.mount, atol=1e-4)
+            )
         )
+
+    def upside_down(self) -> Geometry:
+        """With a roll of 180 deg: seen from above the beams run the other way round."""
+        return replace(self, angles=-self.angles)
+
+    def likelihood(self, sigma: float | None = None) -> Likelihood:
+        """With the noise ``sigma`` m asked for, or what the scans state, or `SIGMA`."""
+        if sigma is not None:
+            return Likelihood(sigma)
+        if not self.sigma and not self.sigma_relative:
+            return Likelihood(SIGMA)
+        return Likelihood(max(self.sigma, LEAST_SIGMA), relative=self.sigma_relative)
 
 
 Factory = Callable[[Geometry], Estimator]
@@ -96,12 +130,11 @@ def prepare(choice: Choice) -> Factory:
 def _precise(choice: Choice, world: World) -> Factory:
     model, places, inflation = generative_model(choice, world)
     seeds = Seeds.at(model, places)
-    likelihood = Likelihood(choice.sigma)
-    _compile(model, seeds, likelihood)
+    _compile(model, seeds, Likelihood())
 
     def make(geometry: Geometry) -> Estimator:
         made = PreciseEstimator(
-            model, seeds, geometry.mount, likelihood, Settings(inflation=inflation),
+            model, seeds, geometry.mount, geometry.likelihood(choice.sigma), Settings(inflation=inflation),
             np.random.default_rng(choice.seed),
         )  # fmt: skip
         if choice.initial_pose is not None:
@@ -140,7 +173,8 @@ def _paper(choice: Choice, world: World) -> Factory:
     # Torch takes a second to import; the other estimators do without.
     from services.estimator import weights as paper_weights  # noqa: PLC0415
     from services.estimator.decoder import use_one_core  # noqa: PLC0415
-    from services.estimator.paper_perception import PaperPerception, check_geometry  # noqa: PLC0415
+    from services.estimator.fitting import fit  # noqa: PLC0415
+    from services.estimator.paper_perception import PaperPerception  # noqa: PLC0415
 
     use_one_core()
     folder = choice.models or paper_weights.FOLDER
@@ -159,14 +193,15 @@ def _paper(choice: Choice, world: World) -> Factory:
     load = functools.cache(paper_weights.load)  # one network, however many estimators are made
 
     def make(geometry: Geometry) -> Estimator:
-        model, card = load(paper_weights.find(folder, world.name, "paper", len(geometry.angles)))
-        check_geometry(card.scanner, geometry.angles, geometry.mount, remedy)
-        return PaperPerception(model, card, choice.descent, choice.initial_pose)
+        model, card = load(paper_weights.nearest(folder, world.name, "paper", len(geometry.angles)))
+        x, y, yaw = geometry.mount
+        other = f" --beams {len(geometry.angles)} --mount {x:g},{y:g},{np.rad2deg(yaw):g}"
+        found = fit(card.scanner, geometry.angles, geometry.mount, remedy + other)
+        return PaperPerception(model, card, choice.descent, choice.initial_pose, found)
 
     return make
 
 
 def default_geometry(beams: int | None = None) -> Geometry:
     """Of the shipped scanner."""
-    scanner = SCANNERS["tim571"].with_beams(beams)
-    return Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max)
+    return Geometry.of(SCANNERS["tim571"].with_beams(beams))

@@ -129,8 +129,9 @@ def cast(segments, circles, lasers, angles, ranges, jacobian):
 
 @jit
 def accumulate(
-    measured, expected, jacobian, scale, sigma, widen, short, random, range_max, unseen, total, gradient, matrices
-):
+    measured, expected, jacobian, scale, sigma, relative, widen, short, random, range_max, unseen,
+    total, gradient, matrices,
+):  # fmt: skip
     """Sums over beams of -ln p(o | pose) and its derivatives; see `services.estimator.precise.likelihood`.
 
     Fills total (N, 3) energy, explained, used; gradient (N, 3); matrices (N, 3, 3, 3): curvature, and its parts from
@@ -159,7 +160,7 @@ def accumulate(
             if g >= range_max:
                 total[k, 0] -= math.log(unseen / range_max)
                 continue
-            noise, model = sigma * sigma, scale[k, b] * scale[k, b]
+            noise, model = sigma * sigma + relative * relative * g * g, scale[k, b] * scale[k, b]
             variance = noise + model + widen * widen
             e = o - g
             core = (1.0 - short - random) * math.exp(-0.5 * e * e / variance) / math.sqrt(2 * math.pi * variance)
@@ -170,6 +171,7 @@ def accumulate(
             total[k, 1] += inlier
             weight = inlier / variance
             slope = weight * e - early / (max(g, 1e-3) * density)  # d ln p / dg
+            slope += inlier * relative * relative * g * (e * e / variance - 1.0) / variance
             for i in range(3):
                 gradient[k, i] += slope * jacobian[k, b, i]
                 for j in range(3):

@@ -60,7 +60,7 @@ def model_in_use(choice: Choice, beams: int | None) -> ModelInUse:
         # Torch takes a second to import; the other estimators do without.
         from services.estimator import weights as paper_weights  # noqa: PLC0415
 
-        path = paper_weights.find(choice.models or paper_weights.FOLDER, world.name, "paper", beams)
+        path = paper_weights.nearest(choice.models or paper_weights.FOLDER, world.name, "paper", beams)
         return _learned(choice.estimator, world, path, path.name)
     return ModelInUse(choice.estimator, world)
 

@@ -9,6 +9,7 @@ import numpy as np
 from common import se2
 from common.errors import UserError
 from services.estimator.asking import Conversation, alone
+from services.estimator.fitting import fit as own_fit
 from services.estimator.generative import Expected
 from services.estimator.interface import Hypothesis, Observation, Posterior, Predicted
 from services.estimator.perception import Descent, PaperEstimator
@@ -18,20 +19,10 @@ if TYPE_CHECKING:
     from common.scanner import Scanner
     from common.se2 import Array
     from services.estimator.decoder import PaperModel
+    from services.estimator.fitting import Fit
     from services.estimator.weights import ModelCard
 
-ANGLE_TOLERANCE = 1e-4  # rad and m, between a scan's beams or mounting and the model's
 HEADING_TOLERANCE = 1e-3  # rad, between a pose's and the model's
-
-
-def check_geometry(scanner: Scanner, angles: Array, mount: Array | None, remedy: str) -> None:
-    """Raises UserError where a scan's beams or mounting are not those a decoder was trained for."""
-    same = len(angles) == scanner.beams and np.abs(angles - scanner.angles()).max() < ANGLE_TOLERANCE
-    if not same or (mount is not None and np.abs(mount - np.array(scanner.mount)).max() > ANGLE_TOLERANCE):
-        raise UserError(
-            f"the scan's beams or mounting are not those of {scanner.name} that the weights were trained for; "
-            f"train for this scanner: {remedy}"
-        )
 
 
 class PaperPerception:
@@ -39,9 +30,12 @@ class PaperPerception:
 
     name = "paper"
 
-    def __init__(self, model: PaperModel, card: ModelCard, descent: Descent, pose: Array | None = None) -> None:
-        """``pose`` (3,) to begin with; none: the map's centre."""
+    def __init__(
+        self, model: PaperModel, card: ModelCard, descent: Descent, pose: Array | None = None, fit: Fit | None = None
+    ) -> None:
+        """``pose`` (3,) to begin with; none: the map's centre. ``fit``: of another scanner's scans; none: its own."""
         self.card, self.model = card, model
+        self.fit = fit or own_fit(card.scanner, card.scanner.angles(), np.array(card.scanner.mount), "")
         self._first = pose
         self.estimator = PaperEstimator(
             model, card.test_l1_mean, card.world.bounds, self._initial(pose), descent,
@@ -62,7 +56,7 @@ class PaperPerception:
 
     def updating(self, observation: Observation) -> Conversation[Posterior]:
         """The same as a conversation: see `asking`."""
-        ranges = usable_ranges(observation.ranges, observation.range_max)
+        ranges = self.fit.ranges(usable_ranges(observation.ranges, observation.range_max))
         estimate = yield from self.estimator.updating(ranges, observation.goal)
         found = estimate.gradient
         return Posterior(
@@ -72,23 +66,19 @@ class PaperPerception:
             found.attraction,
             found.xi,
             found.curvature,
-            estimate.predicted,
+            estimate.predicted if self.fit.same else self.fit.predicted(estimate.predicted, observation.angles)[0],
         )
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
-        """See Estimator: the decoder knows one heading, and the beams of its training. Sigma is its mean error."""
+        """See Estimator: the decoder knows one heading; +inf where it has no beams. Sigma is its mean error."""
         off = np.abs(se2.wrap(poses[:, 2] - self.card.heading))
         if (off > HEADING_TOLERANCE).any():
             raise UserError(
                 f"preset paper predicts at its one heading, {np.rad2deg(self.card.heading):.1f} deg, "
                 f"and was asked for {np.rad2deg(poses[off.argmax(), 2]):.1f} deg"
             )
-        own = self.card.scanner.angles()
-        index = np.abs(own[None, :] - angles[:, None]).argmin(axis=1)
-        if np.abs(own[index] - angles).max() > ANGLE_TOLERANCE:
-            raise UserError("the paper's decoder predicts the beams of its training alone")
         # Far outside the map single precision has no number.
-        ranges = np.nan_to_num(self.model.ranges(poses)[:, index], nan=np.inf, posinf=np.inf)
+        ranges = np.nan_to_num(self.fit.predicted(self.model.ranges(poses), angles), nan=np.inf, posinf=np.inf)
         return Predicted(ranges, np.full(ranges.shape, self.card.test_l1_mean))
 
 
@@ -106,7 +96,7 @@ class PaperScans:
         scanner = self.scanner
         own = scanner.angles()
         index = np.abs(own[None, :] - se2.wrap(angles)[:, None]).argmin(axis=1)
-        if np.abs(own[index] - angles).max() > scanner.angle_increment:
+        if np.abs(own[index] - angles).max() > abs(scanner.angle_increment):
             raise UserError("the paper's decoder predicts the beams of its training alone")
         poses = se2.compose(np.asarray(lasers, float).reshape(-1, 3), se2.inverse(np.array(scanner.mount)))
         poses[:, 2] = self.heading

@@ -140,7 +140,7 @@ class EstimatorService(Service):
     def _estimator_for(self, scan: Scan) -> Estimator | None:
         """The one at hand, or a new one for another scanner; None, and it is said, where there is no model for it."""
         assert self.models is not None  # noqa: S101 - set in open
-        geometry = Geometry(scan.angles(), scan.mount.array(), scan.range_max)
+        geometry = Geometry.of_scan(scan)
         try:
             if self.geometry is None or not self.geometry.same(geometry):
                 made = self.models.factory(geometry)

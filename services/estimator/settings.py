@@ -58,7 +58,9 @@ class EstimatorSettings(ServiceSettings):
             "command: runs are not repeatable to the byte, for it races with the scan"
         ),
     ] = "motion"
-    sigma: Annotated[float, Field(gt=0, lt=10, description="m, the scanner's noise")] = 0.02
+    sigma: Annotated[
+        float | None, Field(gt=0, lt=10, description="m, the scanner's noise; none: as the scan says, else 0.02")
+    ] = None
     seed: Annotated[int, Field(ge=0, le=2**31, description="of particles")] = 0
     initial_pose: Annotated[
         str, Field(pattern=POSE_TEXT, description="x,y[,yaw_deg]; none: nothing is known (paper: the map's centre)")

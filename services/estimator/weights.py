@@ -117,3 +117,11 @@ def find(folder: Path, world: str, preset: str, beams: int) -> Path:
             f"make them with: {train_command(world, preset, beams=beams)}"
         )
     return known[beams]
+
+
+def nearest(folder: Path, world: str, preset: str, beams: int) -> Path:
+    """The weights for the number of beams nearest to that; raises UserError where there are none at all."""
+    known = available(folder, world, preset)
+    if not known:
+        return find(folder, world, preset, beams)
+    return known[min(known, key=lambda count: (abs(count - beams), -count))]

@@ -176,13 +176,16 @@ def read_recording(path: Path) -> Recording:
     try:
         with path.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
-                raise UserError(f"{path}: not an MCAP file; `presage record` and `presage demo` make recordings")
+                raise UserError(f"{path}: not an MCAP file; `presage record` makes recordings, `presage import` of logs")
             if not _read_summary(recording, stream):
                 _read_through(recording, stream)
     except OSError as error:
         raise _unreadable(path, error) from None
     if recording.profile not in {"", PROFILE} and not recording.topics():
-        raise UserError(f"{path}: an MCAP file, but no recording of presage (its profile is {recording.profile!r})")
+        raise UserError(
+            f"{path}: an MCAP file, but no recording of presage (its profile is {recording.profile!r}); of a ROS 2 bag "
+            "`presage import` makes one"
+        )
     return recording
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import Field
 
 from common.config import POSE_TEXT, ServiceSettings
-from common.errors import UserError
 from common.scanner import SCANNERS, Scanner
+from common.scanner_choice import chosen_scanner
 
 
 class SimulatorSettings(ServiceSettings):
@@ -21,15 +21,21 @@ class SimulatorSettings(ServiceSettings):
       python -m services.simulator --world my.yaml --start 2,1,90    x m, y m, yaw deg
       python -m services.simulator --beams 622 --pace lockstep --seed 7
       python -m services.simulator --world office --people 10        who walk about
+      python -m services.simulator --scanner rplidar-a1 --mount -0.1,0,180 --upside-down
+      python -m services.simulator --scanner my-laser.yaml           docs/scanners.md shows such a file
 
     """
 
     service: ClassVar[str] = "simulator"
 
     world: Annotated[str, Field(description="shipped world or world file")] = "corridor"
-    scanner: Annotated[str, Field(description=f"one of {', '.join(SCANNERS)}")] = "tim571"
+    scanner: Annotated[str, Field(description=f"one of {', '.join(SCANNERS)}, or a file")] = "tim571"
     beams: Annotated[int | None, Field(ge=2, le=100_000, description="instead of the scanner's own number")] = None
     noise: Annotated[float | None, Field(ge=0, le=1, description="instead of the scanner's own sigma, m")] = None
+    mount: Annotated[
+        str, Field(pattern=POSE_TEXT, description="x,y[,yaw_deg] of the laser in base_link; none: the scanner's own")
+    ] = ""
+    upside_down: Annotated[bool | None, Field(description="the laser hangs with a roll of 180 deg")] = None
     drive: Annotated[Literal["holonomic", "differential"], Field(description="holonomic or differential")] = "holonomic"
     start: Annotated[str, Field(pattern=POSE_TEXT, description="x,y[,yaw_deg]; none: the world's own")] = ""
     seed: Annotated[int, Field(ge=0, description="of all noise")] = 0
@@ -56,10 +62,7 @@ class SimulatorSettings(ServiceSettings):
 
     def the_scanner(self) -> Scanner:
         """The scanner asked for; raises UserError for an unknown one."""
-        if self.scanner not in SCANNERS:
-            raise UserError(f"no scanner {self.scanner!r}: choose one of {', '.join(SCANNERS)}")
-        scanner = SCANNERS[self.scanner].with_beams(self.beams)
-        return scanner if self.noise is None else scanner.model_copy(update={"sigma": self.noise})
+        return chosen_scanner(self.scanner, self.beams, self.noise, self.mount, upside_down=self.upside_down)
 
     def waited_for(self) -> set[str]:
         """Services without which time does not begin."""

@@ -141,7 +141,7 @@ class Simulation:
         """What is measured now; draws the scanner's noise."""
         pose, twist, scanner = self.physics.pose(), self.physics.twist(), self.setup.scanner
         exact = self._see(pose[None])[0]
-        ranges = scanner.limit(exact + scanner.sigma * self._noise.standard_normal(len(exact)))
+        ranges = scanner.limit(scanner.noisy(exact, self._noise))
         moving = Twist(vx=float(twist[0]), vy=float(twist[1]), wz=float(twist[2]))
         odometer = self.odometer
         odom = Odom(
@@ -165,7 +165,9 @@ class Simulation:
             range_max=scanner.range_max,
             ranges=ranges.astype(np.float32),
             mount=Pose.of(scanner.mount),
-            scan_time=1 / scanner.rate,
+            scan_time=self.period_ns * 1e-9,
+            sigma=scanner.sigma,
+            sigma_relative=scanner.sigma_relative,
         )
 
     def _see(self, poses: Array, scanner: Scanner | None = None, *, people: bool = True) -> Array:
@@ -173,7 +175,7 @@ class Simulation:
         scanner = scanner or self.setup.scanner
         lasers = se2.compose(poses, np.array(scanner.mount))
         # A little beyond the limit, so that noise decides about a return at the limit.
-        reach = scanner.range_max + 6 * scanner.sigma + 1e-6
+        reach = scanner.range_max + 6 * float(scanner.deviation(np.array(scanner.range_max))) + 1e-6
         return self.physics.ranges(lasers, scanner.angles(), reach, people=people)
 
     def sample(self, poses: Array, beams: int | None, noise_seed: int | None) -> Array:
@@ -194,7 +196,7 @@ class Simulation:
         rows = [self._see(poses[i : i + BLOCK], scanner, people=False) for i in range(0, len(poses), BLOCK)]
         ranges = np.concatenate(rows) if rows else np.zeros((0, scanner.beams))
         if noise_seed is not None:
-            ranges = ranges + scanner.sigma * np.random.default_rng(noise_seed).standard_normal(ranges.shape)
+            ranges = scanner.noisy(ranges, np.random.default_rng(noise_seed))
         return scanner.limit(ranges)
 
     def why_not(self, pose: Array) -> str | None:

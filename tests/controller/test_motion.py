@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from common import safety, se2
 from common.robot import Robot
+from common.sweep import Sector
 from services.controller.motion import HOLD, braking_speed, candidates, facing, rollouts, turn_rate
 from services.controller.policy import Around, choose, to_go
 
@@ -124,7 +125,7 @@ def test_a_wall_across_the_way_is_waited_at():
 
 
 def test_where_the_scanner_does_not_look_it_turns_first_or_goes_slowly():
-    behind, view = np.array([-3.0, 0.0]), np.deg2rad(135)
+    behind, view = np.array([-3.0, 0.0]), Sector(0.0, np.deg2rad(135))
     choice = choose(np.zeros(3), behind, around(view=view), Robot())
     assert abs(np.arctan2(choice.action[1], choice.action[0])) <= np.pi / 2 + 1e-9  # the body is wide
     assert abs(facing(choice.action, behind, Robot(), turns=True)[2]) > 1.0

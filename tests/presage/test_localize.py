@@ -15,7 +15,8 @@ from common.errors import UserError
 from common.scanner import SCANNERS
 from common.world import load_world
 from presage.localize import COLUMNS, Job, choice_of, localize
-from presage.scan_files import clean, read_scans
+from presage.logs.log import Reading, clean
+from presage.scan_files import read_scans
 from tests.recorder.sessions import write
 
 SCANNER = SCANNERS["tim571"].with_beams(200)
@@ -42,7 +43,7 @@ def job(file, mode="global", frame="base_link", estimator="precise", model="lear
     out = more.pop("out", None)
     choice = choice_of(file, world, estimator, model, None, 0.02, 0, more.pop("initial_pose", ""))
     given = {"fresh": False, "odometry": True, "out": out, **more}
-    return Job.of(file, choice, mode, frame, "0.2,0,0", **given)
+    return Job.of(file, choice, mode, frame, Reading(), **given)
 
 
 def errors(rows, path=PATH):
@@ -86,6 +87,16 @@ def test_only_what_is_needed(tmp_path):
     assert errors(localize(job(file, mode="track", initial_pose="4,1.5,57"), CONSOLE)).max() < 0.02
 
 
+def test_a_reference_is_what_errors_are_against_and_where_tracking_begins(tmp_path, capsys):
+    reference = PATH.copy()
+    reference[5:] = np.nan  # not known throughout
+    file = npz(tmp_path, mount=(0, 0, 0), reference=reference, initial_pose=None)
+    np.testing.assert_array_equal(read_scans(file, np.zeros(3)).truth, reference)
+    rows = localize(job(file, mode="track", frame="laser"), Console(width=150))
+    assert errors(rows).max() < 0.02
+    assert "against the file's reference: " in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("estimator", ["particle-filter", "amcl-defaults"])
 def test_the_particle_filter_over_the_same_file(tmp_path, estimator):
     rows = localize(job(npz(tmp_path), mode="track", estimator=estimator), CONSOLE)
@@ -105,6 +116,7 @@ def test_the_standard_output_is_csv_alone(tmp_path, capsys):
         ({"ranges": None}, "lacks ranges"),
         ({"angles": np.zeros(3)}, "angles has the shape"),
         ({"odom": np.zeros((3, 3))}, "odom has the shape"),
+        ({"reference": np.zeros((9, 3))}, "reference has the shape"),
         ({"stamps": -np.arange(10.0)}, "not sorted"),
         ({"range_max": -1.0}, "range_max"),
         ({"initial_pose": np.full(3, np.nan)}, "not finite"),
@@ -120,10 +132,12 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path, changes, why):
 def test_files_that_are_none(tmp_path):
     garbage = tmp_path / "x.npz"
     garbage.write_bytes(b"PK\x03\x04 not really")
+    foreign = tmp_path / "x.npz.txt"
+    foreign.write_text("ranges, angles\n")
     for file, why in (
         (garbage, "not an .npz"),
         (tmp_path / "no.npz", "no such file"),
-        (tmp_path / "x.txt", "read from"),
+        (foreign, "not a presage recording, a CARMEN log"),
     ):
         with pytest.raises(UserError, match=why):
             read_scans(file, np.zeros(3))

@@ -114,7 +114,7 @@ class PreciseEstimator:
 
     def _with_noise(self, expected: Expected) -> Predicted:
         unknown = np.isinf(expected.scale)
-        sigma = np.where(unknown, UNKNOWN, np.hypot(expected.scale, self.likelihood.sigma))
+        sigma = np.where(unknown, UNKNOWN, np.hypot(expected.scale, self.likelihood.deviation(expected.ranges)))
         return Predicted(np.where(unknown, np.inf, expected.ranges), sigma)
 
     def _track(self, view: View, observation: Observation) -> Conversation[None]:

@@ -31,17 +31,22 @@ class Quality:
 
 
 def evaluate(
-    model: GenerativeModel, poses: Array, mount: Array, angles: Array, ranges: Array, range_max: float, sigma: float
-) -> Quality:
-    """From scans (N, B) m without noise at base_link poses (N, 3); ``sigma`` m is the noise of the scanner in use."""
+    model: GenerativeModel, poses: Array, mount: Array, angles: Array, ranges: Array, range_max: float, sigma: float,
+    relative: float = 0.0,
+) -> Quality:  # fmt: skip
+    """From scans (N, B) m without noise at base_link poses (N, 3).
+
+    ``sigma`` m is the noise of the scanner in use, ``relative`` its part that grows with the range.
+    """
+    likelihood = Likelihood(sigma, relative=relative)
     expected = model.expect(se2.compose(poses, mount), angles)
     both = np.isfinite(ranges) & np.isfinite(expected.ranges)
     error = np.abs(ranges[both] - expected.ranges[both])
     offsets, misfits, rng = [], [], np.random.default_rng(0)
     for pose, scan in zip(poses, ranges, strict=True):
         for draw in range(1 + DRAWS):  # the first without noise
-            noise = sigma * rng.standard_normal(len(scan)) if draw else 0.0
-            view = View(model, Likelihood(sigma), mount, angles, scan + noise, range_max)
+            noise = likelihood.deviation(scan) * rng.standard_normal(len(scan)) if draw else 0.0
+            view = View(model, likelihood, mount, angles, scan + noise, range_max)
             found, evidence = polish(view, pose[None])
             alone = np.linalg.inv(evidence.curvature[0] + 1e-6 * np.eye(3))
             off = difference(found, pose[None])[0] + alone @ evidence.xi[0]  # to the very minimum

@@ -2,10 +2,11 @@
 
     p(o | g) = (1 - unseen) ((1 - short - random) N(o; g, sigma² + m²) + short [o < g] / g + random / range_max)
 
-sigma is the scanner's noise, m the model's stated error, `short` the share of beams that something unknown ends
-(people, moved furniture), `random` that of all else (something was taken away): a proper density with tails that no
-outlier moves (Thrun, Burgard & Fox 2005, section 6.3, without its gains). A beam without return has the probability
-`unseen` where a surface is expected; where none is, 1 - unseen, and any range is as likely as any other.
+sigma is the scanner's noise (sigma² + (relative g)² where it grows with the range), m the model's stated error, `short`
+the share of beams that something unknown ends (people, moved furniture), `random` that of all else (something was taken
+away): a proper density with tails that no outlier moves (Thrun, Burgard & Fox 2005, section 6.3, without its gains). A
+beam without return has the probability `unseen` where a surface is expected; where none is, 1 - unseen, and any range
+is as likely as any other.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ class Likelihood:
     short: float = 0.25
     random: float = 0.005
     unseen: float = 0.05
+    relative: float = 0.0  # of the range: the part of the scanner's noise that grows with it
 
     def evaluate(self, measured: Array, range_max: float, expected: Expected, widen: float = 0.0) -> Evidence:
         """For ranges (B,) m (+inf no return, -inf too close: not used); ``widen`` m is added to every deviation."""
@@ -53,12 +55,19 @@ class Likelihood:
         matrices = np.zeros((count, 3, 3, 3))
         kernels.accumulate(
             measured, expected.ranges, expected.jacobian, expected.scale,
-            self.sigma, widen, self.short, self.random, range_max, self.unseen, total, gradient, matrices,
+            self.sigma, self.relative, widen, self.short, self.random, range_max, self.unseen,
+            total, gradient, matrices,
         )  # fmt: skip
         # A pose from which nearly nothing is known explains nearly nothing.
         least = KNOWN * len(measured) if np.isinf(expected.scale).any() else 1.0
         explained = total[:, 1] / np.maximum(total[:, 2], max(least, 1.0))
         return Evidence(total[:, 0], explained, gradient, matrices[:, 0], matrices[:, 1], matrices[:, 2])
+
+    def deviation(self, expected: Array) -> Array | float:
+        """M, the scanner's noise of ``expected`` ranges m of any shape; of +inf that of 0 m."""
+        if not self.relative:
+            return self.sigma
+        return np.hypot(self.sigma, self.relative * np.where(np.isfinite(expected), expected, 0.0))
 
     def density(self, measured: Array, expected: float, scale: float, range_max: float) -> Array:
         """p(o | g) in 1/m at measured (K,) m; with the probability of no return it sums to one."""
@@ -75,7 +84,7 @@ class Likelihood:
     def _parts(
         self, measured: Array, expected: Array | float, scale: Array | float, range_max: float
     ) -> tuple[Array, Array]:
-        variance = self.sigma**2 + scale**2
+        variance = self.deviation(np.asarray(expected)) ** 2 + scale**2
         core = np.exp(-0.5 * (measured - expected) ** 2 / variance) / np.sqrt(2 * np.pi * variance)
         flat = self.short / np.maximum(expected, 1e-3) * (measured < expected) + self.random / range_max
         return (1 - self.short - self.random) * core, flat

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from common import se2
 from services.estimator.precise.gauss_newton import Prior, difference
+from services.estimator.precise.motion import smoothed
 
 if TYPE_CHECKING:
     from common.se2 import Array
@@ -106,7 +107,9 @@ def moved(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: float, *
     alone = np.linalg.inv(evidence.curvature[k] + np.eye(3))
     accuracy = float(evidence.accuracy[k])
     # Of a motion that is half unseen nothing is carried on.
-    velocity = None if blind or mode.blind else se2.between(mode.pose, fused.mean) / period
+    velocity = None
+    if not blind and not mode.blind:
+        velocity = smoothed(mode.velocity, se2.between(mode.pose, fused.mean) / period, period)
     energy = MEMORY * mode.energy + (1 - MEMORY) * (accuracy + fused.complexity)
     return Mode(
         fused.mean, noise, alone @ evidence.of_model[k] @ alone, float(evidence.explained[k]), accuracy,

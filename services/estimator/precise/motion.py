@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from common.se2 import Array
 
 
+SMOOTH = 1 / 15  # s, over which velocity is read off the poses at least, however fast scans come
+
+
 @dataclass(frozen=True)
 class MotionNoise:
     """Of each axis of base_link; standard deviations where not said otherwise."""
@@ -69,15 +72,35 @@ def candidates(
         found.append(_moved("odometry", pose, covariance, odom, np.array([across, across, around]), rest))
     else:
         found.append(_moved("standing", pose, covariance, np.zeros(3), np.full(3, noise.standing), rest / 2))
-        change = np.array([noise.acceleration, noise.acceleration, noise.turn_acceleration]) * period**2
+        limits = np.array([noise.acceleration, noise.acceleration, noise.turn_acceleration])
+        change = limits * period * max(period, SMOOTH)
         if command is not None:
             change = change + noise.command_share * np.abs(command) * period
             found.append(_moved("commanded", pose, covariance, command * period, change, rest / 2))
         elif velocity is not None:
-            found.append(_moved("going on", pose, covariance, velocity * period, change, rest / 2))
+            deviation = np.sqrt(change**2 + _read_off(pose, covariance, period))
+            found.append(_moved("going on", pose, covariance, velocity * period, deviation, rest / 2))
     centre = odom if odom is not None else np.zeros(3)
     found.append(_moved("any motion", pose, covariance, centre, reach + np.abs(centre), noise.surprise))
     return found
+
+
+def smoothed(before: Array | None, now: Array, period: float) -> Array:
+    """(3,) velocity from that of the last two poses ``now`` and the one ``before``: over `SMOOTH` s at least."""
+    share = period / SMOOTH
+    return now if before is None or share >= 1 else before + share * (now - before)
+
+
+def _read_off(pose: Array, covariance: Array, period: float) -> Array:
+    """(3,) variances in base_link that going on adds, its velocity having been read off poses of ``covariance``.
+
+    With p the pose, q the one before and g the share of p - q in the velocity, p + g (p - q) has (1 + 2 g + 2 g²) times
+    the variance of p. With a slow scanner that is little beside what the robot can accelerate.
+    """
+    share = min(1.0, period / SMOOTH)
+    axes = np.eye(3)
+    axes[:2, :2] = se2.rotate(float(pose[2]), np.eye(2))
+    return np.asarray(2 * share * (1 + share) * np.diagonal(axes @ covariance @ axes.T))
 
 
 def _moved(name: str, pose: Array, covariance: Array, step: Array, deviation: Array, probability: float) -> Candidate:

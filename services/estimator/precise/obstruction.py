@@ -25,7 +25,7 @@ def contradicted(view: View, expected: Expected) -> float:
     """
     surface = expected.ranges[0]
     both = np.isfinite(view.ranges) & np.isfinite(surface)
-    deviation = np.hypot(expected.scale[0], view.likelihood.sigma)
+    deviation = np.hypot(expected.scale[0], view.likelihood.deviation(surface))
     late = view.ranges[both] > (surface + CLEARLY * deviation)[both]
     return float(late.mean()) if late.size else 0.0
 

@@ -32,9 +32,10 @@ export class ScanPlot {
     const { angle_min: first, angle_increment: step } = frame.scan;
     const last = first + step * (frame.ranges.length - 1);
     this.fitTop(frame);
-    const x = (i) => plot.x + (i / (frame.ranges.length - 1)) * plot.w;
+    const share = (angle) => (angle - Math.min(first, last)) / Math.max(Math.abs(last - first), 1e-9);
+    const x = (i) => plot.x + share(first + step * i) * plot.w;
     const y = (range) => plot.y + plot.h * (1 - range / this.top);
-    this.drawAxes(ctx, plot, first, last, y, colours);
+    this.drawAxes(ctx, plot, Math.min(first, last), Math.max(first, last), y, colours);
     ctx.save();
     ctx.beginPath();
     ctx.rect(plot.x, plot.y, plot.w, plot.h);

@@ -1,0 +1,88 @@
+"""What a log gives, whatever its format: one scanner's geometry, and its scans one by one with poses beside them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from common.errors import UserError
+from common.se2 import Array
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What the user says about a log; None and empty: as the log itself has it."""
+
+    mount: Array | None = None  # (3,) laser in base_link
+    scan_topic: str = ""  # of CARMEN: the line, such as RLASER
+    odom_topic: str = ""
+    base_frame: str = ""
+    upside_down: bool | None = None  # the scanner hangs so; None: as tf says, else not
+    reference: bool | None = None  # False: none; True: also poses that only claim to be corrected (CARMEN)
+    reference_topic: str = ""
+    angles: tuple[float, float] | None = None  # rad, first and last beam, where a line does not say
+    range_max: float | None = None  # m
+    clock: Literal["sensor", "logger"] = "sensor"  # whose stamps
+
+    @property
+    def plain(self) -> bool:
+        """Whether nothing was said."""
+        return self.mount is None and self == Reading()
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One scan of a log."""
+
+    stamp_ns: int | None  # None: the log has no times
+    ranges: Array  # (B,) m; +inf no return, -inf not to be used
+    odom: Array | None = None  # (3,) base_link in odom at the stamp
+    reference: Array | None = None  # (3,) base_link in map
+
+
+@dataclass
+class Log:
+    """A log that was opened: what is known before its scans are read."""
+
+    path: Path
+    format: str  # for people
+    angles: Array  # (B,) rad in laser
+    mount: Array  # (3,) laser in base_link
+    range_max: float  # m
+    scans: int  # that are in it, the unusable included
+    read: Callable[[], Iterator[Sweep]]  # from the beginning; UserError where the file is damaged
+    range_min: float = 0.0  # m
+    odometry: str = ""  # where it comes from; empty: there is none
+    reference: str = ""  # what it is; empty: there is none
+    initial_pose: Array | None = None  # (3,) in map
+    notes: list[str] = field(default_factory=list)  # what was taken for granted
+    left_out: Counter[str] = field(default_factory=Counter)  # of the last pass: what, and how often
+
+    def sweeps(self) -> Iterator[Sweep]:
+        """Scans with growing stamps; the others are counted. UserError where hardly any can be used."""
+        self.left_out.clear()
+        last, used = None, 0
+        for sweep in self.read():
+            if last is not None and sweep.stamp_ns is not None and sweep.stamp_ns <= last:
+                self.left_out["scans twice" if sweep.stamp_ns == last else "scans older than the one before"] += 1
+                continue
+            last, used = sweep.stamp_ns, used + 1
+            yield sweep
+        lost = self.left_out.total()
+        if lost > used:
+            raise UserError(f"{self.path}: too little of use: {used} scans; {self.lost()}")
+
+    def lost(self) -> str:
+        """What was left out, in words; empty: nothing."""
+        return ", ".join(f"{what}: {count}" for what, count in self.left_out.items())
+
+
+def clean(ranges: Array, range_max: float, range_min: float = 0.0) -> Array:
+    """As REP-117 has it: at or beyond the longest range +inf; NaN, not positive or too close -inf (not used)."""
+    far = np.where(ranges >= range_max, np.inf, ranges)
+    return np.where(np.isnan(far) | (far <= 0) | (far < range_min), -np.inf, far)

@@ -1,0 +1,87 @@
+"""Arrays in an .npz: ranges, angles, range_max, and what else there is."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from common.errors import UserError
+from common.se2 import Array
+from presage.logs.log import Log, Reading, Sweep, clean
+
+NAMES = {"ranges", "angles", "range_max", "stamps", "odom", "initial_pose", "reference"}
+MOUNT = (0.2, 0.0, 0.0)  # m, m, rad: the shipped scanner's, where nothing else is said
+
+
+def open_npz(path: Path, reading: Reading) -> Log:
+    """Its poses are base_link's, or with a mount of zero the laser's own; raises UserError saying what is wrong."""
+    data = _arrays(path)
+    missing = [name for name in ("ranges", "angles", "range_max") if name not in data]
+    if missing:
+        raise UserError(f"{path}: lacks {', '.join(missing)}; needed are ranges (N, B), angles (B,) and range_max")
+    ranges = np.atleast_2d(data["ranges"])
+    _check(path, data, ranges)
+    if data["range_max"].size != 1 or not 0 < (range_max := float(data["range_max"].reshape(-1)[0])) < np.inf:
+        raise UserError(f"{path}: range_max must be one number of metres greater than 0")
+    range_max = reading.range_max or range_max
+    reference = None if reading.reference is False else data.get("reference")
+    notes = []
+    if reading.mount is None:
+        notes.append(f"the laser is taken to sit at {MOUNT[0]:g},0,0 in base_link (--mount says where it does)")
+    return Log(
+        path, "npz", data["angles"], np.array(MOUNT) if reading.mount is None else reading.mount, range_max,
+        len(ranges), lambda: _sweeps(ranges, range_max, data.get("stamps"), data.get("odom"), reference),
+        odometry="odom" if "odom" in data else "", reference="" if reference is None else "the file's reference",
+        initial_pose=data.get("initial_pose"), notes=notes,
+    )  # fmt: skip
+
+
+def _check(path: Path, data: dict[str, Array], ranges: Array) -> None:
+    count, beams = ranges.shape[0], ranges.shape[-1]
+    shapes = {
+        "angles": (beams,), "stamps": (count,), "odom": (count, 3), "initial_pose": (3,), "reference": (count, 3),
+    }  # fmt: skip
+    if ranges.ndim != 2 or beams < 3 or not count:
+        raise UserError(f"{path}: ranges has the shape {data['ranges'].shape}, not (N, B) of 3 beams or more")
+    for name, shape in shapes.items():
+        if name in data and data[name].shape != shape:
+            raise UserError(f"{path}: {name} has the shape {data[name].shape}; for these ranges it must be {shape}")
+        if name in data and name != "reference" and not np.isfinite(data[name]).all():
+            raise UserError(f"{path}: {name} has numbers that are not finite")
+    if "stamps" in data and (np.diff(data["stamps"]) < 0).any():
+        raise UserError(f"{path}: stamps are not sorted")
+
+
+def _sweeps(
+    ranges: Array, range_max: float, stamps: Array | None, odom: Array | None, reference: Array | None
+) -> Iterator[Sweep]:
+    for k, row in enumerate(ranges):
+        seen = None if reference is None or not np.isfinite(reference[k]).all() else reference[k]
+        stamp = None if stamps is None else round(float(stamps[k]) * 1e9)
+        yield Sweep(stamp, clean(row, range_max), None if odom is None else odom[k], seen)
+
+
+def _arrays(path: Path) -> dict[str, Array]:
+    """The arrays we know, as numbers."""
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            kept = {name: file[name] for name in file.files if name in NAMES}
+            if wrong := [name for name, array in kept.items() if array.dtype.kind not in "fiu"]:
+                raise UserError(f"{path}: {wrong[0]} holds {kept[wrong[0]].dtype}, not real numbers")
+            return {name: np.asarray(array, np.float64) for name, array in kept.items()}
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    except (
+        OSError,
+        ValueError,
+        zipfile.BadZipFile,
+        EOFError,
+        KeyError,
+        NotImplementedError,
+        zlib.error,
+    ) as error:
+        raise UserError(f"{path}: not an .npz of plain arrays ({' '.join(str(error).split())[:120]})") from None

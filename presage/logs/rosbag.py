@@ -1,0 +1,184 @@
+"""ROS 1 and 2 bags, read with the package rosbags: LaserScan, Odometry, tf, pose topics; no ROS needed."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag2 import Reader as Reader2
+from rosbags.typesys import Stores, get_typestore
+
+from common.errors import UserError
+from common.se2 import Array
+from presage.logs.frames import Frames
+from presage.logs.log import Log, Reading, Sweep, clean
+from presage.logs.ros_poses import Lookup, Poses
+
+SCAN = "sensor_msgs/msg/LaserScan"
+ODOM = "nav_msgs/msg/Odometry"
+TF = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+POSES = (ODOM, "geometry_msgs/msg/PoseWithCovarianceStamped", "geometry_msgs/msg/PoseStamped")
+
+
+class Bag:
+    """One bag, open; every error in it is a UserError."""
+
+    def __init__(self, path: Path, kind: Literal["ros1", "ros2"]) -> None:
+        """Known types are taken as ROS defines them, whatever definitions the bag brings along."""
+        self.path = path
+        self._ros1 = kind == "ros1"
+        # Of ROS 1 the header has a sequence number; tf2_msgs is the same in both.
+        self._store = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_HUMBLE)
+        if self._ros1:
+            self._store.register({TF[0]: get_typestore(Stores.ROS2_HUMBLE).fielddefs[TF[0]]})
+
+    @contextlib.contextmanager
+    def open(self) -> Iterator[Reader1 | Reader2]:
+        """For as long as it is read."""
+        with self._saying(), Reader1(self.path) if self._ros1 else Reader2(self.path) as reader:
+            yield reader
+
+    def messages(self, reader: Reader1 | Reader2, connections: list[Connection]) -> Iterator[tuple[str, int, Any]]:
+        """Topic, time of logging in ns, message; of some connections (none: nothing)."""
+        for connection, logged_ns, data in reader.messages(connections) if connections else ():
+            name = TF[0] if connection.msgtype in TF else connection.msgtype
+            read = self._store.deserialize_ros1 if self._ros1 else self._store.deserialize_cdr
+            yield connection.topic, logged_ns, read(data, name)
+
+    @contextlib.contextmanager
+    def _saying(self) -> Iterator[None]:
+        try:
+            yield
+        except (UserError, KeyboardInterrupt, GeneratorExit):
+            raise
+        except Exception as error:  # noqa: BLE001 - a damaged bag raises kinds of storage, decompression and decoding
+            why = " ".join(str(error).split())[:160] or type(error).__name__
+            raise UserError(
+                f"{self.path}: a ROS bag that cannot be read ({why}): cut short, damaged or not finished; `rosbag "
+                "reindex`, `ros2 bag reindex` or `mcap recover` mend some"
+            ) from None
+
+
+@dataclass(frozen=True)
+class _Topics:
+    """Connections that were chosen."""
+
+    scan: list[Connection]
+    odom: list[Connection]
+    tf: list[Connection]
+    reference: list[Connection]
+
+
+def open_rosbag(path: Path, kind: Literal["ros1", "ros2"], reading: Reading) -> Log:
+    """Raises UserError saying what is wrong, and of several topics which there are."""
+    bag, notes = Bag(path, kind), list[str]()
+    with bag.open() as reader:
+        topics = _topics(path, reader.connections, reading)
+        first = _first_scan(bag, reader, topics)
+        by_logger = reading.clock == "logger" or not _header_ns(first)
+        if by_logger and reading.clock == "sensor":
+            notes.append("the scans have no stamps: the times of logging are taken")
+        poses = Poses(by_logger=by_logger)
+        for topic, logged_ns, message in bag.messages(reader, [*topics.odom, *topics.tf, *topics.reference]):
+            poses.take(topic, logged_ns, message)
+        scans = sum(connection.msgcount for connection in topics.scan)
+    laser = str(first.header.frame_id).lstrip("/")
+    base = poses.base(laser, topics.odom, reading.base_frame)
+    mount, flipped = _mount(path, poses.frames, base, laser, reading, notes)
+    angles, turned = _angles(path, first, flipped=flipped)
+    log = Log(
+        path, f"ROS {1 if kind == 'ros1' else 2} bag ({topics.scan[0].topic})", angles, mount,
+        reading.range_max or float(first.range_max), scans, lambda: iter(()), float(first.range_min), notes=notes,
+    )  # fmt: skip
+    if not 0 < log.range_max < np.inf:
+        raise UserError(f"{path}: its longest range is {log.range_max}: say what it is with --range-max")
+    log.odometry, odom = poses.odometry(topics.odom, base)
+    log.reference, reference = poses.reference(topics.reference, base, reading)
+    log.read = lambda: _sweeps(bag, log, first, odom, reference, by_logger=by_logger, turned=turned)
+    return log
+
+
+def _topics(path: Path, there: list[Connection], reading: Reading) -> _Topics:
+    def of(types: tuple[str, ...], wanted: str, option: str) -> list[Connection]:
+        found = {c.topic for c in there if c.msgtype in types}
+        # Where the base really was is Odometry as well, and then no second candidate.
+        candidates = {wanted} if wanted else found - {reading.reference_topic}
+        if wanted and wanted not in found:
+            raise UserError(f"{path}: {option} {wanted}: no topic of that name and type; it has {_listed(found)}")
+        if len(candidates) > 1:
+            raise UserError(f"{path}: several topics of {types[0]}, choose with {option}: {_listed(found)}")
+        return [c for c in there if c.msgtype in types and c.topic in candidates]
+
+    scan = of((SCAN,), reading.scan_topic, "--scan-topic")
+    if not scan:
+        raise UserError(f"{path}: no {SCAN} in it; it has {_listed({c.msgtype for c in there})}")
+    reference = of(POSES, reading.reference_topic, "--reference-topic") if reading.reference_topic else []
+    odom = of((ODOM,), reading.odom_topic, "--odom-topic")
+    return _Topics(scan, odom, [c for c in there if c.msgtype in TF], reference)
+
+
+def _listed(names: set[str]) -> str:
+    return ", ".join(sorted(names)) or "nothing"
+
+
+def _first_scan(bag: Bag, reader: Reader1 | Reader2, topics: _Topics) -> Any:
+    found = next((message for _, _, message in bag.messages(reader, topics.scan) if len(message.ranges) > 2), None)
+    if found is None:
+        raise UserError(f"{bag.path}: {topics.scan[0].topic} has no scan of three beams or more")
+    return found
+
+
+def _header_ns(message: Any) -> int:
+    """Its header's stamp, ns."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def _mount(path: Path, frames: Frames, base: str, laser: str, reading: Reading, notes: list[str]) -> tuple[Array, bool]:
+    """(3,) laser in base, and whether it hangs upside down."""
+    said = None if reading.mount is not None else frames.mount(base, laser)
+    if reading.mount is None and said is None:
+        raise UserError(
+            f"{path}: tf does not say where {laser or 'the laser'} sits on {base}: say it with --mount x,y,yaw_deg, or "
+            "name what it sits on with --base-frame"
+        )
+    mount, flipped = said if said is not None else (reading.mount, False)
+    flipped = flipped if reading.upside_down is None else reading.upside_down
+    if flipped:
+        notes.append("the scanner hangs upside down: its beams are turned over")
+    return np.asarray(mount), flipped
+
+
+def _angles(path: Path, scan: Any, *, flipped: bool) -> tuple[Array, bool]:
+    """(B,) rad, counter-clockwise, and whether a scan's ranges are to be taken from their end."""
+    start, step, beams = float(scan.angle_min), float(scan.angle_increment), len(scan.ranges)
+    if not (np.isfinite([start, step]).all() and 0 < abs(step) * (beams - 1) <= 2 * np.pi + abs(step)):
+        raise UserError(f"{path}: {beams} beams from {start:g} rad on, {step:g} apart, are no scanner's")
+    angles = (start + step * np.arange(beams, dtype=np.float64)) * (-1 if flipped else 1)
+    turned = bool(angles[-1] < angles[0])
+    return (angles[::-1] if turned else angles), turned
+
+
+def _sweeps(
+    bag: Bag, log: Log, first: Any, odom: Lookup, reference: Lookup, *, by_logger: bool, turned: bool
+) -> Iterator[Sweep]:
+    topic = log.format.split("(")[1].rstrip(")")
+    with bag.open() as reader:
+        connections = [c for c in reader.connections if c.topic == topic and c.msgtype == SCAN]
+        for _, logged_ns, scan in bag.messages(reader, connections):
+            if len(scan.ranges) != len(log.angles) or _start_and_step(scan) != _start_and_step(first):
+                log.left_out["scans of other beams"] += 1
+                continue
+            stamp = logged_ns if by_logger else _header_ns(scan)
+            ranges = clean(np.asarray(scan.ranges[:: -1 if turned else 1], np.float64), log.range_max, log.range_min)
+            yield Sweep(stamp, ranges, odom(stamp), reference(stamp))
+
+
+def _start_and_step(scan: Any) -> tuple[float, float]:
+    return scan.angle_min, scan.angle_increment

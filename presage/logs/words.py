@@ -1,0 +1,45 @@
+"""What a command line says about a log, from words to numbers."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from common.config import POSE_TEXT
+from common.errors import UserError
+from common.se2 import Array
+from presage.logs.log import Reading
+
+NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)"
+
+
+def pose_of(text: str, option: str) -> Array:
+    """(3,) m, m, rad from x,y[,yaw_deg]; raises UserError."""
+    if not re.fullmatch(POSE_TEXT, text) or not text:
+        raise UserError(f"{option} {text!r}: give x,y,yaw_deg, such as 3,1.5,90")
+    numbers = [float(part) for part in text.split(",")]
+    return np.array([*numbers[:2], np.deg2rad(numbers[2]) if len(numbers) > 2 else 0.0])
+
+
+def angles_of(text: str) -> tuple[float, float]:
+    """First and last beam in rad, from degrees FIRST,LAST; raises UserError."""
+    if not re.fullmatch(f"{NUMBER},{NUMBER}", text):
+        raise UserError(f"--angles {text!r}: give the first and the last beam in degrees, such as -90,90")
+    first, last = (float(np.deg2rad(float(part))) for part in text.split(","))
+    if not 0 < last - first <= 2 * np.pi:
+        raise UserError(f"--angles {text!r}: the last beam must lie up to 360 degrees to the left of the first")
+    return first, last
+
+
+def reading_of(
+    mount: str, scan_topic: str, odom_topic: str, reference_topic: str, base_frame: str, angles: str, clock: str, *,
+    reference: bool | None, range_max: float | None, upside_down: bool | None,
+) -> Reading:  # fmt: skip
+    """From the options of `presage import` and `presage localize`; raises UserError on a word that is not known."""
+    if clock not in ("sensor", "logger"):
+        raise UserError(f"no clock {clock!r}: choose sensor or logger")
+    return Reading(
+        pose_of(mount, "--mount") if mount else None, scan_topic, odom_topic, base_frame, upside_down, reference,
+        reference_topic, angles_of(angles) if angles else None, range_max, clock,  # type: ignore[arg-type]
+    )  # fmt: skip

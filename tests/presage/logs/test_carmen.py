@@ -1,0 +1,159 @@
+"""CARMEN logs of every kind of line, compressed or not, with what goes wrong in real ones."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import lzma
+
+import numpy as np
+import pytest
+
+from common.errors import UserError
+from presage.logs.log import Reading
+from presage.logs.opening import open_log
+from tests.presage.logs.drives import ANGLES, BEAMS, MOUNT, SCANS, STAMPS, carmen, odom, ranges, truth, words
+
+FOV = {"angles": (ANGLES[0], ANGLES[-1])}  # FLASER's 91 beams are no usual number
+
+
+def write(tmp_path, lines, pack=None, name="drive.log"):
+    text = ("\n".join(lines) + "\n").encode()
+    file = tmp_path / name
+    file.write_bytes(pack.compress(text) if pack is not None else text)
+    return file
+
+
+def read(path, **said):
+    log = open_log(path, Reading(**said))
+    return log, list(log.sweeps())
+
+
+def close(poses, wanted):
+    np.testing.assert_allclose(np.array(poses), wanted, atol=2e-6)
+
+
+@pytest.mark.parametrize("kind", ["FLASER", "ROBOTLASER1", "OLD", "RAWLASER1"])
+def test_every_kind_of_line(tmp_path, kind):
+    said = FOV if kind == "FLASER" else {}
+    said |= {"mount": MOUNT} if kind == "RAWLASER1" else {}
+    log, sweeps = read(write(tmp_path, carmen(kind)), **said)
+    assert log.scans == SCANS
+    kept = sweeps[:-1] if kind == "RAWLASER1" else sweeps  # no ODOM comes after the last scan
+    np.testing.assert_allclose([sweep.stamp_ns for sweep in sweeps], STAMPS, atol=1000)
+    np.testing.assert_allclose([sweep.ranges for sweep in sweeps], ranges(), atol=1e-6)
+    np.testing.assert_allclose(log.angles, ANGLES, atol=1e-6)
+    np.testing.assert_allclose(log.mount, MOUNT, atol=1e-5)  # by the two poses of a line
+    close([sweep.odom for sweep in kept], odom(STAMPS)[: len(kept)])
+    assert len(kept) == SCANS or sweeps[-1].odom is None
+    assert log.range_max == 25.0
+    assert not log.reference
+
+
+@pytest.mark.parametrize("pack", [gzip, bz2, lzma])
+def test_compressed(tmp_path, pack):
+    file = write(tmp_path, carmen(), pack, "drive.clf.packed")  # told by content
+    assert len(read(file)[1]) == SCANS
+    file.write_bytes(file.read_bytes()[:-40])
+    with pytest.raises(UserError, match="cut short or damaged"):
+        read(file)
+    file.write_bytes(pack.compress(b"a letter\n"))
+    with pytest.raises(UserError, match="compressed, and no CARMEN log is inside"):
+        read(file)
+
+
+def test_odometry_of_its_own_lines(tmp_path):
+    log, sweeps = read(write(tmp_path, carmen("ROBOTLASER1")), odom_topic="ODOM")
+    assert log.odometry == "ODOM, interpolated"
+    close([sweep.odom for sweep in sweeps[1:-1]], odom(STAMPS)[1:-1])
+
+
+def test_corrected_poses_are_the_reference_only_when_that_is_said(tmp_path):
+    file = write(tmp_path, carmen("FLASER", corrected=True, header=f"PARAM robot_frontlaser_offset {MOUNT[0]} h 0"))
+    assert not read(file, **FOV)[0].reference
+    log, sweeps = read(file, **FOV, reference=True, mount=MOUNT)
+    assert log.reference == "FLASER's corrected pose"
+    close([sweep.reference for sweep in sweeps], truth(STAMPS))
+    assert read(file, **FOV)[0].mount.tolist() == [MOUNT[0], 0, 0]  # the poses do not tell; PARAM does
+    raw, _ = read(write(tmp_path, carmen("FLASER")), **FOV, reference=True)
+    assert not raw.reference
+    assert any("no reference" in note for note in raw.notes)
+
+
+def test_a_simulators_true_poses(tmp_path):
+    lines = carmen()
+    lines += [f"TRUEPOS {words(truth(s))} {words(odom(s))} {s * 1e-9:.6f} host {k / 10}" for k, s in enumerate(STAMPS)]
+    log, sweeps = read(write(tmp_path, lines))
+    assert log.reference == "the log's TRUEPOS"
+    np.testing.assert_allclose([sweep.reference for sweep in sweeps], truth(STAMPS), atol=1e-5)
+    assert not read(tmp_path / "drive.log", reference=False)[0].reference
+
+
+@pytest.mark.parametrize(
+    ("beams", "first", "last"), [(180, -90, 89), (181, -90, 90), (360, -90, 89.5), (361, -90, 90), (541, -135, 135)]
+)
+def test_where_so_many_beams_look(tmp_path, beams, first, last):
+    line = f"FLASER {beams} {words(np.full(beams, 2.0))} 0 0 0 0 0 0 {{}} host 0.1"
+    log, _ = read(write(tmp_path, [line.format(1.0), line.format(2.0)]))
+    np.testing.assert_allclose(np.rad2deg(log.angles[[0, -1]]), [first, last])
+    assert any("--angles" in note for note in log.notes)
+    with pytest.raises(UserError, match="where its 100 beams look"):
+        read(write(tmp_path, [f"FLASER 100 {words(np.full(100, 2.0))} 0 0 0 0 0 0 1.0 host 0.1"]))
+
+
+@pytest.mark.parametrize(("longest", "range_max"), [(81.91, 80.0), (8.191, 8.18), (5.0, 80.0)])
+def test_where_an_lms_sees_nothing(tmp_path, longest, range_max):
+    row = np.full(181, 2.0)
+    row[3] = longest
+    log, sweeps = read(write(tmp_path, [f"FLASER 181 {words(row)} 0 0 0 0 0 0 1.0 host 0.1"]))
+    assert log.range_max == range_max
+    assert np.isinf(sweeps[0].ranges[3]) == (longest > range_max)
+
+
+def test_two_lasers(tmp_path):
+    rear = "RLASER 181 " + words(np.full(181, 3.0)) + " -0.2 0 3.141593 0 0 0 {0} host {0}"
+    lines = [*carmen("ROBOTLASER1"), *(rear.format(k) for k in (1, 2, 3))]
+    file = write(tmp_path, lines)
+    assert len(read(file)[1]) == SCANS
+    log, sweeps = read(file, scan_topic="RLASER")
+    assert len(sweeps) == 3
+    np.testing.assert_allclose(np.abs(log.mount), [0.2, 0, np.pi], atol=1e-6)
+    with pytest.raises(UserError, match="no FLASER lines in it; it has RLASER, ROBOTLASER1"):
+        read(file, scan_topic="FLASER")
+
+
+def test_what_cannot_be_used_is_counted(tmp_path):
+    lines = carmen()
+    scans = [k for k, line in enumerate(lines) if line.startswith("ROBOTLASER1")]
+    lines[scans[3]] = lines[scans[3]][:200]  # cut in the middle
+    lines[scans[5]] = lines[scans[4]]  # twice
+    lines[scans[8]] = lines[scans[6]]  # late
+    short = lines[scans[9]].split()
+    lines[scans[9]] = " ".join([*short[:8], str(BEAMS - 1), *short[9 : 9 + BEAMS - 1], *short[9 + BEAMS :]])
+    lines.insert(4, "\x1b[0m@@ garbage")
+    lines.insert(9, "GPS 1 2 3 of no interest")
+    log, sweeps = read(write(tmp_path, lines))
+    assert dict(log.left_out) == {
+        "garbled lines": 2, "scans twice": 1, "scans older than the one before": 1, "scans of other beams": 1,
+    }  # fmt: skip
+    assert len(sweeps) == SCANS - 4
+    assert list(log.sweeps())  # the counts are of the last pass
+    assert log.left_out["garbled lines"] == 2
+
+
+def test_hardly_anything_of_use(tmp_path):
+    lines = [line[:80] if line.startswith("ROBOT") and k > 8 else line for k, line in enumerate(carmen())]
+    with pytest.raises(UserError, match="too little of use: 3 scans; garbled lines: 9"):
+        read(write(tmp_path, lines))
+    with pytest.raises(UserError, match="without a scan"):
+        read(write(tmp_path, ["ODOM 0 0 0 0 0 0 1 h 1"]))
+
+
+def test_clocks(tmp_path):
+    file = write(tmp_path, carmen())
+    _, sweeps = read(file, clock="logger")
+    assert [sweep.stamp_ns for sweep in sweeps] == [k * 100_000_000 for k in range(SCANS)]
+    still = [f"FLASER 181 {words(np.full(181, 2.0))} 0 0 0 0 0 0 0 nohost {k}" for k in range(5)]
+    log, sweeps = read(write(tmp_path, still))
+    assert [sweep.stamp_ns for sweep in sweeps] == [k * 10**9 for k in range(5)]
+    assert any("stand still" in note for note in log.notes)

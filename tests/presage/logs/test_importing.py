@@ -1,0 +1,186 @@
+"""`presage import`: what comes out is a recording like any other."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from common import se2
+from common.errors import UserError
+from common.topics import ODOM, SCAN, TRUTH
+from presage.inspection.info import survey
+from presage.localize import Job, choice_of, localize
+from presage.logs.importing import Import, import_command
+from presage.logs.log import Reading
+from presage.logs.words import reading_of
+from presage.scan_files import read_scans
+from services.recorder.reader import read_recording
+from tests.presage.logs.drives import (
+    ANGLES,
+    MOUNT,
+    SCANS,
+    STAMPS,
+    Bag,
+    believed,
+    carmen,
+    odom,
+    ranges,
+    truth,
+    write_bag,
+)
+
+CONSOLE = Console(quiet=True)
+
+
+def npz(folder, **changes):
+    values = {
+        "ranges": ranges(), "angles": ANGLES, "range_max": 25.0, "stamps": STAMPS * 1e-9, "odom": odom(STAMPS),
+        "reference": truth(STAMPS),
+    }  # fmt: skip
+    file = folder / "drive.npz"
+    np.savez(file, **{name: value for name, value in {**values, **changes}.items() if value is not None})
+    return file
+
+
+def imported(file, out="out.mcap", **more):
+    job = Import(file, file.parent / out, **more)
+    import_command(job, file.parent / "facts.json", CONSOLE)
+    return job.out, json.loads((file.parent / "facts.json").read_text())
+
+
+def make(folder, name):
+    if name == "carmen":
+        file = folder / "drive.log"
+        file.write_text("\n".join(carmen()) + "\n")
+        return file
+    return npz(folder) if name == "npz" else write_bag(folder, Bag(name, localised=True))
+
+
+@pytest.mark.parametrize("name", ["carmen", "npz", "ros1", "db3", "mcap"])
+def test_reads_as_the_log_does(tmp_path, name):
+    file = make(tmp_path, name)
+    reading = Reading(mount=MOUNT) if name == "npz" else Reading()
+    out, facts = imported(file, reading=reading, world="corridor")
+    log, recorded = read_scans(file, reading.mount), read_scans(out)
+    np.testing.assert_allclose(recorded.ranges, log.ranges, rtol=1e-6)
+    np.testing.assert_allclose(recorded.geometry.angles, log.geometry.angles, atol=1e-6)
+    np.testing.assert_allclose(recorded.geometry.mount, MOUNT, atol=1e-5)
+    np.testing.assert_allclose(recorded.stamps, log.stamps)
+    np.testing.assert_allclose(recorded.odom, odom(STAMPS), atol=1e-5)
+    assert (recorded.truth is None) == (log.truth is None) == (name == "carmen")
+    if name != "carmen":
+        assert recorded.truth_is == log.truth_is != "the recorded truth"
+        np.testing.assert_allclose(recorded.truth, log.truth)
+        wanted = truth(STAMPS) if name == "npz" else believed(STAMPS)
+        np.testing.assert_allclose(recorded.truth, wanted, atol=2e-4)
+    assert recorded.world == "corridor"
+    assert facts["scans"] == SCANS
+
+
+def test_is_whole_and_says_where_it_comes_from(tmp_path):
+    out, _ = imported(make(tmp_path, "mcap"), robot="truck")
+    recording = read_recording(out)
+    facts = survey(recording, check=True)
+    assert facts.complete
+    assert facts.robots == ["truck"]
+    assert facts.missing == 0
+    assert {row.key: row.messages for row in facts.topics} == {t.key("truck"): SCANS for t in (SCAN, ODOM, TRUTH)}
+    assert all(row.undecodable == 0 and row.counters["written"] == SCANS for row in facts.topics)
+    about = recording.metadata["log"]
+    assert about["format"] == "ROS 2 bag (/scan)"
+    assert about["reference"] == "the log's own localisation (tf map -> base_link)"
+    scanner = recording.scanner()
+    assert (scanner.beams, scanner.rate) == (len(ANGLES), pytest.approx(10))
+    assert scanner.mount == pytest.approx(tuple(MOUNT))
+    assert recording.start_ns == STAMPS[0]
+
+
+def test_velocities_are_those_between_scans(tmp_path):
+    out, _ = imported(npz(tmp_path), reading=Reading(mount=MOUNT))
+    twists = [m.twist.array() for _, m, _ in read_recording(out).messages(TRUTH)]
+    assert not twists[0].any()
+    np.testing.assert_allclose(
+        twists[1], se2.between(truth(STAMPS[0]), truth(STAMPS[1])) / 0.1, atol=1e-5
+    )  # s in float64
+
+
+def test_localises_from_its_reference_on(tmp_path):
+    out, _ = imported(make(tmp_path, "ros1"), world="corridor")
+    for file, world in ((out, ""), (tmp_path / "drive.bag", "corridor")):
+        choice = choice_of(file, world, "precise", "exact", None, 0.02, 0, "")
+        job = Job.of(file, choice, "track", "base_link", Reading(), fresh=False, odometry=True, out=tmp_path / "p.json")
+        rows = localize(job, CONSOLE)
+        found = np.array([[row["x"], row["y"]] for row in rows])
+        assert np.hypot(*(found - truth(STAMPS)[:, :2]).T).max() < 0.02
+
+
+@pytest.mark.parametrize("name", ["npz", "mcap"])
+def test_poses_of_the_laser(tmp_path, name):
+    file = make(tmp_path, name)
+    scans = read_scans(imported(file, laser=True)[0])
+    assert not scans.geometry.mount.any()
+    # An .npz's poses are taken to be the laser's as they stand.
+    wanted = odom(STAMPS) if name == "npz" else se2.compose(odom(STAMPS), MOUNT)
+    np.testing.assert_allclose(scans.odom, wanted, atol=1e-6)
+
+
+def test_a_scanner_upside_down_is_turned_over(tmp_path):
+    file = npz(tmp_path, ranges=ranges()[:, ::-1])
+    scans = read_scans(imported(file, reading=Reading(mount=MOUNT, upside_down=True))[0])
+    np.testing.assert_allclose(scans.ranges, ranges(), rtol=1e-6)
+    np.testing.assert_allclose(scans.geometry.angles, ANGLES, atol=1e-6)
+
+
+def test_a_log_without_times(tmp_path):
+    file = npz(tmp_path, stamps=None)
+    with pytest.raises(UserError, match="--rate"):
+        imported(file)
+    np.testing.assert_allclose(read_scans(imported(file, rate=5.0)[0]).stamps, np.arange(SCANS) / 5)
+
+
+def test_reference_poses_that_are_not_known_throughout(tmp_path):
+    reference = truth(STAMPS)
+    reference[4:6] = np.nan
+    file = npz(tmp_path, reference=reference)
+    assert imported(file)[1]["reference_poses"] == SCANS - 2
+    assert imported(file, "without.mcap", reading=Reading(reference=False))[1]["reference_poses"] == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"angles": ANGLES**3}, "not evenly spaced"),
+        ({"stamps": STAMPS * 1e-9 - 2e9}, "below 0 s"),
+        ({"stamps": np.zeros(SCANS)}, "1 scans; scans twice: 11"),
+    ],
+)
+def test_what_no_recording_can_be_made_of_leaves_no_file(tmp_path, changes, why):
+    with pytest.raises(UserError, match=why):
+        imported(npz(tmp_path, **changes))
+    assert [path.name for path in tmp_path.iterdir()] == ["drive.npz"]
+
+
+def test_names_that_cannot_be(tmp_path):
+    file = npz(tmp_path)
+    (tmp_path / "there.mcap").write_bytes(b"")
+    for out, why in (("out.bag", "NAME.mcap"), ("there.mcap", "is there already; choose another name with --out")):
+        with pytest.raises(UserError, match=why):
+            imported(file, out)
+    with pytest.raises(UserError, match="no world"):
+        imported(file, world="nowhere")
+
+
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        ({"mount": "1"}, "--mount '1'"), ({"angles": "90"}, "--angles '90'"), ({"angles": "90,-90"}, "to the left"),
+        ({"clock": "wall"}, "no clock 'wall'"),
+    ],
+)  # fmt: skip
+def test_words_that_are_not_known(said, why):
+    usual = dict.fromkeys(("mount", "scan_topic", "odom_topic", "reference_topic", "base_frame", "angles"), "")
+    with pytest.raises(UserError, match=why):
+        reading_of(**{**usual, "clock": "sensor", **said}, reference=None, range_max=None, upside_down=None)
