@@ -47,7 +47,7 @@ def train_precise(job: Job, link: Link, console: Console) -> Path:
     """The weights' path; raises UserError in one line."""
     world, scanner = load_world(job.world), job.scanner
     path = weights.path_of(job.out, world.name)
-    _refuse_to_overwrite(path, world)
+    weights.refuse_to_overwrite(path, world)
     rng = np.random.default_rng(job.recipe.seed)
     poses = {name: _poses(world, count, rng) for name, count in (("train", job.samples), ("test", TEST_SAMPLES))}
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
@@ -74,19 +74,6 @@ def train_precise(job: Job, link: Link, console: Console) -> Path:
 def _poses(world: World, count: int, rng: np.random.Generator) -> se2.Array:
     places = world.sample_free(count, rng, Robot().radius)
     return np.column_stack([places, rng.uniform(-np.pi, np.pi, count)])
-
-
-def _refuse_to_overwrite(path: Path, world: World) -> None:
-    """Another world's field of the same name is not ours to throw away."""
-    try:
-        _, _, card = weights.load(path)
-    except UserError:
-        return
-    if not weights.same_walls(card.world, world):
-        raise UserError(
-            f"{path} belongs to another world of the same name {world.name!r}: give your world a name of its own, "
-            "or another folder with --out"
-        )
 
 
 def _learn(

@@ -46,6 +46,8 @@ class Settings:
     ambiguous: float = 0.05  # weight of a second hypothesis from which the belief is ambiguous
     hypotheses: int = 8
     inflation: float = 1.0  # of the covariance, for errors of the model that hang together
+    floor_position: float = 0.0  # m, standard deviation that no scan takes away, in x and in y
+    floor_heading: float = 0.0  # rad
     sure: float = 0.75  # share of beams from which one scan is enough to say tracking
     patience: int = 30  # scans that a place must persist with less
     probation: int = 10  # scans for which a place that explains less than that must persist to follow another
@@ -193,14 +195,19 @@ class PreciseEstimator:
         best, settings = self.modes[0], self.settings
         if best.explained < settings.glimpse or not best.trusted:
             return False
-        expected = self.model.expect(se2.compose(best.pose, self.mount)[None], view.angles)
-        return obstruction.contradicted(view, expected) <= settings.contradicted
+        return self._contradicted(view) <= settings.contradicted
+
+    def _contradicted(self, view: View) -> float:
+        expected = self.model.expect(se2.compose(self.modes[0].pose, self.mount)[None], view.angles)
+        return obstruction.contradicted(view, expected)
 
     def _relocalise(self, view: View) -> Conversation[None]:
         """Search from nothing; keep what is tracked where nothing better is found."""
         if self._near is not None:
             near, self._near = self._near, None
             found = yield from self._search_near(view, *near)
+            if found[0].explained >= self.settings.believable:  # who says where it is has tracked it until now
+                found[0] = replace(found[0], trusted=True)
         else:
             found = yield from self._search(view)
         if self.modes:
@@ -221,7 +228,7 @@ class PreciseEstimator:
         if not self._hidden(view):
             return False
         best = self.modes[0]
-        spread = best.covariance(self.settings.inflation)[:2, :2] + np.eye(2) * mixture.SAME_PLACE**2
+        spread = self._covariance(best)[:2, :2] + np.eye(2) * mixture.SAME_PLACE**2
         off = found.pose[:2] - best.pose[:2]
         return bool(off @ np.linalg.solve(spread, off) > FAR)
 
@@ -266,10 +273,10 @@ class PreciseEstimator:
         seen: Expected = yield Expect(self.model, se2.compose(best.pose[None], self.mount), view.angles)
         expected = self._with_noise(seen)
         believable = self._believable(view)
-        state = self._state(best, believable=believable)
+        state = self._state(view, best, believable=believable)
         unknown = self.seeds.spread * (not believable)
         hypotheses = tuple(
-            Hypothesis(mode.pose, mode.covariance(self.settings.inflation) + unknown, mode.weight)
+            Hypothesis(mode.pose, self._covariance(mode) + unknown, mode.weight)
             for mode in self.modes
         )
         return Posterior(
@@ -283,14 +290,19 @@ class PreciseEstimator:
             expected.sigma[0],
         )
 
-    def _state(self, best: Mode, *, believable: bool) -> State:
+    def _covariance(self, mode: Mode) -> Array:
+        floor = np.array([self.settings.floor_position] * 2 + [self.settings.floor_heading])
+        return np.asarray(mode.covariance(self.settings.inflation) + np.diag(floor**2))
+
+    def _state(self, view: View, best: Mode, *, believable: bool) -> State:
         settings = self.settings
         if not believable:
             return "lost" if self._was_tracking else "localising"
         if len(self.modes) > 1 and self.modes[1].weight > settings.ambiguous:
             return "ambiguous"
-        vague = np.linalg.eigvalsh(best.covariance(settings.inflation)[:2, :2])[-1] > settings.vague**2
-        if vague or (best.explained < settings.sure and best.age < settings.patience and not best.trusted):
+        vague = np.linalg.eigvalsh(self._covariance(best)[:2, :2])[-1] > settings.vague**2
+        sure = best.trusted or best.explained >= settings.sure
+        if vague or not (sure or (best.age >= settings.patience and self._contradicted(view) <= settings.contradicted)):
             return "localising"
         self._was_tracking = True
         self.modes[0] = replace(best, trusted=True)

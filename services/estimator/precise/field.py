@@ -84,6 +84,14 @@ class Seen:
         )
         return self.cells[np.ix_(i, j)]
 
+    def contains(self, points: Array) -> npt.NDArray[np.bool_]:
+        """(N,) whether somebody has looked there; points (N, 2) m in map."""
+        j, i = np.floor((points - self.origin) / SEEN_CELL).astype(int).T
+        inside = (i >= 0) & (j >= 0) & (i < self.cells.shape[0]) & (j < self.cells.shape[1])
+        found = np.zeros(len(points), np.bool_)
+        found[inside] = self.cells[i[inside], j[inside]]
+        return found
+
     def limit(self, lasers: Array, angles: Array, ranges: Array, jacobian: Array, scale: Array) -> None:
         """Let beams (N, B) end where they enter what nobody has seen, with an infinite scale."""
         lasers, angles = np.asarray(lasers, float).reshape(-1, 3), np.asarray(angles, float)

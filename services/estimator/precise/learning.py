@@ -71,9 +71,16 @@ class Beams:
         """Some of them."""
         return Beams(self.starts[which], self.directions[which], self.ranges[which])
 
+    def joined(self, other: Beams) -> Beams:
+        """And those of another."""
+        mine, theirs = (vars(each).values() for each in (self, other))
+        return Beams(*(np.concatenate(pair) for pair in zip(mine, theirs, strict=True)))
+
 
 def learn_field(
-    beams: Beams, recipe: Recipe, report: Callable[[str, float], None] = lambda _title, _done: None
+    beams: Beams,
+    recipe: Recipe,
+    report: Callable[[str, float], None] = lambda _title, _done: None,
 ) -> DistanceField:
     """The field that predicts the beams; ``report`` hears of stages and the share done."""
     report("surfaces", 0.0)

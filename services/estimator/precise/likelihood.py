@@ -11,6 +11,7 @@ is as likely as any other.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
 
 
 KNOWN = 0.3  # share of the beams of which something must be expected
+
+
+_erf = np.vectorize(math.erf, otypes=[float])
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,14 @@ class Likelihood:
             return np.full(len(measured), self.unseen / range_max)
         core, flat = self._parts(measured, expected, scale, range_max)
         return np.asarray((1 - self.unseen) * (core + flat))
+
+    def cumulative(self, measured: Array, expected: Array, scale: Array, range_max: float) -> Array:
+        """(K,) probability of a range of at most ``measured`` (K,) m, given that there is one."""
+        deviation = np.hypot(self.deviation(expected), scale)
+        core = 0.5 * (1 + _erf((measured - expected) / (np.sqrt(2) * deviation)))
+        early = np.minimum(measured / np.maximum(expected, 1e-3), 1.0)
+        flat = np.minimum(measured / range_max, 1.0)
+        return np.asarray((1 - self.short - self.random) * core + self.short * early + self.random * flat)
 
     def inlier(self, measured: Array, expected: Array, scale: Array, range_max: float) -> Array:
         """(K,) probability that the surface expected ended the beam, and nothing else; finite ranges (K,) m."""
