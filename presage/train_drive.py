@@ -65,7 +65,7 @@ def train_from_drive(job: Job, console: Console) -> Path:
 
         simulated = simulated_beams(world, drive, job.samples, job.recipe.seed) if job.world else None
         learned = learn_drive(drive, job.recipe, simulated, report)
-    card = _card(job, world, drive, learned, time.monotonic() - began)
+    card = card_of(job, world, drive, learned, time.monotonic() - began)
     weights.save(path, learned.model, learned.places, card)
     draw_learned(weights.load(path)[0], card, path.with_suffix(".png"))
     console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB, learned in {card.learning_s:.0f} s from {card.source}")
@@ -122,7 +122,8 @@ def scanner_of(drive: Drive, sigma: float, name: str) -> Scanner:
     )  # fmt: skip
 
 
-def _card(job: Job, world: World, drive: Drive, learned: Learned, seconds: float) -> weights.FieldCard:
+def card_of(job: Job, world: World, drive: Drive, learned: Learned, seconds: float) -> weights.FieldCard:
+    """Where the model comes from, and what its calibration found."""
     found, errors = learned.calibration, learned.errors
     source = f"{len(drive.ranges)} posed scans of {job.log.name}"
     if job.world:
