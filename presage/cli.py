@@ -168,9 +168,7 @@ def train(
     upside_down: UpsideDown = False,
     drive: Annotated[
         Path | None,
-        typer.Option(
-            "--from", help="precise: a log or recording with reference poses; its scans teach, and calibrate, the model."
-        ),
+        typer.Option("--from", help="precise: a log or recording with reference poses; its scans teach and calibrate."),
     ] = None,
     share: Annotated[
         float, typer.Option(min=0.01, max=1.0, help="Of --from, from its beginning: 0.5 leaves half to test with.")
@@ -225,7 +223,8 @@ def _train_from_drive(
     if preset != "precise":
         raise UserError(f"--from teaches preset precise, not {preset}: the paper's decoder needs scans at one heading")
     make_folder(out, "--out")
-    reading = reading_of(mount, "", "", "", "", "", "sensor", reference=None, range_max=None, upside_down=upside_down or None)
+    hangs = upside_down or None
+    reading = reading_of(mount, *[""] * 5, "sensor", reference=None, range_max=None, upside_down=hangs)
     train_from_drive(Job(drive, world, out, samples, recipe, share, reading), console)
 
 

@@ -1,4 +1,4 @@
-"""`presage train --from LOG`: the model of preset precise from a drive with reference poses, calibrated on its scans."""
+"""`presage train --from LOG`: preset precise from a drive with reference poses, calibrated on its scans."""
 
 from __future__ import annotations
 
@@ -147,12 +147,18 @@ def summary(card: weights.FieldCard) -> list[str]:
         return []
     shares = found.likelihood
     return [
-        f"held out: {found.scans} scans, {found.log_likelihood:.3f} nats a beam; range error median "
-        f"{card.test_range_error_median_m * 1e3:.1f} mm, {card.test_share_above_5_cm:.1%} above 5 cm",
-        f"of the beams {shares.short:.1%} end early, {shares.random:.1%} anywhere, {shares.unseen:.1%} do not return; "
-        f"noise {shares.sigma * 1e3:.1f} mm; a scan usually explained to {found.usual:.0%}",
-        f"pose from one scan against the reference: {found.floor_position * 1e3:.0f} mm and "
-        f"{np.rad2deg(found.floor_heading):.2f} deg beyond the scan's own covariance, which is taken "
-        f"{found.inflation:.1f} times; NEES then {found.nees_median:.2f} median (honest 2.37), "
-        f"{found.nees_mean:.2f} mean (3)",
+        (
+            f"held out: {found.scans} scans, {found.log_likelihood:.3f} nats a beam; range error median "
+            f"{card.test_range_error_median_m * 1e3:.1f} mm, {card.test_share_above_5_cm:.1%} above 5 cm"
+        ),
+        (
+            f"of the beams {shares.short:.1%} end early, {shares.random:.1%} anywhere, {shares.unseen:.1%} do not "
+            f"return; noise {shares.sigma * 1e3:.1f} mm; a scan usually explained to {found.usual:.0%}"
+        ),
+        (
+            f"pose from one scan against the reference: {found.floor_position * 1e3:.0f} mm and "
+            f"{np.rad2deg(found.floor_heading):.2f} deg beyond the scan's own covariance, which is taken "
+            f"{found.inflation:.1f} times; NEES then {found.nees_median:.2f} median (honest 2.37), "
+            f"{found.nees_mean:.2f} mean (3)"
+        ),
     ]

@@ -15,7 +15,6 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from common import se2
 from common.bus import Link
-from common.errors import UserError
 from common.robot import Robot
 from common.scanner import SCANNERS, Scanner
 from common.versions import commit, versions

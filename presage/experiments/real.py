@@ -6,8 +6,10 @@ poses, whose own error is among them.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,12 +20,13 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from common.errors import UserError
+from common.versions import commit
 from common.world import load_world
 from presage.drive_figure import calibration_curve
 from presage.experiments import drawing, results
 from presage.experiments.real_drive import BEFORE, GLOBAL, KIDNAPPED, LASER, LIMIT, ODOMETRY, drive_at, trial
 from presage.experiments.real_drive import Job as Stretch
-from presage.experiments.real_tuning import Settings, starting_point, tune
+from presage.experiments.real_tuning import Settings, Tuned, starting_point, tune
 from presage.experiments.trials import run_trials
 from presage.map_drawing import draw_walls
 from presage.train_drive import Job as Training
@@ -67,10 +70,10 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
     half = len(drive.ranges) // 2
     if half < 2 * LIMIT:
         raise UserError(f"{job.log}: {len(drive.ranges)} posed scans; at least {4 * LIMIT} are needed")
-    model, card, settings, tried = _prepared(job, half, out, console)
+    model, card, tuned = _prepared(job, half, out, console)
     plain = Stretch(str(job.log), job.map, job.mount, "precise", ODOMETRY, half, model=str(model), seed=job.seed)
     jobs = [
-        replace(each, estimator=name, particles=settings if name != "precise" else ())
+        replace(each, estimator=name, particles=() if name == "precise" else _settings(tuned, each.task))
         for each in stretches(plain, half, len(drive.ranges), job, odometry=drive.odom is not None)
         for name in ESTIMATORS
     ]
@@ -84,19 +87,26 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
     result = results.Result(
         job.result, f"A real drive: {job.log.name}", job.seed,
         {**{k: str(v) if isinstance(v, Path) else v for k, v in asdict(job).items()}, "scans": len(drive.ranges),
-         "particle_filter": dict(settings), "particle_filter_tried": tried,
+         "particle_filter": {"tracking": dict(tuned.tracking), "finding": dict(tuned.finding), "tried": tuned.tried},
          "calibration": asdict(card.calibration) if card.calibration else None},
-        summary, curves_of(rows), rows, notes(job, card, settings),
+        summary, curves_of(rows), rows, notes(job, card, tuned),
     )  # fmt: skip
-    result.write(out, draw(result, job, card, rows))
+    result.write(out, draw(job, card, rows))
     return result
 
 
-def _prepared(job: Job, half: int, out: Path, console: Console) -> tuple[Path, weights.FieldCard, Settings, list[str]]:
+def _prepared(job: Job, half: int, out: Path, console: Console) -> tuple[Path, weights.FieldCard, Tuned]:
     """The model of the first half, and the particle filter's settings for it."""
     drive = drive_at(str(job.log), job.mount)
     world = load_world(job.map)
     path = out / f".{job.result}" / "model.safetensors"
+    kept = path.with_name("tuned.json")
+    key = json.dumps([commit(), asdict(job)], sort_keys=True, default=str)
+    with suppress(OSError, ValueError, KeyError, TypeError, UserError):  # of an interrupted run, or nothing
+        before = json.loads(kept.read_text(encoding="utf-8"))
+        if before["key"] == key:
+            sets = (tuple((str(n), float(v)) for n, v in before[what].items()) for what in ("tracking", "finding"))
+            return path, weights.load(path)[2], Tuned(*sets, before["tried"])
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("learning", total=1.0)
@@ -111,8 +121,14 @@ def _prepared(job: Job, half: int, out: Path, console: Console) -> tuple[Path, w
         weights.save(path, learned.model, learned.places, card)
         base = Stretch(str(job.log), job.map, job.mount, "particle-filter", ODOMETRY, 0, seed=job.seed)
         start = starting_point(learned.calibration.motion)
-        settings, tried = (start, []) if job.quick else tune(base, half, start, report)
-    return path, card, settings, tried
+        tuned = Tuned(start, start, []) if job.quick else tune(base, half, start, report)
+    plain = {"key": key, "tracking": dict(tuned.tracking), "finding": dict(tuned.finding), "tried": tuned.tried}
+    kept.write_text(json.dumps(plain) + "\n", encoding="utf-8")
+    return path, card, tuned
+
+
+def _settings(tuned: Tuned, task: str) -> Settings:
+    return tuned.tracking if task in (ODOMETRY, LASER) else tuned.finding
 
 
 def stretches(plain: Stretch, half: int, count: int, job: Job, *, odometry: bool) -> list[Stretch]:
@@ -140,7 +156,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     claims = state == "tracking"
     first = [_found(row, skip) for row, skip in zip(rows, after, strict=True)]
     reached = [k for k in first if k is not None]
-    known = np.array([float(value) for value, fine in zip(nees, good & claims, strict=True) if fine and value is not None])
+    known = np.array([value for value in nees[good & claims] if value is not None], float)
     return {
         "trials": len(rows), "scans": len(error), "error_median_m": float(np.median(error)),
         "error_rms_m": float(np.sqrt(np.mean(error**2))), "error_95_m": float(np.quantile(error, 0.95)),
@@ -186,21 +202,26 @@ def curves_of(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
     return curves
 
 
-def notes(job: Job, card: weights.FieldCard, settings: Settings) -> list[str]:
+def notes(job: Job, card: weights.FieldCard, tuned: Tuned) -> list[str]:
     """What the table does not say."""
     found = card.calibration
-    changed = ", ".join(f"{name} {value:.3g}" for name, value in settings)
     lines = [
-        f"tracked: within {FOUND} m and 10 deg of the reference, whose own error is among the errors; found: says "
-        f"`tracking` there, within {LIMIT} scans; wrong claim: says `tracking` elsewhere",
-        f"particle filter, tuned on the first half: {changed}",
+        (
+            f"tracked: within {FOUND} m and 10 deg of the reference, whose own error is among the errors; found: says "
+            f"`tracking` there, within {LIMIT} scans; wrong claim: says `tracking` elsewhere"
+        ),
+        *(
+            f"particle filter, tuned on the first half, {what}: {_listed(each)}"
+            for what, each in (("a and b", tuned.tracking), ("c and d", tuned.finding))
+        ),
     ]
     if found is not None:
         shares = found.likelihood
         lines.append(
-            f"held out of the first half, {found.scans} scans: {found.log_likelihood:.2f} nats a beam; {shares.short:.1%} "
-            f"of the beams end early, {shares.random:.1%} anywhere; pose within {found.floor_position * 1e3:.0f} mm and "
-            f"{np.rad2deg(found.floor_heading):.2f} deg of the reference beyond the scan's covariance; NEES "
+            f"held out of the first half, {found.scans} scans: {found.log_likelihood:.2f} nats a beam; "
+            f"{shares.short:.1%} of the beams end early, {shares.random:.1%} anywhere; pose within "
+            f"{found.floor_position * 1e3:.0f} mm and {np.rad2deg(found.floor_heading):.2f} deg of the reference "
+            f"beyond the scan's covariance; NEES "
             f"{found.nees_median:.2f} median (honest 2.37), {found.nees_mean:.1f} mean (3)"
         )
     if job.quick:
@@ -208,7 +229,11 @@ def notes(job: Job, card: weights.FieldCard, settings: Settings) -> list[str]:
     return lines
 
 
-def draw(result: results.Result, job: Job, card: weights.FieldCard, rows: Sequence[dict[str, Any]]) -> Figure:
+def _listed(settings: Settings) -> str:
+    return ", ".join(f"{name} {value:.3g}" for name, value in settings)
+
+
+def draw(job: Job, card: weights.FieldCard, rows: Sequence[dict[str, Any]]) -> Figure:
     """The map with the second half's way, calibration, errors over time with and without odometry."""
     figure = drawing.blank(14, 9)
     panels = figure.subplots(2, 2, width_ratios=(1.6, 1))

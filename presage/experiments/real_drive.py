@@ -15,7 +15,7 @@ from common.se2 import Array
 from common.world import load_world
 from presage.scan_files import read_scans
 from presage.train_drive import drive_of
-from services.estimator.building import Choice, Geometry, prepare
+from services.estimator.building import Choice, Factory, Geometry, prepare
 from services.estimator.interface import Estimator, Observation
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.sensor import Sensor
@@ -62,7 +62,7 @@ def trial(job: Job) -> dict[str, Any]:
         numbers = list(range(job.first, job.first + job.count))
         odom = drive.odom if job.task == ODOMETRY else None
     elif job.task == GLOBAL:
-        numbers = list(range(job.first, min(job.first + LIMIT, len(drive.ranges))))
+        numbers = list(range(job.first, min(job.first + (job.count or LIMIT), len(drive.ranges))))
         odom = drive.odom
     else:
         estimator.restart(drive.poses[job.first], NEAR)
@@ -119,7 +119,7 @@ def particle_settings(changed: tuple[tuple[str, float], ...]) -> ParticleSetting
 
 
 @functools.lru_cache(maxsize=2)
-def _precise(world: str, model: str) -> Any:  # noqa: ANN401 - a factory of estimators
+def _precise(world: str, model: str) -> Factory:
     return prepare(Choice(world, "precise", model))
 
 

@@ -53,7 +53,8 @@ class Calibration:
         """An estimator's; its thresholds relative to how scans of this place usually look."""
         plain = Settings()
         return Settings(
-            satisfied=0.93 * self.usual, believable=plain.believable * self.usual, sure=0.77 * self.usual,
+            satisfied=0.93 * self.usual, good=self.unusual, sure=0.77 * self.usual,
+            believable=plain.believable * self.usual,
             drop=max(plain.drop, self.usual - self.unusual), rise=max(plain.rise, 3 * self.spread),
             contradicted=max(plain.contradicted, self.late),
             evidence_error=max(plain.evidence_error, self.dependence), inflation=self.inflation,
@@ -175,7 +176,7 @@ def noise_of(ranges: Array) -> float:
 
 def learn_shares(measured: Array, expected: Expected, range_max: float, start: Likelihood) -> Likelihood:
     """The shares that make scans (N, B) most likely, by expectation maximisation; sigma stays ``start``'s."""
-    surface = (expected.ranges < range_max) & np.isfinite(expected.scale) & ~np.isnan(measured) & (measured > -np.inf)
+    surface = (expected.ranges < range_max) & np.isfinite(expected.scale) & (measured > -np.inf)  # NaN is not
     hit = surface & np.isfinite(measured)
     o, g, m = measured[hit], np.maximum(expected.ranges[hit], 1e-3), expected.scale[hit]
     variance = start.sigma**2 + m**2

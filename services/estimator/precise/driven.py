@@ -64,9 +64,7 @@ def learn_drive(drive: Drive, recipe: Recipe, simulated: Beams | None, report: R
     return Learned(final, places, calibration, np.abs(held.ranges[both] - expected.ranges[both]))
 
 
-def _fields(
-    drive: Drive, recipe: Recipe, simulated: Beams | None, report: Callable[[float], None]
-) -> FieldModel:
+def _fields(drive: Drive, recipe: Recipe, simulated: Beams | None, report: Callable[[float], None]) -> FieldModel:
     own = Beams.of(drive.poses, drive.mount, drive.angles, drive.ranges)
     beams = own if simulated is None else own.joined(_beyond(own, simulated))
     field = learn_field(beams, recipe, lambda _, done: report(done))

@@ -37,6 +37,7 @@ class Settings:
     more_seeds: int = 240  # in the second, where the first explains too little
     beams: int = 150  # of the descent from seeds; the last steps take all
     satisfied: float = 0.9  # share of beams explained that ends a search
+    good: float = 0.8  # share of beams that nearly every scan explains at its place
     believable: float = 0.45  # least share of beams that a belief must explain
     glimpse: float = 0.15  # the same, of one that was tracked, while what it does not explain stands in the way
     contradicted: float = 0.05  # share of the beams that may end behind what such a belief expects
@@ -50,7 +51,7 @@ class Settings:
     floor_heading: float = 0.0  # rad
     sure: float = 0.75  # share of beams from which one scan is enough to say tracking
     patience: int = 30  # scans that a place must persist with less
-    probation: int = 10  # scans for which a place that explains less than that must persist to follow another
+    probation: int = 100  # scans for which a place that explains less than that must persist to follow another
     rise: float = 150.0  # nats by which accuracy must worsen at once to call for a search
     vague: float = 0.5  # m, standard deviation of a position that is not known
     motion: MotionNoise = field(default_factory=MotionNoise)
@@ -136,11 +137,18 @@ class PreciseEstimator:
         )
         poses, evidence = yield from polishing(view, starts, wide)
         if evidence.explained[0] < self._usual - self.settings.drop:
+            around = self._around(self.modes[0], period) if odom is None else np.zeros((0, 3))
+            starts = np.concatenate([starts, around])
+            first = np.concatenate([np.arange(len(self.modes)), np.zeros(len(around), np.int64)])
+            wider = Prior(wide.mean[first], wide.information[first])
             for widen in (WIDEST, WIDE, NARROW):
-                starts, _ = yield from descending(view, starts, wide, widen, 5)
-            retried = yield from polishing(view, starts, wide)
-            if retried[1].explained[0] > evidence.explained[0]:
-                poses, evidence = retried
+                starts, _ = yield from descending(view, starts, wider, widen, 5)
+            tried, retried = yield from polishing(view, starts, wider)
+            own = np.flatnonzero(first == 0)
+            best = own[np.argmin(retried.accuracy[own] + wider.energy(tried)[own])]
+            if retried.explained[best] > evidence.explained[0]:
+                keep = np.array([best, *range(1, len(self.modes))])
+                poses, evidence = tried[keep], retried.part(keep)
         modes = []
         for k, (mode, each) in enumerate(zip(self.modes, options, strict=True)):
             # Once blind, a ripple a little larger than the others must not be taken for a feature.
@@ -157,13 +165,23 @@ class PreciseEstimator:
             modes.append(mixture.moved(mode, fused, evidence, k, period, blind=blind is not None))
         self.modes = self._weighed(modes)
 
+    def _around(self, mode: Mode, period: float) -> Array:
+        """(K, 3) poses to which a robot may have driven unseen, where that is further than a descent reaches."""
+        motion = self.settings.motion
+        if motion.speed * period < WIDEST and motion.turn * period < WIDEST:
+            return np.zeros((0, 3))
+        ahead, turned = np.meshgrid(np.array([0.0, 0.5, 1.0]) * motion.speed, np.linspace(-1, 1, 5) * motion.turn)
+        steps = np.stack([ahead.ravel(), np.zeros(ahead.size), turned.ravel()], axis=-1) * period
+        return se2.compose(mode.pose, steps)
+
     def _weighed(self, modes: list[Mode]) -> list[Mode]:
         """The hypotheses by weight; who was tracked leads until another has proven itself."""
         settings = self.settings
         holder = next((mode for mode in modes if mode.trusted), None)
         margin = 3 * settings.evidence_error
         if holder is not None and any(
-            mixture.succeeds(mode, holder, margin, settings.probation, settings.satisfied) for mode in modes
+            mixture.succeeds(mode, holder, margin, settings.probation, settings.good, settings.satisfied)
+            for mode in modes
         ):
             modes = [replace(mode, trusted=False) for mode in modes]
         return mixture.weigh(modes, settings.evidence_error, settings.hypotheses)
@@ -219,7 +237,7 @@ class PreciseEstimator:
             elif mixture.same(found[0].pose[None], before.pose)[0]:
                 found[0] = replace(found[0], age=before.age, velocity=before.velocity, trusted=before.trusted)
             elif before.trusted:
-                found = [*self.modes, *found]
+                found, self._since = [*self.modes, *found], 0
         self.modes = self._weighed(found)
         self._usual, self._energy = self.modes[0].explained, self.modes[0].accuracy
 
@@ -275,10 +293,7 @@ class PreciseEstimator:
         believable = self._believable(view)
         state = self._state(view, best, believable=believable)
         unknown = self.seeds.spread * (not believable)
-        hypotheses = tuple(
-            Hypothesis(mode.pose, self._covariance(mode) + unknown, mode.weight)
-            for mode in self.modes
-        )
+        hypotheses = tuple(Hypothesis(mode.pose, self._covariance(mode) + unknown, mode.weight) for mode in self.modes)
         return Posterior(
             state,
             hypotheses,

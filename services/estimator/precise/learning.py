@@ -206,7 +206,7 @@ def _descend(field: DistanceField, beams: Beams, rate: float) -> Floats:
     ranges, facing = traced.ranges[:, 0], traced.facing[:, 0]
     error = beams.ranges - ranges
     good = np.isfinite(ranges) & (np.abs(error) < CLIP) & (facing > GRAZING)
-    field = _carved(field, beams, ranges, good, error)
+    field = _carved(field, beams, ranges, good, np.where(np.isfinite(ranges), error, 0.0) * facing)
     facing = facing[good]
     where = (beams.starts[good] + ranges[good, None] * beams.unit()[good] - field.origin) / field.resolution
     node = np.minimum(np.maximum(where.astype(int), 0), np.array(field.phi.shape)[::-1] - 2)
@@ -221,9 +221,12 @@ def _descend(field: DistanceField, beams: Beams, rate: float) -> Floats:
     return np.asarray(field.phi + rate * step.reshape(ny, nx), np.float32)
 
 
-def _carved(field: DistanceField, beams: Beams, ranges: Array, hit: np.ndarray, error: Array) -> DistanceField:
-    """The field with what most beams went through taken out: planes carried on past an edge, things that moved away."""
-    through = np.isfinite(ranges) & (error >= CLIP)
+def _carved(field: DistanceField, beams: Beams, ranges: Array, hit: np.ndarray, behind: Array) -> DistanceField:
+    """The field with what most beams went through taken out: planes carried on past an edge, things that moved away.
+
+    ``behind`` (R,) m: how far behind the surface a beam ended, across it.
+    """
+    through = np.isfinite(ranges) & (behind > THROUGH)
     counts = []
     for which in (hit, through):
         where = (beams.starts[which] + ranges[which, None] * beams.unit()[which] - field.origin) / field.resolution

@@ -41,6 +41,10 @@ class Evidence:
     of_noise: Array  # (N, 3, 3) covariance of xi from the scanner's noise
     of_model: Array  # (N, 3, 3) covariance of xi from the model's error, were beams independent
 
+    def part(self, rows: Array) -> Evidence:
+        """Of some of the poses."""
+        return Evidence(*(values[rows] for values in vars(self).values()))
+
 
 @dataclass(frozen=True)
 class Likelihood:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 SAME_PLACE, SAME_YAW = 0.1, 0.1  # m, rad: nearer modes are one
 MEMORY = 0.8  # of the evidence of earlier scans; a model's error repeats, so evidence must not add up for ever
 BLIND, RIPPLES = 1e-4, 7.0  # information along, as a share of that across, that counts as none; of the ripple's
+GOOD_SCANS = 10  # in which a rival must have looked as scans of their place do
 NEGLIGIBLE = 1e-4  # weight below which a hypothesis is refuted
 
 
@@ -156,10 +157,11 @@ def weigh(modes: list[Mode], evidence_error: float, count: int) -> list[Mode]:
     ]
 
 
-def succeeds(rival: Mode, holder: Mode, margin: float, probation: int, satisfied: float) -> bool:
+def succeeds(rival: Mode, holder: Mode, margin: float, probation: int, good: float, satisfied: float) -> bool:
     """Whether the robot was carried to where ``rival`` is, not only its surroundings changed.
 
     One scan of a place that changed may look like another place, by hundreds of nats; scans from several places do not.
     """
-    proven = rival.age >= probation or rival.explained >= satisfied
+    soon = GOOD_SCANS if rival.explained >= good else probation
+    proven = rival.age >= soon or rival.explained >= satisfied
     return proven and rival.energy < holder.energy - margin

@@ -29,7 +29,9 @@ class Seeds:
     """Panoramas expected at places over free space."""
 
     places: Array  # (S, 2) m in map, of the laser
-    panoramas: np.ndarray[tuple[int, ...], np.dtype[np.float32]]  # (S, BINS) m in direction 2 pi k / BINS of map; NaN: not known
+    panoramas: np.ndarray[
+        tuple[int, ...], np.dtype[np.float32]
+    ]  # (S, BINS) m in direction 2 pi k / BINS; NaN: not known
 
     @classmethod
     def at(cls, model: GenerativeModel, places: Array) -> Seeds:
