@@ -224,7 +224,7 @@ def _train_from_drive(
         raise UserError(f"--from teaches preset precise, not {preset}: the paper's decoder needs scans at one heading")
     make_folder(out, "--out")
     hangs = upside_down or None
-    reading = reading_of(mount, *[""] * 5, "sensor", reference=None, range_max=None, upside_down=hangs)
+    reading = reading_of(mount, "", "", "", "", "", "sensor", reference=None, range_max=None, upside_down=hangs)
     train_from_drive(Job(drive, world, out, samples, recipe, share, reading), console)
 
 

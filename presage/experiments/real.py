@@ -105,8 +105,8 @@ def _prepared(job: Job, half: int, out: Path, console: Console) -> tuple[Path, w
     with suppress(OSError, ValueError, KeyError, TypeError, UserError):  # of an interrupted run, or nothing
         before = json.loads(kept.read_text(encoding="utf-8"))
         if before["key"] == key:
-            sets = (tuple((str(n), float(v)) for n, v in before[what].items()) for what in ("tracking", "finding"))
-            return path, weights.load(path)[2], Tuned(*sets, before["tried"])
+            tracking, finding = (tuple(before[what].items()) for what in ("tracking", "finding"))
+            return path, weights.load(path)[2], Tuned(tracking, finding, before["tried"])
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("learning", total=1.0)
@@ -115,7 +115,7 @@ def _prepared(job: Job, half: int, out: Path, console: Console) -> tuple[Path, w
             bar.update(task, description=title, completed=done)
 
         first = drive.part(np.arange(half))
-        training = Training(job.log, job.map, share=0.5, recipe=Recipe(resolution=0.05, seed=job.seed))
+        training = Training(job.log, share=0.5, recipe=Recipe(resolution=0.05, seed=job.seed))
         learned = learn_drive(first, training.recipe, None, report)
         card = card_of(training, world, first, learned, 0.0)
         weights.save(path, learned.model, learned.places, card)

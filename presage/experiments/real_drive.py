@@ -99,7 +99,7 @@ def unaware(odom: Array, before: int, to: int) -> Array:
     """Odometry of a robot that is lifted from scan ``before`` to scan ``to``: its wheels stand still meanwhile."""
     moved = odom.copy()
     moved[to:] = se2.compose(odom[before], se2.between(odom[to], odom[to:]))
-    return moved
+    return np.asarray(moved)
 
 
 def entered(job: Job) -> Estimator:

@@ -176,7 +176,9 @@ def read_recording(path: Path) -> Recording:
     try:
         with path.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
-                raise UserError(f"{path}: not an MCAP file; `presage record` makes recordings, `presage import` of logs")
+                raise UserError(
+                    f"{path}: not an MCAP file; `presage record` makes recordings, `presage import` of logs"
+                )
             if not _read_summary(recording, stream):
                 _read_through(recording, stream)
     except OSError as error:

@@ -42,7 +42,7 @@ def learn_drive(drive: Drive, recipe: Recipe, simulated: Beams | None, report: R
 
     Twice: once without the scans held out, which say how far the model is to be trusted; then from all.
     """
-    sigma = noise_of(drive.ranges)
+    sigma = noise_of(drive.ranges, drive.angles)
     numbers = np.arange(len(drive.ranges))
     held_out = numbers % HELD_OUT == HELD_OUT // 2
     held = drive.part(numbers[held_out])

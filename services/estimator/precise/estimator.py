@@ -252,7 +252,9 @@ class PreciseEstimator:
 
     def _search(self, view: View) -> Conversation[list[Mode]]:
         modes: list[Mode] = []
-        for count in (self.settings.seeds, self.settings.more_seeds):
+        # A place that is tracked and still fits somewhat need not be beaten by what is hard to find.
+        held = bool(self.modes) and self.modes[0].trusted and self._believable(view)
+        for count in (self.settings.seeds, *([] if held else [self.settings.more_seeds])):
             starts = yield Ranking(self.seeds, view, count)
             modes = yield from self._refine(view, starts, None)
             if modes[0].explained >= self.settings.satisfied:
