@@ -185,8 +185,8 @@ def read_recording(path: Path) -> Recording:
         raise _unreadable(path, error) from None
     if recording.profile not in {"", PROFILE} and not recording.topics():
         raise UserError(
-            f"{path}: an MCAP file, but no recording of presage (its profile is {recording.profile!r}); of a ROS 2 bag "
-            "`presage import` makes one"
+            f"{path}: an MCAP file, but no recording of presage (its profile is {recording.profile!r}); of a ROS 2 "
+            "bag `presage import` makes one"
         )
     return recording
 

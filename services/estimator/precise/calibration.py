@@ -54,7 +54,8 @@ class Calibration:
         """An estimator's; its thresholds relative to how scans of this place usually look."""
         plain = Settings()
         return Settings(
-            satisfied=0.93 * self.usual, good=self.unusual, sure=0.77 * self.usual,
+            satisfied=0.93 * self.usual, good=0.77 * self.usual, sure=0.77 * self.usual,
+            doubtful=0.77 * self.usual,
             believable=plain.believable * self.usual,
             drop=max(plain.drop, self.usual - self.unusual), rise=max(plain.rise, 3 * self.spread),
             contradicted=max(plain.contradicted, self.late),

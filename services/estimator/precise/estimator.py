@@ -37,7 +37,8 @@ class Settings:
     more_seeds: int = 240  # in the second, where the first explains too little
     beams: int = 150  # of the descent from seeds; the last steps take all
     satisfied: float = 0.9  # share of beams explained that ends a search
-    good: float = 0.8  # share of beams that nearly every scan explains at its place
+    good: float = 0.75  # share of beams from which another place may soon follow one that was tracked
+    doubtful: float = 0.45  # share of beams below which what contradicts a place voids the claim to it
     believable: float = 0.45  # least share of beams that a belief must explain
     glimpse: float = 0.15  # the same, of one that was tracked, while what it does not explain stands in the way
     contradicted: float = 0.05  # share of the beams that may end behind what such a belief expects
@@ -196,7 +197,7 @@ class PreciseEstimator:
         """The scan fits worse at once, or has fitted badly for long, or not as a belief must."""
         best, settings = self.modes[0], self.settings
         fell = best.explained < self._usual - settings.drop or best.accuracy > self._energy + settings.rise
-        believable = self._believable(view)
+        believable = self._believable(view) and not self._doubtful(view)
         gone, self._believed = self._believed and not believable, believable
         if best.explained >= settings.satisfied:
             self._since, self._wait = 0, FIRST_WAIT
@@ -215,6 +216,11 @@ class PreciseEstimator:
             return False
         return self._contradicted(view) <= settings.contradicted
 
+    def _doubtful(self, view: View) -> bool:
+        """Whether much of the scan is not explained, and some of it cannot be."""
+        settings = self.settings
+        return self.modes[0].explained < settings.doubtful and self._contradicted(view) > settings.contradicted
+
     def _contradicted(self, view: View) -> float:
         expected = self.model.expect(se2.compose(self.modes[0].pose, self.mount)[None], view.angles)
         return obstruction.contradicted(view, expected)
@@ -230,7 +236,8 @@ class PreciseEstimator:
             found = yield from self._search(view)
         if self.modes:
             before = self.modes[0]
-            worse = found[0].energy > before.energy - 3 * self.settings.evidence_error
+            now = max(before.energy, before.accuracy + before.complexity)  # the average still praises earlier scans
+            worse = found[0].energy > now - 3 * self.settings.evidence_error
             if worse or self._unlikely(view, found[0]):
                 found = self.modes  # nothing better: this is how it looks here now; search again later
                 self._since, self._wait = 0, min(2 * self._wait, LONGEST_WAIT)
@@ -253,7 +260,7 @@ class PreciseEstimator:
     def _search(self, view: View) -> Conversation[list[Mode]]:
         modes: list[Mode] = []
         # A place that is tracked and still fits somewhat need not be beaten by what is hard to find.
-        held = bool(self.modes) and self.modes[0].trusted and self._believable(view)
+        held = bool(self.modes) and self.modes[0].trusted and self.modes[0].explained >= self.settings.good
         for count in (self.settings.seeds, *([] if held else [self.settings.more_seeds])):
             starts = yield Ranking(self.seeds, view, count)
             modes = yield from self._refine(view, starts, None)
@@ -317,6 +324,8 @@ class PreciseEstimator:
             return "lost" if self._was_tracking else "localising"
         if len(self.modes) > 1 and self.modes[1].weight > settings.ambiguous:
             return "ambiguous"
+        if best.trusted and self._doubtful(view):
+            return "lost"
         vague = np.linalg.eigvalsh(self._covariance(best)[:2, :2])[-1] > settings.vague**2
         sure = best.trusted or best.explained >= settings.sure
         if vague or not (sure or (best.age >= settings.patience and self._contradicted(view) <= settings.contradicted)):

@@ -26,6 +26,7 @@ LEVEL_POINTS = 3  # points a cell needs to count as surface
 THROUGH = 0.06  # m behind a surface at which a beam has gone through it
 PRESENT = 0.3  # least share of the beams that meet a surface and end there
 CARVED = 0.5  # cells from a surface, at least, of a node that beams go through
+STRAY_CELL = 1.0  # m
 EM_STEPS, OUTLIER, FLAT = 15, 0.1, 25.0  # FLAT: m over which the flat part of the density extends
 CLIP = 0.1  # m, a larger error is another surface's
 GRAZING = 0.15  # least |n . u| of a beam that shapes the field
@@ -84,6 +85,7 @@ def learn_field(
 ) -> DistanceField:
     """The field that predicts the beams; ``report`` hears of stages and the share done."""
     report("surfaces", 0.0)
+    beams = beams.part(_company(beams.ends()))
     field = _surfaces(beams, recipe.resolution)
     rng = np.random.default_rng(recipe.seed)
     phi = field.phi.copy()
@@ -93,6 +95,14 @@ def learn_field(
         rate = 1 / (1 + sweep / 2)  # falls, so that the noise of the last sweeps averages out
         phi = _descend(DistanceField(phi, field.origin, field.resolution), beams.part(some), rate)
     return DistanceField(phi, field.origin, field.resolution)
+
+
+def _company(ends: Array) -> np.ndarray:
+    """(R,) which beams ended near others: a few stray ones would make the grid as large as the scanner's range."""
+    cell = np.floor(ends / STRAY_CELL).astype(np.int64)
+    cell -= cell.min(axis=0)
+    index = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
+    return np.asarray(np.bincount(index)[index] >= LEVEL_POINTS)
 
 
 def _surfaces(beams: Beams, h: float) -> DistanceField:
