@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from pydantic import ValidationError
@@ -48,6 +48,9 @@ from presage.options import (
 )
 from presage.output import make_folder
 from presage.stack import ignoring_interrupts, interruptible
+
+if TYPE_CHECKING:
+    from services.estimator.precise.learning import Recipe
 
 app = typer.Typer(
     help="A robot that localises itself and navigates by predicting what its laser will see.",
@@ -146,13 +149,17 @@ def demo(
 
 @app.command()
 def train(
-    world: WorldName = "corridor",
+    world: Annotated[
+        str, typer.Option(help="A shipped world or a world file; none: corridor, with --from the drive alone.")
+    ] = "",
     preset: Annotated[str, typer.Option(help="precise or paper.")] = "precise",
     scanner: ScannerName = "tim571",
     out: Annotated[Path | None, typer.Option(help="Folder for weights and card; none: where services look.")] = None,
     beams: Beams = None,
     samples: Annotated[int | None, typer.Option(min=10, help="none: 5000, paper 13000.")] = None,
-    resolution: Annotated[float, typer.Option(min=0.005, max=1.0, help="precise: m between nodes.")] = 0.04,
+    resolution: Annotated[
+        float | None, typer.Option(min=0.005, max=1.0, help="precise: m between nodes; none: 0.04, with --from 0.05.")
+    ] = None,
     epochs: Annotated[int, typer.Option(min=1, help="paper.")] = 60,
     batch: Annotated[int, typer.Option(min=1, help="paper.")] = 500,
     learning_rate: Annotated[float, typer.Option(min=1e-6, help="paper.")] = 3e-3,
@@ -161,13 +168,27 @@ def train(
     connect: Connect = DEFAULT_ENDPOINT,
     mount: MountText = "",
     upside_down: UpsideDown = False,
+    drive: Annotated[
+        Path | None,
+        typer.Option("--from", help="precise: a log or recording with reference poses; its scans teach and calibrate."),
+    ] = None,
+    share: Annotated[
+        float, typer.Option(min=0.01, max=1.0, help="Of --from, from its beginning: 0.5 leaves half to test with.")
+    ] = 1.0,
 ) -> None:
-    """Learn to predict a scanner in a world.
+    """Learn to predict a scanner in a world, or from a drive.
 
     Samples come from the scanner on the bus where it is in this world, else from a simulator of its own. An interrupted
     run of preset paper is taken up again by the same command.
     Examples: `presage train --world my.yaml`; `presage train --world corridor --preset paper --beams 622 --out mine`;
     `presage train --world my.yaml --scanner my-laser.yaml --mount 0.1,0,0`.
+
+    With --from no simulator is needed: the drive's own scans at their reference poses teach the model, every fifth of
+    them says how far it is to be trusted, and the card beside the weights reports it. With --world as well, scans
+    simulated in that map fill in where the drive has not been.
+    Examples: `presage train --from drive.npz --out mine`;
+    `presage train --from drive.log --world map.yaml --share 0.5 --out mine`; then
+    `presage localize other.log --world map.yaml --models mine`.
     """
     from presage import train as paper  # noqa: PLC0415
     from presage import train_precise as precise  # noqa: PLC0415
@@ -175,6 +196,11 @@ def train(
     from services.estimator.precise.weights import FOLDER  # noqa: PLC0415
     from services.estimator.training import Recipe as PaperRecipe  # noqa: PLC0415
 
+    if drive is not None:
+        recipe = Recipe(resolution or 0.05, seed=seed)
+        _train_from_drive(drive, world, preset, out or FOLDER, samples or 2000, recipe, share, mount, upside_down)
+        return
+    world, resolution = world or "corridor", resolution or 0.04
     link, folder = link_of(connect, robot), out or FOLDER
     asked = scanner_arguments(scanner, beams, mount, upside_down=upside_down)
     chosen = chosen_scanner(scanner, beams, mount=mount, upside_down=upside_down or None)
@@ -187,6 +213,21 @@ def train(
         paper.train(paper.Job(world, preset, chosen, asked, folder, samples or 13_000, descent), link, console)
     else:
         raise UserError(f"no preset {preset!r}: choose precise or paper")
+
+
+def _train_from_drive(
+    drive: Path, world: str, preset: str, out: Path, samples: int, recipe: Recipe, share: float, mount: str,
+    upside_down: bool,
+) -> None:  # fmt: skip
+    from presage.logs.words import reading_of  # noqa: PLC0415
+    from presage.train_drive import Job, train_from_drive  # noqa: PLC0415
+
+    if preset != "precise":
+        raise UserError(f"--from teaches preset precise, not {preset}: the paper's decoder needs scans at one heading")
+    make_folder(out, "--out")
+    hangs = upside_down or None
+    reading = reading_of(mount, "", "", "", "", "", "sensor", reference=None, range_max=None, upside_down=hangs)
+    train_from_drive(Job(drive, world, out, samples, recipe, share, reading), console)
 
 
 app.add_typer(cli_recording.app)

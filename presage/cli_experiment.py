@@ -204,6 +204,33 @@ def predicted(
     show(prediction, lambda: prediction.run(prediction.Job(seed, scans), out, 1, console), out)
 
 
+@app.command("real")
+def real_drive(
+    log: Annotated[Path, typer.Option(help="Recording or log with reference poses (docs/logs.md).")],
+    world: Annotated[str, typer.Option("--map", help="ROS map or world file made from the first half of the log.")],
+    name: Annotated[str, typer.Option(help="The results are called real-NAME; none: the log's.")] = "",
+    mount: Annotated[str, typer.Option(help="The laser in base_link: x,y,yaw_deg (m, m, deg).")] = "0,0,0",
+    every: Annotated[int, typer.Option(min=1, help="Scans between the starts of c and d.")] = 50,
+    quick: Annotated[bool, typer.Option("--quick", help="A look: few scans, the particle filter not tuned.")] = False,
+    seed: ExperimentSeed = 1,
+    out: Out = OUT,
+    workers: Workers = CORES,
+) -> None:
+    """A real drive: model and tuning from its first half, its second half localised; precise and the particle filter.
+
+    a: tracking with odometry; b: without; c: from nothing, every 50th scan as a start; d: carried off. Errors are
+    against the log's reference poses. Ctrl-C keeps what is done; the same command goes on there.
+    Examples: `presage experiment real --log drive.npz --map first_half.yaml --quick`;
+    `presage experiment real --log fr079.mcap --map fr079.yaml --name fr079 --every 50 --out mine`.
+    """
+    from presage.experiments import real  # noqa: PLC0415
+    from presage.logs.words import pose_of  # noqa: PLC0415
+
+    x, y, yaw = map(float, pose_of(mount, "--mount"))
+    job = real.Job(log, world, (x, y, yaw), every, quick, seed, name)
+    show(real, lambda: real.run(job, out, workers, console), out)
+
+
 @app.command("all")
 def all_experiments(
     trials: Annotated[int, typer.Option(min=0, help="At most so many of each, for a look; 0: each its own.")] = 0,
@@ -237,7 +264,7 @@ def tables(
         page.write_text(filled(page.read_text(encoding="utf-8"), out), encoding="utf-8")
         return
     found = [name for name in MODULES if (out / f"{name}.json").exists()]
-    found += sorted(path.stem for path in out.glob("navigation-*.json"))
+    found += sorted(path.stem for kind in ("navigation", "real") for path in out.glob(f"{kind}-*.json"))
     if not found:
         raise UserError(f"{out}: no results there; make them with: presage experiment all")
     for name in found:

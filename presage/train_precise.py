@@ -15,7 +15,6 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 from common import se2
 from common.bus import Link
-from common.errors import UserError
 from common.robot import Robot
 from common.scanner import SCANNERS, Scanner
 from common.versions import commit, versions
@@ -47,7 +46,7 @@ def train_precise(job: Job, link: Link, console: Console) -> Path:
     """The weights' path; raises UserError in one line."""
     world, scanner = load_world(job.world), job.scanner
     path = weights.path_of(job.out, world.name)
-    _refuse_to_overwrite(path, world)
+    weights.refuse_to_overwrite(path, world)
     rng = np.random.default_rng(job.recipe.seed)
     poses = {name: _poses(world, count, rng) for name, count in (("train", job.samples), ("test", TEST_SAMPLES))}
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
@@ -74,19 +73,6 @@ def train_precise(job: Job, link: Link, console: Console) -> Path:
 def _poses(world: World, count: int, rng: np.random.Generator) -> se2.Array:
     places = world.sample_free(count, rng, Robot().radius)
     return np.column_stack([places, rng.uniform(-np.pi, np.pi, count)])
-
-
-def _refuse_to_overwrite(path: Path, world: World) -> None:
-    """Another world's field of the same name is not ours to throw away."""
-    try:
-        _, _, card = weights.load(path)
-    except UserError:
-        return
-    if not weights.same_walls(card.world, world):
-        raise UserError(
-            f"{path} belongs to another world of the same name {world.name!r}: give your world a name of its own, "
-            "or another folder with --out"
-        )
 
 
 def _learn(

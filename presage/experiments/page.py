@@ -17,6 +17,7 @@ from presage.experiments.results import mean_std, number
 MODULES = {
     "e1": "localisation", "e2": "crossing", "e3": "navigation", "alpha": "step_size", "steps": "stepping",
     "samples": "samples", "aliasing": "aliasing", "prediction": "prediction", "navigation": "driving",
+    "real": "real",
 }  # fmt: skip
 MARKED = re.compile(r"(<!-- table (?P<name>[\w/.-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 Summary = dict[str, dict[str, Any]]

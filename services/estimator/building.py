@@ -128,15 +128,18 @@ def prepare(choice: Choice) -> Factory:
 
 
 def _precise(choice: Choice, world: World) -> Factory:
-    model, places, inflation = generative_model(choice, world)
+    model, places, card = generative_model(choice, world)
+    calibration = card.calibration if card else None
+    settings = calibration.settings() if calibration else Settings(inflation=card.inflation if card else 1.0)
     seeds = Seeds.at(model, places)
     _compile(model, seeds, Likelihood())
 
     def make(geometry: Geometry) -> Estimator:
-        made = PreciseEstimator(
-            model, seeds, geometry.mount, geometry.likelihood(choice.sigma), Settings(inflation=inflation),
-            np.random.default_rng(choice.seed),
-        )  # fmt: skip
+        likelihood = geometry.likelihood(choice.sigma)
+        if calibration and choice.sigma is None:
+            likelihood = calibration.likelihood
+        rng = np.random.default_rng(choice.seed)
+        made = PreciseEstimator(model, seeds, geometry.mount, likelihood, settings, rng)
         if choice.initial_pose is not None:
             made.restart(choice.initial_pose)
         return made
@@ -144,13 +147,12 @@ def _precise(choice: Choice, world: World) -> Factory:
     return make
 
 
-def generative_model(choice: Choice, world: World) -> tuple[GenerativeModel, Array, float]:
-    """The model of that name, places (S, 2) m a laser may be at, and the covariance's inflation."""
+def generative_model(choice: Choice, world: World) -> tuple[GenerativeModel, Array, weights.FieldCard | None]:
+    """The model of that name, places (S, 2) m a laser may be at, and the card of what was learned."""
     if choice.model == "exact":
         places = world.sample_free(max(4000, int(60 * shapely.area(world.free_space))), np.random.default_rng(0), 0.05)
-        return RayCaster(world), thin_places(places, SPACING), 1.0
-    model, places, card = weights.load(field_path(choice, world))
-    return model, places, card.inflation
+        return RayCaster(world), thin_places(places, SPACING), None
+    return weights.load(field_path(choice, world))
 
 
 def field_path(choice: Choice, world: World) -> Path:

@@ -13,6 +13,7 @@ import numpy as np
 MIN_STEP = 0.25  # cells; a shorter stride would creep along walls, a longer one jump over corners
 MAX_STEPS = 2000
 SHORT = 0.6  # of the misfit of a beam too long is that of one too short: much may shorten beams, little lengthens
+UNKNOWN = 0.4  # misfit of a beam of which nothing is expected
 FACING = 0.02  # least |n . u| that is divided by
 GRAZING = 0.05  # |n . u| below which (three degrees from the surface, or an edge) no derivative is claimed
 
@@ -142,6 +143,15 @@ def accumulate(
             o, g = measured[b], expected[k, b]
             if o == -np.inf or np.isnan(o):
                 continue
+            if scale[k, b] == np.inf:  # nobody has looked beyond g: any range from there on is as likely
+                if o < g:
+                    total[k, 2] += 1.0
+                    total[k, 0] -= math.log((1.0 - unseen) * (flat + short / max(g, 1e-3)))
+                elif o < np.inf:
+                    total[k, 0] -= math.log((1.0 - unseen) * (flat + (1.0 - short - random) / max(range_max - g, 1.0)))
+                else:
+                    total[k, 0] -= math.log(unseen)
+                continue
             total[k, 2] += 1.0
             if o == np.inf:
                 total[k, 0] -= math.log(unseen if g < range_max else 1.0 - unseen)
@@ -184,8 +194,76 @@ def rank(panoramas, bins, measured, tolerance, range_max, costs):
                 if o == -np.inf or np.isnan(o):
                     continue
                 g = panoramas[s, (bins[b] + shift) % size]
+                if np.isnan(g):
+                    total, used = total + UNKNOWN, used + 1
+                    continue
                 e = min(o, range_max) - min(g, range_max)
                 misfit = e * e / (e * e + tolerance * tolerance)
                 total += misfit if e > 0.0 else SHORT * misfit
                 used += 1
             costs[s, h] = total / max(used, 1)
+
+
+@jit
+def crossings(starts, unit, ranges, h, surface, mx, my, nx, ny, margin, crossed):
+    """Beams that went through a surface element: counted in crossed (ny, nx), by the cell of the element.
+
+    In metres from node (0, 0): starts (R, 2), unit directions (R, 2), ranges (R,), of each ``surface`` cell of ``h`` m
+    the element's mean and normal. Through: across its plane within the cell, and ``margin`` m behind it at the end.
+    """
+    rows, columns = surface.shape
+    for b in range(ranges.shape[0]):
+        x, y, ux, uy = starts[b, 0] / h, starts[b, 1] / h, unit[b, 0], unit[b, 1]
+        j, i = int(x), int(y)
+        sx, sy = (1 if ux > 0 else -1), (1 if uy > 0 else -1)
+        # Amanatides and Woo 1987: from cell to cell, by the next edge in x or in y.
+        ax = ((j + (ux > 0)) - x) / ux if ux != 0.0 else np.inf
+        ay = ((i + (uy > 0)) - y) / uy if uy != 0.0 else np.inf
+        end, t = ranges[b] / h, 0.0
+        while t < end and 0 <= i < rows and 0 <= j < columns:
+            out = min(ax, ay)
+            if surface[i, j]:
+                ex, ey = x + end * ux - mx[i, j] / h, y + end * uy - my[i, j] / h
+                depth = ex * nx[i, j] + ey * ny[i, j]
+                slope = ux * nx[i, j] + uy * ny[i, j]
+                if slope != 0.0 and abs(depth) * h > margin and (depth > 0.0) == (slope > 0.0):
+                    at = end - depth / slope
+                    if t <= at <= out:
+                        crossed[i, j] += 1.0
+            t = out
+            if ax < ay:
+                j, ax = j + sx, ax + abs(1.0 / ux)
+            else:
+                i, ay = i + sy, ay + abs(1.0 / uy)
+
+
+@jit
+def look(starts, unit, ranges, h, seen):
+    """Beams from starts (R, 2) along unit directions (R, 2) for ranges (R,), m from node (0, 0): marks cells passed."""
+    rows, columns = seen.shape
+    for b in range(ranges.shape[0]):
+        for k in range(int(ranges[b] / (0.5 * h)) + 1):
+            t = min(0.5 * h * k, ranges[b])
+            j, i = int((starts[b, 0] + t * unit[b, 0]) / h), int((starts[b, 1] + t * unit[b, 1]) / h)
+            if 0 <= i < rows and 0 <= j < columns:
+                seen[i, j] = True
+
+
+@jit
+def unseen(seen, ox, oy, h, lasers, angles, allowed, ranges, jacobian, scale):
+    """Of beams that pass more than ``allowed`` m of cells nobody looked into, before they end: end there, scale inf."""
+    rows, columns = seen.shape
+    for k in range(lasers.shape[0]):
+        for b in range(angles.shape[0]):
+            ux, uy = math.cos(lasers[k, 2] + angles[b]), math.sin(lasers[k, 2] + angles[b])
+            dark, t, step = 0.0, 0.0, 0.5 * h
+            while t < ranges[k, b]:
+                x, y = (lasers[k, 0] + t * ux - ox) / h, (lasers[k, 1] + t * uy - oy) / h
+                inside = 0 <= x < columns and 0 <= y < rows
+                if not inside or not seen[int(y), int(x)]:
+                    dark += step
+                    if dark > allowed:
+                        ranges[k, b], scale[k, b] = t, np.inf
+                        jacobian[k, b, :] = 0.0
+                        break
+                t += step

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from services.estimator.generative import GenerativeModel
     from services.estimator.precise.seeding import Seeds
 
-FIRST_WAIT, LONGEST_WAIT = 5, 150  # scans between searches while the scan fits badly
+FIRST_WAIT, LOST_WAIT, LONGEST_WAIT = 5, 10, 150  # scans between searches while the scan fits badly
+UNKNOWN = 100.0  # m, stated where nothing is known
 FAR = 16.0  # squared standard deviations
 WIDEST, WIDE, NARROW = 0.3, 0.1, 0.03  # m, added to every beam's deviation on the way down from a seed
 
@@ -36,6 +37,8 @@ class Settings:
     more_seeds: int = 240  # in the second, where the first explains too little
     beams: int = 150  # of the descent from seeds; the last steps take all
     satisfied: float = 0.9  # share of beams explained that ends a search
+    good: float = 0.75  # share of beams from which another place may soon follow one that was tracked
+    doubtful: float = 0.45  # share of beams below which what contradicts a place voids the claim to it
     believable: float = 0.45  # least share of beams that a belief must explain
     glimpse: float = 0.15  # the same, of one that was tracked, while what it does not explain stands in the way
     contradicted: float = 0.05  # share of the beams that may end behind what such a belief expects
@@ -45,8 +48,11 @@ class Settings:
     ambiguous: float = 0.05  # weight of a second hypothesis from which the belief is ambiguous
     hypotheses: int = 8
     inflation: float = 1.0  # of the covariance, for errors of the model that hang together
+    floor_position: float = 0.0  # m, standard deviation that no scan takes away, in x and in y
+    floor_heading: float = 0.0  # rad
     sure: float = 0.75  # share of beams from which one scan is enough to say tracking
     patience: int = 30  # scans that a place must persist with less
+    probation: int = 100  # scans for which a place that explains less than that must persist to follow another
     rise: float = 150.0  # nats by which accuracy must worsen at once to call for a search
     vague: float = 0.5  # m, standard deviation of a position that is not known
     motion: MotionNoise = field(default_factory=MotionNoise)
@@ -84,6 +90,7 @@ class PreciseEstimator:
         self._odom: Array | None = None
         self._usual, self._energy = 1.0, 0.0  # share of beams explained, and accuracy, lately
         self._since, self._wait = 0, FIRST_WAIT  # scans that fitted badly, and after how many to search
+        self._believed = False  # the last scan
 
     def update(self, observation: Observation) -> Posterior:
         """One more scan."""
@@ -110,7 +117,9 @@ class PreciseEstimator:
         return self._with_noise(self.model.expect(se2.compose(poses, self.mount), angles))
 
     def _with_noise(self, expected: Expected) -> Predicted:
-        return Predicted(expected.ranges, np.sqrt(expected.scale**2 + self.likelihood.deviation(expected.ranges) ** 2))
+        unknown = np.isinf(expected.scale)
+        sigma = np.where(unknown, UNKNOWN, np.hypot(expected.scale, self.likelihood.deviation(expected.ranges)))
+        return Predicted(np.where(unknown, np.inf, expected.ranges), sigma)
 
     def _track(self, view: View, observation: Observation) -> Conversation[None]:
         """Each hypothesis on: where it may have moved, where the scan says it is, both fused."""
@@ -129,11 +138,18 @@ class PreciseEstimator:
         )
         poses, evidence = yield from polishing(view, starts, wide)
         if evidence.explained[0] < self._usual - self.settings.drop:
+            around = self._around(self.modes[0], period) if odom is None else np.zeros((0, 3))
+            starts = np.concatenate([starts, around])
+            first = np.concatenate([np.arange(len(self.modes)), np.zeros(len(around), np.int64)])
+            wider = Prior(wide.mean[first], wide.information[first])
             for widen in (WIDEST, WIDE, NARROW):
-                starts, _ = yield from descending(view, starts, wide, widen, 5)
-            retried = yield from polishing(view, starts, wide)
-            if retried[1].explained[0] > evidence.explained[0]:
-                poses, evidence = retried
+                starts, _ = yield from descending(view, starts, wider, widen, 5)
+            tried, retried = yield from polishing(view, starts, wider)
+            own = np.flatnonzero(first == 0)
+            best = own[np.argmin(retried.accuracy[own] + wider.energy(tried)[own])]
+            if retried.explained[best] > evidence.explained[0]:
+                keep = np.array([best, *range(1, len(self.modes))])
+                poses, evidence = tried[keep], retried.part(keep)
         modes = []
         for k, (mode, each) in enumerate(zip(self.modes, options, strict=True)):
             # Once blind, a ripple a little larger than the others must not be taken for a feature.
@@ -148,7 +164,28 @@ class PreciseEstimator:
             parts = [fuse(option, poses[k], evidence.xi[k], evidence.curvature[k]) for option in each]
             fused = min(parts, key=lambda part: part.surprise)
             modes.append(mixture.moved(mode, fused, evidence, k, period, blind=blind is not None))
-        self.modes = mixture.weigh(modes, self.settings.evidence_error, self.settings.hypotheses)
+        self.modes = self._weighed(modes)
+
+    def _around(self, mode: Mode, period: float) -> Array:
+        """(K, 3) poses to which a robot may have driven unseen, where that is further than a descent reaches."""
+        motion = self.settings.motion
+        if motion.speed * period < WIDEST and motion.turn * period < WIDEST:
+            return np.zeros((0, 3))
+        ahead, turned = np.meshgrid(np.array([0.0, 0.5, 1.0]) * motion.speed, np.linspace(-1, 1, 5) * motion.turn)
+        steps = np.stack([ahead.ravel(), np.zeros(ahead.size), turned.ravel()], axis=-1) * period
+        return se2.compose(mode.pose, steps)
+
+    def _weighed(self, modes: list[Mode]) -> list[Mode]:
+        """The hypotheses by weight; who was tracked leads until another has proven itself."""
+        settings = self.settings
+        holder = next((mode for mode in modes if mode.trusted), None)
+        margin = 3 * settings.evidence_error
+        if holder is not None and any(
+            mixture.succeeds(mode, holder, margin, settings.probation, settings.good, settings.satisfied)
+            for mode in modes
+        ):
+            modes = [replace(mode, trusted=False) for mode in modes]
+        return mixture.weigh(modes, settings.evidence_error, settings.hypotheses)
 
     def _unseen(self, option: Candidate, blind: Array, scans: int, period: float) -> Candidate:
         """Along a direction no scan sees, the robot may have gone at full speed: the deviation grows with time."""
@@ -160,13 +197,13 @@ class PreciseEstimator:
         """The scan fits worse at once, or has fitted badly for long, or not as a belief must."""
         best, settings = self.modes[0], self.settings
         fell = best.explained < self._usual - settings.drop or best.accuracy > self._energy + settings.rise
-        if fell or not self._believable(view):
-            return True
+        believable = self._believable(view) and not self._doubtful(view)
+        gone, self._believed = self._believed and not believable, believable
         if best.explained >= settings.satisfied:
             self._since, self._wait = 0, FIRST_WAIT
-            return False
+            return fell
         self._since += 1
-        return self._since >= self._wait
+        return fell or gone or self._since >= (self._wait if believable else min(self._wait, LOST_WAIT))
 
     def _believable(self, view: View) -> bool:
         """Whether enough of the scan is explained, or the rest may be hidden."""
@@ -177,38 +214,54 @@ class PreciseEstimator:
         best, settings = self.modes[0], self.settings
         if best.explained < settings.glimpse or not best.trusted:
             return False
-        expected = self.model.expect(se2.compose(best.pose, self.mount)[None], view.angles)
-        return obstruction.contradicted(view, expected) <= settings.contradicted
+        return self._contradicted(view) <= settings.contradicted
+
+    def _doubtful(self, view: View) -> bool:
+        """Whether much of the scan is not explained, and some of it cannot be."""
+        settings = self.settings
+        return self.modes[0].explained < settings.doubtful and self._contradicted(view) > settings.contradicted
+
+    def _contradicted(self, view: View) -> float:
+        expected = self.model.expect(se2.compose(self.modes[0].pose, self.mount)[None], view.angles)
+        return obstruction.contradicted(view, expected)
 
     def _relocalise(self, view: View) -> Conversation[None]:
         """Search from nothing; keep what is tracked where nothing better is found."""
         if self._near is not None:
             near, self._near = self._near, None
             found = yield from self._search_near(view, *near)
+            if found[0].explained >= self.settings.believable:  # who says where it is has tracked it until now
+                found[0] = replace(found[0], trusted=True)
         else:
             found = yield from self._search(view)
         if self.modes:
-            before, margin = self.modes[0], 3 * self.settings.evidence_error
-            if mixture.same(found[0].pose[None], before.pose)[0]:
-                found[0] = replace(found[0], age=before.age, velocity=before.velocity, trusted=before.trusted)
-            if found[0].energy > before.energy - margin or self._unlikely(view, found[0]):
+            before = self.modes[0]
+            now = max(before.energy, before.accuracy + before.complexity)  # the average still praises earlier scans
+            worse = found[0].energy > now - 3 * self.settings.evidence_error
+            if worse or self._unlikely(view, found[0]):
                 found = self.modes  # nothing better: this is how it looks here now; search again later
                 self._since, self._wait = 0, min(2 * self._wait, LONGEST_WAIT)
-        self.modes = found
-        self._usual, self._energy = found[0].explained, found[0].accuracy
+            elif mixture.same(found[0].pose[None], before.pose)[0]:
+                found[0] = replace(found[0], age=before.age, velocity=before.velocity, trusted=before.trusted)
+            elif before.trusted:
+                found, self._since = [*self.modes, *found], 0
+        self.modes = self._weighed(found)
+        self._usual, self._energy = self.modes[0].explained, self.modes[0].accuracy
 
     def _unlikely(self, view: View, found: Mode) -> bool:
         """Elsewhere, though nothing contradicts the place that was tracked: a door has closed, a crowd has gathered."""
         if not self._hidden(view):
             return False
         best = self.modes[0]
-        spread = best.covariance(self.settings.inflation)[:2, :2] + np.eye(2) * mixture.SAME_PLACE**2
+        spread = self._covariance(best)[:2, :2] + np.eye(2) * mixture.SAME_PLACE**2
         off = found.pose[:2] - best.pose[:2]
         return bool(off @ np.linalg.solve(spread, off) > FAR)
 
     def _search(self, view: View) -> Conversation[list[Mode]]:
         modes: list[Mode] = []
-        for count in (self.settings.seeds, self.settings.more_seeds):
+        # A place that is tracked and still fits somewhat need not be beaten by what is hard to find.
+        held = bool(self.modes) and self.modes[0].trusted and self.modes[0].explained >= self.settings.good
+        for count in (self.settings.seeds, *([] if held else [self.settings.more_seeds])):
             starts = yield Ranking(self.seeds, view, count)
             modes = yield from self._refine(view, starts, None)
             if modes[0].explained >= self.settings.satisfied:
@@ -247,12 +300,9 @@ class PreciseEstimator:
         seen: Expected = yield Expect(self.model, se2.compose(best.pose[None], self.mount), view.angles)
         expected = self._with_noise(seen)
         believable = self._believable(view)
-        state = self._state(best, believable=believable)
+        state = self._state(view, best, believable=believable)
         unknown = self.seeds.spread * (not believable)
-        hypotheses = tuple(
-            Hypothesis(mode.pose, mode.covariance(self.settings.inflation) + unknown, mode.weight)
-            for mode in self.modes
-        )
+        hypotheses = tuple(Hypothesis(mode.pose, self._covariance(mode) + unknown, mode.weight) for mode in self.modes)
         return Posterior(
             state,
             hypotheses,
@@ -264,14 +314,21 @@ class PreciseEstimator:
             expected.sigma[0],
         )
 
-    def _state(self, best: Mode, *, believable: bool) -> State:
+    def _covariance(self, mode: Mode) -> Array:
+        floor = np.array([self.settings.floor_position] * 2 + [self.settings.floor_heading])
+        return np.asarray(mode.covariance(self.settings.inflation) + np.diag(floor**2))
+
+    def _state(self, view: View, best: Mode, *, believable: bool) -> State:
         settings = self.settings
         if not believable:
             return "lost" if self._was_tracking else "localising"
         if len(self.modes) > 1 and self.modes[1].weight > settings.ambiguous:
             return "ambiguous"
-        vague = np.linalg.eigvalsh(best.covariance(settings.inflation)[:2, :2])[-1] > settings.vague**2
-        if vague or (best.explained < settings.sure and best.age < settings.patience and not best.trusted):
+        if best.trusted and self._doubtful(view):
+            return "lost"
+        vague = np.linalg.eigvalsh(self._covariance(best)[:2, :2])[-1] > settings.vague**2
+        sure = best.trusted or best.explained >= settings.sure
+        if vague or not (sure or (best.age >= settings.patience and self._contradicted(view) <= settings.contradicted)):
             return "localising"
         self._was_tracking = True
         self.modes[0] = replace(best, trusted=True)

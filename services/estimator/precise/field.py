@@ -27,6 +27,7 @@ Floats = npt.NDArray[np.float32]
 DIP_EDGES = np.array([0.001, 0.002, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1])
 DEPTH_EDGES = np.array([0.0, 0.25, 0.5, 0.75])
 FACING_EDGES = np.array([0.05, 0.1, 0.2, 0.5])
+SEEN_CELL = 0.2  # m: neighbouring beams must not leave gaps between them
 CLASSES = (len(DIP_EDGES) + 1, len(DEPTH_EDGES) + 1, len(FACING_EDGES) + 1)
 
 
@@ -68,6 +69,36 @@ class DistanceField:
 
 
 @dataclass(frozen=True)
+class Seen:
+    """Cells of a square grid that a beam of the samples has passed: of the others nothing is known."""
+
+    cells: npt.NDArray[np.bool_]  # (ny, nx); cell (i, j) begins at origin + SEEN_CELL * (j, i)
+    origin: tuple[float, float]  # m in map
+
+    def at(self, field: DistanceField) -> npt.NDArray[np.bool_]:
+        """(ny, nx) for the nodes of a field."""
+        ny, nx = field.phi.shape
+        i, j = (
+            np.clip(((start + field.resolution * np.arange(n) - own) / SEEN_CELL).astype(int), 0, m - 1)
+            for start, own, n, m in zip(field.origin[::-1], self.origin[::-1], (ny, nx), self.cells.shape, strict=True)
+        )
+        return self.cells[np.ix_(i, j)]
+
+    def contains(self, points: Array) -> npt.NDArray[np.bool_]:
+        """(N,) whether somebody has looked there; points (N, 2) m in map."""
+        j, i = np.floor((points - self.origin) / SEEN_CELL).astype(int).T
+        inside = (i >= 0) & (j >= 0) & (i < self.cells.shape[0]) & (j < self.cells.shape[1])
+        found = np.zeros(len(points), np.bool_)
+        found[inside] = self.cells[i[inside], j[inside]]
+        return found
+
+    def limit(self, lasers: Array, angles: Array, ranges: Array, jacobian: Array, scale: Array) -> None:
+        """Let beams (N, B) end where they enter what nobody has seen, with an infinite scale."""
+        lasers, angles = np.asarray(lasers, float).reshape(-1, 3), np.asarray(angles, float)
+        kernels.unseen(self.cells, *self.origin, SEEN_CELL, lasers, angles, SEEN_CELL, ranges, jacobian, scale)
+
+
+@dataclass(frozen=True)
 class FieldModel:
     """A distance field with learned precision."""
 
@@ -77,8 +108,12 @@ class FieldModel:
     )  # m, error of each class
 
     ripple: float = 0.0  # rad, see GenerativeModel
+    seen: Seen | None = None  # where somebody has looked; none: everywhere
 
     def expect(self, lasers: Array, angles: Array) -> Expected:
         """See GenerativeModel."""
         traced = self.field.trace(lasers, angles)
-        return Expected(traced.ranges, self.scales[traced.classes()], traced.jacobian)
+        scale = self.scales[traced.classes()]
+        if self.seen is not None:
+            self.seen.limit(lasers, angles, traced.ranges, traced.jacobian, scale)
+        return Expected(traced.ranges, scale, traced.jacobian)

@@ -16,12 +16,17 @@ import numpy as np
 import shapely
 
 from common.se2 import Array, compose, wrap
+from services.estimator import kernels
 from services.estimator.generative import CORNER
-from services.estimator.precise.field import CLASSES, DistanceField, Floats
+from services.estimator.precise.field import CLASSES, SEEN_CELL, DistanceField, Floats, Seen
 
 POOL = 1  # cells to each side that share their points to find a normal
 REACH = 2.0  # cells around a surface element that it shapes
 LEVEL_POINTS = 3  # points a cell needs to count as surface
+THROUGH = 0.06  # m behind a surface at which a beam has gone through it
+PRESENT = 0.3  # least share of the beams that meet a surface and end there
+CARVED = 0.5  # cells from a surface, at least, of a node that beams go through
+STRAY_CELL = 1.0  # m
 EM_STEPS, OUTLIER, FLAT = 15, 0.1, 25.0  # FLAT: m over which the flat part of the density extends
 CLIP = 0.1  # m, a larger error is another surface's
 GRAZING = 0.15  # least |n . u| of a beam that shapes the field
@@ -67,12 +72,20 @@ class Beams:
         """Some of them."""
         return Beams(self.starts[which], self.directions[which], self.ranges[which])
 
+    def joined(self, other: Beams) -> Beams:
+        """And those of another."""
+        mine, theirs = (vars(each).values() for each in (self, other))
+        return Beams(*(np.concatenate(pair) for pair in zip(mine, theirs, strict=True)))
+
 
 def learn_field(
-    beams: Beams, recipe: Recipe, report: Callable[[str, float], None] = lambda _title, _done: None
+    beams: Beams,
+    recipe: Recipe,
+    report: Callable[[str, float], None] = lambda _title, _done: None,
 ) -> DistanceField:
     """The field that predicts the beams; ``report`` hears of stages and the share done."""
     report("surfaces", 0.0)
+    beams = beams.part(_company(beams.ends()))
     field = _surfaces(beams, recipe.resolution)
     rng = np.random.default_rng(recipe.seed)
     phi = field.phi.copy()
@@ -82,6 +95,14 @@ def learn_field(
         rate = 1 / (1 + sweep / 2)  # falls, so that the noise of the last sweeps averages out
         phi = _descend(DistanceField(phi, field.origin, field.resolution), beams.part(some), rate)
     return DistanceField(phi, field.origin, field.resolution)
+
+
+def _company(ends: Array) -> np.ndarray:
+    """(R,) which beams ended near others: a few stray ones would make the grid as large as the scanner's range."""
+    cell = np.floor(ends / STRAY_CELL).astype(np.int64)
+    cell -= cell.min(axis=0)
+    index = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
+    return np.asarray(np.bincount(index)[index] >= LEVEL_POINTS)
 
 
 def _surfaces(beams: Beams, h: float) -> DistanceField:
@@ -111,6 +132,9 @@ def _surfaces(beams: Beams, h: float) -> DistanceField:
     nx, ny = -np.sin(angle), np.cos(angle)
     flip = np.where(nx * dx + ny * dy > 0, -1.0, 1.0)  # against the beams: towards free space
     nx, ny = nx * flip, ny * flip
+    crossed = np.zeros(own.shape)
+    kernels.crossings(beams.starts - low, unit, beams.ranges, h, surface, mx, my, nx, ny, THROUGH, crossed)
+    surface &= own >= PRESENT * (own + crossed)
     return DistanceField(_distances(surface, mx, my, nx, ny, own, h), (float(low[0]), float(low[1])), h)
 
 
@@ -138,9 +162,21 @@ def _distances(surface: np.ndarray, mx: Array, my: Array, nx: Array, ny: Array, 
     return phi.astype(np.float32)
 
 
-def reachable(field: DistanceField, visited: Array, clearance: float = 0.1) -> Array:
+def looked_into(beams: Beams) -> Seen:
+    """The cells that the beams have passed or ended in."""
+    ends = beams.ends()
+    low = np.minimum(ends.min(0), beams.starts.min(0)) - SEEN_CELL
+    shape = np.ceil((np.maximum(ends.max(0), beams.starts.max(0)) - low) / SEEN_CELL).astype(int)[::-1] + 1
+    cells = np.zeros(shape, np.bool_)
+    kernels.look(beams.starts - low, beams.unit(), beams.ranges, SEEN_CELL, cells)
+    return Seen(cells, (float(low[0]), float(low[1])))
+
+
+def reachable(field: DistanceField, visited: Array, clearance: float = 0.1, seen: Seen | None = None) -> Array:
     """(K, 2) m in map: nodes at least ``clearance`` m from surfaces that hang together with visited places (N, 2)."""
     free = field.phi > clearance
+    if seen is not None:
+        free &= seen.at(field)
     grown = np.zeros_like(free)
     node = np.round((visited - field.origin) / field.resolution).astype(int)
     grown[node[:, 1], node[:, 0]] = True
@@ -180,6 +216,7 @@ def _descend(field: DistanceField, beams: Beams, rate: float) -> Floats:
     ranges, facing = traced.ranges[:, 0], traced.facing[:, 0]
     error = beams.ranges - ranges
     good = np.isfinite(ranges) & (np.abs(error) < CLIP) & (facing > GRAZING)
+    field = _carved(field, beams, ranges, good, np.where(np.isfinite(ranges), error, 0.0) * facing)
     facing = facing[good]
     where = (beams.starts[good] + ranges[good, None] * beams.unit()[good] - field.origin) / field.resolution
     node = np.minimum(np.maximum(where.astype(int), 0), np.array(field.phi.shape)[::-1] - 2)
@@ -192,6 +229,23 @@ def _descend(field: DistanceField, beams: Beams, rate: float) -> Floats:
         norm += np.bincount(index, w / facing**2, ny * nx)
     step = np.divide(up, norm + 1.0, out=np.zeros_like(up))
     return np.asarray(field.phi + rate * step.reshape(ny, nx), np.float32)
+
+
+def _carved(field: DistanceField, beams: Beams, ranges: Array, hit: np.ndarray, behind: Array) -> DistanceField:
+    """The field with what most beams went through taken out: planes carried on past an edge, things that moved away.
+
+    ``behind`` (R,) m: how far behind the surface a beam ended, across it.
+    """
+    through = np.isfinite(ranges) & (behind > THROUGH)
+    counts = []
+    for which in (hit, through):
+        where = (beams.starts[which] + ranges[which, None] * beams.unit()[which] - field.origin) / field.resolution
+        node = np.clip(np.round(where).astype(int), 0, np.array(field.phi.shape)[::-1] - 1)
+        counts.append(np.bincount(node[:, 1] * field.phi.shape[1] + node[:, 0], minlength=field.phi.size))
+    ended, went = (count.reshape(field.phi.shape) for count in counts)
+    absent = (went >= LEVEL_POINTS) & (ended < PRESENT * (ended + went))
+    phi = np.where(absent, np.maximum(field.phi, CARVED * field.resolution), field.phi).astype(np.float32)
+    return DistanceField(phi, field.origin, field.resolution)
 
 
 def learn_scales(field: DistanceField, poses: Array, mount: Array, angles: Array, ranges: Array, sigma: float) -> Array:

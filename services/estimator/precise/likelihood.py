@@ -11,6 +11,7 @@ is as likely as any other.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,12 @@ if TYPE_CHECKING:
     from services.estimator.generative import Expected
 
 
+KNOWN = 0.3  # share of the beams of which something must be expected
+
+
+_erf = np.vectorize(math.erf, otypes=[float])
+
+
 @dataclass(frozen=True)
 class Evidence:
     """What the beams say about N poses; derivatives by the laser's pose."""
@@ -33,6 +40,10 @@ class Evidence:
     curvature: Array  # (N, 3, 3) Gauss-Newton Hessian
     of_noise: Array  # (N, 3, 3) covariance of xi from the scanner's noise
     of_model: Array  # (N, 3, 3) covariance of xi from the model's error, were beams independent
+
+    def part(self, rows: Array) -> Evidence:
+        """Of some of the poses."""
+        return Evidence(*(values[rows] for values in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -55,7 +66,9 @@ class Likelihood:
             self.sigma, self.relative, widen, self.short, self.random, range_max, self.unseen,
             total, gradient, matrices,
         )  # fmt: skip
-        explained = total[:, 1] / np.maximum(total[:, 2], 1)
+        # A pose from which nearly nothing is known explains nearly nothing.
+        least = KNOWN * len(measured) if np.isinf(expected.scale).any() else 1.0
+        explained = total[:, 1] / np.maximum(total[:, 2], max(least, 1.0))
         return Evidence(total[:, 0], explained, gradient, matrices[:, 0], matrices[:, 1], matrices[:, 2])
 
     def deviation(self, expected: Array) -> Array | float:
@@ -70,6 +83,14 @@ class Likelihood:
             return np.full(len(measured), self.unseen / range_max)
         core, flat = self._parts(measured, expected, scale, range_max)
         return np.asarray((1 - self.unseen) * (core + flat))
+
+    def cumulative(self, measured: Array, expected: Array, scale: Array, range_max: float) -> Array:
+        """(K,) probability of a range of at most ``measured`` (K,) m, given that there is one."""
+        deviation = np.hypot(self.deviation(expected), scale)
+        core = 0.5 * (1 + _erf((measured - expected) / (np.sqrt(2) * deviation)))
+        early = np.minimum(measured / np.maximum(expected, 1e-3), 1.0)
+        flat = np.minimum(measured / range_max, 1.0)
+        return np.asarray((1 - self.short - self.random) * core + self.short * early + self.random * flat)
 
     def inlier(self, measured: Array, expected: Array, scale: Array, range_max: float) -> Array:
         """(K,) probability that the surface expected ended the beam, and nothing else; finite ranges (K,) m."""

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 SAME_PLACE, SAME_YAW = 0.1, 0.1  # m, rad: nearer modes are one
 MEMORY = 0.8  # of the evidence of earlier scans; a model's error repeats, so evidence must not add up for ever
 BLIND, RIPPLES = 1e-4, 7.0  # information along, as a share of that across, that counts as none; of the ripple's
+GOOD_SCANS = 10  # in which a rival must have looked as scans of their place do
 NEGLIGIBLE = 1e-4  # weight below which a hypothesis is refuted
 
 
@@ -140,12 +141,27 @@ def weigh(modes: list[Mode], evidence_error: float, count: int) -> list[Mode]:
 
     F between places is only known up to the model's error, a few beams at about 9 nats: ``evidence_error`` nats.
     """
-    kept = distinct(np.array([mode.pose for mode in modes]), np.array([mode.energy for mode in modes]), count)
+    energy = np.array([mode.energy for mode in modes])
+    holder = next((k for k, mode in enumerate(modes) if mode.trusted), None)
+    if holder is not None:  # nobody goes before the place that was tracked but by `succeeds`
+        energy = np.maximum(energy, energy[holder])
+        energy[holder] = np.nextafter(energy[holder], -np.inf)
+    kept = distinct(np.array([mode.pose for mode in modes]), energy, count)
     ordered = [modes[k] for k in kept]
-    weights = np.exp(-(np.array([mode.energy for mode in ordered]) - ordered[0].energy) / evidence_error)
+    weights = np.exp(-(energy[kept] - energy[kept[0]]) / evidence_error)
     weights /= weights.sum()
     return [
         replace(mode, weight=float(weight / weights[weights > NEGLIGIBLE].sum()))
         for mode, weight in zip(ordered, weights, strict=True)
         if weight > NEGLIGIBLE
     ]
+
+
+def succeeds(rival: Mode, holder: Mode, margin: float, probation: int, good: float, satisfied: float) -> bool:
+    """Whether the robot was carried to where ``rival`` is, not only its surroundings changed.
+
+    One scan of a place that changed may look like another place, by hundreds of nats; scans from several places do not.
+    """
+    soon = GOOD_SCANS if rival.explained >= good else probation
+    proven = rival.age >= soon or rival.explained >= satisfied
+    return proven and rival.energy < holder.energy - margin

@@ -29,15 +29,20 @@ class Seeds:
     """Panoramas expected at places over free space."""
 
     places: Array  # (S, 2) m in map, of the laser
-    panoramas: np.ndarray[tuple[int, ...], np.dtype[np.float32]]  # (S, BINS) m in direction 2 pi k / BINS of map
+    panoramas: np.ndarray[
+        tuple[int, ...], np.dtype[np.float32]
+    ]  # (S, BINS) m in direction 2 pi k / BINS; NaN: not known
 
     @classmethod
     def at(cls, model: GenerativeModel, places: Array) -> Seeds:
         """Ask the model for every place (S, 2)."""
         lasers = np.column_stack([places, np.zeros(len(places))])
         directions = np.linspace(0.0, 2 * np.pi, BINS, endpoint=False)
-        parts = [model.expect(part, directions).ranges for part in np.array_split(lasers, max(1, len(lasers) // 500))]
-        return cls(np.asarray(places, float), np.concatenate(parts).astype(np.float32))
+        parts = []
+        for part in np.array_split(lasers, max(1, len(lasers) // 500)):
+            seen = model.expect(part, directions)
+            parts.append(np.where(np.isinf(seen.scale), np.nan, seen.ranges).astype(np.float32))
+        return cls(np.asarray(places, float), np.concatenate(parts))
 
     @property
     def volume(self) -> float:

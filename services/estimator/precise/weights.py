@@ -12,7 +12,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from common.errors import UserError
 from common.scanner import Scanner
 from common.world import World
-from services.estimator.precise.field import CLASSES, DistanceField, FieldModel
+from services.estimator.precise.calibration import Calibration
+from services.estimator.precise.field import CLASSES, DistanceField, FieldModel, Seen
 
 if TYPE_CHECKING:
     from common.se2 import Array
@@ -42,6 +43,8 @@ class FieldCard(BaseModel):
     test_share_above_5_cm: float
     test_position_error_rms_m: float  # of the pose found from scans without noise: what the model alone leaves
     learning_s: float
+    source: str = "simulated scans"
+    calibration: Calibration | None = None  # on real scans; none: the estimator's defaults hold
     commit: str
     command: str
     versions: dict[str, str]
@@ -60,6 +63,8 @@ def save(path: Path, model: FieldModel, places: Array, card: FieldCard) -> None:
         "scales": model.scales.astype(np.float32),
         "places": np.asarray(places, np.float32),
     }
+    if model.seen is not None:
+        tensors |= {"seen": model.seen.cells.astype(np.uint8), "seen_origin": np.array(model.seen.origin)}
     partial = path.with_suffix(".partial")
     safetensors.numpy.save_file(tensors, partial)
     partial.chmod(0o644)
@@ -87,7 +92,18 @@ def load(path: Path) -> tuple[FieldModel, Array, FieldCard]:
     if not all(np.isfinite(a).all() for a in (phi, scales, places)):
         raise UserError(f"weights {path}: not all numbers are finite")
     field = DistanceField(phi.astype(np.float32), card.origin, card.resolution)
-    return FieldModel(field, scales.astype(np.float64), card.ripple), places.astype(np.float64), card
+    model = FieldModel(field, scales.astype(np.float64), card.ripple, _seen(tensors, path))
+    return model, places.astype(np.float64), card
+
+
+def _seen(tensors: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]], path: Path) -> Seen | None:
+    if "seen" not in tensors:
+        return None
+    cells, origin = tensors["seen"], tensors.get("seen_origin", np.zeros(0))
+    if cells.ndim != 2 or origin.shape != (2,) or not np.isfinite(origin.astype(float)).all():
+        raise UserError(f"weights {path}: what was looked into has another shape than a grid's")
+    x, y = origin.astype(float)
+    return Seen(cells.astype(bool), (float(x), float(y)))
 
 
 def train_command(world: str, folder: Path = FOLDER) -> str:
@@ -108,6 +124,19 @@ def find(folder: Path, world: World, asked: str) -> Path:
             f"name of its own, or learn anew with: {train_command(asked, folder)}"
         )
     return path
+
+
+def refuse_to_overwrite(path: Path, world: World) -> None:
+    """Another world's field of the same name is not ours to throw away."""
+    try:
+        _, _, card = load(path)
+    except UserError:
+        return
+    if not same_walls(card.world, world):
+        raise UserError(
+            f"{path} belongs to another world of the same name {world.name!r}: give your world a name of its own, "
+            "or another folder with --out"
+        )
 
 
 def same_walls(a: World, b: World) -> bool:

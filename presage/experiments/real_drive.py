@@ -1,0 +1,128 @@
+"""One estimator on the second half of a real drive: tracking, finding itself, being carried off."""
+
+from __future__ import annotations
+
+import functools
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common import se2
+from common.se2 import Array
+from common.world import load_world
+from presage.scan_files import read_scans
+from presage.train_drive import drive_of
+from services.estimator.building import Choice, Factory, Geometry, prepare
+from services.estimator.interface import Estimator, Observation
+from services.estimator.particle_filter.filter import ParticleFilter
+from services.estimator.particle_filter.sensor import Sensor
+from services.estimator.particle_filter.settings import Settings as ParticleSettings
+from services.estimator.precise.calibration import Drive
+
+LIMIT = 40  # scans that a search may take
+BEFORE = 10  # scans that a robot is tracked for before it is carried off
+NEAR = np.diag([0.01, 0.01, 0.0025])  # covariance of the start that is given, m², m², rad²
+ODOMETRY, LASER, GLOBAL, KIDNAPPED = "odometry", "laser", "global", "kidnapped"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One estimator on one stretch; plain values alone."""
+
+    log: str
+    map: str
+    mount: tuple[float, float, float]
+    estimator: str  # precise or particle-filter
+    task: str
+    first: int  # scan of the drive at which it begins
+    count: int = 0  # scans to go on for
+    to: int = 0  # kidnapped: the scan it is carried to
+    model: str = ""  # of precise: file of weights
+    particles: tuple[tuple[str, float], ...] = ()  # settings of the particle filter, by name
+    seed: int = 1
+
+
+@functools.lru_cache(maxsize=2)
+def drive_at(log: str, mount: tuple[float, float, float]) -> Drive:
+    """The posed scans of a log, once a process."""
+    from presage.logs.log import Reading  # noqa: PLC0415
+
+    path = Path(log)
+    return drive_of(read_scans(path, reading=Reading(mount=np.array(mount))), path)
+
+
+def trial(job: Job) -> dict[str, Any]:
+    """What was believed after every scan."""
+    drive, estimator = drive_at(job.log, job.mount), entered(job)
+    if job.task in (ODOMETRY, LASER):
+        estimator.restart(drive.poses[job.first], NEAR)
+        numbers = list(range(job.first, job.first + job.count))
+        odom = drive.odom if job.task == ODOMETRY else None
+    elif job.task == GLOBAL:
+        numbers = list(range(job.first, min(job.first + (job.count or LIMIT), len(drive.ranges))))
+        odom = drive.odom
+    else:
+        estimator.restart(drive.poses[job.first], NEAR)
+        numbers = [*range(job.first, job.first + BEFORE), *range(job.to, min(job.to + LIMIT, len(drive.ranges)))]
+        odom = None if drive.odom is None else unaware(drive.odom, job.first + BEFORE - 1, job.to)
+    clock = drive.stamps.copy()
+    if job.task == KIDNAPPED:  # carried in no time, as far as the sensors tell
+        clock[job.to :] += clock[job.first + BEFORE] - clock[job.to]
+        clock[: job.first + BEFORE] = drive.stamps[: job.first + BEFORE]
+    rows: dict[str, list[Any]] = {name: [] for name in ("stamp_s", "error_m", "yaw_error_rad", "state", "nees", "ms")}
+    for k in numbers:
+        told = None if odom is None else odom[k]
+        seen = Observation(drive.ranges[k], drive.angles, drive.range_max, float(clock[k]), told)
+        began = time.perf_counter()
+        posterior = estimator.update(seen)
+        rows["ms"].append(round((time.perf_counter() - began) * 1e3, 2))
+        off = posterior.pose - drive.poses[k]
+        off[2] = se2.wrap(off[2])
+        rows["stamp_s"].append(round(float(clock[k]), 4))
+        rows["error_m"].append(round(float(np.hypot(off[0], off[1])), 5))
+        rows["yaw_error_rad"].append(round(abs(float(off[2])), 5))
+        rows["state"].append(posterior.state)
+        rows["nees"].append(_nees(off, posterior.covariance))
+    return {"estimator": job.estimator, "task": job.task, "first": job.first, "to": job.to, **rows}
+
+
+def _nees(off: Array, covariance: Array | None) -> float | None:
+    if covariance is None:
+        return None
+    return round(min(float(off @ np.linalg.pinv(covariance, hermitian=True) @ off), 1e6), 3)
+
+
+def unaware(odom: Array, before: int, to: int) -> Array:
+    """Odometry of a robot that is lifted from scan ``before`` to scan ``to``: its wheels stand still meanwhile."""
+    moved = odom.copy()
+    moved[to:] = se2.compose(odom[before], se2.between(odom[to], odom[to:]))
+    return np.asarray(moved)
+
+
+def entered(job: Job) -> Estimator:
+    """A new estimator that knows the place and nothing of where it is."""
+    drive = drive_at(job.log, job.mount)
+    if job.estimator == "precise":
+        factory = _precise(job.map, job.model)
+        return factory(Geometry(drive.angles, drive.mount, drive.range_max))
+    settings = particle_settings(job.particles)
+    return ParticleFilter(load_world(job.map), settings, job.mount, job.seed, sensor=_sensor(job.map, settings))
+
+
+def particle_settings(changed: tuple[tuple[str, float], ...]) -> ParticleSettings:
+    """The tuned set, with what a tuning on the first half has changed."""
+    values = {name: int(value) if name == "max_beams" else value for name, value in changed}
+    return replace(ParticleSettings.tuned(), **values)  # type: ignore[arg-type]
+
+
+@functools.lru_cache(maxsize=2)
+def _precise(world: str, model: str) -> Factory:
+    return prepare(Choice(world, "precise", model))
+
+
+@functools.lru_cache(maxsize=4)
+def _sensor(world: str, settings: ParticleSettings) -> Sensor:
+    return Sensor(load_world(world), settings)

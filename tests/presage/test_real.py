@@ -1,0 +1,117 @@
+"""`presage train --from` and `presage experiment real`, on a small drive that is made here."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from common import se2
+from common.errors import UserError
+from common.world import save_world
+from presage.experiments import page, real
+from presage.experiments.real_drive import KIDNAPPED, LIMIT, Job, unaware
+from presage.experiments.real_drive import trial as one_trial
+from presage.experiments.real_tuning import starting_point
+from presage.logs.log import Reading
+from presage.train_drive import Job as Training
+from presage.train_drive import train_from_drive
+from services.estimator.precise import weights
+from services.estimator.precise.learning import Recipe
+from services.estimator.precise.motion import MotionNoise
+from tests.presage import real_drive
+
+HERE = Reading(mount=np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The log, the map of its first half, and what was learned from that half."""
+    made = tmp_path_factory.mktemp("drive")
+    real_drive.save(made / "drive.npz", real_drive.drive(200))
+    (made / "before.yaml").write_text(save_world(real_drive.BEFORE), encoding="utf-8")
+    recipe = Recipe(resolution=0.05, sweeps=4, beams_a_sweep=40_000)
+    job = Training(made / "drive.npz", str(made / "before.yaml"), made, 100, recipe, 0.5, HERE)
+    train_from_drive(job, Console(quiet=True))
+    return made
+
+
+def test_the_card_says_where_the_model_comes_from_and_how_good_it_is(folder):
+    _, places, card = weights.load(folder / "before-precise.safetensors")
+    assert card.source == "100 posed scans of drive.npz; elsewhere 100 simulated scans in map before"
+    assert card.calibration is not None
+    assert card.calibration.scans == 20
+    assert card.test_range_error_median_m < 0.03
+    assert len(places) > 50
+    assert (folder / "before-precise.png").stat().st_size > 10_000
+    raw = json.loads((folder / "before-precise.json").read_text(encoding="utf-8"))
+    assert raw["calibration"]["log_likelihood"] == pytest.approx(card.calibration.log_likelihood)
+
+
+def test_without_reference_poses_there_is_nothing_to_learn_from(tmp_path):
+    real_drive.save(tmp_path / "bare.npz", real_drive.drive(60), reference=False)
+    with pytest.raises(UserError, match="no reference poses"):
+        train_from_drive(Training(tmp_path / "bare.npz", out=tmp_path, reading=HERE), Console(quiet=True))
+    real_drive.save(tmp_path / "short.npz", real_drive.drive(60))
+    with pytest.raises(UserError, match="30 scans with a reference pose; 50 are the least"):
+        train_from_drive(Training(tmp_path / "short.npz", out=tmp_path, share=0.5, reading=HERE), Console(quiet=True))
+
+
+@pytest.mark.parametrize("estimator", ["precise", "particle-filter"])
+def test_a_robot_that_is_carried_off_finds_itself(folder, estimator):
+    job = Job(
+        str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), estimator, KIDNAPPED, 100, to=155,
+        model=str(folder / "before-precise.safetensors"),
+        particles=(*starting_point(MotionNoise()), ("max_particles", 4000), ("min_particles", 500)),
+    )  # fmt: skip
+    row = one_trial(job)
+    assert len(row["error_m"]) == 10 + min(LIMIT, 45)
+    assert np.median(row["error_m"][:10]) < 0.2
+    found = real.summarise([row])
+    assert found["found"] == 1
+    if estimator == "precise":
+        assert found["error_median_m"] < 0.06
+        assert found["wrong_claim_longest_s"] <= 2
+
+
+def test_odometry_does_not_tell_of_being_carried_off():
+    rng = np.random.default_rng(0)
+    odom = np.cumsum(rng.normal(0, 0.1, (20, 3)), axis=0)
+    told = unaware(odom, 4, 12)
+    assert told[12] == pytest.approx(odom[4])
+    assert se2.between(told[12], told[15]) == pytest.approx(se2.between(odom[12], odom[15]))
+
+
+def row(task, error, state, stamps=None):
+    count = len(error)
+    return {
+        "task": task, "estimator": "precise", "error_m": error, "yaw_error_rad": [0.0] * count, "state": state,
+        "stamp_s": stamps or [0.5 * k for k in range(count)], "nees": [3.0] * count, "ms": [1.0] * count,
+    }  # fmt: skip
+
+
+def test_wrong_claims_are_counted_while_they_last():
+    t, lost = "tracking", "lost"
+    found = real.summarise([row("odometry", [0, 9, 9, 9, 9, 0, 9], [t, t, t, t, lost, t, t])])
+    assert found["wrong_claim_longest_s"] == pytest.approx(1.0)  # from the second to the fourth scan
+    assert found["wrong_claims_share"] == pytest.approx(4 / 7)
+    assert found["tracked_share"] == pytest.approx(2 / 7)
+    searched = real.summarise([row("global", [9, 9, 0.1, 0], [lost, t, lost, t]), row("global", [9, 9], [lost, lost])])
+    assert searched["found"] == 1
+    assert searched["scans_until_found_median"] == 4
+
+
+def test_its_table_is_one_of_the_page(tmp_path):
+    assert page.MODULES["real"] == "real"
+    summary = {"a: tracking with odometry, precise": real.summarise([row("odometry", [0.01, 0.02], ["tracking"] * 2)])}
+    table = real.table(summary)
+    assert "| a: tracking with odometry, precise | 15.0 |" in table
+
+
+def test_a_log_too_short_is_refused(folder, tmp_path):
+    real_drive.save(tmp_path / "few.npz", real_drive.drive(100))
+    job = real.Job(tmp_path / "few.npz", str(folder / "before.yaml"))
+    with pytest.raises(UserError, match="100 posed scans; at least 160"):
+        real.run(job, tmp_path, 1, Console(quiet=True))
