@@ -73,7 +73,7 @@ class BridgeRos2Service(Service):
 
     def close(self) -> None:
         """A robot under way is stopped."""
-        self._drive(self.wheels.silence())
+        self._drive(self.wheels.silence(time.monotonic()))
         if self._ros is not None:
             self._ros.close()
 
@@ -115,8 +115,9 @@ class BridgeRos2Service(Service):
     def due(self) -> float | None:
         """Until the next look, or until a robot whose commands have ended is stopped."""
         now = time.monotonic()
+        stop = self.wheels.due(now) if self.wheels.moving else self.wheels.reminds_in(now)
         look = self._look_at - now
-        return min(look, self.wheels.due(now)) if self.wheels.moving else look
+        return look if stop is None else min(look, stop)
 
     def on_timer(self) -> None:
         """Stop the robot; look how things stand."""
@@ -124,7 +125,8 @@ class BridgeRos2Service(Service):
         if self.wheels.moving and self.wheels.due(now) <= 0:
             self.counters["stops_for_silence"] += 1
             self.log.warning("stop: commands have ended", silent_s=round(self.wheels.patience, 2))
-            self._drive(self.wheels.silence())
+            self._drive(self.wheels.silence(now))
+        self._drive(self.wheels.remind(now))
         if now >= self._look_at:
             self._look_at = now + AGAIN
             self._look(now)

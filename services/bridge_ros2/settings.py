@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from common.config import NUMBER, ServiceSettings
+from common.errors import UserError
 from common.robot import Robot
 from services.bridge_ros2.frames import Mount
 from services.bridge_ros2.keys import NAME, Names, full_name
@@ -141,6 +142,8 @@ class BridgeRos2Settings(ServiceSettings):
     def the_mount(self) -> Mount | None:
         """How the laser sits, where it was said."""
         if not self.mount:
+            if self.upside_down:
+                raise UserError("--upside-down goes with --mount x,y,yaw_deg: without it, tf says how the laser sits")
             return None
         x, y, yaw = (float(part) for part in self.mount.split(","))
         return Mount((x, y, float(np.deg2rad(yaw))), self.upside_down)

@@ -5,6 +5,8 @@ The base's own watchdog, as ROS drivers have one, stands behind this: nobody can
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
 from common import safety
@@ -14,6 +16,7 @@ from common.se2 import Array
 
 SLOWEST = 1e-3  # m/s and rad/s; less is none
 STANDING = 0.5  # s for which a stop is said again; then the topic is left to others (a joystick, nav2)
+REMIND = 0.1  # s between two of those that nobody asked for
 
 
 class Wheels:
@@ -27,11 +30,17 @@ class Wheels:
         self.stopped = False  # the last command was slowed before an obstacle
         self._points = np.zeros((0, 2))
         self._scan: tuple[int, float] | None = None  # stamp of the newest, and when it came
-        self._period = 0.0  # s between scans
+        self._periods: deque[float] = deque(maxlen=5)  # s between the last scans
         self._velocity: tuple[Array, float] | None = None  # by odometry, and when
         self._stamp = -1  # of the last command
         self._heard = self._moved = -1e9  # when a newer command came, and when one that moves was passed on
         self._moving = False
+        self._ended = self._reminded = -1e9  # when a stop for silence was said first, and last
+
+    @property
+    def _period(self) -> float:
+        """S between scans; a single gap, or a clock that is set, changes nothing."""
+        return float(np.median(self._periods)) if self._periods else 0.0
 
     @property
     def patience(self) -> float:
@@ -45,7 +54,7 @@ class Wheels:
             if scan.stamp_ns < before:  # time begins anew: so do commands
                 self._stamp = -1
             else:
-                self._period = min((scan.stamp_ns - before) * 1e-9, 1.0)
+                self._periods.append(min((scan.stamp_ns - before) * 1e-9, 1.0))
         self._scan = (scan.stamp_ns, now)
         self._points = safety.scan_points(scan)
 
@@ -70,8 +79,8 @@ class Wheels:
         twist = np.where(np.abs(twist) < SLOWEST, 0.0, twist)
         if twist.any():
             if self.due(now) <= 0:  # said again after the time was up
-                return self.silence()
-            self._moving, self._moved = True, now
+                return self.silence(now)
+            self._moving, self._moved, self._ended = True, now, -1e9
             return twist
         self._moving = False
         return twist if now - self._moved <= STANDING else None
@@ -92,7 +101,21 @@ class Wheels:
         """Whether the last that was passed on moves the robot."""
         return self._moving
 
-    def silence(self) -> Array | None:
-        """(3,) zeros, once, where commands have ended under way."""
+    def silence(self, now: float) -> Array | None:
+        """(3,) zeros where commands have ended under way; `remind` says them again."""
         moving, self._moving = self._moving, False
+        if moving:
+            self._ended = self._reminded = now
         return np.zeros(3) if moving else None
+
+    def reminds_in(self, now: float) -> float | None:
+        """S until a stop for silence is to be said again: one message may get lost, and links fail just then."""
+        return None if now - self._ended > STANDING else self._reminded + REMIND - now
+
+    def remind(self, now: float) -> Array | None:
+        """(3,) zeros, where it is time for them."""
+        due = self.reminds_in(now)
+        if due is None or due > 0:
+            return None
+        self._reminded = now
+        return np.zeros(3)

@@ -44,14 +44,37 @@ def test_a_fresh_command_passes_and_an_old_one_does_not():
     assert Wheels(Robot()).command(command(0), 0.0) is None  # no scan at all
 
 
-def test_a_stop_is_said_once_when_commands_end():
+def test_a_stop_is_said_when_commands_end():
     wheels = driving()
     assert not wheels.moving
     wheels.command(command(1000), 0.0)
     assert wheels.moving
     assert wheels.due(0.1) == pytest.approx(0.1)
-    np.testing.assert_array_equal(wheels.silence(), np.zeros(3))
-    assert wheels.silence() is None
+    np.testing.assert_array_equal(wheels.silence(0.2), np.zeros(3))
+    assert wheels.silence(0.2) is None
+
+
+def test_a_stop_for_silence_is_said_again_until_a_command_comes():
+    wheels = driving()
+    wheels.command(command(1000), 0.0)
+    wheels.silence(0.2)
+    said = [now for now in np.arange(0.2, 1.2, 0.05).tolist() if wheels.remind(now) is not None]
+    assert 4 <= len(said) <= STANDING / 0.1
+    assert max(said) <= 0.2 + STANDING + 1e-9
+    assert wheels.reminds_in(1.2) is None
+    wheels.hear_scan(scan(1300), 1.3)
+    wheels.command(command(1300), 1.3)
+    wheels.silence(1.5)
+    wheels.hear_scan(scan(1600), 1.6)
+    assert wheels.command(command(1600), 1.6) is not None
+    assert wheels.remind(1.7) is None
+
+
+def test_one_gap_between_scans_gives_nobody_longer():
+    wheels = driving()
+    for stamp in (1100, 1200, 1300, 2200, 2300):  # 10 Hz, 0.9 s missing
+        wheels.hear_scan(scan(stamp), stamp * 1e-3 - 1)
+        assert wheels.patience == pytest.approx(0.2)
 
 
 def test_a_command_said_again_keeps_nothing_going():
