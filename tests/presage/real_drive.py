@@ -1,4 +1,4 @@
-"""A drive such as a real robot records, made here: moved furniture, people, beams without return, poses a little off."""
+"""A drive such as a real robot records, made here: moved furniture, people, beams lost, poses a little off."""
 
 from __future__ import annotations
 

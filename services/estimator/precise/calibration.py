@@ -169,8 +169,8 @@ def _coverage(
 def noise_of(ranges: Array, angles: Array) -> float:
     """M, the scanner's noise from its scans (N, B) alone, where at most a few beams in a hundred are outliers.
 
-    Along a straight wall 1/r is a sinusoid of the angle, so u(a - d) + u(a + d) = 2 cos(d) u(a) for u = 1/r; what is left
-    is noise. Median absolute deviation: at edges it is not so.
+    Along a straight wall 1/r is a sinusoid of the angle, so u(a - d) + u(a + d) = 2 cos(d) u(a) for u = 1/r; what is
+    left is noise. Median absolute deviation: at edges it is not so.
     """
     turn = 2 * np.cos(np.diff(angles).mean())
     with np.errstate(divide="ignore", invalid="ignore"):

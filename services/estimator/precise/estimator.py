@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from services.estimator.generative import GenerativeModel
     from services.estimator.precise.seeding import Seeds
 
-FIRST_WAIT, LOST_WAIT, LONGEST_WAIT = 5, 10, 150  # scans between searches while the scan fits badly
+FIRST_WAIT, LONGEST_WAIT = 5, 150  # scans between searches while the scan fits badly,
+LOST_WAIT, DOUBTFUL_WAIT = 2, 8  # at most that many while nothing, or little, speaks for the place
 UNKNOWN = 100.0  # m, stated where nothing is known
 FAR = 16.0  # squared standard deviations
 WIDEST, WIDE, NARROW = 0.3, 0.1, 0.03  # m, added to every beam's deviation on the way down from a seed
@@ -197,13 +198,17 @@ class PreciseEstimator:
         """The scan fits worse at once, or has fitted badly for long, or not as a belief must."""
         best, settings = self.modes[0], self.settings
         fell = best.explained < self._usual - settings.drop or best.accuracy > self._energy + settings.rise
-        believable = self._believable(view) and not self._doubtful(view)
-        gone, self._believed = self._believed and not believable, believable
+        believable, doubtful = self._believable(view), self._doubtful(view)
         if best.explained >= settings.satisfied:
             self._since, self._wait = 0, FIRST_WAIT
             return fell
+        if not believable and not best.trusted:
+            return True
+        if self._believed and not believable:
+            self._since, self._wait = 0, 1  # at once, and soon again
         self._since += 1
-        return fell or gone or self._since >= (self._wait if believable else min(self._wait, LOST_WAIT))
+        longest = LOST_WAIT if not believable else DOUBTFUL_WAIT if doubtful else LONGEST_WAIT
+        return fell or self._since >= min(self._wait, longest)
 
     def _believable(self, view: View) -> bool:
         """Whether enough of the scan is explained, or the rest may be hidden."""
@@ -244,7 +249,8 @@ class PreciseEstimator:
             elif mixture.same(found[0].pose[None], before.pose)[0]:
                 found[0] = replace(found[0], age=before.age, velocity=before.velocity, trusted=before.trusted)
             elif before.trusted:
-                found, self._since = [*self.modes, *found], 0
+                found = [*self.modes, *found]
+                self._since, self._wait = 0, min(2 * self._wait, LONGEST_WAIT)
         self.modes = self._weighed(found)
         self._usual, self._energy = self.modes[0].explained, self.modes[0].accuracy
 
@@ -300,6 +306,7 @@ class PreciseEstimator:
         seen: Expected = yield Expect(self.model, se2.compose(best.pose[None], self.mount), view.angles)
         expected = self._with_noise(seen)
         believable = self._believable(view)
+        self._believed = believable
         state = self._state(view, best, believable=believable)
         unknown = self.seeds.spread * (not believable)
         hypotheses = tuple(Hypothesis(mode.pose, self._covariance(mode) + unknown, mode.weight) for mode in self.modes)
