@@ -139,19 +139,7 @@ class PreciseEstimator:
             parts = [fuse(option, poses[k], evidence.xi[k], evidence.curvature[k]) for option in each]
             fused = min(parts, key=lambda part: part.surprise)
             modes.append(mixture.moved(mode, fused, evidence, k, period, blind=blind is not None))
-        self.modes = self._weighed(modes)
-
-    def _weighed(self, modes: list[Mode]) -> list[Mode]:
-        """The hypotheses by weight; who was tracked leads until another has proven itself."""
-        settings = self.settings
-        holder = next((mode for mode in modes if mode.trusted), None)
-        margin = 3 * settings.evidence_error
-        if holder is not None and any(
-            mixture.succeeds(mode, holder, margin, settings.probation, settings.good, settings.satisfied)
-            for mode in modes
-        ):
-            modes = [replace(mode, trusted=False) for mode in modes]
-        return mixture.weigh(modes, settings.evidence_error, settings.hypotheses)
+        self.modes = mixture.led(modes, self.settings)
 
     def _suspicious(self, view: View) -> bool:
         """The scan fits worse at once, or has fitted badly for long, or not as a belief must."""
@@ -210,7 +198,7 @@ class PreciseEstimator:
             elif before.trusted:
                 found = [*self.modes, *found]
                 self._since, self._wait = 0, min(2 * self._wait, LONGEST_WAIT)
-        self.modes = self._weighed(found)
+        self.modes = mixture.led(found, self.settings)
         self._usual, self._energy = self.modes[0].explained, self.modes[0].accuracy
 
     def _unlikely(self, view: View, found: Mode) -> bool:
