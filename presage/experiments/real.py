@@ -99,8 +99,7 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
          "calibration": asdict(card.calibration) if card.calibration else None},
         summary, curves_of(rows), rows, notes(job, card, tuned),
     )  # fmt: skip
-    drive = drive_at(str(job.log), job.mount)
-    result.write(out, draw(load_world(job.map), drive.poses[half:], card, rows, TASKS))
+    result.write(out, draw(card.calibration, rows, TASKS))
     return result
 
 
