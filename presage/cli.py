@@ -187,8 +187,8 @@ def train(
     them says how far it is to be trusted, and the card beside the weights reports it. With --world as well, scans
     simulated in that map fill in where the drive has not been.
     Examples: `presage train --from drive.npz --out mine`;
-    `presage train --from drive.log --world map.yaml --share 0.5 --out mine`; then
-    `presage localize other.log --world map.yaml --models mine`.
+    `presage train --from drive.npz --mount 0,0,0 --world map.yaml --share 0.5 --out mine` (poses of the laser itself);
+    then `presage localize drive.npz --mount 0,0,0 --world map.yaml --models mine`.
     """
     from presage import train as paper  # noqa: PLC0415
     from presage import train_precise as precise  # noqa: PLC0415

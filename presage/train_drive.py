@@ -25,7 +25,8 @@ from services.estimator.generative import RayCaster
 from services.estimator.precise import weights
 from services.estimator.precise.calibration import Drive
 from services.estimator.precise.driven import LEAST_SCANS, Learned, learn_drive
-from services.estimator.precise.learning import Beams, Recipe
+from services.estimator.precise.learning import Recipe
+from services.estimator.precise.surfaces import Beams
 
 MARGIN = 1.0  # m around what the drive has seen: the world of a drive without a map is a rectangle
 

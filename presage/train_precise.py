@@ -24,8 +24,9 @@ from services.estimator.building import LEAST_SIGMA
 from services.estimator.precise import weights
 from services.estimator.precise.evaluation import Quality, evaluate
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.learning import Beams, Recipe, learn_field, learn_ripple, learn_scales, reachable
+from services.estimator.precise.learning import Recipe, learn_field, learn_ripple, learn_scales, reachable
 from services.estimator.precise.seeding import SPACING, thin_places
+from services.estimator.precise.surfaces import Beams
 
 TEST_SAMPLES = 500
 

@@ -24,7 +24,8 @@ from services.estimator.panorama import Shape, train_panorama
 from services.estimator.paper_perception import PaperScans
 from services.estimator.precise.evaluation import evaluate
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.learning import Beams, Recipe, learn_field, learn_scales
+from services.estimator.precise.learning import Recipe, learn_field, learn_scales
+from services.estimator.precise.surfaces import Beams
 
 COLUMNS = ("learning s", "numbers", "range median mm", "mean mm", "> 5 cm %", "position median mm", "RMS mm")
 PAPER = "the paper's decoder, L1, one heading"

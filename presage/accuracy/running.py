@@ -26,8 +26,9 @@ from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.learning import Beams, Recipe, learn_field, learn_ripple, learn_scales
+from services.estimator.precise.learning import Recipe, learn_field, learn_ripple, learn_scales
 from services.estimator.precise.seeding import SPACING, Seeds, thin_places
+from services.estimator.precise.surfaces import Beams
 
 # As users name them; exact is precise over the world itself.
 CHOICES: dict[str, tuple[Name, str]] = {

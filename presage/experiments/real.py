@@ -15,20 +15,28 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from common.errors import UserError
 from common.versions import commit
 from common.world import load_world
-from presage.drive_figure import calibration_curve
-from presage.experiments import drawing, results
-from presage.experiments.real_drive import BEFORE, GLOBAL, KIDNAPPED, LASER, LIMIT, ODOMETRY, drive_at, trial
+from presage.experiments import results
+from presage.experiments.real_drawing import draw
+from presage.experiments.real_drive import (
+    BEFORE,
+    GLOBAL,
+    KIDNAPPED,
+    LASER,
+    LIMIT,
+    NEAR_ENOUGH,
+    ODOMETRY,
+    drive_at,
+    trial,
+)
 from presage.experiments.real_drive import Job as Stretch
 from presage.experiments.real_tuning import Settings, Tuned, starting_point, tune
 from presage.experiments.trials import run_trials
-from presage.map_drawing import draw_walls
 from presage.train_drive import Job as Training
 from presage.train_drive import card_of
 from services.estimator.precise import weights
@@ -40,7 +48,7 @@ TASKS = {
     ODOMETRY: "a: tracking with odometry", LASER: "b: tracking without", GLOBAL: "c: from nothing",
     KIDNAPPED: "d: carried off",
 }  # fmt: skip
-FOUND = 0.5  # m and
+FOUND = NEAR_ENOUGH  # m and
 FOUND_YAW = float(np.deg2rad(10))  # rad from the reference: tracked; beyond, `tracking` is a wrong claim
 QUICK = 120  # scans of (a) and (b), for a look
 
@@ -91,7 +99,7 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
          "calibration": asdict(card.calibration) if card.calibration else None},
         summary, curves_of(rows), rows, notes(job, card, tuned),
     )  # fmt: skip
-    result.write(out, draw(job, card, rows))
+    result.write(out, draw(card.calibration, rows, TASKS))
     return result
 
 
@@ -231,34 +239,6 @@ def notes(job: Job, card: weights.FieldCard, tuned: Tuned) -> list[str]:
 
 def _listed(settings: Settings) -> str:
     return ", ".join(f"{name} {value:.3g}" for name, value in settings)
-
-
-def draw(job: Job, card: weights.FieldCard, rows: Sequence[dict[str, Any]]) -> Figure:
-    """The map with the second half's way, calibration, errors over time with and without odometry."""
-    figure = drawing.blank(14, 9)
-    panels = figure.subplots(2, 2, width_ratios=(1.6, 1))
-    drive = drive_at(str(job.log), job.mount)
-    half = len(drive.ranges) // 2
-    draw_walls(panels[0, 0], load_world(job.map), "#222222")
-    panels[0, 0].plot(*drive.poses[half:, :2].T, color=drawing.MEASURED, linewidth=1, label="second half")
-    panels[0, 0].set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title="map of the first half")
-    panels[0, 0].autoscale_view()
-    if card.calibration is not None:
-        calibration_curve(panels[0, 1], card.calibration)
-    for axes, task in zip(panels[1], (ODOMETRY, LASER), strict=True):
-        drawing.dress(axes)
-        for row in rows:
-            if row["task"] == task:
-                stamps = np.array(row["stamp_s"]) - row["stamp_s"][0]
-                axes.plot(
-                    stamps, np.maximum(row["error_m"], 1e-3), linewidth=0.9, color=drawing.COLOURS[row["estimator"]],
-                    label=row["estimator"],
-                )  # fmt: skip
-        drawing.log_metres(axes)
-        axes.axhline(FOUND, color=drawing.BOUND, linestyle=":", linewidth=1)
-        axes.set(xlabel="time (s)", ylabel="position error (m)", title=TASKS[task])
-    drawing.legend_below(figure, panels[1, 1])
-    return figure
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:

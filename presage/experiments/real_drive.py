@@ -25,6 +25,7 @@ from services.estimator.precise.calibration import Drive
 LIMIT = 40  # scans that a search may take
 BEFORE = 10  # scans that a robot is tracked for before it is carried off
 NEAR = np.diag([0.01, 0.01, 0.0025])  # covariance of the start that is given, m², m², rad²
+NEAR_ENOUGH = 0.5  # m, within which a scan counts as tracked
 ODOMETRY, LASER, GLOBAL, KIDNAPPED = "odometry", "laser", "global", "kidnapped"
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from presage.experiments.real_drive import GLOBAL, LASER, ODOMETRY, Job, trial
+from presage.experiments.real_drive import GLOBAL, LASER, NEAR_ENOUGH, ODOMETRY, Job, trial
 from services.estimator.precise.motion import MotionNoise
 
 TRIED: dict[str, tuple[float, ...]] = {
@@ -32,7 +32,6 @@ TRIED_TO_FIND: dict[str, tuple[float, ...]] = {
 }
 STRETCHES, LENGTH = 2, 30  # of the first half: so many, of so many scans
 STARTS, TO_FIND = 4, 15  # places to find, and scans it may take
-NEAR_ENOUGH = 0.5  # m, within which a scan counts as tracked
 Settings = tuple[tuple[str, float], ...]
 
 

@@ -17,9 +17,10 @@ from services.estimator.paper_perception import PaperPerception
 from services.estimator.perception import Descent
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.learning import Beams, Recipe, learn_field, learn_ripple, learn_scales, reachable
+from services.estimator.precise.learning import Recipe, learn_field, learn_ripple, learn_scales, reachable
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.seeding import SPACING, Seeds, thin_places
+from services.estimator.precise.surfaces import Beams
 from services.estimator.training import Data, usable_ranges
 from services.estimator.weights import ModelCard
 

@@ -23,10 +23,11 @@ from services.estimator.particle_filter.sensor import Sensor
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
 from services.estimator.perception import Descent
 from services.estimator.precise import weights
-from services.estimator.precise.estimator import PreciseEstimator, Settings
+from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.gauss_newton import View, polish
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.seeding import SPACING, Seeds, thin_places
+from services.estimator.precise.settings import Settings
 
 SIGMA = 0.02  # m, the noise of a scanner that states none
 LEAST_SIGMA = 1e-3  # m, of one that states less: no surface is known better

@@ -13,10 +13,10 @@ import numpy.typing as npt
 
 from common import se2
 from services.estimator.precise import obstruction
-from services.estimator.precise.estimator import Settings
 from services.estimator.precise.gauss_newton import View, difference, polish
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion import MotionNoise
+from services.estimator.precise.settings import Settings
 
 if TYPE_CHECKING:
     from common.se2 import Array

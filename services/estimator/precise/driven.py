@@ -12,7 +12,6 @@ from common.se2 import Array
 from services.estimator.precise.calibration import Calibration, Drive, calibrate, learn_motion, noise_of
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.learning import (
-    Beams,
     Recipe,
     learn_field,
     learn_ripple,
@@ -21,6 +20,7 @@ from services.estimator.precise.learning import (
     reachable,
 )
 from services.estimator.precise.seeding import SPACING, thin_places
+from services.estimator.precise.surfaces import Beams
 
 HELD_OUT = 5  # one scan in so many tells of the precision
 LEAST_SCANS = 50

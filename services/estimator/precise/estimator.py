@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,8 +15,9 @@ from services.estimator.precise import mixture, obstruction
 from services.estimator.precise.gauss_newton import Prior, View, descending, polishing
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.mixture import Mode
-from services.estimator.precise.motion import Candidate, MotionNoise, candidates, fuse
+from services.estimator.precise.motion import candidates, fuse, unseen, within_reach
 from services.estimator.precise.seeding import Ranking
+from services.estimator.precise.settings import Settings
 
 if TYPE_CHECKING:
     from common.se2 import Array
@@ -28,35 +29,6 @@ LOST_WAIT, DOUBTFUL_WAIT = 2, 8  # at most that many while nothing, or little, s
 UNKNOWN = 100.0  # m, stated where nothing is known
 FAR = 16.0  # squared standard deviations
 WIDEST, WIDE, NARROW = 0.3, 0.1, 0.03  # m, added to every beam's deviation on the way down from a seed
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What can be set; defaults hold for every shipped world."""
-
-    seeds: int = 48  # poses descended in the first round of a search
-    more_seeds: int = 240  # in the second, where the first explains too little
-    beams: int = 150  # of the descent from seeds; the last steps take all
-    satisfied: float = 0.9  # share of beams explained that ends a search
-    good: float = 0.75  # share of beams from which another place may soon follow one that was tracked
-    doubtful: float = 0.45  # share of beams below which what contradicts a place voids the claim to it
-    believable: float = 0.45  # least share of beams that a belief must explain
-    glimpse: float = 0.15  # the same, of one that was tracked, while what it does not explain stands in the way
-    contradicted: float = 0.05  # share of the beams that may end behind what such a belief expects
-    holding: float = 0.004  # share of the beams on surfaces turned that way that hold a place along a direction
-    drop: float = 0.1  # fall of the share explained that calls for a search
-    evidence_error: float = 20.0  # nats by which a model's error may set two places apart
-    ambiguous: float = 0.05  # weight of a second hypothesis from which the belief is ambiguous
-    hypotheses: int = 8
-    inflation: float = 1.0  # of the covariance, for errors of the model that hang together
-    floor_position: float = 0.0  # m, standard deviation that no scan takes away, in x and in y
-    floor_heading: float = 0.0  # rad
-    sure: float = 0.75  # share of beams from which one scan is enough to say tracking
-    patience: int = 30  # scans that a place must persist with less
-    probation: int = 100  # scans for which a place that explains less than that must persist to follow another
-    rise: float = 150.0  # nats by which accuracy must worsen at once to call for a search
-    vague: float = 0.5  # m, standard deviation of a position that is not known
-    motion: MotionNoise = field(default_factory=MotionNoise)
 
 
 class PreciseEstimator:
@@ -139,7 +111,9 @@ class PreciseEstimator:
         )
         poses, evidence = yield from polishing(view, starts, wide)
         if evidence.explained[0] < self._usual - self.settings.drop:
-            around = self._around(self.modes[0], period) if odom is None else np.zeros((0, 3))
+            around = np.zeros((0, 3))
+            if odom is None:
+                around = within_reach(self.settings.motion, self.modes[0].pose, period, WIDEST)
             starts = np.concatenate([starts, around])
             first = np.concatenate([np.arange(len(self.modes)), np.zeros(len(around), np.int64)])
             wider = Prior(wide.mean[first], wide.information[first])
@@ -161,38 +135,11 @@ class PreciseEstimator:
                 keep, blind = np.eye(3), None
             mixture.project(evidence, k, keep)
             if blind is not None and odom is None:
-                each = [self._unseen(option, blind, mode.blind, period) for option in each]  # noqa: PLW2901
+                each = [unseen(self.settings.motion, option, blind, mode.blind, period) for option in each]  # noqa: PLW2901
             parts = [fuse(option, poses[k], evidence.xi[k], evidence.curvature[k]) for option in each]
             fused = min(parts, key=lambda part: part.surprise)
             modes.append(mixture.moved(mode, fused, evidence, k, period, blind=blind is not None))
-        self.modes = self._weighed(modes)
-
-    def _around(self, mode: Mode, period: float) -> Array:
-        """(K, 3) poses to which a robot may have driven unseen, where that is further than a descent reaches."""
-        motion = self.settings.motion
-        if motion.speed * period < WIDEST and motion.turn * period < WIDEST:
-            return np.zeros((0, 3))
-        ahead, turned = np.meshgrid(np.array([0.0, 0.5, 1.0]) * motion.speed, np.linspace(-1, 1, 5) * motion.turn)
-        steps = np.stack([ahead.ravel(), np.zeros(ahead.size), turned.ravel()], axis=-1) * period
-        return se2.compose(mode.pose, steps)
-
-    def _weighed(self, modes: list[Mode]) -> list[Mode]:
-        """The hypotheses by weight; who was tracked leads until another has proven itself."""
-        settings = self.settings
-        holder = next((mode for mode in modes if mode.trusted), None)
-        margin = 3 * settings.evidence_error
-        if holder is not None and any(
-            mixture.succeeds(mode, holder, margin, settings.probation, settings.good, settings.satisfied)
-            for mode in modes
-        ):
-            modes = [replace(mode, trusted=False) for mode in modes]
-        return mixture.weigh(modes, settings.evidence_error, settings.hypotheses)
-
-    def _unseen(self, option: Candidate, blind: Array, scans: int, period: float) -> Candidate:
-        """Along a direction no scan sees, the robot may have gone at full speed: the deviation grows with time."""
-        covariance = option.covariance.copy()
-        covariance[:2, :2] += np.outer(blind, blind) * (self.settings.motion.speed * period) ** 2 * (2 * scans + 1)
-        return replace(option, covariance=covariance)
+        self.modes = mixture.led(modes, self.settings)
 
     def _suspicious(self, view: View) -> bool:
         """The scan fits worse at once, or has fitted badly for long, or not as a belief must."""
@@ -251,7 +198,7 @@ class PreciseEstimator:
             elif before.trusted:
                 found = [*self.modes, *found]
                 self._since, self._wait = 0, min(2 * self._wait, LONGEST_WAIT)
-        self.modes = self._weighed(found)
+        self.modes = mixture.led(found, self.settings)
         self._usual, self._energy = self.modes[0].explained, self.modes[0].accuracy
 
     def _unlikely(self, view: View, found: Mode) -> bool:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from common.se2 import Array
     from services.estimator.precise.likelihood import Evidence
     from services.estimator.precise.motion import Fused
+    from services.estimator.precise.settings import Settings
 
 SAME_PLACE, SAME_YAW = 0.1, 0.1  # m, rad: nearer modes are one
 MEMORY = 0.8  # of the evidence of earlier scans; a model's error repeats, so evidence must not add up for ever
@@ -143,7 +144,7 @@ def weigh(modes: list[Mode], evidence_error: float, count: int) -> list[Mode]:
     """
     energy = np.array([mode.energy for mode in modes])
     holder = next((k for k, mode in enumerate(modes) if mode.trusted), None)
-    if holder is not None:  # nobody goes before the place that was tracked but by `succeeds`
+    if holder is not None:  # nobody goes before the place that was tracked but as `led` has it
         energy = np.maximum(energy, energy[holder])
         energy[holder] = np.nextafter(energy[holder], -np.inf)
     kept = distinct(np.array([mode.pose for mode in modes]), energy, count)
@@ -157,11 +158,19 @@ def weigh(modes: list[Mode], evidence_error: float, count: int) -> list[Mode]:
     ]
 
 
-def succeeds(rival: Mode, holder: Mode, margin: float, probation: int, good: float, satisfied: float) -> bool:
+def led(modes: list[Mode], settings: Settings) -> list[Mode]:
+    """The hypotheses by weight; who was tracked leads until another has proven itself."""
+    holder = next((mode for mode in modes if mode.trusted), None)
+    if holder is not None and any(succeeds(mode, holder, settings) for mode in modes):
+        modes = [replace(mode, trusted=False) for mode in modes]
+    return weigh(modes, settings.evidence_error, settings.hypotheses)
+
+
+def succeeds(rival: Mode, holder: Mode, settings: Settings) -> bool:
     """Whether the robot was carried to where ``rival`` is, not only its surroundings changed.
 
     One scan of a place that changed may look like another place, by hundreds of nats; scans from several places do not.
     """
-    soon = GOOD_SCANS if rival.explained >= good else probation
-    proven = rival.age >= soon or rival.explained >= satisfied
-    return proven and rival.energy < holder.energy - margin
+    soon = GOOD_SCANS if rival.explained >= settings.good else settings.probation
+    proven = rival.age >= soon or rival.explained >= settings.satisfied
+    return proven and rival.energy < holder.energy - 3 * settings.evidence_error

@@ -7,7 +7,7 @@ by evidence, so that a standing robot's scans are fused and a moving one's belie
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -107,6 +107,22 @@ def _moved(name: str, pose: Array, covariance: Array, step: Array, deviation: Ar
     by_pose, by_step = se2.compose_jacobians(pose, step)
     spread = by_pose @ covariance @ by_pose.T + (by_step * deviation**2) @ by_step.T
     return Candidate(name, se2.compose(pose, step), spread, probability)
+
+
+def unseen(noise: MotionNoise, option: Candidate, blind: Array, scans: int, period: float) -> Candidate:
+    """Along a direction (2,) no scan sees, the robot may have gone at full speed: the deviation grows with time."""
+    covariance = option.covariance.copy()
+    covariance[:2, :2] += np.outer(blind, blind) * (noise.speed * period) ** 2 * (2 * scans + 1)
+    return replace(option, covariance=covariance)
+
+
+def within_reach(noise: MotionNoise, pose: Array, period: float, basin: float) -> Array:
+    """(K, 3) poses to which a robot may have driven unseen; none where a descent reaches as far, ``basin`` m or rad."""
+    if noise.speed * period < basin and noise.turn * period < basin:
+        return np.zeros((0, 3))
+    ahead, turned = np.meshgrid(np.array([0.0, 0.5, 1.0]) * noise.speed, np.linspace(-1, 1, 5) * noise.turn)
+    steps = np.stack([ahead.ravel(), np.zeros(ahead.size), turned.ravel()], axis=-1) * period
+    return se2.compose(pose, steps)
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,10 @@ from services.estimator.precise.calibration import learn_motion, learn_shares, n
 from services.estimator.precise.driven import learn_drive
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.gauss_newton import View
-from services.estimator.precise.learning import Beams, Recipe, learn_field, looked_into
+from services.estimator.precise.learning import Recipe, learn_field, looked_into
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.seeding import Seeds
+from services.estimator.precise.surfaces import Beams
 from tests.presage import real_drive
 from tests.presage.real_drive import ANGLES, BEFORE, LONG, NONE, POSED, RANGE_MAX, SHORT, SIGMA, disturbed
 

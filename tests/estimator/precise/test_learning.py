@@ -10,7 +10,8 @@ from common.world import World
 from services.estimator.precise import weights
 from services.estimator.precise.evaluation import evaluate
 from services.estimator.precise.field import CLASSES, FieldModel
-from services.estimator.precise.learning import Beams, Recipe, learn_field, learn_scales
+from services.estimator.precise.learning import Recipe, learn_field, learn_scales
+from services.estimator.precise.surfaces import Beams
 from tests.estimator.models import ROOM, SCANNER
 
 ANGLES = np.deg2rad(np.linspace(-135, 135, 271))
