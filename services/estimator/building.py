@@ -75,16 +75,17 @@ class Geometry:
         """Of scans like this one."""
         return cls(scan.angles(), scan.mount.array(), scan.range_max, scan.sigma, scan.sigma_relative)
 
-    def same(self, other: Geometry) -> bool:
-        """Whether an estimator made for one takes the other."""
+    def same(self, other: Geometry, *, bound_to_beams: bool) -> bool:
+        """Whether an estimator made for one takes the other; one that is ``bound_to_beams`` only with the same angles.
+
+        Scanners whose motor sets the pace give a few beams more or less each time round.
+        """
         noise = (self.sigma, self.sigma_relative) == (other.sigma, other.sigma_relative)
-        return (
-            noise
-            and len(self.angles) == len(other.angles)
-            and bool(
-                np.allclose(self.angles, other.angles, atol=1e-4) and np.allclose(self.mount, other.mount, atol=1e-4)
-            )
-        )
+        if not noise or not np.allclose(self.mount, other.mount, atol=1e-4):
+            return False
+        if not bound_to_beams:
+            return True
+        return len(self.angles) == len(other.angles) and np.allclose(self.angles, other.angles, atol=1e-4)
 
     def upside_down(self) -> Geometry:
         """With a roll of 180 deg: seen from above the beams run the other way round."""

@@ -142,10 +142,13 @@ class EstimatorService(Service):
         assert self.models is not None  # noqa: S101 - set in open
         geometry = Geometry.of_scan(scan)
         try:
-            if self.geometry is None or not self.geometry.same(geometry):
+            paper = self.options.estimator == "paper"
+            if self.geometry is None or not self.geometry.same(geometry, bound_to_beams=paper):
                 made = self.models.factory(geometry)
+                if self.geometry is not None:
+                    self.log.warning("another scanner, or mounted elsewhere: localisation begins anew")
                 self.estimator, self.geometry = made, geometry
-                if self.options.estimator == "paper":  # whose weights were chosen by the beams just now
+                if paper:  # whose weights were chosen by the beams just now
                     self.model = self.models.in_use(len(geometry.angles))
         except UserError as error:
             self.counters["unfit_scans"] += 1

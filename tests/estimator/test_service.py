@@ -132,6 +132,19 @@ def test_precise_takes_any_scanner(precise):
     assert np.abs(precise.sent[-1].pose.array() - TRUTH).max() < 0.02
 
 
+def test_beams_may_come_and_go(precise):
+    """A scanner whose motor sets the pace: 622 beams, then 621, over the same view."""
+    precise.on_message(SCAN, a_scan(1, TRUTH))
+    made = precise.estimator
+    other = SCANNERS["tim571"].with_beams(621)
+    laser = se2.compose(TRUTH, SCANNER.mount)
+    ranges = WORLD.ray_distances(laser[None], other.angles())[0]
+    precise.on_message(SCAN, a_scan(2, ranges=ranges, angle_increment=other.angle_increment))
+    assert precise.estimator is made
+    assert precise.sent[-1].state == "tracking"
+    assert np.abs(precise.sent[-1].pose.array() - TRUTH).max() < 0.02
+
+
 @pytest.mark.parametrize(
     "changes",
     [
