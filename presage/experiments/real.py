@@ -245,7 +245,7 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     """As docs/experiments.md has it."""
     heads = (
         "task, estimator", "median (mm)", "RMS (mm)", "95 % (mm)", "tracked", "wrong claims; longest (s)", "found",
-        "scans until found", "NEES, median", "update, median; 95 % (ms)",
+        "scans until found", "NEES, median", "update, median; 95 % (CPU ms)",
     )  # fmt: skip
     table_rows: list[list[str]] = []
     number: Callable[..., str] = results.number

@@ -60,29 +60,29 @@ def trial(job: Job) -> dict[str, Any]:
     drive, estimator = drive_at(job.log, job.mount), entered(job)
     if job.task in (ODOMETRY, LASER):
         estimator.restart(drive.poses[job.first], NEAR)
-        numbers = list(range(job.first, job.first + job.count))
-        odom = drive.odom if job.task == ODOMETRY else None
+        numbers = np.arange(job.first, job.first + job.count)
+        odom = drive.odom[numbers] if drive.odom is not None and job.task == ODOMETRY else None
     elif job.task == GLOBAL:
-        numbers = list(range(job.first, min(job.first + (job.count or LIMIT), len(drive.ranges))))
-        odom = drive.odom
+        numbers = np.arange(job.first, min(job.first + (job.count or LIMIT), len(drive.ranges)))
+        odom = None if drive.odom is None else drive.odom[numbers]
     else:
         estimator.restart(drive.poses[job.first], NEAR)
-        numbers = [*range(job.first, job.first + BEFORE), *range(job.to, min(job.to + LIMIT, len(drive.ranges)))]
-        odom = None if drive.odom is None else unaware(drive.odom, job.first + BEFORE - 1, job.to)
-    clock = drive.stamps.copy()
+        after = np.arange(job.to, min(job.to + LIMIT, len(drive.ranges)))
+        numbers = np.concatenate([np.arange(job.first, job.first + BEFORE), after])
+        odom = None if drive.odom is None else unaware(drive.odom[numbers], BEFORE)
+    clock = drive.stamps[numbers]
     if job.task == KIDNAPPED:  # carried in no time, as far as the sensors tell
-        clock[job.to :] += clock[job.first + BEFORE] - clock[job.to]
-        clock[: job.first + BEFORE] = drive.stamps[: job.first + BEFORE]
+        clock[BEFORE:] += drive.stamps[job.first + BEFORE] - clock[BEFORE]
     rows: dict[str, list[Any]] = {name: [] for name in ("stamp_s", "error_m", "yaw_error_rad", "state", "nees", "ms")}
-    for k in numbers:
-        told = None if odom is None else odom[k]
-        seen = Observation(drive.ranges[k], drive.angles, drive.range_max, float(clock[k]), told)
-        began = time.perf_counter()
+    for i, k in enumerate(numbers):
+        told = None if odom is None else odom[i]
+        seen = Observation(drive.ranges[k], drive.angles, drive.range_max, float(clock[i]), told)
+        began = time.process_time()
         posterior = estimator.update(seen)
-        rows["ms"].append(round((time.perf_counter() - began) * 1e3, 2))
+        rows["ms"].append(round((time.process_time() - began) * 1e3, 2))
         off = posterior.pose - drive.poses[k]
         off[2] = se2.wrap(off[2])
-        rows["stamp_s"].append(round(float(clock[k]), 4))
+        rows["stamp_s"].append(round(float(clock[i]), 4))
         rows["error_m"].append(round(float(np.hypot(off[0], off[1])), 5))
         rows["yaw_error_rad"].append(round(abs(float(off[2])), 5))
         rows["state"].append(posterior.state)
@@ -96,10 +96,10 @@ def _nees(off: Array, covariance: Array | None) -> float | None:
     return round(min(float(off @ np.linalg.pinv(covariance, hermitian=True) @ off), 1e6), 3)
 
 
-def unaware(odom: Array, before: int, to: int) -> Array:
-    """Odometry of a robot that is lifted from scan ``before`` to scan ``to``: its wheels stand still meanwhile."""
+def unaware(odom: Array, carried: int) -> Array:
+    """Odometry (N, 3) of a robot that is lifted before its ``carried``-th scan: its wheels stand still meanwhile."""
     moved = odom.copy()
-    moved[to:] = se2.compose(odom[before], se2.between(odom[to], odom[to:]))
+    moved[carried:] = se2.compose(odom[carried - 1], se2.between(odom[carried], odom[carried:]))
     return np.asarray(moved)
 
 

@@ -11,24 +11,24 @@ from common import se2
 from services.estimator.asking import Conversation, Search, alone
 from services.estimator.generative import Expect, Expected
 from services.estimator.interface import Hypothesis, Observation, Posterior, Predicted, State
-from services.estimator.precise import mixture, obstruction
-from services.estimator.precise.gauss_newton import Prior, View, descending, polishing
+from services.estimator.precise import continuity, mixture, obstruction, searching
+from services.estimator.precise.continuity import Continuity
+from services.estimator.precise.gauss_newton import WIDEST, Prior, View, polishing
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.mixture import Mode
-from services.estimator.precise.motion import candidates, fuse, unseen, within_reach
-from services.estimator.precise.seeding import Ranking
+from services.estimator.precise.motion import Candidate, candidates, fuse, unseen, within_reach
+from services.estimator.precise.recent import points_of
 from services.estimator.precise.settings import Settings
 
 if TYPE_CHECKING:
     from common.se2 import Array
     from services.estimator.generative import GenerativeModel
+    from services.estimator.precise.likelihood import Evidence
     from services.estimator.precise.seeding import Seeds
 
 FIRST_WAIT, LONGEST_WAIT = 5, 150  # scans between searches while the scan fits badly,
 LOST_WAIT, DOUBTFUL_WAIT = 2, 8  # at most that many while nothing, or little, speaks for the place
 UNKNOWN = 100.0  # m, stated where nothing is known
-FAR = 16.0  # squared standard deviations
-WIDEST, WIDE, NARROW = 0.3, 0.1, 0.03  # m, added to every beam's deviation on the way down from a seed
 
 
 class PreciseEstimator:
@@ -64,6 +64,9 @@ class PreciseEstimator:
         self._usual, self._energy = 1.0, 0.0  # share of beams explained, and accuracy, lately
         self._since, self._wait = 0, FIRST_WAIT  # scans that fitted badly, and after how many to search
         self._believed = False  # the last scan
+        self._continuity = Continuity(self.mount)
+        self._points = np.zeros((0, 2))
+        self._held = False
 
     def update(self, observation: Observation) -> Posterior:
         """One more scan."""
@@ -74,6 +77,8 @@ class PreciseEstimator:
         view = View(
             self.model, self.likelihood, self.mount, observation.angles, observation.ranges, observation.range_max
         )
+        self._continuity.passed()
+        self._points = points_of(observation.ranges, observation.angles, observation.range_max)
         if self.modes:
             yield from self._track(view, observation)
         if not self.modes or self._suspicious(view):
@@ -81,6 +86,7 @@ class PreciseEstimator:
             yield from self._relocalise(view)
         self._stamp, self._odom = observation.stamp, observation.odom
         best = self.modes[0]
+        self._remember(best)
         self._usual += 0.1 * (best.explained - self._usual)
         self._energy += 0.1 * (best.accuracy - self._energy)
         return (yield from self._posterior(view, best))
@@ -114,17 +120,14 @@ class PreciseEstimator:
             around = np.zeros((0, 3))
             if odom is None:
                 around = within_reach(self.settings.motion, self.modes[0].pose, period, WIDEST)
-            starts = np.concatenate([starts, around])
-            first = np.concatenate([np.arange(len(self.modes)), np.zeros(len(around), np.int64)])
-            wider = Prior(wide.mean[first], wide.information[first])
-            for widen in (WIDEST, WIDE, NARROW):
-                starts, _ = yield from descending(view, starts, wider, widen, 5)
-            tried, retried = yield from polishing(view, starts, wider)
-            own = np.flatnonzero(first == 0)
-            best = own[np.argmin(retried.accuracy[own] + wider.energy(tried)[own])]
-            if retried.explained[best] > evidence.explained[0]:
-                keep = np.array([best, *range(1, len(self.modes))])
-                poses, evidence = tried[keep], retried.part(keep)
+            tried, retried = yield from searching.further(view, starts, wide, around)
+            if retried.explained[0] > evidence.explained[0]:
+                poses, evidence = tried, retried
+        held = self._hold(view, evidence, options[0], poses[0])
+        if held is not None:
+            # Nobody has carried the robot off: what looks like another place is this one, changed.
+            self.modes, options, evidence = self.modes[:1], [[held]], evidence.part(np.array([0]))
+            poses, evidence = yield from continuity.looked_at(view, held, self.settings)
         modes = []
         for k, (mode, each) in enumerate(zip(self.modes, options, strict=True)):
             # Once blind, a ripple a little larger than the others must not be taken for a feature.
@@ -134,17 +137,44 @@ class PreciseEstimator:
             if blind is not None and obstruction.held(view, poses[k], blind) > holding:
                 keep, blind = np.eye(3), None
             mixture.project(evidence, k, keep)
-            if blind is not None and odom is None:
+            if blind is not None and odom is None and held is None:
                 each = [unseen(self.settings.motion, option, blind, mode.blind, period) for option in each]  # noqa: PLW2901
             parts = [fuse(option, poses[k], evidence.xi[k], evidence.curvature[k]) for option in each]
             fused = min(parts, key=lambda part: part.surprise)
-            modes.append(mixture.moved(mode, fused, evidence, k, period, blind=blind is not None))
+            modes.append(mixture.moved(mode, fused, evidence, k, period, blind=blind is not None and held is None))
         self.modes = mixture.led(modes, self.settings)
+
+    def _hold(self, view: View, evidence: Evidence, options: list[Candidate], start: Array) -> Candidate | None:
+        """Where the scans of a moment ago say the robot is, if the model does not explain what is seen."""
+        settings, explained = self.settings, float(evidence.explained[0])
+        before, self._held = self._held, False
+        weak = explained < max(settings.good, self._usual - settings.drop)
+        if not self.modes[0].trusted or not (weak or (before and explained < settings.satisfied)):
+            return None
+        expected = self._expected(view, start)
+        if explained >= settings.glimpse and obstruction.crowded(view, expected, settings.contradicted):
+            return None
+        held = self._continuity.hold(options, start, self._points, obstruction.late(view, expected))
+        if held is None or (not weak and continuity.agree(start, held)):
+            return None
+        self._held = True
+        return held
+
+    def _remember(self, best: Mode) -> None:
+        if not best.trusted:
+            self._held = False
+            self._continuity.forget()
+        elif self._held or best.explained >= self.settings.good:
+            explained = best.explained >= self.settings.good
+            self._continuity.keep(best.pose, self._covariance(best), self._points, explained=explained)
 
     def _suspicious(self, view: View) -> bool:
         """The scan fits worse at once, or has fitted badly for long, or not as a belief must."""
         best, settings = self.modes[0], self.settings
         fell = best.explained < self._usual - settings.drop or best.accuracy > self._energy + settings.rise
+        if self._held:
+            self._since += 1
+            return self._since >= LONGEST_WAIT
         believable, doubtful = self._believable(view), self._doubtful(view)
         if best.explained >= settings.satisfied:
             self._since, self._wait = 0, FIRST_WAIT
@@ -161,12 +191,22 @@ class PreciseEstimator:
         """Whether enough of the scan is explained, or the rest may be hidden."""
         return self.modes[0].explained >= self.settings.believable or self._hidden(view)
 
+    def _goes_on(self, view: View) -> bool:
+        """Whether the robot was tracked and the scan goes on from those before it."""
+        best = self.modes[0]
+        if self._held or not best.trusted or best.explained < self.settings.good:
+            return self._held
+        late = obstruction.late(view, self._expected(view, best.pose))
+        return self._continuity.hold([continuity.around(best.pose)], best.pose, self._points, late) is not None
+
+    def _expected(self, view: View, pose: Array) -> Expected:
+        return view.model.expect(se2.compose(pose, view.mount)[None], view.angles)
+
     def _hidden(self, view: View) -> bool:
         """Whether the place was tracked, shows a glimpse of itself still, and little contradicts it."""
         best, settings = self.modes[0], self.settings
-        if best.explained < settings.glimpse or not best.trusted:
-            return False
-        return self._contradicted(view) <= settings.contradicted
+        glimpsed = best.trusted and best.explained >= settings.glimpse
+        return glimpsed and self._contradicted(view) <= settings.contradicted
 
     def _doubtful(self, view: View) -> bool:
         """Whether much of the scan is not explained, and some of it cannot be."""
@@ -174,16 +214,16 @@ class PreciseEstimator:
         return self.modes[0].explained < settings.doubtful and self._contradicted(view) > settings.contradicted
 
     def _contradicted(self, view: View) -> float:
-        expected = self.model.expect(se2.compose(self.modes[0].pose, self.mount)[None], view.angles)
-        return obstruction.contradicted(view, expected)
+        return obstruction.contradicted(view, self._expected(view, self.modes[0].pose))
 
     def _relocalise(self, view: View) -> Conversation[None]:
         """Search from nothing; keep what is tracked where nothing better is found."""
         if self._near is not None:
             near, self._near = self._near, None
-            found = yield from self._search_near(view, *near)
+            found = yield from searching.near(view, *near, self.seeds, self.settings, self._rng)
             if found[0].explained >= self.settings.believable:  # who says where it is has tracked it until now
                 found[0] = replace(found[0], trusted=True)
+                self._continuity.forget(given=True)
         else:
             found = yield from self._search(view)
         if self.modes:
@@ -203,46 +243,17 @@ class PreciseEstimator:
 
     def _unlikely(self, view: View, found: Mode) -> bool:
         """Elsewhere, though nothing contradicts the place that was tracked: a door has closed, a crowd has gathered."""
-        if not self._hidden(view):
+        if not (self._goes_on(view) or self._hidden(view)):
             return False
         best = self.modes[0]
         spread = self._covariance(best)[:2, :2] + np.eye(2) * mixture.SAME_PLACE**2
         off = found.pose[:2] - best.pose[:2]
-        return bool(off @ np.linalg.solve(spread, off) > FAR)
+        return bool(off @ np.linalg.solve(spread, off) > continuity.FAR)
 
     def _search(self, view: View) -> Conversation[list[Mode]]:
-        modes: list[Mode] = []
         # A place that is tracked and still fits somewhat need not be beaten by what is hard to find.
         held = bool(self.modes) and self.modes[0].trusted and self.modes[0].explained >= self.settings.good
-        for count in (self.settings.seeds, *([] if held else [self.settings.more_seeds])):
-            starts = yield Ranking(self.seeds, view, count)
-            modes = yield from self._refine(view, starts, None)
-            if modes[0].explained >= self.settings.satisfied:
-                break
-        return modes
-
-    def _search_near(self, view: View, pose: Array, covariance: Array) -> Conversation[list[Mode]]:
-        starts = self._rng.multivariate_normal(pose, covariance, self.settings.seeds)
-        starts[0] = pose
-        information = np.linalg.inv(covariance)
-        prior = Prior(np.tile(pose, (len(starts), 1)), np.tile(information, (len(starts), 1, 1)))
-        return (yield from self._refine(view, starts, prior))
-
-    def _refine(self, view: View, starts: Array, prior: Prior | None) -> Conversation[list[Mode]]:
-        """Descend from all starts with few beams and wide deviations, then from the best with all and none."""
-        few = view.thinned(self.settings.beams)
-        poses, evidence = yield from descending(few, starts, prior, WIDEST, 5)
-        poses, evidence = yield from descending(few, poses, prior, WIDE, 4)
-        keep = mixture.distinct(poses, evidence.accuracy, 2 * self.settings.hypotheses)
-        part = Prior(prior.mean[keep], prior.information[keep]) if prior else None
-        poses, evidence = yield from descending(view, poses[keep], part, NARROW, 4)
-        poses, evidence = yield from polishing(view, poses, part)
-        keep = mixture.distinct(poses, evidence.accuracy, self.settings.hypotheses)
-        modes = [
-            mixture.found(poses[k], evidence, k, part, self.seeds.volume, self.seeds.spread, self.model.ripple)
-            for k in keep
-        ]
-        return mixture.weigh(modes, self.settings.evidence_error, self.settings.hypotheses)
+        return (yield from searching.anywhere(view, self.seeds, self.settings, thorough=not held))
 
     def _period(self, stamp: float | None) -> float:
         if stamp is None or self._stamp is None or stamp <= self._stamp:
@@ -253,9 +264,9 @@ class PreciseEstimator:
         seen: Expected = yield Expect(self.model, se2.compose(best.pose[None], self.mount), view.angles)
         expected = self._with_noise(seen)
         believable = self._believable(view)
-        self._believed = believable
+        self._believed = believable or self._held
         state = self._state(view, best, believable=believable)
-        unknown = self.seeds.spread * (not believable)
+        unknown = self.seeds.spread * (not self._believed)
         hypotheses = tuple(Hypothesis(mode.pose, self._covariance(mode) + unknown, mode.weight) for mode in self.modes)
         return Posterior(
             state,

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 MAX_STEP = np.array([0.5, 0.5, 0.3])  # m, m, rad: beyond it the linearisation is not trusted
 CONVERGED = np.array([1e-4, 1e-4, 2e-5])  # m, m, rad: a tenth of what a scan can tell
 SETTLED = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: nearer, F is a parabola and the rest is algebra
+WIDEST, WIDE, NARROW = 0.3, 0.1, 0.03  # m, added to every beam's deviation on the way down from a seed
 DAMPING = np.diag([1.0, 1.0, 1.0]) * 1e-6  # 1/m², 1/rad²: directions of which nothing is known stay put
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from services.estimator import kernels
 
@@ -41,7 +42,7 @@ class Evidence:
     of_noise: Array  # (N, 3, 3) covariance of xi from the scanner's noise
     of_model: Array  # (N, 3, 3) covariance of xi from the model's error, were beams independent
 
-    def part(self, rows: Array) -> Evidence:
+    def part(self, rows: npt.NDArray[np.integer]) -> Evidence:
         """Of some of the poses."""
         return Evidence(*(values[rows] for values in vars(self).values()))
 

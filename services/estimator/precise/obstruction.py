@@ -23,11 +23,25 @@ def contradicted(view: View, expected: Expected) -> float:
     Whatever stands in the way ends a beam early, at the right place too; nothing but a wrong place (or a thing that was
     taken away) ends it late.
     """
+    both = np.isfinite(view.ranges) & np.isfinite(expected.ranges[0])
+    return late(view, expected) * len(both) / max(1, int(both.sum()))
+
+
+def late(view: View, expected: Expected) -> float:
+    """The same as a share of all beams: where little is expected, little can contradict."""
     surface = expected.ranges[0]
-    both = np.isfinite(view.ranges) & np.isfinite(surface)
     deviation = np.hypot(expected.scale[0], view.likelihood.deviation(surface))
-    late = view.ranges[both] > (surface + CLEARLY * deviation)[both]
-    return float(late.mean()) if late.size else 0.0
+    behind = np.isfinite(view.ranges) & (view.ranges > surface + CLEARLY * deviation)
+    return float(behind.mean())
+
+
+def crowded(view: View, expected: Expected, contradicted: float) -> bool:
+    """Whether what stands in the way is all that the model does not explain: (nearly) every beam is expected to end."""
+    surface = expected.ranges[0]
+    known = np.isfinite(expected.scale[0])
+    near = np.abs(view.ranges - surface) <= CLEARLY * np.hypot(expected.scale[0], view.likelihood.deviation(surface))
+    early = view.ranges < surface
+    return float((known & (early | near)).mean()) > 0.95 - contradicted
 
 
 def held(view: View, pose: Array, direction: Array) -> float:

@@ -1,0 +1,191 @@
+"""What was seen a moment ago holds the place where the model knows nothing, and only while nobody carries the robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common import se2
+from common.world import World
+from presage.accuracy.scenes import Scene
+from services.estimator.generative import Expected, RayCaster
+from services.estimator.precise.continuity import BEGINS, PROVEN, Continuity
+from services.estimator.precise.estimator import PreciseEstimator
+from services.estimator.precise.motion import Candidate
+from services.estimator.precise.recent import RecentScans, points_of
+from services.estimator.precise.seeding import Seeds, thin_places
+from tests.estimator.models import ROOM
+
+HALL = World(
+    name="hall",
+    boundary=[(0, 0), (16, 0), (16, 5), (0, 5)],
+    obstacles=[
+        {"box": {"center": (2.5, 4.2), "size": (0.8, 0.5), "yaw_deg": 15}},
+        {"circle": {"center": (5.5, 0.8), "radius": 0.3}},
+        {"box": {"center": (9.5, 4.3), "size": (0.7, 0.7), "yaw_deg": 40}},
+        {"circle": {"center": (12.0, 0.9), "radius": 0.4}},
+        {"box": {"center": (14.6, 2.6), "size": (0.5, 1.2)}},
+    ],
+)
+LEARNED = 8.0  # m: of HALL the part west of it
+STEP = np.diag([0.2, 0.2, 0.3]) ** 2
+
+
+@dataclass(frozen=True)
+class HalfLearned:
+    """The hall as a field learned in its western half knows it."""
+
+    world: World = HALL
+    ripple: float = 0.0
+
+    def expect(self, lasers, angles):
+        whole = RayCaster(self.world).expect(lasers, angles)
+        ends = lasers[:, :1] + whole.ranges * np.cos(lasers[:, 2:] + angles)
+        unknown = (ends > LEARNED) | (lasers[:, :1] > LEARNED)
+        return Expected(
+            np.where(unknown, np.inf, whole.ranges),
+            np.where(unknown, np.inf, whole.scale),
+            np.where(unknown[..., None], 0.0, whole.jacobian),
+        )
+
+
+def scan(scene, pose):
+    """Points (K, 2) m in the laser."""
+    seen = scene.observe(scene.clean(np.array(pose)[None])[0], 0.0)
+    return points_of(seen.ranges, seen.angles, seen.range_max)
+
+
+@given(x=st.floats(-0.15, 0.15), y=st.floats(-0.15, 0.15), yaw=st.floats(-0.25, 0.25), seed=st.integers(0, 99))
+@settings(max_examples=40, deadline=None)
+def test_a_scan_lies_where_it_was_taken(x, y, yaw, seed):
+    scene = Scene.of(ROOM, 361, seed)
+    recent = RecentScans(np.array(scene.scanner.mount))
+    here = np.array([3.0, 1.5, 0.4])
+    assert recent.keep(here, scan(scene, here))
+    there = se2.compose(here, [x, y, yaw])
+    match = recent.match(here[None], scan(scene, there), Candidate("any", here, STEP, 1.0))
+    assert match is not None
+    off = se2.between(there, match.pose)
+    assert np.hypot(off[0], off[1]) < 0.02
+    assert abs(off[2]) < 0.01
+    assert match.share > 0.7
+    assert not match.blind
+
+
+def test_a_scan_from_elsewhere_does_not_go_on():
+    scene = Scene.of(HALL, 361, 1)
+    recent = RecentScans(np.array(scene.scanner.mount))
+    here = np.array([3.0, 2.0, 0.0])
+    recent.keep(here, scan(scene, here))
+    for there in ([12.5, 3.5, 2.0], [14.0, 1.2, -2.0], [9.0, 1.0, 1.0]):
+        match = recent.match(here[None], scan(scene, there), Candidate("any", here, STEP, 1.0))
+        assert match is None or match.share < BEGINS
+
+
+def test_along_a_hall_without_features_a_match_is_blind():
+    bare = World(name="bare", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)])
+    scene = Scene.of(bare, 361, 1)
+    recent = RecentScans(np.array(scene.scanner.mount))
+    here = np.array([30.0, 1.0, 0.0])
+    recent.keep(here, scan(scene, here))
+    match = recent.match(here[None], scan(scene, here), Candidate("any", here, STEP, 1.0))
+    assert match is not None
+    assert match.blind
+
+
+def test_too_few_points_tell_nothing():
+    recent = RecentScans(np.zeros(3))
+    assert not recent.keep(np.zeros(3), np.zeros((3, 2)))
+    assert recent.match(np.zeros((1, 3)), np.ones((100, 2)), Candidate("any", np.zeros(3), STEP, 1.0)) is None
+
+
+@given(yaw=st.floats(-3, 3), x=st.floats(-5, 5))
+@settings(max_examples=15, deadline=None)
+def test_what_it_says_does_not_depend_on_the_frame(yaw, x):
+    """The same scans, anywhere in the map: the same place among them, its covariance turned with it."""
+    scene = Scene.of(ROOM, 361, 7)
+    poses = [np.array([2.5 + 0.3 * k, 1.5, 0.1 * k]) for k in range(5)]
+    points = [scan(scene, pose) for pose in poses]
+
+    def held(move):
+        made = Continuity(np.array(scene.scanner.mount))
+        made.forget(given=True)
+        for pose, seen in zip(poses[:4], points[:4], strict=True):
+            made.keep(se2.compose(move, pose), np.diag([1e-4, 1e-4, 1e-5]), seen, explained=True)
+        start = se2.compose(move, poses[4])
+        turn = np.eye(3)
+        turn[:2, :2] = se2.rotate(float(move[2]), np.eye(2)).T
+        found = made.hold([Candidate("any", start, turn @ STEP @ turn.T, 1.0)], start, points[4], 0.0)
+        assert found is not None
+        return found.mean, turn.T @ found.covariance @ turn
+
+    move = np.array([x, -x, yaw])
+    (mean, covariance), (moved, turned) = held(np.zeros(3)), held(move)
+    assert se2.between(se2.compose(move, mean), moved) == pytest.approx(np.zeros(3), abs=2e-4)
+    assert turned == pytest.approx(covariance, rel=0.05, abs=1e-7)
+
+
+def test_a_place_must_be_proven_and_not_be_contradicted():
+    scene = Scene.of(ROOM, 361, 7)
+    made = Continuity(np.array(scene.scanner.mount))
+    here = np.array([2.5, 1.5, 0.0])
+    option = [Candidate("any", here, STEP, 1.0)]
+    for k in range(PROVEN):
+        assert made.hold(option, here, scan(scene, here), 0.0) is None
+        made.keep(
+            se2.compose(here, [0.3 * k, 0, 0]),
+            np.eye(3) * 1e-4,
+            scan(scene, here + np.array([0.3 * k, 0, 0])),
+            explained=True,
+        )
+    assert made.hold(option, here, scan(scene, here), 0.0) is not None
+    held = [made.hold(option, here, scan(scene, here), 0.9) is not None for _ in range(30)]
+    assert held[0]
+    assert not held[-1]
+
+
+def drive(made, scene, path, first=0):
+    posteriors = []
+    for k, pose in enumerate(path):
+        posteriors.append(made.update(scene.observe(scene.clean(pose[None])[0], (first + k) / 15)))
+    return posteriors
+
+
+def half_learned(beams=271):
+    scene = Scene.of(HALL, beams, 3)
+    places = thin_places(HALL.sample_free(4000, np.random.default_rng(0), 0.05), 0.3)
+    model = HalfLearned()
+    return PreciseEstimator(
+        model, Seeds.at(model, places[places[:, 0] < LEARNED]), np.array(scene.scanner.mount)
+    ), scene
+
+
+def test_in_a_room_never_learned_the_place_is_kept_and_not_claimed():
+    made, scene = half_learned()
+    x = np.linspace(3.0, 13.0, 300)
+    path = np.column_stack([x, 2.5 + 0.3 * np.sin(x), 0.5 * np.sin(0.7 * x)])
+    made.restart(path[0], np.diag([0.01, 0.01, 0.01]))
+    found = drive(made, scene, path)
+    off = np.array([np.hypot(*(p.pose - pose)[:2]) for p, pose in zip(found, path, strict=True)])
+    assert off.max() < 0.15
+    assert found[60].state == "tracking"
+    assert found[-1].state != "tracking"
+    back = drive(made, scene, path[::-1], 300)
+    assert np.hypot(*(back[-1].pose - path[0])[:2]) < 0.02
+    assert back[-1].state == "tracking"
+
+
+def test_carried_off_from_a_room_never_learned_it_finds_itself():
+    made, scene = half_learned()
+    x = np.linspace(3.0, 13.0, 300)
+    path = np.column_stack([x, np.full(300, 2.5), np.zeros(300)])
+    made.restart(path[0], np.diag([0.01, 0.01, 0.01]))
+    drive(made, scene, path)
+    there = np.array([2.0, 1.5, 2.0])
+    found = drive(made, scene, np.tile(there, (20, 1)), 300)
+    assert np.hypot(*(found[-1].pose - there)[:2]) < 0.02
+    assert found[-1].state == "tracking"
