@@ -9,6 +9,7 @@ import numpy as np
 
 from common.errors import UserError
 from common.messages import Odom, Scan, Truth
+from common.ranges import about_place
 from common.se2 import Array
 from common.topics import ODOM, SCAN, TRUTH
 from presage.logs.log import Log, Reading
@@ -25,7 +26,7 @@ class Scans:
     """N scans of B beams."""
 
     geometry: Geometry
-    ranges: Array  # (N, B) m; +inf no return, -inf too close
+    ranges: Array  # (N, B) m; +inf no return, -inf says nothing
     stamps: Array | None = None  # (N,) s
     odom: Array | None = None  # (N, 3) base_link in odom; NaN where not known
     initial_pose: Array | None = None  # (3,) in map
@@ -59,7 +60,7 @@ def scans_of(log: Log) -> Scans:
     nothing = np.full(3, np.nan)
     ranges, stamps, odoms, references = [], [], [], []
     for sweep in log.sweeps():
-        ranges.append(sweep.ranges)
+        ranges.append(about_place(sweep.ranges))
         stamps.append(sweep.stamp_ns)
         odoms.append(nothing if sweep.odom is None else sweep.odom)
         references.append(nothing if sweep.reference is None else sweep.reference)
@@ -99,7 +100,7 @@ def _read_recording(path: Path) -> Scans:
     world = recording.world()
     return Scans(
         Geometry.of_scan(first),
-        np.array([s.ranges for s in scans], np.float64),
+        np.array([about_place(s.ranges) for s in scans]),
         np.array([s.stamp_ns for s in scans]) * 1e-9,
         np.array([odoms.get(s.stamp_ns, nothing) for s in scans]) if odoms else None,
         None,

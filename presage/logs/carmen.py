@@ -16,9 +16,10 @@ import numpy as np
 
 from common import se2
 from common.errors import UserError
+from common.ranges import as_scan
 from common.se2 import Array
 from presage.logs.carmen_lines import WORD, LaserLine, is_laser, laser_line, pose_line
-from presage.logs.log import Log, Reading, Sweep, clean
+from presage.logs.log import Log, Reading, Sweep
 from presage.logs.poses import Track
 
 LONGEST = 1 << 22  # characters of a line; no log has such
@@ -207,7 +208,9 @@ def _sweeps(
             reference = true.at(stamp)
         elif log.reference and line.laser is not None:
             reference = se2.compose(line.laser, se2.inverse(log.mount))
-        yield Sweep(stamp, clean(line.ranges, log.range_max), line.robot if odom is None else odom.at(stamp), reference)
+        yield Sweep(
+            stamp, as_scan(line.ranges, 0.0, log.range_max), line.robot if odom is None else odom.at(stamp), reference
+        )
 
 
 def _lines(path: Path) -> Iterator[list[str]]:

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from common.errors import UserError
 from common.se2 import Array
 
@@ -40,7 +38,7 @@ class Sweep:
     """One scan of a log."""
 
     stamp_ns: int | None  # None: the log has no times
-    ranges: Array  # (B,) m; +inf no return, -inf not to be used
+    ranges: Array  # (B,) m, as `common.ranges.as_scan` has them
     odom: Array | None = None  # (3,) base_link in odom at the stamp
     reference: Array | None = None  # (3,) base_link in map
 
@@ -80,9 +78,3 @@ class Log:
     def lost(self) -> str:
         """What was left out, in words; empty: nothing."""
         return ", ".join(f"{what}: {count}" for what, count in self.left_out.items())
-
-
-def clean(ranges: Array, range_max: float, range_min: float = 0.0) -> Array:
-    """As REP-117 has it: at or beyond the longest range +inf; NaN, not positive or too close -inf (not used)."""
-    far = np.where(ranges >= range_max, np.inf, ranges)
-    return np.where(np.isnan(far) | (far <= 0) | (far < range_min), -np.inf, far)

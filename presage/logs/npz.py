@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from common.errors import UserError
+from common.ranges import as_scan
 from common.se2 import Array
-from presage.logs.log import Log, Reading, Sweep, clean
+from presage.logs.log import Log, Reading, Sweep
 
 NAMES = {"ranges", "angles", "range_max", "stamps", "odom", "initial_pose", "reference"}
 MOUNT = (0.2, 0.0, 0.0)  # m, m, rad: the shipped scanner's, where nothing else is said
@@ -62,7 +63,7 @@ def _sweeps(
     for k, row in enumerate(ranges):
         seen = None if reference is None or not np.isfinite(reference[k]).all() else reference[k]
         stamp = None if stamps is None else round(float(stamps[k]) * 1e9)
-        yield Sweep(stamp, clean(row, range_max), None if odom is None else odom[k], seen)
+        yield Sweep(stamp, as_scan(row, 0.0, range_max), None if odom is None else odom[k], seen)
 
 
 def _arrays(path: Path) -> dict[str, Array]:

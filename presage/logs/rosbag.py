@@ -15,9 +15,10 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_typestore
 
 from common.errors import UserError
+from common.ranges import as_scan
 from common.se2 import Array
 from presage.logs.frames import Frames
-from presage.logs.log import Log, Reading, Sweep, clean
+from presage.logs.log import Log, Reading, Sweep
 from presage.logs.ros_poses import Lookup, Poses
 
 SCAN = "sensor_msgs/msg/LaserScan"
@@ -176,7 +177,7 @@ def _sweeps(
                 log.left_out["scans of other beams"] += 1
                 continue
             stamp = logged_ns if by_logger else _header_ns(scan)
-            ranges = clean(np.asarray(scan.ranges[:: -1 if turned else 1], np.float64), log.range_max, log.range_min)
+            ranges = as_scan(np.asarray(scan.ranges[:: -1 if turned else 1], np.float64), log.range_min, log.range_max)
             yield Sweep(stamp, ranges, odom(stamp), reference(stamp))
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from common.errors import UserError
 from common.messages import Belief, CmdVel, Goal, Hypothesis, Odom, Pose, Prediction, Scan, Stamped
+from common.ranges import about_place
 from common.requests import LocaliseRequest, ModelReply, ModelRequest, PredictRequest, Reply, Request
 from common.se2 import Array
 from common.service import Service
@@ -166,7 +167,7 @@ class EstimatorService(Service):
             self.counters["scans_without_odometry"] += 1
         command = self.command if prior == "command" else None
         return Observation(
-            scan.ranges.astype(np.float64),
+            about_place(scan.ranges),
             scan.angles(),
             scan.range_max,
             scan.stamp_ns * 1e-9,

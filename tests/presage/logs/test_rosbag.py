@@ -66,7 +66,7 @@ def test_ranges_as_rep_117_has_them(tmp_path):
     row = np.full(BEAMS, 5.0, np.float32)
     row[:7] = np.nan, np.inf, -np.inf, 0.0, 0.01, 25.0, 30.0
     _, sweeps = read(write_bag(tmp_path, Bag(scan={"ranges": row})))
-    assert sweeps[0].ranges[:8].tolist() == [-np.inf, np.inf, -np.inf, -np.inf, -np.inf, np.inf, np.inf, 5.0]
+    assert sweeps[0].ranges[:8].tolist() == [0, np.inf, -np.inf, 0, -np.inf, np.inf, np.inf, 5.0]
 
 
 def test_the_longest_range_may_be_said(tmp_path):
