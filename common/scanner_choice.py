@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,8 +9,8 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from common.config import POSE_TEXT
 from common.errors import UserError, first_fault
+from common.pose_text import pose_of_text
 from common.scanner import SCANNERS, Scanner
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -83,7 +82,7 @@ def chosen_scanner(
     if noise is not None:
         changes |= {"sigma": noise, "sigma_relative": 0.0}
     if mount:
-        changes["mount"] = mount_of(mount)
+        changes["mount"] = tuple(map(float, pose_of_text(mount, "--mount")))
     if upside_down is not None:
         changes["upside_down"] = upside_down
     return scanner.model_copy(update=changes) if changes else scanner
@@ -95,11 +94,3 @@ def scanner_arguments(name: str, beams: int | None, mount: str, *, upside_down: 
     given = {"--beams": "" if beams is None else str(beams), "--mount": mount}
     more = [part for option, value in given.items() if value for part in (f"{option}={value}",)]
     return ("--scanner", name, *more, *(["--upside-down"] if upside_down else []))
-
-
-def mount_of(text: str) -> tuple[float, float, float]:
-    """X m, y m, yaw rad from x,y[,yaw_deg]; raises UserError."""
-    if not text or not re.fullmatch(POSE_TEXT, text):
-        raise UserError(f"--mount {text!r}: give x,y[,yaw_deg] of the laser in base_link, such as 0.2,0,180")
-    x, y, *yaw = (float(part) for part in text.split(","))
-    return x, y, float(np.deg2rad(yaw[0])) if yaw else 0.0

@@ -19,7 +19,7 @@ from common.errors import UserError
 from common.ranges import as_scan
 from common.se2 import Array
 from presage.logs.carmen_lines import WORD, LaserLine, is_laser, laser_line, pose_line
-from presage.logs.log import Log, Reading, Sweep
+from presage.logs.log import Log, LoggedScan, Reading
 from presage.logs.poses import Track
 
 LONGEST = 1 << 22  # characters of a line; no log has such
@@ -188,7 +188,7 @@ def _note_laser(survey: _Survey, words: list[str]) -> None:
 
 def _sweeps(
     log: Log, first: LaserLine, clock: int, odom: Track | None, true: Track | None, name: str
-) -> Iterator[Sweep]:
+) -> Iterator[LoggedScan]:
     for words in _lines(log.path):
         if words[0] != name:
             if not WORD.match(words[0]):
@@ -208,7 +208,7 @@ def _sweeps(
             reference = true.at(stamp)
         elif log.reference and line.laser is not None:
             reference = se2.compose(line.laser, se2.inverse(log.mount))
-        yield Sweep(
+        yield LoggedScan(
             stamp, as_scan(line.ranges, 0.0, log.range_max), line.robot if odom is None else odom.at(stamp), reference
         )
 

@@ -24,7 +24,7 @@ from common.se2 import Array
 from common.topics import ODOM, SCAN, TRUTH, Topic
 from common.versions import commit, versions
 from common.world import World, load_world
-from presage.logs.log import Log, Reading, Sweep
+from presage.logs.log import Log, LoggedScan, Reading
 from presage.logs.opening import RECORDING, kind_of, open_log
 from presage.output import check_file, write_json
 from services.estimator.building import SIGMA
@@ -82,7 +82,7 @@ def open_for(job: Import) -> Log:
     def of_laser(pose: Array | None) -> Array | None:
         return None if pose is None else np.asarray(se2.compose(pose, mount))
 
-    def sweeps() -> Iterator[Sweep]:
+    def sweeps() -> Iterator[LoggedScan]:
         for sweep in log.read():
             yield replace(sweep, odom=of_laser(sweep.odom), reference=of_laser(sweep.reference))
 
@@ -111,7 +111,7 @@ class Written:
         }  # fmt: skip
 
 
-def write_recording(job: Import, log: Log, world: World | None, sweeps: Iterator[Sweep] | Any) -> Written:
+def write_recording(job: Import, log: Log, world: World | None, sweeps: Iterator[LoggedScan] | Any) -> Written:
     """Scan after scan; an unfinished recording is not kept."""
     start, step = evenly(log)
     begun = list(itertools.islice(stamped := _stamped(log, sweeps, job.rate), HEAD))
@@ -163,7 +163,7 @@ def scanner_of(log: Log, start: float, step: float, period: float, sigma: float 
         return None
 
 
-def _stamped(log: Log, sweeps: Iterator[Sweep], rate: float | None) -> Iterator[tuple[int, Sweep]]:
+def _stamped(log: Log, sweeps: Iterator[LoggedScan], rate: float | None) -> Iterator[tuple[int, LoggedScan]]:
     """With a time each."""
     for k, sweep in enumerate(sweeps):
         if sweep.stamp_ns is None and rate is None:
@@ -181,7 +181,7 @@ class _Sender:
         self._writer, self._robot, self._written = writer, robot, written
         self._last: dict[Topic, tuple[int, Array]] = {}
 
-    def send(self, stamp_ns: int, sweep: Sweep, template: Scan) -> None:
+    def send(self, stamp_ns: int, sweep: LoggedScan, template: Scan) -> None:
         """Odometry and reference come before the scan, as the estimator takes them."""
         written = self._written
         if sweep.odom is not None:

@@ -34,7 +34,7 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Sweep:
+class LoggedScan:
     """One scan of a log."""
 
     stamp_ns: int | None  # None: the log has no times
@@ -53,7 +53,7 @@ class Log:
     mount: Array  # (3,) laser in base_link
     range_max: float  # m
     scans: int  # that are in it, the unusable included
-    read: Callable[[], Iterator[Sweep]]  # from the beginning; UserError where the file is damaged
+    read: Callable[[], Iterator[LoggedScan]]  # from the beginning; UserError where the file is damaged
     range_min: float = 0.0  # m
     odometry: str = ""  # where it comes from; empty: there is none
     reference: str = ""  # what it is; empty: there is none
@@ -61,7 +61,7 @@ class Log:
     notes: list[str] = field(default_factory=list)  # what was taken for granted
     left_out: Counter[str] = field(default_factory=Counter)  # of the last pass: what, and how often
 
-    def sweeps(self) -> Iterator[Sweep]:
+    def sweeps(self) -> Iterator[LoggedScan]:
         """Scans with growing stamps; the others are counted. UserError where hardly any can be used."""
         self.left_out.clear()
         last, used = None, 0

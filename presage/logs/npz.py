@@ -12,7 +12,7 @@ import numpy as np
 from common.errors import UserError
 from common.ranges import as_scan
 from common.se2 import Array
-from presage.logs.log import Log, Reading, Sweep
+from presage.logs.log import Log, LoggedScan, Reading
 
 NAMES = {"ranges", "angles", "range_max", "stamps", "odom", "initial_pose", "reference"}
 MOUNT = (0.2, 0.0, 0.0)  # m, m, rad: the shipped scanner's, where nothing else is said
@@ -59,11 +59,11 @@ def _check(path: Path, data: dict[str, Array], ranges: Array) -> None:
 
 def _sweeps(
     ranges: Array, range_max: float, stamps: Array | None, odom: Array | None, reference: Array | None
-) -> Iterator[Sweep]:
+) -> Iterator[LoggedScan]:
     for k, row in enumerate(ranges):
         seen = None if reference is None or not np.isfinite(reference[k]).all() else reference[k]
         stamp = None if stamps is None else round(float(stamps[k]) * 1e9)
-        yield Sweep(stamp, as_scan(row, 0.0, range_max), None if odom is None else odom[k], seen)
+        yield LoggedScan(stamp, as_scan(row, 0.0, range_max), None if odom is None else odom[k], seen)
 
 
 def _arrays(path: Path) -> dict[str, Array]:

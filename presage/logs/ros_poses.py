@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -9,8 +10,9 @@ import numpy as np
 from rosbags.interfaces import Connection
 
 from common import se2
+from common.ros_messages import read_pose, stamp_of
 from common.se2 import Array
-from presage.logs.frames import Frames, matrix, planar
+from presage.logs.frame_history import FrameHistory
 from presage.logs.log import Reading
 from presage.logs.poses import Track
 
@@ -30,29 +32,29 @@ class Poses:
 
     def __init__(self, *, by_logger: bool) -> None:
         """``by_logger``: times are those of logging, not those in the headers."""
-        self.frames = Frames()
+        self.frames = FrameHistory()
         self._by_logger = by_logger
         self._tracks: dict[str, Track] = {}  # by topic
         self._bases: dict[str, str] = {}  # child_frame_id of Odometry, by topic
 
     def take(self, topic: str, logged_ns: int, message: Any) -> None:
-        """A TFMessage, or any message with a header and a pose."""
+        """A TFMessage, or any message with a header and a pose; what is no pose is left out."""
         if hasattr(message, "transforms"):
             for each in message.transforms:
-                move, turn = each.transform.translation, each.transform.rotation
-                self.frames.add(
-                    str(each.header.frame_id), str(each.child_frame_id), self._ns(each, logged_ns), _matrix(move, turn)
-                )
+                with contextlib.suppress(ValueError):
+                    transform = read_pose(each.transform.translation, each.transform.rotation)
+                    at = self._ns(each, logged_ns)
+                    self.frames.add(str(each.header.frame_id), str(each.child_frame_id), at, transform)
             return
         pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
         if hasattr(message, "child_frame_id"):
             self._bases[topic] = str(message.child_frame_id).lstrip("/")
         track = self._tracks.setdefault(topic, Track())
-        track.add(self._ns(message, logged_ns), planar(_matrix(pose.position, pose.orientation)))
+        with contextlib.suppress(ValueError):
+            track.add(self._ns(message, logged_ns), read_pose(pose.position, pose.orientation).planar())
 
     def _ns(self, message: Any, logged_ns: int) -> int:
-        stamp = message.header.stamp
-        return logged_ns if self._by_logger else int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+        return logged_ns if self._by_logger else stamp_of(message.header)
 
     def base(self, laser: str, odom: list[Connection], wanted: str) -> str:
         """The frame of the robot: as asked for, odometry's child frame, or one of REP-105's on which the laser sits."""
@@ -99,7 +101,3 @@ class Poses:
                 pose = self.frames.at(chain, 0)
                 return np.zeros(3) if pose is None else se2.inverse(pose) if turn else pose
         return np.zeros(3)
-
-
-def _matrix(move: Any, turn: Any) -> Array:
-    return matrix(np.array([move.x, move.y, move.z]), np.array([turn.x, turn.y, turn.z, turn.w]))

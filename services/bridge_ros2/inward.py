@@ -9,9 +9,9 @@ import numpy as np
 from common import se2
 from common.messages import Odom, Pose, Scan, Twist
 from common.ranges import as_scan
+from common.ros_messages import Mount, Transform, read_pose, stamp_of
 from common.se2 import Array
-from services.bridge_ros2.frames import Dead, Mount, Transform, read_pose
-from services.bridge_ros2.ros_types import stamp_of
+from services.bridge_ros2.frames import Dead
 
 PLANE = [0, 1, 5]  # x, y, yaw among the six of a pose's covariance
 MOST_BEAMS = 100_000

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from common import se2
-from services.bridge_ros2.frames import Dead, Frames, Mount, Odometer, Transform, mount_of
+from common.ros_messages import Mount, Transform, mount_of
+from services.bridge_ros2.frames import Dead, NewestFrames, Odometer
 
 
 class NoMountError(ValueError):
@@ -20,7 +21,7 @@ class Motion:
     def __init__(self, base: str, odom: str, mount: Mount | None = None) -> None:
         """``base`` and ``odom``: names of the frames; ``mount``: of the scanner, else tf says it."""
         self.base, self.odom = base.strip("/"), odom.strip("/")
-        self.frames = Frames()
+        self.frames = NewestFrames()
         self._told = mount
         self._found = mount  # the last one used
         self._by_topic, self._by_tf = Odometer(), Odometer()
@@ -40,7 +41,7 @@ class Motion:
             there = ", ".join(self.frames.names()[:12]) or "none"
             raise NoMountError(
                 f"tf does not connect {frame or 'their empty frame'} with {self.base} (--base-frame); frames: {there}; "
-                "--mount x,y,yaw says it without tf"
+                "--mount x,y[,yaw_deg] says it without tf"
             )
         self._found = mount_of(transform)
         return self._found

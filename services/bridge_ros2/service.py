@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 from common.inbox import Sample
 from common.messages import Belief, CmdVel, Goal, Stamped
 from common.requests import LocaliseRequest, Reply
+from common.ros_messages import stamp_of
 from common.se2 import Array
 from common.service import Service
 from common.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, ODOM, SCAN, STATUS, Query, Topic
@@ -30,7 +31,6 @@ from services.bridge_ros2.ros_types import (
     TWIST_STAMPED,
     CdrError,
     decode,
-    stamp_of,
 )  # fmt: skip
 from services.bridge_ros2.settings import BridgeRos2Settings
 from services.bridge_ros2.wheels import Wheels

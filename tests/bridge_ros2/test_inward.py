@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common import safety
-from services.bridge_ros2.frames import IDENTITY, Mount, Transform
+from common.ros_messages import IDENTITY, Mount, Transform
 from services.bridge_ros2.inward import dead_of, odom_of, pose_of, scan_of
 from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, POSE_STAMPED, decode
 from tests.bridge_ros2 import independent as other

@@ -15,7 +15,7 @@ from presage.inspection.info import survey
 from presage.localize import Job, choice_of, localize
 from presage.logs.importing import Import, import_command
 from presage.logs.log import Reading
-from presage.logs.words import reading_of
+from presage.logs.options import reading_of
 from presage.scan_files import read_scans
 from services.recorder.reader import read_recording
 from tests.presage.logs.drives import (
