@@ -13,6 +13,10 @@ from common.errors import UserError, first_fault
 from common.pose_text import pose_of_text
 from common.scanner import SCANNERS, Scanner
 
+UNITS = {
+    "fov_deg": "degrees", "first_deg": "degrees", "rate": "Hz", "range_min": "m", "range_max": "m", "sigma": "m",
+    "mount": "m, and yaw_deg in degrees",
+}  # fmt: skip
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -31,13 +35,13 @@ class _File(BaseModel):
 
     name: str
     beams: int
-    fov_deg: float
-    rate: float
-    range_min: float = 0.0
-    range_max: float
-    sigma: float
+    fov_deg: Annotated[float, Field(gt=0, le=360)]
+    rate: float  # Hz
+    range_min: float = 0.0  # m
+    range_max: float  # m
+    sigma: float  # m
     sigma_relative: float = 0.0
-    first_deg: float | None = None
+    first_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
     mount: _Mount = _Mount()
     upside_down: bool = False
 
@@ -63,7 +67,9 @@ def load_scanner(name: str) -> Scanner:
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"no scanner {name!r}: choose one of {', '.join(SCANNERS)}, or give a file") from None
     except ValidationError as error:
-        raise UserError(f"scanner {path}: {first_fault(error)}") from None
+        key = ".".join(map(str, error.errors(include_url=False)[0]["loc"]))
+        unit = f" ({UNITS[key]})" if key in UNITS else ""
+        raise UserError(f"scanner {path}: {first_fault(error)}{unit}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"scanner {path}: cannot be read ({error})") from None
     except (yaml.YAMLError, ValueError) as error:

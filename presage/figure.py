@@ -131,7 +131,10 @@ def _draw_map(axes: Axes, session: Session) -> None:
     axes.grid(visible=False)
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
     below = axes.transAxes + ScaledTranslation(0, -0.45, axes.figure.dpi_scale_trans)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=below, ncols=9, fontsize=8.5, frameon=False)
+    if axes.get_legend_handles_labels()[0]:  # of a log without poses there is but the world
+        axes.legend(
+            loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=below, ncols=9, fontsize=8.5, frameon=False
+        )
 
 
 def _draw_goal(axes: Axes, goal: Goal) -> None:

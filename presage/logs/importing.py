@@ -107,7 +107,7 @@ class Written:
             "beams": len(log.angles), "duration_s": (self.last_ns - (self.first_ns or 0)) * 1e-9,
             "odometry": log.odometry, "odometry_poses": self.odoms,
             "reference": log.reference, "reference_poses": self.references,
-            "mount": log.mount.tolist(), "left_out": dict(log.left_out), "notes": log.notes,
+            "mount": log.mount.tolist(), "left_out": dict(log.left_out + log.left_out_beside), "notes": log.notes,
         }  # fmt: skip
 
 
@@ -116,7 +116,7 @@ def write_recording(job: Import, log: Log, world: World | None, sweeps: Iterator
     start, step = evenly(log)
     begun = list(itertools.islice(stamped := _stamped(log, sweeps, job.rate), HEAD))
     if not begun:
-        raise UserError(f"{log.path}: no scan of use in it" + (f" ({log.lost()})" if log.left_out else ""))
+        raise UserError(f"{log.path}: no scan of use in it" + (f" ({lost})" if (lost := log.lost()) else ""))
     period = float(np.median(np.diff([stamp for stamp, _ in begun])) * 1e-9) if len(begun) > 1 else 0.0
     writer, written = RecordingWriter(job.out), Written(first_ns=begun[0][0])
     try:
@@ -226,6 +226,6 @@ def _lines(job: Import, log: Log, facts: dict[str, Any]) -> list[str]:
         f"reference: {log.reference or 'none'} ({facts['reference_poses']} poses)",
         *log.notes,
     ]
-    if log.left_out:
-        lines.append(f"left out: {log.lost()}")
+    if lost := log.lost():
+        lines.append(f"left out: {lost}")
     return [*lines, f"wrote {job.out}"]

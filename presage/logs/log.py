@@ -59,11 +59,13 @@ class Log:
     reference: str = ""  # what it is; empty: there is none
     initial_pose: Array | None = None  # (3,) in map
     notes: list[str] = field(default_factory=list)  # what was taken for granted
-    left_out: Counter[str] = field(default_factory=Counter)  # of the last pass: what, and how often
+    left_out: Counter[str] = field(default_factory=Counter)  # of the last pass, scans: what, and how often
+    left_out_beside: Counter[str] = field(default_factory=Counter)  # the same, of what is no scan
 
     def sweeps(self) -> Iterator[LoggedScan]:
         """Scans with growing stamps; the others are counted. UserError where hardly any can be used."""
         self.left_out.clear()
+        self.left_out_beside.clear()
         last, used = None, 0
         for sweep in self.read():
             if last is not None and sweep.stamp_ns is not None and sweep.stamp_ns <= last:
@@ -77,4 +79,4 @@ class Log:
 
     def lost(self) -> str:
         """What was left out, in words; empty: nothing."""
-        return ", ".join(f"{what}: {count}" for what, count in self.left_out.items())
+        return ", ".join(f"{what}: {count}" for what, count in (self.left_out + self.left_out_beside).items())

@@ -20,6 +20,8 @@ MOUNT = (0.2, 0.0, 0.0)  # m, m, rad: the shipped scanner's, where nothing else 
 
 def open_npz(path: Path, reading: Reading) -> Log:
     """Its poses are base_link's, or with a mount of zero the laser's own; raises UserError saying what is wrong."""
+    if reading.scan_topic or reading.odom_topic or reading.reference_topic:
+        raise UserError(f"{path}: an .npz has no topics: leave out --scan-topic, --odom-topic and --reference-topic")
     data = _arrays(path)
     missing = [name for name in ("ranges", "angles", "range_max") if name not in data]
     if missing:

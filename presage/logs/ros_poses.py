@@ -62,23 +62,25 @@ class Poses:
         candidates = [*of_odom, *BASES]
         return wanted or next((c for c in candidates if self.frames.chain(c, laser) is not None), candidates[0])
 
-    def odometry(self, connections: list[Connection], base: str) -> tuple[str, Lookup]:
+    def odometry(self, connections: list[Connection], base: str, notes: list[str]) -> tuple[str, Lookup]:
         """What it is, empty where there is none, and the base in odom at a time."""
         for topic in {c.topic for c in connections} & self._tracks.keys():
             # Odometry of another frame of the robot is that of the base, seen from there.
-            offset = self._fixed(self._bases.get(topic, ""), base)
+            offset = self._offset(topic, base, notes)
             return f"{topic}, interpolated", self._of(self._tracks[topic], offset)
         chain = self.frames.chain(ODOM, base)
         if not chain:
             return "", nothing
         return f"tf {ODOM} -> {base}, interpolated", lambda stamp: self.frames.at(chain, stamp)
 
-    def reference(self, connections: list[Connection], base: str, reading: Reading) -> tuple[str, Lookup]:
+    def reference(
+        self, connections: list[Connection], base: str, reading: Reading, notes: list[str]
+    ) -> tuple[str, Lookup]:
         """What it is, empty where there is none, and the base in map at a time."""
         if reading.reference is False:
             return "", nothing
         for topic in {c.topic for c in connections} & self._tracks.keys():
-            offset = self._fixed(self._bases.get(topic, ""), base)
+            offset = self._offset(topic, base, notes)
             return f"the log's {topic}", self._of(self._tracks[topic], offset)
         chain = self.frames.chain(MAP, base)
         # A map -> odom that never moves is nobody's localisation.
@@ -93,11 +95,22 @@ class Poses:
 
         return look
 
-    def _fixed(self, frame: str, base: str) -> Array:
-        """(3,) the base in another frame bolted to it; zero where tf does not say."""
+    def _offset(self, topic: str, base: str, notes: list[str]) -> Array:
+        """(3,) the base in the frame whose poses a topic has; where tf does not say, they are taken for the base's."""
+        child = self._bases.get(topic, "")
+        offset = self._fixed(child, base) if child not in ("", base) else np.zeros(3)
+        if offset is None:
+            notes.append(
+                f"{topic} has poses of {child}, and tf does not say where that sits on {base}: they are taken for "
+                f"{base}'s (--base-frame)"
+            )
+        return np.zeros(3) if offset is None else offset
+
+    def _fixed(self, frame: str, base: str) -> Array | None:
+        """(3,) the base in another frame bolted to it; None where tf does not say."""
         for parent, child, turn in ((frame, base, False), (base, frame, True)):
             chain = self.frames.chain(parent, child)
             if chain and not any(edge.moves for edge in chain):
                 pose = self.frames.at(chain, 0)
-                return np.zeros(3) if pose is None else se2.inverse(pose) if turn else pose
-        return np.zeros(3)
+                return None if pose is None else se2.inverse(pose) if turn else pose
+        return None

@@ -103,9 +103,9 @@ def open_rosbag(path: Path, kind: Literal["ros1", "ros2"], reading: Reading) -> 
         reading.range_max or float(first.range_max), scans, lambda: iter(()), float(first.range_min), notes=notes,
     )  # fmt: skip
     if not 0 < log.range_max < np.inf:
-        raise UserError(f"{path}: its longest range is {log.range_max}: say what it is with --range-max")
-    log.odometry, odom = poses.odometry(topics.odom, base)
-    log.reference, reference = poses.reference(topics.reference, base, reading)
+        raise UserError(f"{path}: its longest range is {log.range_max:g} m: say what it is with --range-max")
+    log.odometry, odom = poses.odometry(topics.odom, base, notes)
+    log.reference, reference = poses.reference(topics.reference, base, reading, notes)
     log.read = lambda: _scans(bag, log, odom, reference, by_logger=by_logger, flipped=mount.upside_down)
     return log
 

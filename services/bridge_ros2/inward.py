@@ -57,7 +57,7 @@ def dead_of(message: Any, child_in_base: Transform | None) -> Dead:
     linear, angular = message.twist.twist.linear, message.twist.twist.angular
     twist = np.array([linear.x, linear.y, angular.z], float)
     if not np.isfinite(twist).all():
-        raise ValueError(f"velocity {twist.tolist()} is not finite")
+        raise ValueError(f"velocity {twist.tolist()} (m/s, m/s, rad/s) is not finite")
     if child_in_base is not None:
         child = child_in_base.planar()
         pose = se2.compose(pose, se2.inverse(child))

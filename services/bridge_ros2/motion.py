@@ -26,6 +26,7 @@ class Motion:
         self._found = mount  # the last one used
         self._by_topic, self._by_tf = Odometer(), Odometer()
         self._last: Dead | None = None  # by tf
+        self.unplaced = ""  # odometry's child frame where tf does not connect it with the base, whose it is taken for
 
     def mount(self) -> Mount | None:
         """The scanner's, once it is known."""
@@ -47,9 +48,11 @@ class Motion:
         return self._found
 
     def child_in_base(self, child: str) -> Transform | None:
-        """Of an odometry's child frame; None where it is the base, or tf does not know better."""
+        """Of an odometry's child frame; None where it is the base, or tf does not know better: then `unplaced`."""
         child = child.strip("/")
-        return None if child in ("", self.base) else self.frames.find(child, self.base)
+        found = None if child in ("", self.base) else self.frames.find(child, self.base)
+        self.unplaced = "" if found is not None or child == self.base else child
+        return found
 
     def hear_odometry(self, dead: Dead) -> None:
         """By topic."""

@@ -147,6 +147,13 @@ def test_files_that_are_none(tmp_path):
         read_scans(pickled, np.zeros(3))
 
 
+def test_stamps_are_the_numbers_they_were(tmp_path):
+    stamps = [1000.0, 1000.1, 1600000000.3]
+    values = {"ranges": np.ones((3, 6)), "angles": np.arange(6) / 10, "range_max": 25.0}
+    np.savez(tmp_path / "scan.npz", stamps=np.array(stamps), **values)
+    assert read_scans(tmp_path / "scan.npz", np.zeros(3)).stamps.tolist() == stamps
+
+
 def test_what_says_nothing_about_the_place_is_minus_infinity(tmp_path):
     row = np.array([[1.0, 25.0, np.inf, 0.0, np.nan, -np.inf]])
     np.savez(tmp_path / "scan.npz", ranges=row, angles=np.arange(6) / 10, range_max=25.0)

@@ -87,6 +87,7 @@ class Bag:
     odom: bool = True
     more: tuple[str, ...] = ()  # further topics: scan2, ground_truth
     scan: dict = field(default_factory=dict)  # fields of LaserScan instead of the usual
+    child: str = "base_link"  # of odometry
     each: Callable[[int], dict] = lambda _: {}  # the same, of the k-th
 
     def but(self, **changes) -> Bag:
@@ -162,7 +163,7 @@ class _Filler:
         twist = t["geometry_msgs/msg/TwistWithCovariance"](t["geometry_msgs/msg/Twist"](zero, zero), covariance)
         header = self.header("odom", stamp)
         self.put(
-            topic, "nav_msgs/msg/Odometry", stamp, header=header, child_frame_id="base_link", pose=with_covariance,
+            topic, "nav_msgs/msg/Odometry", stamp, header=header, child_frame_id=self.bag.child, pose=with_covariance,
             twist=twist,
         )  # fmt: skip
 

@@ -11,6 +11,7 @@ from rich.console import Console
 from common import se2
 from common.errors import UserError
 from common.topics import ODOM, SCAN, TRUTH
+from presage.figure import draw_session
 from presage.inspection.info import survey
 from presage.localize import Job, choice_of, localize
 from presage.logs.importing import Import, import_command
@@ -184,3 +185,10 @@ def test_words_that_are_not_known(said, why):
     usual = dict.fromkeys(("mount", "scan_topic", "odom_topic", "reference_topic", "base_frame", "angles"), "")
     with pytest.raises(UserError, match=why):
         reading_of(**{**usual, "clock": "sensor", **said}, reference=None, range_max=None, upside_down=None)
+
+
+def test_is_drawn_without_a_word(tmp_path):
+    """Without poses there is but a world; warnings are errors."""
+    out, _ = imported(make(tmp_path, "mcap"), world="corridor", reading=Reading(reference=False))
+    draw_session(out, tmp_path / "drive.png")
+    assert (tmp_path / "drive.png").stat().st_size > 10_000

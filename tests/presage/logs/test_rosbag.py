@@ -102,6 +102,15 @@ def test_odometry_from_tf_where_there_is_no_topic(tmp_path):
     close([sweep.odom for sweep in sweeps], odom(STAMPS))
 
 
+def test_odometry_of_a_frame_that_tf_does_not_know_is_said_once(tmp_path):
+    log, scans = read(write_bag(tmp_path, Bag(child="wheels")))
+    (note,) = log.notes
+    assert note.startswith("/odom has poses of wheels, and tf does not say where that sits on base_link")
+    close([scan.odom for scan in scans], odom(STAMPS))
+    with pytest.raises(UserError, match="--odom-topic /odm: no topic of that name and type; it has /odom"):
+        read(tmp_path / "drive", odom_topic="/odm")
+
+
 def test_without_tf_the_mount_must_be_said(tmp_path):
     path = write_bag(tmp_path, Bag(tf=False))
     with pytest.raises(UserError, match="tf does not say where laser sits on base_link: say it with --mount"):
