@@ -153,9 +153,10 @@ def evenly(log: Log) -> tuple[float, float]:
 def scanner_of(log: Log, start: float, step: float, period: float, sigma: float | None) -> Scanner | None:
     """What the recording says of the scanner; None where its rate is not known, or a `Scanner` cannot be so."""
     x, y, yaw = map(float, log.mount)
+    fov = min(step * (len(log.angles) - 1), 2 * np.pi)  # in single precision a turn is a little more
     try:
         return Scanner(
-            name="log", beams=len(log.angles), fov=step * (len(log.angles) - 1), rate=1 / period if period else 0.0,
+            name="log", beams=len(log.angles), fov=fov, rate=1 / period if period else 0.0,
             range_min=log.range_min, range_max=log.range_max, sigma=SIGMA if sigma is None else sigma,
             mount=(x, y, yaw), first=start,
         )  # fmt: skip
