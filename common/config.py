@@ -33,8 +33,6 @@ from common.security import Credentials, credentials
 _file_values: ContextVar[dict[str, Any]] = ContextVar("_file_values")
 S = TypeVar("S", bound="ServiceSettings")
 METRICS_TEXT = r"^$|^(\[[0-9A-Fa-f:.]+\]:|[^\s:\[\]]+:)?\d{1,5}$"  # PORT, HOST:PORT, [IPv6]:PORT, or nothing
-NUMBER = r"-?(\d{1,9}\.?\d*|\.\d+)"
-POSE_TEXT = rf"^$|^{NUMBER},{NUMBER}(,{NUMBER})?$"  # x,y[,yaw_deg], or nothing
 
 
 class ServiceSettings(BaseSettings):

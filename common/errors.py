@@ -15,4 +15,7 @@ class UserError(Exception):
 def first_fault(error: ValidationError) -> str:
     """``field.path: what is wrong``, of the first of pydantic's complaints."""
     first = error.errors(include_url=False)[0]
-    return ": ".join(filter(None, [".".join(map(str, first["loc"])), str(first["msg"])]))
+    what = str(first["msg"])
+    if first["type"] in ("model_type", "model_attributes_type"):  # pydantic would name a class of ours
+        what = f"keys with values are expected, such as {{x: 1, y: 2}}, not {str(first['input'])[:40]!r}"
+    return ": ".join(filter(None, [".".join(map(str, first["loc"])), what]))

@@ -31,7 +31,7 @@ class Scan(Stamped):
     angle_increment: Finite  # rad, between beams; negative: they run clockwise, as of a scanner mounted upside down
     range_min: NotNegative  # m
     range_max: Positive  # m
-    ranges: Ranges  # (B,) m; +inf no return, -inf too close (REP-117)
+    ranges: Ranges  # (B,) m; +inf nothing within range_max, -inf too close (REP-117), 0 not measured
     mount: Pose = Pose(x=0.0, y=0.0)  # the scanner's pose in base_link
     scan_time: NotNegative = 0.0  # s, between scans
     frame_id: Name = "laser"

@@ -6,6 +6,7 @@ import numpy as np
 
 from common import se2
 from common.messages import Scan
+from common.ranges import surfaces
 from common.robot import Robot
 from common.se2 import Array
 
@@ -16,8 +17,9 @@ STEP = 1 / 60  # s between the points of a way looked at: 17 mm at 1 m/s, 0.1 mm
 
 def scan_points(scan: Scan) -> Array:
     """(K, 2) m in base_link of every beam that hit something; too close (-inf) counts as at range_min."""
-    ranges = np.where(np.isneginf(scan.ranges), scan.range_min, scan.ranges.astype(np.float64))
-    hit = np.isfinite(ranges)
+    close = np.isneginf(scan.ranges)
+    hit = surfaces(scan.ranges) | close
+    ranges = np.where(close, scan.range_min, scan.ranges.astype(np.float64))
     angles, ranges = scan.angles()[hit], ranges[hit]
     mount = scan.mount.array()
     in_laser = np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=-1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,10 +9,14 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from common.config import POSE_TEXT
 from common.errors import UserError, first_fault
+from common.pose_text import pose_of_text
 from common.scanner import SCANNERS, Scanner
 
+UNITS = {
+    "fov_deg": "degrees", "first_deg": "degrees", "rate": "Hz", "range_min": "m", "range_max": "m", "sigma": "m",
+    "mount": "m, and yaw_deg in degrees",
+}  # fmt: skip
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -32,13 +35,13 @@ class _File(BaseModel):
 
     name: str
     beams: int
-    fov_deg: float
-    rate: float
-    range_min: float = 0.0
-    range_max: float
-    sigma: float
+    fov_deg: Annotated[float, Field(gt=0, le=360)]
+    rate: float  # Hz
+    range_min: float = 0.0  # m
+    range_max: float  # m
+    sigma: float  # m
     sigma_relative: float = 0.0
-    first_deg: float | None = None
+    first_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
     mount: _Mount = _Mount()
     upside_down: bool = False
 
@@ -64,7 +67,9 @@ def load_scanner(name: str) -> Scanner:
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"no scanner {name!r}: choose one of {', '.join(SCANNERS)}, or give a file") from None
     except ValidationError as error:
-        raise UserError(f"scanner {path}: {first_fault(error)}") from None
+        key = ".".join(map(str, error.errors(include_url=False)[0]["loc"]))
+        unit = f" ({UNITS[key]})" if key in UNITS else ""
+        raise UserError(f"scanner {path}: {first_fault(error)}{unit}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"scanner {path}: cannot be read ({error})") from None
     except (yaml.YAMLError, ValueError) as error:
@@ -83,7 +88,7 @@ def chosen_scanner(
     if noise is not None:
         changes |= {"sigma": noise, "sigma_relative": 0.0}
     if mount:
-        changes["mount"] = mount_of(mount)
+        changes["mount"] = tuple(map(float, pose_of_text(mount, "--mount")))
     if upside_down is not None:
         changes["upside_down"] = upside_down
     return scanner.model_copy(update=changes) if changes else scanner
@@ -95,11 +100,3 @@ def scanner_arguments(name: str, beams: int | None, mount: str, *, upside_down: 
     given = {"--beams": "" if beams is None else str(beams), "--mount": mount}
     more = [part for option, value in given.items() if value for part in (f"{option}={value}",)]
     return ("--scanner", name, *more, *(["--upside-down"] if upside_down else []))
-
-
-def mount_of(text: str) -> tuple[float, float, float]:
-    """X m, y m, yaw rad from x,y[,yaw_deg]; raises UserError."""
-    if not text or not re.fullmatch(POSE_TEXT, text):
-        raise UserError(f"--mount {text!r}: give x,y[,yaw_deg] of the laser in base_link, such as 0.2,0,180")
-    x, y, *yaw = (float(part) for part in text.split(","))
-    return x, y, float(np.deg2rad(yaw[0])) if yaw else 0.0

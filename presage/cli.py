@@ -219,7 +219,7 @@ def _train_from_drive(
     drive: Path, world: str, preset: str, out: Path, samples: int, recipe: Recipe, share: float, mount: str,
     upside_down: bool,
 ) -> None:  # fmt: skip
-    from presage.logs.words import reading_of  # noqa: PLC0415
+    from presage.logs.options import reading_of  # noqa: PLC0415
     from presage.train_drive import Job, train_from_drive  # noqa: PLC0415
 
     if preset != "precise":

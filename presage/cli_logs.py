@@ -13,7 +13,8 @@ app = typer.Typer()
 
 PANEL = "What a log does not say itself"
 Mount = Annotated[
-    str, typer.Option(rich_help_panel=PANEL, help="The laser in base_link, x,y,yaw_deg (m, m, deg); none: as it says.")
+    str,
+    typer.Option(rich_help_panel=PANEL, help="Of the laser in base_link, x,y[,yaw_deg] (m, deg); none: as it says."),
 ]
 UpsideDown = Annotated[
     bool | None, typer.Option(rich_help_panel=PANEL, help="The scanner hangs upside down; none: as tf says, else not.")
@@ -67,7 +68,7 @@ def localize(
     ] = "global",
     fresh: Annotated[bool, typer.Option("--fresh", help="Each scan on its own.")] = False,
     odometry: Annotated[bool, typer.Option(help="Use the file's odometry, where there is any.")] = True,
-    initial_pose: Annotated[str, typer.Option(help="x,y,yaw_deg; for mode track.")] = "",
+    initial_pose: Annotated[str, typer.Option(help="x,y[,yaw_deg] (m, m, deg); for mode track.")] = "",
     sigma: Annotated[
         float | None, typer.Option(min=1e-4, max=10, help="The scanner's noise, m; none: as recorded, else 0.02.")
     ] = None,
@@ -93,7 +94,7 @@ def localize(
     """
     from presage.localize import Job, choice_of  # noqa: PLC0415
     from presage.localize import localize as run  # noqa: PLC0415
-    from presage.logs.words import reading_of  # noqa: PLC0415
+    from presage.logs.options import reading_of  # noqa: PLC0415
 
     reading = reading_of(
         mount, scan_topic, odom_topic, reference_topic, base_frame, angles, clock,
@@ -139,7 +140,7 @@ def import_(
     """
     from common.errors import UserError  # noqa: PLC0415
     from presage.logs.importing import Import, import_command  # noqa: PLC0415
-    from presage.logs.words import reading_of  # noqa: PLC0415
+    from presage.logs.options import reading_of  # noqa: PLC0415
     from presage.replaying import checked_robot  # noqa: PLC0415
 
     if frame not in ("base_link", "laser"):

@@ -16,6 +16,7 @@ from matplotlib.transforms import ScaledTranslation
 from common import safety
 from common.errors import UserError
 from common.messages import Goal, Scan
+from common.ranges import surfaces
 from common.se2 import Array, compose
 from common.world import World
 from presage.inspection.gathering import Session, load_session
@@ -130,7 +131,10 @@ def _draw_map(axes: Axes, session: Session) -> None:
     axes.grid(visible=False)
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
     below = axes.transAxes + ScaledTranslation(0, -0.45, axes.figure.dpi_scale_trans)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=below, ncols=9, fontsize=8.5, frameon=False)
+    if axes.get_legend_handles_labels()[0]:  # of a log without poses there is but the world
+        axes.legend(
+            loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=below, ncols=9, fontsize=8.5, frameon=False
+        )
 
 
 def _draw_goal(axes: Axes, goal: Goal) -> None:
@@ -174,7 +178,7 @@ def _draw_scan(axes: Axes, session: Session) -> None:
         return
     scan, prediction = session.predicted
     expected = np.where(np.isfinite(prediction.ranges), prediction.ranges, np.nan).astype(np.float64)
-    measured = np.where(np.isfinite(scan.ranges), scan.ranges, np.nan)
+    measured = np.where(surfaces(scan.ranges), scan.ranges, np.nan)
     angles = np.rad2deg(prediction.angle_min + prediction.angle_increment * np.arange(len(expected)))
     axes.plot(np.rad2deg(scan.angles()), measured, color=MEASURED, lw=1.4, label="measured")
     axes.plot(angles, expected, color=BELIEF, lw=1.2, label="predicted")

@@ -16,11 +16,11 @@ from rich.progress import track
 
 from common import se2
 from common.errors import UserError
+from common.pose_text import pose_of_text
 from common.se2 import Array
 from common.versions import commit, versions
 from presage.logs.log import Reading
 from presage.logs.opening import kind_of
-from presage.logs.words import pose_of
 from presage.output import check_file
 from presage.scan_files import Scans, read_scans
 from services.estimator.building import Choice, Name, prepare
@@ -75,7 +75,7 @@ def choice_of(
     """From the command line's words; the world is the recording's where none is named."""
     if estimator not in get_args(Name):
         raise UserError(f"no estimator {estimator!r}: choose one of {', '.join(get_args(Name))}")
-    pose = pose_of(initial_pose, "--initial-pose") if initial_pose else None
+    pose = pose_of_text(initial_pose, "--initial-pose") if initial_pose else None
     if not world:
         if kind_of(file) != "recording":
             raise UserError(f"{file}: a log does not say which world it is of: name it with --world")

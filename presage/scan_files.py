@@ -9,6 +9,7 @@ import numpy as np
 
 from common.errors import UserError
 from common.messages import Odom, Scan, Truth
+from common.ranges import about_place
 from common.se2 import Array
 from common.topics import ODOM, SCAN, TRUTH
 from presage.logs.log import Log, Reading
@@ -25,7 +26,7 @@ class Scans:
     """N scans of B beams."""
 
     geometry: Geometry
-    ranges: Array  # (N, B) m; +inf no return, -inf too close
+    ranges: Array  # (N, B) m; +inf no return, -inf says nothing
     stamps: Array | None = None  # (N,) s
     odom: Array | None = None  # (N, 3) base_link in odom; NaN where not known
     initial_pose: Array | None = None  # (3,) in map
@@ -54,24 +55,29 @@ def read_scans(path: Path, mount: Array | None = None, reading: Reading | None =
     return scans_of(open_log(path, reading if mount is None else replace(reading, mount=mount)))
 
 
+def seconds(stamps_ns: list[int]) -> Array:
+    """(N,) s, each the nearest number there is: 1000 s is not 1000.0000000000001."""
+    return np.array([stamp / 1_000_000_000 for stamp in stamps_ns])
+
+
 def scans_of(log: Log) -> Scans:
     """All of a log; raises UserError where it has none of use."""
     nothing = np.full(3, np.nan)
     ranges, stamps, odoms, references = [], [], [], []
     for sweep in log.sweeps():
-        ranges.append(sweep.ranges)
+        ranges.append(about_place(sweep.ranges))
         stamps.append(sweep.stamp_ns)
         odoms.append(nothing if sweep.odom is None else sweep.odom)
         references.append(nothing if sweep.reference is None else sweep.reference)
     if not ranges:
-        raise UserError(f"{log.path}: no scan of use in it" + (f" ({log.lost()})" if log.left_out else ""))
+        raise UserError(f"{log.path}: no scan of use in it" + (f" ({lost})" if (lost := log.lost()) else ""))
     times = [stamp for stamp in stamps if stamp is not None]
     return Scans(
         Geometry(log.angles, log.mount, log.range_max), np.array(ranges),
-        np.array(times) * 1e-9 if len(times) == len(ranges) else None,
+        seconds(times) if len(times) == len(ranges) else None,
         np.array(odoms) if log.odometry else None, log.initial_pose,
         np.array(references) if log.reference else None, truth_is=log.reference or RECORDED,
-        notes=(*log.notes, *([f"left out: {log.lost()}"] if log.left_out else [])),
+        notes=(*log.notes, *([f"left out: {lost}"] if (lost := log.lost()) else [])),
     )  # fmt: skip
 
 
@@ -99,8 +105,8 @@ def _read_recording(path: Path) -> Scans:
     world = recording.world()
     return Scans(
         Geometry.of_scan(first),
-        np.array([s.ranges for s in scans], np.float64),
-        np.array([s.stamp_ns for s in scans]) * 1e-9,
+        np.array([about_place(s.ranges) for s in scans]),
+        seconds([s.stamp_ns for s in scans]),
         np.array([odoms.get(s.stamp_ns, nothing) for s in scans]) if odoms else None,
         None,
         np.array([truths.get(s.stamp_ns, nothing) for s in scans]) if truths else None,

@@ -12,7 +12,7 @@ with open(sys.argv[1], "rb") as file:
         fields = msgpack.unpackb(message.data)
         name = channel.metadata["topic"]
         if name == "scan":
-            ranges = memoryview(fields["ranges"]).cast("f")  # little-endian float32, m; inf is no return
+            ranges = memoryview(fields["ranges"]).cast("f")  # little-endian float32, m; inf: no return, 0: none
         elif name == "truth":
             truth[fields["stamp_ns"]] = fields["pose"]
         elif name == "belief" and fields["stamp_ns"] in truth:

@@ -32,6 +32,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from common.messages import Belief, Hypothesis, Prediction, Scan
 from common.occupancy_grid import FREE as FREE_CELL
 from common.occupancy_grid import OCCUPIED as OCCUPIED_CELL
+from common.ranges import surfaces
 from common.se2 import Array
 from common.world import World
 
@@ -83,8 +84,8 @@ def transform(parent: str, child: str, xyyaw: Array, ns: int) -> FrameTransform:
 
 
 def laser_scan(scan: Scan | Prediction, ns: int) -> LaserScan:
-    """Measured or predicted ranges in frame laser; what is no distance (±inf) becomes NaN, which nobody draws."""
-    ranges = np.where(np.isfinite(scan.ranges), scan.ranges, np.nan).astype(float)
+    """Measured or predicted ranges in frame laser; what is no distance (±inf, 0) becomes NaN, which nobody draws."""
+    ranges = np.where(surfaces(scan.ranges), scan.ranges, np.nan).astype(float)
     return LaserScan(
         timestamp=time_of(ns),
         frame_id="laser",

@@ -169,7 +169,8 @@ def _readme(recording: Recording, robot: str, layouts: dict[str, _Layout], rows:
     lines = [
         f"# {recording.path.name}, robot {robot}", "",
         "Written by `presage export --format csv`. Units are SI; poses are of base_link in map unless said otherwise.",
-        "Empty: not stated. inf: no return, -inf: too close (REP-117). `stamp_ns` is simulation or sensor time;",
+        "Empty: not stated. inf: no return, -inf: too close (REP-117); a scan's 0: not measured.",
+        "`stamp_ns` is simulation or sensor time;",
         "`log_time_ns` and `publish_time_ns` are the wall clock's. Lists and arrays stand in files of their own",
         "(TOPIC.FIELD.csv; -N is the number of columns of an array), tied to the message by `log_time_ns` and `seq`.",
     ]  # fmt: skip

@@ -16,14 +16,14 @@ import numpy as np
 
 from common import se2
 from common.errors import UserError
+from common.ranges import as_scan
 from common.se2 import Array
 from presage.logs.carmen_lines import WORD, LaserLine, is_laser, laser_line, pose_line
-from presage.logs.log import Log, Reading, Sweep, clean
+from presage.logs.log import Log, LoggedScan, Reading
 from presage.logs.poses import Track
 
 LONGEST = 1 << 22  # characters of a line; no log has such
 SAME = np.array([0.01, 0.01, np.deg2rad(0.5)])  # m, m, rad: a laser that moves less against the robot is bolted to it
-PREFERRED = ("FLASER", "ROBOTLASER1", "RAWLASER1")  # where a log has several lasers, the front one
 BROKEN = (EOFError, OSError, lzma.LZMAError, zlib.error)  # what a cut or damaged .gz, .bz2, .xz raises
 
 # Degrees from the first beam to the last, where a line only says how many there are. 180 and 360 lack the last of 181
@@ -34,7 +34,11 @@ SPANS = {
 }  # fmt: skip
 LMS_FAR = 80.0  # m; SICK's LMS says 81.83 m and more for "nothing", or 8.183 in its mode of millimetres
 LMS_NEAR, CODES = 8.18, (8.18, 8.192)  # m
+LMS_STATED = ((8.18, 8.2), (LMS_FAR, 82.0))  # m: what headers state of such a laser: its limit, or its highest code
 LOOKED_AT = 100  # scans, for that
+FRONT = ("FLASER", "ROBOTLASER1", "RAWLASER1")  # CARMEN's PARAMs are of these two; of LASER3 and up there are none
+REAR = ("RLASER", "ROBOTLASER2", "RAWLASER2")
+POSE_LINES = ("ODOM", "TRUEPOS")
 
 
 @dataclass
@@ -55,6 +59,11 @@ def open_carmen(path: Path, reading: Reading) -> Log:
     if not survey.lasers:
         raise UserError(f"{path}: a CARMEN log without a scan (FLASER, ROBOTLASER1, RAWLASER1 lines)")
     name = _choose(path, survey.lasers, reading.scan_topic)
+    if reading.odom_topic and (reading.odom_topic != "ODOM" or not len(survey.odom[0])):
+        there = "ODOM lines" if len(survey.odom[0]) else "no ODOM lines"
+        raise UserError(
+            f"{path}: --odom-topic {reading.odom_topic}: of a CARMEN log it can only be ODOM, and this one has {there}"
+        )
     if not survey.firsts.get(name):
         raise UserError(f"{path}: every {name} line is garbled")
     notes: list[str] = []
@@ -82,7 +91,7 @@ def open_carmen(path: Path, reading: Reading) -> Log:
 def _choose(path: Path, there: Counter[str], wanted: str) -> str:
     if wanted and wanted not in there:
         raise UserError(f"{path}: no {wanted} lines in it; it has {', '.join(sorted(there))}: choose with --scan-topic")
-    return wanted or next((name for name in PREFERRED if name in there), min(there))
+    return wanted or next((name for name in FRONT if name in there), min(there))
 
 
 def _angles(path: Path, name: str, first: LaserLine, reading: Reading, notes: list[str]) -> Array:
@@ -106,15 +115,19 @@ def _range_max(survey: _Survey, name: str, reading: Reading, notes: list[str]) -
     lines = survey.firsts[name]
     if reading.range_max is not None:
         return reading.range_max
+    codes = CODES[0] <= max(float(np.max(line.ranges)) for line in lines) <= CODES[1]
     if (said := lines[0].beams) is not None:
-        return said.range_max
-    param = survey.params.get("robot_front_laser_max" if name == "FLASER" else "robot_rear_laser_max", "")
-    try:
-        stated = float(param)
-    except ValueError:
-        stated = 0.0
-    longest = max(float(np.max(line.ranges)) for line in lines)
-    range_max = LMS_NEAR if CODES[0] <= longest <= CODES[1] else stated if 0 < stated < np.inf else LMS_FAR
+        near, far = (low <= said.range_max <= high for low, high in LMS_STATED)
+        if not near and not far:
+            return said.range_max
+        range_max, stated = LMS_NEAR if near or codes else LMS_FAR, said.range_max
+    else:
+        param = survey.params.get(f"robot_{_side(name)}_laser_max", "")
+        try:
+            stated = float(param)
+        except ValueError:
+            stated = 0.0
+        range_max = LMS_NEAR if codes else stated if 0 < stated < np.inf else LMS_FAR
     if range_max != stated:
         notes.append(f"ranges from {range_max:g} m on are taken for no return (--range-max)")
     return range_max
@@ -139,17 +152,21 @@ def _mount(survey: _Survey, name: str, reading: Reading, notes: list[str]) -> tu
         return reading.mount, corrected
     if bolted:
         return (least + largest) / 2, corrected
-    which = {"FLASER": "front", "RLASER": "rear"}.get(name, "")
-    parts = [f"robot_{which}laser_{part}" for part in ("offset", "side_offset", "angular_offset")]
+    side, parts = _side(name), ("offset", "side_offset", "angular_offset")
     try:
-        mount = np.array([float(survey.params.get(part, 0)) for part in parts])
+        mount = np.array([float(survey.params.get(f"robot_{side}laser_{part}", 0)) if side else 0.0 for part in parts])
     except ValueError:
         mount = np.zeros(3)
-    if which == "rear":
+    if side == "rear":
         mount[2] += np.pi
     words = ",".join(f"{number:g}" for number in (*mount[:2], np.rad2deg(mount[2])))
     notes.append(f"the laser is taken to sit at {words} in base_link (--mount says where it does)")
     return mount, corrected
+
+
+def _side(name: str) -> str:
+    """Front or rear, as PARAMs call it; empty of any other laser."""
+    return "front" if name in FRONT else "rear" if name in REAR else ""
 
 
 def _survey(path: Path) -> _Survey:
@@ -158,7 +175,7 @@ def _survey(path: Path) -> _Survey:
         try:
             if words[0] == "PARAM" and len(words) > 2:
                 survey.params[words[1]] = words[2]
-            elif words[0] in ("ODOM", "TRUEPOS"):
+            elif words[0] in POSE_LINES:
                 pose, *times = pose_line(words)
                 for track, time in zip(survey.odom if words[0] == "ODOM" else survey.true, times, strict=True):
                     track.add(round(time * 1e9), pose)
@@ -187,11 +204,13 @@ def _note_laser(survey: _Survey, words: list[str]) -> None:
 
 def _sweeps(
     log: Log, first: LaserLine, clock: int, odom: Track | None, true: Track | None, name: str
-) -> Iterator[Sweep]:
+) -> Iterator[LoggedScan]:
     for words in _lines(log.path):
         if words[0] != name:
             if not WORD.match(words[0]):
                 log.left_out["garbled lines"] += 1
+            elif words[0] in POSE_LINES and not _is_pose(words):
+                log.left_out_beside[f"garbled {words[0]} lines"] += 1
             continue
         try:
             line = laser_line(words)
@@ -207,7 +226,17 @@ def _sweeps(
             reference = true.at(stamp)
         elif log.reference and line.laser is not None:
             reference = se2.compose(line.laser, se2.inverse(log.mount))
-        yield Sweep(stamp, clean(line.ranges, log.range_max), line.robot if odom is None else odom.at(stamp), reference)
+        yield LoggedScan(
+            stamp, as_scan(line.ranges, 0.0, log.range_max), line.robot if odom is None else odom.at(stamp), reference
+        )
+
+
+def _is_pose(words: list[str]) -> bool:
+    try:
+        pose_line(words)
+    except (ValueError, IndexError):
+        return False
+    return True
 
 
 def _lines(path: Path) -> Iterator[list[str]]:

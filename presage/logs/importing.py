@@ -24,7 +24,7 @@ from common.se2 import Array
 from common.topics import ODOM, SCAN, TRUTH, Topic
 from common.versions import commit, versions
 from common.world import World, load_world
-from presage.logs.log import Log, Reading, Sweep
+from presage.logs.log import Log, LoggedScan, Reading
 from presage.logs.opening import RECORDING, kind_of, open_log
 from presage.output import check_file, write_json
 from services.estimator.building import SIGMA
@@ -82,7 +82,7 @@ def open_for(job: Import) -> Log:
     def of_laser(pose: Array | None) -> Array | None:
         return None if pose is None else np.asarray(se2.compose(pose, mount))
 
-    def sweeps() -> Iterator[Sweep]:
+    def sweeps() -> Iterator[LoggedScan]:
         for sweep in log.read():
             yield replace(sweep, odom=of_laser(sweep.odom), reference=of_laser(sweep.reference))
 
@@ -107,16 +107,16 @@ class Written:
             "beams": len(log.angles), "duration_s": (self.last_ns - (self.first_ns or 0)) * 1e-9,
             "odometry": log.odometry, "odometry_poses": self.odoms,
             "reference": log.reference, "reference_poses": self.references,
-            "mount": log.mount.tolist(), "left_out": dict(log.left_out), "notes": log.notes,
+            "mount": log.mount.tolist(), "left_out": dict(log.left_out + log.left_out_beside), "notes": log.notes,
         }  # fmt: skip
 
 
-def write_recording(job: Import, log: Log, world: World | None, sweeps: Iterator[Sweep] | Any) -> Written:
+def write_recording(job: Import, log: Log, world: World | None, sweeps: Iterator[LoggedScan] | Any) -> Written:
     """Scan after scan; an unfinished recording is not kept."""
     start, step = evenly(log)
     begun = list(itertools.islice(stamped := _stamped(log, sweeps, job.rate), HEAD))
     if not begun:
-        raise UserError(f"{log.path}: no scan of use in it" + (f" ({log.lost()})" if log.left_out else ""))
+        raise UserError(f"{log.path}: no scan of use in it" + (f" ({lost})" if (lost := log.lost()) else ""))
     period = float(np.median(np.diff([stamp for stamp, _ in begun])) * 1e-9) if len(begun) > 1 else 0.0
     writer, written = RecordingWriter(job.out), Written(first_ns=begun[0][0])
     try:
@@ -153,9 +153,10 @@ def evenly(log: Log) -> tuple[float, float]:
 def scanner_of(log: Log, start: float, step: float, period: float, sigma: float | None) -> Scanner | None:
     """What the recording says of the scanner; None where its rate is not known, or a `Scanner` cannot be so."""
     x, y, yaw = map(float, log.mount)
+    fov = min(step * (len(log.angles) - 1), 2 * np.pi)  # in single precision a turn is a little more
     try:
         return Scanner(
-            name="log", beams=len(log.angles), fov=step * (len(log.angles) - 1), rate=1 / period if period else 0.0,
+            name="log", beams=len(log.angles), fov=fov, rate=1 / period if period else 0.0,
             range_min=log.range_min, range_max=log.range_max, sigma=SIGMA if sigma is None else sigma,
             mount=(x, y, yaw), first=start,
         )  # fmt: skip
@@ -163,7 +164,7 @@ def scanner_of(log: Log, start: float, step: float, period: float, sigma: float 
         return None
 
 
-def _stamped(log: Log, sweeps: Iterator[Sweep], rate: float | None) -> Iterator[tuple[int, Sweep]]:
+def _stamped(log: Log, sweeps: Iterator[LoggedScan], rate: float | None) -> Iterator[tuple[int, LoggedScan]]:
     """With a time each."""
     for k, sweep in enumerate(sweeps):
         if sweep.stamp_ns is None and rate is None:
@@ -181,7 +182,7 @@ class _Sender:
         self._writer, self._robot, self._written = writer, robot, written
         self._last: dict[Topic, tuple[int, Array]] = {}
 
-    def send(self, stamp_ns: int, sweep: Sweep, template: Scan) -> None:
+    def send(self, stamp_ns: int, sweep: LoggedScan, template: Scan) -> None:
         """Odometry and reference come before the scan, as the estimator takes them."""
         written = self._written
         if sweep.odom is not None:
@@ -226,6 +227,6 @@ def _lines(job: Import, log: Log, facts: dict[str, Any]) -> list[str]:
         f"reference: {log.reference or 'none'} ({facts['reference_poses']} poses)",
         *log.notes,
     ]
-    if log.left_out:
-        lines.append(f"left out: {log.lost()}")
+    if lost := log.lost():
+        lines.append(f"left out: {lost}")
     return [*lines, f"wrote {job.out}"]

@@ -8,8 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from common.errors import UserError
 from common.se2 import Array
 
@@ -36,11 +34,11 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Sweep:
+class LoggedScan:
     """One scan of a log."""
 
     stamp_ns: int | None  # None: the log has no times
-    ranges: Array  # (B,) m; +inf no return, -inf not to be used
+    ranges: Array  # (B,) m, as `common.ranges.as_scan` has them
     odom: Array | None = None  # (3,) base_link in odom at the stamp
     reference: Array | None = None  # (3,) base_link in map
 
@@ -55,17 +53,19 @@ class Log:
     mount: Array  # (3,) laser in base_link
     range_max: float  # m
     scans: int  # that are in it, the unusable included
-    read: Callable[[], Iterator[Sweep]]  # from the beginning; UserError where the file is damaged
+    read: Callable[[], Iterator[LoggedScan]]  # from the beginning; UserError where the file is damaged
     range_min: float = 0.0  # m
     odometry: str = ""  # where it comes from; empty: there is none
     reference: str = ""  # what it is; empty: there is none
     initial_pose: Array | None = None  # (3,) in map
     notes: list[str] = field(default_factory=list)  # what was taken for granted
-    left_out: Counter[str] = field(default_factory=Counter)  # of the last pass: what, and how often
+    left_out: Counter[str] = field(default_factory=Counter)  # of the last pass, scans: what, and how often
+    left_out_beside: Counter[str] = field(default_factory=Counter)  # the same, of what is no scan
 
-    def sweeps(self) -> Iterator[Sweep]:
+    def sweeps(self) -> Iterator[LoggedScan]:
         """Scans with growing stamps; the others are counted. UserError where hardly any can be used."""
         self.left_out.clear()
+        self.left_out_beside.clear()
         last, used = None, 0
         for sweep in self.read():
             if last is not None and sweep.stamp_ns is not None and sweep.stamp_ns <= last:
@@ -79,10 +79,4 @@ class Log:
 
     def lost(self) -> str:
         """What was left out, in words; empty: nothing."""
-        return ", ".join(f"{what}: {count}" for what, count in self.left_out.items())
-
-
-def clean(ranges: Array, range_max: float, range_min: float = 0.0) -> Array:
-    """As REP-117 has it: at or beyond the longest range +inf; NaN, not positive or too close -inf (not used)."""
-    far = np.where(ranges >= range_max, np.inf, ranges)
-    return np.where(np.isnan(far) | (far <= 0) | (far < range_min), -np.inf, far)
+        return ", ".join(f"{what}: {count}" for what, count in (self.left_out + self.left_out_beside).items())

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from common.errors import UserError
+from common.ranges import as_scan
 from common.se2 import Array
-from presage.logs.log import Log, Reading, Sweep, clean
+from presage.logs.log import Log, LoggedScan, Reading
 
 NAMES = {"ranges", "angles", "range_max", "stamps", "odom", "initial_pose", "reference"}
 MOUNT = (0.2, 0.0, 0.0)  # m, m, rad: the shipped scanner's, where nothing else is said
@@ -19,6 +20,8 @@ MOUNT = (0.2, 0.0, 0.0)  # m, m, rad: the shipped scanner's, where nothing else 
 
 def open_npz(path: Path, reading: Reading) -> Log:
     """Its poses are base_link's, or with a mount of zero the laser's own; raises UserError saying what is wrong."""
+    if reading.scan_topic or reading.odom_topic or reading.reference_topic:
+        raise UserError(f"{path}: an .npz has no topics: leave out --scan-topic, --odom-topic and --reference-topic")
     data = _arrays(path)
     missing = [name for name in ("ranges", "angles", "range_max") if name not in data]
     if missing:
@@ -58,11 +61,11 @@ def _check(path: Path, data: dict[str, Array], ranges: Array) -> None:
 
 def _sweeps(
     ranges: Array, range_max: float, stamps: Array | None, odom: Array | None, reference: Array | None
-) -> Iterator[Sweep]:
+) -> Iterator[LoggedScan]:
     for k, row in enumerate(ranges):
         seen = None if reference is None or not np.isfinite(reference[k]).all() else reference[k]
         stamp = None if stamps is None else round(float(stamps[k]) * 1e9)
-        yield Sweep(stamp, clean(row, range_max), None if odom is None else odom[k], seen)
+        yield LoggedScan(stamp, as_scan(row, 0.0, range_max), None if odom is None else odom[k], seen)
 
 
 def _arrays(path: Path) -> dict[str, Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -9,8 +10,9 @@ import numpy as np
 from rosbags.interfaces import Connection
 
 from common import se2
+from common.ros_messages import read_pose, stamp_of
 from common.se2 import Array
-from presage.logs.frames import Frames, matrix, planar
+from presage.logs.frame_history import FrameHistory
 from presage.logs.log import Reading
 from presage.logs.poses import Track
 
@@ -30,29 +32,29 @@ class Poses:
 
     def __init__(self, *, by_logger: bool) -> None:
         """``by_logger``: times are those of logging, not those in the headers."""
-        self.frames = Frames()
+        self.frames = FrameHistory()
         self._by_logger = by_logger
         self._tracks: dict[str, Track] = {}  # by topic
         self._bases: dict[str, str] = {}  # child_frame_id of Odometry, by topic
 
     def take(self, topic: str, logged_ns: int, message: Any) -> None:
-        """A TFMessage, or any message with a header and a pose."""
+        """A TFMessage, or any message with a header and a pose; what is no pose is left out."""
         if hasattr(message, "transforms"):
             for each in message.transforms:
-                move, turn = each.transform.translation, each.transform.rotation
-                self.frames.add(
-                    str(each.header.frame_id), str(each.child_frame_id), self._ns(each, logged_ns), _matrix(move, turn)
-                )
+                with contextlib.suppress(ValueError):
+                    transform = read_pose(each.transform.translation, each.transform.rotation)
+                    at = self._ns(each, logged_ns)
+                    self.frames.add(str(each.header.frame_id), str(each.child_frame_id), at, transform)
             return
         pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
         if hasattr(message, "child_frame_id"):
             self._bases[topic] = str(message.child_frame_id).lstrip("/")
         track = self._tracks.setdefault(topic, Track())
-        track.add(self._ns(message, logged_ns), planar(_matrix(pose.position, pose.orientation)))
+        with contextlib.suppress(ValueError):
+            track.add(self._ns(message, logged_ns), read_pose(pose.position, pose.orientation).planar())
 
     def _ns(self, message: Any, logged_ns: int) -> int:
-        stamp = message.header.stamp
-        return logged_ns if self._by_logger else int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+        return logged_ns if self._by_logger else stamp_of(message.header)
 
     def base(self, laser: str, odom: list[Connection], wanted: str) -> str:
         """The frame of the robot: as asked for, odometry's child frame, or one of REP-105's on which the laser sits."""
@@ -60,23 +62,25 @@ class Poses:
         candidates = [*of_odom, *BASES]
         return wanted or next((c for c in candidates if self.frames.chain(c, laser) is not None), candidates[0])
 
-    def odometry(self, connections: list[Connection], base: str) -> tuple[str, Lookup]:
+    def odometry(self, connections: list[Connection], base: str, notes: list[str]) -> tuple[str, Lookup]:
         """What it is, empty where there is none, and the base in odom at a time."""
         for topic in {c.topic for c in connections} & self._tracks.keys():
             # Odometry of another frame of the robot is that of the base, seen from there.
-            offset = self._fixed(self._bases.get(topic, ""), base)
+            offset = self._offset(topic, base, notes)
             return f"{topic}, interpolated", self._of(self._tracks[topic], offset)
         chain = self.frames.chain(ODOM, base)
         if not chain:
             return "", nothing
         return f"tf {ODOM} -> {base}, interpolated", lambda stamp: self.frames.at(chain, stamp)
 
-    def reference(self, connections: list[Connection], base: str, reading: Reading) -> tuple[str, Lookup]:
+    def reference(
+        self, connections: list[Connection], base: str, reading: Reading, notes: list[str]
+    ) -> tuple[str, Lookup]:
         """What it is, empty where there is none, and the base in map at a time."""
         if reading.reference is False:
             return "", nothing
         for topic in {c.topic for c in connections} & self._tracks.keys():
-            offset = self._fixed(self._bases.get(topic, ""), base)
+            offset = self._offset(topic, base, notes)
             return f"the log's {topic}", self._of(self._tracks[topic], offset)
         chain = self.frames.chain(MAP, base)
         # A map -> odom that never moves is nobody's localisation.
@@ -91,15 +95,22 @@ class Poses:
 
         return look
 
-    def _fixed(self, frame: str, base: str) -> Array:
-        """(3,) the base in another frame bolted to it; zero where tf does not say."""
+    def _offset(self, topic: str, base: str, notes: list[str]) -> Array:
+        """(3,) the base in the frame whose poses a topic has; where tf does not say, they are taken for the base's."""
+        child = self._bases.get(topic, "")
+        offset = self._fixed(child, base) if child not in ("", base) else np.zeros(3)
+        if offset is None:
+            notes.append(
+                f"{topic} has poses of {child}, and tf does not say where that sits on {base}: they are taken for "
+                f"{base}'s (--base-frame)"
+            )
+        return np.zeros(3) if offset is None else offset
+
+    def _fixed(self, frame: str, base: str) -> Array | None:
+        """(3,) the base in another frame bolted to it; None where tf does not say."""
         for parent, child, turn in ((frame, base, False), (base, frame, True)):
             chain = self.frames.chain(parent, child)
             if chain and not any(edge.moves for edge in chain):
                 pose = self.frames.at(chain, 0)
-                return np.zeros(3) if pose is None else se2.inverse(pose) if turn else pose
-        return np.zeros(3)
-
-
-def _matrix(move: Any, turn: Any) -> Array:
-    return matrix(np.array([move.x, move.y, move.z]), np.array([turn.x, turn.y, turn.z, turn.w]))
+                return None if pose is None else se2.inverse(pose) if turn else pose
+        return None

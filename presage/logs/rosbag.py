@@ -15,9 +15,12 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_typestore
 
 from common.errors import UserError
+from common.ranges import as_scan
+from common.ros_messages import Mount, stamp_of
 from common.se2 import Array
-from presage.logs.frames import Frames
-from presage.logs.log import Log, Reading, Sweep, clean
+from presage.logs.frame_history import FrameHistory
+from presage.logs.log import Log, LoggedScan, Reading
+from presage.logs.resampling import resampled
 from presage.logs.ros_poses import Lookup, Poses
 
 SCAN = "sensor_msgs/msg/LaserScan"
@@ -81,7 +84,7 @@ def open_rosbag(path: Path, kind: Literal["ros1", "ros2"], reading: Reading) -> 
     with bag.open() as reader:
         topics = _topics(path, reader.connections, reading)
         first = _first_scan(bag, reader, topics)
-        by_logger = reading.clock == "logger" or not _header_ns(first)
+        by_logger = reading.clock == "logger" or not stamp_of(first.header)
         if by_logger and reading.clock == "sensor":
             notes.append("the scans have no stamps: the times of logging are taken")
         poses = Poses(by_logger=by_logger)
@@ -90,17 +93,20 @@ def open_rosbag(path: Path, kind: Literal["ros1", "ros2"], reading: Reading) -> 
         scans = sum(connection.msgcount for connection in topics.scan)
     laser = str(first.header.frame_id).lstrip("/")
     base = poses.base(laser, topics.odom, reading.base_frame)
-    mount, flipped = _mount(path, poses.frames, base, laser, reading, notes)
-    angles, turned = _angles(path, first, flipped=flipped)
+    mount = _mount(path, poses.frames, base, laser, reading, notes)
+    try:
+        angles, _ = _angles(first, flipped=mount.upside_down)
+    except ValueError as error:
+        raise UserError(f"{path}: {error}") from None
     log = Log(
-        path, f"ROS {1 if kind == 'ros1' else 2} bag ({topics.scan[0].topic})", angles, mount,
+        path, f"ROS {1 if kind == 'ros1' else 2} bag ({topics.scan[0].topic})", angles, np.array(mount.pose),
         reading.range_max or float(first.range_max), scans, lambda: iter(()), float(first.range_min), notes=notes,
     )  # fmt: skip
     if not 0 < log.range_max < np.inf:
-        raise UserError(f"{path}: its longest range is {log.range_max}: say what it is with --range-max")
-    log.odometry, odom = poses.odometry(topics.odom, base)
-    log.reference, reference = poses.reference(topics.reference, base, reading)
-    log.read = lambda: _sweeps(bag, log, first, odom, reference, by_logger=by_logger, turned=turned)
+        raise UserError(f"{path}: its longest range is {log.range_max:g} m: say what it is with --range-max")
+    log.odometry, odom = poses.odometry(topics.odom, base, notes)
+    log.reference, reference = poses.reference(topics.reference, base, reading, notes)
+    log.read = lambda: _scans(bag, log, odom, reference, by_logger=by_logger, flipped=mount.upside_down)
     return log
 
 
@@ -134,51 +140,57 @@ def _first_scan(bag: Bag, reader: Reader1 | Reader2, topics: _Topics) -> Any:
     return found
 
 
-def _header_ns(message: Any) -> int:
-    """Its header's stamp, ns."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-
-
-def _mount(path: Path, frames: Frames, base: str, laser: str, reading: Reading, notes: list[str]) -> tuple[Array, bool]:
-    """(3,) laser in base, and whether it hangs upside down."""
-    said = None if reading.mount is not None else frames.mount(base, laser)
-    if reading.mount is None and said is None:
+def _mount(path: Path, frames: FrameHistory, base: str, laser: str, reading: Reading, notes: list[str]) -> Mount:
+    """As the user says, else tf."""
+    if reading.mount is not None:
+        x, y, yaw = map(float, reading.mount)
+        said: Mount | None = Mount((x, y, yaw))
+    else:
+        said = frames.mount(base, laser)
+    if said is None:
         raise UserError(
-            f"{path}: tf does not say where {laser or 'the laser'} sits on {base}: say it with --mount x,y,yaw_deg, or "
-            "name what it sits on with --base-frame"
+            f"{path}: tf does not say where {laser or 'the laser'} sits on {base}: say it with --mount x,y[,yaw_deg], "
+            "or name what it sits on with --base-frame"
         )
-    mount, flipped = said if said is not None else (reading.mount, False)
-    flipped = flipped if reading.upside_down is None else reading.upside_down
+    flipped = said.upside_down if reading.upside_down is None else reading.upside_down
     if flipped:
         notes.append("the scanner hangs upside down: its beams are turned over")
-    return np.asarray(mount), flipped
+    return Mount(said.pose, flipped)
 
 
-def _angles(path: Path, scan: Any, *, flipped: bool) -> tuple[Array, bool]:
-    """(B,) rad, counter-clockwise, and whether a scan's ranges are to be taken from their end."""
+def _angles(scan: Any, *, flipped: bool) -> tuple[Array, bool]:
+    """(B,) rad, ascending, and whether a scan's ranges are to be taken from their end; ValueError where it has none."""
     start, step, beams = float(scan.angle_min), float(scan.angle_increment), len(scan.ranges)
-    if not (np.isfinite([start, step]).all() and 0 < abs(step) * (beams - 1) <= 2 * np.pi + abs(step)):
-        raise UserError(f"{path}: {beams} beams from {start:g} rad on, {step:g} apart, are no scanner's")
+    if step == 0 and beams > 1:  # some drivers leave it out
+        step = (float(scan.angle_max) - start) / (beams - 1)
+    if not (beams > 2 and np.isfinite([start, step]).all() and 0 < abs(step) * (beams - 1) <= 2 * np.pi + abs(step)):
+        raise ValueError(f"{beams} beams from {start:g} rad on, {step:g} rad apart, are no scanner's")
     angles = (start + step * np.arange(beams, dtype=np.float64)) * (-1 if flipped else 1)
     turned = bool(angles[-1] < angles[0])
     return (angles[::-1] if turned else angles), turned
 
 
-def _sweeps(
-    bag: Bag, log: Log, first: Any, odom: Lookup, reference: Lookup, *, by_logger: bool, turned: bool
-) -> Iterator[Sweep]:
-    topic = log.format.split("(")[1].rstrip(")")
+def _scans(
+    bag: Bag, log: Log, odom: Lookup, reference: Lookup, *, by_logger: bool, flipped: bool
+) -> Iterator[LoggedScan]:
+    topic, fitted = log.format.split("(")[1].rstrip(")"), 0
     with bag.open() as reader:
         connections = [c for c in reader.connections if c.topic == topic and c.msgtype == SCAN]
         for _, logged_ns, scan in bag.messages(reader, connections):
-            if len(scan.ranges) != len(log.angles) or _start_and_step(scan) != _start_and_step(first):
+            try:
+                angles, turned = _angles(scan, flipped=flipped)
+            except ValueError:
+                log.left_out["scans without beams"] += 1
+                continue
+            said = np.asarray(scan.ranges[:: -1 if turned else 1], np.float64)
+            own = as_scan(said, log.range_min, log.range_max)
+            ranges = resampled(own, angles, log.angles)
+            if ranges is None:
                 log.left_out["scans of other beams"] += 1
                 continue
-            stamp = logged_ns if by_logger else _header_ns(scan)
-            ranges = clean(np.asarray(scan.ranges[:: -1 if turned else 1], np.float64), log.range_max, log.range_min)
-            yield Sweep(stamp, ranges, odom(stamp), reference(stamp))
-
-
-def _start_and_step(scan: Any) -> tuple[float, float]:
-    return scan.angle_min, scan.angle_increment
+            fitted += ranges is not own
+            stamp = logged_ns if by_logger else stamp_of(scan.header)
+            yield LoggedScan(stamp, ranges, odom(stamp), reference(stamp))
+    note = f"{fitted} scans of other beams are brought to the angles of the first"
+    if fitted and note not in log.notes:
+        log.notes.append(note)

@@ -26,7 +26,15 @@ from common.versions import commit
 from presage.output import check_file, write_json
 from presage.replays.compare import BIT_FOR_BIT, TOLERANCE_M, TOLERANCE_RAD, Outcome
 from presage.replays.feed import Feed
-from presage.replays.source import SETTINGS, estimator_settings, other_versions, recorded_settings, robot_of, world_file
+from presage.replays.source import (
+    SETTINGS,
+    Unpacked,
+    estimator_settings,
+    other_versions,
+    recorded_settings,
+    robot_of,
+    world_file,
+)
 from presage.stack import Stack
 from services.recorder.reader import Recording, read_recording
 
@@ -68,8 +76,12 @@ def run_again(how: Again, console: Console) -> Outcome:
     scans = recording.counts()[SCAN.key(robot)]
     if not scans:
         raise UserError(f"{how.file}: no scan in it")
+    if imported := "log" in recording.metadata:
+        if names != ("estimator",):
+            raise UserError(f"{how.file}: an imported log has no goal that a controller could answer: --with estimator")
+        how = replace(how, every_scan=True)  # nobody has answered any
     why = why_not_exact(recording, how)
-    outcome = Outcome(not why, why, scans=scans)
+    outcome = Outcome(not why, why, scans=scans, imported=imported)
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PRESAGE_")}
     clean["PRESAGE_LOSSLESS"] = "1"
     with tempfile.TemporaryDirectory(prefix="presage-") as folder, Stack(robot, quiet=True, environment=clean) as stack:
@@ -95,6 +107,11 @@ def configure(recording: Recording, names: tuple[str, ...], folder: Path, notes:
     sections: dict[str, dict[str, Any]] = {}
     for name in names:
         recorded = recorded_settings(recording, name)
+        if recorded is None and "log" in recording.metadata:
+            if (world := world_file(recording, folder)) is None:
+                raise UserError(f"{recording.path}: imported without a world: import it with --world")
+            recorded = Unpacked({"world": str(world)})
+            notes.append("an imported log: the estimator runs as it does by default")
         if recorded is None:
             raise UserError(
                 f"{recording.path}: the {name}'s configuration was not recorded (was it alive then?); start one "
@@ -102,7 +119,8 @@ def configure(recording: Recording, names: tuple[str, ...], folder: Path, notes:
             )
         unpacked = recorded
         if name == "estimator":
-            unpacked = estimator_settings(recording, folder, recorded.values)
+            imported = "log" in recording.metadata
+            unpacked = estimator_settings(recording, folder, recorded.values, weights=not imported)
             notes += unpacked.notes
         elif recorded.values.get("world") and (world := world_file(recording, folder)) is not None:
             unpacked = replace(recorded, values={**recorded.values, "world": str(world)})
@@ -176,6 +194,9 @@ def words(outcome: Outcome) -> list[str]:
 def _verdict(outcome: Outcome) -> str:
     if outcome.damaged:
         return f"[bold red]the recording is damaged ({outcome.damaged}): what comes after that was not compared[/]"
+    if outcome.imported:
+        done = f"{outcome.beliefs.new_tracking} beliefs of {outcome.given} scans say tracking"
+        return f"{done}; the log has none to compare with (`presage rerun` keeps them)"
     if outcome.lockstep and outcome.good:
         return "[bold green]the session ran in lockstep, and this is what it believed[/]"
     if outcome.lockstep:

@@ -37,6 +37,7 @@ class Pairs:
     position_m: list[float] = field(default_factory=list)  # differences, of beliefs
     heading_rad: list[float] = field(default_factory=list)
     tracking: list[bool] = field(default_factory=list)  # both say so
+    new_tracking: int = 0  # beliefs of now that say so
     speed_most: float = 0.0  # m/s and rad/s, of commands
     _waiting: dict[int, deque[tuple[bool, Stamped]]] = field(default_factory=lambda: defaultdict(deque))
 
@@ -46,6 +47,7 @@ class Pairs:
 
     def new(self, message: Stamped) -> None:
         """One of now."""
+        self.new_tracking += isinstance(message, Belief) and message.state == "tracking"
         self._match(message, new=True)
 
     def unmatched(self) -> Counter[str]:
@@ -99,6 +101,7 @@ class Pairs:
 class Outcome:
     """What it came to."""
 
+    imported: bool = field(default=False, kw_only=True)  # from a log, which holds no beliefs to compare with
     lockstep: bool  # the session ran so, and runs so again: equality is required
     why: str = ""  # it is not
     beliefs: Pairs = field(default_factory=Pairs)
@@ -114,10 +117,15 @@ class Outcome:
 
     @property
     def good(self) -> bool:
-        """Equal bit for bit; where the session did not run in lockstep, within the tolerance once tracking."""
+        """Equal bit for bit; where the session did not run in lockstep, within the tolerance once tracking.
+
+        Of an imported log: every scan was answered.
+        """
         pairs, left = self.beliefs, self.beliefs.unmatched()["recorded"]
         if self.damaged:
             return False
+        if self.imported:
+            return self.given > self.unanswered == 0
         if self.lockstep:
             driven = self.commands.compared == self.commands.equal or not self.goals_placed
             return 0 < pairs.compared == pairs.equal and not left and driven
@@ -130,6 +138,7 @@ class Outcome:
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
         return {
+            "imported": self.imported, "tracking": self.beliefs.new_tracking,
             "lockstep": self.lockstep, "why_not": self.why, "good": self.good, "damaged": self.damaged,
             "scans": self.scans, "scans_left_out": self.left_out,
             "scans_unanswered": self.unanswered, "beliefs": self.beliefs.as_dict(),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from services.bridge_ros2.ros_types import LASER_SCAN, TWIST_STAMPED
+from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, TWIST_STAMPED
 
 if TYPE_CHECKING:
     from services.bridge_ros2.graph import Graph
@@ -34,6 +34,8 @@ def complaint(
 
 def _with_scans(options: BridgeRos2Settings, graph: Graph, *, reckoned: bool) -> str:
     """What else may be wrong while scans come."""
+    if wrong := _no_odometry(options, graph):
+        return wrong
     if options.tf == "map-odom" and not reckoned:
         where = f"on {options.topic(options.odom_topic)} or in tf" if options.odom_topic else "in tf"
         return (
@@ -44,6 +46,17 @@ def _with_scans(options: BridgeRos2Settings, graph: Graph, *, reckoned: bool) ->
     if wanted and (wanted == TWIST_STAMPED) != options.stamped:
         return f"{command}: the robot listens for {wanted}: --{'' if wanted == TWIST_STAMPED else 'no-'}stamped"
     return ""
+
+
+def _no_odometry(options: BridgeRos2Settings, graph: Graph) -> str:
+    """Of a topic that was asked for by name and is not there, though others of its type are; tf may do, but unasked."""
+    if "odom_topic" not in options.model_fields_set or not options.odom_topic:
+        return ""
+    topic = options.topic(options.odom_topic)
+    there = graph.topics_of(ODOMETRY)
+    if not there or topic in there:
+        return ""
+    return f"no odometry on {topic}: {ODOMETRY} is on {', '.join(there[:4])}: --odom-topic"
 
 
 def _nobody(options: BridgeRos2Settings) -> str:

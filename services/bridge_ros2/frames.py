@@ -6,69 +6,16 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from common import se2
+from common.ros_messages import IDENTITY, Transform, read_pose, stamp_of
 from common.se2 import Array
 
-TILT = np.deg2rad(5)  # a scanner inclined by more does not see a plane of the map
 KEPT = 10.0  # s of odometry
 BEYOND = 0.2  # s by which the newest odometry is carried on
 LONGEST = 32  # frames from the scanner to the base
 
 
-@dataclass(frozen=True)
-class Transform:
-    """Pose of a child frame in its parent."""
-
-    translation: Array  # (3,) m
-    rotation: Array  # (3, 3)
-
-    def then(self, child: Transform) -> Transform:
-        """The child's child in this one's parent."""
-        return Transform(self.translation + self.rotation @ child.translation, self.rotation @ child.rotation)
-
-    def planar(self) -> Array:
-        """(3,) x m, y m, yaw rad of the x axis."""
-        return np.array([*self.translation[:2], np.arctan2(self.rotation[1, 0], self.rotation[0, 0])])
-
-
-IDENTITY = Transform(np.zeros(3), np.eye(3))
-
-
-@dataclass(frozen=True)
-class Mount:
-    """How the scanner sits on the base."""
-
-    pose: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x m, y m, yaw rad in base_link, of the laser's x axis
-    upside_down: bool = False  # its z axis points to the floor: angles grow clockwise seen from above
-
-
-def read_rotation(q: Any) -> Array:
-    """(3, 3) of a geometry_msgs/Quaternion; raises ValueError where it is none."""
-    xyzw = np.array([q.x, q.y, q.z, q.w], float)
-    norm = float(np.linalg.norm(xyzw))
-    if not np.isfinite(norm) or abs(norm - 1) > 0.1:
-        raise ValueError(f"quaternion {xyzw.tolist()} is no rotation")
-    x, y, z, w = xyzw / norm
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def read_pose(position: Any, orientation: Any) -> Transform:
-    """Of a geometry_msgs/Pose or Transform; raises ValueError where a number is none."""
-    translation = np.array([position.x, position.y, position.z], float)
-    if not np.isfinite(translation).all():
-        raise ValueError(f"position {translation.tolist()} is not finite")
-    return Transform(translation, read_rotation(orientation))
-
-
-class Frames:
+class NewestFrames:
     """The newest transform of every child frame. Fixed joints are all that is asked for, so time does not matter."""
 
     def __init__(self) -> None:
@@ -86,8 +33,7 @@ class Frames:
                 continue
             if child in self._parents or len(self._parents) < 10_000:
                 self._parents[child] = (parent, transform)
-            stamp = int(each.header.stamp.sec) * 10**9 + int(each.header.stamp.nanosec)
-            heard.append((parent, child, stamp, transform))
+            heard.append((parent, child, stamp_of(each.header), transform))
         return heard
 
     def find(self, child: str, base: str) -> Transform | None:
@@ -95,7 +41,7 @@ class Frames:
         up, down = self._chain(child), self._chain(base)
         for frame, transform in up.items():
             if frame in down:
-                return _inverse(down[frame]).then(transform)
+                return down[frame].inverse().then(transform)
         return None
 
     def names(self) -> list[str]:
@@ -112,20 +58,6 @@ class Frames:
                 break
             chain[frame] = pose
         return chain
-
-
-def _inverse(a: Transform) -> Transform:
-    return Transform(-a.rotation.T @ a.translation, a.rotation.T)
-
-
-def mount_of(transform: Transform) -> Mount:
-    """Raises ValueError where the scanner is inclined: neither upright nor upside down."""
-    up = float(transform.rotation[2, 2])
-    if abs(up) < np.cos(TILT):
-        inclined = np.rad2deg(np.arccos(np.clip(abs(up), 0, 1)))
-        raise ValueError(f"the scanner is inclined by {inclined:.0f} degrees; it has to lie level, or upside down")
-    x, y, yaw = (float(v) for v in transform.planar())
-    return Mount((x, y, yaw), upside_down=up < 0)
 
 
 @dataclass(frozen=True)

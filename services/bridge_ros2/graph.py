@@ -48,6 +48,10 @@ class Graph:
             return f"nobody publishes it; {kind} is on {_some(others)}: {option}"
         return f"nobody publishes it, nor any other {kind}; there are {_some(sorted({e.topic for e in publishers}))}"
 
+    def topics_of(self, kind: str) -> list[str]:
+        """On which a type is published."""
+        return sorted({each.topic for each in self.endpoints() if each.publishes and each.kind == kind})
+
     def twist_wanted(self, topic: str) -> str:
         """The type that subscriptions on the command topic have; empty where there is none, or both are there."""
         kinds = {e.kind for e in self.endpoints() if not e.publishes and e.topic == topic}

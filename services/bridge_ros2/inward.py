@@ -8,9 +8,10 @@ import numpy as np
 
 from common import se2
 from common.messages import Odom, Pose, Scan, Twist
+from common.ranges import as_scan
+from common.ros_messages import Mount, Transform, read_pose, stamp_of
 from common.se2 import Array
-from services.bridge_ros2.frames import Dead, Mount, Transform, read_pose
-from services.bridge_ros2.ros_types import stamp_of
+from services.bridge_ros2.frames import Dead
 
 PLANE = [0, 1, 5]  # x, y, yaw among the six of a pose's covariance
 MOST_BEAMS = 100_000
@@ -19,9 +20,8 @@ MOST_BEAMS = 100_000
 def scan_of(message: Any, mount: Mount, stamp_ns: int) -> Scan:
     """A sensor_msgs/LaserScan with beams that turn to the left; raises ValueError where it makes no sense.
 
-    A scanner upside down, or one that turns to the right, gives its beams in the other order. Ranges as REP-117 has
-    them: nearer than ``range_min`` is -inf, farther than ``range_max`` +inf; 0, negative and NaN,
-    by which older drivers mean "nothing", are +inf.
+    A scanner upside down, or one that turns to the right, gives its beams in the other order. Of ranges
+    `common.ranges` has the rule.
     """
     beams = len(message.ranges)
     first, step = float(message.angle_min), float(message.angle_increment)
@@ -39,14 +39,12 @@ def scan_of(message: Any, mount: Mount, stamp_ns: int) -> Scan:
     first, step = side * first, side * step
     if step < 0:
         first, step, ranges = first + step * (beams - 1), -step, ranges[::-1]
-    nothing = np.isnan(ranges) | ((ranges <= 0) & ~np.isneginf(ranges)) | (ranges > farthest)
-    near = (ranges < nearest) & ~nothing
-    clean = np.where(nothing, np.float32(np.inf), np.where(near, np.float32(-np.inf), ranges))
     period = float(message.scan_time)
     return Scan(
         stamp_ns=stamp_ns, angle_min=float(se2.wrap(first)), angle_increment=step,
-        range_min=max(nearest, 0.0), range_max=farthest, ranges=clean.astype(np.float32), mount=Pose.of(mount.pose),
-        scan_time=period if 0 < period < 3600 else 0.0, frame_id=(message.header.frame_id or "laser")[:64],
+        range_min=max(nearest, 0.0), range_max=farthest, ranges=as_scan(ranges, nearest, farthest),
+        mount=Pose.of(mount.pose), scan_time=period if 0 < period < 3600 else 0.0,
+        frame_id=(message.header.frame_id or "laser")[:64],
     )  # fmt: skip
 
 
@@ -59,7 +57,7 @@ def dead_of(message: Any, child_in_base: Transform | None) -> Dead:
     linear, angular = message.twist.twist.linear, message.twist.twist.angular
     twist = np.array([linear.x, linear.y, angular.z], float)
     if not np.isfinite(twist).all():
-        raise ValueError(f"velocity {twist.tolist()} is not finite")
+        raise ValueError(f"velocity {twist.tolist()} (m/s, m/s, rad/s) is not finite")
     if child_in_base is not None:
         child = child_in_base.planar()
         pose = se2.compose(pose, se2.inverse(child))

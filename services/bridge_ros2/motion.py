@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from common import se2
-from services.bridge_ros2.frames import Dead, Frames, Mount, Odometer, Transform, mount_of
+from common.ros_messages import Mount, Transform, mount_of
+from services.bridge_ros2.frames import Dead, NewestFrames, Odometer
 
 
 class NoMountError(ValueError):
@@ -20,11 +21,12 @@ class Motion:
     def __init__(self, base: str, odom: str, mount: Mount | None = None) -> None:
         """``base`` and ``odom``: names of the frames; ``mount``: of the scanner, else tf says it."""
         self.base, self.odom = base.strip("/"), odom.strip("/")
-        self.frames = Frames()
+        self.frames = NewestFrames()
         self._told = mount
         self._found = mount  # the last one used
         self._by_topic, self._by_tf = Odometer(), Odometer()
         self._last: Dead | None = None  # by tf
+        self.unplaced = ""  # odometry's child frame where tf does not connect it with the base, whose it is taken for
 
     def mount(self) -> Mount | None:
         """The scanner's, once it is known."""
@@ -40,15 +42,17 @@ class Motion:
             there = ", ".join(self.frames.names()[:12]) or "none"
             raise NoMountError(
                 f"tf does not connect {frame or 'their empty frame'} with {self.base} (--base-frame); frames: {there}; "
-                "--mount x,y,yaw says it without tf"
+                "--mount x,y[,yaw_deg] says it without tf"
             )
         self._found = mount_of(transform)
         return self._found
 
     def child_in_base(self, child: str) -> Transform | None:
-        """Of an odometry's child frame; None where it is the base, or tf does not know better."""
+        """Of an odometry's child frame; None where it is the base, or tf does not know better: then `unplaced`."""
         child = child.strip("/")
-        return None if child in ("", self.base) else self.frames.find(child, self.base)
+        found = None if child in ("", self.base) else self.frames.find(child, self.base)
+        self.unplaced = "" if found is not None or child == self.base else child
+        return found
 
     def hear_odometry(self, dead: Dead) -> None:
         """By topic."""

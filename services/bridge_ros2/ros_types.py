@@ -68,11 +68,6 @@ def decode(name: str, payload: bytes) -> Any:
         raise CdrError(f"{name}: {len(payload)} bytes that are none ({type(error).__name__})") from None
 
 
-def stamp_of(header: Any) -> int:
-    """Ns of a std_msgs/Header."""
-    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
-
-
 def header(stamp_ns: int, frame: str) -> Any:
     """A std_msgs/Header."""
     time = make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)

@@ -9,11 +9,12 @@ from typing import Any, ClassVar
 from common.inbox import Sample
 from common.messages import Belief, CmdVel, Goal, Stamped
 from common.requests import LocaliseRequest, Reply
+from common.ros_messages import stamp_of
 from common.se2 import Array
 from common.service import Service
 from common.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, ODOM, SCAN, STATUS, Query, Topic
 from services.bridge_ros2 import outward
-from services.bridge_ros2.complaints import complaint
+from services.bridge_ros2.complaints import SILENT, complaint
 from services.bridge_ros2.graph import Graph
 from services.bridge_ros2.inward import dead_of, odom_of, pose_of, scan_of
 from services.bridge_ros2.keys import KEPT, LATEST, SENSOR, TF, TF_STATIC, Qos
@@ -30,7 +31,6 @@ from services.bridge_ros2.ros_types import (
     TWIST_STAMPED,
     CdrError,
     decode,
-    stamp_of,
 )  # fmt: skip
 from services.bridge_ros2.settings import BridgeRos2Settings
 from services.bridge_ros2.wheels import Wheels
@@ -63,6 +63,7 @@ class BridgeRos2Service(Service):
         self._began = time.monotonic()
         self._clock: tuple[int, float] | None = None  # the robot's, and ours, when its last scan came
         self._waiting_said = False
+        self._unplaced_said = False
         self._reckoned = False  # the last scan came with odometry
         self._problem = ""  # why the last message could not be used
 
@@ -147,10 +148,22 @@ class BridgeRos2Service(Service):
                 linked=self._ros.linked(), quiet=now - since, heard=self._scan_at is not None,
                 reckoned=self._reckoned,
             )  # fmt: skip
+            self._say_unplaced(now)
         if self.note and self.note != before:
             self.log.warning(self.note)
         elif before and not self.note:
             self.log.info("scans come", mount=self.motion.mount())
+
+    def _say_unplaced(self, now: float) -> None:
+        """Once: odometry is about a frame that tf does not know, though it had the time to come."""
+        child, base = self.motion.unplaced, self.motion.base
+        if child and not self._unplaced_said and now - self._began > SILENT:
+            self._unplaced_said = True
+            self.log.warning(
+                "odometry is about a frame that tf does not connect with the base: taken for the base's",
+                frame=child,
+                base=base,
+            )
 
     def on_sample(self, sample: Sample) -> None:
         """Ours as ever; one of ROS is decoded, and handed to what is done with its topic."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-import numpy as np
 from pydantic import Field
 
-from common.config import NUMBER, ServiceSettings
+from common.config import ServiceSettings
 from common.errors import UserError
+from common.pose_text import POSE_TEXT, pose_of_text
 from common.robot import Robot
-from services.bridge_ros2.frames import Mount
+from common.ros_messages import Mount
 from services.bridge_ros2.keys import NAME, Names, full_name
 
 TOPIC = rf"^$|^{NAME}$"
@@ -113,8 +113,8 @@ class BridgeRos2Settings(ServiceSettings):
     mount: Annotated[
         str,
         Field(
-            pattern=rf"^$|^{NUMBER},{NUMBER},{NUMBER}$",
-            description="x,y,yaw_deg (m, m, degrees) of the laser in the base frame; none: tf says",
+            pattern=POSE_TEXT,
+            description="x,y[,yaw_deg] (m, m, degrees) of the laser in the base frame; none: tf says",
         ),
     ] = ""
     upside_down: Annotated[bool, Field(description="with --mount: its z axis points down")] = False
@@ -143,7 +143,7 @@ class BridgeRos2Settings(ServiceSettings):
         """How the laser sits, where it was said."""
         if not self.mount:
             if self.upside_down:
-                raise UserError("--upside-down goes with --mount x,y,yaw_deg: without it, tf says how the laser sits")
+                raise UserError("--upside-down goes with --mount x,y[,yaw_deg]: without it, tf says how the laser sits")
             return None
-        x, y, yaw = (float(part) for part in self.mount.split(","))
-        return Mount((x, y, float(np.deg2rad(yaw))), self.upside_down)
+        x, y, yaw = map(float, pose_of_text(self.mount, "--mount"))
+        return Mount((x, y, yaw), self.upside_down)

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from common import se2
+from common.ranges import surfaces
 from common.sweep import Sweep
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class TemporaryObstacles:
         laser = se2.compose(pose, scan.mount.array())
         ranges = scan.ranges.astype(np.float64)
         angles = scan.angles()
-        hit = np.isfinite(ranges) & (ranges < FARTHEST)
+        hit = surfaces(ranges) & (ranges < FARTHEST)
         heading = laser[2] + angles[hit]
         ends = laser[:2] + ranges[hit, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
         odd = ends[self._free.grid.inside(ends) & (self._free.clear(ends) > UNEXPLAINED)]

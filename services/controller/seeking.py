@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common import se2
+from common.ranges import surfaces
 from common.sweep import Sweep
 from services.controller.decision import Decision
 from services.controller.epistemic import Explorer, Options
@@ -33,6 +34,7 @@ DESTINATIONS = 60
 AGAIN = 1_000_000_000  # ns between two choices
 SPEED = 0.5  # m/s at most, for what is behind and beside is not known
 FIRST_LOOK = 1_000_000_000  # ns that the estimator is given before anybody moves
+FARTHEST = 5.0  # m; more room than this is no better
 WINDOW = 0.35  # rad to either side of a direction that must be free
 ROOM = 0.7  # m; with less in every direction it turns on the spot
 
@@ -131,13 +133,17 @@ class Seeker:
 
     def _wander(self, belief: Belief, scan: Scan, around: Around, velocity: Array) -> Decision:
         """Towards the most room, rather ahead than aside."""
-        ranges = np.minimum(np.where(np.isneginf(scan.ranges), 0.0, scan.ranges.astype(np.float64)), 5.0)
+        ranges = np.minimum(np.where(np.isneginf(scan.ranges), 0.0, scan.ranges.astype(np.float64)), FARTHEST)
+        ranges[~surfaces(scan.ranges) & ~np.isinf(scan.ranges)] = (
+            np.inf
+        )  # not measured: their neighbours speak for them
         angles = scan.angles() + scan.mount.yaw
         sweep = Sweep.of(scan)
         half = max(1, round(WINDOW / max(sweep.spacing, WINDOW / 1000)))
         # Beyond the outermost beams nothing is known to be free; all round there is no outermost.
         padded = np.pad(ranges, half, mode="wrap") if sweep.all_round else np.pad(ranges, half)
         free = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1).min(axis=1)
+        free[np.isinf(free)] = 0.0  # where none has measured anything
         best = int(np.argmax(free + 0.5 * np.cos(angles - around.front)))
         reason = f"the belief is {belief.state}: going where there is room, to see more"
         if free[best] < ROOM:

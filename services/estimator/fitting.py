@@ -45,6 +45,14 @@ class Fit:
         found[self.order] = (1 - self.share) * ranges[self.low] + self.share * ranges[self.high]
         return found
 
+    def of_all(self, beams: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """(M,) which of the model's beams are made of none but these (B,) of the scan's."""
+        if self.same:
+            return beams
+        found = np.empty(len(self.own), bool)
+        found[self.order] = (beams[self.low] | (self.share >= 1)) & (beams[self.high] | (self.share <= 0))
+        return found
+
     def predicted(self, ranges: Array, angles: Array) -> Array:
         """(N, B) m expected along the scan's beams at ``angles`` (B,) rad, of the model's (N, M); +inf outside."""
         off = wrap(angles - self.middle)

@@ -17,7 +17,7 @@ State = Literal["localising", "tracking", "ambiguous", "lost"]
 class Observation:
     """One scan, and what else is known of the motion that led to it."""
 
-    ranges: Array  # (B,) m; +inf no return, -inf too close (REP-117)
+    ranges: Array  # (B,) m; +inf nothing within range_max, -inf says nothing (common/ranges.py)
     angles: Array  # (B,) rad in laser
     range_max: float  # m
     stamp: float | None = None  # s, of the measurement; None: no clock, scans count

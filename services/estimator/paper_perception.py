@@ -57,7 +57,8 @@ class PaperPerception:
     def updating(self, observation: Observation) -> Conversation[Posterior]:
         """The same as a conversation: see `asking`."""
         ranges = self.fit.ranges(usable_ranges(observation.ranges, observation.range_max))
-        estimate = yield from self.estimator.updating(ranges, observation.goal)
+        says = self.fit.of_all(observation.ranges > -np.inf)
+        estimate = yield from self.estimator.updating(ranges, observation.goal, says)
         found = estimate.gradient
         return Posterior(
             estimate.state,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from services.estimator.asking import Conversation, alone
 from services.estimator.free_energy import Gradient, gradient
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from services.estimator.asking import Pieces
     from services.estimator.decoder import GenerativeModel
 
+Mask = npt.NDArray[np.bool_]
 State = Literal["localising", "tracking", "lost"]
 
 
@@ -93,26 +95,35 @@ class PaperEstimator:
         self.pose, self.known = np.array(pose, float), known
         self.__post_init__()
 
-    def update(self, ranges: Array, goal: Array | None = None) -> Estimate:
-        """Descend F for a scan of usable ranges (B,) m; ``goal`` (3,) attracts the belief where beta > 0."""
-        return alone(self.updating(ranges, goal))
+    def update(self, ranges: Array, goal: Array | None = None, says: Mask | None = None) -> Estimate:
+        """Descend F for a scan of usable ranges (B,) m; ``goal`` (3,) attracts the belief where beta > 0.
 
-    def updating(self, ranges: Array, goal: Array | None = None) -> Conversation[Estimate]:
+        Beams that are not among ``says`` (B,) say nothing: F is that of the others.
+        """
+        return alone(self.updating(ranges, goal, says))
+
+    def updating(self, ranges: Array, goal: Array | None = None, says: Mask | None = None) -> Conversation[Estimate]:
         """The same as a conversation: see `asking`."""
+        used = slice(None) if says is None or says.all() else says
+        ranges = ranges[used]
         precision = np.ones(len(ranges))
         before = self.pose
         metric = np.append(self.metric, 1.0)
         g_goal = None
         if goal is not None and self.settings.beta > 0:
             g_goal, _ = yield Decode(self.model, goal)
+            g_goal = g_goal[used]
         for _ in range(self.settings.iterations):
             g, dg = yield Decode(self.model, self.pose)
-            step = self.settings.alpha * metric * gradient(ranges, g, dg, precision, g_goal, self.settings.beta).descent
+            found = gradient(ranges, g[used], dg[used], precision, g_goal, self.settings.beta)
+            step = self.settings.alpha * metric * found.descent
             length = float(np.hypot(step[0], step[1]))
             self.pose = self._inside(self.pose + step * min(1.0, self.settings.max_step / max(length, 1e-12)))
         g, dg = yield Decode(self.model, self.pose)
-        final = gradient(ranges, g, dg, precision, g_goal, self.settings.beta)
-        state = self._judge(float(np.hypot(*(self.pose - before)[:2])), float(np.mean(np.abs(ranges - g))))
+        final = gradient(ranges, g[used], dg[used], precision, g_goal, self.settings.beta)
+        # A scan that says nothing fits no worse, and no better, than the one before.
+        misfit = float(np.mean(np.abs(ranges - g[used]))) if len(ranges) else (self._misfits or [np.inf])[-1]
+        state = self._judge(float(np.hypot(*(self.pose - before)[:2])), misfit)
         return Estimate(self.pose.copy(), g, final, state)
 
     def _inside(self, pose: Array) -> Array:

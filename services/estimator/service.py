@@ -8,8 +8,9 @@ import numpy as np
 
 from common.errors import UserError
 from common.messages import Belief, CmdVel, Goal, Hypothesis, Odom, Pose, Prediction, Scan, Stamped
+from common.pose_text import pose_of_text
+from common.ranges import about_place
 from common.requests import LocaliseRequest, ModelReply, ModelRequest, PredictRequest, Reply, Request
-from common.se2 import Array
 from common.service import Service
 from common.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, MODEL, ODOM, PREDICT, PREDICTION, SCAN, STATUS, Query, Topic
 from services.estimator import predicting
@@ -27,7 +28,7 @@ class Models:
         """Raises UserError where a world has no weights."""
         self.choice = Choice(
             settings.world, settings.estimator, settings.model, settings.models, settings.sigma, settings.seed,
-            initial_pose=_pose(settings.initial_pose),
+            initial_pose=pose_of_text(settings.initial_pose, "--initial-pose") if settings.initial_pose else None,
             descent=Descent(alpha=settings.alpha, beta=settings.beta, iterations=settings.iterations),
         )  # fmt: skip
         self.factory: Factory = prepare(self.choice)
@@ -166,7 +167,7 @@ class EstimatorService(Service):
             self.counters["scans_without_odometry"] += 1
         command = self.command if prior == "command" else None
         return Observation(
-            scan.ranges.astype(np.float64),
+            about_place(scan.ranges),
             scan.angles(),
             scan.range_max,
             scan.stamp_ns * 1e-9,
@@ -174,14 +175,6 @@ class EstimatorService(Service):
             command.twist.array() if command else None,
             self.goal.pose.array() if self.goal else None,
         )
-
-
-def _pose(text: str) -> Array | None:
-    """Of a setting in m, m, deg."""
-    if not text:
-        return None
-    numbers = [float(part) for part in text.split(",")]
-    return np.array([*numbers[:2], np.deg2rad(numbers[2]) if len(numbers) > 2 else 0.0])
 
 
 def _belief(scan: Scan, posterior: Posterior, estimator: str) -> Belief:

@@ -8,7 +8,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from common.config import POSE_TEXT, ServiceSettings
+from common.config import ServiceSettings
+from common.pose_text import POSE_TEXT
 
 ROBOT_NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 _PATTERN = r"[A-Za-z0-9_.*?-]{1,64}"

@@ -112,5 +112,5 @@ class Data:
 
 
 def usable_ranges(ranges: Array, range_max: float) -> Array:
-    """The paper's network knows no infinity: no return counts as ``range_max`` m, too close as 0."""
-    return np.clip(np.where(np.isposinf(ranges), range_max, ranges), 0.0, range_max)
+    """The paper's network knows no infinity: no return counts as ``range_max`` m, what says nothing (-inf) as 0."""
+    return np.clip(np.where(np.isposinf(ranges), range_max, np.nan_to_num(ranges)), 0.0, range_max)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
-import numpy as np
 from pydantic import Field
 
-from common.config import POSE_TEXT, ServiceSettings
+from common.config import ServiceSettings
+from common.pose_text import POSE_TEXT, pose_of_text
 from common.scanner import SCANNERS, Scanner
 from common.scanner_choice import chosen_scanner
 
@@ -73,5 +73,5 @@ class SimulatorSettings(ServiceSettings):
         """X m, y m, yaw rad, or None."""
         if not self.start:
             return None
-        x, y, *yaw = (float(part) for part in self.start.split(","))
-        return x, y, float(np.deg2rad(yaw[0])) if yaw else 0.0
+        x, y, yaw = map(float, pose_of_text(self.start, "--start"))
+        return x, y, yaw

@@ -67,6 +67,17 @@ def test_where_tf_does_not_say_it_is_said_what_there_is():
         motion.mount_for("laser")
 
 
+def test_odometry_of_a_frame_that_tf_does_not_know_is_noticed():
+    motion = Motion("base_link", "odom")
+    assert motion.child_in_base("base_link") is None
+    assert motion.unplaced == ""
+    assert motion.child_in_base("/wheels") is None
+    assert motion.unplaced == "wheels"
+    motion.hear_tf(tf(("wheels", "base_link", (0.5, 0, 0), turned(), 0)))
+    np.testing.assert_allclose(motion.child_in_base("wheels").planar(), [-0.5, 0, 0])
+    assert motion.unplaced == ""
+
+
 def test_nonsense_in_tf_is_left_out():
     motion = Motion("base_link", "odom")
     motion.hear_tf(tf(

@@ -69,6 +69,11 @@ def test_a_complaint_names_the_option_that_mends_it():
     assert "on /r1/scan for 3 s" in said(graph, quiet=4.0, namespace="r1")
     assert said(graph, "too odd", quiet=4.0) == "scans on /scan cannot be used: too odd"
     assert "on /odom or in tf" in said(graph, reckoned=False)
+    graph.change(token("MP", "/odom", ODOMETRY, 9), there=True)
+    assert said(graph, odom_topic="odm") == "no odometry on /odm: nav_msgs/msg/Odometry is on /odom: --odom-topic"
+    assert said(graph, odom_topic="odom") == ""
+    graph.change(token("MP", "/odom", ODOMETRY, 9), there=False)
+    assert said(graph, odom_topic="odm") == ""  # nothing to choose from: tf does
     assert said(graph, reckoned=False, tf="map-base") == ""
     graph.change(token("MS", "/cmd_vel", TWIST_STAMPED), there=True)
     assert said(graph) == "/cmd_vel: the robot listens for geometry_msgs/msg/TwistStamped: --stamped"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common import safety
-from services.bridge_ros2.frames import IDENTITY, Mount, Transform
+from common.ros_messages import IDENTITY, Mount, Transform
 from services.bridge_ros2.inward import dead_of, odom_of, pose_of, scan_of
 from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, POSE_STAMPED, decode
 from tests.bridge_ros2 import independent as other
@@ -30,10 +30,10 @@ def test_a_scan_as_it_is():
     assert scan.scan_time == pytest.approx(0.1)
 
 
-def test_ranges_that_are_none_as_rep_117_and_older_drivers_say_it():
+def test_ranges_by_the_one_rule():
     inf, nan = np.inf, np.nan
     scan = scan_of(laser([0.0, nan, inf, -inf, 0.05, 11.0, -1.0, 10.0, 0.1]), Mount(), 0)
-    expected = np.array([inf, inf, inf, -inf, -inf, inf, inf, 10.0, 0.1], np.float32)
+    expected = np.array([0, 0, inf, -inf, -inf, inf, 0, inf, 0.1], np.float32)
     np.testing.assert_array_equal(scan.ranges, expected)
 
 

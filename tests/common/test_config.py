@@ -11,8 +11,9 @@ import yaml
 from pydantic import Field
 
 from common.bus import DEFAULT_ENDPOINT, Link
-from common.config import POSE_TEXT, ServiceSettings, load_settings, split_endpoints
+from common.config import ServiceSettings, load_settings, split_endpoints
 from common.errors import UserError
+from common.pose_text import POSE_TEXT, pose_of_text
 from common.router import RouterSettings
 
 
@@ -82,6 +83,13 @@ def test_poses_are_numbers_with_commas(text):
 @pytest.mark.parametrize("text", ["1.2.3,1", "1", ".,1", "nan,1", "1,2,3,4", "1,,2", "-,1", "1e3,1"])
 def test_what_is_no_pose_is_refused(text):
     assert not re.match(POSE_TEXT, text)
+    with pytest.raises(UserError, match=r"--mount '.*': give x,y\[,yaw_deg\] in m and degrees"):
+        pose_of_text(text, "--mount")
+
+
+def test_a_pose_is_in_radians_and_may_lack_its_yaw():
+    np.testing.assert_allclose(pose_of_text("1,-2.5", "--start"), [1, -2.5, 0])
+    np.testing.assert_allclose(pose_of_text("1,2,-90", "--start"), [1, 2, -np.pi / 2])
 
 
 def test_empty_is_a_value_on_the_command_line_and_none_in_the_environment(monkeypatch):

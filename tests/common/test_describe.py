@@ -23,7 +23,8 @@ def test_every_row_and_field_is_on_it_with_what_the_source_says():
     for cls in (Scan, Belief):
         section = text.split(f"### {cls.__name__}\n")[1].split("###")[0]
         assert all(f"| `{name}` |" in section for name in cls.model_fields)
-    assert "| `ranges` | binary `<f4` (N,) | required | (B,) m; +inf no return, -inf too close (REP-117) |" in text
+    said = "(B,) m; +inf nothing within range_max, -inf too close (REP-117), 0 not measured"
+    assert f"| `ranges` | binary `<f4` (N,) | required | {said} |" in text
     assert "the negative gradient of accuracy" in text  # a comment below its field
 
 

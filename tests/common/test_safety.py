@@ -80,3 +80,10 @@ def test_points_of_a_scan_stand_in_base_link():
     )  # fmt: skip
     points = safety.scan_points(scan)
     assert points == pytest.approx(np.array([[1.2, 0.0], [0.1, 0.0]]))  # no return is no point, too close is one
+
+
+def test_what_was_not_measured_is_nothing_in_the_way():
+    scan = Scan(
+        stamp_ns=0, angle_min=0.0, angle_increment=0.1, range_min=0.1, range_max=9.0, ranges=[0.0, np.inf, 2.0, 0.0]
+    )
+    assert safety.scan_points(scan) == pytest.approx(2 * np.array([[np.cos(0.2), np.sin(0.2)]]))

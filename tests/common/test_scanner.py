@@ -101,13 +101,14 @@ def test_a_file_describes_a_scanner(tmp_path):
     [
         (("beams: 720", "beams: 1"), "beams: Input should be greater than or equal to 2"),
         (("sigma: 0.01", "sigma: wide"), "sigma: Input should be a valid number"),
-        (("fov_deg: 359.5", "fov_deg: 400"), "fov: Input should be less than"),
+        (("fov_deg: 359.5", "fov_deg: 400"), r"fov_deg: Input should be less than or equal to 360 \(degrees\)"),
         (("rate: 10\n", ""), "rate: Field required"),
         (("rate: 10", "speed: 10"), "rate: Field required"),
         (("range_max: 8", "range_max: 0.1"), "range_max 0.1 m must be more than range_min 0.1 m"),
         (("x: 0.1", "z: 0.1"), "mount.z: Extra inputs"),
         (("name: mine", "name: [mine"), "no YAML"),
-        ((FILE, "- 1"), "valid dictionary"),
+        ((FILE, "- 1"), "keys with values are expected"),
+        (("{x: 0.1, yaw_deg: 90}", "3"), r"mount: keys with values are expected, such as {x: 1, y: 2}, not '3' \(m"),
     ],
 )
 def test_a_wrong_file_says_what_and_where(tmp_path, change, wrong):

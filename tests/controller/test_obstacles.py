@@ -56,6 +56,17 @@ def test_a_new_box_is_found_where_it_is_and_becomes_furniture():
         assert layer.moving(stamp).all() == (stamp < STANDS)
 
 
+def test_beams_that_measured_nothing_neither_find_nor_clear():
+    world = load_world("maze")
+    changed, pose, layer = with_box(world, 3.2, 3.0), np.array([1.5, 3.0, 0.0]), TemporaryObstacles(FreeSpace.of(world))
+    layer.see(scan_of(changed, pose, 0), pose)
+    before = layer.points()
+    scan = scan_of(world, pose, SECOND // 15)
+    layer.see(scan.model_copy(update={"ranges": np.zeros_like(scan.ranges)}), pose)
+    np.testing.assert_array_equal(layer.points(), before)
+    assert len(before)
+
+
 def test_what_went_away_is_forgotten_once_a_beam_passes_and_not_before():
     world = load_world("maze")
     changed, pose, layer = with_box(world, 3.2, 3.0), np.array([1.5, 3.0, 0.0]), TemporaryObstacles(FreeSpace.of(world))

@@ -107,6 +107,24 @@ def test_lost_it_goes_where_there_is_room_whichever_way_the_beams_run(name):
     assert abs(decision.action[1]) < decision.action[0]
 
 
+def test_beams_that_measured_nothing_are_neither_room_nor_wall():
+    """Every other beam has no return: the way is the same; where none has measured anything there is no room."""
+    pose, none = np.array([1.0, 3.0, 0.0]), np.zeros((0, 2))
+    whole = scan_of(TURNED["0 to 359 deg"], HALL, pose)
+    found = []
+    for silent in (slice(0, 0), slice(0, None, 2), slice(None)):
+        ranges = np.array(whole.ranges)
+        ranges[silent] = 0.0
+        scan, pilot = whole.model_copy(update={"ranges": ranges, "stamp_ns": 2 * 10**9}), Pilot(Robot(), HALL)
+        pilot.see(scan, belief_at(pose, scan.stamp_ns, "lost"))
+        for stamp in (0, 2 * 10**9):
+            decision = pilot.seeker.act(belief_at(pose, stamp, "lost"), scan, none, np.zeros(3), pilot._view)
+        assert decision.state == "exploring"
+        found.append(decision.action)
+    np.testing.assert_allclose(found[1], found[0], atol=0.05)
+    assert not found[2][:2].any()  # it turns on the spot
+
+
 @pytest.mark.parametrize("scanner", [LMS, BACKWARDS])
 def test_with_half_a_view_it_turns_before_it_drives_and_touches_nothing(scanner):
     """The goal lies behind, and in the way a box that the map does not know: the wheels are held by nobody else."""

@@ -89,6 +89,11 @@ def test_the_beam_model_knows_people_from_holes():
     assert hit > near > beyond
 
 
+def test_a_beam_that_says_nothing_weighs_no_place_against_another():
+    model, seen = BeamModel(0.7, 0.2, 0.05, 0.05, 0.1, 1.0), np.array([[5.0, 5.0, 5.0], [2.0, 30.0, 0.1]])
+    assert not model.log_density(np.array([-np.inf, -np.inf, np.nan]), seen, 25.0).any()
+
+
 def test_the_range_table_agrees_with_exact_rays():
     table, rng = RangeTable(ROOM, 0.02), np.random.default_rng(1)
     poses = np.column_stack([ROOM.sample_free(50, rng, 0.3), rng.uniform(-np.pi, np.pi, 50)])

@@ -15,7 +15,7 @@ from common.errors import UserError
 from common.scanner import SCANNERS
 from common.world import load_world
 from presage.localize import COLUMNS, Job, choice_of, localize
-from presage.logs.log import Reading, clean
+from presage.logs.log import Reading
 from presage.scan_files import read_scans
 from tests.recorder.sessions import write
 
@@ -147,10 +147,18 @@ def test_files_that_are_none(tmp_path):
         read_scans(pickled, np.zeros(3))
 
 
-def test_ranges_as_rep_117_has_them():
-    assert clean(np.array([[1.0, 25.0, np.inf, 0.0, np.nan, -np.inf]]), 25.0).tolist() == [
-        [1.0, np.inf, np.inf, -np.inf, -np.inf, -np.inf]
-    ]
+def test_stamps_are_the_numbers_they_were(tmp_path):
+    stamps = [1000.0, 1000.1, 1600000000.3]
+    values = {"ranges": np.ones((3, 6)), "angles": np.arange(6) / 10, "range_max": 25.0}
+    np.savez(tmp_path / "scan.npz", stamps=np.array(stamps), **values)
+    assert read_scans(tmp_path / "scan.npz", np.zeros(3)).stamps.tolist() == stamps
+
+
+def test_what_says_nothing_about_the_place_is_minus_infinity(tmp_path):
+    row = np.array([[1.0, 25.0, np.inf, 0.0, np.nan, -np.inf]])
+    np.savez(tmp_path / "scan.npz", ranges=row, angles=np.arange(6) / 10, range_max=25.0)
+    found = read_scans(tmp_path / "scan.npz", np.zeros(3)).ranges
+    assert found.tolist() == [[1.0, np.inf, np.inf, -np.inf, -np.inf, -np.inf]]
 
 
 def test_words_that_are_not_known(tmp_path):

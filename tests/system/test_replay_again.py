@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import json
 
+from rich.console import Console
+
 from common.messages import Belief, Pose
 from common.topics import BELIEF, topic_of
+from presage.logs.importing import Import, import_command
 from services.recorder.reader import read_recording
 from services.recorder.writer import RecordingWriter
+from tests.presage.logs.drives import SCANS as SCANS_OF_LOG
+from tests.presage.logs.drives import Bag, write_bag
 from tests.recorder import sessions as made
 from tests.system.test_loop import SCANS, run_in_lockstep
 
@@ -90,3 +95,24 @@ def test_what_a_file_does_not_hold_is_named(process, tmp_path):
         assert command.wait(60) == 2, command.output
         (line,) = command.output.splitlines()
         assert says in line
+
+
+def test_an_imported_log_is_answered_scan_by_scan(process, tmp_path):
+    """There is no belief to compare with; the estimator is as it is by default, in the world it was imported with."""
+    log = write_bag(tmp_path, Bag(localised=True))
+    for name, world in (("there", "corridor"), ("nowhere", "")):
+        import_command(Import(log, tmp_path / f"{name}.mcap", world=world), None, Console(quiet=True))
+    status, said, numbers = command(
+        process, tmp_path / "a.json", "replay", tmp_path / "there.mcap", "--with", "estimator"
+    )
+    assert status == 0, said
+    assert numbers["imported"]
+    assert (numbers["scans"], numbers["scans_unanswered"]) == (SCANS_OF_LOG, 0)
+    assert numbers["tracking"] > SCANS_OF_LOG / 2
+    assert "presage rerun" in said
+    for file, services, why in (
+        ("nowhere", "estimator", "import it with --world"), ("there", "estimator,controller", "no goal"),
+    ):  # fmt: skip
+        status, said, _ = command(process, tmp_path / "b.json", "replay", tmp_path / f"{file}.mcap", "--with", services)
+        assert status == 2
+        assert why in said

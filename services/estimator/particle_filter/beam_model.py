@@ -36,13 +36,15 @@ class BeamModel:
     def log_density(self, ranges: Array, expected: Array, range_max: float) -> Array:
         """(N, B) ln p of ranges (B,) m where ``expected`` (N, B) m; no return (+inf) is a mass, not a density.
 
+        -inf says nothing: 0 for every pose.
         Hit and short are normalised over what can be measured, [0, range_max] and [0, expected], as in the book; a
         beam expected to meet nothing is a maximum reading instead of a hit, and cannot be short.
         """
         total = self.z_hit + self.z_short + self.z_max + self.z_rand
         far = expected >= range_max
         mean = np.minimum(expected, range_max)
-        missed = ~np.isfinite(ranges) | (ranges >= range_max)
+        silent = np.isneginf(ranges) | np.isnan(ranges)
+        missed = silent | (ranges >= range_max)
         z = np.where(missed, 0.0, np.maximum(ranges, 0.0))
         root = math.sqrt(2) * self.sigma_hit
         # The part of the Gaussian that lies in [0, range_max]; nearly always 1, so erf is asked for few.
@@ -55,7 +57,8 @@ class BeamModel:
         random = self.z_rand / range_max
         measured = np.where(far, random, self.z_hit * hit + self.z_short * short + random)
         nothing = np.where(far, self.z_hit + self.z_short + self.z_max, self.z_max)
-        return np.log(np.maximum(np.where(missed, nothing, measured) / total, 1e-300))
+        log = np.log(np.maximum(np.where(missed, nothing, measured) / total, 1e-300))
+        return np.asarray(np.where(silent, 0.0, log))
 
 
 class RangeTable:

@@ -58,7 +58,7 @@ class Likelihood:
     relative: float = 0.0  # of the range: the part of the scanner's noise that grows with it
 
     def evaluate(self, measured: Array, range_max: float, expected: Expected, widen: float = 0.0) -> Evidence:
-        """For ranges (B,) m (+inf no return, -inf too close: not used); ``widen`` m is added to every deviation."""
+        """For ranges (B,) m (+inf no return, -inf: not used); ``widen`` m is added to every deviation."""
         count = len(expected.ranges)
         total, gradient = np.zeros((count, 3)), np.zeros((count, 3))
         matrices = np.zeros((count, 3, 3, 3))

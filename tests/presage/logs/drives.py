@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -86,6 +87,8 @@ class Bag:
     odom: bool = True
     more: tuple[str, ...] = ()  # further topics: scan2, ground_truth
     scan: dict = field(default_factory=dict)  # fields of LaserScan instead of the usual
+    child: str = "base_link"  # of odometry
+    each: Callable[[int], dict] = lambda _: {}  # the same, of the k-th
 
     def but(self, **changes) -> Bag:
         return replace(self, **changes)
@@ -130,12 +133,12 @@ class _Filler:
             ])  # fmt: skip
         for stamp in range(int(STAMPS[0]) - 90_000_000, int(STAMPS[-1]) + 100_000_000, 40_000_000):
             self.moving(stamp)
-        for stamp, row in zip(STAMPS.tolist(), ranges(), strict=True):
+        for k, (stamp, row) in enumerate(zip(STAMPS.tolist(), ranges(), strict=True)):
             values = {
                 "angle_min": ANGLES[0], "angle_max": ANGLES[-1], "angle_increment": ANGLES[1] - ANGLES[0],
                 "time_increment": 0.0, "scan_time": 0.1, "range_min": 0.05, "range_max": RANGE_MAX,
                 "ranges": (row[::-1] if self.bag.upside_down else row).astype(np.float32),
-                "intensities": np.zeros(0, np.float32), **self.bag.scan,
+                "intensities": np.zeros(0, np.float32), **self.bag.scan, **self.bag.each(k),
             }  # fmt: skip
             header = self.header("laser", stamp)
             for topic in ("/scan", "/scan2")[: 2 if "scan2" in self.bag.more else 1]:
@@ -160,7 +163,7 @@ class _Filler:
         twist = t["geometry_msgs/msg/TwistWithCovariance"](t["geometry_msgs/msg/Twist"](zero, zero), covariance)
         header = self.header("odom", stamp)
         self.put(
-            topic, "nav_msgs/msg/Odometry", stamp, header=header, child_frame_id="base_link", pose=with_covariance,
+            topic, "nav_msgs/msg/Odometry", stamp, header=header, child_frame_id=self.bag.child, pose=with_covariance,
             twist=twist,
         )  # fmt: skip
 

@@ -110,6 +110,53 @@ def test_where_an_lms_sees_nothing(tmp_path, longest, range_max):
     assert np.isinf(sweeps[0].ranges[3]) == (longest > range_max)
 
 
+@pytest.mark.parametrize(
+    ("stated", "longest", "range_max"),
+    [(81.92, 81.91, 80.0), (81.83, 81.83, 80.0), (80.0, 81.9, 80.0), (8.19, 8.187, 8.18), (81.9, 8.187, 8.18),
+     (30.0, 8.187, 30.0), (81.92, 7.5, 80.0)],
+)  # fmt: skip
+def test_what_a_header_states_of_an_lms_is_its_highest_code(tmp_path, stated, longest, range_max):
+    row = np.full(181, 2.0)
+    row[3] = longest
+    head = f"0 -1.570796 3.141593 0.0174533 {stated} 0.01 0 181 {words(row)} 0"
+    log, scans = read(write(tmp_path, [f"ROBOTLASER1 {head} 0 0 0 0 0 0 0 0 0 0 0 1.0 host 0.1"]))
+    assert log.range_max == range_max
+    assert np.isinf(scans[0].ranges[3]) == (longest >= range_max)
+    assert any("--range-max" in note for note in log.notes) == (stated != range_max)
+
+
+@pytest.mark.parametrize(("name", "range_max"), [("FLASER", 20.0), ("RLASER", 10.0), ("LASER3", 80.0)])
+def test_params_are_of_the_front_and_the_rear_laser(tmp_path, name, range_max):
+    line = f"{name} 181 {words(np.full(181, 2.0))} {{0}} 0 0 0 0 0 {{0}} host {{0}}"  # its poses are corrected
+    params = [
+        "PARAM robot_front_laser_max 20 h 0", "PARAM robot_rear_laser_max 10 h 0",
+        "PARAM robot_frontlaser_offset 0.3 h 0", "PARAM robot_rearlaser_offset -0.4 h 0",
+    ]  # fmt: skip
+    log, _ = read(write(tmp_path, [*params, line.format(1), line.format(2)]))
+    assert log.range_max == range_max
+    assert log.mount[0] == {"FLASER": 0.3, "RLASER": -0.4, "LASER3": 0.0}[name]
+
+
+def test_garbled_poses_are_counted_and_cost_no_scan(tmp_path):
+    lines = carmen()
+    poses = [k for k, line in enumerate(lines) if line.startswith("ODOM")]
+    lines[poses[2]] = "ODOM 1 2"
+    lines[poses[4]] = lines[poses[4]].replace("ODOM ", "ODOM x")
+    lines.insert(7, "TRUEPOS nan 0 0 0 0 0 1 h 1")
+    log, scans = read(write(tmp_path, lines))
+    assert len(scans) == SCANS
+    assert log.lost() == "garbled ODOM lines: 2, garbled TRUEPOS lines: 1"
+    assert not log.left_out
+
+
+def test_another_odometry_than_odom_is_refused(tmp_path):
+    with pytest.raises(UserError, match=r"--odom-topic ODOMETRY: .* only be ODOM, and this one has ODOM lines"):
+        read(write(tmp_path, carmen()), odom_topic="ODOMETRY")
+    lines = [line for line in carmen() if not line.startswith("ODOM")]
+    with pytest.raises(UserError, match="no ODOM lines"):
+        read(write(tmp_path, lines), odom_topic="ODOM")
+
+
 def test_two_lasers(tmp_path):
     rear = "RLASER 181 " + words(np.full(181, 3.0)) + " -0.2 0 3.141593 0 0 0 {0} host {0}"
     lines = [*carmen("ROBOTLASER1"), *(rear.format(k) for k in (1, 2, 3))]

@@ -11,11 +11,13 @@ from rich.console import Console
 from common import se2
 from common.errors import UserError
 from common.topics import ODOM, SCAN, TRUTH
+from common.world import load_world
+from presage.figure import draw_session
 from presage.inspection.info import survey
 from presage.localize import Job, choice_of, localize
 from presage.logs.importing import Import, import_command
 from presage.logs.log import Reading
-from presage.logs.words import reading_of
+from presage.logs.options import reading_of
 from presage.scan_files import read_scans
 from services.recorder.reader import read_recording
 from tests.presage.logs.drives import (
@@ -184,3 +186,33 @@ def test_words_that_are_not_known(said, why):
     usual = dict.fromkeys(("mount", "scan_topic", "odom_topic", "reference_topic", "base_frame", "angles"), "")
     with pytest.raises(UserError, match=why):
         reading_of(**{**usual, "clock": "sensor", **said}, reference=None, range_max=None, upside_down=None)
+
+
+def test_is_drawn_without_a_word(tmp_path):
+    """Without poses there is but a world; warnings are errors."""
+    out, _ = imported(make(tmp_path, "mcap"), world="corridor", reading=Reading(reference=False))
+    draw_session(out, tmp_path / "drive.png")
+    assert (tmp_path / "drive.png").stat().st_size > 10_000
+
+
+def test_an_rplidar_that_looks_all_round(tmp_path):
+    """The first direction is measured twice, in single precision a little more than a turn; beams come and go."""
+    exact = load_world("corridor")
+
+    def turn(k):
+        beams = 360 + (k * 11) % 9 - 4 if k else 360
+        first, last = np.float32(-np.pi), np.float32(np.pi)
+        angles = np.linspace(first, last, beams)
+        row = exact.ray_distances(se2.compose(truth(STAMPS[k]), MOUNT)[None], angles)[0]
+        row[::7] = (0.0, np.inf)[k % 2]
+        step = np.float32((last - first) / (beams - 1))
+        return {"angle_min": first, "angle_max": last, "angle_increment": step, "ranges": row.astype(np.float32)}
+
+    out, facts = imported(write_bag(tmp_path, Bag("ros1", each=turn, localised=True)), world="corridor")
+    assert (facts["scans"], facts["left_out"]) == (SCANS, {})
+    assert any("brought to the angles of the first" in note for note in facts["notes"])
+    assert read_recording(out).scanner().beams == 360
+    choice = choice_of(out, "", "precise", "exact", None, 0.02, 0, "")
+    job = Job.of(out, choice, "track", "base_link", Reading(), fresh=False, odometry=True, out=tmp_path / "p.json")
+    found = np.array([[row["x"], row["y"]] for row in localize(job, CONSOLE)])
+    assert np.hypot(*(found - truth(STAMPS)[:, :2]).T).max() < 0.02

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from common import se2
 from common.errors import UserError
+from common.world import load_world
 from presage.logs.log import Reading
 from presage.logs.opening import open_log
+from presage.logs.resampling import resampled
 from tests.presage.logs.drives import ANGLES, BEAMS, MOUNT, SCANS, STAMPS, Bag, believed, odom, ranges, truth, write_bag
 
 
@@ -66,7 +71,7 @@ def test_ranges_as_rep_117_has_them(tmp_path):
     row = np.full(BEAMS, 5.0, np.float32)
     row[:7] = np.nan, np.inf, -np.inf, 0.0, 0.01, 25.0, 30.0
     _, sweeps = read(write_bag(tmp_path, Bag(scan={"ranges": row})))
-    assert sweeps[0].ranges[:8].tolist() == [-np.inf, np.inf, -np.inf, -np.inf, -np.inf, np.inf, np.inf, 5.0]
+    assert sweeps[0].ranges[:8].tolist() == [0, np.inf, -np.inf, 0, -np.inf, np.inf, np.inf, 5.0]
 
 
 def test_the_longest_range_may_be_said(tmp_path):
@@ -97,11 +102,20 @@ def test_odometry_from_tf_where_there_is_no_topic(tmp_path):
     close([sweep.odom for sweep in sweeps], odom(STAMPS))
 
 
+def test_odometry_of_a_frame_that_tf_does_not_know_is_said_once(tmp_path):
+    log, scans = read(write_bag(tmp_path, Bag(child="wheels")))
+    (note,) = log.notes
+    assert note.startswith("/odom has poses of wheels, and tf does not say where that sits on base_link")
+    close([scan.odom for scan in scans], odom(STAMPS))
+    with pytest.raises(UserError, match="--odom-topic /odm: no topic of that name and type; it has /odom"):
+        read(tmp_path / "drive", odom_topic="/odm")
+
+
 def test_without_tf_the_mount_must_be_said(tmp_path):
     path = write_bag(tmp_path, Bag(tf=False))
     with pytest.raises(UserError, match="tf does not say where laser sits on base_link: say it with --mount"):
         read(path)
-    assert read(path, mount=MOUNT)[0].mount is MOUNT
+    np.testing.assert_array_equal(read(path, mount=MOUNT)[0].mount, MOUNT)
 
 
 def test_several_scanners_and_odometries(tmp_path):
@@ -125,3 +139,60 @@ def test_no_scan_in_it(tmp_path):
     path = write_bag(tmp_path, Bag(scan={"ranges": np.zeros(0, np.float32)}))
     with pytest.raises(UserError, match="/scan has no scan of three beams"):
         read(path)
+
+
+def test_a_scanner_whose_beams_come_and_go(tmp_path):
+    """As an RPLIDAR: another number of beams in every turn, from the first angle to the last."""
+    exact = load_world("corridor")
+
+    def turn(k):
+        beams = 2 * BEAMS + (k * 7) % 5 - 2 if k else 2 * BEAMS
+        angles = np.linspace(ANGLES[0], ANGLES[-1], beams)
+        row = exact.ray_distances(se2.compose(truth(STAMPS[k]), MOUNT)[None], angles)[0]
+        row[5] = 0.0  # no answer there
+        step = (ANGLES[-1] - ANGLES[0]) / (beams - 1)
+        return {"angle_increment": step, "ranges": row.astype(np.float32)}
+
+    log, scans = read(write_bag(tmp_path, Bag(each=turn)))
+    assert len(scans) == SCANS
+    assert not log.left_out
+    assert any("scans of other beams are brought to the angles of the first" in note for note in log.notes)
+    for stamp, scan in zip(STAMPS, scans, strict=True):
+        wanted = exact.ray_distances(se2.compose(truth(stamp), MOUNT)[None], log.angles)[0]
+        off = np.abs(scan.ranges - wanted)
+        assert scan.ranges[5] == 0
+        assert np.median(off) < 1e-3
+        assert np.mean(off < 0.01 * wanted) > 0.95  # at an edge the nearer beam speaks
+
+
+def test_scans_that_cannot_stand_for_the_first_are_counted(tmp_path):
+    def turn(k):
+        if k == 1:  # too few beams, far apart
+            return {"ranges": np.ones(9, np.float32), "angle_increment": np.pi / 8}
+        if k == 2:  # looks elsewhere
+            return {"angle_min": np.pi / 2, "angle_max": 3 * np.pi / 2}
+        return {"ranges": np.ones(1, np.float32)} if k == 3 else {}
+
+    log, scans = read(write_bag(tmp_path, Bag(each=turn)))
+    assert len(scans) == SCANS - 3
+    assert dict(log.left_out) == {"scans of other beams": 2, "scans without beams": 1}
+
+
+def test_angles_that_differ_by_a_rounding_are_the_same(tmp_path):
+    step = ANGLES[1] - ANGLES[0]
+    log, scans = read(write_bag(tmp_path, Bag(each=lambda k: {"angle_increment": step * (1 + 1e-7 * k)})))
+    np.testing.assert_allclose([scan.ranges for scan in scans], ranges(), rtol=1e-6)
+    assert not log.left_out
+    assert not any("other beams" in note for note in log.notes)
+
+
+@given(st.integers(20, 400), st.floats(0.3, 0.9), st.floats(-np.pi, np.pi))
+def test_a_round_room_looks_the_same_from_other_beams(beams, share, first):
+    """All round, from any first direction on; never a range that neither neighbour has."""
+    angles = first + 2 * np.pi / beams * np.arange(beams)
+    wanted = -np.pi + 2 * np.pi / 90 * np.arange(90)
+    found = resampled(np.where(np.arange(beams) / beams < share, 2.0, 7.0), angles, wanted)
+    if beams < 90 / 4:
+        assert found is None
+    else:
+        assert set(found.tolist()) <= {2.0, 7.0}

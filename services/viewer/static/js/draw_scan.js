@@ -43,7 +43,7 @@ export function drawMeasured(ctx, camera, frame, pose, colours) {
   ctx.beginPath();
   for (let i = 0; i < frame.ranges.length; i++) {
     const r = frame.ranges[i];
-    if (!Number.isFinite(r)) continue;
+    if (!Number.isFinite(r) || r <= 0) continue; // 0: not measured
     const [c, s] = ray(i);
     const [px, py] = camera.toScreen(pose.x + r * c, pose.y + r * s);
     ctx.rect(px - size / 2, py - size / 2, size, size);

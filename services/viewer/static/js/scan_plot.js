@@ -97,7 +97,7 @@ function drawMeasured(ctx, { ranges }, x, y, colours) {
   ctx.fillStyle = colours.measured;
   ctx.beginPath();
   for (let i = 0; i < ranges.length; i++) {
-    if (Number.isFinite(ranges[i])) ctx.rect(x(i) - 1.2, y(ranges[i]) - 1.2, 2.4, 2.4);
+    if (Number.isFinite(ranges[i]) && ranges[i] > 0) ctx.rect(x(i) - 1.2, y(ranges[i]) - 1.2, 2.4, 2.4);
   }
   ctx.fill();
 }

@@ -6,20 +6,9 @@ import re
 
 import numpy as np
 
-from common.config import POSE_TEXT
 from common.errors import UserError
-from common.se2 import Array
+from common.pose_text import NUMBER, pose_of_text
 from presage.logs.log import Reading
-
-NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)"
-
-
-def pose_of(text: str, option: str) -> Array:
-    """(3,) m, m, rad from x,y[,yaw_deg]; raises UserError."""
-    if not re.fullmatch(POSE_TEXT, text) or not text:
-        raise UserError(f"{option} {text!r}: give x,y,yaw_deg, such as 3,1.5,90")
-    numbers = [float(part) for part in text.split(",")]
-    return np.array([*numbers[:2], np.deg2rad(numbers[2]) if len(numbers) > 2 else 0.0])
 
 
 def angles_of(text: str) -> tuple[float, float]:
@@ -40,6 +29,6 @@ def reading_of(
     if clock not in ("sensor", "logger"):
         raise UserError(f"no clock {clock!r}: choose sensor or logger")
     return Reading(
-        pose_of(mount, "--mount") if mount else None, scan_topic, odom_topic, base_frame, upside_down, reference,
+        pose_of_text(mount, "--mount") if mount else None, scan_topic, odom_topic, base_frame, upside_down, reference,
         reference_topic, angles_of(angles) if angles else None, range_max, clock,  # type: ignore[arg-type]
     )  # fmt: skip
