@@ -8,9 +8,9 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from common.config import NUMBER, ServiceSettings
+from common.config import NUMBER
 from common.errors import UserError
-from common.robot import Robot
+from common.robot_settings import RobotSettings
 from services.bridge_ros2.frames import Mount
 from services.bridge_ros2.keys import NAME, Names, full_name
 
@@ -19,7 +19,7 @@ ENDPOINTS = r"^[a-z]+/[^\s,]+(,[a-z]+/[^\s,]+)*$"
 FRAME = r"^[A-Za-z0-9_./-]{1,64}$"
 
 
-class BridgeRos2Settings(ServiceSettings):
+class BridgeRos2Settings(RobotSettings):
     """Bridge to ROS 2: a robot, or Gazebo, in the simulator's place; presage in AMCL's. Needs no ROS here.
 
     On the robot: RMW_IMPLEMENTATION=rmw_zenoh_cpp and `ros2 run rmw_zenoh_cpp rmw_zenohd`, or zenoh-bridge-ros2dds.
@@ -48,7 +48,6 @@ class BridgeRos2Settings(ServiceSettings):
             "upside_down",
             "stamped",
             "commands",
-            "radius",
             "tf",
         }
     )
@@ -119,10 +118,6 @@ class BridgeRos2Settings(ServiceSettings):
     ] = ""
     upside_down: Annotated[bool, Field(description="with --mount: its z axis points down")] = False
 
-    drive: Annotated[Literal["holonomic", "differential"], Field(description="of the robot")] = "holonomic"
-    radius: Annotated[float, Field(gt=0, le=5, description="of the robot, m, for the obstacle stop")] = 0.27
-    max_speed: Annotated[float, Field(gt=0, le=10, description="m/s, whatever is commanded")] = 1.0
-    acceleration: Annotated[float, Field(gt=0, le=20, description="m/s², with which it can brake")] = 1.0
     obstacle_stop: Annotated[bool, Field(description="slow commands down before what the scan shows")] = True
 
     def names(self) -> Names:
@@ -132,12 +127,6 @@ class BridgeRos2Settings(ServiceSettings):
     def topic(self, name: str) -> str:
         """A topic's absolute name."""
         return full_name(name, self.namespace)
-
-    def the_robot(self) -> Robot:
-        """Its limits."""
-        return Robot(
-            drive=self.drive, radius=self.radius, max_speed=self.max_speed, acceleration=self.acceleration
-        )  # fmt: skip
 
     def the_mount(self) -> Mount | None:
         """How the laser sits, where it was said."""

@@ -24,12 +24,14 @@ def belief_at(pose, stamp_ns, state="tracking", hypotheses=()):
     )  # fmt: skip
 
 
-def drive(world, robot, start, goal, limit=900, *, known=None, change=None, more=None, seed=0, stop=True):
+def drive(
+    world, robot, start, goal, limit=900, *, known=None, change=None, more=None, seed=0, stop=True, scanner=SCANNER
+):
     """Scans until it is there: true poses, statuses, contacts, scans held back. ``known`` is the controller's map.
 
     Without ``stop`` nobody holds the wheels back but the controller.
     """
-    simulation = Simulation(Setup(world, SCANNER, robot, start, seed, obstacle_stop=stop))
+    simulation = Simulation(Setup(world, scanner, robot, start, seed, obstacle_stop=stop))
     navigator = Navigator(robot, world=known or world, preset=Pilot(robot, known or world))
     navigator.hear_goal(
         Goal(stamp_ns=0, pose=Pose(x=goal[0], y=goal[1], yaw=(more or {}).pop("yaw", 0)), **(more or {}))
