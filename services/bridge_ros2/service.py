@@ -51,7 +51,7 @@ class BridgeRos2Service(Service):
         """Nothing is reached yet."""
         super().__init__(settings)
         self.options = settings
-        self.graph = Graph()
+        self.graph = Graph(settings.names())
         self.motion = Motion(settings.base_frame, settings.odom_frame, settings.the_mount())
         self.wheels = Wheels(settings.the_robot(), obstacle_stop=settings.obstacle_stop)
         self.note = f"waits for the zenoh router at {settings.ros_connect}"
