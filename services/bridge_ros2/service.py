@@ -54,6 +54,7 @@ class BridgeRos2Service(Service):
         self.graph = Graph(settings.names())
         self.motion = Motion(settings.base_frame, settings.odom_frame, settings.the_mount())
         self.wheels = Wheels(settings.the_robot(), obstacle_stop=settings.obstacle_stop)
+        self.blind = settings.the_blind()
         self.note = f"waits for the zenoh router at {settings.ros_connect}"
         self._ros: RosSession | None = None
         self._out: dict[str, RosPublisher] = {}
@@ -193,8 +194,8 @@ class BridgeRos2Service(Service):
             self.publish(ODOM, odom_of(dead))
         else:
             self.counters["scans_without_odometry"] += 1
-        self.wheels.hear_scan(scan, now)
-        self.publish(SCAN, scan)
+        self.wheels.hear_scan(self.blind.seen(scan), now)
+        self.publish(SCAN, self.blind.silenced(scan))
         self._scan_at, self._problem = now, ""
 
     def _hear_initial_pose(self, message: Any) -> None:

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from common.config import NUMBER
 from common.errors import UserError
-from common.robot_settings import RobotSettings
+from common.robot_settings import SeenRobotSettings
 from services.bridge_ros2.frames import Mount
 from services.bridge_ros2.keys import NAME, Names, full_name
 
@@ -19,7 +19,7 @@ ENDPOINTS = r"^[a-z]+/[^\s,]+(,[a-z]+/[^\s,]+)*$"
 FRAME = r"^[A-Za-z0-9_./-]{1,64}$"
 
 
-class BridgeRos2Settings(RobotSettings):
+class BridgeRos2Settings(SeenRobotSettings):
     """Bridge to ROS 2: a robot, or Gazebo, in the simulator's place; presage in AMCL's. Needs no ROS here.
 
     On the robot: RMW_IMPLEMENTATION=rmw_zenoh_cpp and `ros2 run rmw_zenoh_cpp rmw_zenohd`, or zenoh-bridge-ros2dds.

@@ -131,7 +131,9 @@ class Seeker:
 
     def _wander(self, belief: Belief, scan: Scan, around: Around, velocity: Array) -> Decision:
         """Towards the most room, rather ahead than aside."""
-        ranges = np.minimum(np.where(np.isneginf(scan.ranges), 0.0, scan.ranges.astype(np.float64)), 5.0)
+        # Where nothing is said (too close, or cut out), nothing is known to be free.
+        said = np.isfinite(scan.ranges) | np.isposinf(scan.ranges)
+        ranges = np.minimum(np.where(said, scan.ranges.astype(np.float64), 0.0), 5.0)
         angles = scan.angles() + scan.mount.yaw
         sweep = Sweep.of(scan)
         half = max(1, round(WINDOW / max(sweep.spacing, WINDOW / 1000)))

@@ -51,6 +51,7 @@ class ControllerService(Service):
         self.options = settings
         self.navigator = Navigator()
         self.pilot: Pilot | None = None
+        self.blind = settings.the_blind()
         self._last: tuple[int, CmdVel, Status] | None = None
         self._waiting: Belief | None = None  # for predictions
         self._questioning_ns = 0
@@ -93,7 +94,7 @@ class ControllerService(Service):
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
         """A belief is answered by a command of the same stamp; a goal by a status, at once."""
         if isinstance(message, Scan):
-            self.navigator.hear_scan(message)
+            self.navigator.hear_scan(self.blind.seen(message))
             if self._early is not None and self._early.stamp_ns <= message.stamp_ns:
                 self._take_early()
             # A hand needs no belief, and so no estimator.

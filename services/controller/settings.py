@@ -7,10 +7,10 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from common.errors import UserError
-from common.robot_settings import RobotSettings
+from common.robot_settings import SeenRobotSettings
 
 
-class ControllerSettings(RobotSettings):
+class ControllerSettings(SeenRobotSettings):
     """Action controller: from each belief, and the goal preferred, a velocity command.
 
     Examples:
@@ -46,6 +46,7 @@ class ControllerSettings(RobotSettings):
     def check(self) -> None:
         """Raises UserError where settings do not go together."""
         self.the_robot()
+        self.the_blind()
         if self.preset == "geodesic" and not self.world:
             raise UserError("preset geodesic needs a map: give --world, or --preset paper")
         if self.preset == "paper" and self.drive != "holonomic":
