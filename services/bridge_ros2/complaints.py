@@ -41,6 +41,9 @@ def _with_scans(options: BridgeRos2Settings, graph: Graph, *, reckoned: bool) ->
         return (
             f"no odometry of the scans' moments {where}, so no transform from map to odom: --odom-topic, --tf map-base"
         )
+    chart = options.topic(options.map_topic)
+    if options.publish_map and (other := graph.publishers(chart)):
+        return f"{chart}: {other} publishes a map there as well: leave out --publish-map, or --map-topic"
     command = options.topic(options.cmd_topic)
     wanted = graph.twist_wanted(command) if options.commands else ""
     if wanted and (wanted == TWIST_STAMPED) != options.stamped:

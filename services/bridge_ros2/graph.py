@@ -71,6 +71,11 @@ class Graph:
             return f"nobody publishes it; {kind} is on {_some(others)}: {option}"
         return f"nobody publishes it, nor any other {kind}; there are {_some(sorted({e.topic for e in publishers}))}"
 
+    def publishers(self, topic: str) -> str:
+        """Who publishes a topic beside us; empty: nobody."""
+        there = [each for each in self.endpoints() if each.publishes and each.topic == topic]
+        return _nodes(there) if there else ""
+
     def twist_wanted(self, topic: str) -> str:
         """The type that subscriptions on the command topic have; empty where there is none, or both are there."""
         kinds = {e.kind for e in self.endpoints() if not e.publishes and e.topic == topic}

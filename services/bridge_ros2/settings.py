@@ -30,6 +30,7 @@ class BridgeRos2Settings(SeenRobotSettings):
       python -m services.bridge_ros2 --ros-connect tcp/ROBOT:7447 --flavor ros2dds   through zenoh-bridge-ros2dds
       python -m services.bridge_ros2 --distro humble --cmd-topic cmd_vel --drive differential
       python -m services.bridge_ros2 --namespace robot1 --scan-topic scan --stamped
+      python -m services.bridge_ros2 --publish-map --world my.yaml        rviz and nav2 without a map_server
       python -m services.bridge_ros2 --mount 0.1,0,180 --upside-down      where tf does not say how the laser sits
 
     More, with TurtleBot, TIAGo, rviz and nav2: docs/ros2.md.
@@ -98,6 +99,14 @@ class BridgeRos2Settings(SeenRobotSettings):
     commands: Annotated[
         bool, Field(description="pass velocity commands and goals on; --no-commands: others drive, such as nav2")
     ] = True
+
+    publish_map: Annotated[
+        bool, Field(description="publish the world as OccupancyGrid, in map_server's place; not where one runs")
+    ] = False
+    map_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="of --publish-map")] = "map"
+    world: Annotated[
+        str, Field(description="of --publish-map: shipped world, world file or ROS map.yaml, that of the estimator")
+    ] = "corridor"
 
     map_frame: Annotated[str, Field(pattern=FRAME, description="the world")] = "map"
     odom_frame: Annotated[str, Field(pattern=FRAME, description="of dead reckoning")] = "odom"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from services.bridge_ros2.complaints import complaint
 from services.bridge_ros2.graph import Graph
 from services.bridge_ros2.keys import Names, Node, Qos
-from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, TWIST, TWIST_STAMPED, type_hash
+from services.bridge_ros2.ros_types import LASER_SCAN, OCCUPANCY_GRID, ODOMETRY, TWIST, TWIST_STAMPED, type_hash
 from services.bridge_ros2.settings import BridgeRos2Settings
 
 ROBOT = Node(Names(), "ab", "", "driver")
@@ -127,6 +127,16 @@ def test_a_distro_that_does_not_fit_is_named_though_scans_come():
     assert said(scans, rviz, distro="humble") == ""
     assert "--distro humble" in said(scans, rviz, distro="jazzy")
     assert said(listens, rviz, distro="jazzy") == said(listens, rviz, distro="humble") == ""
+
+
+def test_a_second_map_is_named():
+    graph = Graph()
+    graph.change(token("MP", "/map", OCCUPANCY_GRID), there=True)
+    for publish, says in ((True, "/map: /driver publishes a map there as well: leave out --publish-map"), (False, "")):
+        settings = BridgeRos2Settings(publish_map=publish)
+        said = complaint(settings, graph, "", linked=True, quiet=0.0, heard=True, reckoned=True)
+        assert said.startswith(says)
+        assert bool(said) is publish
 
 
 def test_a_token_of_a_domain_that_is_no_number_is_nobodys():

@@ -7,13 +7,17 @@ from collections import deque
 
 import numpy as np
 import pytest
+import zenoh
+import zenoh.ext
 
 from common import se2
 from common.bus import Link, open_bus, wait_until
 from common.inbox import Inbox, Sample
 from common.messages import CmdVel, Goal, Health, Odom, Scan, Twist
+from common.raster import rasterised
 from common.requests import LocaliseRequest, Reply
 from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, LOCALISE, ODOM, SCAN
+from common.world import load_world
 from tests.bridge_ros2 import independent as other
 from tests.bridge_ros2.made import belief
 from tests.conftest import PATIENCE, Processes
@@ -53,7 +57,7 @@ class Beside:
     """What the bridge joins, in the test's hands."""
 
     def __init__(self, bus, node) -> None:
-        self.bus, self.stamp = bus, BEGIN
+        self.bus, self.node, self.stamp = bus, node, BEGIN
         self.inbox, self.calls, self.kept = Inbox(), Inbox(), deque(maxlen=100)
         self.heard = {"amcl_pose": [], "tf": [], "cmd_vel": []}
         for topic in (SCAN, ODOM, GOAL, HEALTH):
@@ -103,7 +107,8 @@ def beside(tmp_path_factory, router):
         with open_bus(link) as bus, Ros(router, "rmw_zenoh", "jazzy") as node:
             found = Beside(bus, node)
             environment = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": "rover"}
-            bridge = processes.start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{router}", env=environment)
+            args = ("--ros-connect", f"tcp/127.0.0.1:{router}", "--publish-map", "--world", "maze")
+            bridge = processes.start("bridge_ros2", *args, env=environment)
             bridge.wait_for("ready")
             assert bus.wait_matching(BELIEF, PATIENCE)
             assert bus.wait_matching(CMD_VEL, PATIENCE)
@@ -177,6 +182,40 @@ def test_rvizs_two_buttons(beside):
     beside.put["goal_pose"](posed(5, 1))
     goal = beside.next(Goal)
     assert (goal.pose.x, goal.pose.y, goal.seq) == (5, 1, 0)
+
+
+def test_the_map_is_there_for_who_comes_later(beside):
+    """As rmw_zenoh's transient-local subscriptions ask for it: history of an advanced subscriber, at once."""
+    key = "0/map/nav_msgs::msg::dds_::OccupancyGrid_/*"
+
+    def ask():
+        """What comes first to who wants history; whether it was said again just then, to anybody."""
+        heard, again = [], []
+        plain = beside.node.session.declare_subscriber(key, again.append)
+        late = zenoh.ext.declare_advanced_subscriber(
+            beside.node.session, key, heard.append,
+            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+        )  # fmt: skip
+        try:
+            assert wait_until(lambda: bool(heard), PATIENCE)
+            return heard, bool(again)
+        finally:
+            late.undeclare()
+            plain.undeclare()
+
+    heard, again = ask()
+    if again:  # the next time is far off
+        heard, again = ask()
+    assert not again
+    sample = heard[0]
+    assert len(sample.attachment.to_bytes()) == 33
+    said = other.decode("nav_msgs/msg/OccupancyGrid", sample.payload.to_bytes())
+    grid = rasterised(load_world("maze"))
+    assert (said.info.width, said.info.height, said.header.frame_id) == (grid.width, grid.height, "map")
+    np.testing.assert_array_equal(np.array(said.data, np.int8).view(np.uint8), grid.values.ravel())
+    tokens = beside.node.session.liveliness().get("@ros2_lv/0/**")
+    (token,) = [str(reply.ok.key_expr) for reply in tokens if reply.ok and "/%map/" in str(reply.ok.key_expr)]
+    assert token.endswith("/:1:,1:,:,:,,")
 
 
 def test_it_says_what_it_waits_for_and_what_is_wrong(processes, router):
