@@ -25,7 +25,12 @@ class RobotSettings(ServiceSettings):
     ] = "holonomic"
     radius: Annotated[
         float,
-        Field(gt=0, le=5, allow_inf_nan=False, description="of the robot, m: from base_link to its farthest corner"),
+        Field(
+            gt=0,
+            le=5,
+            allow_inf_nan=False,
+            description="of the robot, m: from base_link to its farthest corner; what it keeps from walls",
+        ),
     ] = 0.27
     max_speed: Annotated[
         float,

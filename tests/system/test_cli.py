@@ -23,6 +23,7 @@ WRONG = [
         ("up", "--radius", "nan", "--port", "0"),
         "presage: radius: Input should be a finite number (--radius, PRESAGE_RADIUS)",
     ),
+    (("demo", "--model", "exakt", "--out", "{tmp}/m"), "presage: no model 'exakt': give learned, exact"),
     (("demo", "--world", "{tmp}/no.yaml"), "give a file or one of"),
     (("demo", "--goal", "6.8", "3.95"), "from a wall of 'corridor'"),
     (("up", "--world", "maze", "--estimator", "paper", "--port", "0"), "presage train --world maze"),
