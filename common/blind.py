@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 WIDE = float(np.deg2rad(30))  # a blind sector wider than this is taken out of the field of view; a post is not
 
 
+SILENT = -np.inf  # of a beam on the bus
+
+
 @dataclass(frozen=True)
 class Blind:
     """Of one scanner; nothing is cut out unless told."""
@@ -35,7 +38,7 @@ class Blind:
 
     def silenced(self, scan: Scan) -> Scan:
         """For the bus: beams cut out are -inf."""
-        return self._with(scan, self._cut(scan), -np.inf) if self.anything else scan
+        return self._with(scan, self._cut(scan), SILENT) if self.anything else scan
 
     def seen(self, scan: Scan) -> Scan:
         """For who brakes and plans, never for the bus: beams cut out are NaN; a wide sector is no more in the sweep.
@@ -66,8 +69,10 @@ class Blind:
         return cut
 
     def _cut(self, scan: Scan) -> npt.NDArray[np.bool_]:
-        """(B,) too near as well; what is too close to say (-inf) is."""
-        return np.asarray(self._by_angle(scan) | (scan.ranges < np.float32(self.radius)) & (self.radius > 0))
+        """(B,) too near as well; what is too close to say (-inf) is, and 0, which is no distance, is not."""
+        if not self.radius:
+            return self._by_angle(scan)
+        return np.asarray(self._by_angle(scan) | (scan.ranges < np.float32(self.radius)) & (scan.ranges != 0))
 
     @staticmethod
     def _with(scan: Scan, cut: npt.NDArray[np.bool_], value: float) -> Scan:

@@ -66,10 +66,7 @@ def _nobody(options: BridgeRos2Settings, graph: Graph) -> str:
     where = f"nothing of ROS is heard at {options.ros_connect}: is that the robot's, and not presage's own router?"
     if options.flavor == "ros2dds":
         return f"{where} does zenoh-bridge-ros2dds run there, in the ROS_DOMAIN_ID of the robot's nodes?"
-    return (
-        f"{where} do its nodes run with RMW_IMPLEMENTATION=rmw_zenoh_cpp, started after rmw_zenohd, "
-        "and does ros2 topic list show them there?"
-    )
+    return f"{where} do its nodes run with RMW_IMPLEMENTATION=rmw_zenoh_cpp, and does ros2 topic list show them there?"
 
 
 def _numbers(domains: list[int]) -> str:

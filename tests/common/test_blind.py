@@ -56,6 +56,8 @@ def test_a_blind_radius():
     ranges = [-np.inf, 0.1, 0.19, 0.2, 0.25, 3.0, np.inf]
     found = blind(blind_radius=0.2).seen(scan(7, ranges=ranges))
     np.testing.assert_array_equal(found.ranges, np.float32([np.nan, np.nan, np.nan, 0.2, 0.25, 3, np.inf]))
+    zero = blind(blind_radius=0.2).silenced(scan(3, ranges=[0.0, 0.1, 1.0]))
+    np.testing.assert_array_equal(zero.ranges, np.float32([0, -np.inf, 1]))  # 0 is no distance
     found = blind(ignore_angles="1:2").seen(scan(7, ranges=ranges))
     np.testing.assert_array_equal(found.ranges, np.float32(ranges))  # nothing too close is cut out without
 
