@@ -69,6 +69,7 @@ class Member:
 
     robot: str
     child: subprocess.Popen[str] | None = None
+    passing: threading.Thread | None = None  # its output on
     began: float = 0.0  # s, monotonic
     wait: float = FIRST_WAIT  # s, before it is started again
     due: float | None = 0.0  # s, monotonic: when it is started; None: no more
@@ -129,7 +130,8 @@ class Fleet:
             preexec_fn=dying_with_us(),  # noqa: PLW1509 - one call, before any thread of the child
         )
         member.began, member.due = now, None
-        threading.Thread(target=_pass_on, args=(member.robot, member.child), daemon=True).start()
+        member.passing = threading.Thread(target=_pass_on, args=(member.robot, member.child), daemon=True)
+        member.passing.start()
 
     def _end(self) -> None:
         """Ask all, then kill those that do not listen."""
@@ -143,6 +145,9 @@ class Fleet:
             except subprocess.TimeoutExpired:
                 child.kill()
                 child.wait()
+        for member in self.members:
+            if member.passing is not None:  # their last words; a grandchild may hold the pipe open for ever
+                member.passing.join(LOOK)
 
 
 def _refuse(why: str) -> int:

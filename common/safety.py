@@ -44,7 +44,8 @@ def ramp(current: Array, wanted: Array, robot: Robot, dt: float, *, hard: bool =
 
     ``hard``: as fast as the base can, which is meant for standing.
     """
-    change, harder = wanted - current, robot.braking / robot.acceleration if hard else 1.0
+    # Hard is never less than at ease, whatever the base's own acceleration.
+    change, harder = wanted - current, max(1.0, robot.braking / robot.acceleration) if hard else 1.0
     linear, most = float(np.hypot(change[0], change[1])), robot.acceleration * harder * dt
     scale = min(1.0, most / linear) if linear > 0 else 1.0
     turn = robot.turn_acceleration * harder * dt

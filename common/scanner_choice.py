@@ -81,7 +81,8 @@ def chosen_scanner(
 ) -> Scanner:
     """A known scanner or a file's, with what was asked for instead of its own; raises UserError.
 
-    ``mount`` is x,y[,yaw_deg] in base_link, in m and deg; empty or None: the scanner's own.
+    ``noise`` is the standard deviation of a range in m; ``mount`` is x,y[,yaw_deg] in base_link, in m and deg.
+    Empty or None: the scanner's own.
     """
     scanner = load_scanner(name).with_beams(beams)
     changes: dict[str, Any] = {}
@@ -91,7 +92,10 @@ def chosen_scanner(
         changes["mount"] = tuple(map(float, pose_of_text(mount, "--mount")))
     if upside_down is not None:
         changes["upside_down"] = upside_down
-    return scanner.model_copy(update=changes) if changes else scanner
+    try:
+        return Scanner.model_validate({**scanner.model_dump(), **changes}) if changes else scanner
+    except ValidationError as error:
+        raise UserError(f"{scanner.name} with --noise {noise}: {first_fault(error)}") from None
 
 
 def scanner_arguments(name: str, beams: int | None, mount: str, *, upside_down: bool) -> tuple[str, ...]:

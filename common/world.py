@@ -116,6 +116,14 @@ class World(Model):
             return _signed(points, self.free_space)
         return self._off_furniture(points, 0.0 - self.grid.shapes.distance(FREE, points))
 
+    def why_no_room(self, place: Array, radius: float) -> str | None:
+        """Why a robot of ``radius`` m cannot stand at ``place`` (2,) or a pose, or None."""
+        clearance = float(self.clearance(place[:2])[0])
+        if clearance >= radius:
+            return None
+        what = "is inside a wall or outside" if clearance < 0 else f"is {clearance:.2f} m from a wall of"
+        return f"({place[0]:.2f}, {place[1]:.2f}) {what} {self.name!r}; the robot needs {radius:g} m around it"
+
     def clearances(self, x: Array, y: Array) -> Array:
         """(len(y), len(x)) m: `clearance` of the nodes of a lattice in map, ascending."""
         nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

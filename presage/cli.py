@@ -25,10 +25,14 @@ from presage import (
     cli_tools,
 )
 from presage.options import (
+    Acceleration,
     Beams,
     Connect,
+    DriveName,
     EstimatorName,
     Json,
+    MaxSpeed,
+    MaxTurn,
     ModelName,
     MountText,
     OpenPage,
@@ -36,15 +40,18 @@ from presage.options import (
     PeopleSpeed,
     Port,
     PriorName,
+    Radius,
     RobotName,
     ScannerName,
     Seed,
     StartPose,
+    TurnAcceleration,
     UpsideDown,
     Viewer,
     WorldName,
     console,
     link_of,
+    robot_arguments,
 )
 from presage.output import make_folder
 from presage.stack import ignoring_interrupts, interruptible
@@ -65,7 +72,7 @@ app = typer.Typer(
 def up(
     world: WorldName = "corridor",
     beams: Beams = None,
-    drive: Annotated[str, typer.Option(help="holonomic or differential.")] = "holonomic",
+    drive: DriveName = "holonomic",
     pace: Annotated[str, typer.Option(help="realtime, fast or lockstep.")] = "realtime",
     seed: Seed = 0,
     record: Annotated[Path | None, typer.Option(help="Record into this folder.")] = None,
@@ -86,6 +93,11 @@ def up(
     scanner: ScannerName = "tim571",
     mount: MountText = "",
     upside_down: UpsideDown = False,
+    radius: Radius = None,
+    max_speed: MaxSpeed = None,
+    max_turn: MaxTurn = None,
+    acceleration: Acceleration = None,
+    turn_acceleration: TurnAcceleration = None,
 ) -> None:
     """Start router, simulator, estimator, controller and the live page here, until Ctrl-C.
 
@@ -94,14 +106,15 @@ def up(
     `presage up --record recordings --seed 7`; `presage up --world my.yaml --port 7500`; `presage up --no-viewer`;
     `presage up --world office --people 10 --start 9,3.5,90`; `presage up --robots 3`, then
     `presage goal 15 1.5 --robot robot-2`; `presage up --scanner my-laser.yaml`;
-    `presage up --scanner rplidar-a1 --mount=-0.1,0,180 --upside-down`.
+    `presage up --scanner rplidar-a1 --mount=-0.1,0,180 --upside-down`;
+    `presage up --drive differential --radius 0.105 --max-speed 0.22 --mount=-0.032,0` (a TurtleBot 3).
     """
     from presage.up import run_up  # noqa: PLC0415
 
     run_up(
         world=world,
         scanner=scanner_arguments(scanner, beams, mount, upside_down=upside_down),
-        drive=drive,
+        limits=robot_arguments(drive, radius, max_speed, max_turn, acceleration, turn_acceleration),
         pace=pace,
         seed=seed,
         record=record,

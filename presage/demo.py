@@ -20,6 +20,7 @@ from common.robot import Robot
 from common.topics import BELIEF, GOAL, HEALTH, STATUS, TRUTH
 from common.versions import commit
 from common.world import World, load_world
+from presage.checking import check_services
 from presage.figure import draw_session
 from presage.options import credentials_for
 from presage.output import check_file, make_folder, write_json
@@ -59,16 +60,19 @@ def run_demo(demo: Demo, stack: Stack, console: Console) -> tuple[Path, bool]:
     make_folder(demo.out, "--out")
     # A name of its own: others may record into the same folder in the same second.
     began = datetime.now(timezone.utc).strftime("%Y%m%d-%H%M%S")
+    perceiving = ["--world", demo.world, *demo.estimator]
+    driving = controller_arguments(demo.world, demo.estimator, lockstep=demo.pace == "lockstep")
+    simulator = ["--world", demo.world, "--beams", str(demo.beams), "--seed", str(demo.seed), "--pace", demo.pace]
+    simulator += ["--people", str(demo.people)]
+    check_services(demo.world, perceiving, driving, simulator)
     recording = demo.out / f"presage-{stack.robot}-{began}-{secrets.token_hex(3)}.mcap"
     stack.start_router()
     with open_bus(stack.link()) as bus:
         watch = Watch(bus, TRUTH, BELIEF, STATUS, HEALTH)
         page = demo.viewer and start_page(stack, demo.out, console)
         stack.start("recorder", "--directory", str(demo.out), "--file", recording.name)
-        stack.start("controller", *controller_arguments(demo.world, demo.estimator, lockstep=demo.pace == "lockstep"))
-        stack.start("estimator", "--world", demo.world, *demo.estimator)
-        simulator = ["--world", demo.world, "--beams", str(demo.beams), "--seed", str(demo.seed), "--pace", demo.pace]
-        simulator += ["--people", str(demo.people)]
+        stack.start("controller", *driving)
+        stack.start("estimator", *perceiving)
         if demo.pace != "realtime":  # time must not have run off before the others see it
             simulator += ["--wait-for", "estimator,controller,recorder"]
         stack.start("simulator", *simulator)

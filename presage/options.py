@@ -56,6 +56,27 @@ StartPose = Annotated[
     str,
     typer.Option(envvar="PRESAGE_START", help="Where the robot stands at first: x,y[,yaw_deg]; none: the world's own."),
 ]
+DriveName = Annotated[
+    str, typer.Option("--drive", envvar="PRESAGE_DRIVE", help="Of the robot: holonomic or differential.")
+]
+Radius = Annotated[
+    float | None,
+    typer.Option(envvar="PRESAGE_RADIUS", help="Of the robot, m; none: 0.27. It stays that far from walls."),
+]
+MaxSpeed = Annotated[
+    float | None, typer.Option(envvar="PRESAGE_MAX_SPEED", help="Of the robot, m/s; none: 1. No command is faster.")
+]
+MaxTurn = Annotated[
+    float | None, typer.Option(envvar="PRESAGE_MAX_TURN", help="Of the robot, rad/s; none: 2. No command turns faster.")
+]
+Acceleration = Annotated[
+    float | None,
+    typer.Option(envvar="PRESAGE_ACCELERATION", help="With which it gains speed and surely brakes, m/s²; none: 1."),
+]
+TurnAcceleration = Annotated[
+    float | None,
+    typer.Option(envvar="PRESAGE_TURN_ACCELERATION", help="The same of turning, rad/s²; none: 3."),
+]
 Viewer = Annotated[bool, typer.Option(help="Serve the live page.")]
 OpenPage = Annotated[bool, typer.Option("--open/--no-open", help="Open the page, where there is a display.")]
 
@@ -68,6 +89,18 @@ RoleName = Annotated[
     typer.Option(envvar="PRESAGE_ROLE", help="Whose credentials of that folder; none: those that suit the command."),
 ]
 LOOKING_ON = frozenset({"echo", "hz", "top", "doctor"})  # commands for which an observer's credentials do
+
+
+def robot_arguments(
+    drive: str, radius: float | None, max_speed: float | None, max_turn: float | None, acceleration: float | None,
+    turn_acceleration: float | None,
+) -> tuple[str, ...]:  # fmt: skip
+    """Of every service that moves the robot or holds it back; what is None is theirs to know."""
+    given = {
+        "radius": radius, "max-speed": max_speed, "max-turn": max_turn, "acceleration": acceleration,
+        "turn-acceleration": turn_acceleration,
+    }  # fmt: skip
+    return ("--drive", drive, *(f"--{name}={value}" for name, value in given.items() if value is not None))
 
 
 @dataclass(frozen=True)

@@ -49,10 +49,10 @@ class Process:
 
 
 def controller_arguments(
-    world: str, estimator: Sequence[str], drive: str = "holonomic", *, lockstep: bool = False
+    world: str, estimator: Sequence[str], limits: Sequence[str] = ("--drive", "holonomic"), *, lockstep: bool = False
 ) -> list[str]:
     """Of the controller beside an estimator with these arguments: the paper's two belong together, at one heading."""
-    arguments = ["--world", world, "--drive", drive]
+    arguments = ["--world", world, *limits]
     if "paper" in estimator:
         arguments += ["--preset", "paper"]
     return [*arguments, *(["--belief-timeout", "20"] if lockstep else [])]

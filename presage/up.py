@@ -9,7 +9,7 @@ from rich.console import Console
 
 from common.bus import open_bus
 from common.errors import UserError
-from common.world import load_world
+from presage.checking import check_services
 from presage.options import credentials_for
 from presage.page import say_page, start_page
 from presage.stack import Stack, controller_arguments
@@ -21,7 +21,7 @@ def run_up(
     *,
     world: str,
     scanner: tuple[str, ...],
-    drive: str,
+    limits: tuple[str, ...],
     pace: str,
     seed: int,
     record: Path | None,
@@ -37,25 +37,27 @@ def run_up(
     robots: int = 1,
 ) -> None:
     """Start, wait until all are alive, say what can be done, and watch; a service that ends is named, not restarted."""
-    load_world(world)  # one clear line now rather than three from the children
     names = [robot] if robots == 1 else [f"{robot}-{k}" for k in range(1, robots + 1)]
     if robots > 1 and record is not None:
         raise UserError(f"--record records one robot: leave it out, and `presage record --robot {names[0]}` beside it")
     if not simulated and (robots > 1 or pace != "realtime"):
         raise UserError("--no-simulator goes with one robot, and with time as it passes: leave out --robots and --pace")
+    lockstep = pace == "lockstep"
+    together = ["--robots", ",".join(names)] if robots > 1 else []
+    perceiving = ["--world", world, *estimator, *together]
+    driving = controller_arguments(world, estimator, limits, lockstep=lockstep)
+    simulator = ["--world", world, *scanner, *limits, "--pace", pace, *people, "--start", start]
+    # One clear line now rather than three from the children.
+    check_services(world, perceiving, driving, [*simulator, "--seed", str(seed)] if simulated else None)
     with Stack(names[0], port or None, security=credentials_for(names[0])) as stack:
         stack.start_router()
-        lockstep = pace == "lockstep"
         page = viewer and start_page(stack, record or RECORDINGS, console)
         if (page or record is not None) and robots == 1:  # idle, it waits for the page's button
             stack.start("recorder", "--directory", str(record or RECORDINGS), *(["--idle"] if record is None else []))
-        together = ["--robots", ",".join(names)] if robots > 1 else []
-        stack.start("estimator", "--world", world, *estimator, *together)
-        driving = controller_arguments(world, estimator, drive, lockstep=lockstep)
+        stack.start("estimator", *perceiving)
         stack.start("controller", *driving)
         waits = ",".join(sorted(set(stack.processes) - {"router", "viewer"}))
-        simulator = ["--world", world, *scanner, "--drive", drive, "--pace", pace]
-        simulator += [*people, "--start", start, *(["--wait-for", waits] if pace != "realtime" else [])]
+        simulator += ["--wait-for", waits] if pace != "realtime" else []
         if simulated:
             stack.start("simulator", *simulator, "--seed", str(seed))
         for k, name in enumerate(names[1:], 1):  # each in a simulation of its own

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 from foxglove_schemas_protobuf.ArrowPrimitive_pb2 import ArrowPrimitive
 from foxglove_schemas_protobuf.Color_pb2 import Color
@@ -29,9 +28,8 @@ from foxglove_schemas_protobuf.Vector2_pb2 import Vector2
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
+from common import raster
 from common.messages import Belief, Hypothesis, Prediction, Scan
-from common.occupancy_grid import FREE as FREE_CELL
-from common.occupancy_grid import OCCUPIED as OCCUPIED_CELL
 from common.ranges import surfaces
 from common.se2 import Array
 from common.world import World
@@ -40,7 +38,6 @@ TRUTH, BELIEF, GOAL = (0.0, 0.0, 0.0), (0.84, 0.37, 0.0), (0.0, 0.62, 0.45)  # r
 WALL, FURNITURE = (0.55, 0.55, 0.55), (0.78, 0.78, 0.78)
 WALL_HEIGHT, WALL_THICKNESS = 0.5, 0.06  # m, as drawn
 NINETY_FIVE = 2.447746830680816  # a Gaussian's 95 % ellipse in the plane: the root of chi² with 2 degrees at 0.95
-CELL, MOST_CELLS = 0.05, 4_000_000  # m; larger worlds get larger cells
 FREE, OCCUPIED = (245, 245, 245, 255), (70, 70, 70, 255)  # red, green, blue, alpha; outside stays clear
 
 
@@ -202,26 +199,12 @@ def _slabs(ring: Array, rgb: Sequence[float], *, outside: bool) -> list[CubePrim
     return found
 
 
-def _cells(world: World, x: Array, y: Array, cell: float) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Which places x, y (rows, columns) m are free, and which are drawn as walls and furniture."""
-    if world.grid is not None:
-        kinds = world.grid.at(np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(x.shape)
-        covered = shapely.contains_xy(world.furniture, x, y)
-        return (kinds == FREE_CELL) & ~covered, (kinds == OCCUPIED_CELL) | covered
-    free = shapely.contains_xy(world.free_space, x, y)
-    around = shapely.Polygon(world.boundary).buffer(1.5 * cell, join_style="mitre")
-    return free, shapely.contains_xy(around, x, y) & ~free
-
-
 def grid(world: World, ns: int) -> Grid:
     """The map: red, green, blue, alpha and occupancy (0 free, 100 occupied, 255 outside: unknown), a byte each."""
-    x0, y0, x1, y1 = world.bounds
-    cell = max(CELL, float(np.sqrt((x1 - x0) * (y1 - y0) / MOST_CELLS)))
-    x0, y0 = x0 - 2 * cell, y0 - 2 * cell
-    columns, rows = int(np.ceil((x1 - x0) / cell)) + 2, int(np.ceil((y1 - y0) / cell)) + 2
-    x, y = np.meshgrid(x0 + cell * (np.arange(columns) + 0.5), y0 + cell * (np.arange(rows) + 0.5))
-    free, wall = _cells(world, x, y, cell)
-    data = np.zeros((rows, columns, 5), np.uint8)
+    (x0, y0), cell, x, y = raster.lattice(world)
+    free, wall = raster.kinds(world, x, y, cell)
+    columns = x.shape[1]
+    data = np.zeros((*x.shape, 5), np.uint8)
     data[..., 4] = 255
     data[free], data[wall] = (*FREE, 0), (*OCCUPIED, 100)
     names = ("red", "green", "blue", "alpha", "occupancy")

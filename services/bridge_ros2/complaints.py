@@ -24,10 +24,12 @@ def complaint(
     topic = options.topic(options.scan_topic)
     if not linked:
         return f"waits for the zenoh router at {options.ros_connect}: it is gone"
+    if wrong := graph.misfit(topic):
+        return wrong
     if quiet > SILENT:
         if problem:
             return f"scans on {topic} cannot be used: {problem}"
-        why = graph.why_silent(topic, LASER_SCAN, "--scan-topic", nobody=_nobody(options))
+        why = graph.why_silent(topic, LASER_SCAN, "--scan-topic", nobody=_nobody(options, graph))
         return f"no scan on {topic} for {SILENT:g} s: {why}"
     return _with_scans(options, graph, reckoned=reckoned) if heard else f"no scan on {topic} yet"
 
@@ -41,6 +43,9 @@ def _with_scans(options: BridgeRos2Settings, graph: Graph, *, reckoned: bool) ->
         return (
             f"no odometry of the scans' moments {where}, so no transform from map to odom: --odom-topic, --tf map-base"
         )
+    chart = options.topic(options.map_topic)
+    if options.publish_map and (other := graph.publishers(chart)):
+        return f"{chart}: {other} publishes a map there as well: leave out --publish-map, or --map-topic"
     command = options.topic(options.cmd_topic)
     wanted = graph.twist_wanted(command) if options.commands else ""
     if wanted and (wanted == TWIST_STAMPED) != options.stamped:
@@ -59,10 +64,23 @@ def _no_odometry(options: BridgeRos2Settings, graph: Graph) -> str:
     return f"no odometry on {topic}: {ODOMETRY} is on {', '.join(there[:4])}: --odom-topic"
 
 
-def _nobody(options: BridgeRos2Settings) -> str:
+def _nobody(options: BridgeRos2Settings, graph: Graph) -> str:
+    """Where nobody of our flavour and domain is seen: who is there instead, or what to look at."""
+    others = graph.elsewhere()
+    domains = sorted({each.domain for each in others if each.flavor == "rmw_zenoh" and each.domain is not None})
+    if options.flavor == "rmw_zenoh":
+        if any(each.flavor == "ros2dds" for each in others):
+            return "there it is zenoh-bridge-ros2dds that speaks, not rmw_zenoh: --flavor ros2dds"
+        if domains:
+            return f"nobody is seen in ROS domain {options.domain}, but in {_numbers(domains)}: --domain {domains[0]}"
+    elif domains:
+        domain = "" if options.domain in domains else f" --domain {domains[0]}"
+        return f"there it is rmw_zenoh that speaks, not zenoh-bridge-ros2dds: --flavor rmw_zenoh{domain}"
+    where = f"nothing of ROS is heard at {options.ros_connect}: is that the robot's, and not presage's own router?"
     if options.flavor == "ros2dds":
-        return "zenoh-bridge-ros2dds says of no topic: does it run there, in the domain of the robot's nodes?"
-    return (
-        f"nobody is seen in ROS domain {options.domain}: does the robot run RMW_IMPLEMENTATION=rmw_zenoh_cpp, "
-        "and is its ROS_DOMAIN_ID this one (--domain)?"
-    )
+        return f"{where} does zenoh-bridge-ros2dds run there, in the ROS_DOMAIN_ID of the robot's nodes?"
+    return f"{where} do its nodes run with RMW_IMPLEMENTATION=rmw_zenoh_cpp, and does ros2 topic list show them there?"
+
+
+def _numbers(domains: list[int]) -> str:
+    return ", ".join(map(str, domains[:4]))

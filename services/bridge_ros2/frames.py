@@ -11,6 +11,7 @@ from common.ros_messages import IDENTITY, Transform, read_pose, stamp_of
 from common.se2 import Array
 
 KEPT = 10.0  # s of odometry
+ANEW = 1.0  # s; no network delays by more, so the clock was set back; by less, and it is soon past the old time
 BEYOND = 0.2  # s by which the newest odometry is carried on
 LONGEST = 32  # frames from the scanner to the base
 
@@ -78,9 +79,9 @@ class Odometer:
         self._kept: deque[Dead] = deque()
 
     def hear(self, dead: Dead) -> None:
-        """What comes out of order is left out; where time has gone back by far (a simulation anew), all before."""
+        """What comes out of order is left out; where the clock was set back (a simulation anew), all before."""
         if self._kept and dead.stamp_ns <= (newest := self._kept[-1].stamp_ns):
-            if newest - dead.stamp_ns < KEPT * 1e9:
+            if newest - dead.stamp_ns < ANEW * 1e9:
                 return
             self._kept.clear()
         self._kept.append(dead)

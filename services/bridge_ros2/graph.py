@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from services.bridge_ros2.keys import Endpoint, read_token
+from services.bridge_ros2.keys import Endpoint, Names, read_token
 from services.bridge_ros2.ros_types import NO_HASH, TWIST, TWIST_STAMPED, type_hash
 
 SHOWN = 4  # names in one line
@@ -11,8 +11,9 @@ SHOWN = 4  # names in one line
 class Graph:
     """Publishers and subscriptions by their tokens; a zenoh thread tells, a loop asks."""
 
-    def __init__(self) -> None:
-        """Nobody has been seen."""
+    def __init__(self, names: Names | None = None) -> None:
+        """Nobody has been seen; ``names``: how we call topics."""
+        self._names = names or Names()
         self._tokens: dict[str, Endpoint] = {}
 
     def change(self, token: str, *, there: bool) -> None:
@@ -23,15 +24,37 @@ class Graph:
             self._tokens.pop(token, None)
 
     def endpoints(self) -> list[Endpoint]:
-        """All, ordered by name."""
+        """All of our flavour and domain, ordered by name."""
+        return [each for each in self._all() if self._names.ours(each)]
+
+    def elsewhere(self) -> list[Endpoint]:
+        """All others."""
+        return [each for each in self._all() if not self._names.ours(each)]
+
+    def _all(self) -> list[Endpoint]:
         return sorted(self._tokens.copy().values(), key=lambda each: (each.topic, each.kind, each.node))
+
+    def misfit(self, topic: str) -> str:
+        """Which ``--distro`` fits, where ours does not by the hashes of types; those who publish ``topic`` decide."""
+        if self._names.flavor == "ros2dds":
+            return ""
+        there = self.endpoints()
+        there = [each for each in there if each.publishes and each.topic == topic] or there
+        hashes = {each.hash != NO_HASH for each in there}
+        if hashes != {not self._names.hashes}:  # nobody, ours, or some of either
+            return ""
+        who = _nodes(there)
+        if self._names.hashes:
+            return f"the types of {who} have no hashes, as Humble's: --distro humble, or it will not hear us"
+        return f"the types of {who} have hashes, as from Iron on: --distro jazzy, or it will not hear us"
 
     def why_silent(self, topic: str, kind: str, option: str, *, nobody: str) -> str:
         """Why nothing may come on ``topic``; ``option`` names another one, ``nobody`` is said where none is seen."""
         there = self.endpoints()
-        if not there:
-            return nobody
         publishers = [each for each in there if each.publishes]
+        known = any(each.kind == kind for each in publishers)
+        if not there or (not known and any(each.publishes and each.kind == kind for each in self.elsewhere())):
+            return nobody
         here = [each for each in publishers if each.topic == topic]
         of_kind = [each for each in here if each.kind == kind]
         foreign = [each for each in of_kind if each.hash not in ("", NO_HASH, type_hash(kind))]
@@ -51,6 +74,11 @@ class Graph:
     def topics_of(self, kind: str) -> list[str]:
         """On which a type is published."""
         return sorted({each.topic for each in self.endpoints() if each.publishes and each.kind == kind})
+
+    def publishers(self, topic: str) -> str:
+        """Who publishes a topic beside us; empty: nobody."""
+        there = [each for each in self.endpoints() if each.publishes and each.topic == topic]
+        return _nodes(there) if there else ""
 
     def twist_wanted(self, topic: str) -> str:
         """The type that subscriptions on the command topic have; empty where there is none, or both are there."""

@@ -21,6 +21,9 @@ Flavor = Literal["rmw_zenoh", "ros2dds"]
 Kind = Literal["NN", "MP", "MS"]  # node, publisher, subscription
 NAME = r"(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*"
 DEPTH = 42  # of a history, where none is said (qos.cpp)
+# Everybody's tokens, whatever flavour and domain: where messages do not come, it is said who is there instead. Those of
+# zenoh-bridge-ros2dds; those of rmw_zenoh, and of that bridge before 1.0.
+TOKENS = ("@/*/@ros2_lv/**", "@ros2_lv/**")
 ATTACHMENT = struct.Struct("<qqB16s")  # sequence number, ns of wall time, length, gid
 LEGACY = re.compile(rb"\x0fsequence_number(.{8})\x10source_timestamp(.{8})\x0asource_gid\x10(.{16})", re.DOTALL)
 
@@ -86,11 +89,9 @@ class Names:
         if self.flavor == "rmw_zenoh" and told not in (type_hash(kind), NO_HASH):
             raise ValueError(f"its {kind} has the type hash {told}, not {type_hash(kind)}: another definition")
 
-    def tokens(self) -> tuple[str, ...]:
-        """Key expressions of everybody's tokens."""
-        if self.flavor == "ros2dds":
-            return "@/*/@ros2_lv/**", "@ros2_lv/**"  # of now, of versions before 1.0
-        return (f"@ros2_lv/{self.domain}/**",)
+    def ours(self, endpoint: Endpoint) -> bool:
+        """Whether somebody's endpoint is called as we call ours, so that messages can meet."""
+        return endpoint.flavor == self.flavor and endpoint.domain in (None, self.domain)
 
     def caches(self, topic: str) -> tuple[str, ...]:
         """Where zenoh-bridge-ros2dds is asked for messages kept for those who come later."""
@@ -155,6 +156,8 @@ class Endpoint:
     kind: str  # a/msg/B
     hash: str = ""
     node: str = ""  # absolute; zenoh-bridge-ros2dds does not say
+    flavor: Flavor = "rmw_zenoh"
+    domain: int | None = None  # zenoh-bridge-ros2dds does not say
 
 
 def read_token(key: str) -> Endpoint | None:
@@ -162,9 +165,12 @@ def read_token(key: str) -> Endpoint | None:
     parts = key.split("/")
     if parts[0] == "@ros2_lv" and len(parts) >= 13 and parts[5] in ("MP", "MS"):
         namespace, name, topic, kind, digest = (part.replace("%", "/") for part in parts[7:12])
-        return Endpoint(parts[5] == "MP", topic, ros_name(kind), digest, f"{namespace.rstrip('/')}/{name}")
+        domain = int(parts[1]) if re.fullmatch(r"[0-9]{1,3}", parts[1]) else None
+        node = f"{namespace.rstrip('/')}/{name}"
+        return Endpoint(parts[5] == "MP", topic, ros_name(kind), digest, node, domain=domain)
     where = parts.index("@ros2_lv") if "@ros2_lv" in parts else -1
     rest = parts[where + (1 if where == 2 else 2) :] if where in (0, 2) else []
     if len(rest) >= 3 and rest[0] in ("MP", "MS"):
-        return Endpoint(rest[0] == "MP", "/" + rest[1].replace("§", "/").strip("/"), rest[2].replace("§", "/"))
+        topic, kind = (part.replace("§", "/") for part in rest[1:3])
+        return Endpoint(rest[0] == "MP", "/" + topic.strip("/"), kind, flavor="ros2dds")
     return None

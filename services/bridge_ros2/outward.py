@@ -8,9 +8,18 @@ import numpy as np
 
 from common import se2
 from common.messages import Belief, Pose
+from common.occupancy_grid import OccupancyGrid
 from common.se2 import Array
 from services.bridge_ros2.inward import PLANE
-from services.bridge_ros2.ros_types import POSE_ARRAY, POSE_WITH_COVARIANCE, TWIST, TWIST_STAMPED, header, make
+from services.bridge_ros2.ros_types import (
+    OCCUPANCY_GRID,
+    POSE_ARRAY,
+    POSE_WITH_COVARIANCE,
+    TWIST,
+    TWIST_STAMPED,
+    header,
+    make,
+)
 
 
 def said(belief: Belief) -> bool:
@@ -53,6 +62,17 @@ def transform_message(pose: Array, stamp_ns: int, parent: str, child: str) -> An
         transform=transform,
     )  # fmt: skip
     return make("tf2_msgs/msg/TFMessage", transforms=[stamped])
+
+
+def map_message(grid: OccupancyGrid, frame: str) -> Any:
+    """OccupancyGrid as nav2's map_server says it, but for the stamp, which is 0: a map holds at any time."""
+    x, y, yaw = grid.origin
+    info = make(
+        "nav_msgs/msg/MapMetaData", map_load_time=header(0, frame).stamp, resolution=grid.resolution,
+        width=grid.width, height=grid.height, origin=_pose(Pose(x=x, y=y, yaw=yaw)),
+    )  # fmt: skip
+    cells = grid.values.ravel().view(np.int8)  # 255 without a sign is -1, unknown
+    return make(OCCUPANCY_GRID, header=header(0, frame), info=info, data=cells)
 
 
 def twist_message(twist: Array, stamp_ns: int | None, frame: str) -> tuple[str, Any]:

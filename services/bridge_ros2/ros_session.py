@@ -18,7 +18,7 @@ import zenoh.ext
 from common.errors import UserError
 from common.inbox import Inbox, Sample
 from common.topics import Topic
-from services.bridge_ros2.keys import Names, Node, Qos, attachment, gid_of, read_attachment
+from services.bridge_ros2.keys import TOKENS, Names, Node, Qos, attachment, gid_of, read_attachment
 from services.bridge_ros2.ros_types import encode
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ class RosSession:
         if names.flavor == "rmw_zenoh":
             self._node = Node(names, str(session.zid()), namespace, name)
             self._token(self._node.token())
-        for key in names.tokens():
+        for key in TOKENS:
             self._declared.append(session.liveliness().declare_subscriber(key, self._seen, history=True))
 
     def _seen(self, sample: zenoh.Sample) -> None:

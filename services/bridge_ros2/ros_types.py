@@ -18,8 +18,10 @@ TWIST_STAMPED: Final = "geometry_msgs/msg/TwistStamped"
 POSE_STAMPED: Final = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 POSE_ARRAY: Final = "geometry_msgs/msg/PoseArray"
+OCCUPANCY_GRID: Final = "nav_msgs/msg/OccupancyGrid"
 USED: Final = (
     LASER_SCAN, ODOMETRY, TF_MESSAGE, TWIST, TWIST_STAMPED, POSE_STAMPED, POSE_WITH_COVARIANCE, POSE_ARRAY,
+    OCCUPANCY_GRID,
 )  # fmt: skip
 NO_HASH: Final = "TypeHashNotSupported"  # what Humble, which knows no hashes, writes in their place
 

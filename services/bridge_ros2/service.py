@@ -8,11 +8,13 @@ from typing import Any, ClassVar
 
 from common.inbox import Sample
 from common.messages import Belief, CmdVel, Goal, Stamped
+from common.raster import rasterised
 from common.requests import LocaliseRequest, Reply
 from common.ros_messages import stamp_of
 from common.se2 import Array
 from common.service import Service
 from common.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, ODOM, SCAN, STATUS, Query, Topic
+from common.world import load_world
 from services.bridge_ros2 import outward
 from services.bridge_ros2.complaints import SILENT, complaint
 from services.bridge_ros2.graph import Graph
@@ -22,6 +24,7 @@ from services.bridge_ros2.motion import Motion, NoMountError
 from services.bridge_ros2.ros_session import RosPublisher, RosSession, open_ros_session
 from services.bridge_ros2.ros_types import (
     LASER_SCAN,
+    OCCUPANCY_GRID,
     ODOMETRY,
     POSE_ARRAY,
     POSE_STAMPED,
@@ -35,6 +38,7 @@ from services.bridge_ros2.ros_types import (
 from services.bridge_ros2.settings import BridgeRos2Settings
 from services.bridge_ros2.wheels import Wheels
 
+MAP_AGAIN = 10.0  # s between two messages of the map, for who has missed it; SLAM's nodes say theirs as often
 AGAIN = 1.0  # s between two looks at how things stand, and between two tries to reach the router
 YAW_TOLERANCE = 0.25  # rad, of rviz's goals, as nav2 has it
 
@@ -51,9 +55,10 @@ class BridgeRos2Service(Service):
         """Nothing is reached yet."""
         super().__init__(settings)
         self.options = settings
-        self.graph = Graph()
+        self.graph = Graph(settings.names())
         self.motion = Motion(settings.base_frame, settings.odom_frame, settings.the_mount())
         self.wheels = Wheels(settings.the_robot(), obstacle_stop=settings.obstacle_stop)
+        self.blind = settings.the_blind()
         self.note = f"waits for the zenoh router at {settings.ros_connect}"
         self._ros: RosSession | None = None
         self._out: dict[str, RosPublisher] = {}
@@ -65,10 +70,14 @@ class BridgeRos2Service(Service):
         self._waiting_said = False
         self._unplaced_said = False
         self._reckoned = False  # the last scan came with odometry
+        self._map: Any = None  # the message
+        self._map_at = 0.0  # when it is due
         self._problem = ""  # why the last message could not be used
 
     def open(self) -> None:
         """Declared before anybody asks: the first message on a key just declared may be lost."""
+        if self.options.publish_map:
+            self._map = outward.map_message(rasterised(load_world(self.options.world)), self.options.map_frame)
         for topic in (ODOM, SCAN):
             self.loop.bus.publisher(topic, self.name)
 
@@ -101,6 +110,8 @@ class BridgeRos2Service(Service):
             (options.hypotheses_topic, POSE_ARRAY, SENSOR),
             (options.tf_topic if options.tf != "none" else "", TF_MESSAGE, TF),
         ]
+        if self._map is not None:
+            said.append((options.map_topic, OCCUPANCY_GRID, KEPT))
         if options.commands:
             heard.append((options.goal_topic, POSE_STAMPED, Qos(), self._hear_goal))
             said.append((options.cmd_topic, TWIST_STAMPED if options.stamped else TWIST, LATEST))
@@ -139,6 +150,7 @@ class BridgeRos2Service(Service):
             self._look_at = time.monotonic() + AGAIN
         before = self.note
         if self._ros is not None:
+            self._say_map(now)
             static = self.options.topic(self.options.tf_topic + "_static")
             if self.motion.mount() is None:
                 self._ros.fetch(_row(self.options.tf_topic + "_static"), static, self.loop.inbox)
@@ -206,8 +218,8 @@ class BridgeRos2Service(Service):
             self.publish(ODOM, odom_of(dead))
         else:
             self.counters["scans_without_odometry"] += 1
-        self.wheels.hear_scan(scan, now)
-        self.publish(SCAN, scan)
+        self.wheels.hear_scan(self.blind.seen(scan), now)
+        self.publish(SCAN, self.blind.silenced(scan))
         self._scan_at, self._problem = now, ""
 
     def _hear_initial_pose(self, message: Any) -> None:
@@ -262,6 +274,12 @@ class BridgeRos2Service(Service):
         ahead = belief.stamp_ns + round(options.transform_tolerance * 1e9)
         pose = outward.correction(belief.pose, odometry)
         tf.put(outward.transform_message(pose, ahead, options.map_frame, child))
+
+    def _say_map(self, now: float) -> None:
+        """Kept for those who come later, as map_server's; and again, for those whom that does not reach."""
+        if self._map is not None and now >= self._map_at:
+            self._map_at = now + MAP_AGAIN
+            self._out[self.options.map_topic].put(self._map)
 
     def _drive(self, twist: Array | None) -> None:
         """Send a velocity, dated by the robot's clock."""

@@ -7,10 +7,9 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from common.config import ServiceSettings
 from common.errors import UserError
 from common.pose_text import POSE_TEXT, pose_of_text
-from common.robot import Robot
+from common.robot_settings import SeenRobotSettings
 from common.ros_messages import Mount
 from services.bridge_ros2.keys import NAME, Names, full_name
 
@@ -19,7 +18,7 @@ ENDPOINTS = r"^[a-z]+/[^\s,]+(,[a-z]+/[^\s,]+)*$"
 FRAME = r"^[A-Za-z0-9_./-]{1,64}$"
 
 
-class BridgeRos2Settings(ServiceSettings):
+class BridgeRos2Settings(SeenRobotSettings):
     """Bridge to ROS 2: a robot, or Gazebo, in the simulator's place; presage in AMCL's. Needs no ROS here.
 
     On the robot: RMW_IMPLEMENTATION=rmw_zenoh_cpp and `ros2 run rmw_zenoh_cpp rmw_zenohd`, or zenoh-bridge-ros2dds.
@@ -30,6 +29,7 @@ class BridgeRos2Settings(ServiceSettings):
       python -m services.bridge_ros2 --ros-connect tcp/ROBOT:7447 --flavor ros2dds   through zenoh-bridge-ros2dds
       python -m services.bridge_ros2 --distro humble --cmd-topic cmd_vel --drive differential
       python -m services.bridge_ros2 --namespace robot1 --scan-topic scan --stamped
+      python -m services.bridge_ros2 --publish-map --world my.yaml        rviz and nav2 without a map_server
       python -m services.bridge_ros2 --mount 0.1,0,180 --upside-down      where tf does not say how the laser sits
 
     More, with TurtleBot, TIAGo, rviz and nav2: docs/ros2.md.
@@ -48,7 +48,6 @@ class BridgeRos2Settings(ServiceSettings):
             "upside_down",
             "stamped",
             "commands",
-            "radius",
             "tf",
         }
     )
@@ -100,6 +99,14 @@ class BridgeRos2Settings(ServiceSettings):
         bool, Field(description="pass velocity commands and goals on; --no-commands: others drive, such as nav2")
     ] = True
 
+    publish_map: Annotated[
+        bool, Field(description="publish the world as OccupancyGrid, in map_server's place; not where one runs")
+    ] = False
+    map_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="of --publish-map")] = "map"
+    world: Annotated[
+        str, Field(description="of --publish-map: shipped world, world file or ROS map.yaml, that of the estimator")
+    ] = "corridor"
+
     map_frame: Annotated[str, Field(pattern=FRAME, description="the world")] = "map"
     odom_frame: Annotated[str, Field(pattern=FRAME, description="of dead reckoning")] = "odom"
     base_frame: Annotated[str, Field(pattern=FRAME, description="of the robot's centre")] = "base_link"
@@ -119,10 +126,6 @@ class BridgeRos2Settings(ServiceSettings):
     ] = ""
     upside_down: Annotated[bool, Field(description="with --mount: its z axis points down")] = False
 
-    drive: Annotated[Literal["holonomic", "differential"], Field(description="of the robot")] = "holonomic"
-    radius: Annotated[float, Field(gt=0, le=5, description="of the robot, m, for the obstacle stop")] = 0.27
-    max_speed: Annotated[float, Field(gt=0, le=10, description="m/s, whatever is commanded")] = 1.0
-    acceleration: Annotated[float, Field(gt=0, le=20, description="m/s², with which it can brake")] = 1.0
     obstacle_stop: Annotated[bool, Field(description="slow commands down before what the scan shows")] = True
 
     def names(self) -> Names:
@@ -132,12 +135,6 @@ class BridgeRos2Settings(ServiceSettings):
     def topic(self, name: str) -> str:
         """A topic's absolute name."""
         return full_name(name, self.namespace)
-
-    def the_robot(self) -> Robot:
-        """Its limits."""
-        return Robot(
-            drive=self.drive, radius=self.radius, max_speed=self.max_speed, acceleration=self.acceleration
-        )  # fmt: skip
 
     def the_mount(self) -> Mount | None:
         """How the laser sits, where it was said."""

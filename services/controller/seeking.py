@@ -34,7 +34,7 @@ DESTINATIONS = 60
 AGAIN = 1_000_000_000  # ns between two choices
 SPEED = 0.5  # m/s at most, for what is behind and beside is not known
 FIRST_LOOK = 1_000_000_000  # ns that the estimator is given before anybody moves
-FARTHEST = 5.0  # m; more room than this is no better
+ROOM_ENOUGH = 5.0  # m; more room than this is no better
 WINDOW = 0.35  # rad to either side of a direction that must be free
 ROOM = 0.7  # m; with less in every direction it turns on the spot
 
@@ -133,10 +133,10 @@ class Seeker:
 
     def _wander(self, belief: Belief, scan: Scan, around: Around, velocity: Array) -> Decision:
         """Towards the most room, rather ahead than aside."""
-        ranges = np.minimum(np.where(np.isneginf(scan.ranges), 0.0, scan.ranges.astype(np.float64)), FARTHEST)
-        ranges[~surfaces(scan.ranges) & ~np.isinf(scan.ranges)] = (
-            np.inf
-        )  # not measured: their neighbours speak for them
+        ranges = np.where(np.isneginf(scan.ranges), 0.0, scan.ranges.astype(np.float64))
+        ranges = np.minimum(ranges, ROOM_ENOUGH)
+        # Not measured, or cut out: their neighbours speak for them.
+        ranges[~surfaces(scan.ranges) & ~np.isinf(scan.ranges)] = np.inf
         angles = scan.angles() + scan.mount.yaw
         sweep = Sweep.of(scan)
         half = max(1, round(WINDOW / max(sweep.spacing, WINDOW / 1000)))

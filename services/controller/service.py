@@ -7,11 +7,9 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from common.errors import UserError
 from common.messages import Belief, CmdVel, Drive, Goal, Plan, Pose, Scan, Stamped, Status
 from common.messages import Preference as Prior
 from common.requests import PredictReply, PredictRequest, Reply
-from common.robot import Robot
 from common.service import Service
 from common.topics import BELIEF, CMD_VEL, DRIVE, GOAL, PLAN, PREDICT, PREFERENCE, SCAN, STATUS, Query, Topic
 from common.world import load_world
@@ -53,6 +51,7 @@ class ControllerService(Service):
         self.options = settings
         self.navigator = Navigator()
         self.pilot: Pilot | None = None
+        self.blind = settings.the_blind()
         self._last: tuple[int, CmdVel, Status] | None = None
         self._waiting: Belief | None = None  # for predictions
         self._questioning_ns = 0
@@ -66,17 +65,14 @@ class ControllerService(Service):
     def open(self) -> None:
         """Know the robot's limits, and where walls are."""
         options = self.options
-        robot = Robot(drive=options.drive, max_speed=options.max_speed, acceleration=options.acceleration)
+        options.check()
+        robot = options.the_robot()
         world = load_world(options.world) if options.world else None
-        if options.preset == "geodesic":
-            if world is None:
-                raise UserError("preset geodesic needs a map: give --world, or --preset paper")
+        if options.preset == "geodesic" and world is not None:
             # scipy takes a third of a second to import; preset paper does without.
             from services.controller.pilot import Pilot  # noqa: PLC0415
 
             self.pilot = Pilot(robot, world, keep_heading=options.heading == "keep", epistemic=options.epistemic)
-        elif options.drive != "holonomic":
-            raise UserError("preset paper moves without turning: give --drive holonomic, or --preset geodesic")
         preference = Preference(gamma=options.gamma, reach=options.reach)
         self.navigator = Navigator(robot, preference, world, self.pilot)
         # Declared before anybody asks: the first message on a key just declared may be lost.
@@ -98,7 +94,7 @@ class ControllerService(Service):
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
         """A belief is answered by a command of the same stamp; a goal by a status, at once."""
         if isinstance(message, Scan):
-            self.navigator.hear_scan(message)
+            self.navigator.hear_scan(self.blind.seen(message))
             if self._early is not None and self._early.stamp_ns <= message.stamp_ns:
                 self._take_early()
             # A hand needs no belief, and so no estimator.

@@ -163,7 +163,18 @@ def field_path(choice: Choice, world: World) -> Path:
         return weights.find(choice.models or weights.FOLDER, world, choice.asked)
     if (path := Path(choice.model)).suffix != ".safetensors":
         raise UserError(f"no model {choice.model!r}: give learned, exact, or a file of weights (.safetensors)")
+    if not path.exists():
+        made = weights.train_command(choice.asked, path.parent)
+        raise UserError(f"--model {path}: there is no such file; {made} makes one, --model exact needs none")
     return path
+
+
+def check(choice: Choice, world: World) -> None:
+    """Raises UserError where `prepare` would for want of a model; nothing is compiled, so it is quick."""
+    if choice.estimator == "precise" and choice.model != "exact":
+        weights.load(field_path(choice, world))
+    elif choice.estimator == "paper":
+        _paper_weights(choice, world)
 
 
 def _compile(model: GenerativeModel, seeds: Seeds, likelihood: Likelihood) -> None:
@@ -181,12 +192,8 @@ def _paper(choice: Choice, world: World) -> Factory:
     from services.estimator.paper_perception import PaperPerception  # noqa: PLC0415
 
     use_one_core()
-    folder = choice.models or paper_weights.FOLDER
-    known = paper_weights.available(folder, world.name, "paper")
-    remedy = paper_weights.train_command(choice.asked, "paper")
+    folder, known, remedy = _paper_weights(choice, world)
     without = remedy.rpartition(" --scanner")[0]
-    if not known:
-        raise UserError(f"no weights of preset paper for world {world.name!r} in {folder}; make them with: {remedy}")
     for path in known.values():  # a broken file is found now, and torch is warm for the first scan
         model, card = paper_weights.load(path)
         if not weights.same_walls(card.world, world):
@@ -203,6 +210,23 @@ def _paper(choice: Choice, world: World) -> Factory:
         return PaperPerception(model, card, choice.descent, choice.initial_pose, found)
 
     return make
+
+
+def _paper_weights(choice: Choice, world: World) -> tuple[Path, dict[int, Path], str]:
+    """Folder, files by number of beams, and the command that makes them; raises UserError where there are none."""
+    from services.estimator import weights as paper_weights  # noqa: PLC0415 - torch, as above
+
+    folder = choice.models or paper_weights.FOLDER
+    known, remedy = (
+        paper_weights.available(folder, world.name, "paper"),
+        paper_weights.train_command(choice.asked, "paper"),
+    )
+    if not known:
+        raise UserError(
+            f"no weights of preset paper for world {world.name!r} in {folder}; make them with: {remedy}; "
+            "preset precise does without, where told: --estimator precise --model exact"
+        )
+    return folder, known, remedy
 
 
 def _options(geometry: Geometry) -> str:

@@ -21,16 +21,21 @@ from services.estimator.perception import Descent
 from services.estimator.settings import EstimatorSettings
 
 
+def choice_of(settings: EstimatorSettings) -> Choice:
+    """The estimator asked for."""
+    return Choice(
+        settings.world, settings.estimator, settings.model, settings.models, settings.sigma, settings.seed,
+        initial_pose=pose_of_text(settings.initial_pose, "--initial-pose") if settings.initial_pose else None,
+        descent=Descent(alpha=settings.alpha, beta=settings.beta, iterations=settings.iterations),
+    )  # fmt: skip
+
+
 class Models:
     """What is loaded once, for however many robots."""
 
     def __init__(self, settings: EstimatorSettings) -> None:
         """Raises UserError where a world has no weights."""
-        self.choice = Choice(
-            settings.world, settings.estimator, settings.model, settings.models, settings.sigma, settings.seed,
-            initial_pose=pose_of_text(settings.initial_pose, "--initial-pose") if settings.initial_pose else None,
-            descent=Descent(alpha=settings.alpha, beta=settings.beta, iterations=settings.iterations),
-        )  # fmt: skip
+        self.choice = choice_of(settings)
         self.factory: Factory = prepare(self.choice)
         self._described: dict[int | None, ModelInUse | str] = {}
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +18,7 @@ from common.se2 import Array
 from common.world import Obstacle, World
 
 SUBSTEP = 1 / 240  # s
+RADIUS = 0.27  # m, of robot.urdf
 LASER_HEIGHT = 0.1  # m
 WALL_HEIGHT = 0.5  # m, from below the floor, so that no ray sees an edge
 CIRCLE_CORNERS = 360  # 0.02 mm off at a radius of 0.5 m
@@ -35,9 +39,11 @@ class Physics:
         self.robot = robot
         p = pybullet
         p.setPhysicsEngineParameter(fixedTimeStep=SUBSTEP, deterministicOverlappingPairs=1, physicsClientId=self.client)
-        self.body = p.loadURDF(
-            str(Path(__file__).with_name("robot.urdf")), useFixedBase=True, physicsClientId=self.client
-        )
+        with _urdf(robot.radius) as path:
+            self.body = p.loadURDF(str(path), useFixedBase=True, physicsClientId=self.client)
+        # What the motors are made for, or what this base's limits ask.
+        stronger = max(1.0, robot.acceleration, robot.turn_acceleration / 3)
+        self._forces = [stronger * force for force in MOTOR_FORCE]
         for link in range(-1, p.getNumJoints(self.body, physicsClientId=self.client)):
             touches = WORLD_GROUP | PEOPLE_GROUP
             p.setCollisionFilterGroupMask(self.body, link, ROBOT_GROUP, touches, physicsClientId=self.client)
@@ -150,7 +156,7 @@ class Physics:
             [0, 1, 2],
             pybullet.VELOCITY_CONTROL,
             targetVelocities=target,
-            forces=list(MOTOR_FORCE),
+            forces=self._forces,
             physicsClientId=self.client,
         )
         pybullet.stepSimulation(physicsClientId=self.client)
@@ -177,6 +183,20 @@ class Physics:
             )
             found[part] = [hit[2] if hit[0] >= 0 else np.inf for hit in hits]
         return (found * reach).reshape(len(lasers), len(angles))
+
+
+@contextmanager
+def _urdf(radius: float) -> Iterator[Path]:
+    """The base's description with a footprint of ``radius`` m; pybullet reads nothing but files."""
+    shipped = Path(__file__).with_name("robot.urdf")
+    if radius == RADIUS:
+        yield shipped
+        return
+    text = shipped.read_text(encoding="utf-8").replace(f'radius="{RADIUS}"', f'radius="{radius}"')
+    with tempfile.NamedTemporaryFile("w", suffix=".urdf", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        yield Path(file.name)
 
 
 def _round(radius: float) -> Array:

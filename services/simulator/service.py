@@ -21,7 +21,6 @@ from common.requests import (
     SpeedRequest,
     WorldReply,
 )
-from common.robot import Robot
 from common.service import Service
 from common.topics import (
     CMD_VEL,
@@ -85,7 +84,7 @@ class SimulatorService(Service):
         """Build world and robot; begin once those waited for are there."""
         options = self.options
         drift = Drift(options.turn_by_turn, options.turn_by_path, options.path_by_path, options.path_by_turn)
-        robot = Robot(drive=options.drive)
+        robot = options.the_robot()
         scanner = options.the_scanner()
         self.setup = Setup(
             load_world(options.world), scanner, robot, options.start_pose(), options.seed, drift,

@@ -6,13 +6,13 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from common.config import ServiceSettings
 from common.pose_text import POSE_TEXT, pose_of_text
+from common.robot_settings import RobotSettings
 from common.scanner import SCANNERS, Scanner
 from common.scanner_choice import chosen_scanner
 
 
-class SimulatorSettings(ServiceSettings):
+class SimulatorSettings(RobotSettings):
     """Simulator: a mobile base with a laser scanner in a world, in pybullet.
 
     Examples:
@@ -22,6 +22,7 @@ class SimulatorSettings(ServiceSettings):
       python -m services.simulator --beams 622 --pace lockstep --seed 7
       python -m services.simulator --world office --people 10        who walk about
       python -m services.simulator --scanner rplidar-a1 --mount=-0.1,0,180 --upside-down
+      python -m services.simulator --radius 0.105 --max-speed 0.22 --mount=-0.032,0     a TurtleBot 3's body
       python -m services.simulator --scanner my-laser.yaml           docs/scanners.md shows such a file
 
     """
@@ -36,7 +37,6 @@ class SimulatorSettings(ServiceSettings):
         str, Field(pattern=POSE_TEXT, description="x,y[,yaw_deg] of the laser in base_link; none: the scanner's own")
     ] = ""
     upside_down: Annotated[bool | None, Field(description="the laser hangs with a roll of 180 deg")] = None
-    drive: Annotated[Literal["holonomic", "differential"], Field(description="holonomic or differential")] = "holonomic"
     start: Annotated[str, Field(pattern=POSE_TEXT, description="x,y[,yaw_deg]; none: the world's own")] = ""
     seed: Annotated[int, Field(ge=0, description="of all noise")] = 0
     pace: Annotated[

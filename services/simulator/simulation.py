@@ -201,11 +201,7 @@ class Simulation:
 
     def why_not(self, pose: Array) -> str | None:
         """Why the robot cannot stand at a pose (3,), or None."""
-        clearance, radius = float(self.world.clearance(pose[:2])[0]), self.setup.robot.radius
-        if clearance >= radius:
-            return None
-        what = "is inside a wall or outside" if clearance < 0 else f"is {clearance:.2f} m from a wall of"
-        return f"({pose[0]:.2f}, {pose[1]:.2f}) {what} {self.world.name!r}; the robot needs {radius:g} m around it"
+        return self.world.why_no_room(pose, self.setup.robot.radius)
 
     def teleport(self, pose: Array) -> None:
         """Carry the robot off, standing; odometry does not notice, and people make room. Raises UserError in a wall."""

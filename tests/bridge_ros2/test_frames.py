@@ -112,6 +112,22 @@ def test_odometry_between_two_and_a_little_beyond():
     np.testing.assert_allclose(odometer.at(0).pose, [3, 0, 0])
 
 
+@pytest.mark.parametrize("ran", [1.5, 5.0, 9.9, 3600.0])
+def test_odometry_goes_on_after_the_clock_is_set_back(ran):
+    """However long the simulation ran before it began anew: a few seconds just as an hour."""
+    odometer, motion = Odometer(), Motion("base_link", "odom")
+    for k in range(int(min(ran, 12) * 20)):
+        stamp = round((ran - min(ran, 12)) * SECOND) + k * SECOND // 20
+        odometer.hear(dead(stamp, [k, 0, 0]))
+        motion.hear_tf(tf(("odom", "base_link", (k, 0, 0), turned(), stamp)))
+    for k in range(5):
+        odometer.hear(dead(k * SECOND // 20, [0.1 * k, 0, 0], [2.0, 0, 0]))
+        motion.hear_tf(tf(("odom", "base_link", (0.1 * k, 0, 0), turned(), k * SECOND // 20)))
+    for found in (odometer.at(SECOND // 8), motion.at(SECOND // 8)):
+        np.testing.assert_allclose(found.pose, [0.25, 0, 0], atol=1e-9)
+    assert abs(odometer.at(SECOND // 5).pose[0] - 0.4) < 1e-9  # nothing of before is in it
+
+
 def test_odometry_by_tf_with_its_velocity():
     """The base is 0.5 m ahead of the frame that odometry is about."""
     motion = Motion("base_link", "odom")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from services.bridge_ros2.complaints import complaint
 from services.bridge_ros2.graph import Graph
 from services.bridge_ros2.keys import Names, Node, Qos
-from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, TWIST, TWIST_STAMPED, type_hash
+from services.bridge_ros2.ros_types import LASER_SCAN, OCCUPANCY_GRID, ODOMETRY, TWIST, TWIST_STAMPED, type_hash
 from services.bridge_ros2.settings import BridgeRos2Settings
 
 ROBOT = Node(Names(), "ab", "", "driver")
@@ -64,8 +64,11 @@ def test_a_complaint_names_the_option_that_mends_it():
     assert said(graph) == ""
     assert "it is gone" in said(graph, linked=False)
     assert said(graph, heard=False) == "no scan on /scan yet"
-    assert "ROS domain 4" in said(graph, quiet=4.0, domain=4)
-    assert "zenoh-bridge-ros2dds says of no topic" in said(graph, quiet=4.0, flavor="ros2dds")
+    nothing = said(graph, quiet=4.0, ros_connect="tcp/rover:7447")
+    assert "nothing of ROS is heard at tcp/rover:7447" in nothing
+    assert "RMW_IMPLEMENTATION=rmw_zenoh_cpp" in nothing
+    assert "does zenoh-bridge-ros2dds run there" in said(graph, quiet=4.0, flavor="ros2dds")
+    assert said(graph, quiet=1.0, heard=False) == "no scan on /scan yet"  # not at once
     assert "on /r1/scan for 3 s" in said(graph, quiet=4.0, namespace="r1")
     assert said(graph, "too odd", quiet=4.0) == "scans on /scan cannot be used: too odd"
     assert "on /odom or in tf" in said(graph, reckoned=False)
@@ -78,3 +81,70 @@ def test_a_complaint_names_the_option_that_mends_it():
     graph.change(token("MS", "/cmd_vel", TWIST_STAMPED), there=True)
     assert said(graph) == "/cmd_vel: the robot listens for geometry_msgs/msg/TwistStamped: --stamped"
     assert said(graph, stamped=True) == said(graph, commands=False) == ""
+
+
+DDS_SCAN = "@/a1/@ros2_lv/MP/scan/sensor_msgs§msg§LaserScan/:::"
+
+
+def silent(*tokens, **options):
+    """What is said of a scan that has not come for 4 s."""
+    settings = BridgeRos2Settings(**options)
+    graph = Graph(settings.names())
+    for each in tokens:
+        graph.change(each, there=True)
+    return complaint(settings, graph, "", linked=True, quiet=4.0, heard=False, reckoned=False)
+
+
+def test_the_other_flavor_and_another_domain_are_named():
+    far = Node(Names(domain=5), "ab", "", "driver").endpoint_token("MP", 1, "/scan", LASER_SCAN, Qos())
+    assert silent(DDS_SCAN).endswith("zenoh-bridge-ros2dds that speaks, not rmw_zenoh: --flavor ros2dds")
+    assert "in ROS domain 0, but in 5: --domain 5" in silent(far)
+    assert silent(far, flavor="ros2dds").endswith("--flavor rmw_zenoh --domain 5")
+    assert silent(token("MP", "/scan", LASER_SCAN), flavor="ros2dds").endswith("--flavor rmw_zenoh")
+    # Somebody's rviz is there, but the scanner is not.
+    assert "--flavor ros2dds" in silent(DDS_SCAN, token("MS", "/scan", LASER_SCAN))
+    assert "--domain 5" in silent(far, token("MP", "/odom", ODOMETRY))
+    assert "nothing arrives" in silent(far, token("MP", "/scan", LASER_SCAN))
+    assert "nothing arrives" in silent(DDS_SCAN, flavor="ros2dds", domain=3)  # it does not say of which domain
+
+
+def test_a_distro_that_does_not_fit_is_named_though_scans_come():
+    """Humble's robot is heard by any hash, but drops what is sent with one without a word."""
+    humble = Node(Names(hashes=False), "ab", "", "driver")
+    jazzy = token("MP", "/scan", LASER_SCAN)
+
+    def said(*tokens, distro):
+        settings = BridgeRos2Settings(distro=distro)
+        graph = Graph(settings.names())
+        for each in tokens:
+            graph.change(each, there=True)
+        return complaint(settings, graph, "", linked=True, quiet=0.0, heard=True, reckoned=True)
+
+    scans, listens = (humble.endpoint_token(*each, Qos()) for each in (
+        ("MP", 1, "/scan", LASER_SCAN), ("MS", 2, "/cmd_vel", TWIST),
+    ))  # fmt: skip
+    assert "types of /driver have no hashes, as Humble's: --distro humble" in said(scans, distro="jazzy")
+    assert "--distro humble" in said(listens, distro="jazzy")
+    assert "--distro jazzy" in said(jazzy, distro="humble")
+    assert said(scans, distro="humble") == said(jazzy, distro="jazzy") == ""
+    # Several are there: whoever has the scanner decides.
+    rviz = token("MS", "/amcl_pose", ODOMETRY, 3)
+    assert said(scans, rviz, distro="humble") == ""
+    assert "--distro humble" in said(scans, rviz, distro="jazzy")
+    assert said(listens, rviz, distro="jazzy") == said(listens, rviz, distro="humble") == ""
+
+
+def test_a_second_map_is_named():
+    graph = Graph()
+    graph.change(token("MP", "/map", OCCUPANCY_GRID), there=True)
+    for publish, says in ((True, "/map: /driver publishes a map there as well: leave out --publish-map"), (False, "")):
+        settings = BridgeRos2Settings(publish_map=publish)
+        said = complaint(settings, graph, "", linked=True, quiet=0.0, heard=True, reckoned=True)
+        assert said.startswith(says)
+        assert bool(said) is publish
+
+
+def test_a_token_of_a_domain_that_is_no_number_is_nobodys():
+    graph = Graph()
+    graph.change(token("MP", "/scan", LASER_SCAN).replace("@ros2_lv/0/", "@ros2_lv/x/"), there=True)
+    assert len(graph.elsewhere()) + len(graph.endpoints()) == 1

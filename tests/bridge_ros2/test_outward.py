@@ -7,7 +7,10 @@ import pytest
 
 from common import se2
 from common.messages import Pose
+from common.occupancy_grid import OccupancyGrid
 from services.bridge_ros2 import outward
+from services.bridge_ros2.ros_types import OCCUPANCY_GRID, encode
+from tests.bridge_ros2 import independent as other
 from tests.bridge_ros2.made import belief
 
 
@@ -39,3 +42,15 @@ def test_a_yaw_is_a_quaternion():
     turn = each.transform.rotation
     assert 2 * np.arctan2(turn.z, turn.w) == pytest.approx(-2.5)
     assert (each.header.stamp.sec, each.header.stamp.nanosec) == (3, 4)
+
+
+def test_a_map_is_as_map_server_says_it():
+    """Row by row from the lower left: 0 free, 100 occupied, -1 unknown; the origin is that corner's pose."""
+    grid = OccupancyGrid.of(np.array([[0, 100, 255], [0, 0, 0]], np.uint8), 0.05, (-1.0, 2.0, np.pi / 2))
+    read = other.decode(OCCUPANCY_GRID, encode(OCCUPANCY_GRID, outward.map_message(grid, "map")))
+    assert (read.header.frame_id, read.info.width, read.info.height) == ("map", 3, 2)
+    assert read.info.resolution == pytest.approx(0.05)
+    assert list(read.data) == [0, 100, -1, 0, 0, 0]
+    origin = read.info.origin
+    assert (origin.position.x, origin.position.y) == (-1.0, 2.0)
+    assert (origin.orientation.z, origin.orientation.w) == pytest.approx((np.sqrt(0.5), np.sqrt(0.5)))

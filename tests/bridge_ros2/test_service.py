@@ -7,13 +7,17 @@ from collections import deque
 
 import numpy as np
 import pytest
+import zenoh
+import zenoh.ext
 
 from common import se2
 from common.bus import Link, open_bus, wait_until
 from common.inbox import Inbox, Sample
 from common.messages import CmdVel, Goal, Health, Odom, Scan, Twist
+from common.raster import rasterised
 from common.requests import LocaliseRequest, Reply
 from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, LOCALISE, ODOM, SCAN
+from common.world import load_world
 from tests.bridge_ros2 import independent as other
 from tests.bridge_ros2.made import belief
 from tests.conftest import PATIENCE, Processes
@@ -53,7 +57,7 @@ class Beside:
     """What the bridge joins, in the test's hands."""
 
     def __init__(self, bus, node) -> None:
-        self.bus, self.stamp = bus, BEGIN
+        self.bus, self.node, self.stamp = bus, node, BEGIN
         self.inbox, self.calls, self.kept = Inbox(), Inbox(), deque(maxlen=100)
         self.heard = {"amcl_pose": [], "tf": [], "cmd_vel": []}
         for topic in (SCAN, ODOM, GOAL, HEALTH):
@@ -103,7 +107,8 @@ def beside(tmp_path_factory, router):
         with open_bus(link) as bus, Ros(router, "rmw_zenoh", "jazzy") as node:
             found = Beside(bus, node)
             environment = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": "rover"}
-            bridge = processes.start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{router}", env=environment)
+            args = ("--ros-connect", f"tcp/127.0.0.1:{router}", "--publish-map", "--world", "maze")
+            bridge = processes.start("bridge_ros2", *args, env=environment)
             bridge.wait_for("ready")
             assert bus.wait_matching(BELIEF, PATIENCE)
             assert bus.wait_matching(CMD_VEL, PATIENCE)
@@ -125,10 +130,16 @@ def beside(tmp_path_factory, router):
 
 
 def test_a_scan_comes_with_the_odometry_of_its_moment(beside):
-    odom, scan = beside.sweep()
+    seen = []
+
+    def carried_on():  # by 50 ms; where odometry comes after the scan of its time, it is the one before that is
+        seen.append(beside.sweep())
+        return seen[-1][0].pose.x == pytest.approx(2.025)
+
+    assert wait_until(carried_on, PATIENCE), seen
+    _, scan = seen[-1]
     np.testing.assert_array_equal(scan.ranges, np.array([1, 2, 3, 0, 5], np.float32))
     assert scan.mount.x == pytest.approx(0.3)
-    assert odom.pose.x == pytest.approx(2.025)
 
 
 def test_the_belief_is_said_only_while_it_tracks(beside):
@@ -180,6 +191,40 @@ def test_rvizs_two_buttons(beside):
     assert (goal.pose.x, goal.pose.y, goal.seq) == (5, 1, 0)
 
 
+def test_the_map_is_there_for_who_comes_later(beside):
+    """As rmw_zenoh's transient-local subscriptions ask for it: history of an advanced subscriber, at once."""
+    key = "0/map/nav_msgs::msg::dds_::OccupancyGrid_/*"
+
+    def ask():
+        """What comes first to who wants history; whether it was said again just then, to anybody."""
+        heard, again = [], []
+        plain = beside.node.session.declare_subscriber(key, again.append)
+        late = zenoh.ext.declare_advanced_subscriber(
+            beside.node.session, key, heard.append,
+            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+        )  # fmt: skip
+        try:
+            assert wait_until(lambda: bool(heard), PATIENCE)
+            return heard, bool(again)
+        finally:
+            late.undeclare()
+            plain.undeclare()
+
+    heard, again = ask()
+    if again:  # the next time is far off
+        heard, again = ask()
+    assert not again
+    sample = heard[0]
+    assert len(sample.attachment.to_bytes()) == 33
+    said = other.decode("nav_msgs/msg/OccupancyGrid", sample.payload.to_bytes())
+    grid = rasterised(load_world("maze"))
+    assert (said.info.width, said.info.height, said.header.frame_id) == (grid.width, grid.height, "map")
+    np.testing.assert_array_equal(np.array(said.data, np.int8).view(np.uint8), grid.values.ravel())
+    tokens = beside.node.session.liveliness().get("@ros2_lv/0/**")
+    (token,) = [str(reply.ok.key_expr) for reply in tokens if reply.ok and "/%map/" in str(reply.ok.key_expr)]
+    assert token.endswith("/:1:,1:,:,:,,")
+
+
 def test_it_says_what_it_waits_for_and_what_is_wrong(processes, router):
     ours = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{router}", "PRESAGE_ROBOT": "lost"}
     theirs, port = processes.start_router()
@@ -202,3 +247,22 @@ def test_it_says_what_it_waits_for_and_what_is_wrong(processes, router):
     theirs.kill()
     bridge.wait_for("it is gone")
     assert nowhere.stop()[0] == bridge.stop()[0] == 0
+
+
+def test_it_says_which_distro_and_flavor_fit_and_that_nobody_is_there(processes, router):
+    (_, port), (_, empty) = processes.start_router(), processes.start_router()
+
+    def bridge(name, at, *args):
+        ours = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{router}", "PRESAGE_ROBOT": name}
+        return processes.start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{at}", *args, env=ours)
+
+    with Ros(port, "rmw_zenoh", "jazzy") as node:
+        node.publisher("scan", LASER)
+        humble, dds = bridge("humble", port, "--distro", "humble"), bridge("dds", port, "--flavor", "ros2dds")
+        far, alone = bridge("far", port, "--domain", "7"), bridge("alone", empty)
+        humble.wait_for("the types of /robot have hashes, as from Iron on: --distro jazzy")
+        dds.wait_for("it is rmw_zenoh that speaks, not zenoh-bridge-ros2dds: --flavor rmw_zenoh")
+        far.wait_for("nobody is seen in ROS domain 7, but in 0: --domain 0")
+        alone.wait_for(f"nothing of ROS is heard at tcp/127.0.0.1:{empty}: is that the robot's")
+    for each in (humble, dds, far, alone):
+        assert each.stop()[0] == 0

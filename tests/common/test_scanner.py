@@ -8,10 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common import se2
+from common.config import load_settings
 from common.errors import UserError
 from common.scanner import SCANNERS
 from common.scanner_choice import chosen_scanner, load_scanner, scanner_arguments
 from common.sweep import ALL_ROUND, Sweep
+from services.simulator.settings import SimulatorSettings
 
 TIM571 = SCANNERS["tim571"]
 FILE = """
@@ -132,3 +134,16 @@ def test_an_unknown_scanner_names_those_there_are(name):
 def test_a_mount_that_is_none_is_refused(mount):
     with pytest.raises(UserError, match=r"--mount '.*': give x,y"):
         chosen_scanner("tim571", mount=mount)
+
+
+@pytest.mark.parametrize("noise", [-1.0, -1e-9, float("nan"), float("inf")])
+def test_noise_that_is_none_is_refused(noise):
+    with pytest.raises(UserError, match=r"tim571 with --noise .*: sigma: Input should be"):
+        chosen_scanner("tim571", noise=noise)
+    with pytest.raises(UserError, match=r"noise: Input should be .*--noise, PRESAGE_NOISE"):
+        load_settings(SimulatorSettings, [f"--noise={noise}"])
+
+
+def test_noise_asked_for_is_the_whole_of_it():
+    scanner = chosen_scanner("rplidar-a1", 30, 0.0)
+    assert (scanner.sigma, scanner.sigma_relative, scanner.beams) == (0, 0, 30)

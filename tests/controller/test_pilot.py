@@ -24,12 +24,15 @@ def belief_at(pose, stamp_ns, state="tracking", hypotheses=()):
     )  # fmt: skip
 
 
-def drive(world, robot, start, goal, limit=900, *, known=None, change=None, more=None, seed=0, stop=True):
+def drive(
+    world, robot, start, goal, limit=900, *, known=None, change=None, more=None, seed=0, stop=True, scanner=SCANNER,
+    seen=None,
+):  # fmt: skip
     """Scans until it is there: true poses, statuses, contacts, scans held back. ``known`` is the controller's map.
 
-    Without ``stop`` nobody holds the wheels back but the controller.
+    Without ``stop`` nobody holds the wheels back but the controller. ``seen``: what it is shown of a scan.
     """
-    simulation = Simulation(Setup(world, SCANNER, robot, start, seed, obstacle_stop=stop))
+    simulation = Simulation(Setup(world, scanner, robot, start, seed, obstacle_stop=stop))
     navigator = Navigator(robot, world=known or world, preset=Pilot(robot, known or world))
     navigator.hear_goal(
         Goal(stamp_ns=0, pose=Pose(x=goal[0], y=goal[1], yaw=(more or {}).pop("yaw", 0)), **(more or {}))
@@ -42,7 +45,7 @@ def drive(world, robot, start, goal, limit=900, *, known=None, change=None, more
             _, truth, scan = simulation.observe()
             poses.append(truth.pose.array())
             contacts += truth.contact
-            navigator.hear_scan(scan)
+            navigator.hear_scan(seen(scan) if seen else scan)
             command, status = navigator.step(belief_at(poses[-1], scan.stamp_ns))
             said.append(status)
             if status.state == "reached" and not np.any(simulation.physics.twist().round(3)):

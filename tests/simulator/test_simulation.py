@@ -262,3 +262,19 @@ def test_furniture_that_cannot_be_is_refused(make, action, name, center, why):
 def test_a_start_in_a_wall_is_one_clear_line():
     with pytest.raises(UserError, match=r"start \(0\.10, 3\.00\) is 0\.10 m from a wall of 'hall'"):
         Simulation(Setup(HALL, SCANNER, start=(0.1, 3.0, 0.0)))
+
+
+@pytest.mark.parametrize("radius", [0.105, 0.27, 0.4])
+def test_the_body_is_as_wide_as_it_is_told(make, radius):
+    """Without the stop it drives into the wall at x = 8 m, and stands at its own radius from it."""
+    robot = Robot(radius=radius, max_speed=0.3)
+    last = drive(make(start=(7.2, 3.0, 0.0), robot=robot, obstacle_stop=False), Twist(vx=1.0), 5)
+    assert last[-1].contact
+    assert max(map(speed, last)) == pytest.approx(0.3, abs=0.01)
+    assert 8 - last[-1].pose.x == pytest.approx(radius, abs=0.02)
+
+
+def test_a_strong_base_gains_speed_as_fast_as_it_may(make):
+    robot = Robot(max_speed=3.0, acceleration=8.0)
+    truths = drive(make(robot=robot, obstacle_stop=False), Twist(vx=3.0), 0.6)
+    assert speed(truths[-1]) == pytest.approx(3.0, abs=0.05)

@@ -16,6 +16,14 @@ NOWHERE = ("--connect", "tcp/127.0.0.1:9")  # the discard port: nobody is there
 
 WRONG = [
     (("up", "--world", "nowhere"), "give a file or one of corridor, maze, office"),
+    (("up", "--model", "exakt", "--port", "0"), "presage: no model 'exakt': give learned, exact"),
+    (("up", "--drive", "sideways", "--port", "0"), "presage: drive: Input should be 'holonomic' or 'differential'"),
+    (("up", "--start", "-1,0.5", "--port", "0"), "presage: start (-1.00, 0.50) is inside a wall or outside 'corridor'"),
+    (
+        ("up", "--radius", "nan", "--port", "0"),
+        "presage: radius: Input should be a finite number (--radius, PRESAGE_RADIUS)",
+    ),
+    (("demo", "--model", "exakt", "--out", "{tmp}/m"), "presage: no model 'exakt': give learned, exact"),
     (("demo", "--world", "{tmp}/no.yaml"), "give a file or one of"),
     (("demo", "--goal", "6.8", "3.95"), "from a wall of 'corridor'"),
     (("up", "--world", "maze", "--estimator", "paper", "--port", "0"), "presage train --world maze"),

@@ -116,7 +116,10 @@ def find(folder: Path, world: World, asked: str) -> Path:
     """The field of a world the user named ``asked``; raises UserError with the command that makes it."""
     path = path_of(folder, world.name)
     if not path.exists():
-        raise UserError(f"no field of world {world.name!r} in {folder}; make it with: {train_command(asked, folder)}")
+        raise UserError(
+            f"no field of world {world.name!r} in {folder}; make it with: {train_command(asked, folder)}; "
+            "or do without, by rays cast in the world itself: --model exact"
+        )
     _, _, card = load(path)
     if not same_walls(card.world, world):
         raise UserError(

@@ -1,0 +1,100 @@
+"""Robots that are not the shipped one: their own radius and limits decide where they go, and how fast."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from common.blind import Blind
+from common.messages import CmdVel, Twist
+from common.robot import Robot
+from common.world import Obstacle, World
+from services.bridge_ros2.wheels import Wheels
+from services.controller.pilot import Pilot
+from services.simulator.simulation import Setup, Simulation
+from tests.controller.test_pilot import SCANNER, drive
+
+BURGER = Robot(drive="differential", radius=0.105, max_speed=0.22, max_turn=2.84, acceleration=0.5, turn_acceleration=3)
+HEAVY = Robot(drive="differential", radius=0.4, max_speed=0.6, max_turn=0.8, acceleration=0.4, turn_acceleration=0.6)
+CENTRED = SCANNER.model_copy(update={"mount": (0.0, 0.0, 0.0)})
+
+
+def two_rooms(gap):
+    """A wall across, with a door of ``gap`` m in the middle."""
+    side = (3 - gap) / 2
+    walls = [Obstacle(box={"center": (3.0, y), "size": (0.2, side)}) for y in (side / 2, 3 - side / 2)]
+    return World(name="two", boundary=[(0, 0), (6, 0), (6, 3), (0, 3)], obstacles=walls)
+
+
+@pytest.mark.parametrize(("robot", "gap"), [(BURGER, 0.45), (HEAVY, 1.3)])
+def test_each_goes_through_its_own_door_within_its_own_limits(robot, gap):
+    world = two_rooms(gap)
+    poses, said, contacts = drive(world, robot, (1.0, 1.5, 2.0), (5.0, 1.5), 900, scanner=CENTRED)
+    assert said[-1].state == "reached", said[-1]
+    assert not contacts
+    assert world.clearance(poses[:, :2]).min() >= robot.radius
+    steps = np.array([b - a for a, b in itertools.pairwise(poses)])
+    speed = np.hypot(*steps[:, :2].T) * 15
+    assert 0.8 * robot.max_speed < speed.max() <= robot.max_speed * 1.02
+    turn = np.abs((steps[:, 2] + np.pi) % (2 * np.pi) - np.pi) * 15
+    assert turn.max() <= robot.max_turn * 1.02
+    assert np.abs(np.diff(speed)).max() * 15 <= robot.acceleration * 1.1
+
+
+def test_a_door_too_narrow_for_one_is_not_for_another():
+    world, goal = two_rooms(0.45), np.array([5.0, 1.5])
+    for robot, fits in ((BURGER, True), (Robot(), False)):
+        pilot = Pilot(robot, world)
+        roads = pilot.roads
+        here, there = (roads.nearest_free(np.array(at)) for at in ((1.0, 1.5), goal))
+        assert (roads.component[here] == roads.component[there]) is np.bool_(fits)
+
+
+POSTS = ((25, 0.12), (-110, 0.15), (110, 0.02))  # deg, m: of the robot itself; the last nearer than the scanner can say
+
+
+def with_posts(scan):
+    """Scans of a scanner that sees three posts of its own robot, each 4 degrees wide."""
+    ranges = scan.ranges.copy()
+    for at, away in POSTS:
+        beams = np.abs(np.rad2deg(scan.angles()) - at) <= 2
+        ranges[beams] = away if away > scan.range_min else -np.inf
+    return scan.model_copy(update={"ranges": ranges})
+
+
+@pytest.mark.parametrize(
+    "blind", [Blind(tuple(tuple(np.deg2rad([at - 3, at + 3])) for at, _ in POSTS)), Blind(radius=0.2)]
+)
+@pytest.mark.parametrize("kind", ["holonomic", "differential"])
+def test_who_sees_himself_drives_once_told(kind, blind):
+    """Round what stands in the way, which is seen all the same; without being told it is blocked for ever."""
+    world = World(name="hall", boundary=[(0, 0), (8, 0), (8, 4), (0, 4)])
+    box = Obstacle(name="box", circle={"center": (4.0, 2.0), "radius": 0.3})
+    robot, found = Robot(drive=kind), world.with_obstacles([box])
+
+    def run(limit, seen):
+        return drive(found, robot, (1.0, 2.0, 0.0), (7.0, 2.0), limit, known=world, seen=seen, stop=False)
+
+    _, said, contacts = run(600, lambda scan: blind.seen(with_posts(scan)))
+    assert said[-1].state == "reached", said[-1]
+    assert not contacts
+    poses, said, _ = run(150, with_posts)
+    assert said[-1].state != "reached"
+    assert np.hypot(*(poses[-1] - poses[0])[:2]) < 0.5
+
+
+def test_the_bridges_stop_knows_it_too():
+    world, robot = World(name="hall", boundary=[(0, 0), (8, 0), (8, 4), (0, 4)]), Robot()
+    simulation = Simulation(Setup(world, SCANNER, robot, (1.0, 2.0, 0.0)))
+    scan = with_posts(simulation.observe()[2])
+    simulation.close()
+    command, blind, driven = CmdVel(stamp_ns=scan.stamp_ns, twist=Twist(vx=0.3)), Blind(radius=0.2), []
+    for shown in (scan, blind.silenced(scan), blind.seen(scan)):
+        wheels = Wheels(robot)
+        wheels.hear_scan(shown, 0.0)
+        driven.append(wheels.command(command, 0.01))
+    assert driven[0] is None or not driven[0].any()
+    assert driven[1][0] > 0
+    assert driven[2][0] > 0
