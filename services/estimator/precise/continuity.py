@@ -28,6 +28,7 @@ BEGINS, GOES_ON = (
 )  # least share of a scan's points that were seen before: of the first that is held, of others
 TURNS = np.array([-0.3, -0.15, 0.15, 0.3])  # rad, tried besides where a scan does not go on so clearly:
 CLEARLY = 0.8
+REACH = 0.3  # m: a robot that may have gone further since the last scan may have been carried as well
 PROVEN = 3  # scans kept that the model explained, before it may explain less
 DRIFT = np.array([0.02, 0.02, 0.005])  # m, m, rad: standard deviation that every scan kept adds
 DOUBT, MEMORY = 0.35, 0.95  # share of the beams, averaged over so many scans, that may end behind what is expected
@@ -54,6 +55,7 @@ class Continuity:
         self._late, self._proven = 0.0, PROVEN * given
         self._seen_from: Array | None = None  # (3,) in that frame, of the last scan
         self._holds = False  # the place, since some scans
+        self._often = True  # scans come, for a robot as fast as this
 
     def keep(self, pose: Array, covariance: Array, points: Array, *, explained: bool) -> None:
         """A scan's points (K, 2) m in the laser, seen from ``pose`` (3,) that is known within ``covariance``."""
@@ -68,9 +70,9 @@ class Continuity:
             self._anchor = covariance + np.diag(DRIFT**2)
             self._proven += explained
 
-    def passed(self) -> None:
-        """The next scan is another."""
-        self._seen_from = None
+    def passed(self, reach: float) -> None:
+        """The next scan is another; the robot may have gone ``reach`` m since the last."""
+        self._seen_from, self._often = None, reach <= REACH
 
     def hold(self, options: list[Candidate], start: Array, points: Array, late: float) -> Candidate | None:
         """Where a scan goes on from those kept, if it does.
@@ -78,7 +80,7 @@ class Continuity:
         ``options``: where the robot may have moved, the widest last; ``start`` (3,): where else to begin; points (K, 2)
         m in the laser; ``late``: the share of the beams that end behind what is expected.
         """
-        if self._proven < PROVEN:
+        if self._proven < PROVEN or not self._often:
             return None
         self._late += (1 - MEMORY) * (late - self._late)
         match = self._match(np.array([*(option.mean for option in options), start]), points, options[-1])

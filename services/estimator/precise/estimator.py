@@ -77,7 +77,7 @@ class PreciseEstimator:
         view = View(
             self.model, self.likelihood, self.mount, observation.angles, observation.ranges, observation.range_max
         )
-        self._continuity.passed()
+        self._continuity.passed(self.settings.motion.speed * self._period(observation.stamp))
         self._points = points_of(observation.ranges, observation.angles, observation.range_max)
         if self.modes:
             yield from self._track(view, observation)

@@ -143,6 +143,9 @@ def test_a_place_must_be_proven_and_not_be_contradicted():
             explained=True,
         )
     assert made.hold(option, here, scan(scene, here), 0.0) is not None
+    made.passed(1.0)
+    assert made.hold(option, here, scan(scene, here), 0.0) is None  # it may have gone a metre
+    made.passed(0.1)
     held = [made.hold(option, here, scan(scene, here), 0.9) is not None for _ in range(30)]
     assert held[0]
     assert not held[-1]
