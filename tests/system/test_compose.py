@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from common.bus import Link, open_bus, wait_until
-from common.messages import Belief, Scan, Truth
+from common.messages import Belief, Scan, Status, Truth
 from common.security import credentials
 from common.topics import BELIEF, CMD_VEL, SCAN, STATUS, TRUTH
 from presage import secure
@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.docker, pytest.mark.timeout(1500)]
 HEAVY = ("pybullet", "torch", "numba", "scipy", "mcap", "starlette", "typer", "matplotlib", "rosbags")
 HOLDS = {
     "router": set(), "none": set(), "recorder": {"mcap"}, "replay": {"mcap"}, "controller": {"scipy"},
-    "bridge_ros2": {"rosbags"}, "simulator": {"pybullet", "scipy"}, "estimator": {"torch", "numba"},
+    "bridge_ros2": {"rosbags"}, "simulator": {"pybullet", "scipy"}, "estimator": {"torch", "numba", "scipy"},
     "viewer": {"mcap", "starlette", "typer"}, "cli": {"mcap", "typer", "matplotlib", "rosbags"},
 }  # fmt: skip
 
@@ -135,7 +135,11 @@ def test_services_are_exchanged_while_the_others_go_on(compose):
         watch = Watch(bus, TRUTH, STATUS, BELIEF, SCAN)
         assert watch.until(Truth, lambda truth: truth.pose.x > 5.0, PATIENCE), project.explain("goal")
 
-        # Another estimator, while it drives: it stands meanwhile, then goes on to its goal.
+        # Another estimator, while it drives: it stands meanwhile, however short that is, then goes on to its goal.
+        project.do("stop", "estimator")
+        alone = watch.until(Status, lambda status: "no belief for" in status.reason, PATIENCE)
+        assert alone is not None
+        assert watch.until(Truth, lambda truth: truth.stamp_ns > alone.stamp_ns + 2e9, PATIENCE) is not None
         project.do("up", "--detach", "--no-deps", "estimator", PRESAGE_ESTIMATOR="particle-filter")
         assert project.ends("goal") == 0
         assert "reached: within 0.2 m of the goal" in project.do("logs", "goal")
