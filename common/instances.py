@@ -53,7 +53,8 @@ class Instances:
 
     def change(self, name: str, *, leads: bool, there: bool) -> None:
         """An instance leads or waits from now on, or does so no more."""
-        if name == self.me:
+        # This session itself: as it is now, or as it led this robot before, which zenoh may tell again.
+        if name.partition("~")[2] == self.me.partition("~")[2]:
             return
         with self._lock:
             group = self._leading if leads else self._waiting

@@ -34,10 +34,13 @@ def test_what_is_no_name_is_said_as_it_is():
     assert spoken("estimator") == "estimator"
 
 
-@given(st.lists(st.tuples(st.sampled_from("abcde"), st.booleans(), st.booleans()), max_size=30))
+EVERYBODY = [Instance(k, "host", 1, f"{k}").name for k in range(5)]
+
+
+@given(st.lists(st.tuples(st.sampled_from(EVERYBODY), st.booleans(), st.booleans()), max_size=30))
 def test_of_all_who_see_the_same_at_most_one_takes_the_lead(events):
     """What each of them sees: everything but itself; those that may lead when nobody does are one."""
-    everybody = {name: Instances(name) for name in "abcde"}
+    everybody = {name: Instances(name) for name in EVERYBODY}
     leading, waiting = set(), set()
     for name, leads, there in events:
         group = leading if leads else waiting
@@ -48,6 +51,17 @@ def test_of_all_who_see_the_same_at_most_one_takes_the_lead(events):
     assert len(candidates) == (0 if leading or not waiting else 1)
     stay = [name for name in leading if not everybody[name].must_yield()]
     assert stay == ([min(leading)] if leading else [])
+
+
+@given(names, names)
+def test_what_this_session_said_before_is_nobody_else(me, other):
+    """Zenoh may tell a session of a token of its own that is gone: a robot that came back was never served again."""
+    instances = Instances(me.name)
+    instances.change(Instance(other.started_ms, me.host, me.pid, me.zid).name, leads=True, there=True)
+    assert instances.may_lead()
+    assert not instances.must_yield()
+    instances.change(Instance(other.started_ms, me.host, me.pid + 1, me.zid).name, leads=True, there=True)
+    assert not instances.may_lead()
 
 
 def test_where_nobody_leads_the_first_source_is_heard_until_it_is_silent():

@@ -57,7 +57,7 @@ def test_the_second_controller_stands_by_and_takes_the_goal_over(process, bus, h
     first.send(signal.SIGSTOP)
     next_of(truths, Truth, lambda t: speed(t) < 1e-3)
     second.wait_for("taking over", PATIENCE)
-    assert "going on to the goal of the controller before this one" in second.output
+    second.wait_for("going on to the goal of the controller before this one", PATIENCE)
     next_of(states, Status, lambda s: s.goal_seq == 7 and s.state == "navigating")
     next_of(truths, Truth, lambda t: speed(t) > 0.3)
 
