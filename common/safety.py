@@ -21,9 +21,8 @@ def scan_points(scan: Scan) -> Array:
     hit = surfaces(scan.ranges) | close
     ranges = np.where(close, scan.range_min, scan.ranges.astype(np.float64))
     angles, ranges = scan.angles()[hit], ranges[hit]
-    mount = scan.mount.array()
     in_laser = np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=-1)
-    return mount[:2] + se2.rotate(float(mount[2]), in_laser)
+    return se2.transform(scan.mount.array(), in_laser)
 
 
 def clip_twist(twist: Array, robot: Robot) -> Array:

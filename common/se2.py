@@ -61,3 +61,9 @@ def rotate(yaw: float, vector: npt.ArrayLike) -> Array:
     v = np.asarray(vector, float)
     cos, sin = np.cos(yaw), np.sin(yaw)
     return np.stack([cos * v[..., 0] - sin * v[..., 1], sin * v[..., 0] + cos * v[..., 1]], axis=-1)
+
+
+def transform(pose: npt.ArrayLike, points: npt.ArrayLike) -> Array:
+    """Points (..., 2) m seen from ``pose`` (3,), in its parent."""
+    p = np.asarray(pose, float)
+    return np.asarray(p[:2] + rotate(float(p[2]), points))

@@ -61,18 +61,17 @@ def trial(job: Job) -> dict[str, Any]:
     if job.task in (ODOMETRY, LASER):
         estimator.restart(drive.poses[job.first], NEAR)
         numbers = np.arange(job.first, job.first + job.count)
-        odom = drive.odom[numbers] if drive.odom is not None and job.task == ODOMETRY else None
     elif job.task == GLOBAL:
         numbers = np.arange(job.first, min(job.first + (job.count or LIMIT), len(drive.ranges)))
-        odom = None if drive.odom is None else drive.odom[numbers]
     else:
         estimator.restart(drive.poses[job.first], NEAR)
         after = np.arange(job.to, min(job.to + LIMIT, len(drive.ranges)))
         numbers = np.concatenate([np.arange(job.first, job.first + BEFORE), after])
-        odom = None if drive.odom is None else unaware(drive.odom[numbers], BEFORE)
     clock = drive.stamps[numbers]
+    odom = None if drive.odom is None or job.task == LASER else drive.odom[numbers]
     if job.task == KIDNAPPED:  # carried in no time, as far as the sensors tell
         clock[BEFORE:] += drive.stamps[job.first + BEFORE] - clock[BEFORE]
+        odom = None if odom is None else unaware(odom, BEFORE)
     rows: dict[str, list[Any]] = {name: [] for name in ("stamp_s", "error_m", "yaw_error_rad", "state", "nees", "ms")}
     for i, k in enumerate(numbers):
         told = None if odom is None else odom[i]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from services.bridge_ros2.graph import named
 from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, TWIST_STAMPED
 
 if TYPE_CHECKING:
@@ -61,18 +62,19 @@ def _no_odometry(options: BridgeRos2Settings, graph: Graph) -> str:
     there = graph.topics_of(ODOMETRY)
     if not there or topic in there:
         return ""
-    return f"no odometry on {topic}: {ODOMETRY} is on {', '.join(there[:4])}: --odom-topic"
+    return f"no odometry on {topic}: {ODOMETRY} is on {named(there)}: --odom-topic"
 
 
 def _nobody(options: BridgeRos2Settings, graph: Graph) -> str:
     """Where nobody of our flavour and domain is seen: who is there instead, or what to look at."""
-    others = graph.elsewhere()
-    domains = sorted({each.domain for each in others if each.flavor == "rmw_zenoh" and each.domain is not None})
+    elsewhere = graph.elsewhere()
+    domains = sorted({each.domain for each in elsewhere if each.flavor == "rmw_zenoh" and each.domain is not None})
     if options.flavor == "rmw_zenoh":
-        if any(each.flavor == "ros2dds" for each in others):
+        if any(each.flavor == "ros2dds" for each in elsewhere):
             return "there it is zenoh-bridge-ros2dds that speaks, not rmw_zenoh: --flavor ros2dds"
         if domains:
-            return f"nobody is seen in ROS domain {options.domain}, but in {_numbers(domains)}: --domain {domains[0]}"
+            others = named([str(domain) for domain in domains])
+            return f"nobody is seen in ROS domain {options.domain}, but in {others}: --domain {domains[0]}"
     elif domains:
         domain = "" if options.domain in domains else f" --domain {domains[0]}"
         return f"there it is rmw_zenoh that speaks, not zenoh-bridge-ros2dds: --flavor rmw_zenoh{domain}"
@@ -80,7 +82,3 @@ def _nobody(options: BridgeRos2Settings, graph: Graph) -> str:
     if options.flavor == "ros2dds":
         return f"{where} does zenoh-bridge-ros2dds run there, in the ROS_DOMAIN_ID of the robot's nodes?"
     return f"{where} do its nodes run with RMW_IMPLEMENTATION=rmw_zenoh_cpp, and does ros2 topic list show them there?"
-
-
-def _numbers(domains: list[int]) -> str:
-    return ", ".join(map(str, domains[:4]))

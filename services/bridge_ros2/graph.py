@@ -68,8 +68,8 @@ class Graph:
         if here:
             return f"it is of type {here[0].kind}, not {kind}"
         if others := sorted({each.topic for each in publishers if each.kind == kind}):
-            return f"nobody publishes it; {kind} is on {_some(others)}: {option}"
-        return f"nobody publishes it, nor any other {kind}; there are {_some(sorted({e.topic for e in publishers}))}"
+            return f"nobody publishes it; {kind} is on {named(others)}: {option}"
+        return f"nobody publishes it, nor any other {kind}; there are {named(sorted({e.topic for e in publishers}))}"
 
     def topics_of(self, kind: str) -> list[str]:
         """On which a type is published."""
@@ -88,9 +88,10 @@ class Graph:
 
 
 def _nodes(endpoints: list[Endpoint]) -> str:
-    return _some(sorted({each.node for each in endpoints} - {""})) or "somebody"
+    return named(sorted({each.node for each in endpoints} - {""})) or "somebody"
 
 
-def _some(names: list[str]) -> str:
+def named(names: list[str]) -> str:
+    """The first of them, and how many more, for one line."""
     more = len(names) - SHOWN
     return ", ".join(names[:SHOWN]) + (f" and {more} more" if more > 0 else "")

@@ -137,7 +137,9 @@ class Pilot:
         if self.robot.drive == "differential" and not bool(around.sees(0.0)):
             reason = BLIND
         stands = bool(reason) and not choice.action.any()
-        return Decision(action, reason, "blocked" if stands else "navigating", way, _in_map(pose, choice.way))
+        return Decision(
+            action, reason, "blocked" if stands else "navigating", way, se2.transform(pose, choice.way[:, :2])
+        )
 
     def question(self, belief: Belief) -> Options | None:
         """Where scans must be predicted before `seek` can choose where to go; None: nowhere, now."""
@@ -201,7 +203,7 @@ class Pilot:
         radius = self.robot.radius
 
         def known(places: Array) -> Array:
-            return self.free.clear(pose[:2] + se2.rotate(pose[2], places))
+            return self.free.clear(se2.transform(pose, places))
 
         return Around(
             known, se2.rotate(-pose[2], points[near] - pose[:2]), moving[near], self.roads.least, radius + KEEP,
@@ -223,7 +225,9 @@ class Pilot:
         best = int(np.argmax(around.gaps(places[:, None, :], np.zeros(1))[:, 0]))
         choice = choose(velocity, places[best], around, self.robot)
         action = facing(choice.action, places[best], self.robot, turns=around.turns, front=around.front)
-        return Decision(action, "stuck: backing off", path=way, motion=_in_map(pose, choice.way), recovering=True)
+        return Decision(
+            action, "stuck: backing off", path=way, motion=se2.transform(pose, choice.way[:, :2]), recovering=True
+        )
 
     def _what_holds(self, pose: Array, around: Around, *, stood: bool) -> str:
         does = "waiting" if stood else "slowing"
@@ -241,9 +245,5 @@ class Pilot:
 def _nearest(pose: Array, around: Around) -> tuple[int, str]:
     """Index of the nearest of ``around.points``, of which there are some, and where it is in map."""
     nearest = int(np.argmin(np.hypot(*around.points.T)))
-    x, y = pose[:2] + se2.rotate(pose[2], around.points[nearest])
+    x, y = se2.transform(pose, around.points[nearest])
     return nearest, f"({x:.1f}, {y:.1f})"
-
-
-def _in_map(pose: Array, way: Array) -> Array:
-    return np.asarray(pose[:2] + se2.rotate(pose[2], way[:, :2]))

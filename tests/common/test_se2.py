@@ -58,3 +58,8 @@ def test_batches_broadcast():
     many = np.arange(12.0).reshape(4, 3)
     assert se2.compose(many, [0.2, 0, 0]).shape == (4, 3)
     assert se2.rotate(np.pi / 2, [[1, 0], [0, 1]]) == pytest.approx(np.array([[0, 1], [-1, 0]]))
+
+
+@given(poses, poses)
+def test_a_point_is_transformed_as_the_pose_that_stands_there(a, b):
+    assert se2.transform(a, b[None, :2])[0] == pytest.approx(se2.compose(a, b)[:2], abs=1e-9)

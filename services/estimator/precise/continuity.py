@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common import se2
-from services.estimator.precise.gauss_newton import NARROW, WIDE, Prior, View, descending, difference, polishing
+from services.estimator.precise.gauss_newton import NARROW, WIDE, Prior, View, descending, polishing
 from services.estimator.precise.motion import Candidate
 from services.estimator.precise.recent import Match, RecentScans
 
@@ -22,18 +22,13 @@ if TYPE_CHECKING:
     from services.estimator.precise.likelihood import Evidence
     from services.estimator.precise.settings import Settings
 
-BEGINS, GOES_ON = (
-    0.75,
-    0.45,
-)  # least share of a scan's points that were seen before: of the first that is held, of others
+BEGINS, GOES_ON = 0.75, 0.45  # least share of a scan's points that were seen before: the first that is held; others
 TURNS = np.array([-0.3, -0.15, 0.15, 0.3])  # rad, tried besides where a scan does not go on so clearly:
 CLEARLY = 0.8
 REACH = 0.3  # m: a robot that may have gone further since the last scan may have been carried as well
 PROVEN = 3  # scans kept that the model explained, before it may explain less
 DRIFT = np.array([0.02, 0.02, 0.005])  # m, m, rad: standard deviation that every scan kept adds
 DOUBT, MEMORY = 0.35, 0.95  # share of the beams, averaged over so many scans, that may end behind what is expected
-
-
 PARTLY, LESS = 0.1, 4  # weight of what a model says that explains a scan in part, and the power of its share of `good`
 FAR = 16.0  # squared standard deviations
 AROUND = np.array([0.3, 0.3, 0.3])  # m, m, rad: how far a place that the model claims may be off
@@ -115,8 +110,7 @@ def looked_at(view: View, held: Candidate, settings: Settings) -> Conversation[t
     """
     starts = held.mean + _spread_out(held.covariance)
     starts[:, 2] = se2.wrap(starts[:, 2])
-    information = np.linalg.inv(held.covariance)
-    prior = Prior(np.tile(held.mean, (len(starts), 1)), np.tile(information, (len(starts), 1, 1)))
+    prior = Prior.alike(len(starts), held.mean, held.covariance)
     for widen in (WIDE, NARROW):
         starts, _ = yield from descending(view, starts, prior, widen, 4)
     poses, evidence = yield from polishing(view, starts, prior)
@@ -133,8 +127,7 @@ def looked_at(view: View, held: Candidate, settings: Settings) -> Conversation[t
 
 def agree(pose: Array, held: Candidate) -> bool:
     """Whether ``pose`` (3,) lies where ``held`` says."""
-    off = difference(pose[None], held.mean[None])[0]
-    return bool(off @ np.linalg.solve(held.covariance, off) < FAR)
+    return held.squared_distance(pose) < FAR
 
 
 def around(pose: Array) -> Candidate:

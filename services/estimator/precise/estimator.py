@@ -17,7 +17,6 @@ from services.estimator.precise.gauss_newton import WIDEST, Prior, View, polishi
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.mixture import Mode
 from services.estimator.precise.motion import Candidate, candidates, fuse, unseen, within_reach
-from services.estimator.precise.recent import points_of
 from services.estimator.precise.settings import Settings
 
 if TYPE_CHECKING:
@@ -65,7 +64,6 @@ class PreciseEstimator:
         self._since, self._wait = 0, FIRST_WAIT  # scans that fitted badly, and after how many to search
         self._believed = False  # the last scan
         self._continuity = Continuity(self.mount)
-        self._points = np.zeros((0, 2))
         self._held = False
 
     def update(self, observation: Observation) -> Posterior:
@@ -78,7 +76,6 @@ class PreciseEstimator:
             self.model, self.likelihood, self.mount, observation.angles, observation.ranges, observation.range_max
         )
         self._continuity.passed(self.settings.motion.speed * self._period(observation.stamp))
-        self._points = points_of(observation.ranges, observation.angles, observation.range_max)
         if self.modes:
             yield from self._track(view, observation)
         if not self.modes or self._suspicious(view):
@@ -86,7 +83,7 @@ class PreciseEstimator:
             yield from self._relocalise(view)
         self._stamp, self._odom = observation.stamp, observation.odom
         best = self.modes[0]
-        self._remember(best)
+        self._remember(view, best)
         self._usual += 0.1 * (best.explained - self._usual)
         self._energy += 0.1 * (best.accuracy - self._energy)
         return (yield from self._posterior(view, best))
@@ -154,19 +151,20 @@ class PreciseEstimator:
         expected = self._expected(view, start)
         if explained >= settings.glimpse and obstruction.crowded(view, expected, settings.contradicted):
             return None
-        held = self._continuity.hold(options, start, self._points, obstruction.late(view, expected))
+        held = self._continuity.hold(options, start, view.points, obstruction.late(view, expected))
         if held is None or (not weak and continuity.agree(start, held)):
             return None
         self._held = True
         return held
 
-    def _remember(self, best: Mode) -> None:
+    def _remember(self, view: View, best: Mode) -> None:
+        """For the scans to come: where this one was seen from, if that is known."""
         if not best.trusted:
             self._held = False
             self._continuity.forget()
         elif self._held or best.explained >= self.settings.good:
             explained = best.explained >= self.settings.good
-            self._continuity.keep(best.pose, self._covariance(best), self._points, explained=explained)
+            self._continuity.keep(best.pose, self._covariance(best), view.points, explained=explained)
 
     def _suspicious(self, view: View) -> bool:
         """The scan fits worse at once, or has fitted badly for long, or not as a belief must."""
@@ -197,7 +195,7 @@ class PreciseEstimator:
         if self._held or not best.trusted or best.explained < self.settings.good:
             return self._held
         late = obstruction.late(view, self._expected(view, best.pose))
-        return self._continuity.hold([continuity.around(best.pose)], best.pose, self._points, late) is not None
+        return self._continuity.hold([continuity.around(best.pose)], best.pose, view.points, late) is not None
 
     def _expected(self, view: View, pose: Array) -> Expected:
         return view.model.expect(se2.compose(pose, view.mount)[None], view.angles)

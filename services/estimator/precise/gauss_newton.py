@@ -7,11 +7,13 @@ information of the density), D its diagonal. A step that does not lower F is tak
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from common import se2
+from common.ranges import surfaces
 from services.estimator.asking import Conversation, alone
 from services.estimator.generative import Expect, Expected
 from services.estimator.precise.likelihood import Evidence
@@ -46,6 +48,13 @@ class View:
         angles, ranges = np.ascontiguousarray(self.angles[::k]), np.ascontiguousarray(self.ranges[::k])
         return View(self.model, self.likelihood, self.mount, angles, ranges, self.range_max)
 
+    @cached_property
+    def points(self) -> Array:
+        """(K, 2) m in the laser, where beams ended."""
+        hit = surfaces(self.ranges) & (self.ranges < self.range_max)
+        angles = self.angles[hit]
+        return np.asarray(self.ranges[hit, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1))
+
     def evidence(self, poses: Array, widen: float = 0.0) -> Evidence:
         """What the scan says about base_link poses (N, 3), derivatives by these."""
         return alone(self.looking(poses, widen))
@@ -74,6 +83,12 @@ class Prior:
     mean: Array  # (N, 3)
     information: Array  # (N, 3, 3)
 
+    @classmethod
+    def alike(cls, count: int, mean: Array, covariance: Array) -> Prior:
+        """The same (3,), (3, 3) for each of ``count``."""
+        information = np.linalg.inv(covariance)
+        return cls(np.tile(mean, (count, 1)), np.tile(information, (count, 1, 1)))
+
     def energy(self, poses: Array) -> Array:
         """(N,) nats, the quadratic part."""
         off = difference(poses, self.mean)
@@ -85,6 +100,12 @@ def difference(a: Array, b: Array) -> Array:
     off = a - b
     off[:, 2] = se2.wrap(off[:, 2])
     return np.asarray(off)
+
+
+def of_position(curvature: Array) -> Array:
+    """(2, 2) what ``curvature`` (3, 3) says of the position, the heading being unknown (Schur complement)."""
+    across = np.outer(curvature[:2, 2], curvature[2, :2])
+    return np.asarray(curvature[:2, :2] - across / max(float(curvature[2, 2]), 1e-12))
 
 
 def descend(

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common import se2
-from services.estimator.precise.gauss_newton import Prior, difference
+from services.estimator.precise.gauss_newton import Prior, difference, of_position
 from services.estimator.precise.motion import smoothed
 
 if TYPE_CHECKING:
@@ -53,10 +53,9 @@ def seen(curvature: Array, ripple: float) -> tuple[Array, Array | None]:
     """What a scan tells of the position: (3, 3) projection onto it, and the direction (2,) it tells nothing of.
 
     Along a corridor without features a learned field still has ripples: walls tilted by ``ripple`` rad, which add about
-    ripple² of the curvature across. Not clearly more than that is taken for none. (Schur: the heading is not known.)
+    ripple² of the curvature across. Not clearly more than that is taken for none.
     """
-    S = curvature[:2, :2] - np.outer(curvature[:2, 2], curvature[2, :2]) / max(float(curvature[2, 2]), 1e-12)
-    values, vectors = np.linalg.eigh(S)
+    values, vectors = np.linalg.eigh(of_position(curvature))
     if values[0] >= (BLIND + RIPPLES * ripple**2) * values[1] and values[1] > 0:
         return np.eye(3), None
     keep, blind = np.eye(3), vectors[:, 0]

@@ -48,6 +48,12 @@ class Candidate:
     covariance: Array  # (3, 3) in map
     probability: float
 
+    def squared_distance(self, pose: Array) -> float:
+        """Of ``pose`` (3,) from the mean, squared standard deviations (Mahalanobis)."""
+        off = pose - self.mean
+        off[2] = se2.wrap(off[2])
+        return float(off @ np.linalg.solve(self.covariance, off))
+
 
 def candidates(
     noise: MotionNoise,

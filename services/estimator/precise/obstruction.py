@@ -29,19 +29,13 @@ def contradicted(view: View, expected: Expected) -> float:
 
 def late(view: View, expected: Expected) -> float:
     """The same as a share of all beams: where little is expected, little can contradict."""
-    surface = expected.ranges[0]
-    deviation = np.hypot(expected.scale[0], view.likelihood.deviation(surface))
-    behind = np.isfinite(view.ranges) & (view.ranges > surface + CLEARLY * deviation)
-    return float(behind.mean())
+    return float((np.isfinite(view.ranges) & (view.ranges > _behind(view, expected))).mean())
 
 
 def crowded(view: View, expected: Expected, contradicted: float) -> bool:
     """Whether what stands in the way is all that the model does not explain: (nearly) every beam is expected to end."""
-    surface = expected.ranges[0]
     known = np.isfinite(expected.scale[0])
-    near = np.abs(view.ranges - surface) <= CLEARLY * np.hypot(expected.scale[0], view.likelihood.deviation(surface))
-    early = view.ranges < surface
-    return float((known & (early | near)).mean()) > 0.95 - contradicted
+    return float((known & (view.ranges <= _behind(view, expected))).mean()) > 0.95 - contradicted
 
 
 def held(view: View, pose: Array, direction: Array) -> float:
@@ -51,3 +45,9 @@ def held(view: View, pose: Array, direction: Array) -> float:
     turned = np.abs(normal @ direction) > np.sin(CORNER) * np.hypot(*normal.T)
     there = turned & np.isfinite(view.ranges) & np.isfinite(surface)
     return float(view.likelihood.inlier(view.ranges[there], surface[there], scale[there], view.range_max).sum())
+
+
+def _behind(view: View, expected: Expected) -> Array:
+    """(B,) m: what is seen beyond is clearly behind the surface expected."""
+    surface = expected.ranges[0]
+    return np.asarray(surface + CLEARLY * np.hypot(expected.scale[0], view.likelihood.deviation(surface)))

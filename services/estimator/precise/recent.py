@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from common import se2
 from common.se2 import Array
-from services.estimator.precise.gauss_newton import difference
+from services.estimator.precise.gauss_newton import difference, of_position
 from services.estimator.precise.motion import Candidate
 
 KEPT = 8  # scans in the map
@@ -79,14 +79,14 @@ class RecentScans:
             return None
         information = np.asarray(np.linalg.inv(prior.covariance), float)
         found = [self._descend(start, points, prior.mean, information) for start in starts]
-        within = [each for each in found if each is not None and _distance(each.pose, prior.mean, information) < FAR]
+        within = [each for each in found if each is not None and prior.squared_distance(each.pose) < FAR]
         return max(within, key=lambda each: each.score, default=None)
 
     def _built(self) -> cKDTree:
         if self._tree is not None:
             return self._tree
         self._points = _thinned(
-            np.concatenate([_seen(se2.compose(pose, self.mount), points) for pose, points in self._scans])
+            np.concatenate([se2.transform(se2.compose(pose, self.mount), points) for pose, points in self._scans])
         )
         self._tree = cKDTree(self._points)
         _, near = self._tree.query(self._points, NEIGHBOURS, distance_upper_bound=AROUND)
@@ -102,7 +102,7 @@ class RecentScans:
         pose, H = np.array(start), np.eye(3)
         for reach in REACHES:
             laser = se2.compose(pose, self.mount)
-            seen = _seen(laser, points)
+            seen = se2.transform(laser, points)
             off, partner = tree.query(seen, distance_upper_bound=reach)
             met = np.isfinite(off)
             if met.sum() < LEAST_POINTS:
@@ -117,7 +117,7 @@ class RecentScans:
             step = np.linalg.solve(H + SCALE**2 * information, SCALE**2 * information @ back - (J.T * weight) @ error)
             pose = pose + step
             pose[2] = se2.wrap(pose[2])
-        seen = _seen(se2.compose(pose, self.mount), points)
+        seen = se2.transform(se2.compose(pose, self.mount), points)
         off, partner = tree.query(seen)
         error = np.einsum("ni,ni->n", self._normals[partner], seen - self._points[partner])
         score = ((off < 2 * MET) / (1 + (error / SCALE) ** 2)).mean()
@@ -133,23 +133,6 @@ def _thinned(points: Array) -> Array:
     return np.stack([np.bincount(cell, points[:, k]) / count for k in (0, 1)], axis=-1)
 
 
-def _distance(pose: Array, mean: Array, information: Array) -> float:
-    off = difference(pose[None], mean[None])[0]
-    return float(off @ information @ off)
-
-
-def _seen(laser: Array, points: Array) -> Array:
-    """(K, 2) m in map, of points (K, 2) in ``laser`` (3,)."""
-    return np.asarray(laser[:2] + se2.rotate(float(laser[2]), points))
-
-
-def points_of(ranges: Array, angles: Array, range_max: float) -> Array:
-    """(K, 2) m in the laser, where beams (B,) ended."""
-    hit = np.isfinite(ranges) & (ranges > 0) & (ranges < range_max)
-    return np.stack([ranges[hit] * np.cos(angles[hit]), ranges[hit] * np.sin(angles[hit])], axis=-1)
-
-
 def _blind(H: Array) -> bool:
-    S = H[:2, :2] - np.outer(H[:2, 2], H[2, :2]) / max(float(H[2, 2]), 1e-12)
-    low, high = np.linalg.eigvalsh(S)
+    low, high = np.linalg.eigvalsh(of_position(H))
     return bool(low < BLIND * high)

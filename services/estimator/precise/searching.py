@@ -36,9 +36,7 @@ def near(
     """What fits best near ``pose`` (3,), given with ``covariance`` (3, 3)."""
     starts = rng.multivariate_normal(pose, covariance, settings.seeds)
     starts[0] = pose
-    information = np.linalg.inv(covariance)
-    prior = Prior(np.tile(pose, (len(starts), 1)), np.tile(information, (len(starts), 1, 1)))
-    return (yield from _refine(view, starts, prior, seeds, settings))
+    return (yield from _refine(view, starts, Prior.alike(len(starts), pose, covariance), seeds, settings))
 
 
 def further(view: View, starts: Array, prior: Prior, around: Array) -> Conversation[tuple[Array, Evidence]]:

@@ -15,8 +15,10 @@ from presage.accuracy.scenes import Scene
 from services.estimator.generative import Expected, RayCaster
 from services.estimator.precise.continuity import BEGINS, PROVEN, Continuity
 from services.estimator.precise.estimator import PreciseEstimator
+from services.estimator.precise.gauss_newton import View
+from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion import Candidate
-from services.estimator.precise.recent import RecentScans, points_of
+from services.estimator.precise.recent import RecentScans
 from services.estimator.precise.seeding import Seeds, thin_places
 from tests.estimator.models import ROOM
 
@@ -56,7 +58,7 @@ class HalfLearned:
 def scan(scene, pose):
     """Points (K, 2) m in the laser."""
     seen = scene.observe(scene.clean(np.array(pose)[None])[0], 0.0)
-    return points_of(seen.ranges, seen.angles, seen.range_max)
+    return View(RayCaster(HALL), Likelihood(), np.zeros(3), seen.angles, seen.ranges, seen.range_max).points
 
 
 @given(x=st.floats(-0.1, 0.1), y=st.floats(-0.1, 0.1), yaw=st.floats(-0.12, 0.12), seed=st.integers(0, 99))

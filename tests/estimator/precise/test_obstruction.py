@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.world import World, load_world
-from services.estimator.generative import RayCaster
+from services.estimator.generative import Expected, RayCaster
 from services.estimator.precise import obstruction
 from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.likelihood import Likelihood
@@ -40,6 +40,18 @@ def test_people_contradict_nothing_and_another_place_does():
     assert obstruction.contradicted(view, expected_at(view, here)) < 0.01
     whole = view_of(made, scene, clean)
     assert obstruction.contradicted(whole, expected_at(whole, there)) > 0.2
+
+
+def test_where_no_return_is_expected_nothing_contradicts():
+    made, scene = estimator(ROOM)
+    count = len(scene.scanner.angles())
+    nothing = Expected(np.full((1, count), np.inf), np.full((1, count), 0.01), np.zeros((1, count, 3)))
+    for measured in (np.inf, 2.0, -np.inf):
+        view = view_of(made, scene, np.full(count, measured))
+        assert obstruction.crowded(view, nothing, 0.02)
+        assert obstruction.late(view, nothing) == obstruction.contradicted(view, nothing) == 0
+    unknown = Expected(nothing.ranges, np.full((1, count), np.inf), nothing.jacobian)
+    assert not obstruction.crowded(view_of(made, scene, np.full(count, np.inf)), unknown, 0.02)
 
 
 def test_what_holds_a_place_along_a_hall_is_what_stands_across():
