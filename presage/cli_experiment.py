@@ -207,11 +207,14 @@ def predicted(
 @app.command("real")
 def real_drive(
     log: Annotated[Path, typer.Option(help="Recording or log with reference poses (docs/logs.md).")],
-    world: Annotated[str, typer.Option("--map", help="ROS map or world file made from the first half of the log.")],
+    world: Annotated[str, typer.Option("--map", help="ROS map or world file of the half that is learned.")],
     name: Annotated[str, typer.Option(help="The results are called real-NAME; none: the log's.")] = "",
     mount: Annotated[str, typer.Option(help="The laser in base_link: x,y[,yaw_deg] (m, m, deg).")] = "0,0,0",
     every: Annotated[int, typer.Option(min=1, help="Scans between the starts of c and d.")] = 50,
     quick: Annotated[bool, typer.Option("--quick", help="A look: few scans, the particle filter not tuned.")] = False,
+    exchange: Annotated[
+        bool, typer.Option("--exchange", help="Learn from the second half, localise the first.")
+    ] = False,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
     workers: Workers = CORES,
@@ -220,14 +223,15 @@ def real_drive(
 
     a: tracking with odometry; b: without; c: from nothing, every 50th scan as a start; d: carried off. Errors are
     against the log's reference poses. Ctrl-C keeps what is done; the same command goes on there.
-    Examples: `presage experiment real --log drive.npz --map first_half.yaml --quick`;
+    Examples: `presage map drive.npz --mount 0,0,0 --half first -o first_half.yaml`, then
+    `presage experiment real --log drive.npz --map first_half.yaml --quick`;
     `presage experiment real --log fr079.mcap --map fr079.yaml --name fr079 --every 50 --out mine`.
     """
     from common.pose_text import pose_of_text  # noqa: PLC0415
     from presage.experiments import real  # noqa: PLC0415
 
     x, y, yaw = map(float, pose_of_text(mount, "--mount"))
-    job = real.Job(log, world, (x, y, yaw), every, quick, seed, name)
+    job = real.Job(log, world, (x, y, yaw), every, quick, seed, name, exchange)
     show(real, lambda: real.run(job, out, workers, console), out)
 
 

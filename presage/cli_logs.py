@@ -153,3 +153,37 @@ def import_(
     target = out or Path(f"{stem}.mcap")
     job = Import(file, target, reading, world, checked_robot(robot), frame == "laser", rate, sigma)
     import_command(job, json_file, console)
+
+
+@app.command("map")
+def map_(
+    log: Annotated[Path, typer.Argument(help="Recording or log with reference poses (docs/logs.md).")],
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="NAME.yaml; none: the log's name, here.")] = None,
+    half: Annotated[str, typer.Option(help="first or second, of the drive; none: all of it.")] = "",
+    cell: Annotated[float, typer.Option(min=0.005, max=1.0, help="Edge of a cell, m.")] = 0.05,
+    mount: Mount = "",
+    upside_down: UpsideDown = None,
+    scan_topic: ScanTopic = "",
+    odom_topic: OdomTopic = "",
+    base_frame: BaseFrame = "",
+    reference: Reference = None,
+    reference_topic: ReferenceTopic = "",
+    angles: Angles = "",
+    range_max: RangeMax = None,
+    clock: Clock = "sensor",
+) -> None:
+    """A ROS map (map.yaml, .pgm) of a drive whose poses are known; this is no SLAM.
+
+    Occupied where at least two scans, and a quarter of those that looked, ended; free where one went through.
+    Examples: `presage map run.mcap`; `presage map fr079.npz --mount 0,0,0 --half first -o first_half.yaml`, then
+    `presage experiment real --log fr079.npz --map first_half.yaml`.
+    """
+    from presage.logs.options import reading_of  # noqa: PLC0415
+    from presage.map_of_log import Job, map_command  # noqa: PLC0415
+
+    reading = reading_of(
+        mount, scan_topic, odom_topic, reference_topic, base_frame, angles, clock,
+        reference=reference, range_max=range_max, upside_down=upside_down,
+    )  # fmt: skip
+    target = out or Path(f"{log.resolve().name.split('.')[0]}.yaml")
+    map_command(Job(log, target, half, cell, reading), console, err_console)

@@ -1,4 +1,4 @@
-"""A real building, a real laser: map and model from the first half of a drive, its second half localised.
+"""A real building, a real laser: map and model from one half of a drive, the other half localised.
 
 (a) tracking with odometry, (b) without, (c) from nothing, (d) carried off. The errors are against the log's reference
 poses, whose own error is among them.
@@ -40,6 +40,7 @@ from presage.experiments.trials import run_trials
 from presage.train_drive import Job as Training
 from presage.train_drive import card_of
 from services.estimator.precise import weights
+from services.estimator.precise.calibration import Drive
 from services.estimator.precise.driven import learn_drive
 from services.estimator.precise.learning import Recipe
 
@@ -64,22 +65,32 @@ class Job:
     quick: bool = False
     seed: int = 1
     name: str = ""  # of the result, real-NAME
+    exchange: bool = False  # learn from the second half, localise the first
 
     @property
     def result(self) -> str:
         """Of the files."""
-        return f"real-{self.name or re.sub(r'[^A-Za-z0-9_]', '_', self.log.stem)}"
+        stem = re.sub(r"[^A-Za-z0-9_]", "_", self.log.stem) + "_exchanged" * self.exchange
+        return f"real-{self.name or stem}"
+
+    @property
+    def drive(self) -> Drive:
+        """Its first half is learned from."""
+        return drive_at(str(self.log), self.mount, self.exchange)
 
 
 def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
     """Learn, tune, localise; writes real-NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
     load_world(job.map)
-    drive = drive_at(str(job.log), job.mount)
+    drive = job.drive
     half = len(drive.ranges) // 2
     if half < 2 * LIMIT:
         raise UserError(f"{job.log}: {len(drive.ranges)} posed scans; at least {4 * LIMIT} are needed")
     model, card, tuned = _prepared(job, half, out, console)
-    plain = Stretch(str(job.log), job.map, job.mount, "precise", ODOMETRY, half, model=str(model), seed=job.seed)
+    plain = Stretch(
+        str(job.log), job.map, job.mount, "precise", ODOMETRY, half, model=str(model), seed=job.seed,
+        exchanged=job.exchange,
+    )  # fmt: skip
     jobs = [
         replace(each, estimator=name, particles=() if name == "precise" else _settings(tuned, each.task))
         for each in stretches(plain, half, len(drive.ranges), job, odometry=drive.odom is not None)
@@ -104,8 +115,8 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
 
 
 def _prepared(job: Job, half: int, out: Path, console: Console) -> tuple[Path, weights.FieldCard, Tuned]:
-    """The model of the first half, and the particle filter's settings for it."""
-    drive = drive_at(str(job.log), job.mount)
+    """The model of the half that is learned, and the particle filter's settings for it."""
+    drive = job.drive
     world = load_world(job.map)
     path = out / f".{job.result}" / "model.safetensors"
     kept = path.with_name("tuned.json")
@@ -127,7 +138,9 @@ def _prepared(job: Job, half: int, out: Path, console: Console) -> tuple[Path, w
         learned = learn_drive(first, training.recipe, None, report)
         card = card_of(training, world, first, learned, 0.0)
         weights.save(path, learned.model, learned.places, card)
-        base = Stretch(str(job.log), job.map, job.mount, "particle-filter", ODOMETRY, 0, seed=job.seed)
+        base = Stretch(
+            str(job.log), job.map, job.mount, "particle-filter", ODOMETRY, 0, seed=job.seed, exchanged=job.exchange
+        )
         start = starting_point(learned.calibration.motion)
         tuned = Tuned(start, start, []) if job.quick else tune(base, half, start, report)
     plain = {"key": key, "tracking": dict(tuned.tracking), "finding": dict(tuned.finding), "tried": tuned.tried}
@@ -212,21 +225,21 @@ def curves_of(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
 
 def notes(job: Job, card: weights.FieldCard, tuned: Tuned) -> list[str]:
     """What the table does not say."""
-    found = card.calibration
+    found, learned = card.calibration, "second" if job.exchange else "first"
     lines = [
         (
             f"tracked: within {FOUND} m and 10 deg of the reference, whose own error is among the errors; found: says "
             f"`tracking` there, within {LIMIT} scans; wrong claim: says `tracking` elsewhere"
         ),
         *(
-            f"particle filter, tuned on the first half, {what}: {_listed(each)}"
+            f"particle filter, tuned on the {learned} half, {what}: {_listed(each)}"
             for what, each in (("a and b", tuned.tracking), ("c and d", tuned.finding))
         ),
     ]
     if found is not None:
         shares = found.likelihood
         lines.append(
-            f"held out of the first half, {found.scans} scans: {found.log_likelihood:.2f} nats a beam; "
+            f"held out of the {learned} half, {found.scans} scans: {found.log_likelihood:.2f} nats a beam; "
             f"{shares.short:.1%} of the beams end early, {shares.random:.1%} anywhere; pose within "
             f"{found.floor_position * 1e3:.0f} mm and {np.rad2deg(found.floor_heading):.2f} deg of the reference "
             f"beyond the scan's covariance; NEES "

@@ -44,20 +44,31 @@ class Job:
     model: str = ""  # of precise: file of weights
     particles: tuple[tuple[str, float], ...] = ()  # settings of the particle filter, by name
     seed: int = 1
+    exchanged: bool = False  # the halves of the drive
 
 
 @functools.lru_cache(maxsize=2)
-def drive_at(log: str, mount: tuple[float, float, float]) -> Drive:
-    """The posed scans of a log, once a process."""
+def drive_at(log: str, mount: tuple[float, float, float], exchanged: bool = False) -> Drive:
+    """The posed scans of a log, once a process; ``exchanged``: its second half first."""
     from presage.logs.log import Reading  # noqa: PLC0415
 
     path = Path(log)
-    return drive_of(read_scans(path, reading=Reading(mount=np.array(mount))), path)
+    drive = drive_of(read_scans(path, reading=Reading(mount=np.array(mount))), path)
+    return second_first(drive) if exchanged else drive
+
+
+def second_first(drive: Drive) -> Drive:
+    """The second half, and then the first as if it had followed at the usual interval."""
+    half = len(drive.ranges) // 2
+    late, early = drive.part(np.arange(half, len(drive.ranges))), drive.part(np.arange(half))
+    follows = late.stamps[-1] + float(np.median(np.diff(drive.stamps))) - early.stamps[0]
+    turned = drive.part(np.roll(np.arange(len(drive.ranges)), -half))
+    return replace(turned, stamps=np.concatenate([late.stamps, early.stamps + follows]))
 
 
 def trial(job: Job) -> dict[str, Any]:
     """What was believed after every scan."""
-    drive, estimator = drive_at(job.log, job.mount), entered(job)
+    drive, estimator = drive_at(job.log, job.mount, job.exchanged), entered(job)
     if job.task in (ODOMETRY, LASER):
         estimator.restart(drive.poses[job.first], NEAR)
         numbers = np.arange(job.first, job.first + job.count)
@@ -104,7 +115,7 @@ def unaware(odom: Array, carried: int) -> Array:
 
 def entered(job: Job) -> Estimator:
     """A new estimator that knows the place and nothing of where it is."""
-    drive = drive_at(job.log, job.mount)
+    drive = drive_at(job.log, job.mount, job.exchanged)
     if job.estimator == "precise":
         factory = _precise(job.map, job.model)
         return factory(Geometry(drive.angles, drive.mount, drive.range_max))

@@ -12,7 +12,7 @@ from common import se2
 from common.errors import UserError
 from common.world import save_world
 from presage.experiments import page, real
-from presage.experiments.real_drive import KIDNAPPED, LIMIT, Job, unaware
+from presage.experiments.real_drive import KIDNAPPED, LASER, LIMIT, Job, drive_at, second_first, unaware
 from presage.experiments.real_drive import trial as one_trial
 from presage.experiments.real_tuning import starting_point
 from presage.logs.log import Reading
@@ -93,6 +93,31 @@ def test_time_goes_on_while_a_robot_is_carried_back(folder):
     stamps = np.array(one_trial(job)["stamp_s"])
     assert (np.diff(stamps) > 0).all()
     assert np.diff(stamps).max() < 3 * np.median(np.diff(stamps))
+
+
+@pytest.mark.parametrize("count", [20, 21])
+def test_halves_exchanged_are_a_drive_whose_time_goes_on(count):
+    drive = real_drive.drive(count)
+    turned = second_first(drive)
+    late = count - count // 2
+    assert turned.poses[:late] == pytest.approx(drive.poses[count // 2 :])
+    assert turned.ranges[late:] == pytest.approx(drive.ranges[: count // 2])
+    assert turned.odom[late:] == pytest.approx(drive.odom[: count // 2])
+    assert np.diff(turned.stamps) == pytest.approx(0.25)
+
+
+def test_with_halves_exchanged_the_first_scans_are_localised(folder):
+    where, mount = str(folder / "drive.npz"), (0.0, 0.0, 0.0)
+    job = Job(
+        where, str(folder / "before.yaml"), mount, "precise", LASER, 100, 30,
+        model=str(folder / "before-precise.safetensors"), exchanged=True,
+    )  # fmt: skip
+    found = real.summarise([one_trial(job)])  # by a model of these very scans
+    assert found["error_median_m"] < 0.05
+    assert drive_at(where, mount, exchanged=True).poses[100] == pytest.approx(drive_at(where, mount).poses[0])
+    exchanged = real.Job(folder / "drive.npz", "map.yaml", exchange=True)
+    assert exchanged.result == "real-drive_exchanged"
+    assert exchanged.drive.poses[100] == pytest.approx(drive_at(where, mount).poses[0])
 
 
 def row(task, error, state, stamps=None):
