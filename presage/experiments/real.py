@@ -31,7 +31,6 @@ from presage.experiments.real_drive import (
     LIMIT,
     NEAR_ENOUGH,
     ODOMETRY,
-    drive_at,
     trial,
 )
 from presage.experiments.real_drive import Job as Stretch
@@ -40,7 +39,6 @@ from presage.experiments.trials import run_trials
 from presage.train_drive import Job as Training
 from presage.train_drive import card_of
 from services.estimator.precise import weights
-from services.estimator.precise.calibration import Drive
 from services.estimator.precise.driven import learn_drive
 from services.estimator.precise.learning import Recipe
 
@@ -73,24 +71,19 @@ class Job:
         stem = re.sub(r"[^A-Za-z0-9_]", "_", self.log.stem) + "_exchanged" * self.exchange
         return f"real-{self.name or stem}"
 
-    @property
-    def drive(self) -> Drive:
-        """Its first half is learned from."""
-        return drive_at(str(self.log), self.mount, self.exchange)
-
 
 def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
     """Learn, tune, localise; writes real-NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
     load_world(job.map)
-    drive = job.drive
+    plain = Stretch(
+        str(job.log), job.map, job.mount, "precise", ODOMETRY, 0, seed=job.seed, exchanged=job.exchange
+    )  # its drive's first half is learned from
+    drive = plain.drive
     half = len(drive.ranges) // 2
     if half < 2 * LIMIT:
         raise UserError(f"{job.log}: {len(drive.ranges)} posed scans; at least {4 * LIMIT} are needed")
-    model, card, tuned = _prepared(job, half, out, console)
-    plain = Stretch(
-        str(job.log), job.map, job.mount, "precise", ODOMETRY, half, model=str(model), seed=job.seed,
-        exchanged=job.exchange,
-    )  # fmt: skip
+    model, card, tuned = _prepared(job, plain, half, out, console)
+    plain = replace(plain, first=half, model=str(model))
     jobs = [
         replace(each, estimator=name, particles=() if name == "precise" else _settings(tuned, each.task))
         for each in stretches(plain, half, len(drive.ranges), job, odometry=drive.odom is not None)
@@ -114,9 +107,10 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
     return result
 
 
-def _prepared(job: Job, half: int, out: Path, console: Console) -> tuple[Path, weights.FieldCard, Tuned]:
+def _prepared(
+    job: Job, stretch: Stretch, half: int, out: Path, console: Console
+) -> tuple[Path, weights.FieldCard, Tuned]:
     """The model of the half that is learned, and the particle filter's settings for it."""
-    drive = job.drive
     world = load_world(job.map)
     path = out / f".{job.result}" / "model.safetensors"
     kept = path.with_name("tuned.json")
@@ -133,16 +127,17 @@ def _prepared(job: Job, half: int, out: Path, console: Console) -> tuple[Path, w
         def report(title: str, done: float) -> None:
             bar.update(task, description=title, completed=done)
 
-        first = drive.part(np.arange(half))
+        first = stretch.drive.part(np.arange(half))
         training = Training(job.log, share=0.5, recipe=Recipe(resolution=0.05, seed=job.seed))
         learned = learn_drive(first, training.recipe, None, report)
         card = card_of(training, world, first, learned, 0.0)
         weights.save(path, learned.model, learned.places, card)
-        base = Stretch(
-            str(job.log), job.map, job.mount, "particle-filter", ODOMETRY, 0, seed=job.seed, exchanged=job.exchange
-        )
         start = starting_point(learned.calibration.motion)
-        tuned = Tuned(start, start, []) if job.quick else tune(base, half, start, report)
+        tuned = (
+            Tuned(start, start, [])
+            if job.quick
+            else tune(replace(stretch, estimator="particle-filter"), half, start, report)
+        )
     plain = {"key": key, "tracking": dict(tuned.tracking), "finding": dict(tuned.finding), "tried": tuned.tried}
     kept.write_text(json.dumps(plain) + "\n", encoding="utf-8")
     return path, card, tuned

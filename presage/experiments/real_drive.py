@@ -46,6 +46,11 @@ class Job:
     seed: int = 1
     exchanged: bool = False  # the halves of the drive
 
+    @property
+    def drive(self) -> Drive:
+        """All of it."""
+        return drive_at(self.log, self.mount, self.exchanged)
+
 
 @functools.lru_cache(maxsize=2)
 def drive_at(log: str, mount: tuple[float, float, float], exchanged: bool = False) -> Drive:
@@ -68,7 +73,7 @@ def second_first(drive: Drive) -> Drive:
 
 def trial(job: Job) -> dict[str, Any]:
     """What was believed after every scan."""
-    drive, estimator = drive_at(job.log, job.mount, job.exchanged), entered(job)
+    drive, estimator = job.drive, entered(job)
     if job.task in (ODOMETRY, LASER):
         estimator.restart(drive.poses[job.first], NEAR)
         numbers = np.arange(job.first, job.first + job.count)
@@ -115,7 +120,7 @@ def unaware(odom: Array, carried: int) -> Array:
 
 def entered(job: Job) -> Estimator:
     """A new estimator that knows the place and nothing of where it is."""
-    drive = drive_at(job.log, job.mount, job.exchanged)
+    drive = job.drive
     if job.estimator == "precise":
         factory = _precise(job.map, job.model)
         return factory(Geometry(drive.angles, drive.mount, drive.range_max))
