@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -209,7 +210,9 @@ def real_drive(
     log: Annotated[Path, typer.Option(help="Recording or log with reference poses (docs/logs.md).")],
     world: Annotated[str, typer.Option("--map", help="ROS map or world file of the half that is learned.")],
     name: Annotated[str, typer.Option(help="The results are called real-NAME; none: the log's.")] = "",
-    mount: Annotated[str, typer.Option(help="The laser in base_link: x,y[,yaw_deg] (m, m, deg).")] = "0,0,0",
+    mount: Annotated[
+        str, typer.Option(help="Of the laser in base_link, x,y[,yaw_deg] (m, deg); none: as the log says.")
+    ] = "",
     every: Annotated[int, typer.Option(min=1, help="Scans between the starts of c and d.")] = 50,
     quick: Annotated[bool, typer.Option("--quick", help="A look: few scans, the particle filter not tuned.")] = False,
     exchange: Annotated[
@@ -224,14 +227,16 @@ def real_drive(
     a: tracking with odometry; b: without; c: from nothing, every 50th scan as a start; d: carried off. Errors are
     against the log's reference poses. Ctrl-C keeps what is done; the same command goes on there.
     Examples: `presage map drive.npz --mount 0,0,0 --half first -o first_half.yaml`, then
-    `presage experiment real --log drive.npz --map first_half.yaml --quick`;
+    `presage experiment real --log drive.npz --mount 0,0,0 --map first_half.yaml --quick`;
     `presage experiment real --log fr079.mcap --map fr079.yaml --name fr079 --every 50 --out mine`.
     """
     from common.pose_text import pose_of_text  # noqa: PLC0415
     from presage.experiments import real  # noqa: PLC0415
 
-    x, y, yaw = map(float, pose_of_text(mount, "--mount"))
-    job = real.Job(log, world, (x, y, yaw), every, quick, seed, name, exchange)
+    if not re.fullmatch(r"[\w.-]*", name):
+        raise UserError(f"--name {name!r}: letters, digits, '.', '_' and '-' make a file's name")
+    x, y, yaw = map(float, pose_of_text(mount, "--mount")) if mount else (0.0, 0.0, 0.0)
+    job = real.Job(log, world, (x, y, yaw) if mount else None, every, quick, seed, name, exchange)
     show(real, lambda: real.run(job, out, workers, console), out)
 
 

@@ -174,9 +174,9 @@ def map_(
 ) -> None:
     """A ROS map (map.yaml, .pgm) of a drive whose poses are known; this is no SLAM.
 
-    Occupied where at least two scans, and a quarter of those that looked, ended; free where one went through.
+    Occupied where at least two scans ended, and 60 % of those that looked; free where one went through.
     Examples: `presage map run.mcap`; `presage map fr079.npz --mount 0,0,0 --half first -o first_half.yaml`, then
-    `presage experiment real --log fr079.npz --map first_half.yaml`.
+    `presage experiment real --log fr079.npz --mount 0,0,0 --map first_half.yaml`.
     """
     from presage.logs.options import reading_of  # noqa: PLC0415
     from presage.map_of_log import Job, map_command  # noqa: PLC0415

@@ -92,10 +92,7 @@ def localize(job: Job, console: Console) -> list[dict[str, Any]]:
     laser = job.frame == "laser"
     with console.status(f"reading {job.file.name}"):
         # An .npz's poses are the laser's where that is asked for; of every other file it is known where the laser sits.
-        kind = kind_of(job.file)
-        if kind == "recording" and not job.reading.plain:
-            raise UserError(f"{job.file}: a recording says itself what its scanner is: those options are about logs")
-        itself = laser and kind == "npz"
+        itself = laser and kind_of(job.file) == "npz"
         scans = read_scans(job.file, np.zeros(3) if itself else None, job.reading)
     console.print(*scans.notes, sep="\n", highlight=False, soft_wrap=True, end="\n" if scans.notes else "")
     start = _start(job, scans)

@@ -10,7 +10,7 @@ import yaml
 
 from common.occupancy_grid import FREE, OCCUPIED, UNKNOWN, Cells
 
-KEYS = {"resolution": 0.05, "origin": [0.0, 0.0, 0.0], "negate": 0, "occupied_thresh": 0.65, "free_thresh": 0.25}
+KEYS = {"resolution": 0.05, "origin": [0.0, 0.0, 0.0], "negate": 0, "occupied_thresh": 0.65, "free_thresh": 0.196}
 ROOM, DOOR = 6.0, 1.2  # m wide
 
 

@@ -21,12 +21,13 @@ from common.ranges import surfaces
 from common.se2 import Array
 from presage.logs.log import Reading
 from presage.made_map import write_map
+from presage.output import make_folder
 from presage.scan_files import read_scans
 from presage.train_drive import drive_of
 from services.estimator.precise.calibration import Drive
 from services.estimator.precise.surfaces import Beams, in_company
 
-LEAST, SHARE = 2, 0.25
+LEAST, SHARE = 2, 0.6  # less, and noise lets walls grow towards the scanner; more, and corners wear away
 MARGIN = 0.5  # m around what was seen
 
 
@@ -45,17 +46,19 @@ def map_command(job: Job, console: Console, progress: Console) -> Path:
     """Write map.yaml and its image; raises UserError in one line."""
     if job.half not in ("", "first", "second"):
         raise UserError(f"no half {job.half!r}: choose first or second, or leave out --half")
-    image = job.out.with_suffix(".pgm")
     if job.out.suffix != ".yaml":
         raise UserError(f"--out {job.out}: give NAME.yaml; the image is written beside it")
+    image = job.out.with_suffix(".pgm")
     if there := next((path for path in (job.out, image) if path.exists()), None):
         raise UserError(f"{there} is there already: --out another name, or remove it")
-    drive = drive_of(read_scans(job.log, reading=job.reading), job.log)
+    make_folder(job.out.parent, "--out")
+    scans = read_scans(job.log, reading=job.reading)
+    progress.print(*scans.notes, sep="\n", highlight=False, soft_wrap=True, end="\n" if scans.notes else "")
+    drive = drive_of(scans, job.log)
     middle = len(drive.ranges) // 2
     first, last = {"first": (0, middle), "second": (middle, None)}.get(job.half, (0, None))
     drive = drive.part(np.arange(len(drive.ranges))[first:last])
     values, origin = cells_of(drive, job.cell, progress)
-    job.out.parent.mkdir(parents=True, exist_ok=True)
     keys = {"resolution": job.cell, "origin": [round(origin[0], 6), round(origin[1], 6), 0.0]}
     path = write_map(job.out.parent, values, name=job.out.stem, image=image.name, **keys)
     rows, columns = values.shape
@@ -70,8 +73,6 @@ def map_command(job: Job, console: Console, progress: Console) -> Path:
 def cells_of(drive: Drive, cell: float, progress: Console | None = None) -> tuple[Cells, tuple[float, float]]:
     """(rows, columns), the lowest row first, and x, y m of the lower left corner; raises UserError."""
     beams = Beams.of(drive.poses, drive.mount, drive.angles, drive.ranges)
-    if not len(beams.ranges):
-        raise UserError("no beam of the drive ended anywhere: there is nothing to map")
     ends = beams.ends()
     seen = np.concatenate([ends[in_company(ends)], drive.poses[:, :2]])
     corner = np.floor((seen.min(axis=0) - MARGIN) / cell) * cell
@@ -86,20 +87,20 @@ def cells_of(drive: Drive, cell: float, progress: Console | None = None) -> tupl
     ):  # fmt: skip
         hit, passed = (_index(points, corner, cell, rows, columns) for points in _looked(laser, ranges, drive, cell))
         ended[hit] += 1
-        through[passed] += 1
+        through[np.setdiff1d(passed, hit, assume_unique=True)] += 1
     occupied = (ended >= LEAST) & (ended >= SHARE * (ended + through))
     values = np.where(occupied, OCCUPIED, np.where(through > 0, FREE, UNKNOWN)).astype(np.uint8)
     return values.reshape(rows, columns), (float(corner[0]), float(corner[1]))
 
 
 def _looked(laser: Array, ranges: Array, drive: Drive, cell: float) -> tuple[Array, Array]:
-    """Points (K, 2) m in map where beams ended, and points (L, 2) all along them, to a cell before that."""
+    """Points (K, 2) m in map where beams ended, and points (L, 2) all along them."""
     hit = surfaces(ranges) & (ranges < drive.range_max)
     ranges = ranges[hit]
     angles = laser[2] + drive.angles[hit]
     unit = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     along = np.arange(0.0, ranges.max(initial=0.0), cell / 2)
-    beam, step = np.nonzero(along < ranges[:, None] - cell)
+    beam, step = np.nonzero(along < ranges[:, None])
     return laser[:2] + ranges[:, None] * unit, laser[:2] + along[step, None] * unit[beam]
 
 

@@ -49,9 +49,11 @@ def read_scans(path: Path, mount: Array | None = None, reading: Reading | None =
     (odom, initial_pose, reference) are base_link's, with a mount of zero the laser's own. `Scans.truth` is the
     recording's truth or the log's reference. ``reading``: what else is said about a log.
     """
-    if kind_of(path) == "recording":
-        return _read_recording(path)
     reading = reading or Reading()
+    if kind_of(path) == "recording":
+        if not reading.plain:
+            raise UserError(f"{path}: a recording says itself what its scanner is: those options are about logs")
+        return _read_recording(path)
     return scans_of(open_log(path, reading if mount is None else replace(reading, mount=mount)))
 
 

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from common import se2
 from common.errors import UserError
+from common.ranges import surfaces
 from common.robot import Robot
 from common.scanner import Scanner
 from common.versions import commit, versions
@@ -47,6 +48,7 @@ class Job:
 def train_from_drive(job: Job, console: Console) -> Path:
     """The weights' path; raises UserError in one line."""
     scans = read_scans(job.log, reading=job.reading)
+    console.print(*scans.notes, sep="\n", highlight=False, soft_wrap=True, end="\n" if scans.notes else "")
     drive = drive_of(scans, job.log)
     drive = drive.part(np.arange(round(job.share * len(drive.ranges))))
     if len(drive.ranges) < LEAST_SCANS:
@@ -85,6 +87,8 @@ def drive_of(scans: Scans, log: Path) -> Drive:
     if scans.stamps is None:
         raise UserError(f"{log}: no stamps; without them nobody knows how fast the robot moved")
     use = np.flatnonzero(np.isfinite(scans.truth).all(axis=1))
+    if not surfaces(scans.ranges[use]).any():
+        raise UserError(f"{log}: no beam of the scans with a reference pose ended anywhere")
     odom = None if scans.odom is None or not np.isfinite(scans.odom[use]).all() else scans.odom
     whole = Drive(
         scans.stamps, scans.truth, scans.ranges, scans.geometry.angles, scans.geometry.mount,

@@ -20,7 +20,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from common.errors import UserError
 from common.versions import commit
-from common.world import load_world
+from common.world import World, load_world
 from presage.experiments import results
 from presage.experiments.real_drawing import draw
 from presage.experiments.real_drive import (
@@ -39,6 +39,7 @@ from presage.experiments.trials import run_trials
 from presage.train_drive import Job as Training
 from presage.train_drive import card_of
 from services.estimator.precise import weights
+from services.estimator.precise.calibration import Drive
 from services.estimator.precise.driven import learn_drive
 from services.estimator.precise.learning import Recipe
 
@@ -47,6 +48,7 @@ TASKS = {
     ODOMETRY: "a: tracking with odometry", LASER: "b: tracking without", GLOBAL: "c: from nothing",
     KIDNAPPED: "d: carried off",
 }  # fmt: skip
+LEAST_FREE = 0.5  # share of the poses; a map may lack what the drive saw
 FOUND = NEAR_ENOUGH  # m and
 FOUND_YAW = float(np.deg2rad(10))  # rad from the reference: tracked; beyond, `tracking` is a wrong claim
 QUICK = 120  # scans of (a) and (b), for a look
@@ -58,7 +60,7 @@ class Job:
 
     log: Path
     map: str
-    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mount: tuple[float, float, float] | None = None  # of the laser in base_link; None: as the log says
     every: int = 50  # scans between the starts of (c) and (d)
     quick: bool = False
     seed: int = 1
@@ -74,12 +76,18 @@ class Job:
 
 def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
     """Learn, tune, localise; writes real-NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
-    load_world(job.map)
+    world = load_world(job.map)
     plain = Stretch(
         str(job.log), job.map, job.mount, "precise", ODOMETRY, 0, seed=job.seed, exchanged=job.exchange
     )  # its drive's first half is learned from
     drive = plain.drive
     half = len(drive.ranges) // 2
+    x, y, yaw = drive.mount
+    console.print(
+        f"{job.log.name}: {len(drive.ranges)} posed scans, the laser at {x:g} m, {y:g} m, {np.rad2deg(yaw):g} deg in "
+        f"base_link{'' if job.mount else ' (--mount)'}; {'first' if job.exchange else 'second'} half localised"
+    )
+    _fits(world, drive.part(np.arange(half)), job.map)
     if half < 2 * LIMIT:
         raise UserError(f"{job.log}: {len(drive.ranges)} posed scans; at least {4 * LIMIT} are needed")
     model, card, tuned = _prepared(job, plain, half, out, console)
@@ -105,6 +113,16 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
     )  # fmt: skip
     result.write(out, draw(card.calibration, rows, TASKS))
     return result
+
+
+def _fits(world: World, learned: Drive, name: str) -> None:
+    """Raises UserError where the drive cannot have been in that map."""
+    free = float((world.clearance(learned.poses[:, :2]) > 0).mean())
+    if free < LEAST_FREE:
+        raise UserError(
+            f"only {free:.0%} of the reference poses of the half that is learned are in free space of {name}: "
+            "is it a map of this place, in the frame of these poses?"
+        )
 
 
 def _prepared(
@@ -229,6 +247,7 @@ def notes(job: Job, card: weights.FieldCard, tuned: Tuned) -> list[str]:
         *(
             f"particle filter, tuned on the {learned} half, {what}: {_listed(each)}"
             for what, each in (("a and b", tuned.tracking), ("c and d", tuned.finding))
+            if not job.quick
         ),
     ]
     if found is not None:
@@ -241,7 +260,7 @@ def notes(job: Job, card: weights.FieldCard, tuned: Tuned) -> list[str]:
             f"{found.nees_median:.2f} median (honest 2.37), {found.nees_mean:.1f} mean (3)"
         )
     if job.quick:
-        lines.append("quick: a look; few scans, and the particle filter as it comes")
+        lines.append("quick: a look; few scans, and of the particle filter's settings only its motion noise is learned")
     return lines
 
 

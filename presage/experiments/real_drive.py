@@ -35,7 +35,7 @@ class Job:
 
     log: str
     map: str
-    mount: tuple[float, float, float]
+    mount: tuple[float, float, float] | None  # of the laser in base_link; None: as the log says
     estimator: str  # precise or particle-filter
     task: str
     first: int  # scan of the drive at which it begins
@@ -53,12 +53,12 @@ class Job:
 
 
 @functools.lru_cache(maxsize=2)
-def drive_at(log: str, mount: tuple[float, float, float], exchanged: bool = False) -> Drive:
+def drive_at(log: str, mount: tuple[float, float, float] | None, exchanged: bool = False) -> Drive:
     """The posed scans of a log, once a process; ``exchanged``: its second half first."""
     from presage.logs.log import Reading  # noqa: PLC0415
 
     path = Path(log)
-    drive = drive_of(read_scans(path, reading=Reading(mount=np.array(mount))), path)
+    drive = drive_of(read_scans(path, reading=Reading(mount=None if mount is None else np.array(mount))), path)
     return second_first(drive) if exchanged else drive
 
 
@@ -125,7 +125,8 @@ def entered(job: Job) -> Estimator:
         factory = _precise(job.map, job.model)
         return factory(Geometry(drive.angles, drive.mount, drive.range_max))
     settings = particle_settings(job.particles)
-    return ParticleFilter(load_world(job.map), settings, job.mount, job.seed, sensor=_sensor(job.map, settings))
+    x, y, yaw = map(float, drive.mount)
+    return ParticleFilter(load_world(job.map), settings, (x, y, yaw), job.seed, sensor=_sensor(job.map, settings))
 
 
 def particle_settings(changed: tuple[tuple[str, float], ...]) -> ParticleSettings:

@@ -15,6 +15,7 @@ from common.se2 import Array
 from presage.logs.log import Log, LoggedScan, Reading
 
 NAMES = {"ranges", "angles", "range_max", "stamps", "odom", "initial_pose", "reference"}
+SPAN = float(np.deg2rad(361))
 MOUNT = (0.2, 0.0, 0.0)  # m, m, rad: the shipped scanner's, where nothing else is said
 
 
@@ -55,6 +56,8 @@ def _check(path: Path, data: dict[str, Array], ranges: Array) -> None:
             raise UserError(f"{path}: {name} has the shape {data[name].shape}; for these ranges it must be {shape}")
         if name in data and name != "reference" and not np.isfinite(data[name]).all():
             raise UserError(f"{path}: {name} has numbers that are not finite")
+    if (span := float(np.ptp(data["angles"]))) > SPAN:
+        raise UserError(f"{path}: angles go over {span:.4g} rad, more than once round: are they degrees?")
     if "stamps" in data and (np.diff(data["stamps"]) < 0).any():
         raise UserError(f"{path}: stamps are not sorted")
 

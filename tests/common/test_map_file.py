@@ -63,7 +63,7 @@ def test_what_map_saver_writes_is_read_whatever_its_thresholds(tmp_path):
         assert world.bounds == pytest.approx((-1, 2.5, -0.7, 2.8))
     # In an image that map_saver did not write, 205 is a grey like others.
     Image.fromarray(np.array([[0, 205, 254, 250]], np.uint8)).save(tmp_path / "own.png")
-    assert cells_of(tmp_path, "own.png").tolist() == [[OCCUPIED, FREE, FREE, FREE]]
+    assert cells_of(tmp_path, "own.png", free_thresh=0.25).tolist() == [[OCCUPIED, FREE, FREE, FREE]]
 
 
 def test_what_is_between_free_and_occupied(tmp_path):

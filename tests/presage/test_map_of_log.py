@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rich.console import Console
@@ -14,6 +16,7 @@ from presage.map_of_log import Job, cells_of, map_command
 from services.estimator.generative import RayCaster
 from services.estimator.precise.calibration import Drive
 from tests.presage import real_drive
+from tests.recorder import sessions as recorded
 
 QUIET = Console(quiet=True)
 HERE = Reading(mount=np.zeros(3))
@@ -46,6 +49,7 @@ def test_a_map_of_a_half_is_the_room_of_that_time(log, tmp_path, half, world):
         RayCaster(each).expect(np.array([[3.0, 3.0, 0.0]]), real_drive.ANGLES).ranges for each in (world, mapped)
     )
     assert np.median(np.abs(seen - rays)) < 0.06
+    assert abs(np.median(seen - rays)) < 0.025  # half a cell
 
 
 def test_who_walks_through_is_not_in_the_map():
@@ -80,3 +84,16 @@ def test_what_cannot_be_is_said(log, tmp_path):
     with pytest.raises(UserError, match="larger --cell"):
         cells_of(real_drive.drive(20), 0.0005)
     assert not list(tmp_path.glob("*.yaml"))
+
+
+def test_a_recording_says_itself_where_its_laser_sits(tmp_path):
+    recorded.write(tmp_path / "run.mcap")
+    with pytest.raises(UserError, match="says itself what its scanner is"):
+        map_command(Job(tmp_path / "run.mcap", tmp_path / "r.yaml", reading=HERE), QUIET, QUIET)
+
+
+def test_a_log_without_returns_is_refused(tmp_path):
+    path, drive = tmp_path / "empty.npz", real_drive.drive(20)
+    real_drive.save(path, replace(drive, ranges=np.full_like(drive.ranges, np.inf)))
+    with pytest.raises(UserError, match="no beam of the scans"):
+        map_command(Job(path, tmp_path / "e.yaml", reading=HERE), QUIET, QUIET)

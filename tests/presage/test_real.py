@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from rich.console import Console
 
 from common import se2
 from common.errors import UserError
-from common.world import save_world
+from common.world import World, save_world
 from presage.experiments import page, real
 from presage.experiments.real_drive import KIDNAPPED, LASER, LIMIT, Job, drive_at, second_first, unaware
 from presage.experiments.real_drive import trial as one_trial
@@ -149,3 +150,11 @@ def test_a_log_too_short_is_refused(folder, tmp_path):
     job = real.Job(tmp_path / "few.npz", str(folder / "before.yaml"))
     with pytest.raises(UserError, match="100 posed scans; at least 160"):
         real.run(job, tmp_path, 1, Console(quiet=True))
+
+
+def test_a_map_of_another_place_is_refused(folder, tmp_path):
+    job = real.Job(folder / "drive.npz", "office", (0.0, 0.0, 0.0))
+    elsewhere = World(name="elsewhere", boundary=[(50, 50), (60, 50), (60, 60), (50, 60)])
+    (tmp_path / "elsewhere.yaml").write_text(save_world(elsewhere), encoding="utf-8")
+    with pytest.raises(UserError, match="only 0% of the reference poses .* in free space"):
+        real.run(replace(job, map=str(tmp_path / "elsewhere.yaml")), tmp_path, 1, Console(quiet=True))

@@ -154,7 +154,8 @@ def test_reference_poses_that_are_not_known_throughout(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"angles": ANGLES**3}, "not evenly spaced"),
+        ({"angles": ANGLES**3 / 4}, "not evenly spaced"),
+        ({"angles": np.rad2deg(ANGLES)}, "more than once round: are they degrees"),
         ({"stamps": STAMPS * 1e-9 - 2e9}, "below 0 s"),
         ({"stamps": np.zeros(SCANS)}, "1 scans; scans twice: 11"),
     ],
