@@ -156,5 +156,5 @@ def test_a_map_of_another_place_is_refused(folder, tmp_path):
     job = real.Job(folder / "drive.npz", "office", (0.0, 0.0, 0.0))
     elsewhere = World(name="elsewhere", boundary=[(50, 50), (60, 50), (60, 60), (50, 60)])
     (tmp_path / "elsewhere.yaml").write_text(save_world(elsewhere), encoding="utf-8")
-    with pytest.raises(UserError, match="only 0% of the reference poses .* in free space"):
+    with pytest.raises(UserError, match=r"only 0% of the reference poses .* in free space"):
         real.run(replace(job, map=str(tmp_path / "elsewhere.yaml")), tmp_path, 1, Console(quiet=True))
