@@ -19,11 +19,12 @@ from common.errors import UserError
 from common.pose_text import pose_of_text
 from common.se2 import Array
 from common.versions import commit, versions
+from common.world import load_world
 from presage.logs.log import Reading
 from presage.logs.opening import kind_of
 from presage.output import check_file
 from presage.scan_files import Scans, read_scans
-from services.estimator.building import Choice, Name, prepare
+from services.estimator.building import Choice, Name, check_start, prepare
 from services.estimator.interface import Posterior
 from services.recorder.reader import read_recording
 
@@ -89,6 +90,10 @@ def choice_of(
 def localize(job: Job, console: Console) -> list[dict[str, Any]]:
     """A row for each scan; raises UserError in one line."""
     check_file(job.out, "--out")
+    if job.mode == "global" and job.choice.initial_pose is not None:
+        raise UserError("--initial-pose is where mode track begins: add --mode track, or leave it out")
+    world = job.choice.world
+    check_start(job.choice, load_world(world) if isinstance(world, str) else world)
     laser = job.frame == "laser"
     with console.status(f"reading {job.file.name}"):
         # An .npz's poses are the laser's where that is asked for; of every other file it is known where the laser sits.

@@ -72,9 +72,10 @@ def run_up(
         where += "" if names == ["robot"] else f" --robot {names[0]}"
         if robots > 1:
             console.print(f"robots: {', '.join(names)}, one estimator for all", soft_wrap=True)
+        goal = "15 1.5" if world == "corridor" else "X Y"
         console.print(
             f"[bold green]all alive[/] at {stack.endpoint}. In another terminal: "
-            f"presage goal 15 1.5 --wait{where} | presage echo belief{where} | presage hz{where}. Ctrl-C ends all.",
+            f"presage goal {goal} --wait{where} | presage echo belief{where} | presage hz{where}. Ctrl-C ends all.",
             soft_wrap=True,
         )
         _watch(stack, console)

@@ -76,6 +76,7 @@ class BridgeRos2Service(Service):
 
     def open(self) -> None:
         """Declared before anybody asks: the first message on a key just declared may be lost."""
+        self.options.check()
         if self.options.publish_map:
             self._map = outward.map_message(rasterised(load_world(self.options.world)), self.options.map_frame)
         for topic in (ODOM, SCAN):

@@ -14,7 +14,8 @@ from common.ros_messages import Mount
 from services.bridge_ros2.keys import NAME, Names, full_name
 
 TOPIC = rf"^$|^{NAME}$"
-ENDPOINTS = r"^[a-z]+/[^\s,]+(,[a-z]+/[^\s,]+)*$"
+ENDPOINT = r"[a-z]+/[^\s,]+:(6553[0-5]|655[0-2]\d|65[0-4]\d\d|6[0-4]\d{3}|[1-5]\d{4}|[1-9]\d{0,3})"
+ENDPOINTS = rf"^{ENDPOINT}(,{ENDPOINT})*$"
 FRAME = r"^[A-Za-z0-9_./-]{1,64}$"
 
 
@@ -131,6 +132,15 @@ class BridgeRos2Settings(SeenRobotSettings):
     def names(self) -> Names:
         """How topics are called on zenoh."""
         return Names(self.flavor, self.domain, hashes=self.distro != "humble")
+
+    def check(self) -> None:
+        """Raises UserError where two of these settings do not go together."""
+        frames = {"--map-frame": self.map_frame, "--odom-frame": self.odom_frame, "--base-frame": self.base_frame}
+        if len(set(frames.values())) < len(frames):
+            said = ", ".join(f"{option} {name}" for option, name in frames.items())
+            raise UserError(f"{said}: these are three frames, each needs a name of its own")
+        if self.scan_topic == self.odom_topic:
+            raise UserError(f"--scan-topic and --odom-topic are both {self.scan_topic!r}: a topic has one type")
 
     def topic(self, name: str) -> str:
         """A topic's absolute name."""

@@ -70,7 +70,7 @@ class Pilot:
         if clearance >= self.robot.radius and cell is not None and here in (None, self.roads.component[cell]):
             return None
         if clearance < 0:
-            why = "is inside something"
+            why = "is inside something, or off the map"
         elif clearance < self.robot.radius or cell is None:
             why = f"is {clearance:.2f} m from a wall"
         else:

@@ -34,7 +34,8 @@ class Straight:
         if clearance >= self.robot.radius:
             return None
         where = f"({goal[0]:.2f}, {goal[1]:.2f}) in {self.world.name}"
-        return f"goal refused: {where} is {'inside something' if clearance < 0 else f'{clearance:.2f} m from a wall'}"
+        what = "inside something, or off the map" if clearance < 0 else f"{clearance:.2f} m from a wall"
+        return f"goal refused: {where} is {what}"
 
     def aim(self, goal: Array | None) -> None:
         """The sum of equation 4 begins at 0."""

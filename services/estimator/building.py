@@ -15,7 +15,7 @@ from common.errors import UserError
 from common.messages import Scan
 from common.scanner import SCANNERS, Scanner
 from common.se2 import Array
-from common.world import World, load_world
+from common.world import World, known_worlds, load_world
 from services.estimator.generative import GenerativeModel, RayCaster
 from services.estimator.interface import Estimator
 from services.estimator.particle_filter.filter import ParticleFilter
@@ -50,7 +50,9 @@ class Choice:
     @property
     def asked(self) -> str:
         """The world as the user names it."""
-        return self.world.name if isinstance(self.world, World) else self.world
+        if isinstance(self.world, str):
+            return self.world
+        return self.world.name if self.world.name in known_worlds() else f"{self.world.name}.yaml"  # it was recorded
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,7 @@ def prepare(choice: Choice) -> Factory:
     if choice.estimator not in get_args(Name):
         raise UserError(f"no estimator {choice.estimator!r}: choose one of {', '.join(get_args(Name))}")
     world = choice.world if isinstance(choice.world, World) else load_world(choice.world)
+    check_start(choice, world)
     if choice.estimator == "paper":
         return _paper(choice, world)
     if choice.estimator == "precise":
@@ -171,10 +174,23 @@ def field_path(choice: Choice, world: World) -> Path:
 
 def check(choice: Choice, world: World) -> None:
     """Raises UserError where `prepare` would for want of a model; nothing is compiled, so it is quick."""
+    check_start(choice, world)
     if choice.estimator == "precise" and choice.model != "exact":
         weights.load(field_path(choice, world))
     elif choice.estimator == "paper":
         _paper_weights(choice, world)
+
+
+def check_start(choice: Choice, world: World) -> None:
+    """Raises UserError where the initial pose is off the map; a wall there may have been moved."""
+    if choice.initial_pose is None:
+        return
+    x0, y0, x1, y1 = world.bounds
+    x, y = map(float, choice.initial_pose[:2])
+    if not (x0 <= x <= x1 and y0 <= y <= y1):
+        raise UserError(
+            f"initial pose ({x:g}, {y:g}) is off the map: {world.name} goes from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g})"
+        )
 
 
 def _compile(model: GenerativeModel, seeds: Seeds, likelihood: Likelihood) -> None:

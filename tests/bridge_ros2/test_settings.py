@@ -22,3 +22,27 @@ def test_a_mount_with_or_without_its_yaw(said, pose):
 def test_a_wrong_mount_says_what_is_expected(said):
     with pytest.raises(UserError, match=r"mount: '.*' is not as it should be: x,y\[,yaw_deg\] \(m, m, degrees\)"):
         load_settings(BridgeRos2Settings, ["--mount", said])
+
+
+@pytest.mark.parametrize("said", ["nonsense", "tcp/127.0.0.1", "tcp/127.0.0.1:99999", "tcp/127.0.0.1:0", "tcp/a:1,b"])
+def test_a_router_has_a_port(said):
+    with pytest.raises(UserError, match="ros_connect"):
+        load_settings(BridgeRos2Settings, ["--ros-connect", said])
+
+
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        (["--map-frame", "odom"], "three frames, each needs a name of its own"),
+        (["--base-frame", "odom"], "--odom-frame odom, --base-frame odom"),
+        (["--scan-topic", "odom"], "a topic has one type"),
+    ],
+)
+def test_what_does_not_go_together_is_said(said, why):
+    settings = load_settings(BridgeRos2Settings, said)
+    with pytest.raises(UserError, match=why):
+        settings.check()
+
+
+def test_what_is_taken_for_granted_goes_together():
+    load_settings(BridgeRos2Settings, []).check()

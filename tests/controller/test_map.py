@@ -43,5 +43,5 @@ def test_goals_in_unknown_cells_and_walls_are_refused():
     nowhere = WORLD.grid.shapes.within(np.array([[column, row]]), 0.5)[0]
     pilot, straight = Pilot(Robot(), WORLD), Straight(Robot(), None, WORLD)
     for goal in (nowhere, np.array([50.0, 50.0])):
-        assert "is inside something; the nearest place that can be reached is" in pilot.refusal(goal)
+        assert "is inside something, or off the map; the nearest place that can be reached is" in pilot.refusal(goal)
         assert "is inside something" in straight.refusal(goal)

@@ -247,7 +247,7 @@ def test_what_is_claimed_refused_late_or_broken_is_not_reached():
     broken = driven.measure(track, TRIP, HALL, ROBOT)
     assert (broken["outcome"], broken["why"]) == ("failed", track.failure)
     track = a_track()
-    why = "goal refused: (5.00, 1.00) in hall is inside something"
+    why = "goal refused: (5.00, 1.00) in hall is inside something, or off the map"
     track.statuses[400_000_000] = status(4, "blocked", why, refused=True)
     assert driven.measure(track, TRIP, HALL, ROBOT)["outcome"] == "refused"
     track.health = None

@@ -166,6 +166,8 @@ def test_words_that_are_not_known(tmp_path):
     for wrong, why in (
         ({"mode": "best"}, "no mode"), ({"frame": "map"}, "no frame"), ({"estimator": "kalman"}, "no estimator"),
         ({"world": ""}, "--world"), ({"model": "best"}, "no model"), ({"initial_pose": "1"}, "initial-pose"),
+        ({"initial_pose": "4,1.5"}, "add --mode track"),
+        ({"initial_pose": "400,1.5", "mode": "track"}, r"\(400, 1.5\) is off the map: .* goes from"),
         ({"out": tmp_path / "x.txt"}, "csv or .json"), ({"out": tmp_path / "no" / "x.csv"}, "cannot be written"),
     ):  # fmt: skip
         with pytest.raises(UserError, match=why):
