@@ -6,7 +6,7 @@ where one went through, else unknown. What moves was mostly looked through. Beam
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +54,8 @@ def map_command(job: Job, console: Console, progress: Console) -> Path:
     make_folder(job.out.parent, "--out")
     scans = read_scans(job.log, reading=job.reading)
     progress.print(*scans.notes, sep="\n", highlight=False, soft_wrap=True, end="\n" if scans.notes else "")
+    if scans.stamps is None:  # a map needs none
+        scans = replace(scans, stamps=np.arange(len(scans.ranges), dtype=np.float64))
     drive = drive_of(scans, job.log)
     middle = len(drive.ranges) // 2
     first, last = {"first": (0, middle), "second": (middle, None)}.get(job.half, (0, None))

@@ -219,10 +219,10 @@ class _Sender:
 def _lines(job: Import, log: Log, facts: dict[str, Any]) -> list[str]:
     """What a user wants to know of it."""
     first, last = np.rad2deg(log.angles[[0, -1]])
-    x, y, yaw = *log.mount[:2], np.rad2deg(log.mount[2])
+    x, y, yaw = np.round([*log.mount[:2], np.rad2deg(log.mount[2])], 4) + 0.0  # no 1e-17, no -0
     lines = [
         f"{log.format}: {facts['scans']} scans of {facts['beams']} beams in {facts['duration_s']:.1f} s",
-        f"scanner: {first:.1f} to {last:.1f} deg, up to {log.range_max:g} m, at {x:.3g},{y:.3g},{yaw:.3g} in base_link",
+        f"scanner: {first:.1f} to {last:.1f} deg, up to {log.range_max:g} m, at {x:.4g},{y:.4g},{yaw:.4g} in base_link",
         f"odometry: {log.odometry or 'none'} ({facts['odometry_poses']} poses)",
         f"reference: {log.reference or 'none'} ({facts['reference_poses']} poses)",
         *log.notes,

@@ -92,6 +92,13 @@ def test_a_recording_says_itself_where_its_laser_sits(tmp_path):
         map_command(Job(tmp_path / "run.mcap", tmp_path / "r.yaml", reading=HERE), QUIET, QUIET)
 
 
+def test_a_map_needs_no_stamps(log, tmp_path):
+    with np.load(log) as arrays:
+        np.savez(tmp_path / "bare.npz", **{name: values for name, values in arrays.items() if name != "stamps"})
+    bare = map_command(Job(tmp_path / "bare.npz", tmp_path / "bare.yaml", reading=HERE), QUIET, QUIET)
+    assert load_world(str(bare)).grid.values.tolist() == made(log, tmp_path).grid.values.tolist()
+
+
 def test_a_log_without_returns_is_refused(tmp_path):
     path, drive = tmp_path / "empty.npz", real_drive.drive(20)
     real_drive.save(path, replace(drive, ranges=np.full_like(drive.ranges, np.inf)))
