@@ -34,7 +34,7 @@ def draw(found: Calibration | None, rows: Sequence[dict[str, Any]], titles: dict
         axes.axhline(NEAR_ENOUGH, color=drawing.BOUND, linestyle=":", linewidth=1)
         axes.set(xlabel="time (s)", ylabel="position error (m)", title=titles[task])
     drawing.log_metres(shares, "x")
-    shares.set(xlabel="position error (m)", ylabel="share of scans with less", ylim=(0, 1), title="second half")
+    shares.set(xlabel="position error (m)", ylabel="share of scans with less", ylim=(0, 1), title="the half localised")
     shares.legend(frameon=False, fontsize=9)
     if found is not None:
         calibration_curve(drawing.dress(panels[0, 1]), found)
