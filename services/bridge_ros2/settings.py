@@ -139,6 +139,8 @@ class BridgeRos2Settings(SeenRobotSettings):
         if len(set(frames.values())) < len(frames):
             said = ", ".join(f"{option} {name}" for option, name in frames.items())
             raise UserError(f"{said}: these are three frames, each needs a name of its own")
+        if self.ros_config is not None and not self.ros_config.is_file():
+            raise UserError(f"--ros-config {self.ros_config}: there is no such file")
         if self.scan_topic == self.odom_topic:
             raise UserError(f"--scan-topic and --odom-topic are both {self.scan_topic!r}: a topic has one type")
 

@@ -36,6 +36,7 @@ def test_a_router_has_a_port(said):
         (["--map-frame", "odom"], "three frames, each needs a name of its own"),
         (["--base-frame", "odom"], "--odom-frame odom, --base-frame odom"),
         (["--scan-topic", "odom"], "a topic has one type"),
+        (["--ros-config", "no/such.json5"], "there is no such file"),
     ],
 )
 def test_what_does_not_go_together_is_said(said, why):
