@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -235,8 +235,8 @@ def real_drive(
 
     if not re.fullmatch(r"[\w.-]*", name):
         raise UserError(f"--name {name!r}: letters, digits, '.', '_' and '-' make a file's name")
-    x, y, yaw = map(float, pose_of_text(mount, "--mount")) if mount else (0.0, 0.0, 0.0)
-    job = real.Job(log, world, (x, y, yaw) if mount else None, every, quick, seed, name, exchange)
+    sits: Any = tuple(pose_of_text(mount, "--mount").tolist()) if mount else None
+    job = real.Job(log, world, sits, every, quick, seed, name, exchange)
     show(real, lambda: real.run(job, out, workers, console), out)
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from presage.options import EstimatorName, Json, ModelName, Seed, console, err_console
+from presage.logs.log import Reading
+from presage.options import EstimatorName, Json, ModelName, Seed, console, err_console, with_options
 
 app = typer.Typer()
 
@@ -45,9 +48,29 @@ RangeMax = Annotated[
     float | None, typer.Option(min=0.1, max=1000, rich_help_panel=PANEL, help="A range from here on, m, is no return.")
 ]
 Clock = Annotated[str, typer.Option(rich_help_panel=PANEL, help="Stamps of the sensor, or of the logger.")]
+READING = (
+    ("mount", Mount, ""), ("upside_down", UpsideDown, None), ("scan_topic", ScanTopic, ""),
+    ("odom_topic", OdomTopic, ""), ("base_frame", BaseFrame, ""), ("reference", Reference, None),
+    ("reference_topic", ReferenceTopic, ""), ("angles", Angles, ""), ("range_max", RangeMax, None),
+    ("clock", Clock, "sensor"),
+)  # fmt: skip
+
+
+def reads_logs(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The command with these options, called with the ``reading`` that they ask for."""
+
+    @wraps(command)
+    def run(*args: Any, **kwargs: Any) -> Any:
+        from presage.logs.options import reading_of  # noqa: PLC0415
+
+        said = {name: kwargs.pop(name) for name, _, _ in READING}
+        return command(*args, reading=reading_of(**said), **kwargs)
+
+    return with_options(run, command, READING, without="reading")
 
 
 @app.command()
+@reads_logs
 def localize(
     file: Annotated[Path, typer.Argument(help="A recording, CARMEN log, ROS 1 or 2 bag (a file, or a folder), .npz.")],
     world: Annotated[
@@ -73,16 +96,8 @@ def localize(
         float | None, typer.Option(min=1e-4, max=10, help="The scanner's noise, m; none: as recorded, else 0.02.")
     ] = None,
     seed: Seed = 0,
-    mount: Mount = "",
-    upside_down: UpsideDown = None,
-    scan_topic: ScanTopic = "",
-    odom_topic: OdomTopic = "",
-    base_frame: BaseFrame = "",
-    reference: Reference = None,
-    reference_topic: ReferenceTopic = "",
-    angles: Angles = "",
-    range_max: RangeMax = None,
-    clock: Clock = "sensor",
+    *,
+    reading: Reading,
 ) -> None:
     """Run an estimator over a recording or a log, as fast as it goes; one row a scan.
 
@@ -94,33 +109,21 @@ def localize(
     """
     from presage.localize import Job, choice_of  # noqa: PLC0415
     from presage.localize import localize as run  # noqa: PLC0415
-    from presage.logs.options import reading_of  # noqa: PLC0415
 
-    reading = reading_of(
-        mount, scan_topic, odom_topic, reference_topic, base_frame, angles, clock,
-        reference=reference, range_max=range_max, upside_down=upside_down,
-    )  # fmt: skip
     choice = choice_of(file, world, estimator, model, models, sigma, seed, initial_pose)
     run(Job.of(file, choice, mode, frame, reading, fresh=fresh, odometry=odometry, out=out), err_console)
 
 
 @app.command("import")
+@reads_logs
 def import_(
     file: Annotated[Path, typer.Argument(help="CARMEN log, ROS 1 or 2 bag (a file, or a folder), or .npz.")],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="NAME.mcap; none: the log's name, here.")] = None,
     world: Annotated[str, typer.Option("--world", "--map", help="Of the log: stored with it. None: none.")] = "",
     robot: Annotated[str, typer.Option(help="Its name in the keys.")] = "robot",
     frame: Annotated[str, typer.Option(help="base_link or laser: whose poses the recording has.")] = "base_link",
-    mount: Mount = "",
-    upside_down: UpsideDown = None,
-    scan_topic: ScanTopic = "",
-    odom_topic: OdomTopic = "",
-    base_frame: BaseFrame = "",
-    reference: Reference = None,
-    reference_topic: ReferenceTopic = "",
-    angles: Angles = "",
-    range_max: RangeMax = None,
-    clock: Clock = "sensor",
+    *,
+    reading: Reading,
     rate: Annotated[float | None, typer.Option(min=0.01, max=1000, help="Hz, of an .npz without stamps.")] = None,
     sigma: Annotated[
         float | None, typer.Option(min=1e-4, max=10, help="The scanner's noise, m; none: unknown.")
@@ -140,15 +143,10 @@ def import_(
     """
     from common.errors import UserError  # noqa: PLC0415
     from presage.logs.importing import Import, import_command  # noqa: PLC0415
-    from presage.logs.options import reading_of  # noqa: PLC0415
     from presage.replaying import checked_robot  # noqa: PLC0415
 
     if frame not in ("base_link", "laser"):
         raise UserError(f"no frame {frame!r}: choose base_link or laser")
-    reading = reading_of(
-        mount, scan_topic, odom_topic, reference_topic, base_frame, angles, clock,
-        reference=reference, range_max=range_max, upside_down=upside_down,
-    )  # fmt: skip
     stem = file.resolve().name.split(".")[0]
     target = out or Path(f"{stem}.mcap")
     job = Import(file, target, reading, world, checked_robot(robot), frame == "laser", rate, sigma)
@@ -156,21 +154,14 @@ def import_(
 
 
 @app.command("map")
+@reads_logs
 def map_(
     log: Annotated[Path, typer.Argument(help="Recording or log with reference poses (docs/logs.md).")],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="NAME.yaml; none: the log's name, here.")] = None,
     half: Annotated[str, typer.Option(help="first or second, of the drive; none: all of it.")] = "",
     cell: Annotated[float, typer.Option(min=0.005, max=1.0, help="Edge of a cell, m.")] = 0.05,
-    mount: Mount = "",
-    upside_down: UpsideDown = None,
-    scan_topic: ScanTopic = "",
-    odom_topic: OdomTopic = "",
-    base_frame: BaseFrame = "",
-    reference: Reference = None,
-    reference_topic: ReferenceTopic = "",
-    angles: Angles = "",
-    range_max: RangeMax = None,
-    clock: Clock = "sensor",
+    *,
+    reading: Reading,
 ) -> None:
     """A ROS map (map.yaml, .pgm) of a drive whose poses are known; this is no SLAM.
 
@@ -178,12 +169,7 @@ def map_(
     Examples: `presage map run.mcap`; `presage map fr079.npz --mount 0,0,0 --half first -o first_half.yaml`, then
     `presage experiment real --log fr079.npz --mount 0,0,0 --map first_half.yaml`.
     """
-    from presage.logs.options import reading_of  # noqa: PLC0415
     from presage.map_of_log import Job, map_command  # noqa: PLC0415
 
-    reading = reading_of(
-        mount, scan_topic, odom_topic, reference_topic, base_frame, angles, clock,
-        reference=reference, range_max=range_max, upside_down=upside_down,
-    )  # fmt: skip
     target = out or Path(f"{log.resolve().name.split('.')[0]}.yaml")
     map_command(Job(log, target, half, cell, reading), console, err_console)

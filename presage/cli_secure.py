@@ -6,7 +6,7 @@ import datetime as dt
 import json
 from collections.abc import Callable
 from functools import wraps
-from inspect import Parameter, signature
+from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -44,14 +44,7 @@ def secured(command: Callable[..., Any]) -> Callable[..., Any]:
             options.asked.reset(token)
 
     added = (("security", options.Security, None), ("role", options.RoleName, ""))
-    before = signature(command, eval_str=True)
-    parameters = [
-        *before.parameters.values(),
-        *(Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind) for name, kind, default in added),
-    ]
-    run.__signature__ = before.replace(parameters=parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {each.name: each.annotation for each in parameters}
-    return run
+    return options.with_options(run, command, added)
 
 
 @app.command()

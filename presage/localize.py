@@ -90,16 +90,17 @@ def choice_of(
 def localize(job: Job, console: Console) -> list[dict[str, Any]]:
     """A row for each scan; raises UserError in one line."""
     check_file(job.out, "--out")
-    if job.mode == "global" and job.choice.initial_pose is not None:
-        raise UserError("--initial-pose is where mode track begins: add --mode track, or leave it out")
-    world = job.choice.world
-    check_start(job.choice, load_world(world) if isinstance(world, str) else world)
+    if job.choice.initial_pose is not None:
+        if job.mode == "global":
+            raise UserError("--initial-pose is where mode track begins: add --mode track, or leave it out")
+        world = job.choice.world
+        check_start(job.choice, load_world(world) if isinstance(world, str) else world)
     laser = job.frame == "laser"
     with console.status(f"reading {job.file.name}"):
         # An .npz's poses are the laser's where that is asked for; of every other file it is known where the laser sits.
         itself = laser and kind_of(job.file) == "npz"
         scans = read_scans(job.file, np.zeros(3) if itself else None, job.reading)
-    console.print(*scans.notes, sep="\n", highlight=False, soft_wrap=True, end="\n" if scans.notes else "")
+    scans.say_notes(console)
     start = _start(job, scans)
     estimator = prepare(replace(job.choice, initial_pose=None))(scans.geometry)
     rows = []

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from inspect import Parameter, signature
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -129,3 +131,17 @@ def credentials_for(robot: str, *suiting: str) -> Credentials | None:
         return credentials(now.security, (now.role,), robot)
     usual = ("observer", "operator") if now.command in LOOKING_ON else ("operator",)
     return credentials(now.security, suiting or usual, robot)
+
+
+def with_options(
+    run: Callable[..., Any], command: Callable[..., Any], added: Sequence[tuple[str, Any, Any]], without: str = ""
+) -> Callable[..., Any]:
+    """``run``, which wraps ``command``, with that one's parameters but ``without``, and (name, type, default) added."""
+    before = signature(command, eval_str=True)
+    parameters = [
+        *(each for each in before.parameters.values() if each.name != without),
+        *(Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind) for name, kind, default in added),
+    ]
+    run.__signature__ = before.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {each.name: each.annotation for each in parameters}
+    return run

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
 
 from common.errors import UserError
 from common.messages import Odom, Scan, Truth
@@ -34,6 +35,11 @@ class Scans:
     world: str | None = None  # name of the world it was recorded in
     truth_is: str = RECORDED  # or the log's reference, which is none
     notes: tuple[str, ...] = ()  # what was taken for granted, and left out
+
+    def say_notes(self, console: Console) -> None:
+        """What was taken for granted, a line each."""
+        for note in self.notes:
+            console.print(note, highlight=False, soft_wrap=True)
 
     def observation(self, k: int, *, odometry: bool = True) -> Observation:
         """The k-th scan for an estimator."""

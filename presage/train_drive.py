@@ -48,7 +48,7 @@ class Job:
 def train_from_drive(job: Job, console: Console) -> Path:
     """The weights' path; raises UserError in one line."""
     scans = read_scans(job.log, reading=job.reading)
-    console.print(*scans.notes, sep="\n", highlight=False, soft_wrap=True, end="\n" if scans.notes else "")
+    scans.say_notes(console)
     drive = drive_of(scans, job.log)
     drive = drive.part(np.arange(round(job.share * len(drive.ranges))))
     if len(drive.ranges) < LEAST_SCANS:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common import se2
+from common.ranges import surfaces
 from services.estimator.precise import obstruction
 from services.estimator.precise.gauss_newton import View, difference, polish
 from services.estimator.precise.likelihood import Likelihood
@@ -174,7 +175,7 @@ def noise_of(ranges: Array, angles: Array) -> float:
     """
     turn = 2 * np.cos(np.diff(angles).mean())
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1 / np.where(np.isfinite(ranges) & (ranges > 0), ranges, np.nan)
+        inverse = 1 / np.where(surfaces(ranges), ranges, np.nan)
         bend = (inverse[:, 2:] - turn * inverse[:, 1:-1] + inverse[:, :-2]) * ranges[:, 1:-1] ** 2
     return max(LEAST_SIGMA, float(1.4826 * np.nanmedian(np.abs(bend)) / np.sqrt(2 + turn**2)))
 
