@@ -81,11 +81,15 @@ class Compatibility:
         """Before we are there for others; raises UserError where one that is there speaks another protocol."""
         if not wait_until(self._bus.linked, WITHIN):
             return
-        self._bus.ask_each(CONFIG, Request(), self._inbox, WITHIN).wait(2 * WITHIN)
+        wait_until(self._asked_somebody, WITHIN)  # a session that has just opened does not know yet who is there
         for other in self._answers():
             if not fits(mine, other):
                 raise UserError(misfit(mine, other))
             self._compare(mine, other)
+
+    def _asked_somebody(self) -> bool:
+        self._bus.ask_each(CONFIG, Request(), self._inbox, WITHIN).wait(2 * WITHIN)
+        return len(self._inbox) > 0
 
     def watch(self) -> None:
         """From now on hear of who comes, and of who is there."""

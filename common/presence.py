@@ -11,8 +11,11 @@ from contextlib import suppress
 import zenoh
 
 from common.instances import Instance, Instances
+from common.session import wait_until
 from common.topics import Topic, alive_key, standby_key
 from common.wire import ENCODING
+
+TOLD_WITHIN = 0.3  # s for a subscriber to hear of those who were there before it
 
 
 class Presence:
@@ -79,12 +82,11 @@ class Presence:
             found.change(name, leads=kind == "alive", there=sample.kind == zenoh.SampleKind.PUT)
             changed()
 
-        liveliness, keys = (
-            self._session.liveliness(),
-            [alive_key(self.robot, service), standby_key(self.robot, service)],
-        )
-        self._declared += [liveliness.declare_subscriber(key, move, history=True) for key in keys]
-        for key in keys:  # an answer, where the subscriber's history may still be on its way
+        liveliness = self._session.liveliness()
+        keys = [alive_key(self.robot, service), standby_key(self.robot, service)]
+        for key in keys:
+            self._follow(key, move, timeout)
+        for key in keys:
             for reply in liveliness.get(key, timeout=timeout):
                 if reply.ok is not None:
                     move(reply.ok)
@@ -114,21 +116,37 @@ class Presence:
         return {service: sorted(names) for service, names in found.items()}
 
     def _tokens(self, key: str, timeout: float) -> set[str]:
-        """Keys of those there now.
-
-        A query alone now and then leaves out what is there (zenoh 1.10; the more so while sessions find one another), a
-        subscriber does not, but what it tells of those before it may still be on its way.
-        """
-        liveliness, there = self._session.liveliness(), self._there.get(key)
+        """Keys of those there now: a query alone now and then leaves out what is there (see `_follow`)."""
+        there = self._there.get(key)
         if there is None:
             there = self._there[key] = set()
 
             def move(sample: zenoh.Sample) -> None:
                 (there.add if sample.kind == zenoh.SampleKind.PUT else there.discard)(str(sample.key_expr))
 
-            self._declared.append(liveliness.declare_subscriber(key, move, history=True))
-        answers = liveliness.get(key, timeout=timeout)
-        return {str(answer.ok.key_expr) for answer in answers if answer.ok is not None} | there
+            self._follow(key, move, timeout)
+        return self._asked(key, timeout) | there
+
+    def _asked(self, key: str, timeout: float) -> set[str]:
+        """What one query for tokens finds."""
+        answers = self._session.liveliness().get(key, timeout=timeout)
+        return {str(answer.ok.key_expr) for answer in answers if answer.ok is not None}
+
+    def _follow(self, key: str, move: Callable[[zenoh.Sample], None], timeout: float) -> None:
+        """Hear of all tokens from now on; returns once it was told of those that are there.
+
+        Zenoh (1.10) does not say when that is. A query knows, with two faults: it leaves some out while sessions find
+        one another, and, of a router's client, all that a subscriber just declared was not told of yet. So it comes
+        first, and who is gone in between is not waited for long.
+        """
+        untold = self._asked(key, timeout)
+
+        def hear(sample: zenoh.Sample) -> None:
+            move(sample)
+            untold.discard(str(sample.key_expr))
+
+        self._declared.append(self._session.liveliness().declare_subscriber(key, hear, history=True))
+        wait_until(lambda: not untold, TOLD_WITHIN, period=0.001)
 
     def watch_alive(self, changed: Callable[[str, bool], None]) -> None:
         """Call ``changed(service, is_there)`` for those there now and at every change, from another thread."""

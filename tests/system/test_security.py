@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -223,6 +223,19 @@ def test_nobody_s_certificate_passes_for_a_router_s(guarded, name, answered):
             with pytest.raises(UserError, match="nobody answers"):
                 bus.ask(WORLD, Request(), WorldReply, 2.0)
     fake.kill()
+
+
+def test_a_session_just_opened_knows_at_once_who_is_there(guarded):
+    """A router's client answers its own queries, also before it was told."""
+    with ExitStack() as stack:
+        for name in SERVICES[:4]:
+            stack.enter_context(guarded.session(name)).declare_alive(name)
+        watching = stack.enter_context(guarded.session("observer"))
+        assert wait_until(lambda: watching.alive() == set(SERVICES[:4]), PATIENCE)
+        for _ in range(20):
+            with guarded.session("observer") as newcomer:
+                assert newcomer.alive() == set(SERVICES[:4])
+                assert newcomer.alive() == set(SERVICES[:4])
 
 
 def test_who_is_struck_off_is_let_in_no_more_once_the_router_starts_again(guarded):
