@@ -82,17 +82,21 @@ def free_port():
     return free_tcp_port
 
 
+def taken(inbox, kind):
+    """The messages of a kind that wait, out of the inbox one by one."""
+    while isinstance(sample := inbox.get(0), Sample):
+        message = sample.topic.message.decode(sample.payload)
+        if isinstance(message, kind):
+            yield message
+
+
 def next_of(inbox, kind, condition, timeout=60.0):
     """The first message of a kind that meets a condition."""
     found = []
 
     def look():
-        while isinstance(sample := inbox.get(0), Sample):
-            message = sample.topic.message.decode(sample.payload)
-            if isinstance(message, kind) and condition(message):
-                found.append(message)
-                return True
-        return False
+        found.extend(itertools.islice(filter(condition, taken(inbox, kind)), 1))
+        return bool(found)
 
     assert wait_until(look, timeout), f"no {kind.__name__} as wanted within {timeout:g} s"
     return found[0]
