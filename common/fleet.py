@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import FrameType
 
 from common.processes import dying_with_us
 
@@ -83,22 +84,25 @@ class Fleet:
         self.command, self.again = command, again
         self.members = [Member(robot) for robot in robots]
         self.worst = 0
-        self._asked = threading.Event()
+        self._asked = False  # an Event's wait may hold the lock that its set, in a signal handler, waits for
 
     def run(self) -> int:
         """Until told to end, or, where nothing is started again, until all have ended; the status."""
         for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: self._asked.set())
+            signal.signal(number, self._ask)
         try:
-            while not self._asked.is_set():
+            while not self._asked:
                 for member in self.members:
                     self._tend(member, time.monotonic())
                 if all(member.child is None and member.due is None for member in self.members):
                     break
-                self._asked.wait(LOOK)
+                time.sleep(LOOK)
         finally:
             self._end()
-        return 0 if self._asked.is_set() else self.worst
+        return 0 if self._asked else self.worst
+
+    def _ask(self, _signal: int, _frame: FrameType | None) -> None:
+        self._asked = True
 
     def _tend(self, member: Member, now: float) -> None:
         """Start it where that is due; note its end."""

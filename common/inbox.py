@@ -75,13 +75,16 @@ class Inbox:
         self._bytes = 0
         self._serial = 0
         self._counted: set[str] = set()
-        self._changed = changed or threading.Condition()  # reentrant: a signal handler may wake us inside wait
+        lock = threading.RLock()  # reentrant: a signal handler may wake us inside wait
+        self._changed = changed or threading.Condition(lock)
+        # Not entered through the condition: Ctrl-C in its __enter__, which is Python, would leave it locked for ever.
+        self._lock = changed or lock
 
     def put(self, entry: Sample | Call | Answer, *, newest_only: bool = False) -> None:
         """Add an entry; where a newest-only key still waits, the new one takes the old one's place."""
         size = len(entry.payload)
         full_key = entry.key if isinstance(entry, Sample) else entry.query.name
-        with self._changed:
+        with self._lock:
             key = self.counted_as(full_key)
             self.received[key] += 1
             if size > (MAX_BYTES if isinstance(entry, Sample) else 64 * MAX_BYTES):
@@ -118,19 +121,19 @@ class Inbox:
 
     def tally(self) -> tuple[Counter[str], Counter[str], Counter[str]]:
         """By key and as of one moment: received and no longer waiting, dropped, oversized."""
-        with self._changed:
+        with self._lock:
             taken = self.received.copy()
             taken.subtract(self.counted_as(entry.key) for entry in self._entries.values() if isinstance(entry, Sample))
             return taken, self.dropped.copy(), self.oversized.copy()
 
     def arrivals(self) -> tuple[Counter[str], Counter[str], Counter[str]]:
         """By key and as of one moment: received, those that wait included, dropped, oversized."""
-        with self._changed:
+        with self._lock:
             return self.received.copy(), self.dropped.copy(), self.oversized.copy()
 
     def get(self, timeout: float) -> Sample | Call | Answer | None:
         """The oldest entry, waiting at most ``timeout`` s for one; None when none came."""
-        with self._changed:
+        with self._lock:
             if not self._entries and timeout > 0:
                 self._changed.wait(timeout)
             if not self._entries:
@@ -141,7 +144,7 @@ class Inbox:
 
     def wake(self) -> None:
         """End a wait early."""
-        with self._changed:
+        with self._lock:
             self._changed.notify_all()
 
     def __len__(self) -> int:

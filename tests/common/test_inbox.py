@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
 from collections import Counter
@@ -13,6 +15,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from common.inbox import MAX_KEYS, Answer, Call, Inbox, Sample
 from common.requests import Reply
 from common.topics import HEALTH, MAX_BYTES, SCAN, TELEPORT
+from tests.conftest import ROOT
 
 
 def sample(key="a", payload=b"", topic=SCAN) -> Sample:
@@ -159,6 +162,38 @@ def test_wake_ends_a_wait():
     threading.Timer(0.05, inbox.wake).start()
     assert inbox.get(30) is None
     assert time.monotonic() - began < 15
+
+
+INTERRUPTED = """
+import signal, threading, time
+from common.inbox import Inbox, Sample
+from common.topics import SCAN
+
+signal.signal(signal.SIGALRM, signal.default_int_handler)
+for number in range(200):
+    inbox, putting = Inbox(), True
+
+    def put():
+        while putting:
+            inbox.put(Sample(SCAN, "key", b"", 0, 0), newest_only=True)
+
+    thread = threading.Thread(target=put, daemon=True)
+    thread.start()
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.0005 + number * 2e-5)
+        while True:
+            inbox.get(0.001)
+    except (KeyboardInterrupt, RuntimeError):  # the second inside Condition.wait, in the moment before it waits
+        putting = False
+    thread.join(10)
+    assert not thread.is_alive(), "locked for ever"
+"""
+
+
+def test_ctrl_c_does_not_leave_it_locked():
+    """Zenoh's threads would wait for it, and the session, which waits for them, would never close."""
+    done = subprocess.run([sys.executable, "-c", INTERRUPTED], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_many_threads_put_and_every_entry_is_accounted_for():
