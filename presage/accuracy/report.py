@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from rich.console import Console
 from rich.table import Table
 
@@ -18,10 +19,10 @@ from common.world import load_world
 from presage.accuracy.running import CHOICES, TASKS, Job, about, run_all
 from presage.output import check_file, write_json
 
-# Colours and marks that the colour-blind can tell apart (Okabe & Ito).
+# Colours and marks that the colour-blind can tell apart (Okabe & Ito), and where words stand: points above the mark.
 MARKS = {
-    "precise": ("#0072B2", "o"), "precise-exact": ("#56B4E9", "s"), "particle-filter": ("#D55E00", "^"),
-    "amcl-defaults": ("#CC79A7", "v"),
+    "precise": ("#0072B2", "o", 7), "precise-exact": ("#56B4E9", "s", -14), "particle-filter": ("#D55E00", "^", 7),
+    "amcl-defaults": ("#CC79A7", "v", -14),
 }  # fmt: skip
 
 
@@ -128,12 +129,12 @@ def _draw(rows: list[dict[str, Any]], file: Path) -> None:
     title, rows = next(iter(_by_title(rows).items()))
     rows = [row for row in rows if row["position_error_rms_m"] is not None]
     tasks = list(dict.fromkeys(row["task"] for row in rows))
-    figure = Figure(figsize=(9, 0.55 * len(tasks) + 1.6), layout="constrained")
+    figure = Figure(figsize=(9, 0.55 * len(tasks) + 2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for name in dict.fromkeys(row["estimator"] for row in rows):
         own = [row for row in rows if row["estimator"] == name]
-        colour, mark = MARKS[name]
+        colour, mark, above = MARKS[name]
         axes.scatter(
             [row["position_error_rms_m"] * 1e3 for row in own], [tasks.index(row["task"]) for row in own],
             color=colour, marker=mark, s=50, label=name, zorder=3,
@@ -142,7 +143,7 @@ def _draw(rows: list[dict[str, Any]], file: Path) -> None:
             if row["found"] < row["of"]:
                 axes.annotate(
                     f"{row['found']}/{row['of']}", (row["position_error_rms_m"] * 1e3, tasks.index(row["task"])),
-                    textcoords="offset points", xytext=(0, 7), ha="center", fontsize=7, color=colour,
+                    textcoords="offset points", xytext=(0, above), ha="center", fontsize=7, color=colour,
                 )  # fmt: skip
     bounds = [row for row in rows if row["bound_rms_m"] is not None]
     axes.scatter(
@@ -155,6 +156,9 @@ def _draw(rows: list[dict[str, Any]], file: Path) -> None:
         xscale="log", xlabel="position error, RMS (mm)",
         title=f"{title}; numbers: found of all, where not all",
     )  # fmt: skip
+    axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("{x:g}")
     axes.grid(alpha=0.3, which="both", axis="x")
-    axes.legend(loc="lower right")
+    figure.legend(loc="outside lower center", ncols=len(MARKS) + 1)
     figure.savefig(file, dpi=150)
