@@ -82,21 +82,18 @@ class Presence:
             found.change(name, leads=kind == "alive", there=sample.kind == zenoh.SampleKind.PUT)
             changed()
 
-        liveliness = self._session.liveliness()
-        keys = [alive_key(self.robot, service), standby_key(self.robot, service)]
-        for key in keys:
-            self._follow(key, move, timeout)
-        for key in keys:
-            for reply in liveliness.get(key, timeout=timeout):
-                if reply.ok is not None:
-                    move(reply.ok)
-
         def heard(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
                 move(reply.ok)
 
+        liveliness, alive = self._session.liveliness(), alive_key(self.robot, service)
+        for key in (alive, standby_key(self.robot, service)):
+            self._follow(key, move, timeout)
+            for reply in liveliness.get(key, timeout=timeout):
+                heard(reply)
+
         def look() -> None:
-            liveliness.get(keys[0], zenoh.handlers.Callback(heard), timeout=timeout)
+            liveliness.get(alive, zenoh.handlers.Callback(heard), timeout=timeout)
 
         found.look = look
         return found

@@ -20,17 +20,18 @@ class Timeline:
     def __init__(self) -> None:
         """Empty."""
         self.rows: list[Row] = []
-        self._changed = threading.Condition()
+        self._lock = threading.RLock()  # entered by itself: Ctrl-C in Condition's __enter__ would leave it locked
+        self._changed = threading.Condition(self._lock)
 
     def add(self, row: Row) -> None:
         """A row came."""
-        with self._changed:
+        with self._lock:
             self.rows.append(row)
             self._changed.notify_all()
 
     def first(self, since: float, wanted: Callable[[Row], bool], until: float = float("inf")) -> Row | None:
         """The first row from ``since`` s on that is wanted."""
-        with self._changed:
+        with self._lock:
             rows = list(self.rows)
         return next((row for row in rows if since <= row["t"] < until and wanted(row)), None)
 
@@ -39,7 +40,7 @@ class Timeline:
         deadline = time.monotonic() + timeout
         at = 0
         while True:
-            with self._changed:
+            with self._lock:
                 new, at = self.rows[at:], len(self.rows)
                 for row in new:
                     if row["t"] >= since and wanted(row):
@@ -51,7 +52,7 @@ class Timeline:
 
     def forget(self, before: float) -> None:
         """Rows older than ``before`` s, which nobody will ask for."""
-        with self._changed:
+        with self._lock:
             self.rows = [row for row in self.rows if row["t"] >= before]
 
 

@@ -15,7 +15,7 @@ class Session:
     """A zenoh session of which queries answer ``answers``, and whose subscribers are told what a test says."""
 
     def __init__(self):
-        self.answers, self.before, self.tell = [], [], []
+        self.answers, self.tell = [], []
 
     def zid(self):
         return "0123456789abcdef"
@@ -30,8 +30,6 @@ class Session:
     def declare_subscriber(self, _key, handler, *, history):
         assert history
         self.tell.append(handler)
-        for key in self.before:
-            handler(sample(key, zenoh.SampleKind.PUT))
 
 
 @pytest.fixture

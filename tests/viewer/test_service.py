@@ -22,7 +22,7 @@ from common.scanner import SCANNERS
 from common.topics import HEALTH, PAUSE, PREFERENCE, SCAN, TOPICS, TRUTH, WORLD
 from common.world import load_world
 from services.viewer.view import SHOWN
-from tests.conftest import PATIENCE
+from tests.conftest import PATIENCE, taken
 from tests.viewer.client import Page, page_of
 from tests.viewer.messages import RANGES, at, preference
 
@@ -311,11 +311,10 @@ def test_hostile_messages_are_answered_and_do_nothing(viewer, bus):
         assert page.ask("recordings")["ok"]
 
     def counted():
-        while isinstance(sample := inbox.get(0), Sample):
-            health = Health.decode(sample.payload)
-            if health.service == "viewer" and health.counters.get("malformed", 0) == len(HOSTILE):
-                return True
-        return False
+        return any(
+            health.service == "viewer" and health.counters.get("malformed", 0) == len(HOSTILE)
+            for health in taken(inbox, Health)
+        )
 
     assert wait_until(counted, PATIENCE)
     assert running.running
