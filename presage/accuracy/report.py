@@ -17,6 +17,7 @@ from common.scanner import Scanner
 from common.scanner_choice import chosen_scanner
 from common.world import load_world
 from presage.accuracy.running import CHOICES, TASKS, Job, about, run_all
+from presage.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW, TWINS_FROM
 from presage.output import check_file, write_json
 
 # Colours and marks that the colour-blind can tell apart (Okabe & Ito), and where words stand: points above the mark.
@@ -24,6 +25,12 @@ MARKS = {
     "precise": ("#0072B2", "o", 7), "precise-exact": ("#56B4E9", "s", -14), "particle-filter": ("#D55E00", "^", 7),
     "amcl-defaults": ("#CC79A7", "v", -14),
 }  # fmt: skip
+# Below each table of --markdown: the errors alone would hide the trials that failed.
+LEGEND = f"""Position error median / RMS; found of all (within {FOUND_DISTANCE:g} m and {np.rad2deg(FOUND_YAW):g}°);
+wrong: how many of all published `tracking` while the robot was elsewhere; NEES, 3 is honest. Errors and NEES are of
+those found alone. The bound is Cramér-Rao's, RMS in mm. Both kept: from scan {TWINS_FROM} on, until a scan tells the
+rooms apart, every belief has a hypothesis at the true pose and one at its twin; wrong there: trials with such a claim
+meanwhile."""
 
 
 def bench_accuracy(
@@ -53,6 +60,7 @@ def bench_accuracy(
     for title, own in _by_title(rows).items():
         if markdown:
             print(_markdown(own, title))
+            print(LEGEND)
         else:
             console.print(_table(own, title))
     write_json(json_file, {"rows": rows, "trials": trials, "minutes": minutes, **about(seed)})
@@ -87,7 +95,9 @@ def _number(value: float | None, scale: float = 1.0, digits: int = 2) -> str:
 
 
 def _table(rows: list[dict[str, Any]], title: str) -> Table:
-    table = Table(title=f"{title}; errors of what was found", title_justify="left")
+    table = Table(
+        title=f"{title}; errors and NEES of the found alone; wrong: `tracking` elsewhere", title_justify="left"
+    )
     heads = "task|estimator|found|wrong|median mm|RMS mm|95 % mm|yaw deg|bound mm|RMS/bound|NEES|band|update ms"
     for column in heads.split("|"):
         table.add_column(column, justify="left" if column in ("task", "estimator") else "right")
@@ -104,7 +114,7 @@ def _table(rows: list[dict[str, Any]], title: str) -> Table:
 
 
 def _markdown(rows: list[dict[str, Any]], title: str) -> str:
-    """A line for each task: median and root mean square in mm, found of all; the bound; NEES and its band."""
+    """A line for each task; `LEGEND` says what the cells hold."""
     names = list(dict.fromkeys(row["estimator"] for row in rows))
     lines = [f"| {title} | " + " | ".join(names) + " | bound |", "|---" * (len(names) + 2) + "|"]
     for task in dict.fromkeys(row["task"] for row in rows):
@@ -116,12 +126,12 @@ def _markdown(rows: list[dict[str, Any]], title: str) -> str:
 
 
 def _cell(row: dict[str, Any]) -> str:
-    share = f"{row['found']}/{row['of']}"
+    counts = f"{row['found']}/{row['of']}, {row['tracking_but_wrong']} wrong"
     if row["position_error_median_m"] is None:
-        return share
+        return counts
     error = f"{_number(row['position_error_median_m'], 1e3)} / {_number(row['position_error_rms_m'], 1e3)} mm"
     nees = f", NEES {row['nees_mean']:.2f}" if row["nees_mean"] is not None else ""
-    return f"{error}, {share}{nees}"
+    return f"{error}, {counts}{nees}"
 
 
 def _draw(rows: list[dict[str, Any]], file: Path) -> None:

@@ -143,6 +143,8 @@ def _row(job: Job, world: str, task: str, outcome: tasks.Outcome) -> dict[str, A
         "of": outcome.of,
         "found": outcome.found,
         "tracking_but_wrong": outcome.wrong,
+        "found_share_95": wilson(outcome.found, outcome.of) if outcome.independent else None,
+        "tracking_but_wrong_share_95": wilson(outcome.wrong, outcome.of) if outcome.independent else None,
         "position_error_median_m": float(np.median(position)) if count else None,
         "position_error_rms_m": rms,
         "position_error_p95_m": float(np.quantile(position, 0.95)) if count else None,
@@ -154,6 +156,13 @@ def _row(job: Job, world: str, task: str, outcome: tasks.Outcome) -> dict[str, A
         "nees_band": [DEGREES_OF_FREEDOM - half, DEGREES_OF_FREEDOM + half] if len(misfits) else None,
         "update_ms_median": float(np.median(outcome.update_ms)) if outcome.update_ms else None,
     }
+
+
+def wilson(count: int, of: int) -> list[float]:
+    """Wilson's interval of 95 % for the probability of an event that happened ``count`` times in ``of`` trials."""
+    z2 = 1.96**2
+    middle, half = count + z2 / 2, 1.96 * np.sqrt(count * (of - count) / of + z2 / 4)
+    return [float(np.clip((middle + side * half) / (of + z2), 0, 1)) for side in (-1, 1)]
 
 
 def about(seed: int) -> dict[str, Any]:

@@ -133,10 +133,15 @@ def twin_path(scene: Scene) -> tuple[Array, int]:
     return poses, int(np.argmin(same)) if not same.all() else len(same)
 
 
+def twin_of(poses: Array) -> Array:
+    """(..., 3) the same places and headings in the other of the two rooms."""
+    offset = np.where(poses[..., :1] < TWIN_OFFSET, TWIN_OFFSET, -TWIN_OFFSET)
+    return np.asarray(poses + offset * np.array([1.0, 0.0, 0.0]))
+
+
 def alike(scene: Scene, poses: Array) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Whether poses (N, 3) of the first room give the very scan of their twins."""
-    twins = poses + np.array([TWIN_OFFSET, 0, 0])
-    return np.asarray(np.abs(scene.clean(poses) - scene.clean(twins)).max(axis=1) < 1e-6)
+    """Whether poses (N, 3) give the very scan of their twins."""
+    return np.asarray(np.abs(scene.clean(poses) - scene.clean(twin_of(poses))).max(axis=1) < 1e-6)
 
 
 def _sees_door(scene: Scene, pose: Array) -> bool:

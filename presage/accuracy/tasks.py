@@ -11,13 +11,20 @@ import numpy as np
 from common import se2
 from common.se2 import Array
 from presage.accuracy import bound
-from presage.accuracy.scenes import Scene, twin_path
+from presage.accuracy.scenes import Scene, twin_of, twin_path
 from services.estimator.interface import Estimator, Observation, Posterior
 from services.simulator.odometry import Drift, Odometer
 
 FOUND_DISTANCE, FOUND_YAW = 0.2, np.deg2rad(5)  # m, rad
 STANDING = 20  # scans
+TWINS_FROM = 20  # scans: from this one on a belief must contain both rooms; no estimator can know them at once
 Watch = Callable[[Iterable[Array]], Iterator[Array]]
+
+
+def is_at(believed: Array, pose: Array) -> bool:
+    """Whether poses (3,) differ by less than the distance and the heading within which a place counts as found."""
+    dx, dy, turn = believed - pose
+    return bool(np.hypot(dx, dy) < FOUND_DISTANCE and abs(se2.wrap(turn)) < FOUND_YAW)
 
 
 @dataclass
@@ -30,13 +37,14 @@ class Outcome:
     update_ms: list[float] = field(default_factory=list)
     found: int = 0
     of: int = 0
-    wrong: int = 0  # said tracking, but was not there
+    wrong: int = 0  # `tracking` was published, but the robot was elsewhere
+    independent: bool = True  # the counts are of separate trials, not of scans along one path
 
     def add(self, posterior: Posterior, pose: Array, limit: float | None) -> bool:
         """Take an estimate; whether it is at the place."""
         error = posterior.pose - pose
         error[2] = se2.wrap(error[2])
-        here = bool(np.hypot(error[0], error[1]) < FOUND_DISTANCE and abs(error[2]) < FOUND_YAW)
+        here = is_at(posterior.pose, pose)
         self.of += 1
         self.found += here
         self.wrong += posterior.state == "tracking" and not here
@@ -90,7 +98,7 @@ def blocked(estimator: Estimator, scene: Scene, trials: int, watch: Watch) -> di
 
 def tracking(estimator: Estimator, scene: Scene, seconds: float, watch: Watch, *, odometry: bool) -> dict[str, Outcome]:
     """Along a path from a known start; with the simulator's odometry or none."""
-    outcome, path = Outcome(), scene.path(seconds)
+    outcome, path = Outcome(independent=False), scene.path(seconds)
     limits = (
         bound.recursive(scene, path, Drift()) if odometry else bound.single(scene, path)
     )  # without odometry the motion is not known: the bound is that of each scan alone
@@ -120,18 +128,29 @@ def kidnapped(estimator: Estimator, scene: Scene, trials: int, watch: Watch) -> 
     return {f"kidnapped, {k} scan{'s' if k > 1 else ''}": outcome for k, outcome in after.items()}
 
 
+def holds_both(posterior: Posterior, pose: Array) -> bool:
+    """Whether hypotheses lie at ``pose`` (3,) and at its twin in the other room."""
+    return all(any(is_at(h.pose, place) for h in posterior.hypotheses) for place in (pose, twin_of(pose)))
+
+
 def twins(estimator: Estimator, scene: Scene, trials: int, watch: Watch) -> dict[str, Outcome]:
-    """Two rooms alike: both kept while no scan tells them apart, and right once one did."""
+    """Two rooms alike: both kept while no scan tells them apart, and the right one believed at the end of the path.
+
+    Kept: every belief from the 20th scan on, until a scan differs between the rooms, has a hypothesis at the true pose
+    and one at its twin, of whatever weight. Wrong: in a trial `tracking` was published at the wrong place meanwhile.
+    """
     kept, right = Outcome(), Outcome()
     for _ in watch(np.arange(float(trials))):
         path, same = twin_path(scene)
         estimator.restart()
-        both = True
+        both, wrong = True, False
         for k, pose in enumerate(path):
             posterior = _timed(estimator, scene.observe(scene.clean(pose[None])[0], k / scene.scanner.rate))
-            if k < same:
-                both &= posterior.state == "ambiguous" or (k < STANDING and posterior.state == "localising")
-                both &= any(np.hypot(*(h.pose - pose)[:2]) < FOUND_DISTANCE for h in posterior.hypotheses)
-        kept.of, kept.found = kept.of + 1, kept.found + int(both)
+            if k >= same:
+                continue
+            wrong |= posterior.state == "tracking" and not is_at(posterior.pose, pose)
+            if k + 1 >= TWINS_FROM:
+                both &= holds_both(posterior, pose)
+        kept.of, kept.found, kept.wrong = kept.of + 1, kept.found + both, kept.wrong + wrong
         right.add(posterior, pose, None)
     return {"two rooms alike: both kept": kept, "two rooms alike: right after": right}

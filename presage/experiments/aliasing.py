@@ -18,7 +18,7 @@ from rich.console import Console
 
 from common.se2 import Array
 from common.world import World, load_world
-from presage.accuracy.scenes import ROBOT, TWIN_OFFSET, TWINS, Scene, alike
+from presage.accuracy.scenes import ROBOT, TWIN_OFFSET, TWINS, Scene, alike, twin_of
 from presage.experiments import drawing, results
 from presage.experiments import training as learning
 from presage.experiments.contestants import PAPER
@@ -121,7 +121,7 @@ def _row(pose: Array, posteriors: Sequence[Posterior], *, twins: bool) -> dict[s
     found = {"pose": pose.tolist(), "believed": last.pose.tolist(), "error_m": off, "wrong": wrong, "claim": last.state}
     if not twins:
         return found
-    twin = pose + np.array([TWIN_OFFSET if pose[0] < TWIN_OFFSET else -TWIN_OFFSET, 0, 0])
+    twin = twin_of(pose)
     near = [any(np.hypot(*(h.pose - at)[:2]) < CLOSE for h in last.hypotheses) for at in (pose, twin)]
     either = min(off[-1], float(np.hypot(*(last.pose - twin)[:2])))
     return {**found, "both_kept": int(last.state == "ambiguous" and all(near)), "either_error_m": round(either, 6)}

@@ -12,9 +12,11 @@ from common import se2
 from common.errors import UserError
 from common.robot import Robot
 from common.world import load_world
-from presage.accuracy import bound
-from presage.accuracy.report import bench_accuracy, scanners_of
-from presage.accuracy.scenes import TWINS, Scene, alike, twin_path
+from presage.accuracy import bound, tasks
+from presage.accuracy.report import _markdown, bench_accuracy, scanners_of
+from presage.accuracy.running import Job, _row, wilson
+from presage.accuracy.scenes import TWINS, Scene, alike, twin_of, twin_path
+from services.estimator.interface import Hypothesis, Posterior
 from services.simulator.odometry import Drift
 
 CONSOLE = Console(quiet=True)
@@ -85,10 +87,86 @@ def test_twins_are_twins_until_the_corridor():
     scene = Scene.of(TWINS, 200, 1)
     path, same = twin_path(scene)
     assert 5 <= same < len(path)
-    left = path - np.array([6.1, 0, 0]) if path[0, 0] > 6 else path
-    assert alike(scene, left)[:same].all()
-    assert not alike(scene, left)[-1]
+    assert alike(scene, path)[:same].all()
+    assert not alike(scene, path)[-1]
+    assert twin_of(twin_of(path)) == pytest.approx(path)
+    assert abs(twin_of(path) - path) == pytest.approx(np.tile([6.1, 0, 0], (len(path), 1)))
     assert TWINS.clearance(path[:, :2]).min() > Robot().radius
+
+
+class Believes:
+    """An estimator that publishes what a function of the number of scans and of the true poses makes."""
+
+    def __init__(self, paths, believe):
+        self.paths, self.believe, self.trial = iter(paths), believe, 0
+
+    def restart(self):
+        self.path, self.scans = next(self.paths), 0
+
+    def update(self, observation):
+        pose = self.path[self.scans]
+        self.scans += 1
+        state, poses = self.believe(self.scans, pose, twin_of(pose))
+        hypotheses = tuple(Hypothesis(np.array(each), np.eye(3), 1 / len(poses)) for each in poses)
+        return Posterior(state, hypotheses, 0.0, 0.0, np.zeros(3), np.eye(3), np.zeros(1))
+
+
+def nothing_at_first(scans, pose, twin):
+    return ("ambiguous", [pose, twin]) if scans >= 20 else ("localising", [np.array([3.0, 5.0, 0.0])])
+
+
+def nothing_until_later(scans, pose, twin):
+    return ("ambiguous", [pose, twin]) if scans >= 21 else ("localising", [pose])
+
+
+def the_true_room_alone(scans, pose, twin):
+    return "tracking", [pose]
+
+
+def the_other_room_alone(scans, pose, twin):
+    return "tracking", [twin]
+
+
+def another_heading_in_the_twin(scans, pose, twin):
+    return "ambiguous", [pose, twin + np.array([0, 0, np.deg2rad(6)])]
+
+
+@pytest.mark.parametrize(
+    ("believe", "kept", "wrong"),
+    [
+        (nothing_at_first, 2, 0),
+        (nothing_until_later, 0, 0),
+        (the_true_room_alone, 0, 0),
+        (the_other_room_alone, 0, 2),
+        (another_heading_in_the_twin, 0, 0),
+    ],
+)
+def test_both_rooms_must_be_believed_from_scan_20_on(believe, kept, wrong):
+    paths = [twin_path(scene)[0] for scene in [Scene.of(TWINS, 60, 4)] for _ in range(2)]
+    scene = Scene.of(TWINS, 60, 4)
+    scene.observe = lambda clean, stamp: None  # the noise would change the paths drawn after it
+    found = tasks.twins(Believes(paths, believe), scene, 2, iter)["two rooms alike: both kept"]
+    assert (found.found, found.of, found.wrong) == (kept, 2, wrong)
+
+
+def test_the_short_table_shows_wrong_claims_beside_what_was_found(capsys):
+    outcome = tasks.Outcome(found=1, of=3, wrong=2, errors=[np.array([0.003, 0.004, 0.0])], misfits=[2.5])
+    nothing = tasks.Outcome(of=3, wrong=1)
+    tim = scanners_of("tim571", "")[0]
+    job = Job("precise", "office", tim, 3, 1.0, 0)
+    rows = [_row(job, "office", task, each) for task, each in (("kidnapped", outcome), ("blocked", nothing))]
+    assert "| kidnapped | 5.00 / 5.00 mm, 1/3, 2 wrong, NEES 2.50 |" in _markdown(rows, "office")
+    assert "| blocked | 0/3, 1 wrong |" in _markdown(rows, "office")
+    assert rows[0]["found_share_95"] == pytest.approx([0.061, 0.792], abs=1e-3)
+
+
+def test_counts_have_an_interval_unless_they_are_of_one_path():
+    assert wilson(294, 300) == pytest.approx([0.9570, 0.9908], abs=1e-3)
+    assert wilson(0, 100) == pytest.approx([0.0, 0.0370], abs=1e-3)
+    assert wilson(100, 100) == pytest.approx([0.9630, 1.0], abs=1e-3)
+    tim = scanners_of("tim571", "")[0]
+    along = tasks.Outcome(found=9, of=9, independent=False)
+    assert _row(Job("precise", "office", tim, 3, 1.0, 0), "office", "tracking", along)["found_share_95"] is None
 
 
 def test_rows_say_what_was_measured(tmp_path):
