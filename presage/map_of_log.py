@@ -23,7 +23,7 @@ from presage.logs.log import Reading
 from presage.made_map import write_map
 from presage.output import make_folder
 from presage.scan_files import read_scans
-from presage.train_drive import drive_of
+from presage.train_drive import drive_of, split
 from services.estimator.precise.calibration import Drive
 from services.estimator.precise.surfaces import Beams, in_company
 
@@ -57,9 +57,8 @@ def map_command(job: Job, console: Console, progress: Console) -> Path:
     if scans.stamps is None:  # a map needs none
         scans = replace(scans, stamps=np.arange(len(scans.ranges), dtype=np.float64))
     drive = drive_of(scans, job.log)
-    middle = len(drive.ranges) // 2
-    first, last = {"first": (0, middle), "second": (middle, None)}.get(job.half, (0, None))
-    drive = drive.part(np.arange(len(drive.ranges))[first:last])
+    if job.half:
+        drive = split(drive)[0 if job.half == "first" else 1]
     values, origin = cells_of(drive, job.cell, progress)
     keys = {"resolution": job.cell, "origin": [round(origin[0], 6), round(origin[1], 6), 0.0]}
     path = write_map(job.out.parent, values, name=job.out.stem, image=image.name, **keys)

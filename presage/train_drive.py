@@ -50,7 +50,7 @@ def train_from_drive(job: Job, console: Console) -> Path:
     scans = read_scans(job.log, reading=job.reading)
     scans.say_notes(console)
     drive = drive_of(scans, job.log)
-    drive = drive.part(np.arange(round(job.share * len(drive.ranges))))
+    drive, _ = split(drive, job.share)
     if len(drive.ranges) < LEAST_SCANS:
         raise UserError(
             f"{job.log}: {len(drive.ranges)} scans with a reference pose; {LEAST_SCANS} are the least to learn from"
@@ -95,6 +95,16 @@ def drive_of(scans: Scans, log: Path) -> Drive:
         scans.geometry.range_max, odom,
     )  # fmt: skip
     return whole.part(use)
+
+
+def split(drive: Drive, share: float = 0.5) -> tuple[Drive, Drive]:
+    """The first ``share`` of the scans, rounded down, and all others: of an odd number the second half has one more.
+
+    Every command that learns from one part of a drive and tests with the other takes both from here.
+    """
+    numbers = np.arange(len(drive.ranges))
+    first = numbers < int(share * len(numbers))
+    return drive.part(numbers[first]), drive.part(numbers[~first])
 
 
 def rectangle(drive: Drive, log: Path) -> World:

@@ -77,18 +77,16 @@ class Job:
 def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
     """Learn, tune, localise; writes real-NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
     world = load_world(job.map)
-    plain = Stretch(
-        str(job.log), job.map, job.mount, "precise", ODOMETRY, 0, seed=job.seed, exchanged=job.exchange
-    )  # its drive's first half is learned from
+    plain = Stretch(str(job.log), job.map, job.mount, "precise", ODOMETRY, 0, seed=job.seed, exchanged=job.exchange)
     drive = plain.drive
-    half = len(drive.ranges) // 2
+    half = plain.learned
     x, y, yaw = drive.mount
     console.print(
         f"{job.log.name}: {len(drive.ranges)} posed scans, the laser at {x:g} m, {y:g} m, {np.rad2deg(yaw):g} deg in "
         f"base_link{'' if job.mount else ' (--mount)'}; {'first' if job.exchange else 'second'} half localised"
     )
     _fits(world, drive.part(np.arange(half)), job.map)
-    if half < 2 * LIMIT:
+    if len(drive.ranges) < 4 * LIMIT:
         raise UserError(f"{job.log}: {len(drive.ranges)} posed scans; at least {4 * LIMIT} are needed")
     model, card, tuned = _prepared(job, plain, half, out, console)
     plain = replace(plain, first=half, model=str(model))

@@ -14,7 +14,7 @@ from common import se2
 from common.se2 import Array
 from common.world import load_world
 from presage.scan_files import read_scans
-from presage.train_drive import drive_of
+from presage.train_drive import drive_of, split
 from services.estimator.building import Choice, Factory, Geometry, prepare
 from services.estimator.interface import Estimator, Observation
 from services.estimator.particle_filter.filter import ParticleFilter
@@ -48,26 +48,32 @@ class Job:
 
     @property
     def drive(self) -> Drive:
-        """All of it."""
+        """All of it; the half that is learned comes first."""
         return drive_at(self.log, self.mount, self.exchanged)
+
+    @property
+    def learned(self) -> int:
+        """Scans of `drive` that are learned from; the one with this number is the first of the other half."""
+        first, second = split(drive_at(self.log, self.mount))
+        return len((second if self.exchanged else first).ranges)
 
 
 @functools.lru_cache(maxsize=2)
 def drive_at(log: str, mount: tuple[float, float, float] | None, exchanged: bool = False) -> Drive:
-    """The posed scans of a log, once a process; ``exchanged``: its second half first."""
+    """The posed scans of a log, read once in each process; ``exchanged``: its second half first."""
     from presage.logs.log import Reading  # noqa: PLC0415
 
+    if exchanged:
+        return second_first(drive_at(log, mount))
     path = Path(log)
-    drive = drive_of(read_scans(path, reading=Reading(mount=None if mount is None else np.array(mount))), path)
-    return second_first(drive) if exchanged else drive
+    return drive_of(read_scans(path, reading=Reading(mount=None if mount is None else np.array(mount))), path)
 
 
 def second_first(drive: Drive) -> Drive:
     """The second half, and then the first as if it had followed at the usual interval."""
-    half = len(drive.ranges) // 2
-    late, early = drive.part(np.arange(half, len(drive.ranges))), drive.part(np.arange(half))
+    early, late = split(drive)
     follows = late.stamps[-1] + float(np.median(np.diff(drive.stamps))) - early.stamps[0]
-    turned = drive.part(np.roll(np.arange(len(drive.ranges)), -half))
+    turned = drive.part(np.roll(np.arange(len(drive.ranges)), -len(early.ranges)))
     return replace(turned, stamps=np.concatenate([late.stamps, early.stamps + follows]))
 
 

@@ -18,7 +18,7 @@ from presage.experiments.real_drive import trial as one_trial
 from presage.experiments.real_tuning import starting_point
 from presage.logs.log import Reading
 from presage.train_drive import Job as Training
-from presage.train_drive import train_from_drive
+from presage.train_drive import split, train_from_drive
 from services.estimator.precise import weights
 from services.estimator.precise.learning import Recipe
 from services.estimator.precise.motion import MotionNoise
@@ -97,14 +97,38 @@ def test_time_goes_on_while_a_robot_is_carried_back(folder):
 
 
 @pytest.mark.parametrize("count", [20, 21])
+def test_halves_are_disjoint_and_complete(count):
+    drive = real_drive.drive(count)
+    first, second = split(drive)
+    assert len(first.ranges) == count // 2
+    assert np.concatenate([first.stamps, second.stamps]) == pytest.approx(drive.stamps)
+
+
+@pytest.mark.parametrize("count", [20, 21])
 def test_halves_exchanged_are_a_drive_whose_time_goes_on(count):
     drive = real_drive.drive(count)
+    first, second = split(drive)
     turned = second_first(drive)
-    late = count - count // 2
-    assert turned.poses[:late] == pytest.approx(drive.poses[count // 2 :])
-    assert turned.ranges[late:] == pytest.approx(drive.ranges[: count // 2])
-    assert turned.odom[late:] == pytest.approx(drive.odom[: count // 2])
+    late = len(second.ranges)
+    assert turned.poses[:late] == pytest.approx(second.poses)
+    assert turned.ranges[late:] == pytest.approx(first.ranges)
+    assert turned.odom[late:] == pytest.approx(first.odom)
     assert np.diff(turned.stamps) == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("count", [100, 101])
+@pytest.mark.parametrize("exchanged", [False, True])
+def test_no_scan_is_both_learned_and_localised(tmp_path, count, exchanged):
+    log = tmp_path / "drive.npz"
+    real_drive.save(log, real_drive.drive(count))
+    first, second = split(drive_at(str(log), None))
+    learned, localised = (second, first) if exchanged else (first, second)
+    job = Job(str(log), "", None, "precise", LASER, 0, exchanged=exchanged)
+    assert job.drive.poses[: job.learned] == pytest.approx(learned.poses)
+    assert job.drive.poses[job.learned :] == pytest.approx(localised.poses)
+    assert job.drive.odom[job.learned :] == pytest.approx(localised.odom)
+    steps = se2.between(job.drive.poses[job.learned : -1], job.drive.poses[job.learned + 1 :])
+    assert np.hypot(steps[:, 0], steps[:, 1]).max() < 0.4  # the robot drives at most 0.2 m between two scans
 
 
 def test_with_halves_exchanged_the_first_scans_are_localised(folder):
