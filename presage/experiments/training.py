@@ -24,7 +24,8 @@ from services.estimator.precise.surfaces import Beams
 from services.estimator.training import Data, usable_ranges
 from services.estimator.weights import ModelCard
 
-# Of the shipped weights; 520 steps are the paper's 20 epochs of 13 000 samples in batches of 500.
+# Of the shipped weights. 520 steps are 20 epochs of 13 000 samples in batches of 500: our reading of the paper's "20
+# batches of 500 samples", which to the letter are 20 steps.
 HIDDEN, CHANNELS, BATCH, RATE, STEPS = 128, 8, 500, 3e-3, 520
 WATCHED = 50  # clean scans on which the curve of learning is drawn, after each pass over the samples
 JUDGED = 500  # clean scans on which the decoder's own error is measured
