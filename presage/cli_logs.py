@@ -91,6 +91,9 @@ def localize(
     ] = "global",
     fresh: Annotated[bool, typer.Option("--fresh", help="Each scan on its own.")] = False,
     odometry: Annotated[bool, typer.Option(help="Use the file's odometry, where there is any.")] = True,
+    start: Annotated[float | None, typer.Option(min=0.0, help="s from the first scan.")] = None,
+    end: Annotated[float | None, typer.Option(help="s from the first scan; negative: from the last.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Use only each N-th scan.")] = 1,
     initial_pose: Annotated[str, typer.Option(help="x,y[,yaw_deg] (m, m, deg); for mode track.")] = "",
     sigma: Annotated[
         float | None, typer.Option(min=1e-4, max=10, help="The scanner's noise, m; none: as recorded, else 0.02.")
@@ -101,17 +104,27 @@ def localize(
 ) -> None:
     """Run an estimator over a recording or a log, as fast as it goes; one row a scan.
 
+    Rows are written as they are computed: after Ctrl-C the CSV holds those of the scans so far (status 130), and JSON
+    says "complete": false. Progress goes to standard error. With `--start`, `--end` and `--every` the other scans are
+    skipped; stamps and odometry stay the log's own. With `--start`, mode track begins at the reference there, or at
+    `--initial-pose`.
+
     Columns: stamp (s), x, y (m), yaw (rad), covariance (cov_xx ... cov_yawyaw), free_energy (nats), state, update_ms.
     Examples: `presage localize scans.npz --world office --out poses.csv`;
     `presage localize run.mcap --estimator particle-filter --out poses.json`;
     `presage localize scans.npz --world office --fresh --frame laser`;
-    `presage localize drive.bag --world office --mode track --initial-pose 3,1.5,90`.
+    `presage localize drive.bag --world office --mode track --initial-pose 3,1.5,90`;
+    `presage localize drive.log.bz2 --map map.yaml --start 60 --end 120 --out minute.csv` (its second minute);
+    `presage localize drive.log.bz2 --map map.yaml --every 10 --end -30` (each tenth scan, less the last 30 s).
     """
     from presage.localize import Job, choice_of  # noqa: PLC0415
     from presage.localize import localize as run  # noqa: PLC0415
 
     choice = choice_of(file, world, estimator, model, models, sigma, seed, initial_pose)
-    run(Job.of(file, choice, mode, frame, reading, fresh=fresh, odometry=odometry, out=out), err_console)
+    job = Job.of(
+        file, choice, mode, frame, reading, fresh=fresh, odometry=odometry, out=out, start=start, end=end, every=every
+    )
+    run(job, err_console)
 
 
 @app.command("import")
@@ -150,7 +163,7 @@ def import_(
     stem = file.resolve().name.split(".")[0]
     target = out or Path(f"{stem}.mcap")
     job = Import(file, target, reading, world, checked_robot(robot), frame == "laser", rate, sigma)
-    import_command(job, json_file, console)
+    import_command(job, json_file, console, err_console)
 
 
 @app.command("map")

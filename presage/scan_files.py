@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 
 from common.errors import UserError
@@ -40,6 +41,17 @@ class Scans:
         """What was taken for granted, a line each."""
         for note in self.notes:
             console.print(note, highlight=False, soft_wrap=True)
+
+    def part(self, numbers: npt.NDArray[np.intp]) -> Scans:
+        """The scans of these numbers (K,), ascending; initial_pose only goes with the first of the file."""
+
+        def of(values: Array | None) -> Array | None:
+            return None if values is None else values[numbers]
+
+        return replace(
+            self, ranges=self.ranges[numbers], stamps=of(self.stamps), odom=of(self.odom), truth=of(self.truth),
+            initial_pose=self.initial_pose if numbers[0] == 0 else None,
+        )  # fmt: skip
 
     def observation(self, k: int, *, odometry: bool = True) -> Observation:
         """The k-th scan for an estimator."""

@@ -21,6 +21,7 @@ from common.se2 import Array
 from presage.logs.carmen_lines import WORD, LaserLine, is_laser, laser_line, pose_line
 from presage.logs.log import Log, LoggedScan, Reading
 from presage.logs.poses import Track
+from presage.logs.resampling import resampled
 
 LONGEST = 1 << 22  # characters of a line; no log has such
 SAME = np.array([0.01, 0.01, np.deg2rad(0.5)])  # m, m, rad: a laser that moves less against the robot is bolted to it
@@ -84,7 +85,9 @@ def open_carmen(path: Path, reading: Reading) -> Log:
         log.reference = f"{name}'s corrected pose"
     elif reading.reference:
         notes.append(f"no reference: {name}'s poses are its odometry, and there are no TRUEPOS lines")
-    log.read = lambda: _sweeps(log, first, clock, odom, true, name)
+    # With --angles a header does not count, and nothing says where the beams of another header would be.
+    fixed = reading.angles is not None or first.beams is None
+    log.read = lambda: _sweeps(log, first, clock, odom, true, name, fixed=fixed)
     return log
 
 
@@ -100,7 +103,7 @@ def _angles(path: Path, name: str, first: LaserLine, reading: Reading, notes: li
     if reading.angles is not None:
         return np.linspace(*reading.angles, count)
     if said is not None:
-        return said.start + said.step * np.arange(count, dtype=np.float64)
+        return said.angles()
     if count not in SPANS:
         raise UserError(
             f"{path}: {name} does not say where its {count} beams look: say it, such as --angles -90,90 (first, last)"
@@ -203,8 +206,9 @@ def _note_laser(survey: _Survey, words: list[str]) -> None:
 
 
 def _sweeps(
-    log: Log, first: LaserLine, clock: int, odom: Track | None, true: Track | None, name: str
+    log: Log, first: LaserLine, clock: int, odom: Track | None, true: Track | None, name: str, *, fixed: bool
 ) -> Iterator[LoggedScan]:
+    fitted = 0
     for words in _lines(log.path):
         if words[0] != name:
             if not WORD.match(words[0]):
@@ -217,18 +221,32 @@ def _sweeps(
         except (ValueError, IndexError):
             log.left_out["garbled lines"] += 1
             continue
-        if len(line.ranges) != len(first.ranges) or line.beams != first.beams:
+        own = as_scan(line.ranges, 0.0, log.range_max)
+        ranges = _at_beams_of(first, line, own, log.angles, fixed=fixed)
+        if ranges is None:
             log.left_out["scans of other beams"] += 1
             continue
+        fitted += ranges is not own
         stamp = round((line.ipc, line.logger)[clock] * 1e9)
         reference = None
         if true is not None:
             reference = true.at(stamp)
         elif log.reference and line.laser is not None:
             reference = se2.compose(line.laser, se2.inverse(log.mount))
-        yield LoggedScan(
-            stamp, as_scan(line.ranges, 0.0, log.range_max), line.robot if odom is None else odom.at(stamp), reference
-        )
+        yield LoggedScan(stamp, ranges, line.robot if odom is None else odom.at(stamp), reference)
+    log.note_fitted(fitted)
+
+
+def _at_beams_of(first: LaserLine, line: LaserLine, ranges: Array, angles: Array, *, fixed: bool) -> Array | None:
+    """The line's ``ranges`` at the first line's ``angles``: an interlaced LMS turns its beams by 0.25 deg each scan.
+
+    Returns None where the line cannot be brought to them; with ``fixed`` only a line of the same beams can.
+    """
+    if line.beams == first.beams and len(ranges) == len(angles):
+        return ranges
+    if fixed or line.beams is None or first.beams is None or line.beams.range_max != first.beams.range_max:
+        return None
+    return resampled(ranges, line.beams.angles(), angles)
 
 
 def _is_pose(words: list[str]) -> bool:
@@ -249,7 +267,7 @@ def _lines(path: Path) -> Iterator[list[str]]:
                     yield words
     except BROKEN as error:
         raise UserError(
-            f"{path}: cut short or damaged ({error}); copy it anew, or unpack what is whole of it"
+            f"{path}: cut short or damaged ({error}); copy or download it again, or unpack what is intact and use that"
         ) from None
 
 

@@ -35,6 +35,10 @@ class Beams:
     count: int
     range_max: float  # m
 
+    def angles(self) -> Array:
+        """(count,) rad."""
+        return self.start + self.step * np.arange(self.count, dtype=np.float64)
+
 
 @dataclass(frozen=True)
 class LaserLine:

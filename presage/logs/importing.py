@@ -6,6 +6,7 @@ import itertools
 import json
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,6 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 from rich.console import Console
-from rich.progress import track
 
 from common import se2
 from common.errors import UserError
@@ -27,6 +27,7 @@ from common.world import World, load_world
 from presage.logs.log import Log, LoggedScan, Reading
 from presage.logs.opening import RECORDING, kind_of, open_log
 from presage.output import check_file, write_json
+from presage.progress import progress, working
 from services.estimator.building import SIGMA
 from services.recorder.accounting import Ledger, as_metadata
 from services.recorder.recording import write_answer
@@ -51,8 +52,8 @@ class Import:
     sigma: float | None = None  # m, the scanner's noise; None: the recording does not state it
 
 
-def import_command(job: Import, json_file: Path | None, console: Console) -> None:
-    """Everything; raises UserError in one line, and leaves no file then."""
+def import_command(job: Import, json_file: Path | None, console: Console, err_console: Console) -> None:
+    """Everything, with progress on ``err_console``; raises UserError in one line, and leaves no file then."""
     check_file(json_file, "--json")
     if kind_of(job.file) == "recording":
         raise UserError(f"{job.file}: {RECORDING}")
@@ -61,10 +62,10 @@ def import_command(job: Import, json_file: Path | None, console: Console) -> Non
     if job.out.exists():
         raise UserError(f"{job.out}: is there already; choose another name with --out")
     world = load_world(job.world) if job.world else None
-    with console.status(f"reading {job.file.name}"):
+    with working(f"reading {job.file.name}", err_console):
         log = open_for(job)
-    sweeps = track(log.sweeps(), "importing", total=log.scans, console=console, transient=True)
-    written = write_recording(job, log, world, sweeps)
+    with closing(progress(log.sweeps(), "importing", log.scans, err_console)) as sweeps:
+        written = write_recording(job, log, world, sweeps)
     facts = written.facts(job, log)
     console.print(*_lines(job, log, facts), sep="\n", highlight=False, soft_wrap=True)
     write_json(json_file, {**facts, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:]})

@@ -77,6 +77,12 @@ class Log:
         if lost > used:
             raise UserError(f"{self.path}: too little of use: {used} scans; {self.lost()}")
 
+    def note_fitted(self, count: int) -> None:
+        """Adds the note, once, that ``count`` scans were brought to the first scan's angles."""
+        note = f"{count} scans of other beams are brought to the angles of the first"
+        if count and note not in self.notes:
+            self.notes.append(note)
+
     def lost(self) -> str:
         """What was left out, in words; empty: nothing."""
         return ", ".join(f"{what}: {count}" for what, count in (self.left_out + self.left_out_beside).items())

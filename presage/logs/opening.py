@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -68,10 +67,8 @@ def open_log(path: Path, reading: Reading) -> Log:
 
 def turned_over(log: Log) -> Log:
     """Of a scanner that hangs upside down: what is on its left is on the robot's right."""
-    return replace(
-        log, angles=-log.angles[::-1], read=lambda: (replace(s, ranges=s.ranges[::-1]) for s in log.read()),
-        notes=[*log.notes, "the scanner hangs upside down: its beams are turned over"],
-    )  # fmt: skip
+    log.notes.append("the scanner hangs upside down: its beams are turned over")  # to this list reading adds its own
+    return replace(log, angles=-log.angles[::-1], read=lambda: (replace(s, ranges=s.ranges[::-1]) for s in log.read()))
 
 
 def _is_ours(path: Path, head: bytes) -> bool:
@@ -96,14 +93,16 @@ def _refuse_others(path: Path, head: bytes) -> None:
     if head.startswith(b"\x28\xb5\x2f\xfd"):
         raise UserError(f"{path}: one file of a compressed ROS 2 bag: name its folder, or unpack it with zstd")
     try:
-        with unpacked(io.BytesIO(head)) as stream:
-            text = stream.read1(PEEK) if hasattr(stream, "read1") else stream.read(PEEK)
+        # From the file, not from its head: a block of bzip2 (up to 900 kB) unpacks only as a whole.
+        with path.open("rb") as raw, unpacked(raw) as stream:
+            text, compressed = stream.read(PEEK), stream is not raw
     except BROKEN as error:
-        raise UserError(f"{path}: cut short or damaged ({error})") from None
-    if text != head and not _is_carmen(text):
+        raise UserError(f"{path}: cut short or damaged ({error}); copy or download it again") from None
+    if _is_carmen(text):
+        return
+    if compressed:
         raise UserError(f"{path}: compressed, and no CARMEN log is inside: unpack it first")
-    if not _is_carmen(text):
-        raise UserError(f"{path}: not {KNOWN} (it begins with {head[:8]!r})")
+    raise UserError(f"{path}: not {KNOWN} (it begins with {head[:8]!r})")
 
 
 def _is_carmen(text: bytes) -> bool:

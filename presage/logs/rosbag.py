@@ -191,6 +191,4 @@ def _scans(
             fitted += ranges is not own
             stamp = logged_ns if by_logger else stamp_of(scan.header)
             yield LoggedScan(stamp, ranges, odom(stamp), reference(stamp))
-    note = f"{fitted} scans of other beams are brought to the angles of the first"
-    if fitted and note not in log.notes:
-        log.notes.append(note)
+    log.note_fitted(fitted)

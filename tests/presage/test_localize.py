@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import signal
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +13,14 @@ import pytest
 from rich.console import Console
 
 from common import se2
+from common.bus import wait_until
 from common.errors import UserError
 from common.scanner import SCANNERS
 from common.world import load_world
-from presage.localize import COLUMNS, Job, choice_of, localize
+from presage.localize import COLUMNS, Job, choice_of, chosen, localize
 from presage.logs.log import Reading
-from presage.scan_files import read_scans
+from presage.scan_files import Scans, read_scans
+from tests.conftest import PATIENCE
 from tests.recorder.sessions import write
 
 SCANNER = SCANNERS["tim571"].with_beams(200)
@@ -82,7 +86,7 @@ def test_the_laser_frame_is_that_of_the_files_poses_too(tmp_path):
 def test_only_what_is_needed(tmp_path):
     file = npz(tmp_path, stamps=None, odom=None, initial_pose=None)
     assert errors(localize(job(file), CONSOLE)).max() < 0.02
-    with pytest.raises(UserError, match="mode track needs where to begin"):
+    with pytest.raises(UserError, match="mode track needs the pose of the first scan"):
         localize(job(file, mode="track"), CONSOLE)
     assert errors(localize(job(file, mode="track", initial_pose="4,1.5,57"), CONSOLE)).max() < 0.02
 
@@ -161,6 +165,103 @@ def test_what_says_nothing_about_the_place_is_minus_infinity(tmp_path):
     assert found.tolist() == [[1.0, np.inf, np.inf, -np.inf, -np.inf, -np.inf]]
 
 
+def plain(rows):
+    return [{name: value for name, value in row.items() if name != "update_ms"} for row in rows]
+
+
+@pytest.mark.parametrize("estimator", ["precise", "particle-filter"])
+def test_chosen_scans_give_the_rows_of_a_file_with_only_these(tmp_path, estimator):
+    whole, stamps = npz(tmp_path), 1.6e9 + np.arange(10) / 10
+    data = dict(np.load(whole))
+    chosen = slice(2, 9, 3)  # between 0.2 and 0.8 s each third scan: 2, 5, 8
+    np.savez(whole, **{**data, "stamps": stamps, "reference": PATH})
+    few = {name: data[name][chosen] for name in ("ranges", "odom")}
+    part = tmp_path / "part.npz"
+    np.savez(part, **{**data, **few, "stamps": stamps[chosen], "reference": PATH[chosen], "initial_pose": PATH[2]})
+    given = {"mode": "track", "estimator": estimator, "start": 0.2, "end": 0.8, "every": 3}
+    rows = localize(job(whole, **given), CONSOLE)
+    assert [row["stamp"] for row in rows] == stamps[chosen].tolist()
+    assert plain(rows) == plain(localize(job(part, mode="track", estimator=estimator), CONSOLE))
+    rows = localize(job(whole, **{**given, "end": -0.1}), CONSOLE)
+    assert [row["stamp"] for row in rows] == stamps[chosen].tolist()
+
+
+def test_the_summary_counts_the_chosen_scans(tmp_path, capsys):
+    reference = np.column_stack([PATH[:, :2] + np.arange(10)[:, None], PATH[:, 2]])  # 0 m off at the first, then more
+    out = tmp_path / "poses.json"
+    file = npz(tmp_path, reference=reference)
+    rows = localize(job(file, start=0.1, every=4, out=out), Console(width=150))  # scans 2 and 6
+    said = capsys.readouterr().out
+    assert "2 of 10 scans: 2 tracking" in said
+    middle, most = (float(said.split("reference: ")[1].split(",")[k].split()[0]) for k in (0, 2))
+    assert [middle, most] == pytest.approx([4e3 * 2**0.5, 6e3 * 2**0.5], abs=20)  # mm
+    data = json.loads(out.read_text())
+    assert data["rows"] == rows
+    assert (data["start"], data["end"], data["every"], data["complete"]) == (0.1, None, 4, True)
+
+
+def test_choices_that_leave_nothing(tmp_path):
+    file = npz(tmp_path)
+    scans, unstamped = read_scans(file), replace(read_scans(file), stamps=None)
+    for wrong, why in (
+        ({"start": 2.0}, "--start 2: the recording lasts 0.60 s"),
+        ({"start": 0.4, "end": 0.2}, "nothing lies between"),
+        ({"start": 0.21, "end": 0.25}, r"scans.npz: no scan between 0.21 and 0.25 s"),
+    ):
+        with pytest.raises(UserError, match=why):
+            chosen(job(file, **wrong), scans)
+    for choice in ({"start": 0.2}, {"end": 0.2}, {"every": 2}):
+        with pytest.raises(UserError, match="no stamps, which --start, --end and --every need"):
+            chosen(job(file, **choice), unstamped)
+    with pytest.raises(UserError, match="mode track needs the pose of the first scan"):  # initial_pose is of another
+        localize(job(file, start=0.2, mode="track"), CONSOLE)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "json"])
+def test_an_interrupted_run_keeps_its_rows(tmp_path, capsys, monkeypatch, suffix):
+    file, out, given = npz(tmp_path), tmp_path / f"poses.{suffix}", Scans.observation
+
+    def interrupted_at_the_fifth(scans, k, **how):
+        if k < 4:
+            return given(scans, k, **how)
+        if suffix == "csv":  # also of a run that is killed
+            assert len(out.read_text().splitlines()) == 1 + 4
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Scans, "observation", interrupted_at_the_fifth)
+    with pytest.raises(KeyboardInterrupt):
+        localize(job(file, out=out), Console(width=500))
+    last = capsys.readouterr().out.splitlines()[-2:]
+    assert last[0].startswith("4 of 10 scans: 4 tracking")
+    assert last[1] == f"interrupted after 4 of 10 scans; {out} holds their rows"
+    if suffix == "json":
+        data = json.loads(out.read_text())
+        assert not data["complete"]
+        assert len(data["rows"]) == 4
+        return
+    with out.open() as stream:
+        assert len([float(row["update_ms"]) for row in csv.DictReader(stream)]) == 4
+
+
+def test_ctrl_c_ends_with_a_table_and_status_130(tmp_path, processes):
+    data = dict(np.load(npz(tmp_path)))
+    many = {name: np.tile(data[name], (300, 1)) for name in ("ranges", "odom")}
+    np.savez(tmp_path / "long.npz", **{**data, **many, "stamps": np.arange(3000) / 10})
+    out = tmp_path / "poses.csv"
+    arguments = ["localize", str(tmp_path / "long.npz"), "--world", "corridor", "--fresh", "--out", str(out)]
+    running = processes.start("presage.__main__", *arguments)
+    wait_until(lambda: not running.running or (out.exists() and len(out.read_text().splitlines()) > 3), 4 * PATIENCE)
+    assert running.stop(signal.SIGINT)[0] == 130
+    lines = running.output.splitlines()
+    assert "reading long.npz" in lines
+    assert lines[-1].startswith("interrupted after ")
+    assert lines[-1].endswith(f" of 3000 scans; {out} holds their rows")
+    with out.open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == int(lines[-1].split()[2])
+    assert all(None not in row.values() and row["update_ms"] for row in rows)
+
+
 def test_words_that_are_not_known(tmp_path):
     file = npz(tmp_path)
     for wrong, why in (
@@ -183,6 +284,6 @@ def test_a_recording_says_its_world_and_its_truth(tmp_path):
     rows = localize(job(file, world="", model="exact"), CONSOLE)
     assert errors(rows, scans.truth).max() < 0.03
     with pytest.raises(UserError, match="those options are about logs"):
-        localize(job(file, world="", reading=Reading(mount=np.zeros(3))), CONSOLE)
+        localize(job(file, world="", model="exact", reading=Reading(mount=np.zeros(3))), CONSOLE)
     with pytest.raises(UserError, match="presage train --world hall"):  # no field was learned of that world
         localize(job(file, world=""), CONSOLE)

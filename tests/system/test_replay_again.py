@@ -101,7 +101,9 @@ def test_an_imported_log_is_answered_scan_by_scan(process, tmp_path):
     """There is no belief to compare with; the estimator is as it is by default, in the world it was imported with."""
     log = write_bag(tmp_path, Bag(localised=True))
     for name, world in (("there", "corridor"), ("nowhere", "")):
-        import_command(Import(log, tmp_path / f"{name}.mcap", world=world), None, Console(quiet=True))
+        import_command(
+            Import(log, tmp_path / f"{name}.mcap", world=world), None, Console(quiet=True), Console(quiet=True)
+        )
     status, said, numbers = command(
         process, tmp_path / "a.json", "replay", tmp_path / "there.mcap", "--with", "estimator"
     )

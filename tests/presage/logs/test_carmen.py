@@ -9,9 +9,11 @@ import lzma
 import numpy as np
 import pytest
 
+from common import se2
 from common.errors import UserError
+from common.world import load_world
 from presage.logs.log import Reading
-from presage.logs.opening import open_log
+from presage.logs.opening import PEEK, kind_of, open_log
 from tests.presage.logs.drives import ANGLES, BEAMS, MOUNT, SCANS, STAMPS, carmen, odom, ranges, truth, words
 
 FOV = {"angles": (ANGLES[0], ANGLES[-1])}  # FLASER's 91 beams are no usual number
@@ -60,6 +62,22 @@ def test_compressed(tmp_path, pack):
     file.write_bytes(pack.compress(b"a letter\n"))
     with pytest.raises(UserError, match="compressed, and no CARMEN log is inside"):
         read(file)
+
+
+@pytest.mark.parametrize("pack", [gzip, bz2, lzma])
+def test_compressed_and_longer_than_its_head(tmp_path, pack):
+    """A block of bzip2 is up to 900 kB: the first 64 KiB of such a file hold no whole one."""
+    rng = np.random.default_rng(0)
+    lines = [f"FLASER 361 {words(row)} 0 0 0 0 0 0 {k} h {k}" for k, row in enumerate(rng.uniform(1, 9, (150, 361)))]
+    file = write(tmp_path, lines, pack)
+    assert file.stat().st_size > 2 * PEEK
+    assert kind_of(file) == "carmen"
+    assert len(read(file)[1]) == 150
+    whole = file.read_bytes()
+    for share in (0.1, 0.5, 0.99):
+        file.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(UserError, match="cut short or damaged"):
+            read(file)
 
 
 def test_odometry_of_its_own_lines(tmp_path):
@@ -176,7 +194,7 @@ def test_what_cannot_be_used_is_counted(tmp_path):
     lines[scans[5]] = lines[scans[4]]  # twice
     lines[scans[8]] = lines[scans[6]]  # late
     short = lines[scans[9]].split()
-    lines[scans[9]] = " ".join([*short[:8], str(BEAMS - 1), *short[9 : 9 + BEAMS - 1], *short[9 + BEAMS :]])
+    lines[scans[9]] = " ".join([*short[:8], "30", *short[9 : 9 + 30], *short[9 + BEAMS :]])
     lines.insert(4, "\x1b[0m@@ garbage")
     lines.insert(9, "GPS 1 2 3 of no interest")
     log, sweeps = read(write(tmp_path, lines))
@@ -186,6 +204,27 @@ def test_what_cannot_be_used_is_counted(tmp_path):
     assert len(sweeps) == SCANS - 4
     assert list(log.sweeps())  # the counts are of the last pass
     assert log.left_out["garbled lines"] == 2
+
+
+def test_an_interlaced_scanner_is_brought_to_the_first_beams(tmp_path):
+    lines, quarter = carmen(), np.deg2rad(0.5)
+    scans = [k for k, line in enumerate(lines) if line.startswith("ROBOTLASER1")]
+    lasers = se2.compose(truth(STAMPS), MOUNT)
+    turned = load_world("corridor").ray_distances(lasers, ANGLES[:-1] + quarter)
+    for k, row in list(zip(scans, turned, strict=True))[1::2]:
+        parts = lines[k].split()
+        parts[2] = f"{ANGLES[0] + quarter:.8f}"
+        lines[k] = " ".join([*parts[:8], str(BEAMS - 1), words(row), *parts[9 + BEAMS :]])
+    file = write(tmp_path, lines)
+    log, sweeps = read(file)
+    assert not log.left_out
+    assert "6 scans of other beams are brought to the angles of the first" in log.notes
+    off = np.abs([sweep.ranges for sweep in sweeps] - ranges())[1::2, 1:-1]
+    assert np.quantile(off, 0.9) < 0.05  # at edges a ray half a spacing aside sees another surface
+    upside_down = read(file, upside_down=True)
+    assert upside_down[0].notes == ["the scanner hangs upside down: its beams are turned over", log.notes[-1]]
+    np.testing.assert_array_equal(upside_down[1][1].ranges, sweeps[1].ranges[::-1])
+    assert read(file, angles=(ANGLES[0], ANGLES[-1]))[0].left_out == {"scans of other beams": 6}
 
 
 def test_hardly_anything_of_use(tmp_path):

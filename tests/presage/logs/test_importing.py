@@ -49,7 +49,7 @@ def npz(folder, **changes):
 
 def imported(file, out="out.mcap", **more):
     job = Import(file, file.parent / out, **more)
-    import_command(job, file.parent / "facts.json", CONSOLE)
+    import_command(job, file.parent / "facts.json", CONSOLE, CONSOLE)
     return job.out, json.loads((file.parent / "facts.json").read_text())
 
 
