@@ -44,7 +44,6 @@ export class MapView {
     });
     this.buildLegend();
     this.buildZoom();
-    new ResizeObserver(() => this.rearrange()).observe($("dock"));
   }
 
   /** Room beside the map for what floats over it; on a phone the tools are below the map. */
@@ -98,6 +97,7 @@ export class MapView {
   }
 
   fit() {
+    this.arrange(this.surface.width);
     if (this.store.world) this.camera.fit(boundsOf(this.store.world.boundary));
     this.invalidate();
   }

@@ -4,8 +4,8 @@ import { $, h, setIcon, setText } from "./dom.js";
 
 const TOUCH = matchMedia("(pointer: coarse)").matches, CLICK = TOUCH ? "Tap" : "Click";
 const HINTS = {
-  goal: `${CLICK} to set a goal, drag to set its heading too`,
-  carry: `${CLICK} to carry the robot there, drag to set its heading too`,
+  goal: `${CLICK} to set a goal, drag for its heading`,
+  carry: `${CLICK} to carry the robot there, drag for its heading`,
   obstacle: `${CLICK} to add, drag to move`,
   look: TOUCH ? "Drag to move the view, pinch to zoom" : "Drag to move the view, scroll to zoom",
 };
