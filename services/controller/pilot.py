@@ -234,12 +234,13 @@ class Pilot:
         if not len(around.points):
             return f"{does}: a wall is near"
         nearest, where = _nearest(pose, around)
-        what = "something that moves" if around.moving[nearest] else "something the map does not know"
+        # What has been seen for less than a second may be a person as well as a box that was just moved.
+        what = "something that may move" if around.moving[nearest] else "something that is not in the map"
         return f"{does}: {what}, {np.hypot(*around.points[nearest]):.1f} m away at {where}"
 
     def _no_way(self, pose: Array, around: Around) -> str:
         at = f" at {_nearest(pose, around)[1]}" if len(around.points) else ""
-        return f"no way round what the map does not know{at}: waiting until it clears"
+        return f"no way around something that is not in the map{at}: waiting until it clears"
 
 
 def _nearest(pose: Array, around: Around) -> tuple[int, str]:

@@ -145,8 +145,8 @@ class Control:
         goal = Goal(stamp_ns=self._sight.stamp_ns(robot), seq=time.time_ns(), pose=Pose(x=0.0, y=0.0), cancel=True)
         self._bus.put(GOAL, goal.encode(), key=GOAL.key(robot))
         if self._status(robot, lambda status: status.goal is None) is None:
-            raise UserError("the controller did not confirm it")
-        return Answer(ok=True, reason="the robot stands")
+            raise UserError(f"the controller did not cancel the goal within {WITHIN:g} s")
+        return Answer(ok=True, reason="goal cancelled")
 
     def _status(self, robot: str, wanted: Callable[[Status], bool]) -> Status | None:
         """The controller's word once it is as wanted; None where that does not happen in time."""
@@ -160,7 +160,7 @@ class Control:
     def _teleport(self, robot: str, action: a.Carry) -> Answer:
         pose = Pose(x=action.x, y=action.y, yaw=action.yaw)
         self.ask(robot, TELEPORT, PoseRequest(pose=pose), Reply)
-        return Answer(ok=True, reason=f"carried to ({action.x:.2f}, {action.y:.2f}); nobody told the estimator")
+        return Answer(ok=True, reason=f"carried to ({action.x:.2f}, {action.y:.2f}); the estimator is not informed")
 
     def _localise(self, robot: str, action: a.Localise) -> Answer:
         if (action.x is None) != (action.y is None):
@@ -169,7 +169,7 @@ class Control:
         if action.x is not None and action.y is not None:
             pose = Pose(x=action.x, y=action.y, yaw=action.yaw or 0.0)
         self.ask(robot, LOCALISE, LocaliseRequest(pose=pose), Reply)
-        return Answer(ok=True, reason="localising anew" + (" from there" if pose is not None else " from nothing"))
+        return Answer(ok=True, reason="searching near there" if pose is not None else "searching the whole map")
 
     def _obstacle(self, robot: str, action: a.Furnish) -> Answer:
         request = ObstacleRequest(action=action.action, name=action.name, obstacle=action.obstacle)
@@ -183,7 +183,7 @@ class Control:
 
     def _reset(self, robot: str, action: a.Reset) -> Answer:
         self.ask(robot, RESET, ResetRequest(seed=action.seed), Reply)
-        return Answer(ok=True, reason="begun anew" + (f" with seed {action.seed}" if action.seed is not None else ""))
+        return Answer(ok=True, reason="simulation restarted" + (f" with seed {action.seed}" if action.seed is not None else ""))
 
     def _speed(self, robot: str, action: a.Pace) -> Answer:
         if not 0.1 <= action.factor <= 20:

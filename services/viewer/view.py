@@ -79,6 +79,8 @@ class RobotView:
             self._begin_anew()
         elif topic in BEGINNING and self._waiting is not None and message.stamp_ns != self._waiting[0]:
             frame = self._frame(at)
+        if isinstance(message, Truth) and last is not None and isinstance(last.message, Truth):
+            self.new_row |= self.journal.add_carry(last.message, message)
         self._heard[topic.name] = Heard(message, at, published_ns)
         self._keep(message)
         if not self.live:

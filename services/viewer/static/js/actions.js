@@ -30,15 +30,15 @@ export class Actions {
   }
 
   cancel() {
-    return this.ask("cancel", {}, "Goal forgotten");
+    return this.ask("cancel", {}, "Goal cancelled");
   }
 
   teleport(pose) {
-    return this.ask("teleport", neat(pose), `Carried to ${at(pose)}; watch it find itself`);
+    return this.ask("teleport", neat(pose), `Carried to ${at(pose)}; the estimator is not informed`);
   }
 
   localise() {
-    return this.ask("localise", {}, "Belief forgotten; localising from nothing");
+    return this.ask("localise", {}, "Searching the whole map");
   }
 
   addObstacle(obstacle) {
@@ -69,7 +69,7 @@ export class Actions {
   }
 
   async reset() {
-    const answer = await this.ask("reset", {}, "The simulation begins anew");
+    const answer = await this.ask("reset", {}, "Simulation restarted");
     if (answer.ok) this.store.forget();
   }
 

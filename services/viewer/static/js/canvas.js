@@ -50,12 +50,20 @@ export function tickLabel(value, step) {
   return (Math.abs(value) < step * 1e-6 ? 0 : value).toFixed(Math.min(6, digits)).replace("-", "−");
 }
 
+const axisFont = (colours) => `10.5px ${colours.sans}`;
+
+/** Pixels left of a plot that hold its level lines' labels, `[value, text]` each, and `gap`; at least `least`. */
+export function leftMargin(ctx, lines, colours, gap, least) {
+  ctx.font = axisFont(colours);
+  return Math.max(least, ...lines.map(([, text]) => Math.ceil(ctx.measureText(text).width) + gap + 2));
+}
+
 /** Begins the path of a plot's grid with its level lines, `[value, text]` each, `gap` px between text and plot. */
 export function beginGrid(ctx, plot, lines, y, colours, gap) {
   ctx.strokeStyle = colours.line;
   ctx.fillStyle = colours["ink-3"];
   ctx.lineWidth = 1;
-  ctx.font = `10.5px ${colours.sans}`;
+  ctx.font = axisFont(colours);
   ctx.textBaseline = "middle";
   ctx.textAlign = "right";
   ctx.beginPath();

@@ -1,10 +1,10 @@
 // Numbers over the last minute on a canvas; one cursor for all charts.
 
-import { beginGrid, sharp, tickLabel, ticks } from "./canvas.js";
+import { beginGrid, leftMargin, sharp, tickLabel, ticks } from "./canvas.js";
 import { palette } from "./theme.js";
 import { WINDOW } from "./store.js";
 
-const LEFT = 44, RIGHT = 8, TOP = 6, BOTTOM = 17;
+const LEFT = 44, GAP = 6, RIGHT = 8, TOP = 6, BOTTOM = 17;
 
 /** The time under the pointer, for all charts; null where it is elsewhere. */
 export const cursor = { t: null, changed: () => {} };
@@ -12,7 +12,7 @@ export const cursor = { t: null, changed: () => {} };
 export class Chart {
   /** `series`: {key, tone, width?, fill?}; `log`, `low`, `high` (never narrower), `axis` false leaves the times out. */
   constructor(canvas, store, series, options = {}) {
-    Object.assign(this, { store, series, options });
+    Object.assign(this, { store, series, options, left: LEFT });
     this.surface = sharp(canvas, () => this.draw());
     canvas.addEventListener("pointermove", (event) => this.point(event.offsetX));
     canvas.addEventListener("pointerleave", () => this.point(null));
@@ -20,12 +20,12 @@ export class Chart {
 
   point(px) {
     const end = this.end();
-    cursor.t = px === null || end === null ? null : end - WINDOW + ((px - LEFT) / this.plotWidth()) * WINDOW;
+    cursor.t = px === null || end === null ? null : end - WINDOW + ((px - this.left) / this.plotWidth()) * WINDOW;
     cursor.changed();
   }
 
   plotWidth() {
-    return Math.max(10, this.surface.width - LEFT - RIGHT);
+    return Math.max(10, this.surface.width - this.left - RIGHT);
   }
 
   end() {
@@ -58,7 +58,9 @@ export class Chart {
     ctx.clearRect(0, 0, width, height);
     const end = this.end(), range = this.range();
     const bottom = this.options.axis === false ? 4 : BOTTOM;
-    const plot = { x: LEFT, y: TOP, w: this.plotWidth(), h: Math.max(4, height - TOP - bottom) };
+    const h = Math.max(4, height - TOP - bottom), lines = range ? this.gridLines(...range, h) : [];
+    this.left = leftMargin(ctx, lines, colours, GAP, LEFT);
+    const plot = { x: this.left, y: TOP, w: this.plotWidth(), h };
     if (end === null || range === null) {
       this.drawNothing(ctx, plot, colours);
       return;
@@ -67,7 +69,7 @@ export class Chart {
     const [low, high] = log ? range.map(Math.log10) : range;
     const x = (t) => plot.x + (1 - (end - t) / WINDOW) * plot.w;
     const y = (value) => plot.y + plot.h * (1 - ((log ? Math.log10(Math.max(value, range[0])) : value) - low) / (high - low || 1));
-    this.drawAxes(ctx, plot, range, y, colours);
+    this.drawAxes(ctx, plot, lines, y, colours);
     ctx.save();
     ctx.beginPath();
     ctx.rect(plot.x, plot.y - 1, plot.w + 1, plot.h + 2);
@@ -89,12 +91,12 @@ export class Chart {
     if (plot.h > 24) ctx.fillText(this.options.nothing ?? "nothing yet", plot.x + plot.w / 2, plot.y + plot.h / 2);
   }
 
-  drawAxes(ctx, plot, [low, high], y, colours) {
-    beginGrid(ctx, plot, this.gridLines(low, high, plot.h), y, colours, 6);
+  drawAxes(ctx, plot, lines, y, colours) {
+    beginGrid(ctx, plot, lines, y, colours, GAP);
     ctx.stroke();
     if (this.options.axis === false) return;
     ctx.textBaseline = "alphabetic";
-    for (const ago of plot.w > 150 ? [60, 45, 30, 15, 0] : [60, 30, 0]) {
+    for (const ago of plot.w > 200 ? [60, 45, 30, 15, 0] : [60, 30, 0]) {
       ctx.textAlign = ago === 60 ? "left" : ago === 0 ? "right" : "center";
       ctx.fillText(ago ? `−${ago} s` : "now", plot.x + (1 - ago / WINDOW) * plot.w, plot.y + plot.h + 13);
     }

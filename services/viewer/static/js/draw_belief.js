@@ -4,7 +4,7 @@ import { degrees, metres } from "./format.js";
 import { ellipse, niceAtLeast } from "./geometry.js";
 import { label } from "./draw_world.js";
 
-const VISIBLE = 16; // px, a smaller 2 sigma ellipse is drawn enlarged, and said so
+const VISIBLE = 16; // px, a smaller 2 sigma ellipse is drawn enlarged, with the factor beside it
 
 /** A path over the last minute, older parts fainter. */
 export function drawTrail(ctx, camera, path, colour, { dash = [], width = 2 } = {}) {
@@ -90,9 +90,11 @@ export function drawBelief(ctx, camera, frame, radius, colours) {
   drawBody(ctx, camera, belief, radius, { stroke: colours.predicted, fill: colours.predicted, dash: vague ? [5, 3] : [] });
   const factor = belief.cov ? drawCovariance(ctx, camera, belief, belief.cov, colours.predicted) : 1;
   const [px, py] = camera.toScreen(belief.x, belief.y);
-  const beside = px + Math.max(radius * camera.scale, VISIBLE) + 9;
-  if (factor > 1) label(ctx, `2σ × ${factor}`, beside, py - 7, colours, { colour: colours.predicted, size: 10.5 });
-  if (frame.error > 0.1) label(ctx, `${metres(frame.error)} off`, beside, py + 7, colours, { size: 10.5 });
+  const gap = Math.max(radius * camera.scale, VISIBLE) + 9;
+  const left = px + gap + 160 > camera.width - camera.padding.right; // 160 px: the longest text
+  const beside = (text, y, colour) => label(ctx, text, px + (left ? -gap : gap), y, colours, { align: left ? "right" : "left", colour, size: 10.5 });
+  if (factor > 1) beside(`uncertainty enlarged ${factor}×`, py - 7, colours.predicted);
+  if (frame.error > 0.1) beside(`${metres(frame.error)} from the true position`, py + 7, colours.ink);
 }
 
 /** The true pose, and a line to what is believed where the two differ. */
@@ -177,8 +179,8 @@ export function describeBelief(belief) {
     return `± ${metres(2 * ellipse(belief.cov).major)}, ± ${degrees(2 * Math.sqrt(Math.max(0, belief.cov[8])), 1)}`;
   }
   const rivals = (belief.hypotheses ?? []).filter((one) => one.weight > 0.02).length;
-  if (belief.state === "ambiguous") return rivals > 1 ? `${rivals} places would explain the scan` : "more than one place would explain the scan";
-  if (belief.state === "lost") return "the scan is not what this place predicts";
+  if (belief.state === "ambiguous") return rivals > 1 ? `${rivals} places match the scan` : "more than one place matches the scan";
+  if (belief.state === "lost") return "the scan does not match this place";
   if (belief.state === "localising") return "searching the whole map";
   return belief.estimator ?? "";
 }

@@ -94,10 +94,10 @@ export function drawRulers(ctx, camera, world, colours) {
   for (let x = Math.ceil(x0 / step) * step; x <= x1 + 1e-9; x += step) ctx.fillText(`${x}`, camera.toScreen(x, y0)[0], bottom);
   ctx.textAlign = "right";
   ctx.textBaseline = "middle";
-  const left = Math.max(camera.toScreen(x0, y0)[0] - 7, 16);
+  const edge = camera.toScreen(x0, y0)[0] - 7;
   for (let y = Math.ceil(y0 / step) * step; y <= y1 + 1e-9; y += step) {
-    const py = camera.toScreen(x0, y)[1];
-    ctx.fillText(y === 0 && x0 === 0 ? "0 m" : `${y}`, left, py);
+    const text = y === 0 && x0 === 0 ? "0 m" : `${y}`;
+    ctx.fillText(text, Math.max(edge, ctx.measureText(text).width + 4), camera.toScreen(x0, y)[1]);
   }
 }
 

@@ -93,12 +93,12 @@ function takeHello(hello) {
 function takeWorld({ world, scanner, robot }) {
   const before = store.world;
   Object.assign(store, { world, scanner, robot });
+  if (view.gesture.selected && !modes.selected) modes.select("");
+  redraw(); // first, for the view is fitted clear of the tools
   if (!before || before.name !== world?.name || String(before.boundary) !== String(world?.boundary)) {
     arrange();
     view.fit();
   }
-  if (view.gesture.selected && !modes.selected) modes.select("");
-  redraw();
 }
 
 function takeServices({ services: rows, missing }) {

@@ -14,18 +14,18 @@ import { palette } from "./theme.js";
 const LAYERS = [
   { key: "measured", label: "measured scan", tone: "measured", mark: "dots" },
   { key: "predicted", label: "predicted scan", tone: "predicted", mark: "line" },
-  { key: "belief", label: "believed pose", tone: "predicted", mark: "disc" },
-  { key: "hypotheses", label: "hypotheses", tone: "hypothesis", mark: "disc" },
+  { key: "belief", label: "believed pose, uncertainty", tone: "predicted", mark: "disc" },
+  { key: "hypotheses", label: "other possible poses", tone: "hypothesis", mark: "disc" },
   { key: "truth", label: "true pose, people", tone: "truth", mark: "ring" },
-  { key: "path", label: "way, last minute", tone: "predicted", mark: "trail" },
+  { key: "path", label: "path of the last minute", tone: "predicted", mark: "trail" },
   { key: "motion", label: "predicted motion", tone: "predicted", mark: "thick" },
   { key: "goal", label: "goal", tone: "goal", mark: "disc" },
   { key: "plan", label: "planned path", tone: "goal", mark: "plain" },
-  { key: "field", label: "distance to go", tone: "goal", mark: "rings" },
-  { key: "unmapped", label: "not in the map", tone: "unmapped", mark: "diamond" },
+  { key: "field", label: "distance to the goal", tone: "goal", mark: "rings" },
+  { key: "unmapped", label: "obstacles not in the map", tone: "unmapped", mark: "diamond" },
 ];
 
-const NARROW = 620; // px, where the legend would cover the map
+const NARROW = 620, LOW = 340; // px, below which the legend would cover the map
 
 export class MapView {
   constructor(store) {
@@ -36,7 +36,8 @@ export class MapView {
     this.gesture = {}; // what the pointer is doing: ghost, plan, goal, carry, hovered, selected
     this.invalidate = eachPicture(() => this.draw());
     this.surface = sharp($("map"), ({ width, height }) => {
-      if ((width >= NARROW) !== this.roomy) $("legend").open = this.roomy = width >= NARROW;
+      const roomy = width >= NARROW && height >= LOW;
+      if (roomy !== this.roomy) $("legend").open = this.roomy = roomy;
       this.arrange(width);
       this.camera.resize(width, height);
       this.invalidate();
@@ -45,12 +46,13 @@ export class MapView {
     this.buildZoom();
   }
 
-  /** Room beside the map for what floats over it. */
+  /** Room beside the map for what floats over it; on a phone the tools are below the map. */
   arrange(width) {
     const stick = $("joystick").hidden ? 0 : 114;
+    const dock = Math.max(0, $("map").getBoundingClientRect().bottom - $("dock").getBoundingClientRect().top);
     this.camera.padding = width < NARROW
-      ? { left: 26, right: 16, top: 52, bottom: 112 + stick }
-      : { left: $("legend").open ? 186 : 40, right: 64, top: 28, bottom: 122 };
+      ? { left: 26, right: 16, top: 56, bottom: 26 + dock + stick }
+      : { left: $("legend").open ? $("legend").offsetWidth + 44 : 40, right: 64, top: 28, bottom: 24 + dock };
   }
 
   buildLegend() {
@@ -95,6 +97,7 @@ export class MapView {
   }
 
   fit() {
+    this.arrange(this.surface.width);
     if (this.store.world) this.camera.fit(boundsOf(this.store.world.boundary));
     this.invalidate();
   }

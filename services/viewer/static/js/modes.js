@@ -53,8 +53,8 @@ export class Modes {
 
   /** The obstacle under a point, where it may be taken hold of. */
   grip(point) {
-    if (!this.can || point.shift || this.name === "look" || this.name === "carry") return null;
-    const reach = (this.name === "obstacle" ? GRIP : 1) / this.view.camera.scale;
+    if (!this.can || point.shift || this.name !== "obstacle") return null;
+    const reach = GRIP / this.view.camera.scale;
     return this.obstacles.findLast((one) => one.name && distance(one, point.x, point.y) <= reach) ?? null;
   }
 

@@ -17,7 +17,7 @@ export class Panels {
     this.charts = [
       chart("c-energy", [{ key: "accuracy", tone: "measured", width: 1 }, { key: "free_energy", tone: "predicted" }], { axis: false, nothing: "no belief yet" }),
       chart("c-complexity", [{ key: "complexity", tone: "goal", fill: true }], { low: 0, high: 1 }),
-      chart("c-error", [{ key: "error", tone: "predicted", fill: true }], { log: true, low: 0.0001, high: 0.01, nothing: "no true pose to compare with" }),
+      chart("c-error", [{ key: "error", tone: "predicted", fill: true }], { log: true, low: 0.0001, high: 0.01, nothing: "no true pose: only a simulator knows it" }),
       chart("c-speed", [{ key: "speed", tone: "measured", fill: true }], { low: 0, high: 0.5 }),
     ];
     this.scan = new ScanPlot($("c-scan"), store);
@@ -50,7 +50,7 @@ export class Panels {
     const gone = (name) => servicesKnown && missing.some((one) => one.name === name);
     const { belief, status } = frame ?? {};
     const none = (name) => (gone(name) ? ["s-triangle", "bad", "missing", "see the note on the map"]
-      : this.store.stuck.some((one) => one.name === name) ? ["s-triangle", "bad", "silent", "see the note on the map"] : ["s-ring", "", "silent", "nothing is heard of it"]);
+      : this.store.stuck.some((one) => one.name === name) ? ["s-triangle", "bad", "silent", "see the note on the map"] : ["s-ring", "", "silent", "no messages"]);
     this.badges.estimator(...(belief && !gone("estimator") ? [...(BELIEF[belief.state] ?? ["s-ring", ""]), belief.state, describeBelief(belief)] : none("estimator")));
     const why = status?.reason || (status?.state === "navigating" && status.distance !== null ? `${metres(status.distance)} to go` : "");
     this.badges.controller(...(status && !gone("controller") ? [...(STATUS[status.state] ?? ["s-ring", ""]), status.state, why] : none("controller")));

@@ -4,9 +4,9 @@ import { $, h, icon, setText } from "./dom.js";
 
 export const STATUS = {
   idle: ["s-ring", ""], navigating: ["s-play", "work"], reached: ["s-check", "good"], blocked: ["s-square", "warn"],
-  lost: ["s-triangle", "bad"], manual: ["s-dot", "work"], exploring: ["i-localise", "work"],
+  lost: ["s-triangle", "bad"], manual: ["s-dot", "work"], exploring: ["i-localise", "work"], carried: ["i-carry", "warn"],
 };
-const TOLD = { blocked: "Standing", lost: "Lost", exploring: "Exploring" };
+const TOLD = { blocked: "Blocked", lost: "Lost", exploring: "Exploring" };
 const HELD_BACK = 600; // ms of the obstacle stop that are worth a word
 
 export class Reasons {
@@ -25,7 +25,7 @@ export class Reasons {
     if (status && status.state in TOLD) return [status.state, `${TOLD[status.state]}:`, status.reason || "no reason given"];
     if (frame?.truth?.contact) return ["lost", "Contact:", "the robot touches something"];
     if (frame?.truth?.stopped && performance.now() - stoppedAt > HELD_BACK) {
-      return ["blocked", "Obstacle stop:", "something is too near ahead; the robot's own stop holds its wheels back"];
+      return ["blocked", "Obstacle stop:", "an obstacle is too close ahead; the robot's safety stop holds the wheels"];
     }
     return null;
   }
@@ -48,6 +48,6 @@ export class Reasons {
       return h("li", { data: { tone } }, h("time", {}, `${t.toFixed(1)} s`), icon(mark),
         h("span", {}, h("b", {}, state), reason ? ` ${reason}` : ""));
     });
-    $("journal").replaceChildren(...(rows.length ? rows : [h("li", { class: "quiet" }, "The controller has said nothing yet.")]));
+    $("journal").replaceChildren(...(rows.length ? rows : [h("li", { class: "quiet" }, "No events yet.")]));
   }
 }

@@ -1,10 +1,10 @@
 // The unrolled scan: range against angle, the prediction with its stated precision over the measurement.
 
-import { beginGrid, sharp, tickLabel, ticks } from "./canvas.js";
+import { beginGrid, leftMargin, sharp, tickLabel, ticks } from "./canvas.js";
 import { niceAtLeast } from "./geometry.js";
 import { palette } from "./theme.js";
 
-const LEFT = 34, RIGHT = 8, TOP = 6, BOTTOM = 17;
+const LEFT = 34, GAP = 5, RIGHT = 8, TOP = 6, BOTTOM = 17;
 const DEGREE = Math.PI / 180;
 
 export class ScanPlot {
@@ -35,7 +35,10 @@ export class ScanPlot {
     const share = (angle) => (angle - Math.min(first, last)) / Math.max(Math.abs(last - first), 1e-9);
     const x = (i) => plot.x + share(first + step * i) * plot.w;
     const y = (range) => plot.y + plot.h * (1 - range / this.top);
-    this.drawAxes(ctx, plot, Math.min(first, last), Math.max(first, last), y, colours);
+    const lines = this.gridLines(plot.h);
+    plot.x = leftMargin(ctx, lines, colours, GAP, LEFT);
+    plot.w = Math.max(10, width - plot.x - RIGHT);
+    this.drawAxes(ctx, plot, lines, Math.min(first, last), Math.max(first, last), y, colours);
     ctx.save();
     ctx.beginPath();
     ctx.rect(plot.x, plot.y, plot.w, plot.h);
@@ -54,10 +57,13 @@ export class ScanPlot {
     if (this.top > 3 * wanted) this.top = niceAtLeast(wanted);
   }
 
-  drawAxes(ctx, plot, first, last, y, colours) {
-    const values = ticks(0, this.top, Math.max(2, Math.floor(plot.h / 36)));
-    const label = (value) => tickLabel(value, values[1] - values[0]) + (value === 0 ? " m" : "");
-    beginGrid(ctx, plot, values.map((value) => [value, label(value)]), y, colours, 5);
+  gridLines(h) {
+    const values = ticks(0, this.top, Math.max(2, Math.floor(h / 36)));
+    return values.map((value) => [value, tickLabel(value, values[1] - values[0]) + (value === 0 ? " m" : "")]);
+  }
+
+  drawAxes(ctx, plot, lines, first, last, y, colours) {
+    beginGrid(ctx, plot, lines, y, colours, GAP);
     ctx.textBaseline = "alphabetic";
     const by = plot.w > 260 ? 45 : 90;
     for (let angle = Math.ceil(first / DEGREE / by - 1e-6) * by; angle <= last / DEGREE + 1e-6; angle += by) {

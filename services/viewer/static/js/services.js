@@ -18,10 +18,10 @@ export class Services {
   drawTable() {
     const { services } = this.store;
     const alive = services.filter((one) => one.alive).length;
-    setText($("k-services"), services.length ? `${alive} of ${services.length} alive` : "");
+    setText($("k-services"), services.length ? `${alive} of ${services.length} running` : "");
     const focused = document.activeElement?.dataset?.service;
     const rows = services.flatMap((one) => this.rows(one));
-    if (!rows.length) rows.push(h("tr", { class: "note" }, h("td", { colspan: 6 }, this.store.servicesKnown ? "No service is alive." : "Waiting for the first pulse.")));
+    if (!rows.length) rows.push(h("tr", { class: "note" }, h("td", { colspan: 6 }, this.store.servicesKnown ? "No service is running." : "Waiting for the services.")));
     $("services").replaceChildren(...rows);
     if (focused) [...$("services").querySelectorAll("button")].find((button) => button.dataset.service === focused)?.focus();
   }
@@ -33,7 +33,7 @@ export class Services {
     const head = h("tr", { class: one.alive ? "" : "dead" },
       h("td", {}, this.toggle(one, open, rates.length)), ...cells({
         published_hz: sum("published_hz"), received_hz: sum("received_hz"), dropped: sum("dropped"), undecodable: sum("undecodable"),
-      }), h("td", { title: one.age_s == null ? "" : `last pulse ${one.age_s} s ago` }, one.alive ? (one.uptime_s == null ? "–" : span(one.uptime_s)) : "gone"));
+      }), h("td", { title: one.age_s == null ? "" : `last sign of life ${one.age_s} s ago` }, one.alive ? (one.uptime_s == null ? "–" : span(one.uptime_s)) : "gone"));
     const note = one.note ? [h("tr", { class: "note" }, h("td", { colspan: 6 }, one.note))] : [];
     const topics = open ? rates.map((rate) => h("tr", { class: "topic" }, h("th", { scope: "row" }, rate.topic), ...cells(rate), h("td"))) : [];
     return [head, ...note, ...topics];
@@ -65,7 +65,7 @@ export class Services {
     const notices = [];
     if (connected && servicesKnown && !empty && !player) {
       notices.push(...missing.map((one) => this.notice(`${one.name} is missing.`, consequence(one.name), one.start)));
-      notices.push(...stuck.map((name) => this.notice(`${name} is silent.`, "It is connected, but its pulse has stopped: hung, stopped, or starved.", "")));
+      notices.push(...stuck.map((name) => this.notice(`${name} is silent.`, "It is connected but sends nothing: it hangs, is stopped, or gets no processor time.", "")));
       if (silent && !this.store.paused && !missing.length && !stuck.length) {
         notices.push(this.notice("No scan for a while.", "The simulation is paused, or its source has stopped.", ""));
       }
@@ -78,12 +78,12 @@ export class Services {
     const all = missing.some((one) => one.name === "simulator");
     return h("div", { class: "sheet" },
       h("h2", {}, all ? "Nothing is running yet" : "Waiting for the world"),
-      h("p", {}, all ? "The page is connected, but no robot is on the bus. Start everything at once, in a terminal beside this one:"
-        : "A simulator is alive but has not said yet what its world looks like."),
+      h("p", {}, all ? "The page works, but no robot is running. Start everything at once, in a terminal beside this one:"
+        : "The simulator is running but has not sent its world yet."),
       ...(all ? [this.start("presage up")] : []),
       ...(missing.length ? [h("p", { class: "or" }, all ? "or one by one:" : "Also missing:")] : []),
       ...missing.map((one) => h("div", {}, this.start(one.start))),
-      ...(all && this.store.control ? [h("p", { class: "or" }, "A recording needs none of them: Open, below.")] : []));
+      ...(all && this.store.control ? [h("p", { class: "or" }, "To look at a recording, none of them is needed: use Open, below.")] : []));
   }
 
   notice(title, text, command) {
@@ -96,7 +96,7 @@ export class Services {
         await navigator.clipboard.writeText(command);
         this.toast("Copied");
       } catch {
-        this.toast("This browser lets no page copy; select the text instead", false);
+        this.toast("The browser does not allow copying; select the text instead", false);
       }
     };
     return h("div", { class: "start" }, h("code", {}, command), h("button", { class: "icon", type: "button", title: "Copy", "aria-label": `Copy: ${command}`, onclick: copy }, icon("i-copy")));
@@ -104,7 +104,7 @@ export class Services {
 }
 
 const consequence = (name) => ({
-  simulator: "There are no scans.", estimator: "Nobody predicts or believes.", controller: "Nobody drives.",
+  simulator: "There are no scans.", estimator: "The robot's pose is not estimated.", controller: "The robot does not drive.",
   router: "The services do not find one another.",
 }[name] ?? "");
 

@@ -2,10 +2,12 @@
 
 import { $, h, setIcon, setText } from "./dom.js";
 
+const TOUCH = matchMedia("(pointer: coarse)").matches, CLICK = TOUCH ? "Tap" : "Click";
 const HINTS = {
-  goal: "Click sets a goal, drag gives its heading",
-  carry: "Click carries the robot off, drag gives its heading",
-  look: "Drag moves the view, the wheel zooms",
+  goal: `${CLICK} to set a goal, drag for its heading`,
+  carry: `${CLICK} to carry the robot there, drag for its heading`,
+  obstacle: `${CLICK} to add, drag to move`,
+  look: TOUCH ? "Drag to move the view, pinch to zoom" : "Drag to move the view, scroll to zoom",
 };
 
 export class Toolbar {
@@ -46,10 +48,9 @@ export class Toolbar {
     $("open").disabled = !store.connected || !store.control;
     $("step").disabled = !can || !this.standing;
     setIcon($("pause"), this.standing ? "i-play" : "i-pause");
-    $("pause").setAttribute("aria-label", this.standing ? "Resume" : "Pause");
+    setText($("pause-label"), this.standing ? "Resume" : "Pause");
     $("record").setAttribute("aria-pressed", String(actions.recording));
     setText($("record-label"), actions.recording ? "Stop" : "Record");
-    $("record").setAttribute("aria-label", actions.recording ? "Stop recording" : "Record");
     $("record").title = actions.recording ? "Stop recording (R)" : "Record (R)";
     this.drawSub(can);
   }
@@ -66,7 +67,7 @@ export class Toolbar {
 
   parts(can, selected) {
     const { modes, actions } = this;
-    if (!can) return [h("span", { class: "hint" }, this.store.control ? "Not connected" : "Watching only; whoever started this page allows no more")];
+    if (!can) return [h("span", { class: "hint" }, this.store.control ? "Not connected" : "View only: this page was started without --allow-control")];
     const hint = (text) => h("span", { class: "hint" }, text);
     const button = (text, run, attributes = {}) => h("button", { type: "button", onclick: run, ...attributes }, text);
     if (selected) {
@@ -76,7 +77,7 @@ export class Toolbar {
       ];
       return [hint(selected.name), ...turns, button("Remove", () => actions.removeObstacle(selected.name)), button("Done", () => modes.select(""))];
     }
-    if (modes.name === "goal") return [hint(HINTS.goal), ...this.place(), h("button", { class: "primary" }, "Go"), button("Forget goal", () => actions.cancel())];
+    if (modes.name === "goal") return [hint(HINTS.goal), ...this.place(), h("button", { class: "primary" }, "Go"), button("Cancel goal", () => actions.cancel())];
     if (modes.name === "carry") return [hint(HINTS.carry), ...this.place(), h("button", { class: "primary" }, "Carry")];
     if (modes.name === "obstacle") return this.furniture(hint);
     return [hint(HINTS.look)];
@@ -89,7 +90,7 @@ export class Toolbar {
     shape.value = modes.shape;
     const size = h("input", { type: "number", min: 0.05, max: 20, step: 0.05, value: modes.size, "aria-label": "Size in metres",
       oninput: () => { if (size.valueAsNumber >= 0.05 && size.valueAsNumber <= 20) modes.size = size.valueAsNumber; } });
-    return [hint("Click adds, drag moves"), shape, h("label", {}, size, "m"), ...this.place(false), h("button", { class: "primary" }, "Add")];
+    return [hint(HINTS.obstacle), shape, h("label", {}, size, "m"), ...this.place(false), h("button", { class: "primary" }, "Add")];
   }
 
   /** Fields for those who do not point. */
