@@ -41,7 +41,7 @@ class Facts:
     file: str
     file_bytes: int
     complete: bool
-    checked: bool  # every payload was read, with its chunk's checksum
+    checked: bool  # every payload was read, and every checksum compared as far as the file is whole
     warning: str
     robots: list[str]
     world: str | None
@@ -105,6 +105,7 @@ def survey(recording: Recording, check: bool | None = None) -> Facts:
     if check if check is not None else size <= SMALL:
         seen = _Pass()
         seen.read(recording)
+        recording.verify()
     about = recording.metadata.get("presage", {})
     world = recording.world()
     return Facts(

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-import errno
+import heapq
+import os
+import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from struct import Struct
+from typing import Any, BinaryIO
 
 import yaml
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Header, Metadata
+from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Header, Metadata
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
+from mcap.summary import Summary
 from pydantic import ValidationError
 
 from common.errors import UserError
@@ -23,9 +29,14 @@ from common.scanner import Scanner
 from common.topics import Topic, topic_of
 from common.wire import DecodeError
 from common.world import NOT_YAML, World
+from services.recorder.chunks import PREFIX, records_of
 from services.recorder.writer import PROFILE
 
 MAGIC = b"\x89MCAP0\r\n"
+FOOTER = Struct("<BQQQI")  # opcode, length, where the summary begins, where its offsets do, its checksum
+CRC_BYTES = 4  # the footer's last field, which the summary's checksum leaves out
+OVERHEAD = 512  # bytes of memory that a message takes beside its payload, about
+MAX_WAITING_BYTES = 1 << 28  # of messages that wait for their place in time, where chunks overlap
 
 
 @dataclass(frozen=True)
@@ -143,13 +154,22 @@ class Recording:
         except ValidationError:
             return None
 
+    def verify(self) -> None:
+        """Compare the checksum of all that is before the summary; `problem` is set where it is wrong.
+
+        Reads the whole file. Recorders of before this checksum wrote none, and then only records are looked at.
+        """
+        if not self.problem:
+            with self.path.open("rb") as stream:
+                for _ in _records(self, stream, chunks=False):
+                    pass
+
     def _indexed(
         self, stream: BinaryIO, keys: Collection[str] | None, start_ns: int | None, end_ns: int | None
     ) -> Iterator[tuple[Channel, McapMessage]]:
-        reader = SeekingReader(stream, validate_crcs=True)
         try:
-            for _, channel, message in reader.iter_messages(keys, starting_at=start_ns, ending_before=end_ns):
-                yield channel, message
+            summary = SeekingReader(stream).get_summary()
+            yield from _in_order(stream, summary, keys, start_ns, end_ns)
         except OSError:
             raise
         except Exception as error:  # noqa: BLE001 - a damaged chunk raises kinds of each decompressor
@@ -177,7 +197,8 @@ def read_recording(path: Path) -> Recording:
         with path.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 raise UserError(
-                    f"{path}: not an MCAP file; `presage record` makes recordings, `presage import` of logs"
+                    f"{path}: not an MCAP file, or its first bytes are damaged; `presage record` makes recordings, "
+                    "`presage import` of logs, and `presage recover` a whole one of a damaged one"
                 )
             if not _read_summary(recording, stream):
                 _read_through(recording, stream)
@@ -191,14 +212,72 @@ def read_recording(path: Path) -> Recording:
     return recording
 
 
+def summary_of(stream: BinaryIO) -> Summary | None:
+    """The summary at a file's end; None where the file states that it has none, ValueError where it is damaged."""
+    size = stream.seek(0, os.SEEK_END)
+    at = size - len(MAGIC) - FOOTER.size
+    stream.seek(max(0, at))
+    tail = stream.read()
+    if at < len(MAGIC) or not tail.endswith(MAGIC):
+        raise ValueError("its end is missing")
+    opcode, length, start, _, crc = FOOTER.unpack_from(tail)
+    if (opcode, length) != (Opcode.FOOTER, FOOTER.size - PREFIX.size):
+        raise ValueError("its end is damaged")
+    if start == 0:
+        return None
+    stream.seek(start)
+    summary = stream.read(max(0, at + FOOTER.size - CRC_BYTES - start))
+    if crc and zlib.crc32(summary) != crc:
+        raise ValueError("its index is damaged")
+    stream.seek(0)
+    return SeekingReader(stream, record_size_limit=size).get_summary()
+
+
+def _in_order(
+    stream: BinaryIO, summary: Summary, keys: Collection[str] | None, start_ns: int | None, end_ns: int | None
+) -> Iterator[tuple[Channel, McapMessage]]:
+    """Messages of some keys and times, by their log times; raises where a chunk is damaged."""
+    ids = {number for number, channel in summary.channels.items() if keys is None or channel.topic in keys}
+    # By time, then by place in the file: a chunk stands before its messages. Of a chunk the index, of a message itself.
+    queue: list[tuple[int, int, int, Any]] = [
+        (index.message_start_time, index.chunk_start_offset, -1, index)
+        for index in summary.chunk_indexes
+        if not index.message_index_offsets or not ids.isdisjoint(index.message_index_offsets)
+    ]
+    heapq.heapify(queue)
+    waiting = 0  # bytes
+    while queue:
+        _, offset, _, entry = heapq.heappop(queue)
+        if not isinstance(entry, ChunkIndex):
+            waiting -= len(entry.data) + OVERHEAD
+            yield summary.channels[entry.channel_id], entry
+            continue
+        if (start_ns is not None and entry.message_end_time < start_ns) or (
+            end_ns is not None and entry.message_start_time >= end_ns
+        ):
+            continue
+        stream.seek(offset + PREFIX.size)
+        for number, record in enumerate(records_of(Chunk.read(ReadDataStream(stream)))):
+            if not isinstance(record, McapMessage) or record.channel_id not in ids:
+                continue
+            at = record.log_time
+            if (start_ns is None or at >= start_ns) and (end_ns is None or at < end_ns):
+                heapq.heappush(queue, (at, offset, number, record))
+                waiting += len(record.data) + OVERHEAD
+        if waiting > MAX_WAITING_BYTES:
+            raise ValueError("too many chunks are of the same time")
+
+
 def _read_summary(recording: Recording, stream: BinaryIO) -> bool:
     """From the index of a finished file; False where there is none that can be trusted."""
-    stream.seek(0)
     try:
-        reader = SeekingReader(stream, validate_crcs=True)
-        summary = reader.get_summary()
+        summary = summary_of(stream)
         if summary is None or summary.statistics is None:
             return False
+        if summary.statistics.message_count and not summary.chunk_indexes:
+            return False
+        stream.seek(0)
+        reader = SeekingReader(stream, record_size_limit=recording.path.stat().st_size)
         recording.profile = reader.get_header().profile
         for metadata in reader.iter_metadata():
             recording.metadata[metadata.name] = dict(metadata.metadata)
@@ -210,12 +289,11 @@ def _read_summary(recording: Recording, stream: BinaryIO) -> bool:
             summary.statistics.message_start_time,
             summary.statistics.message_end_time,
         )
-    except OSError as error:
-        if error.errno == errno.EINVAL:  # it is shorter than an end
-            return False
+    except OSError:
         raise
-    except Exception:  # noqa: BLE001 - whatever a torn or damaged end makes of it
+    except Exception as error:  # noqa: BLE001 - whatever a torn or damaged end makes of it
         recording.metadata, recording.attachments, recording._counts = {}, {}, Counter()  # noqa: SLF001
+        recording.problem = str(error) if isinstance(error, ValueError) else "its index is damaged"
         return False
     recording._finished = True  # noqa: SLF001
     return True
@@ -240,12 +318,19 @@ def _read_through(recording: Recording, stream: BinaryIO) -> None:
             recording.end_ns = max(recording.end_ns, record.log_time)
 
 
-def _records(recording: Recording, stream: BinaryIO) -> Iterator[object]:
-    """Until the end or the first damage, which is noted; a record longer than the file is damage."""
+def _records(recording: Recording, stream: BinaryIO, *, chunks: bool = True) -> Iterator[object]:
+    """Until the end or the first damage, which is noted; a record longer than the file is damage.
+
+    With ``chunks`` what is in chunks comes in their place.
+    """
     stream.seek(0)
     size = recording.path.stat().st_size
     try:
-        yield from StreamReader(stream, validate_crcs=True, record_size_limit=size).records
+        for record in StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size).records:
+            if chunks and isinstance(record, Chunk):
+                yield from records_of(record)
+            else:
+                yield record
     except OSError:
         raise
     except Exception as error:  # noqa: BLE001 - a torn or damaged chunk raises kinds of each decompressor
