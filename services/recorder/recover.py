@@ -227,7 +227,9 @@ def _reason(found: Recovered) -> str:
     if not found.damages:
         return "its recorder ended before there was one"
     lost = sum(damage.length for damage in found.damages)
-    return f"not an MCAP file, or {lost} of its {found.size} bytes are damaged or cut short"
+    if lost >= found.size - len(MAGIC):
+        return "not an MCAP file, or all of it is damaged"
+    return f"{lost} of its {found.size} bytes are damaged or cut short"
 
 
 def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[list[object], int]]:

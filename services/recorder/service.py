@@ -108,10 +108,21 @@ class RecorderService(Service):
         for key, written in recording.ledger.written.items():
             self._written[key] += written
             self._missing[key] += recording.ledger.lost(key).missing
-        *_, path = files = recording.writer.finish()
+        writer = recording.writer
+        try:
+            *_, path = files = writer.finish()
+        finally:
+            if writer.failed:
+                self._ended = self._ended.model_copy(update={"messages": writer.saved})
+                self.log.error(
+                    "recording is incomplete", file=str(writer.part.active), messages=writer.saved,
+                    lost=recording.lost(), dropped=dropped, missing=missing,
+                )  # fmt: skip
         self._ended = self._ended.model_copy(update={"file": str(path)})
-        parts = {"parts": len(files)} if len(files) > 1 else {}
-        self.log.info("recorded", file=str(path), messages=state.messages, dropped=dropped, missing=missing, **parts)
+        if not writer.failed:
+            parts = {"parts": len(files)} if len(files) > 1 else {}
+            counts = {"messages": state.messages, "dropped": dropped, "missing": missing}
+            self.log.info("recorded", file=str(path), **counts, **parts)
 
     def counted(self, key: str) -> dict[str, int]:
         """For health: what was written of a key, and what never came."""

@@ -32,7 +32,7 @@ class RecordingWriter:
         self.path, self.active = path, path.with_name(path.name + UNFINISHED)
         self.written: Counter[str] = Counter()  # by key
         self.failed = False
-        self._safe = 0  # messages of complete chunks, which the system has
+        self._saved = 0
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         try:
@@ -49,9 +49,9 @@ class RecordingWriter:
         return self._stream.tell()
 
     @property
-    def unsaved(self) -> int:
-        """Messages that were written and would be lost if this process ended now, or are lost where it failed."""
-        return self.written.total() - self._safe
+    def saved(self) -> int:
+        """Messages, at least, that are in complete chunks which the system has: they survive a failure to write on."""
+        return self._saved
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
         """A named map of text."""
@@ -88,12 +88,12 @@ class RecordingWriter:
         self._guarded(add)
         if not self._chunk.num_messages:  # that was the last message of a chunk
             self._guarded(self._stream.flush)
-            self._safe = self.written.total()
+            self._saved = self.written.total()
 
     def flush(self) -> None:
         """Complete the chunk and hand it to the system: what came before survives this process."""
         self._guarded(self._writer.flush)
-        self._safe = self.written.total()
+        self._saved = self.written.total()
         if not is_there(self.active, self._stream):
             self.failed = True
             raise UserError(
@@ -115,7 +115,7 @@ class RecordingWriter:
             self._abandon()
             return self.active
         self._guarded(self._writer.flush)
-        self._safe = self.written.total()
+        self._saved = self.written.total()
         self._guarded(end)
         return self.path
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import tracemalloc
 
 import lz4.frame
@@ -15,13 +16,16 @@ from mcap.writer import Writer
 from rich.console import Console
 
 from common.errors import UserError
+from common.inbox import Inbox, Sample
 from common.messages import CmdVel, Pose, Truth, Twist
 from common.topics import CMD_VEL, TRUTH
 from presage.inspection.info import survey
 from presage.inspection.show import info
 from services.recorder.chunks import COMPRESSION, MAX_CHUNK_BYTES
 from services.recorder.reader import MAGIC, read_recording
+from services.recorder.recording import OpenRecording
 from services.recorder.recover import recover
+from services.recorder.settings import RecorderSettings
 from services.recorder.writer import PROFILE, RecordingWriter
 
 CHUNKS = 6
@@ -169,3 +173,37 @@ def test_a_chunk_that_unpacks_to_gigabytes(tmp_path, compression, stated):
         assert tracemalloc.get_traced_memory()[1] < 4 * MAX_CHUNK_BYTES
     finally:
         tracemalloc.stop()
+
+
+class FullDisk:
+    """A file that takes so many bytes, and then no more."""
+
+    def __init__(self, stream, room):
+        self.stream, self.room = stream, room
+
+    def write(self, data):
+        if self.stream.tell() + len(data) > self.room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return self.stream.write(data)
+
+    def __getattr__(self, name):
+        return getattr(self.stream, name)
+
+
+def test_on_a_full_disk_each_lost_message_is_counted(tmp_path):
+    inbox = Inbox()
+    session = OpenRecording(RecorderSettings(directory=tmp_path, compression="none", chunk_size=1024), (), inbox)
+    part = session.writer.part
+    part._stream = part._writer._Writer__stream = FullDisk(part._stream, 40_000)
+    for number in range(200):
+        topic, payload = message(number)
+        inbox.put(Sample(topic, topic.key("robot"), payload, number, number))
+    written = 0
+    with pytest.raises(UserError, match="No space left"):
+        while True:
+            session.write(inbox.get(0))
+            written += 1
+    session.writer.finish()
+    recovered = recover(part.active).messages.total()
+    assert 0 < recovered < written + 1
+    assert (session.writer.saved, session.lost()) == (recovered, 200 - recovered)
