@@ -61,7 +61,7 @@ class OpenRecording:
 
     def missing(self) -> int:
         """Messages that were sent and never came, by their numbers."""
-        return sum(sequence.missing for sequence in self.ledger.sequences.values())
+        return sum(self.ledger.lost(key).missing for key in self.ledger.sequences)
 
     def lost(self) -> int:
         """Messages that were received, had room in the queue and are not in the file, at most; where writing failed."""

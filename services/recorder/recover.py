@@ -89,8 +89,8 @@ class Recovered:
             told.append("altered: metadata or indexes, outside of the chunks; the file's checksum does not say where")
         if not self.whole:
             told.append("missing: its end; what came after the last flush was never in the file")
-        for key, sequence in self.ledger.sequences.items():
-            if sequence.missing:
+        for key in self.messages:
+            if (sequence := self.ledger.lost(key)).missing:
                 told.append(f"missing: {sequence.missing} messages of {key} by their numbers, in {sequence.gaps} gaps")
         return told
 

@@ -29,9 +29,11 @@ class RecorderService(Service):
     queries: ClassVar[tuple[Query, ...]] = (RECORDING,)
     keep_all: ClassVar[bool] = True
 
-    def __init__(self, settings: RecorderSettings) -> None:
-        """The file is opened in `open`, or when somebody asks."""
+    def __init__(self, settings: RecorderSettings, *, remote: bool = True) -> None:
+        """The file is opened in `open`, or on request; without ``remote`` no request begins or ends a recording."""
         super().__init__(settings)
+        if not remote:
+            self.queries = ()  # type: ignore[misc]
         self.options = settings
         self.inputs = chosen_topics(settings.topics)  # type: ignore[misc]
         self.recording: OpenRecording | None = None

@@ -9,17 +9,19 @@ import re
 import signal
 import threading
 import time
+from collections import Counter
 
 import pytest
 
 from common.bus import wait_until
 from common.inbox import MAX_KEYS, Inbox
 from common.messages import Health, Odom, Pose, Twist
-from common.requests import WorldReply
+from common.requests import RecordReply, RecordRequest, WorldReply
 from common.robot import Robot
 from common.scanner import SCANNERS
 from common.service import Loop, Service
-from common.topics import HEALTH, ODOM, SCAN, TOPICS, WORLD
+from common.topics import HEALTH, ODOM, RECORDING, SCAN, TOPICS, WORLD
+from presage.inspection.info import survey
 from services.recorder.accounting import from_metadata
 from services.recorder.reader import read_recording
 from services.recorder.recover import recover
@@ -325,3 +327,32 @@ def test_parts_by_time(recorder, bus, tmp_path):
         got = [raw.payload for file in files for raw in read_recording(file).payloads({key})]
         assert got == [payload for sent_key, payload in sent if sent_key == key]
     assert "counters" in read_recording(files[0]).metadata
+
+
+def test_presage_record_beside_a_sessions_own_recorder(recorder, process, bus, link, tmp_path):
+    first = recorder("--file", "first")
+    where = ("--robot", bus.robot, "--connect", link.connect[0])
+    second = process("presage.__main__", "record", "--out", str(tmp_path / "second"), *where)
+    second.wait_for("ready")
+    pulses, own = Inbox(), HEALTH.key(bus.robot, "recorder")
+    bus.subscribe(HEALTH, pulses, keep_all=True)
+    heard = Counter()
+
+    def both_went_on():
+        if (entry := pulses.get(0)) is not None and entry.key == own:
+            heard[Health.decode(entry.payload).instance] += 1
+        return len(heard) == 2 and min(heard.values()) >= 3
+
+    assert wait_until(both_went_on, 30), second.output
+    state = bus.ask(RECORDING, RecordRequest(action="stop"), RecordReply)  # the page's button
+    assert (state.ok, state.recording) == (True, False)
+    assert state.file.endswith("first.mcap")
+    assert "recorded" not in second.output
+    assert second.stop(signal.SIGINT)[0] == 0
+    assert first.stop()[0] == 0
+    for path in (tmp_path / "logs" / "first.mcap", only_file(tmp_path / "second")):
+        recording = read_recording(path)
+        (row,) = [row for row in survey(recording).topics if row.key == own]
+        assert (row.missing, row.gaps, row.restarts, row.reordered) == (0, 0, 0, 0)
+        count = from_metadata(recording.metadata["counters"])[own]
+        assert (count.missing, count.restarts, count.reordered) == (0, 0, 0)
