@@ -20,10 +20,11 @@ COMPRESSION = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none":
 # A file of 200 kB can state and hold chunks of gigabytes; the recorder writes at most half of this.
 MAX_CHUNK_BYTES = 1 << 24
 PREFIX = Struct("<BQ")  # of every record: opcode, length of what follows (MCAP specification, "Records")
+BUILDER = "_Writer__chunk_builder"  # mcap has no setting that repeats declarations
 MESSAGE = Struct("<HIQQ")  # channel, sequence, log time, publish time
 
 
-class SelfContainedChunk(ChunkBuilder):  # type: ignore[misc] # mcap has no types
+class SelfContainedChunk(ChunkBuilder):
     """A chunk with the schemas and channels of all its messages: where another chunk is damaged, it stays readable."""
 
     def __init__(self) -> None:
@@ -49,7 +50,7 @@ class SelfContainedChunk(ChunkBuilder):  # type: ignore[misc] # mcap has no type
 
     def reset(self) -> None:
         """Begin the next chunk."""
-        super().reset()
+        super().reset()  # type: ignore[no-untyped-call]
         self._here.clear()
 
     def _declare_schema(self, schema: Schema) -> None:
@@ -69,8 +70,10 @@ class SelfContainedChunk(ChunkBuilder):  # type: ignore[misc] # mcap has no type
 def mcap_writer(stream: BinaryIO, compression: str, chunk_size: int) -> tuple[Writer, SelfContainedChunk]:
     """A writer with checksums of every part of the file, and the chunk it fills."""
     writer = Writer(stream, chunk_size=chunk_size, compression=COMPRESSION[compression], enable_data_crcs=True)
+    if not isinstance(getattr(writer, BUILDER, None), ChunkBuilder):
+        raise TypeError("this version of the package mcap builds its chunks elsewhere: install mcap 1.6")
     chunk = SelfContainedChunk()
-    writer._Writer__chunk_builder = chunk  # noqa: SLF001 - mcap offers no other way to repeat declarations
+    setattr(writer, BUILDER, chunk)
     return writer, chunk
 
 

@@ -168,8 +168,8 @@ class Recording:
         self, stream: BinaryIO, keys: Collection[str] | None, start_ns: int | None, end_ns: int | None
     ) -> Iterator[tuple[Channel, McapMessage]]:
         try:
-            summary = SeekingReader(stream).get_summary()
-            yield from _in_order(stream, summary, keys, start_ns, end_ns)
+            if (summary := SeekingReader(stream).get_summary()) is not None:
+                yield from _in_order(stream, summary, keys, start_ns, end_ns)
         except OSError:
             raise
         except Exception as error:  # noqa: BLE001 - a damaged chunk raises kinds of each decompressor

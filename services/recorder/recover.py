@@ -89,9 +89,11 @@ class Recovered:
             told.append("altered: metadata or indexes, outside of the chunks; the file's checksum does not say where")
         if not self.whole:
             told.append("missing: its end; what came after the last flush was never in the file")
-        for key in self.messages:
-            if (sequence := self.ledger.lost(key)).missing:
-                told.append(f"missing: {sequence.missing} messages of {key} by their numbers, in {sequence.gaps} gaps")
+        told += [
+            f"missing: {numbers.missing} messages of {key} by their numbers, in {numbers.gaps} gaps"
+            for key in self.messages
+            if (numbers := self.ledger.lost(key)).missing
+        ]
         return told
 
 
@@ -290,13 +292,13 @@ def _is_checksum(data: mmap.mmap, end: int, record: object) -> bool:
     if not isinstance(record, DataEnd) or not record.data_section_crc:
         return True
     with memoryview(data) as view, view[:end] as before:
-        return zlib.crc32(before) == record.data_section_crc
+        return bool(zlib.crc32(before) == record.data_section_crc)
 
 
 def _next_whole(data: mmap.mmap, damaged: int) -> int:
     """Where reading goes on behind the damaged record: at the one behind it, or at the next landmark."""
     if damaged + PREFIX.size <= len(data):
-        after = damaged + PREFIX.size + PREFIX.unpack_from(data, damaged)[1]
+        after = damaged + PREFIX.size + int(PREFIX.unpack_from(data, damaged)[1])
         if _parse(data, after) is not None:
             return after
     for landmark in LANDMARK.finditer(data, damaged + 1):
