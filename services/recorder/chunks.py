@@ -19,6 +19,7 @@ from mcap.writer import CompressionType, Writer
 COMPRESSION = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 # A file of 200 kB can state and hold chunks of gigabytes; the recorder writes at most half of this.
 MAX_CHUNK_BYTES = 1 << 24
+MAGIC = b"\x89MCAP0\r\n"  # what every file begins and ends with
 PREFIX = Struct("<BQ")  # of every record: opcode, length of what follows (MCAP specification, "Records")
 BUILDER = "_Writer__chunk_builder"  # mcap has no setting that repeats declarations
 MESSAGE = Struct("<HIQQ")  # channel, sequence, log time, publish time

@@ -13,38 +13,25 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
+from mcap import records as kinds
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Header,
-    Message,
-    MessageIndex,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, Message, Metadata, Schema
 
 from common.errors import UserError
 from services.recorder.accounting import Ledger, as_metadata
-from services.recorder.chunks import PREFIX, mcap_writer, records_of
-from services.recorder.reader import MAGIC, summary_of
+from services.recorder.chunks import MAGIC, PREFIX, mcap_writer, records_of
+from services.recorder.index import summary_of
 from services.recorder.writer import PROFILE, UNFINISHED, claim, is_being_written
 
 TORN = ".torn"  # behind the name of what was recovered from
 # All records that may stand before a file's end; each is read whole, so that a damaged length or kind is noticed.
 PARSERS: dict[int, Callable[[ReadDataStream], object]] = {
     Opcode.HEADER: Header.read, Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read, Opcode.CHUNK: Chunk.read,
-    Opcode.MESSAGE_INDEX: MessageIndex.read, Opcode.CHUNK_INDEX: ChunkIndex.read, Opcode.ATTACHMENT: Attachment.read,
-    Opcode.ATTACHMENT_INDEX: AttachmentIndex.read, Opcode.STATISTICS: Statistics.read, Opcode.METADATA: Metadata.read,
-    Opcode.METADATA_INDEX: MetadataIndex.read, Opcode.SUMMARY_OFFSET: SummaryOffset.read,
+    Opcode.MESSAGE_INDEX: kinds.MessageIndex.read, Opcode.CHUNK_INDEX: kinds.ChunkIndex.read,
+    Opcode.ATTACHMENT: Attachment.read, Opcode.ATTACHMENT_INDEX: kinds.AttachmentIndex.read,
+    Opcode.STATISTICS: kinds.Statistics.read, Opcode.METADATA: Metadata.read,
+    Opcode.METADATA_INDEX: kinds.MetadataIndex.read, Opcode.SUMMARY_OFFSET: kinds.SummaryOffset.read,
     Opcode.DATA_END: DataEnd.read,
 }  # fmt: skip
 # Where reading goes on behind damage: the prefix of a chunk, an attachment or metadata shorter than 2^40 bytes.
@@ -250,7 +237,7 @@ def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[list[object], int
             found.altered = not found.damages and not _is_checksum(data, at, records[0])
             return
         at += PREFIX.size + length
-        if opcode == Opcode.MESSAGE and found.chunks:  # a damaged index: whoever writes chunks has messages there
+        if opcode == Opcode.MESSAGE and found.chunks:  # a damaged index: in a file of chunks messages stand in those
             continue
         found.chunks += opcode == Opcode.CHUNK
         yield records, at

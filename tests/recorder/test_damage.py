@@ -22,8 +22,8 @@ from common.messages import CmdVel, Pose, Truth, Twist
 from common.topics import CMD_VEL, TRUTH
 from presage.inspection.info import survey
 from presage.inspection.show import info
-from services.recorder.chunks import COMPRESSION, MAX_CHUNK_BYTES
-from services.recorder.reader import MAGIC, read_recording
+from services.recorder.chunks import COMPRESSION, MAGIC, MAX_CHUNK_BYTES
+from services.recorder.reader import read_recording
 from services.recorder.recording import OpenRecording
 from services.recorder.recover import recover
 from services.recorder.settings import RecorderSettings
