@@ -253,4 +253,5 @@ class Loop:
             topics=rows,
             counters=counters,
             note=self.service.note,
+            instance=self.bus.instance,
         )

@@ -196,3 +196,4 @@ class Health(Stamped):
     topics: list[TopicHealth] = []  # noqa: RUF012
     counters: dict[str, Count] = {}  # noqa: RUF012 - pydantic copies defaults
     note: Text = ""  # what the service waits for or last complained of
+    instance: Name = ""  # which process of the service; each numbers its own messages

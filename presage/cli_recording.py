@@ -32,12 +32,15 @@ def record(
     from services.recorder.service import RecorderService  # noqa: PLC0415
     from services.recorder.settings import RecorderSettings  # noqa: PLC0415
 
+    def make(settings: RecorderSettings) -> RecorderService:
+        return RecorderService(settings, remote=False)  # the page's button is for the session's own recorder
+
     args = ["--directory", str(out), "--robot", robot, "--connect", connect]
     args += ["--split-minutes", str(split_minutes), "--split-size", str(split_size)]
     args += ["--weights" if weights else "--no-weights", *(["--topics", topics] if topics else [])]
     if (here := asked.get()).security is not None:
         args += ["--security", str(here.security), "--role", here.role]
-    serve(RecorderSettings, RecorderService, args)
+    serve(RecorderSettings, make, args)
 
 
 @app.command()

@@ -113,6 +113,9 @@ def _write(recording: Recording, robot: str, writer: Writer, console: Console) -
     for topic, message, raw in tracked(entries(recording, robot), total, "foxglove", console):
         for out in view.feed(topic, message, raw):
             channels.write(out)
+    if view.left_out:
+        rows = ", ".join(f"{count} of {name}" for name, count in view.left_out.items())
+        console.print(f"left out, as Foxglove has no form for them here: {rows}", highlight=False, soft_wrap=True)
     return channels.counts
 
 

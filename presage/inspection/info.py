@@ -41,7 +41,7 @@ class Facts:
     file: str
     file_bytes: int
     complete: bool
-    checked: bool  # every payload was read, with its chunk's checksum
+    checked: bool  # every payload was read, and every checksum compared as far as the file is whole
     warning: str
     robots: list[str]
     world: str | None
@@ -73,7 +73,7 @@ class _Pass:
         self.undecodable: Counter[str] = Counter()
         self.first: dict[str, int] = {}  # ns, wall clock
         self.last: dict[str, int] = {}
-        self.healths: dict[str, Health] = {}
+        self.healths: dict[tuple[str, str], Health] = {}  # by service and instance, the last
 
     def read(self, recording: Recording) -> None:
         for raw in recording.payloads():
@@ -90,12 +90,15 @@ class _Pass:
                 self.undecodable[raw.key] += 1
                 continue
             if isinstance(message, Health):
-                self.healths[message.service] = message
+                self.healths[message.service, message.instance] = message
 
     def dropped(self) -> dict[str, int]:
         """What services received and did not use, by their last counts."""
-        rows = [(health.service, row) for health in self.healths.values() for row in health.topics]
-        return {f"{service} {row.key}": row.dropped for service, row in rows if row.dropped}
+        dropped = Counter[str]()
+        for health in self.healths.values():
+            for row in health.topics:
+                dropped[f"{health.service} {row.key}"] += row.dropped
+        return dict(+dropped)
 
 
 def survey(recording: Recording, check: bool | None = None) -> Facts:
@@ -105,6 +108,7 @@ def survey(recording: Recording, check: bool | None = None) -> Facts:
     if check if check is not None else size <= SMALL:
         seen = _Pass()
         seen.read(recording)
+        recording.verify()
     about = recording.metadata.get("presage", {})
     world = recording.world()
     return Facts(

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from common.messages import Belief, CmdVel, Health, Status, Truth
+from common.messages import Belief, CmdVel, Drive, Health, Status, Truth
 from common.se2 import Array, between
 
 # Channel: field: JSON type and meaning. A field that is unknown at the moment is left out.
@@ -39,6 +39,12 @@ FIELDS: dict[str, dict[str, tuple[str, str]]] = {
     },
     "/cmd_vel": {
         "stamp_s": ("number", "s, of the scan it answers"),
+        "vx": ("number", "m/s, base_link"),
+        "vy": ("number", "m/s, base_link"),
+        "wz": ("number", "rad/s"),
+    },
+    "/drive": {
+        "stamp_s": ("number", "s"),
         "vx": ("number", "m/s, base_link"),
         "vy": ("number", "m/s, base_link"),
         "wz": ("number", "rad/s"),
@@ -125,12 +131,12 @@ def of_truth(truth: Truth) -> dict[str, Any]:
     return {**_twist(truth), "contact": truth.contact, "stopped": truth.stopped}
 
 
-def of_command(command: CmdVel) -> dict[str, Any]:
+def of_command(command: CmdVel | Drive) -> dict[str, Any]:
     """The velocity asked for."""
     return _twist(command)
 
 
-def _twist(message: Truth | CmdVel) -> dict[str, Any]:
+def _twist(message: Truth | CmdVel | Drive) -> dict[str, Any]:
     twist = message.twist
     return {"stamp_s": message.stamp_ns * 1e-9, "vx": twist.vx, "vy": twist.vy, "wz": twist.wz}
 

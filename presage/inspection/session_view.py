@@ -11,7 +11,7 @@ truth; without either the odometry itself. Without odometry map and odom are one
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -24,7 +24,21 @@ from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletio
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message as Protobuf
 
-from common.messages import Belief, CmdVel, Goal, Health, Odom, Prediction, Scan, Stamped, Status, Truth
+from common.messages import (
+    Belief,
+    CmdVel,
+    Drive,
+    Goal,
+    Health,
+    Odom,
+    Plan,
+    Prediction,
+    Preference,
+    Scan,
+    Stamped,
+    Status,
+    Truth,
+)
 from common.robot import Robot
 from common.se2 import Array, between, compose
 from common.topics import Topic
@@ -89,6 +103,7 @@ class SessionView:
     def __init__(self, driver: str) -> None:
         """``driver``: belief, truth or odom, see the module."""
         self.driver = driver
+        self.left_out: Counter[str] = Counter()  # messages of topics that have no form here, by topic
         self._clock = Clock()
         self._odoms, self._truths = Recent(), Recent()
         self._chain: dict[str, tuple[str, Array, int]] = {}  # child: parent, pose, ns
@@ -98,10 +113,15 @@ class SessionView:
         self._makers: dict[type[Stamped], Callable[[Any, int, int], Iterator[tuple[str, Any]]]] = {
             Scan: self._scan, Odom: self._odom, Truth: self._truth, Belief: self._belief, Prediction: self._prediction,
             Goal: self._new_goal, CmdVel: self._command, Status: self._status, Health: self._health,
+            Drive: self._drive, Plan: self._plan, Preference: self._preference,
         }  # fmt: skip
 
     def feed(self, topic: Topic, message: Stamped, raw: Raw) -> Iterator[Out]:
-        """What one message becomes."""
+        """What one message becomes; of a topic that has no form here nothing, and it is counted in `left_out`."""
+        make = self._makers.get(type(message))
+        if make is None:
+            self.left_out[topic.name] += 1
+            return
         logged = raw.logged_ns
         sensor = isinstance(message, Scan | Odom | Truth)
         at = (
@@ -109,7 +129,7 @@ class SessionView:
             if sensor
             else self._clock.of(message.stamp_ns, logged)
         )
-        for name, content in self._makers[type(message)](message, at, logged):
+        for name, content in make(message, at, logged):
             yield Out(name, content, logged, raw.published_ns)
 
     def _scan(self, scan: Scan, at: int, _: int) -> Iterator[tuple[str, Any]]:
@@ -166,6 +186,16 @@ class SessionView:
 
     def _command(self, command: CmdVel, _at: int, _logged: int) -> Iterator[tuple[str, Any]]:
         yield "/cmd_vel", numbers.of_command(command)
+
+    def _drive(self, drive: Drive, _at: int, _logged: int) -> Iterator[tuple[str, Any]]:
+        yield "/drive", numbers.of_command(drive)
+
+    def _plan(self, plan: Plan, at: int, _: int) -> Iterator[tuple[str, Any]]:
+        yield "/plan", SceneUpdate(entities=[shapes.plan_entity(plan, at)])
+        yield "/plan/obstacles", shapes.obstacle_points(plan, at)
+
+    def _preference(self, preference: Preference, at: int, _: int) -> Iterator[tuple[str, Any]]:
+        yield "/preference", shapes.preference_grid(preference, at)
 
     def _status(self, status: Status, _: int, logged: int) -> Iterator[tuple[str, Any]]:
         yield "/status", numbers.of_status(status)

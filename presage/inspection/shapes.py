@@ -20,6 +20,7 @@ from foxglove_schemas_protobuf.LaserScan_pb2 import LaserScan
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.Point3_pb2 import Point3
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
@@ -29,7 +30,7 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from common import raster
-from common.messages import Belief, Hypothesis, Prediction, Scan
+from common.messages import Belief, Hypothesis, Plan, Prediction, Preference, Scan
 from common.ranges import surfaces
 from common.se2 import Array
 from common.world import World
@@ -38,6 +39,7 @@ TRUTH, BELIEF, GOAL = (0.0, 0.0, 0.0), (0.84, 0.37, 0.0), (0.0, 0.62, 0.45)  # r
 WALL, FURNITURE = (0.55, 0.55, 0.55), (0.78, 0.78, 0.78)
 WALL_HEIGHT, WALL_THICKNESS = 0.5, 0.06  # m, as drawn
 NINETY_FIVE = 2.447746830680816  # a Gaussian's 95 % ellipse in the plane: the root of chi² with 2 degrees at 0.95
+AXES = (("x", 0), ("y", 4))  # float32 of a point in the plane, and where it begins
 FREE, OCCUPIED = (245, 245, 245, 255), (70, 70, 70, 255)  # red, green, blue, alpha; outside stays clear
 
 
@@ -143,6 +145,42 @@ def disc(frame: str, name: str, at: Array, radius: float, height: float, rgb: Se
         pose=pose(at, height / 2), size=size, bottom_scale=1, top_scale=1, color=color(rgb, alpha)
     )
     return SceneEntity(timestamp=time_of(ns), frame_id=frame, id=name, frame_locked=True, cylinders=[shape])
+
+
+def plan_entity(plan: Plan, ns: int) -> SceneEntity:
+    """The way ahead and where the command leads; one plan replaces the last."""
+    entity = SceneEntity(timestamp=time_of(ns), frame_id="map", id="plan", frame_locked=True)
+    for points, rgb in ((plan.path, GOAL), (plan.motion, BELIEF)):
+        if len(points) > 1:
+            entity.lines.append(line(points.astype(float), rgb, 0.8, z=0.04))
+    return entity
+
+
+def obstacle_points(plan: Plan, ns: int) -> PointCloud:
+    """What the scan sees and the map does not have."""
+    return PointCloud(
+        timestamp=time_of(ns),
+        frame_id="map",
+        pose=pose((0, 0, 0), 0.1),
+        point_stride=8,
+        fields=[PackedElementField(name=name, offset=at, type=PackedElementField.FLOAT32) for name, at in AXES],
+        data=np.asarray(plan.obstacles, "<f4").tobytes(),
+    )
+
+
+def preference_grid(preference: Preference, ns: int) -> Grid:
+    """Metres to go of each cell, a float32 named distance; infinite where the goal is out of reach."""
+    return Grid(
+        timestamp=time_of(ns),
+        frame_id="map",
+        pose=pose(preference.origin.array(), -0.005),  # between the map and the rest
+        column_count=preference.width,
+        cell_size=Vector2(x=preference.resolution, y=preference.resolution),
+        row_stride=preference.width * 4,
+        cell_stride=4,
+        fields=[PackedElementField(name="distance", offset=0, type=PackedElementField.FLOAT32)],
+        data=np.asarray(preference.distance, "<f4").tobytes(),
+    )
 
 
 def path_entity(name: str, path: Array, rgb: Sequence[float], ns: int) -> SceneEntity:

@@ -11,7 +11,7 @@ from presage.logs.carmen import BROKEN, open_carmen, unpacked
 from presage.logs.carmen_lines import is_laser
 from presage.logs.log import Log, Reading
 from presage.logs.npz import open_npz
-from services.recorder.reader import MAGIC as MCAP
+from services.recorder.chunks import MAGIC as MCAP
 from services.recorder.reader import read_recording
 from services.recorder.writer import PROFILE
 

@@ -11,6 +11,8 @@ import msgpack
 from common.topics import topic_of
 
 MOST = 1 << 62  # a count that is larger, by numbers somebody made up, stays there: a message must hold it
+MAX_INSTANCES = 100  # of a key; a sender that invents instances must not fill memory
+MAX_INSTANCE_LENGTH = 200
 FAR = 64  # a number so much below the last is a publisher that began anew, not a late message
 
 
@@ -59,20 +61,31 @@ class Ledger:
 
     written: dict[str, int] = field(default_factory=dict)
     unreadable: dict[str, int] = field(default_factory=dict)
-    sequences: dict[str, Sequence] = field(default_factory=dict)
+    # By key and instance: two processes of one service publish under one key, each with numbers of its own.
+    sequences: dict[str, dict[str, Sequence]] = field(default_factory=dict)
 
     def see(self, key: str, payload: bytes) -> None:
         """A payload that was written."""
         self.written[key] = self.written.get(key, 0) + 1
-        number = sequence_of(payload)
-        if number is None:
+        numbered = sequence_of(payload)
+        if numbered is None:
             self.unreadable[key] = self.unreadable.get(key, 0) + 1
         elif is_numbered(key):
-            self.sequences.setdefault(key, Sequence()).see(number)
+            number, instance = numbered
+            instances = self.sequences.setdefault(key, {})
+            if instance not in instances and len(instances) >= MAX_INSTANCES:
+                instance = ""
+            instances.setdefault(instance, Sequence()).see(number)
 
     def lost(self, key: str) -> Sequence:
-        """What a key's numbers say."""
-        return self.sequences.get(key) or Sequence()
+        """What a key's numbers say, of all instances together."""
+        total = Sequence()
+        for sequence in self.sequences.get(key, {}).values():
+            total.gaps += sequence.gaps
+            total.missing = min(MOST, total.missing + sequence.missing)
+            total.restarts += sequence.restarts
+            total.reordered += sequence.reordered
+        return total
 
     def counts(
         self, received: Mapping[str, int], dropped: Mapping[str, int], oversized: Mapping[str, int]
@@ -111,10 +124,13 @@ def is_numbered(key: str) -> bool:
     return topic is not None and topic.rate > 0
 
 
-def sequence_of(payload: bytes) -> int | None:
-    """The message's `seq`; None where the payload is no MessagePack map that could have one."""
+def sequence_of(payload: bytes) -> tuple[int, str] | None:
+    """The message's `seq` and `instance`; None where the payload is no MessagePack map that could have a `seq`."""
     try:
-        number = msgpack.unpackb(payload).get("seq", 0)
+        message = msgpack.unpackb(payload)
+        number, instance = message.get("seq", 0), message.get("instance", "")
     except Exception:  # noqa: BLE001 - msgpack raises many kinds, and the payload may be anything
         return None
-    return number if isinstance(number, int) and 0 <= number < 1 << 63 else None
+    if not isinstance(number, int) or not 0 <= number < 1 << 63:
+        return None
+    return number, instance[:MAX_INSTANCE_LENGTH] if isinstance(instance, str) else ""

@@ -30,6 +30,7 @@ class PartsWriter:
         self._attachments: dict[str, tuple[bytes, str, int]] = {}
         self._channels: dict[str, Topic] = {}  # by key
         self._began_ns: int | None = None  # reception of the part's first message
+        self._saved_before = 0  # messages in parts that are complete
         self.finished: list[Path] = []
         self.part = open_part(1)
 
@@ -37,6 +38,11 @@ class PartsWriter:
     def failed(self) -> bool:
         """Whether the part that is open cannot be written any more."""
         return self.part.failed
+
+    @property
+    def saved(self) -> int:
+        """Messages in all parts that are there whatever happens now."""
+        return self._saved_before + self.part.saved
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
         """A named map of text, in this part and in those to come."""
@@ -86,6 +92,7 @@ class PartsWriter:
         self._write_ending()
         before = self.part.finish()
         self.finished.append(before)
+        self._saved_before += self.part.saved
         self.part, self._began_ns = following, None
         for name, values in self._metadata.items():
             self.part.metadata(name, values)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
@@ -11,7 +10,7 @@ from typing import BinaryIO
 
 import yaml
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Header, Metadata
+from mcap.records import Attachment, Channel, Chunk, Header, Metadata
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 from pydantic import ValidationError
@@ -23,9 +22,9 @@ from common.scanner import Scanner
 from common.topics import Topic, topic_of
 from common.wire import DecodeError
 from common.world import NOT_YAML, World
+from services.recorder.chunks import MAGIC, records_of
+from services.recorder.index import in_order, summary_of
 from services.recorder.writer import PROFILE
-
-MAGIC = b"\x89MCAP0\r\n"
 
 
 @dataclass(frozen=True)
@@ -143,13 +142,22 @@ class Recording:
         except ValidationError:
             return None
 
+    def verify(self) -> None:
+        """Compare the checksum of all that is before the summary; `problem` is set where it is wrong.
+
+        Reads the whole file. Recorders of before this checksum wrote none, and then only records are looked at.
+        """
+        if not self.problem:
+            with self.path.open("rb") as stream:
+                for _ in _records(self, stream, chunks=False):
+                    pass
+
     def _indexed(
         self, stream: BinaryIO, keys: Collection[str] | None, start_ns: int | None, end_ns: int | None
     ) -> Iterator[tuple[Channel, McapMessage]]:
-        reader = SeekingReader(stream, validate_crcs=True)
         try:
-            for _, channel, message in reader.iter_messages(keys, starting_at=start_ns, ending_before=end_ns):
-                yield channel, message
+            if (summary := SeekingReader(stream).get_summary()) is not None:
+                yield from in_order(stream, summary, keys, start_ns, end_ns)
         except OSError:
             raise
         except Exception as error:  # noqa: BLE001 - a damaged chunk raises kinds of each decompressor
@@ -177,7 +185,8 @@ def read_recording(path: Path) -> Recording:
         with path.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 raise UserError(
-                    f"{path}: not an MCAP file; `presage record` makes recordings, `presage import` of logs"
+                    f"{path}: not an MCAP file, or its first bytes are damaged; `presage record` makes recordings, "
+                    "`presage import` of logs, and `presage recover` a whole one of a damaged one"
                 )
             if not _read_summary(recording, stream):
                 _read_through(recording, stream)
@@ -193,12 +202,14 @@ def read_recording(path: Path) -> Recording:
 
 def _read_summary(recording: Recording, stream: BinaryIO) -> bool:
     """From the index of a finished file; False where there is none that can be trusted."""
-    stream.seek(0)
     try:
-        reader = SeekingReader(stream, validate_crcs=True)
-        summary = reader.get_summary()
+        summary = summary_of(stream)
         if summary is None or summary.statistics is None:
             return False
+        if summary.statistics.message_count and not summary.chunk_indexes:
+            return False
+        stream.seek(0)
+        reader = SeekingReader(stream, record_size_limit=recording.path.stat().st_size)
         recording.profile = reader.get_header().profile
         for metadata in reader.iter_metadata():
             recording.metadata[metadata.name] = dict(metadata.metadata)
@@ -210,12 +221,11 @@ def _read_summary(recording: Recording, stream: BinaryIO) -> bool:
             summary.statistics.message_start_time,
             summary.statistics.message_end_time,
         )
-    except OSError as error:
-        if error.errno == errno.EINVAL:  # it is shorter than an end
-            return False
+    except OSError:
         raise
-    except Exception:  # noqa: BLE001 - whatever a torn or damaged end makes of it
+    except Exception as error:  # noqa: BLE001 - whatever a torn or damaged end makes of it
         recording.metadata, recording.attachments, recording._counts = {}, {}, Counter()  # noqa: SLF001
+        recording.problem = str(error) if isinstance(error, ValueError) else "its index is damaged"
         return False
     recording._finished = True  # noqa: SLF001
     return True
@@ -240,12 +250,19 @@ def _read_through(recording: Recording, stream: BinaryIO) -> None:
             recording.end_ns = max(recording.end_ns, record.log_time)
 
 
-def _records(recording: Recording, stream: BinaryIO) -> Iterator[object]:
-    """Until the end or the first damage, which is noted; a record longer than the file is damage."""
+def _records(recording: Recording, stream: BinaryIO, *, chunks: bool = True) -> Iterator[object]:
+    """Until the end or the first damage, which is noted; a record longer than the file is damage.
+
+    With ``chunks`` what is in chunks comes in their place.
+    """
     stream.seek(0)
     size = recording.path.stat().st_size
     try:
-        yield from StreamReader(stream, validate_crcs=True, record_size_limit=size).records
+        for record in StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size).records:
+            if chunks and isinstance(record, Chunk):
+                yield from records_of(record)
+            else:
+                yield record
     except OSError:
         raise
     except Exception as error:  # noqa: BLE001 - a torn or damaged chunk raises kinds of each decompressor

@@ -6,6 +6,7 @@ import itertools
 import json
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext, suppress
 from datetime import datetime, timezone
@@ -60,19 +61,25 @@ class OpenRecording:
 
     def missing(self) -> int:
         """Messages that were sent and never came, by their numbers."""
-        return sum(sequence.missing for sequence in self.ledger.sequences.values())
+        return sum(self.ledger.lost(key).missing for key in self.ledger.sequences)
+
+    def lost(self) -> int:
+        """Messages that were received, had room in the queue and are not in the file, at most; where writing failed."""
+        arrived, dropped, oversized = (sum(counts.values()) for counts in self._since(self._inbox.arrivals()))
+        return arrived - dropped - oversized - self.writer.saved
 
     def dropped(self) -> int:
         """Messages for which the queue had no room."""
         return sum(count.dropped for count in self._counts().values())
 
     def _counts(self) -> dict[str, Count]:
-        """Of messages; what was asked of the recorder is counted by the inbox under the query's name, and left out."""
-        since = [now - before for now, before in zip(self._inbox.tally(), self._before, strict=True)]
-        received, dropped, oversized = (
-            {key: number for key, number in counts.items() if "/" in key or key == OTHERS} for counts in since
-        )
+        received, dropped, oversized = self._since(self._inbox.tally())
         return self.ledger.counts(received, dropped, oversized)
+
+    def _since(self, now: tuple[Counter[str], ...]) -> list[dict[str, int]]:
+        """Counts of messages since the beginning; the inbox counts requests too, under the query's name."""
+        since = [after - before for after, before in zip(now, self._before, strict=True)]
+        return [{key: n for key, n in counts.items() if "/" in key or key == OTHERS} for counts in since]
 
     def _counters(self) -> dict[str, dict[str, str]]:
         return {"counters": as_metadata(self._counts())}

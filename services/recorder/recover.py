@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import re
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -10,27 +11,31 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from struct import Struct
+from typing import BinaryIO
 
+from mcap import records as kinds
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Header, Message, Metadata, Schema
-from mcap.stream_reader import breakup_chunk
-from mcap.writer import Writer
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, Message, Metadata, Schema
 
 from common.errors import UserError
 from services.recorder.accounting import Ledger, as_metadata
-from services.recorder.reader import MAGIC
-from services.recorder.writer import COMPRESSION, PROFILE, UNFINISHED, claim, is_being_written
+from services.recorder.chunks import MAGIC, PREFIX, mcap_writer, records_of
+from services.recorder.index import summary_of
+from services.recorder.writer import PROFILE, UNFINISHED, claim, is_being_written
 
-PREFIX = Struct("<BQ")  # of every record: opcode, length of what follows (MCAP specification, "Records")
-# Of a chunk: start and end time, size and CRC of what is in it, length of the compression's name.
-CHUNK = Struct("<QQQII")
 TORN = ".torn"  # behind the name of what was recovered from
+# All records that may stand before a file's end; each is read whole, so that a damaged length or kind is noticed.
 PARSERS: dict[int, Callable[[ReadDataStream], object]] = {
-    Opcode.HEADER: Header.read, Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read,
-    Opcode.ATTACHMENT: Attachment.read, Opcode.METADATA: Metadata.read,
+    Opcode.HEADER: Header.read, Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read, Opcode.CHUNK: Chunk.read,
+    Opcode.MESSAGE_INDEX: kinds.MessageIndex.read, Opcode.CHUNK_INDEX: kinds.ChunkIndex.read,
+    Opcode.ATTACHMENT: Attachment.read, Opcode.ATTACHMENT_INDEX: kinds.AttachmentIndex.read,
+    Opcode.STATISTICS: kinds.Statistics.read, Opcode.METADATA: Metadata.read,
+    Opcode.METADATA_INDEX: kinds.MetadataIndex.read, Opcode.SUMMARY_OFFSET: kinds.SummaryOffset.read,
+    Opcode.DATA_END: DataEnd.read,
 }  # fmt: skip
+# Where reading goes on behind damage: the prefix of a chunk, an attachment or metadata shorter than 2^40 bytes.
+LANDMARK = re.compile(rb"[\x06\x09\x0c](?=.{5}\x00\x00\x00)", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,9 @@ class Recovered:
     messages: Counter[str] = field(default_factory=Counter)  # by key
     start_ns: int | None = None
     end_ns: int | None = None
+    skipped: int = 0  # messages of whole chunks, whose channel is not declared in anything that is whole
     damages: list[Damage] = field(default_factory=list)
+    altered: bool = False  # there is no damage to a chunk or a length, and yet the file's checksum is wrong
     whole: bool = False  # the source had its end: nothing was missing but what is damaged
     ledger: Ledger = field(default_factory=Ledger)
 
@@ -63,11 +70,17 @@ class Recovered:
         for damage in self.damages:
             at = "at its end" if damage.offset + damage.length == self.size else f"from byte {damage.offset}"
             told.append(f"missing: {damage.length} bytes {at} are no complete chunk")
+        if self.skipped:
+            told.append(f"missing: {self.skipped} messages of channels that are declared only in what is damaged")
+        if self.altered:
+            told.append("altered: metadata or indexes, outside of the chunks; the file's checksum does not say where")
         if not self.whole:
             told.append("missing: its end; what came after the last flush was never in the file")
-        for key, sequence in self.ledger.sequences.items():
-            if sequence.missing:
-                told.append(f"missing: {sequence.missing} messages of {key} by their numbers, in {sequence.gaps} gaps")
+        told += [
+            f"missing: {numbers.missing} messages of {key} by their numbers, in {numbers.gaps} gaps"
+            for key in self.messages
+            if (numbers := self.ledger.lost(key)).missing
+        ]
         return told
 
 
@@ -76,7 +89,7 @@ def recover(
 ) -> Recovered:
     """Write the readable part of ``source`` to ``path`` (none: the finished name); an unfinished file is kept as .torn.
 
-    Raises UserError where the source is still written, is no MCAP file or has nothing in it, or the target is there.
+    Raises UserError where the source is still written, where no message can be recovered, or the target is there.
     """
     path = path or target_of(source)
     try:
@@ -85,10 +98,9 @@ def recover(
                 raise UserError(f"{source}: is being written by a recorder that lives; end that first")
             if source.stat().st_size == 0:
                 raise UserError(f"{source}: is empty, there is nothing to recover: it can be removed")
-            if stream.read(len(MAGIC)) != MAGIC:
-                raise UserError(f"{source}: not an MCAP file, or not even its first bytes are there")
+            declared = _declared(stream)
             with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                found = _copy(data, Recovered(source, path, len(data)), on_progress)
+                found = _copy(data, Recovered(source, path, len(data)), declared, on_progress)
     except OSError as error:
         what = error.filename or source
         raise UserError(f"{what}: cannot be read or written ({error.strerror}); name another file with --out") from None
@@ -104,13 +116,24 @@ def target_of(source: Path) -> Path:
     return source.with_name(source.name.split(".mcap")[0] + "-recovered.mcap")
 
 
-def _copy(data: mmap.mmap, found: Recovered, on_progress: Callable[[float], None]) -> Recovered:
+def _declared(stream: BinaryIO) -> list[Schema | Channel]:
+    """Schemas and channels of a finished file's summary; none where there is no whole summary."""
+    try:
+        summary = summary_of(stream)
+    except Exception:  # noqa: BLE001 - damage raises what it will
+        return []
+    return [] if summary is None else [*summary.schemas.values(), *summary.channels.values()]
+
+
+def _copy(
+    data: mmap.mmap, found: Recovered, declared: list[Schema | Channel], on_progress: Callable[[float], None]
+) -> Recovered:
     active = found.path.with_name(found.path.name + ".recovering")
     if not is_being_written(active):  # of a recovery that was cut short
         active.unlink(missing_ok=True)
     stream = claim(found.path, active, remedy="--out")
     try:
-        copier = _Copier(Writer(stream, chunk_size=1 << 18, compression=COMPRESSION["zstd"]), found)
+        copier = _Copier(stream, found, declared)
         for records, end in _walk(data, found):
             for record in records:
                 copier.take(record)
@@ -128,8 +151,10 @@ def _copy(data: mmap.mmap, found: Recovered, on_progress: Callable[[float], None
 class _Copier:
     """Records of one file into another."""
 
-    def __init__(self, writer: Writer, found: Recovered) -> None:
-        self._writer, self._found = writer, found
+    def __init__(self, stream: BinaryIO, found: Recovered, declared: list[Schema | Channel]) -> None:
+        """Onto ``stream``; ``declared`` is what the summary says of channels, which need not be in a whole chunk."""
+        self._writer, _ = mcap_writer(stream, "zstd", 1 << 18)
+        self._found, self._declared = found, declared
         self._schemas: dict[int, int] = {0: 0}
         self._channels: dict[int, int] = {}
         self._keys: dict[int, str] = {}
@@ -141,6 +166,8 @@ class _Copier:
             header = record if isinstance(record, Header) else Header(PROFILE, "presage recover")
             self._writer.start(header.profile, header.library)
             self._started = True
+            for each in self._declared:
+                self.take(each)
         if isinstance(record, Message):
             self._message(record)
         elif isinstance(record, Schema) and record.id not in self._schemas:
@@ -159,7 +186,8 @@ class _Copier:
 
     def _message(self, record: Message) -> None:
         channel, found = self._channels.get(record.channel_id), self._found
-        if channel is None:  # what declared it is damaged
+        if channel is None:
+            found.skipped += 1
             return
         self._writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
         key = self._keys[record.channel_id]
@@ -171,8 +199,8 @@ class _Copier:
     def finish(self) -> None:
         """With a record of what was done."""
         found = self._found
-        if not self._started:
-            raise UserError(f"{found.source}: nothing in it can be read")
+        if not found.messages:
+            raise UserError(f"{found.source}: no message in it can be recovered: {_reason(found)}")
         lost = sum(damage.length for damage in found.damages)
         about = {"from": found.source.name, "bytes": str(found.size), "bytes_not_used": str(lost)}
         counts = found.ledger.counts(found.messages, {}, {})
@@ -181,21 +209,36 @@ class _Copier:
         self._writer.finish()  # type: ignore[no-untyped-call]
 
 
+def _reason(found: Recovered) -> str:
+    """Why nothing came of it."""
+    if found.skipped:
+        return f"{found.skipped} are in whole chunks, and what declared their channels is damaged"
+    if not found.damages:
+        return "its recorder ended before there was one"
+    lost = sum(damage.length for damage in found.damages)
+    if lost >= found.size - len(MAGIC):
+        return "not an MCAP file, or all of it is damaged"
+    return f"{lost} of its {found.size} bytes are damaged or cut short"
+
+
 def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[list[object], int]]:
-    """Complete records and where each ends; over what is damaged to the next chunk that is whole."""
+    """Complete records and where each ends; over what is damaged to the next that is whole."""
     at, size = len(MAGIC), len(data)
     while at < size:
         records = _parse(data, at)
         if records is None:
-            after = _next_chunk(data, at + 1)
+            after = _next_whole(data, at)
             found.damages.append(Damage(at, after - at))
             at = after
             continue
         opcode, length = PREFIX.unpack_from(data, at)
-        at += PREFIX.size + length
         if opcode == Opcode.DATA_END:
             found.whole = True
+            found.altered = not found.damages and not _is_checksum(data, at, records[0])
             return
+        at += PREFIX.size + length
+        if opcode == Opcode.MESSAGE and found.chunks:  # a damaged index: in a file of chunks messages stand in those
+            continue
         found.chunks += opcode == Opcode.CHUNK
         yield records, at
 
@@ -216,13 +259,14 @@ def _parse(data: mmap.mmap, at: int) -> list[object] | None:
 
 def _records(data: mmap.mmap, opcode: int, begin: int, length: int) -> list[object] | None:
     body = ReadDataStream(BytesIO(data[begin : begin + length]))
-    if opcode == Opcode.CHUNK:
-        return list(breakup_chunk(Chunk.read(body), validate_crc=True))
-    if opcode == Opcode.MESSAGE:
-        return [Message.read(body, length)]
-    if opcode == Opcode.ATTACHMENT and zlib.crc32(data[begin : begin + length - 4]) != _crc(data, begin + length):
+    record = Message.read(body, length) if opcode == Opcode.MESSAGE else PARSERS[opcode](body)
+    if body.count != length:
         return None
-    return [PARSERS[opcode](body)] if opcode in PARSERS else []
+    if isinstance(record, Chunk):
+        return list(records_of(record))
+    if isinstance(record, Attachment) and zlib.crc32(data[begin : begin + length - 4]) != _crc(data, begin + length):
+        return None
+    return [record]
 
 
 def _crc(data: mmap.mmap, end: int) -> int:
@@ -230,15 +274,21 @@ def _crc(data: mmap.mmap, end: int) -> int:
     return int.from_bytes(data[end - 4 : end], "little")
 
 
-def _next_chunk(data: mmap.mmap, at: int) -> int:
-    """Where the next whole chunk begins; the end where there is none."""
-    while (at := data.find(bytes([Opcode.CHUNK]), at)) >= 0:
-        begin = at + PREFIX.size
-        if begin + CHUNK.size > len(data):
-            break
-        length, name = PREFIX.unpack_from(data, at)[1], CHUNK.unpack_from(data, begin)[4]
-        plausible = name in (0, 3, 4) and begin + length <= len(data)
-        if plausible and _parse(data, at):
-            return at
-        at += 1
+def _is_checksum(data: mmap.mmap, end: int, record: object) -> bool:
+    """Whether the checksum of all that is before ``end`` is right, where there is one."""
+    if not isinstance(record, DataEnd) or not record.data_section_crc:
+        return True
+    with memoryview(data) as view, view[:end] as before:
+        return bool(zlib.crc32(before) == record.data_section_crc)
+
+
+def _next_whole(data: mmap.mmap, damaged: int) -> int:
+    """Where reading goes on behind the damaged record: at the one behind it, or at the next landmark."""
+    if damaged + PREFIX.size <= len(data):
+        after = damaged + PREFIX.size + int(PREFIX.unpack_from(data, damaged)[1])
+        if _parse(data, after) is not None:
+            return after
+    for landmark in LANDMARK.finditer(data, damaged + 1):
+        if _parse(data, landmark.start()) is not None:
+            return landmark.start()
     return len(data)

@@ -29,9 +29,11 @@ class RecorderService(Service):
     queries: ClassVar[tuple[Query, ...]] = (RECORDING,)
     keep_all: ClassVar[bool] = True
 
-    def __init__(self, settings: RecorderSettings) -> None:
-        """The file is opened in `open`, or when somebody asks."""
+    def __init__(self, settings: RecorderSettings, *, remote: bool = True) -> None:
+        """The file is opened in `open`, or on request; without ``remote`` no request begins or ends a recording."""
         super().__init__(settings)
+        if not remote:
+            self.queries = ()  # type: ignore[misc]
         self.options = settings
         self.inputs = chosen_topics(settings.topics)  # type: ignore[misc]
         self.recording: OpenRecording | None = None
@@ -108,10 +110,21 @@ class RecorderService(Service):
         for key, written in recording.ledger.written.items():
             self._written[key] += written
             self._missing[key] += recording.ledger.lost(key).missing
-        *_, path = files = recording.writer.finish()
+        writer = recording.writer
+        try:
+            *_, path = files = writer.finish()
+        finally:
+            if writer.failed:
+                self._ended = self._ended.model_copy(update={"messages": writer.saved})
+                self.log.error(
+                    "recording is incomplete", file=str(writer.part.active), messages=writer.saved,
+                    lost=recording.lost(), dropped=dropped, missing=missing,
+                )  # fmt: skip
         self._ended = self._ended.model_copy(update={"file": str(path)})
-        parts = {"parts": len(files)} if len(files) > 1 else {}
-        self.log.info("recorded", file=str(path), messages=state.messages, dropped=dropped, missing=missing, **parts)
+        if not writer.failed:
+            parts = {"parts": len(files)} if len(files) > 1 else {}
+            counts = {"messages": state.messages, "dropped": dropped, "missing": missing}
+            self.log.info("recorded", file=str(path), **counts, **parts)
 
     def counted(self, key: str) -> dict[str, int]:
         """For health: what was written of a key, and what never came."""

@@ -31,7 +31,8 @@ class RecorderSettings(ServiceSettings):
     idle: Annotated[bool, Field(description="record nothing until told to: query `recording`")] = False
     topics: Annotated[str, Field(description="comma-separated topic names; empty: all that the table marks")] = ""
     compression: Annotated[Literal["zstd", "lz4", "none"], Field(description="zstd, lz4 or none")] = "zstd"
-    chunk_size: Annotated[int, Field(ge=1024, le=1 << 30, description="bytes; a crash loses at most one chunk")] = (
+    # Half of the largest chunk that is read (chunks.py): a message and declarations may come on top.
+    chunk_size: Annotated[int, Field(ge=1024, le=1 << 23, description="bytes; a crash loses at most one chunk")] = (
         1 << 18
     )
     flush: Annotated[float, Field(ge=0.05, le=60, description="s; a kill loses at most what came since")] = 0.5

@@ -11,15 +11,13 @@ from contextlib import suppress
 from io import BufferedWriter
 from pathlib import Path
 
-from mcap.writer import CompressionType, Writer
-
 from common.errors import UserError
 from common.topics import Topic
+from services.recorder.chunks import mcap_writer
 
 PROFILE = "presage"
 LIBRARY = "presage recorder"
 UNFINISHED = ".active"  # behind the name of a file that is not complete
-COMPRESSION = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 
 
 class NameTakenError(UserError):
@@ -34,6 +32,7 @@ class RecordingWriter:
         self.path, self.active = path, path.with_name(path.name + UNFINISHED)
         self.written: Counter[str] = Counter()  # by key
         self.failed = False
+        self._saved = 0
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         try:
@@ -41,13 +40,18 @@ class RecordingWriter:
             self._stream = claim(path, self.active)
         except OSError as error:
             raise UserError(f"{path.parent}: cannot be written to ({error.strerror}); choose another folder") from None
-        self._writer = Writer(self._stream, chunk_size=chunk_size, compression=COMPRESSION[compression])
+        self._writer, self._chunk = mcap_writer(self._stream, compression, chunk_size)
         self._guarded(lambda: self._writer.start(PROFILE, LIBRARY))
 
     @property
     def size(self) -> int:
         """Bytes that lie in the file so far; what is not flushed is not counted."""
         return self._stream.tell()
+
+    @property
+    def saved(self) -> int:
+        """Messages, at least, that are in complete chunks which the system has: they survive a failure to write on."""
+        return self._saved
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
         """A named map of text."""
@@ -77,15 +81,19 @@ class RecordingWriter:
                 log_time=received_ns,
                 data=payload,
                 publish_time=published_ns,
-                sequence=self.written[key] & 0xFFFFFFFF,
+                sequence=(self.written[key] - 1) & 0xFFFFFFFF,
             )
 
-        self._guarded(add)
         self.written[key] += 1
+        self._guarded(add)
+        if not self._chunk.num_messages:  # that was the last message of a chunk
+            self._guarded(self._stream.flush)
+            self._saved = self.written.total()
 
     def flush(self) -> None:
         """Complete the chunk and hand it to the system: what came before survives this process."""
         self._guarded(self._writer.flush)
+        self._saved = self.written.total()
         if not is_there(self.active, self._stream):
             self.failed = True
             raise UserError(
@@ -106,6 +114,8 @@ class RecordingWriter:
         if self.failed:
             self._abandon()
             return self.active
+        self._guarded(self._writer.flush)
+        self._saved = self.written.total()
         self._guarded(end)
         return self.path
 

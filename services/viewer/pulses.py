@@ -36,8 +36,8 @@ class Pulses:
         before = self._pulses.get(health.service)
         if before is None and len(self._pulses) >= MOST:
             return
-        # A service that was started anew counts from 0 again.
-        same = before is not None and before.now.uptime < health.uptime
+        # A service that was started anew counts from 0 again; two recorders may run, each with counts of its own.
+        same = before is not None and before.now.instance == health.instance and before.now.uptime < health.uptime
         self._pulses[health.service] = Pulse(health, before.now if before is not None and same else None, at)
 
     def rows(self, alive: Collection[str], at: float) -> list[Row]:

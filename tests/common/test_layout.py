@@ -24,7 +24,7 @@ ALSO_SHELL = {
     "services/viewer/web.py", "services/viewer/session.py", "services/viewer/desk.py",  # a web server
     "services/viewer/visitors.py", "services/viewer/control.py", "services/viewer/playback.py",
     "services/recorder/reader.py", "services/recorder/replay.py", "services/recorder/playing.py",
-    "services/recorder/writer.py",
+    "services/recorder/writer.py", "services/recorder/chunks.py", "services/recorder/index.py",
     "services/recorder/parts.py", "services/recorder/recording.py", "services/recorder/recover.py",
     "services/recorder/describing.py",  # a thread that asks
     "services/bridge_ros2/ros_session.py",  # the session on the robot's side

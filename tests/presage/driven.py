@@ -8,12 +8,15 @@ from common import se2
 from common.messages import (
     Belief,
     CmdVel,
+    Drive,
     Goal,
     Health,
     Hypothesis,
     Odom,
+    Plan,
     Pose,
     Prediction,
+    Preference,
     Scan,
     Status,
     TopicHealth,
@@ -22,7 +25,20 @@ from common.messages import (
 )
 from common.requests import WorldReply
 from common.robot import Robot
-from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, PREDICTION, SCAN, STATUS, TRUTH
+from common.topics import (
+    BELIEF,
+    CMD_VEL,
+    DRIVE,
+    GOAL,
+    HEALTH,
+    ODOM,
+    PLAN,
+    PREDICTION,
+    PREFERENCE,
+    SCAN,
+    STATUS,
+    TRUTH,
+)
 from services.recorder.service import write_world
 from services.recorder.writer import RecordingWriter
 from tests.recorder.sessions import SCANNER, WORLD
@@ -35,6 +51,11 @@ SENSED_NS, BELIEVED_NS = 1_000_000, 9_000_000  # after the truth of the same sta
 COVARIANCE = np.diag([0.04, 0.01, 0.0025])
 GOAL_AT = 4  # after this step
 RANGES = np.array([1.0, np.inf, -np.inf, 2.5], np.float32)
+PLANNED = Plan(stamp_ns=GOAL_AT * PERIOD_NS, path=[(1, 1), (8, 1)], motion=[(1, 1), (1.2, 1)], obstacles=[(3, 1)])
+PREFERRED = Preference(
+    stamp_ns=GOAL_AT * PERIOD_NS, goal=Pose(x=8.0, y=1.0), origin=Pose(x=0.5, y=0.25), resolution=0.5, width=3,
+    height=2, distance=[0.0, 0.5, np.inf, 0.5, 1.0, np.inf],
+)  # fmt: skip
 
 
 def true(i):
@@ -83,6 +104,9 @@ def events(robot="rob"):
         yield PREDICTION, PREDICTION.key(robot), prediction, at + BELIEVED_NS
         if i == GOAL_AT:
             yield GOAL, GOAL.key(robot), Goal(stamp_ns=0, pose=Pose(x=8.0, y=1.0), tolerance=0.25), at + BELIEVED_NS
+            yield PLAN, PLAN.key(robot), PLANNED, at + BELIEVED_NS
+            yield PREFERENCE, PREFERENCE.key(robot), PREFERRED, at + BELIEVED_NS
+            yield DRIVE, DRIVE.key(robot), Drive(stamp_ns=stamp, twist=twist), at + BELIEVED_NS
         state, distance = ("navigating", 3.5) if i >= GOAL_AT else ("idle", None)
         status = Status(stamp_ns=stamp, seq=i, state=state, reason="on the way" * (i >= GOAL_AT), distance=distance)
         yield STATUS, STATUS.key(robot), status, at + BELIEVED_NS + 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from collections import defaultdict
@@ -15,9 +16,11 @@ from mcap_protobuf.decoder import DecoderFactory
 from rich.console import Console
 
 from common import se2
+from common import topics as table
 from common.errors import UserError
-from common.messages import Goal, Pose, Truth, Twist
-from common.topics import BELIEF, GOAL, ODOM, TOPICS, TRUTH
+from common.messages import Goal, Pose, Stamped, Truth, Twist
+from common.topics import BELIEF, GOAL, ODOM, TOPICS, TRUTH, Topic
+from presage.inspection.exporting import Export, run_export
 from presage.inspection.foxglove import export_foxglove
 from presage.inspection.numbers import FIELDS
 from presage.inspection.session_view import Clock, driver_of
@@ -26,12 +29,20 @@ from services.recorder.reader import read_recording
 from tests.presage import driven, mcap_by_specification
 from tests.recorder.sessions import WORLD
 
+
+class Odour(Stamped):
+    """A message that a later version may have."""
+
+    strength: float = 0.0
+
+
 LAYOUT = Path(__file__).resolve().parents[2] / "docs" / "foxglove-layout.json"
 FOXGLOVE = {
     "/tf": "FrameTransforms", "/scan": "LaserScan", "/prediction": "LaserScan", "/belief": "PoseInFrame",
     "/truth": "PoseInFrame", "/odom": "PoseInFrame", "/goal": "PoseInFrame", "/hypotheses": "PosesInFrame",
     "/map": "Grid", "/world": "SceneUpdate", "/robot": "SceneUpdate", "/paths": "SceneUpdate", "/log": "Log",
-    "/belief/shape": "SceneUpdate", "/goal/shape": "SceneUpdate",
+    "/belief/shape": "SceneUpdate", "/goal/shape": "SceneUpdate", "/plan": "SceneUpdate",
+    "/plan/obstacles": "PointCloud", "/preference": "Grid",
 }  # fmt: skip
 
 
@@ -85,6 +96,38 @@ def test_every_channel_has_the_schema_its_panel_wants(tmp_path):
     for topic in (*FIELDS, "/health/estimator"):
         assert kinds[topic][:2] == ("json", "jsonschema"), topic
     assert {topic: len(messages) for topic, messages in found.items()} == counts
+
+
+def test_a_recording_of_every_topic_is_exported_whole(tmp_path):
+    path = driven.write(tmp_path / "run.mcap")
+    recording = read_recording(path)
+    assert set(recording.topics().values()) == set(TOPICS)
+    for form in ("foxglove", "csv", "tum"):
+        run_export(Export(path, form, tmp_path / form), None, console := Console(record=True, file=io.StringIO()))
+        assert "left out" not in console.export_text()
+
+
+def test_a_topic_without_a_form_is_left_out_and_named(tmp_path, monkeypatch):
+    topic = Topic("odour", Odour, "nose", 1, "newest")
+    monkeypatch.setattr(table, "TOPICS", (*TOPICS, topic))
+    sniffed = [(topic, topic.key("rob"), Odour(stamp_ns=n, strength=1.0).encode(), n) for n in range(3)]
+    recording, console = read_recording(driven.write(tmp_path / "run.mcap", also=sniffed)), Console(record=True)
+    counts = export_foxglove(recording, tmp_path / "view.mcap", "", console, force=False)
+    assert counts["/scan"] == driven.STEPS
+    assert re.search("left out, .*: 3 of odour", console.export_text())
+
+
+def test_plans_and_preferences(tmp_path):
+    found, _ = decoded(exported(tmp_path)[0])
+    (_, update), (_, cloud), (_, field) = found["/plan"][0], found["/plan/obstacles"][0], found["/preference"][0]
+    assert [[(p.x, p.y) for p in each.points] for each in update.entities[0].lines] == [
+        [(1.0, 1.0), (8.0, 1.0)], [(1.0, 1.0), (pytest.approx(1.2), 1.0)],
+    ]  # fmt: skip
+    assert np.frombuffer(cloud.data, "<f4").tolist() == [3.0, 1.0]
+    assert (field.column_count, field.cell_size.x) == (3, 0.5)
+    assert (field.pose.position.x, field.pose.position.y) == (0.5, 0.25)
+    assert np.frombuffer(field.data, "<f4").reshape(-1, 3).tolist() == [[0.0, 0.5, np.inf], [0.5, 1.0, np.inf]]
+    assert found["/drive"][0][1]["vx"] == 1.0
 
 
 def test_the_robot_stands_where_the_belief_says_at_the_scans_own_time(tmp_path):
@@ -283,9 +326,8 @@ def test_all_that_the_layout_names_is_in_an_export(tmp_path):
         topic, field = path.split(".")
         assert field in FIELDS[topic], path
         assert any(field in content for _, content in found[topic]), path
-    drawn = {
-        t for t, kind in kinds.items() if kind[2] in {"foxglove.LaserScan", "foxglove.SceneUpdate", "foxglove.Grid"}
-    }
+    drawable = {f"foxglove.{name}" for name in ("LaserScan", "SceneUpdate", "Grid", "PointCloud")}
+    drawn = {topic for topic, kind in kinds.items() if kind[2] in drawable}
     assert drawn <= topics  # nothing that can be drawn is forgotten
     text = json.dumps(layout["layout"])
     assert all(name in text for name in layout["configById"])

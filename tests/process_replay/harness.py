@@ -28,6 +28,7 @@ class FakeBus:
     """What a service needs of `common.bus.Bus`; keeps what is put."""
 
     robot: str = ROBOT
+    instance: str = "replayed"
     sent: list[tuple[Topic, bytes]] = field(default_factory=list)
     replies: dict[tuple[str, str], Reply] = field(default_factory=dict)  # by service and query, of those beside it
     subscribed: dict[Topic, Inbox] = field(default_factory=dict)

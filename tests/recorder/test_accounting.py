@@ -9,8 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.messages import Goal, Pose, TopicHealth, Truth, Twist
-from services.recorder.accounting import FAR, Count, Ledger, Sequence, as_metadata, from_metadata, sequence_of
+from common.messages import Goal, Health, Pose, TopicHealth, Truth, Twist
+from services.recorder.accounting import (
+    FAR,
+    MAX_INSTANCES,
+    Count,
+    Ledger,
+    Sequence,
+    as_metadata,
+    from_metadata,
+    sequence_of,
+)
 
 SCAN, GOAL = "presage/r/scan", "presage/r/goal"
 
@@ -73,14 +82,30 @@ def test_the_ledger_counts_by_key_and_a_goals_numbers_are_none():
     assert from_metadata(as_metadata(counts)) == counts
 
 
+def test_two_instances_of_a_service_are_counted_apart():
+    ledger, key = Ledger(), "presage/r/health/recorder"
+    for first, second in enumerate([0, 1, 2, 4]):
+        for name, number in (("a", 100 + first), ("b", second)):
+            ledger.see(key, Health(stamp_ns=0, seq=number, service="recorder", uptime=1, instance=name).encode())
+    lost = ledger.lost(key)
+    assert (lost.gaps, lost.missing, lost.restarts, lost.reordered) == (1, 1, 0, 0)
+
+
+def test_invented_instances_do_not_fill_memory():
+    ledger = Ledger()
+    for number in range(3 * MAX_INSTANCES):
+        ledger.see(SCAN, msgpack.packb({"seq": 0, "instance": str(number)}))
+    assert len(ledger.sequences[SCAN]) == MAX_INSTANCES + 1
+
+
 def test_what_is_no_count_is_left_out():
     assert from_metadata({"a": "no JSON", "b": '{"strange": 1}', "c": '{"written": 3}'}) == {"c": Count(written=3)}
 
 
 @given(st.binary(max_size=100))
 def test_any_payload_may_come(payload):
-    number = sequence_of(payload)
-    assert number is None or number >= 0
+    numbered = sequence_of(payload)
+    assert numbered is None or numbered[0] >= 0
 
 
 @pytest.mark.parametrize("numbers", [[0, 2**63 - 1], [0, 2**64 - 1, 5], [0, 2**62, 0, 2**62, 0, 2**62, 0, 2**62]])

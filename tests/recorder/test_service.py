@@ -5,20 +5,23 @@ from __future__ import annotations
 import itertools
 import json
 import random
+import re
 import signal
 import threading
 import time
+from collections import Counter
 
 import pytest
 
 from common.bus import wait_until
 from common.inbox import MAX_KEYS, Inbox
 from common.messages import Health, Odom, Pose, Twist
-from common.requests import WorldReply
+from common.requests import RecordReply, RecordRequest, WorldReply
 from common.robot import Robot
 from common.scanner import SCANNERS
 from common.service import Loop, Service
-from common.topics import HEALTH, ODOM, SCAN, TOPICS, WORLD
+from common.topics import HEALTH, ODOM, RECORDING, SCAN, TOPICS, WORLD
+from presage.inspection.info import survey
 from services.recorder.accounting import from_metadata
 from services.recorder.reader import read_recording
 from services.recorder.recover import recover
@@ -191,7 +194,7 @@ def test_bad_input_is_one_line(process, args, said):
 
 LIMITED = """
 import resource, runpy, sys
-resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))  # a disk that is full after so much
+resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))  # a disk that is full after so much
 sys.argv = ["recorder", *sys.argv[1:]]
 runpy.run_module("services.recorder", run_name="__main__")
 """
@@ -199,9 +202,10 @@ runpy.run_module("services.recorder", run_name="__main__")
 
 def test_a_full_disk_ends_it_with_one_line_and_what_was_written_is_recovered(process, bus, tmp_path):
     (tmp_path / "limited.py").write_text(LIMITED)
-    running = process(tmp_path / "limited.py", "--directory", str(tmp_path / "logs"), "--compression", "none")
+    small = ("--compression", "none", "--chunk-size", "20000")
+    running = process(tmp_path / "limited.py", "--directory", str(tmp_path / "logs"), *small)
     running.wait_for("ready")
-    sent = publish(bus, 200)
+    sent = publish(bus, 400)
     assert running.wait() == 2, running.output
     told = [line for line in running.output.splitlines() if line.startswith("recorder: ")]
     assert len(told) == 1
@@ -209,8 +213,14 @@ def test_a_full_disk_ends_it_with_one_line_and_what_was_written_is_recovered(pro
     assert "presage recover" in told[0]
     assert "Traceback" not in running.output
     found = recover(only_file(tmp_path / "logs", ".mcap.active"))
-    got = [(raw.key, raw.payload) for raw in read_recording(found.path).payloads() if raw.key.count("/") == 2]
-    assert got == [entry for entry in sent if entry[0].count("/") == 2][: len(got)]
+    last = next(line for line in running.output.splitlines() if "recording is incomplete" in line)
+    counts = {name: int(number) for name, number in re.findall(r"(messages|lost|missing)=(\d+)", last)}
+    assert counts["lost"] > 0
+    assert 0 < counts["messages"] <= found.messages.total()
+    for topic in TOPICS:
+        key = topic.key(bus.robot, "me")
+        got = [raw.payload for raw in read_recording(found.path).payloads({key})]
+        assert got == [payload for sent_key, payload in sent if sent_key == key][: len(got)]
 
 
 def test_a_file_removed_underneath_is_noticed(recorder, bus, tmp_path):
@@ -317,3 +327,32 @@ def test_parts_by_time(recorder, bus, tmp_path):
         got = [raw.payload for file in files for raw in read_recording(file).payloads({key})]
         assert got == [payload for sent_key, payload in sent if sent_key == key]
     assert "counters" in read_recording(files[0]).metadata
+
+
+def test_presage_record_beside_a_sessions_own_recorder(recorder, process, bus, link, tmp_path):
+    first = recorder("--file", "first")
+    where = ("--robot", bus.robot, "--connect", link.connect[0])
+    second = process("presage.__main__", "record", "--out", str(tmp_path / "second"), *where)
+    second.wait_for("ready")
+    pulses, own = Inbox(), HEALTH.key(bus.robot, "recorder")
+    bus.subscribe(HEALTH, pulses, keep_all=True)
+    heard = Counter()
+
+    def both_went_on():
+        if (entry := pulses.get(0)) is not None and entry.key == own:
+            heard[Health.decode(entry.payload).instance] += 1
+        return len(heard) == 2 and min(heard.values()) >= 3
+
+    assert wait_until(both_went_on, 30), second.output
+    state = bus.ask(RECORDING, RecordRequest(action="stop"), RecordReply)  # the page's button
+    assert (state.ok, state.recording) == (True, False)
+    assert state.file.endswith("first.mcap")
+    assert "recorded" not in second.output
+    assert second.stop(signal.SIGINT)[0] == 0
+    assert first.stop()[0] == 0
+    for path in (tmp_path / "logs" / "first.mcap", only_file(tmp_path / "second")):
+        recording = read_recording(path)
+        (row,) = [row for row in survey(recording).topics if row.key == own]
+        assert (row.missing, row.gaps, row.restarts, row.reordered) == (0, 0, 0, 0)
+        count = from_metadata(recording.metadata["counters"])[own]
+        assert (count.missing, count.restarts, count.reordered) == (0, 0, 0)

@@ -16,7 +16,8 @@ from common.errors import UserError
 from common.messages import Pose, Truth, Twist
 from common.topics import HEALTH, ODOM, SCAN, TOPICS, TRUTH
 from common.world import load_world
-from services.recorder.reader import MAGIC, read_recording
+from services.recorder.chunks import MAGIC
+from services.recorder.reader import read_recording
 from services.recorder.recording import open_writer
 from services.recorder.service import RecorderService, chosen_topics
 from services.recorder.settings import RecorderSettings
