@@ -22,11 +22,12 @@ from common.messages import Stamped
 from common.presence import Presence, published_ns
 from common.requests import Reply, Request
 from common.security import Credentials, may_ask, may_put
-from common.session import DEFAULT_ENDPOINT, LOG_FILTER, Link, open_session, wait_until
+from common.session import DEFAULT_ENDPOINT, JOIN_TIMEOUT_S, LOG_FILTER, Link, open_session, wait_until
 from common.topics import Query, Topic, topic_of
 from common.wire import ENCODING, DecodeError, Message
 
 R = TypeVar("R", bound=Reply)
+JOIN_PAUSE_S = 0.2  # between two attempts to join a router, where it refuses at once
 
 
 class Bus(Presence):
@@ -214,7 +215,8 @@ def open_bus(
         refuse_exposure(link.listen)
     zenoh.init_log_from_env_or(log_filter)
     began, waiting = time.monotonic(), False
-    while (session := open_session(link)) is None:
+    join_timeout = JOIN_TIMEOUT_S if patience is None else min(patience, JOIN_TIMEOUT_S)
+    while (session := open_session(link, join_timeout)) is None:
         assert link.security is not None  # noqa: S101 - others do not wait
         why = not_let_in(link.security.member.name, link.connect)
         if give_up():
@@ -224,6 +226,7 @@ def open_bus(
         if patience is None and not waiting:
             logging.getLogger(__name__).warning("%s; waiting", why)
         waiting = True
+        time.sleep(JOIN_PAUSE_S)
     with closing(session):  # its own __exit__ fails while another thread is inside one of its calls; close() does not
         yield Bus(session, link.robot, link.security, lossless=link.lossless)
 

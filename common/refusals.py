@@ -38,6 +38,7 @@ HANDSHAKES = (  # of zenoh's and rustls' words
     ("peer sent no certificates", "no certificate"),
     ("invalid peer certificate", "certificate of another authority, or expired"),
     ("InvalidContentType", "no TLS"),
+    ("Timeout during TLS handshake", "no TLS handshake in time"),
 )
 NAMES = frozenset(topic.name for topic in TOPICS) | frozenset(query.name for query in QUERIES)
 MOST_NAMES = 1000  # a stranger who comes again and again must not fill memory

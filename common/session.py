@@ -15,6 +15,10 @@ from common.errors import UserError
 from common.security import Credentials
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+# A router in secure mode handles at most ten failed handshakes per second, and a connection waits behind them: with 32
+# clients that fail all the time it waits for 6 s. An attempt that ends earlier starts again at the end of the queue.
+# Zenoh cannot be interrupted while it waits, so this is also how long ending a service may take.
+JOIN_TIMEOUT_S = 8.0
 # Both call it an error when something arrives while a session opens or closes.
 # The third says at every message that a host's clock is ahead; `presage doctor` says it once.
 LOG_FILTER = (
@@ -36,7 +40,7 @@ class Link:
     insecure: bool = False  # may listen beyond loopback without credentials
 
 
-def _config(link: Link) -> zenoh.Config:
+def _config(link: Link, join_timeout: float = JOIN_TIMEOUT_S) -> zenoh.Config:
     config: zenoh.Config = zenoh.Config()
     settings: dict[str, Any] = {
         "mode": "router" if link.router else "peer",
@@ -60,17 +64,20 @@ def _config(link: Link) -> zenoh.Config:
         settings |= {**link.security.zenoh(), "mode": "router" if link.router else "client"}
         settings["connect/endpoints"] = [over_tls(each) for each in link.connect]
         settings["listen/endpoints"] = [over_tls(each) for each in link.listen] if link.router else []
-        if not link.router:  # opening waits for the router: in pieces, so that it can be given up
-            settings |= {"connect/timeout_ms": 1000, "connect/exit_on_failure": True}
+        if not link.router:  # one attempt, which the caller repeats: so that it can be given up
+            settings |= {
+                "connect/timeout_ms": 0, "connect/exit_on_failure": True,
+                "transport/unicast/open_timeout": int(join_timeout * 1000),
+            }  # fmt: skip
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
 
 
-def open_session(link: Link) -> zenoh.Session | None:
-    """None where a router did not let us in yet."""
+def open_session(link: Link, join_timeout: float = JOIN_TIMEOUT_S) -> zenoh.Session | None:
+    """Returns None if in secure mode no router lets us in; each endpoint has ``join_timeout`` s to do so."""
     try:
-        return zenoh.open(_config(link))
+        return zenoh.open(_config(link, join_timeout))
     except zenoh.ZError as error:
         text = str(error)
         if link.security is not None and "Unable to connect" in text:

@@ -57,10 +57,12 @@ def test_handshakes():
         tls + "invalid peer certificate: BadSignature. Hint: increase the system open file limit.",
         tls + "peer sent no certificates. Hint: increase the system open file limit.",
         tls + "received corrupt message of type InvalidContentType. Hint: increase the system open file limit.",
+        tls + "Timeout during TLS handshake. Hint: increase the system open file limit.",
         tls + "tls handshake eof. Hint: increase the system open file limit.",
     ) == [
         Refusal("wrong password", "observer"), Refusal("no password", "observer"),
         Refusal("certificate of another authority, or expired"), Refusal("no certificate"), Refusal("no TLS"),
+        Refusal("no TLS handshake in time"),
     ]  # fmt: skip
 
 

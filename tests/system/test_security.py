@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
-from contextlib import ExitStack, contextmanager
+import socket
+import ssl
+import threading
+import time
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -252,6 +256,43 @@ def test_who_is_struck_off_is_let_in_no_more_once_the_router_starts_again(guarde
     kept.rename(guarded.keys / "anna")
     assert "not let in" in guarded.intrude({**annas, "connect/timeout_ms": 1000})
     guarded.router.wait_for("password'")
+
+
+@contextmanager
+def clients_without_certificate(port, count):
+    """Clients that connect, fail and connect again until the block ends."""
+    tls = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    tls.check_hostname, tls.verify_mode = False, ssl.CERT_NONE
+    ended, failed = threading.Event(), [False] * count
+
+    def fail(number):
+        while not ended.is_set():
+            with (
+                suppress(OSError),
+                socket.create_connection(("127.0.0.1", port), PATIENCE) as plain,
+                tls.wrap_socket(plain) as refused,
+            ):
+                refused.recv(1)
+            failed[number] = True
+
+    threads = [threading.Thread(target=fail, args=(number,)) for number in range(count)]
+    for thread in threads:
+        thread.start()
+    try:
+        assert wait_until(lambda: all(failed), PATIENCE)
+        yield
+    finally:
+        ended.set()
+        for thread in threads:
+            thread.join()
+
+
+def test_a_member_joins_while_others_keep_failing(guarded):
+    """Zenoh handles ten failed handshakes per second: a member waits behind all of them, twice."""
+    with clients_without_certificate(guarded.port, 16):
+        began = time.monotonic()
+        with guarded.session("operator"):
+            print(f"joined in {time.monotonic() - began:.2f} s")
 
 
 def test_our_own_commands_say_what_a_role_may_not(guarded):
