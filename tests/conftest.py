@@ -193,7 +193,7 @@ class Processes:
                 process.send(signal.SIGTERM)
         for process in self.started:
             try:
-                process.child.wait(10)
+                process.child.wait(PATIENCE)
             except subprocess.TimeoutExpired:
                 process.kill()
                 killed.append(process)

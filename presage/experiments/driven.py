@@ -155,7 +155,7 @@ def _times(track: Track) -> dict[str, Any]:
 
 
 def plain(reason: str) -> str:
-    """A reason without where and how far: "waiting: something that may move, 0.8 m away at (1.2, 3.4)" up to the comma."""
+    """A reason without where and how far: "waiting: something that may move, 0.8 m away at (1, 3)" up to the comma."""
     return re.sub(r"(,? \d[\d.]* m away)?( at| to)? \(-?[\d.]+, -?[\d.]+\)", "", reason)
 
 

@@ -208,7 +208,9 @@ class Navigator:
         self.mind.interrupt()
         self._velocity = np.zeros(3)
         self._lose_goal(why)
-        status = self.status(stamp_ns, None).model_copy(update={"reason": why})  # idle, too, says so
+        status = self.status(stamp_ns, None)
+        if not self._refused:  # why a goal was refused is still to be read
+            status = status.model_copy(update={"reason": why})  # idle, too, says so
         return CmdVel(stamp_ns=stamp_ns, twist=Twist()), status
 
     def _lose_goal(self, why: str) -> None:

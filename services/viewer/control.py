@@ -149,13 +149,16 @@ class Control:
         return Answer(ok=True, reason="goal cancelled")
 
     def _status(self, robot: str, wanted: Callable[[Status], bool]) -> Status | None:
-        """The controller's word once it is as wanted; None where that does not happen in time."""
+        """The first status seen that is as ``wanted``; None if there is none in time."""
+        found: list[Status] = []
 
         def there() -> bool:
             status = self._sight.status(robot)
-            return status is not None and wanted(status)
+            if status is not None and wanted(status):
+                found.append(status)
+            return bool(found)
 
-        return self._sight.status(robot) if wait_until(there, WITHIN) else None
+        return found[0] if wait_until(there, WITHIN) else None
 
     def _teleport(self, robot: str, action: a.Carry) -> Answer:
         pose = Pose(x=action.x, y=action.y, yaw=action.yaw)
@@ -183,7 +186,8 @@ class Control:
 
     def _reset(self, robot: str, action: a.Reset) -> Answer:
         self.ask(robot, RESET, ResetRequest(seed=action.seed), Reply)
-        return Answer(ok=True, reason="simulation restarted" + (f" with seed {action.seed}" if action.seed is not None else ""))
+        seed = "" if action.seed is None else f" with seed {action.seed}"
+        return Answer(ok=True, reason=f"simulation restarted{seed}")
 
     def _speed(self, robot: str, action: a.Pace) -> Answer:
         if not 0.1 <= action.factor <= 20:

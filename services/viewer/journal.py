@@ -1,4 +1,4 @@
-"""The page's list of events: changes of the controller's state, and the robot being carried off. Messages in, rows out."""
+"""The page's list of events: the controller's changes of state, and the robot being carried. Messages in, rows out."""
 
 from __future__ import annotations
 

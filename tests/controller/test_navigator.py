@@ -133,6 +133,14 @@ def test_without_a_belief_it_stands_and_keeps_the_goal():
     assert command.twist.vx > 0
 
 
+def test_without_a_belief_a_refused_goal_keeps_its_reason():
+    navigator = Navigator(world=ROOM)
+    navigator.hear_goal(goal(8.5, -3))
+    refusal = navigator.status(5, None)
+    assert (refusal.state, refusal.refused) == ("blocked", True)
+    assert navigator.without_belief(5, "no belief")[1] == refusal
+
+
 def test_the_controller_needs_no_torch():
     code = (
         "import sys, services.controller.service; assert 'torch' not in sys.modules and 'pybullet' not in sys.modules"

@@ -8,7 +8,7 @@ import pytest
 from common.messages import Belief, Goal, Pose
 from common.robot import Robot
 from common.scanner import SCANNERS
-from common.world import World, load_world
+from common.world import Obstacle, World, load_world
 from services.controller.navigator import Navigator
 from services.controller.pilot import Pilot
 from services.simulator.simulation import Setup, Simulation
@@ -95,6 +95,21 @@ def test_a_box_that_no_map_knows_is_gone_round_and_said(kind):
     assert contacts == 0
     assert np.abs(poses[:, 1] - 2.5).max() > 0.8
     assert np.hypot(*np.diff(poses[:, :2], axis=0).T).sum() < 9.0
+
+
+def test_a_box_just_put_in_the_way_may_move_until_it_has_stood_for_a_second():
+    hall = World(name="hall", boundary=[(0, 0), (10, 0), (10, 3), (0, 3)])
+    far, near = (Obstacle(name="box", box={"center": (x, 1.5), "size": (0.6, 1.2)}) for x in (9.5, 3.9))
+    world = hall.model_copy(update={"obstacles": [far]})
+
+    def move(simulation):
+        if simulation.steps == 30:
+            simulation.change("move", "box", near)
+
+    _, said, _ = drive(world, Robot(), (1.5, 1.5, 0.0), (8.5, 1.5), 60, known=hall, change=move)
+    nearby = [status.reason.split(",")[0] for status in said[30:]]
+    assert {"waiting: something that may move"} == set(nearby[:15])
+    assert not any("may move" in reason for reason in nearby[15:])
 
 
 def test_a_door_that_was_shut_is_said_and_once_it_opens_it_goes_on():

@@ -17,6 +17,15 @@ ARGUMENTS = [
     "--disable-component-update", "--disable-sync", "--force-color-profile=srgb",
 ]  # fmt: skip
 
+PATIENCE = 60.0  # s, deadline of a wait for an answer that takes well under a second on an idle machine
+# An answer is on the screen for some seconds only, and a busy machine may look too late: keep them all.
+KEEP_TOASTS = """window.toasts = [];
+new MutationObserver((changes) => {
+    for (const node of changes.flatMap((change) => [...change.addedNodes])) {
+        if (node.matches?.(".toast")) window.toasts.push({ text: node.textContent, ok: node.dataset.ok === "true" });
+    }
+}).observe(document, { childList: true, subtree: true });"""
+
 
 def find_browser() -> str | None:
     """Its path: PRESAGE_TEST_BROWSER, or the first of the usual names."""
@@ -78,15 +87,16 @@ class Visit:
         self.page.mouse.up()
 
     def toast(self, text: str = "", *, ok: bool = True) -> str:
-        """The newest answer with some text in it, once it is there."""
-        found = self.page.locator(f'.toast[data-ok="{str(ok).lower()}"]', has_text=text).last
-        found.wait_for(timeout=20_000)
-        return found.inner_text()
+        """The first answer with some text in it since the last one returned here, once it was shown."""
+        found = "window.toasts.findIndex((toast) => toast.ok === arg[0] && toast.text.includes(arg[1]))"
+        self.wait(f"{found} >= 0", PATIENCE, [ok, text])
+        return str(self.see(f"window.toasts.splice(0, 1 + {found}).at(-1).text", [ok, text]))
 
 
 def visit(browser: Browser, address: str, *, width: int = 1100, height: int = 760, **options: Any) -> Visit:
     """A page in a context of its own, once its socket is open."""
     context = browser.new_context(viewport={"width": width, "height": height}, **options)
+    context.add_init_script(KEEP_TOASTS)
     seen = Visit(context.new_page())
     seen.page.goto(address)
     seen.page.wait_for_function("() => window.presage && presage.store.connected")

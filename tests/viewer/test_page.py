@@ -128,6 +128,7 @@ def test_a_robot_that_was_carried_off_is_found_again(page):
     page.page.keyboard.up("Shift")
     page.toast("carried")
     page.wait(f"{AWAY.format('store.frame.truth')} < 0.5", 10, there)
+    page.page.locator("#journal b", has_text="carried").first.wait_for(timeout=20_000)
     found = f"store.frame.belief?.state === 'tracking' && {AWAY.format('store.frame.belief')} < 0.6"
     page.wait(f"{found} && store.frame.error < 0.1", 60, there)
     off = [error for _, _, error in page.see("window.seen") if error >= 0]

@@ -25,6 +25,23 @@ OVERLAPPING = """((boxes) => boxes.filter(([, a], i) => boxes.some(([, b], k) =>
     && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1)).map(([name]) => name))(
     ["#legend", "#zoom", "#why", "#sub", "#toolbar", "#joystick"].map((name) => [name, document.querySelector(name)])
         .filter(([, box]) => box.checkVisibility()).map(([name, box]) => [name, box.getBoundingClientRect()]))"""
+TOOLS = """[...document.querySelectorAll("#toolbar button, #toolbar .speed")].map((tool) => {
+    const { left, right, bottom, height } = tool.getBoundingClientRect(), label = tool.querySelector("span");
+    return { left, right, bottom, height, text: label.checkVisibility() ? label.innerText : "" };
+})"""
+LEFT_EDGE = """((canvas) => {
+    const data = canvas.getContext("2d").getImageData(0, 0, 1, canvas.height).data;
+    const colours = new Set();
+    for (let i = 0; i < data.length; i += 4) colours.add(String(data.slice(i, i + 4)));
+    return colours.size;
+})(document.getElementById(arg))"""  # how many colours the leftmost pixels have: one where nothing is drawn
+LARGE_NUMBERS = """(() => {
+    for (const name of ["free_energy", "complexity", "speed"]) store.history[name].fill(-123456.5);
+    store.frame.ranges[0] = 12345;
+    store.world.boundary = [[-10, -10], [20, -10], [20, 20], [-10, 20]];
+    view.fit();
+    for (const canvas of document.querySelectorAll(".card canvas")) canvas.style.width = "99%"; // draws it again
+})()"""
 PIXEL = """((copy) => {
     copy.drawImage(document.getElementById("map"), ...arg.map((px) => px * devicePixelRatio), 1, 1, 0, 0, 1, 1);
     return String(copy.getImageData(0, 0, 1, 1).data);
@@ -158,6 +175,42 @@ def test_a_click_is_any_heading_and_a_drag_is_that_one(look):
     seen.drag((12.0, 1.5), (12.0, 2.5))
     seen.wait("store.frame.status.goal.yaw_tolerance === 0.15", 10)
     assert seen.see("store.frame.status.goal.yaw") == pytest.approx(1.571, abs=0.05)
+
+
+def test_a_click_on_furniture_is_a_goal_and_it_is_said_why_not(look):
+    seen = look("tracking")
+    seen.wait("store.world && store.frame")
+    seen.click(10.6, 3.75)
+    assert "does not fit" in seen.toast(ok=False)
+    assert not seen.see("view.gesture.selected")
+    seen.page.keyboard.press("o")
+    seen.click(10.6, 3.75)
+    assert seen.see("view.gesture.selected") == "cylinder"
+
+
+@pytest.mark.parametrize(("width", "height"), [(360, 640), (390, 844), (844, 390)])
+def test_a_phone_shows_every_tool_with_its_label(look, width, height):
+    seen = look("planning", **{**PHONE, "width": width, "height": height})
+    seen.wait("store.world && store.frame && modes.can")
+    tools = seen.see(TOOLS)
+    assert {"Goal", "Carry", "Obstacle", "Look", "Pause", "Restart", "Speed", "Localise", "Record", "Open"} < {
+        tool["text"] for tool in tools
+    }
+    for tool in tools:
+        assert tool["left"] >= 0, tool
+        assert tool["right"] <= width, tool
+        assert min(tool["right"] - tool["left"], tool["height"]) >= 44, tool
+        assert height < 640 or tool["bottom"] <= height, tool  # all of them without scrolling
+
+
+def test_axis_labels_are_not_cut_off(look):
+    seen = look("tracking", **PHONE)
+    seen.wait("store.world && store.frame")
+    seen.see("presage.connection.ask('pause')")
+    seen.wait("performance.now() - store.arrivals.at(-1) > 500")
+    seen.see(LARGE_NUMBERS)
+    for name in ("c-energy", "c-complexity", "c-speed", "c-scan", "map"):
+        seen.wait(f"{LEFT_EDGE} === 1", 10, name)
 
 
 class Fingers:

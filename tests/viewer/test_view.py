@@ -351,6 +351,32 @@ def test_the_journal_has_a_row_for_each_change_of_mind():
     assert [row["t"] for row in view.journal.rows()] == [1.0]
 
 
+@pytest.mark.parametrize(
+    ("x", "yaw", "seconds", "carried"),
+    [
+        (1.05, 0.25, 0.1, False),  # driven, at 0.5 m/s
+        (1.45, 0.25, 0.5, False),  # driven, faster towards the end
+        (1.3, 0.25, 0.1, True),
+        (9.0, 0.25, 0.1, True),
+        (1.0, 0.4, 0.1, False),
+        (1.0, 3.0, 0.1, True),  # turned on the spot by hand
+        (1e308, 0.25, 0.1, True),
+    ],
+)
+def test_a_robot_carried_off_is_an_event(x, yaw, seconds, carried):
+    view = RobotView("robot")
+    feed(view, 1.0)
+    later = at(1.0 + seconds)
+    truth = later[TRUTH].model_copy(update={"pose": Pose(x=x, y=2.0, yaw=yaw)})
+    view.hear(TRUTH, truth, 1.0 + seconds)
+    view.hear(STATUS, later[STATUS], 1.0 + seconds)
+    rows = view.journal.rows()
+    assert [row["state"] for row in rows] == ["navigating", *["carried"] * carried]
+    if x == 9.0:
+        assert rows[-1]["t"] == pytest.approx(1.1)
+        assert rows[-1]["reason"].startswith("8.0 m, to (9.00, 2.00)")
+
+
 def test_numbers_that_no_robot_has_are_shown_as_none():
     view, messages = RobotView("robot"), at(1.1)
     feed(view, 1.0)
