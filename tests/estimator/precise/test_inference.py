@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from common import se2
 from services.estimator.generative import Expected, RayCaster
 from services.estimator.kernels import FACING
-from services.estimator.precise.gauss_newton import Prior, View, descend, polish
+from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View, descend, difference, polish
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.mixture import Mode, distinct, weigh
 from services.estimator.precise.motion import Candidate, MotionNoise, candidates, fuse
@@ -162,6 +162,21 @@ def test_fusing_is_bayes_rule_for_gaussians(seed):
     by_hand = 0.5 * off @ np.linalg.solve(S, off) + 0.5 * np.linalg.slogdet(S @ H)[1] - np.log(0.5)
     assert found.surprise == pytest.approx(by_hand, rel=1e-4, abs=1e-4)
     assert found.complexity >= -1e-6
+
+
+@given(
+    st.lists(st.floats(-1e6, 1e6), min_size=9, max_size=9),
+    st.lists(st.floats(0, 1e9), min_size=3, max_size=3),
+    st.lists(st.floats(1e-4, 300), min_size=3, max_size=3),
+)
+@example([0, 0, 0, 0.3, 0, 0, 4.7, 0, 0], [0, 1e4, 1e4], [2.9, 0.01, 0.01])  # no curvature along x: 39.5 m
+def test_fusing_takes_no_step_beyond_the_trust_region(numbers, curvatures, deviations):
+    mean, mode, slope = np.array(numbers).reshape(3, 3)
+    mean[2] = se2.wrap(mean[2])
+    found = fuse(Candidate("x", mean, np.diag(deviations) ** 2, 0.5), mode, slope, np.diag(curvatures))
+    taken, off = (np.abs(difference(pose[None], mean[None])[0]) for pose in (found.mean, mode))
+    assert (taken <= (off + MAX_STEP) * (1 + 1e-6) + 1e-6).all()
+    assert (taken <= (3 * np.array(deviations) + 5 * MAX_STEP) * (1 + 1e-6) + 1e-6).all()
 
 
 def test_motion_priors():
