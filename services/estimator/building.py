@@ -136,7 +136,7 @@ def _precise(choice: Choice, world: World) -> Factory:
     model, places, card = generative_model(choice, world)
     calibration = card.calibration if card else None
     settings = calibration.settings() if calibration else Settings(inflation=card.inflation if card else 1.0)
-    seeds = Seeds.at(model, places)
+    seeds, bounds = Seeds.at(model, places), (card.world if card else world).bounds
     _compile(model, seeds, Likelihood())
 
     def make(geometry: Geometry) -> Estimator:
@@ -144,7 +144,7 @@ def _precise(choice: Choice, world: World) -> Factory:
         if calibration and choice.sigma is None:
             likelihood = calibration.likelihood
         rng = np.random.default_rng(choice.seed)
-        made = PreciseEstimator(model, seeds, geometry.mount, likelihood, settings, rng)
+        made = PreciseEstimator(model, seeds, geometry.mount, likelihood, settings, rng, bounds)
         if choice.initial_pose is not None:
             made.restart(choice.initial_pose)
         return made

@@ -16,7 +16,7 @@ from services.estimator.precise.continuity import Continuity
 from services.estimator.precise.gauss_newton import WIDEST, Prior, View, polishing
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.mixture import Mode
-from services.estimator.precise.motion import Candidate, candidates, fuse, unseen, within_reach
+from services.estimator.precise.motion import Candidate, candidates, fuse, unseen, within_map, within_reach
 from services.estimator.precise.settings import Settings
 
 if TYPE_CHECKING:
@@ -43,10 +43,15 @@ class PreciseEstimator:
         likelihood: Likelihood | None = None,
         settings: Settings | None = None,
         rng: np.random.Generator | None = None,
+        bounds: tuple[float, float, float, float] | None = None,
     ) -> None:
-        """``mount`` (3,) is the laser in base_link; ``rng`` only places the starts near a pose that is given."""
+        """``mount`` (3,) is the laser in base_link; ``rng`` only places the starts near a pose that is given.
+
+        The belief stays within ``bounds``, x0, y0, x1, y1 of the map in m.
+        """
         self.model, self.seeds, self.mount = model, seeds, np.array(mount, float)
         self.likelihood, self.settings = likelihood or Likelihood(), settings or Settings()
+        self.bounds = bounds or (-np.inf, -np.inf, np.inf, np.inf)
         self._rng = rng or np.random.default_rng(0)
         self.restart()
 
@@ -81,6 +86,7 @@ class PreciseEstimator:
         if not self.modes or self._suspicious(view):
             yield Search()
             yield from self._relocalise(view)
+        self.modes = mixture.within(self.modes, self.bounds)
         self._stamp, self._odom = observation.stamp, observation.odom
         best = self.modes[0]
         self._remember(view, best)
@@ -136,6 +142,7 @@ class PreciseEstimator:
             mixture.project(evidence, k, keep)
             if blind is not None and odom is None and held is None:
                 each = [unseen(self.settings.motion, option, blind, mode.blind, period) for option in each]  # noqa: PLW2901
+            each = [within_map(option, self.seeds.spread) for option in each]  # noqa: PLW2901
             parts = [fuse(option, poses[k], evidence.xi[k], evidence.curvature[k]) for option in each]
             fused = min(parts, key=lambda part: part.surprise)
             modes.append(mixture.moved(mode, fused, evidence, k, period, blind=blind is not None and held is None))
@@ -266,16 +273,8 @@ class PreciseEstimator:
         state = self._state(view, best, believable=believable)
         unknown = self.seeds.spread * (not self._believed)
         hypotheses = tuple(Hypothesis(mode.pose, self._covariance(mode) + unknown, mode.weight) for mode in self.modes)
-        return Posterior(
-            state,
-            hypotheses,
-            best.accuracy,
-            best.complexity,
-            best.xi,
-            best.curvature,
-            expected.ranges[0],
-            expected.sigma[0],
-        )
+        evidence = (best.accuracy, best.complexity, best.xi, best.curvature)
+        return Posterior(state, hypotheses, *evidence, expected.ranges[0], expected.sigma[0])
 
     def _covariance(self, mode: Mode) -> Array:
         floor = np.array([self.settings.floor_position] * 2 + [self.settings.floor_heading])

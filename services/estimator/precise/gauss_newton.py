@@ -149,8 +149,12 @@ def _steps(poses: Array, evidence: Evidence, prior: Prior | None, damping: Array
         H = H + prior.information
         slope = slope + np.einsum("nij,nj->ni", prior.information, difference(prior.mean, poses))
     H = H + damping[:, None, None] * H * np.eye(3)
-    step = np.linalg.solve(H, slope[..., None])[..., 0]
-    return np.asarray(step / np.maximum((np.abs(step) / MAX_STEP).max(axis=1, keepdims=True), 1.0))
+    return limited(np.linalg.solve(H, slope[..., None])[..., 0], MAX_STEP)
+
+
+def limited(steps: Array, largest: Array) -> Array:
+    """Steps (..., 3) made shorter, in their direction, so that no component exceeds ``largest`` (3,)."""
+    return np.asarray(steps / np.maximum((np.abs(steps) / largest).max(axis=-1, keepdims=True), 1.0))
 
 
 def polish(view: View, poses: Array, prior: Prior | None = None, iterations: int = 5) -> tuple[Array, Evidence]:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common import se2
-from services.estimator.precise.gauss_newton import Prior, difference, of_position
+from services.estimator.precise.gauss_newton import MAX_STEP, Prior, difference, limited, of_position
 from services.estimator.precise.motion import smoothed
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def found(
     information = prior.information[k] if prior else np.linalg.inv(spread)
     inverse = np.linalg.inv(evidence.curvature[k] + information)
     slope = evidence.xi[k] + (prior.information[k] @ difference(prior.mean[k : k + 1], pose[None])[0] if prior else 0)
-    pose = pose + inverse @ slope
+    pose = pose + limited(inverse @ slope, MAX_STEP)
     pose[2] = se2.wrap(pose[2])
     noise = inverse @ (evidence.of_noise[k] + information) @ inverse
     error = inverse @ evidence.of_model[k] @ inverse
@@ -117,6 +117,13 @@ def moved(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: float, *
         fused.complexity, energy, evidence.xi[k], evidence.curvature[k], velocity,
         blind=mode.blind + 1 if blind else 0, age=mode.age + 1, trusted=mode.trusted,
     )  # fmt: skip
+
+
+def within(modes: list[Mode], bounds: tuple[float, float, float, float]) -> list[Mode]:
+    """The modes, none outside the map, which goes from x0, y0 to x1, y1 (m)."""
+    x0, y0, x1, y1 = bounds
+    low, high = np.array([x0, y0, -np.inf]), np.array([x1, y1, np.inf])
+    return [replace(mode, pose=np.clip(mode.pose, low, high)) for mode in modes]
 
 
 def same(poses: Array, pose: Array) -> npt.NDArray[np.bool_]:

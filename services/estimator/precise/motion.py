@@ -13,12 +13,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common import se2
+from services.estimator.precise.gauss_newton import MAX_STEP, limited
 
 if TYPE_CHECKING:
     from common.se2 import Array
 
 
 SMOOTH = 1 / 15  # s, over which velocity is read off the poses at least, however fast scans come
+PLAUSIBLE = 3.0  # standard deviations: motion beyond it is not taken for the robot's
+FARTHEST = 5 * MAX_STEP  # m, m, rad beyond what is plausible: as far as the last steps of a descent go
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,7 @@ def candidates(
             change = change + noise.command_share * np.abs(command) * period
             found.append(_moved("commanded", pose, covariance, command * period, change, rest / 2))
         elif velocity is not None:
+            velocity = limited(velocity, PLAUSIBLE * np.array([noise.speed, noise.speed, noise.turn]))
             deviation = np.sqrt(change**2 + _read_off(pose, covariance, period))
             found.append(_moved("going on", pose, covariance, velocity * period, deviation, rest / 2))
     centre = odom if odom is not None else np.zeros(3)
@@ -122,6 +126,16 @@ def unseen(noise: MotionNoise, option: Candidate, blind: Array, scans: int, peri
     return replace(option, covariance=covariance)
 
 
+def within_map(option: Candidate, spread: Array) -> Candidate:
+    """With no more variance of the position than ``spread`` (3, 3), that of a position of which nothing is known."""
+    excess = np.sqrt(np.diag(option.covariance) / np.diag(spread))
+    excess[2] = 1.0
+    if (excess <= 1).all():
+        return option
+    scale = 1 / np.maximum(excess, 1.0)
+    return replace(option, covariance=option.covariance * np.outer(scale, scale))
+
+
 def within_reach(noise: MotionNoise, pose: Array, period: float, basin: float) -> Array:
     """(K, 3) poses to which a robot may have driven unseen; none where a descent reaches as far, ``basin`` m or rad."""
     if noise.speed * period < basin and noise.turn * period < basin:
@@ -143,7 +157,12 @@ class Fused:
 
 
 def fuse(candidate: Candidate, mode: Array, slope: Array, curvature: Array) -> Fused:
-    """Laplace: the scan's -ln p is a parabola, ``slope`` (3,) minus its gradient at ``mode``, ``curvature`` its own."""
+    """Laplace: the scan's -ln p is a parabola, ``slope`` (3,) minus its gradient at ``mode``, ``curvature`` its own.
+
+    Along a direction without curvature the parabola is a straight line, whose minimum with a vague prior may be
+    kilometres away. The step is therefore limited to a trust region: `MAX_STEP` beyond ``mode``, where the parabola was
+    expanded, and `FARTHEST` beyond what the candidate's covariance makes plausible.
+    """
     information = np.linalg.inv(candidate.covariance)
     total = curvature + information
     off = mode - candidate.mean
@@ -155,6 +174,8 @@ def fuse(candidate: Candidate, mode: Array, slope: Array, curvature: Array) -> F
     misfit = float(pull @ np.linalg.solve(sound, pull) - pull @ step)
     logdet = float(np.linalg.slogdet(total)[1] - np.linalg.slogdet(information)[1])
     evidence = 0.5 * misfit + 0.5 * logdet - np.log(candidate.probability)
+    plausible = PLAUSIBLE * np.sqrt(np.diag(candidate.covariance))
+    step = limited(step, np.minimum(np.abs(off) + MAX_STEP, plausible + FARTHEST))
     posterior = np.linalg.inv(total)
     kl = 0.5 * (float(np.trace(information @ posterior)) - 3 + float(step @ information @ step) + logdet)
     mean = candidate.mean + step

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from common import se2
 from common.world import World, load_world
@@ -180,3 +182,54 @@ def test_shipped_fields_find_the_robot_anywhere(world):
     assert position.max() < 0.02
     assert np.median(position) < 0.003
     assert np.rad2deg(np.median(np.abs(np.array(errors)[:, 2]))) < 0.06
+
+
+def odd_scan(kind, clean, rng):
+    """A scan of a place, or one that no place gives."""
+    count = len(clean)
+    return {
+        "ordinary": clean,
+        "no return": np.full(count, np.inf),
+        "says nothing": np.full(count, -np.inf),
+        "random": rng.uniform(0.05, 25, count),
+        "a ring": np.full(count, rng.uniform(0.1, 3)),
+        "scaled": clean * rng.uniform(0.2, 1.5),
+        "blocked": clean * np.where(rng.random(count) < 0.7, rng.uniform(0.05, 1, count), 1),
+    }[kind]
+
+
+KINDS = ("ordinary", "no return", "says nothing", "random", "a ring", "scaled", "blocked")
+
+
+@pytest.fixture(scope="module")
+def in_a_hall():
+    """Two walls 60 m long: nothing is known along them."""
+    made, scene = estimator(World(name="hall", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)]), 60)
+    made.bounds = scene.world.bounds
+    return made, scene
+
+
+@given(st.lists(st.sampled_from(KINDS), min_size=5, max_size=12), st.integers(0, 1000), st.sampled_from([1 / 15, 1.0]))
+@example(["random"] * 20, 25, 1.0)
+@settings(max_examples=8, deadline=None)
+def test_the_belief_stays_in_the_map_whatever_the_scans_are(in_a_hall, kinds, seed, period):
+    """And a hypothesis moves at most 10 m, which is 20 steps of a descent, beyond what motion allows."""
+    made, scene = in_a_hall
+    rng = np.random.default_rng(seed)
+    pose = np.array([rng.uniform(5, 55), rng.uniform(0.5, 1.5), rng.uniform(-3, 3)])
+    made.restart(pose, np.diag([1e-4] * 3))
+    clean = scene.clean(pose[None])[0]
+    for k, kind in enumerate(["ordinary", *kinds]):
+        before = np.array([mode.pose[:2] for mode in made.modes])
+        ranges = odd_scan(kind, clean, rng)
+        posterior = made.update(Observation(ranges, scene.scanner.angles(), 25.0, k * period))
+        for each in posterior.hypotheses:
+            assert np.isfinite(each.pose).all()
+            assert np.isfinite(each.covariance).all()
+            assert 0 <= each.pose[0] <= 60
+            assert 0 <= each.pose[1] <= 2
+            assert np.diag(each.covariance)[:2].max() < 2 * 60**2
+        for mode in made.modes:
+            if mode.age:  # not found by a search just now
+                moved = np.abs(mode.pose[:2] - before).max(axis=1).min()
+                assert moved <= 20 * 0.5 + 3 * made.settings.motion.speed * period
