@@ -43,7 +43,7 @@ from services.estimator.precise.calibration import Drive
 from services.estimator.precise.driven import learn_drive
 from services.estimator.precise.learning import Recipe
 
-ESTIMATORS = ("precise", "particle-filter")
+ESTIMATORS = ("precise", "particle-filter", "amcl-defaults")
 TASKS = {
     ODOMETRY: "a: tracking with odometry", LASER: "b: tracking without", GLOBAL: "c: from nothing",
     KIDNAPPED: "d: carried off",
@@ -91,7 +91,7 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
     model, card, tuned = _prepared(job, plain, half, out, console)
     plain = replace(plain, first=half, model=str(model))
     jobs = [
-        replace(each, estimator=name, particles=() if name == "precise" else _settings(tuned, each.task))
+        replace(each, estimator=name, particles=_settings(tuned, each.task) if name == "particle-filter" else ())
         for each in stretches(plain, half, len(drive.ranges), job, odometry=drive.odom is not None)
         for name in ESTIMATORS
     ]
@@ -152,7 +152,7 @@ def _prepared(
         tuned = (
             Tuned(start, start, [])
             if job.quick
-            else tune(replace(stretch, estimator="particle-filter"), half, start, report)
+            else tune(replace(stretch, estimator="particle-filter"), half, start, path.parent, report)
         )
     plain = {"key": key, "tracking": dict(tuned.tracking), "finding": dict(tuned.finding), "tried": tuned.tried}
     kept.write_text(json.dumps(plain) + "\n", encoding="utf-8")

@@ -36,7 +36,7 @@ class Job:
     log: str
     map: str
     mount: tuple[float, float, float] | None  # of the laser in base_link; None: as the log says
-    estimator: str  # precise or particle-filter
+    estimator: str  # precise, particle-filter or amcl-defaults
     task: str
     first: int  # scan of the drive at which it begins
     count: int = 0  # scans to go on for
@@ -130,14 +130,17 @@ def entered(job: Job) -> Estimator:
     if job.estimator == "precise":
         factory = _precise(job.map, job.model)
         return factory(Geometry(drive.angles, drive.mount, drive.range_max))
-    settings = particle_settings(job.particles)
+    # A differential model cannot follow every base; AMCL has an omnidirectional one for these.
+    amcl = ParticleSettings(robot_model_type="omni")
+    settings = amcl if job.estimator == "amcl-defaults" else particle_settings(job.particles)
     x, y, yaw = map(float, drive.mount)
     return ParticleFilter(load_world(job.map), settings, (x, y, yaw), job.seed, sensor=_sensor(job.map, settings))
 
 
 def particle_settings(changed: tuple[tuple[str, float], ...]) -> ParticleSettings:
     """The tuned set, with what a tuning on the first half has changed."""
-    values = {name: int(value) if name == "max_beams" else value for name, value in changed}
+    kinds = {"max_beams": int, "keep_initial_pose": bool}
+    values = {name: kinds[name](value) if name in kinds else value for name, value in changed}
     return replace(ParticleSettings.tuned(), **values)  # type: ignore[arg-type]
 
 

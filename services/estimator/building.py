@@ -16,7 +16,7 @@ from common.messages import Scan
 from common.scanner import SCANNERS, Scanner
 from common.se2 import Array
 from common.world import World, known_worlds, load_world
-from services.estimator.generative import GenerativeModel, RayCaster
+from services.estimator.generative import GenerativeModel, RayCaster, map_error
 from services.estimator.interface import Estimator
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.sensor import Sensor
@@ -31,6 +31,7 @@ from services.estimator.precise.settings import Settings
 
 SIGMA = 0.02  # m, the noise of a scanner that states none
 LEAST_SIGMA = 1e-3  # m, of one that states less: no surface is known better
+MAP_LEVER = 5.0  # m, typical distance of walls: an error of the map there turns the pose by error / distance
 Name = Literal["precise", "paper", "particle-filter", "amcl-defaults"]
 
 
@@ -136,6 +137,9 @@ def _precise(choice: Choice, world: World) -> Factory:
     model, places, card = generative_model(choice, world)
     calibration = card.calibration if card else None
     settings = calibration.settings() if calibration else Settings(inflation=card.inflation if card else 1.0)
+    if not calibration and (error := map_error(world)):
+        # Neighbouring cells err alike: their error averages out neither over beams nor over scans.
+        settings = replace(settings, floor_position=error, floor_heading=error / MAP_LEVER)
     seeds, bounds = Seeds.at(model, places), (card.world if card else world).bounds
     _compile(model, seeds, Likelihood())
 

@@ -54,9 +54,17 @@ class GenerativeModel(Protocol):
         ...
 
 
+def map_error(world: World) -> float:
+    """Standard deviation, m, of real surfaces from where the world has them: half a cell of a ROS map, else 0.
+
+    The surface lies anywhere in the cell, and a mapping has rounded its poses and walls besides.
+    """
+    return 0.0 if world.grid is None else 0.5 * world.grid.resolution
+
+
 @dataclass(frozen=True)
 class RayCaster:
-    """The world itself: the limit of any learning."""
+    """The world itself: the limit of any learning. The cells of a ROS map are known to half a cell."""
 
     world: World
     ripple: float = 0.0
@@ -73,7 +81,7 @@ class RayCaster:
             first = grid.to_map(np.array([-size, -size]))  # rays have a frame of empty cells around the map
             frame = np.array([*first, grid.origin[2], size])
             cell_kernels.cast_cells(rays.occupied, rays.clear, frame, lasers, angles, ranges, jacobian)
-        return Expected(ranges, np.full(shape, EXACT_SCALE), jacobian)
+        return Expected(ranges, np.full(shape, max(EXACT_SCALE, map_error(world))), jacobian)
 
 
 @dataclass(frozen=True)

@@ -73,3 +73,31 @@ def test_the_robot_finds_itself_on_a_map(hall):
         ranges = SCANNER.limit(exact + 0.02 * rng.standard_normal(len(exact)))
         found = make(geometry).update(Observation(ranges, geometry.angles, geometry.range_max))
         assert np.hypot(*(found.pose[:2] - place)) < 0.02
+
+
+def test_stated_deviation_covers_the_error_of_the_cells():
+    """A slanted room, mapped in cells of 5 cm: its walls are off by up to a cell, the same at every scan."""
+    corners = se2.rotate(0.3, np.array([(0.0, 0), (7, 0), (7, 5), (4, 5), (4, 3.5), (0, 3.5)]))
+    room = World(name="room", boundary=corners.tolist())
+    edges = np.roll(corners, -1, axis=0) - corners
+    walls = np.concatenate([a + np.linspace(0, 1, 2000)[:, None] * ab for a, ab in zip(corners, edges, strict=True)])
+    first = walls.min(axis=0) - 0.2
+    column, row = np.floor((walls - first) / 0.05).astype(int).T
+    values = np.full((row.max() + 4, column.max() + 4), FREE, np.uint8)
+    values[row, column] = OCCUPIED
+    mapped = World(name="mapped", grid=OccupancyGrid.of(values, 0.05, (float(first[0]), float(first[1]), 0.0)))
+    rng, geometry = np.random.default_rng(4), Geometry(SCANNER.angles(), np.array(SCANNER.mount), SCANNER.range_max)
+    make, misfits = prepare(Choice(world=mapped, model="exact")), []
+    for place in room.sample_free(4, rng, 0.5):
+        pose = np.array([*place, rng.uniform(-np.pi, np.pi)])
+        estimator = make(geometry)
+        estimator.restart(pose, np.diag([0.01, 0.01, 0.01]))
+        exact = room.ray_distances(se2.compose(pose, geometry.mount), geometry.angles)[0]
+        for k in range(20):
+            ranges = SCANNER.limit(exact + 0.02 * rng.standard_normal(len(exact)))
+            found = estimator.update(Observation(ranges, geometry.angles, geometry.range_max, k / 15, np.zeros(3)))
+        assert found.state == "tracking"
+        off = found.pose - pose
+        off[2] = se2.wrap(off[2])
+        misfits.append(off @ np.linalg.solve(found.covariance, off))
+    assert np.mean(misfits) < 6  # three degrees of freedom; scanner noise alone would make it hundreds

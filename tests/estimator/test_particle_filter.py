@@ -107,7 +107,7 @@ def test_standing_still_is_millimetres():
 
 def test_kidnapped_is_noticed_and_recovered():
     rng, first, second = np.random.default_rng(5), np.array([1.0, 1.0, 0.3]), np.array([5.0, 1.2, 2.0])
-    found = make(5)
+    found = make(5, dataclasses.replace(SMALL, keep_initial_pose=False))
     found.restart(first, CERTAIN)
     assert [found.update(observe(first, rng)).state for _ in range(15)][-1] == "tracking"
     after = [found.update(observe(second, rng)) for _ in range(40)]
@@ -118,7 +118,7 @@ def test_kidnapped_is_noticed_and_recovered():
 
 def test_without_recovery_a_kidnapped_filter_stays_lost():
     """The strangers are what finds it: the test above would pass for another reason otherwise."""
-    settings = dataclasses.replace(SMALL, recovery_alpha_slow=0.0, recovery_alpha_fast=0.0)
+    settings = dataclasses.replace(SMALL, recovery_alpha_slow=0.0, recovery_alpha_fast=0.0, keep_initial_pose=False)
     rng, first, second = np.random.default_rng(5), np.array([1.0, 1.0, 0.3]), np.array([5.0, 1.2, 2.0])
     found = make(5, settings)
     found.restart(first, CERTAIN)
@@ -127,6 +127,30 @@ def test_without_recovery_a_kidnapped_filter_stays_lost():
     after = [found.update(observe(second, rng, odom=np.zeros(3))) for _ in range(40)]
     assert after[-1].state == "lost"
     assert errors(after[-1], second)[0] > 0.5
+
+
+def test_initial_pose_is_kept_in_an_unmapped_room():
+    """Scans that fit nowhere must not make the filter search: odometry still says where the robot is."""
+    unmapped = World(name="unmapped", boundary=[(0, 0), (6, 0), (6, 2.4), (0, 2.4)])
+    odom, path = np.random.default_rng(12), drive(60)
+    found = make(12)
+    found.restart(path[0], CERTAIN)
+    worst = 0.0
+    for i, pose in enumerate(path):
+        seen = observe(pose, odom, ROOM if i < 20 else unmapped, stamp=i / 15, odom=pose)
+        worst = max(worst, errors(found.update(seen), pose)[0])
+    assert worst < 0.5
+
+
+@pytest.mark.parametrize("period", [1 / 15, 1.0])
+def test_scanner_rate_does_not_spread_the_particles(period):
+    """A robot that stands, with odometry that says so, stays where it is however slowly scans come."""
+    rng, truth = np.random.default_rng(13), np.array([3.0, 1.5, 0.4])
+    found = make(13)
+    found.restart(truth, CERTAIN)
+    seen = [found.update(observe(truth, rng, stamp=i * period, odom=np.zeros(3))) for i in range(15)]
+    assert max(errors(p, truth)[0] for p in seen) < 0.1
+    assert {p.state for p in seen[10:]} == {"tracking"}
 
 
 def test_two_identical_places_are_both_kept():

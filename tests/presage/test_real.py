@@ -11,14 +11,15 @@ from rich.console import Console
 
 from common import se2
 from common.errors import UserError
-from common.world import World, save_world
-from presage.experiments import page, real
-from presage.experiments.real_drive import KIDNAPPED, LASER, LIMIT, Job, drive_at, second_first, unaware
+from common.world import World, load_world, save_world
+from presage.experiments import page, real, real_tuning
+from presage.experiments.real_drive import KIDNAPPED, LASER, LIMIT, Job, drive_at, entered, second_first, unaware
 from presage.experiments.real_drive import trial as one_trial
 from presage.experiments.real_tuning import starting_point
 from presage.logs.log import Reading
 from presage.train_drive import Job as Training
 from presage.train_drive import split, train_from_drive
+from services.estimator.particle_filter import Settings as ParticleSettings
 from services.estimator.precise import weights
 from services.estimator.precise.learning import Recipe
 from services.estimator.precise.motion import MotionNoise
@@ -65,7 +66,9 @@ def test_a_robot_that_is_carried_off_finds_itself(folder, estimator):
     job = Job(
         str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), estimator, KIDNAPPED, 100, to=155,
         model=str(folder / "before-precise.safetensors"),
-        particles=(*starting_point(MotionNoise()), ("max_particles", 4000), ("min_particles", 500)),
+        particles=(
+            *starting_point(MotionNoise()), ("keep_initial_pose", 0.0), ("max_particles", 4000), ("min_particles", 500),
+        ),
     )  # fmt: skip
     row = one_trial(job)
     assert len(row["error_m"]) == 10 + min(LIMIT, 45)
@@ -75,6 +78,35 @@ def test_a_robot_that_is_carried_off_finds_itself(folder, estimator):
     if estimator == "precise":
         assert found["error_median_m"] < 0.06
         assert found["wrong_claim_longest_s"] <= 2
+
+
+def test_tuning_uses_the_second_quarter_in_a_map_of_the_first(folder, tmp_path, monkeypatch):
+    """What is evaluated later must not decide the settings, and the map must lack rooms as it does later."""
+    tried = []
+
+    def fake(job):
+        tried.append(job)
+        error = [0.1 if dict(job.particles).get("keep_initial_pose", 1.0) else 9.0] * 20
+        return {"task": job.task, "error_m": error, "state": ["tracking"] * 20}
+
+    monkeypatch.setattr(real_tuning, "trial", fake)
+    job = Job(str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "particle-filter", LASER, 0)
+    tuned = real_tuning.tune(job, 100, starting_point(MotionNoise()), tmp_path, lambda *_: None)
+    assert dict(tuned.tracking).get("keep_initial_pose", 1.0) == 1.0  # recovery was tried, and lost
+    assert dict(tuned.finding)["keep_initial_pose"] == 0.0
+    assert any(dict(each.particles).get("keep_initial_pose") == 0.0 for each in tried if each.task == LASER)
+    for each in tried:
+        assert each.first >= 50
+        assert max(each.first + each.count, each.to + LIMIT * (each.task == KIDNAPPED)) <= 100
+    mapped = load_world(tried[0].map)
+    poses = job.drive.poses[:50, :2]
+    assert mapped.grid is not None
+    assert (mapped.clearance(poses) > 0).mean() > 0.9
+
+
+def test_amcl_follows_a_base_that_moves_sideways(folder):
+    job = Job(str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "amcl-defaults", LASER, 100)
+    assert entered(job).settings == ParticleSettings(robot_model_type="omni")
 
 
 def test_odometry_does_not_tell_of_being_carried_off():

@@ -77,7 +77,10 @@ class ParticleFilter:
         self._state: State = "localising"
         self._was_found, self._searches = False, 0
         self._scans = 0
-        self._sigma = self.sensor.widest
+        # A pose that was given is kept: nothing is searched, and no particles are drawn elsewhere.
+        self._recovers = s.recovery_alpha_fast > 0 and (pose is None or not s.keep_initial_pose)
+        self._searching = pose is None and self.sensor.widest > s.sigma_hit
+        self._sigma = self.sensor.widest if self._searching else s.sigma_hit
         self._last: Observation | None = None
         self._speed = np.zeros(2)  # m/s, rad/s recently commanded
 
@@ -85,16 +88,16 @@ class ParticleFilter:
         """The posterior after one more scan."""
         self._predict(observation)
         self._anneal()
-        sigma = self._sigma
-        if self.settings.sigma_odometry and observation.odom is not None and sigma <= 1.01 * self.settings.sigma_hit:
-            sigma = self.settings.sigma_odometry  # the particles lie close enough
-        log_weights = self.sensor.weigh(se2.compose(self.particles, self.mount), observation, sigma)
+        s, sigma, beams = self.settings, self._sigma, self.settings.max_beams
+        share = s.search_share if self._searching else 0.0
+        if s.sigma_odometry and observation.odom is not None and sigma <= 1.01 * s.sigma_hit:
+            sigma, beams, share = s.sigma_odometry, None, s.odometry_share  # the particles are few and close together
+        log_weights = self.sensor.weigh(se2.compose(self.particles, self.mount), observation, sigma, beams)
         log_weights += np.log(np.maximum(self.weights, 1e-300))
-        searching = self._sigma > self.settings.sigma_hit
-        self.weights = resampling.tempered(log_weights, self.settings.search_share if searching else 0.0)
+        self.weights = resampling.tempered(log_weights, share)
         posterior = self._posterior(observation, hypotheses(self.particles, self.weights))
         self._scans += 1
-        if self._scans % self.settings.resample_interval == 0:
+        if self._scans % s.resample_interval == 0:
             self._resample()
         self._last = observation
         return posterior
@@ -121,9 +124,12 @@ class ParticleFilter:
         alphas = (s.alpha1, s.alpha2, s.alpha3, s.alpha4, s.alpha5)
         model = motion.omni if s.robot_model_type == "omni" else motion.differential
         walk = np.array([s.jitter_position, s.jitter_heading]) * dt / NOMINAL_DT
-        # While searching a particle stands for its surroundings: it must be able to come nearer.
-        search = (self._sigma - s.sigma_hit) / max(self.sensor.widest - s.sigma_hit, 1e-9)
-        position, heading = np.maximum((s.floor_position, s.floor_heading), search * walk)
+        # While searching a particle stands for its surroundings: it must be able to come nearer. How far its neighbours
+        # are does not depend on the time between scans.
+        search = self._searching * (self._sigma - s.sigma_hit) / max(self.sensor.widest - s.sigma_hit, 1e-9)
+        position, heading = np.maximum(
+            (s.floor_position, s.floor_heading), (search * s.jitter_position, search * s.jitter_heading)
+        )
         moved = self.particles
         if now.odom is not None and last.odom is not None:
             moved = model(moved, se2.between(last.odom, now.odom), alphas, self._rng)
@@ -147,19 +153,21 @@ class ParticleFilter:
 
     def _anneal(self) -> None:
         """Sigma of a hit follows the spread of the particles; a search that found nothing begins again."""
-        if self._state == "lost" and self._sigma <= self.settings.sigma_hit and self._health.ratio < LOST:
-            self._sigma = self.sensor.widest
+        if self._recovers and self._state == "lost" and not self._searching and self._health.ratio < LOST:
+            self._searching, self._sigma = True, self.sensor.widest
             self._searches += 1
             return
         off = self.particles[:, :2] - np.median(self.particles[:, :2], axis=0)
         spread = float(np.median(np.hypot(off[:, 0], off[:, 1])))
         self._sigma = self.sensor.sigma(spread, self._sigma)
+        self._searching &= self._sigma > self.settings.sigma_hit
 
     def _judge(self, found: tuple[Hypothesis, ...]) -> State:
         tight = [h.covariance is not None and np.sqrt(np.trace(h.covariance[:2, :2])) < TIGHT for h in found]
-        settled = found[0].weight > SURE and tight[0] and self._sigma < 1.5 * self.settings.sigma_hit
+        sharp = not self._searching or self._sigma < 1.5 * self.settings.sigma_hit
+        settled = found[0].weight > SURE and tight[0] and sharp
         if self._was_found and self._health.ratio < (FOUND if self._state == "lost" else LOST):
-            if self._searches <= SEARCHES or not settled or self.settings.recovery_alpha_fast == 0:
+            if self._searches <= SEARCHES or not settled or not self._recovers:
                 return "lost"
             self._health.accept()
             self._recovery.accept()
@@ -193,7 +201,7 @@ class ParticleFilter:
     def _resample(self) -> None:
         """As many particles as the belief needs, a share of them anywhere when scans have stopped to fit."""
         s, rng = self.settings, self._rng
-        share = self._recovery.random_share
+        share = self._recovery.random_share if self._recovers else 0.0
         at = resampling.bins(self.particles)
         trial = self._most_needed(len(np.unique(at)), share)
         drawn = at[rng.permutation(resampling.low_variance(self.weights, trial, rng))]

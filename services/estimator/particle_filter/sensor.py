@@ -48,9 +48,12 @@ class Sensor:
         wanted = float(np.clip(SIGMA_PER_SPREAD * spread, self.settings.sigma_hit, self.widest))
         return max(wanted, SLOWEST * before) if before > self.settings.sigma_hit else wanted
 
-    def weigh(self, poses: Array, observation: Observation, sigma: float) -> Array:
-        """(N,) log weights of scanner poses (N, 3) in map; ``sigma`` m of a hit, but the beam model keeps its own."""
-        used, ranges, angles = self._beams(observation, self.settings.max_beams)
+    def weigh(self, poses: Array, observation: Observation, sigma: float, beams: int | None) -> Array:
+        """(N,) log weights of scanner poses (N, 3) in map, by at most ``beams`` beams, or all.
+
+        ``sigma`` m of a hit, but the beam model keeps its own.
+        """
+        used, ranges, angles = self._beams(observation, beams)
         kind = self.settings.laser_model_type
         if kind == "beam" and self._table is not None:
             expected = self._table.ranges(poses, observation.angles[used])

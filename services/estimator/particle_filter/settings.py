@@ -40,11 +40,13 @@ class Settings:
     pf_z: float = 0.99  # quantile of the standard normal; nav2 hands this number to the formula as it is
     recovery_alpha_slow: float = 0.0  # 0: no random particles
     recovery_alpha_fast: float = 0.0
+    keep_initial_pose: bool = True  # a pose that was given is never given up for a search: no recovery
     resample_interval: int = 1  # scans
     resolution: float = 0.05  # m, cells of the likelihood field and of the beam model's table
     sigma_search: float = 0.0  # m, replaces sigma_hit while the particles are spread; 0: never
-    sigma_odometry: float = 0.0  # m, replaces sigma_hit once found while odometry tells of motion; 0: never
+    sigma_odometry: float = 0.0  # m, with all beams, replaces sigma_hit once found while there is odometry; 0: never
     search_share: float = 0.0  # of the particles keep weight while sigma is wide, by tempering; 0: none need to
+    odometry_share: float = 0.0  # the same while sigma_odometry holds: a single particle would have no covariance
     jitter_position: float = 0.05  # m in 1/15 s, random walk where neither odometry nor command is known
     jitter_heading: float = 0.05  # rad in 1/15 s
     walk_share: float = 1.0  # of the particles take that walk, the others stay: a robot that stands is found exactly
@@ -70,11 +72,6 @@ class Settings:
     def tuned(cls) -> Settings:
         """What finds and holds a pose by laser alone: the best AMCL is known to do, and more particles to search."""
         return cls(
-            alpha1=0.02,
-            alpha2=0.02,
-            alpha3=0.02,
-            alpha4=0.02,
-            alpha5=0.02,
             robot_model_type="omni",
             laser_model_type="likelihood_field_prob",
             z_hit=0.95,
@@ -84,6 +81,7 @@ class Settings:
             sigma_odometry=0.05,
             sigma_search=0.5,
             search_share=0.05,
+            odometry_share=0.005,
             min_particles=2000,
             max_particles=20_000,
             walk_share=0.95,
