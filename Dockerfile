@@ -18,6 +18,7 @@ COPY pyproject.toml README.md ./
 COPY common common
 COPY services services
 COPY presage presage
+COPY lab lab
 COPY worlds worlds
 COPY models models
 RUN pip install --no-cache-dir --no-deps --target /app .
@@ -26,13 +27,13 @@ FROM base AS router
 COPY --from=program /app /app
 WORKDIR /tmp
 USER presage
-HEALTHCHECK --interval=10s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "router"]
+HEALTHCHECK --interval=10s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "router"]
 CMD ["python", "-m", "common.router", "--listen", "tcp/0.0.0.0:7447"]
 
 # Where the robot is elsewhere: waits for its scans.
 FROM router AS none
-HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "remote"]
-CMD ["python", "-m", "common.fleet", "each", "common.remote"]
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "remote"]
+CMD ["python", "-m", "common.containers.run_per_robot", "each", "common.containers.remote_robot"]
 
 # A robot in ROS 2 in the simulator's place.
 FROM base AS bridge_ros2
@@ -40,8 +41,8 @@ RUN python install.py bridge_ros2
 COPY --from=program /app /app
 WORKDIR /tmp
 USER presage
-HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "bridge_ros2"]
-CMD ["python", "-m", "common.fleet", "each", "services.bridge_ros2"]
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "bridge_ros2"]
+CMD ["python", "-m", "common.containers.run_per_robot", "each", "services.bridge_ros2"]
 
 FROM base AS recorder-packages
 RUN python install.py recorder
@@ -50,13 +51,13 @@ FROM recorder-packages AS recorder
 COPY --from=program /app /app
 WORKDIR /tmp
 USER presage
-HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "recorder"]
-CMD ["python", "-m", "common.fleet", "each", "services.recorder", "--directory", "/recordings"]
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "recorder"]
+CMD ["python", "-m", "common.containers.run_per_robot", "each", "services.recorder", "--directory", "/recordings"]
 
 # A recording in the scanner's place.
 FROM recorder AS replay
-HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "replay"]
-CMD ["python", "-m", "common.fleet", "each", "services.recorder.playing", "--directory", "/recordings"]
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "replay"]
+CMD ["python", "-m", "common.containers.run_per_robot", "each", "services.recorder.replaying.service", "--directory", "/recordings"]
 
 FROM recorder-packages AS terminal-packages
 RUN python install.py terminal
@@ -67,8 +68,8 @@ RUN python install.py viewer
 COPY --from=program /app /app
 WORKDIR /tmp
 USER presage
-HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "viewer"]
-CMD ["python", "-m", "common.fleet", "together", "services.viewer", "--host", "0.0.0.0", "--port", "8080", \
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "viewer"]
+CMD ["python", "-m", "common.containers.run_per_robot", "together", "services.viewer", "--host", "0.0.0.0", "--port", "8080", \
      "--allow-control", "--recordings", "/recordings"]
 
 FROM terminal-packages AS cli
@@ -85,16 +86,16 @@ FROM controller-packages AS controller
 COPY --from=program /app /app
 WORKDIR /tmp
 USER presage
-HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "controller"]
-CMD ["python", "-m", "common.fleet", "each", "services.controller"]
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "controller"]
+CMD ["python", "-m", "common.containers.run_per_robot", "each", "services.controller"]
 
 FROM controller-packages AS simulator
 RUN python install.py simulator
 COPY --from=program /app /app
 WORKDIR /tmp
 USER presage
-HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "simulator"]
-CMD ["python", "-m", "common.fleet", "each", "services.simulator"]
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "simulator"]
+CMD ["python", "-m", "common.containers.run_per_robot", "each", "services.simulator"]
 
 FROM base AS estimator
 ARG WHEEL_INDEX=""
@@ -103,9 +104,9 @@ COPY --from=program /app /app
 # The compiled loops are kept in the image; on another processor they are compiled again. Numba insists on a folder it
 # can write to: each container takes a copy.
 RUN NUMBA_CACHE_DIR=/numba python -c \
-    'from services.estimator.building import *; [prepare(Choice(model=m)) for m in ("learned", "exact")]'
+    'from services.estimator.factory import *; [prepare(Choice(model=m)) for m in ("learned", "exact")]'
 ENV NUMBA_CACHE_DIR=/tmp/numba
 WORKDIR /tmp
 USER presage
-HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.healthy", "estimator"]
-CMD ["sh", "-c", "cp -r /numba /tmp && exec python -m common.fleet together services.estimator"]
+HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "estimator"]
+CMD ["sh", "-c", "cp -r /numba /tmp && exec python -m common.containers.run_per_robot together services.estimator"]

@@ -60,7 +60,7 @@ demo: install ## localise and drive in the corridor: every service, a live page,
 
 test: install ## all tests, the fast ones first
 	@# Hundreds of processes are started: each would compile all modules anew where Python is told to write none (PYTHONDONTWRITEBYTECODE).
-	@$(BIN)/python -m compileall -q common services presage worlds models tests
+	@$(BIN)/python -m compileall -q common services presage lab worlds models tests
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 bless: install ## show what services answer differently than their references, and accept it
@@ -91,4 +91,4 @@ images: ## build every container image, and say what each adds to its base, pyth
 
 clean: ## remove .venv and what tools leave behind; recordings stay
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist
-	find common services presage tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find common services presage lab tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,4 +1,4 @@
-"""Errors a user can mend: one line that says what was wrong, where, and what to do."""
+"""UserError, an error with a one-line message that says what was wrong, where, and what to do."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Log lines, to stderr, readable or as JSON; zenoh's own complaints included."""
+"""Logging to stderr, as text or as JSON lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What native code writes to stdout and stderr (zenoh's own log, pybullet), line by line to a function instead."""
+"""Redirects what native code (zenoh, pybullet) prints into the log."""
 
 from __future__ import annotations
 

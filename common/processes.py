@@ -1,4 +1,4 @@
-"""Children that do not outlive their parent."""
+"""Child processes that end when their parent ends."""
 
 from __future__ import annotations
 

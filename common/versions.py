@@ -1,4 +1,4 @@
-"""What runs here: package versions and the commit of a checkout."""
+"""Package versions, the protocol version, and the commit of a checkout."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ import sys
 def main() -> None:
     """Entry point."""
     try:
-        from presage.cli import main as run  # noqa: PLC0415
+        from presage.cli.main import main as run  # noqa: PLC0415
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)

@@ -15,8 +15,8 @@ import hypothesis
 import psutil
 import pytest
 
-from common.bus import Link, open_bus, wait_until
-from common.inbox import Sample
+from common.bus.bus import Link, open_bus, wait_until
+from common.bus.inbox import Sample
 from tests.fork_server import Child, ForkServer, die_with
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -21,7 +21,7 @@ import time
 from pathlib import Path
 
 PRELOADED = (
-    "common.router", "presage.cli", "services.controller.service", "services.estimator.service",
+    "common.router", "presage.cli.main", "services.controller.service", "services.estimator.service",
     "services.recorder.service", "services.simulator.service", "services.viewer.service",
 )  # fmt: skip
 OURS = {"common", "presage", "services", "worlds", "models"}

@@ -1,4 +1,4 @@
-"""CARMEN logs, also compressed: scans of one laser, odometry, true poses; read line by line."""
+"""CARMEN logs."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from typing import BinaryIO
 
 import numpy as np
 
-from common import se2
 from common.errors import UserError
-from common.ranges import as_scan
-from common.se2 import Array
+from common.geometry import se2
+from common.geometry.se2 import Array
+from common.robot.ranges import as_scan
 from presage.logs.carmen_lines import WORD, LaserLine, is_laser, laser_line, pose_line
 from presage.logs.log import Log, LoggedScan, Reading
 from presage.logs.poses import Track

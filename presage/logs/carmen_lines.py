@@ -1,4 +1,4 @@
-"""Lines of a CARMEN log: words to numbers. The format: the header that CARMEN's logger writes into each log.
+"""One line of a CARMEN log.
 
     FLASER n [ranges] laser_x laser_y laser_theta odom_x odom_y odom_theta TIMES        (also RLASER, LASER3 ...)
     ROBOTLASER1 HEADER n [ranges] m [remissions] laser pose, robot pose, tv rv forward side turn_axis TIMES
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.se2 import Array
+from common.geometry.se2 import Array
 
 OLD = re.compile(r"(FLASER|RLASER|LASER\d)$")
 ROBOT, RAW = re.compile(r"ROBOTLASER\d$"), re.compile(r"RAWLASER\d$")

@@ -1,4 +1,4 @@
-"""The tree of frames of a ROS log: where the laser sits on the base, and where the base went."""
+"""The tf tree of a ROS bag over time."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from common import se2
 from common.errors import UserError
-from common.ros_messages import IDENTITY, Mount, Transform, mount_of
-from common.se2 import Array
+from common.geometry import se2
+from common.geometry.se2 import Array
+from common.messages.ros_messages import IDENTITY, Mount, Transform, mount_of
 from presage.logs.poses import Track
 
 MOVED = 0.01  # m and rad, by which what is bolted on does not move

@@ -1,4 +1,4 @@
-"""`presage import`: a log of another program as an ordinary recording, written while it is read."""
+"""`presage import`: a log as a recording."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ import numpy as np
 from pydantic import ValidationError
 from rich.console import Console
 
-from common import se2
 from common.errors import UserError
-from common.messages import Odom, Pose, Scan, Stamped, Truth, Twist
-from common.requests import WorldReply
-from common.scanner import Scanner
-from common.se2 import Array
-from common.topics import ODOM, SCAN, TRUTH, Topic
+from common.geometry import se2
+from common.geometry.se2 import Array
+from common.geometry.world import World, load_world
+from common.messages.definitions import Odom, Pose, Scan, Stamped, Truth, Twist
+from common.messages.requests import WorldReply
+from common.messages.topics import ODOM, SCAN, TRUTH, Topic
+from common.robot.scanner import Scanner
 from common.versions import commit, versions
-from common.world import World, load_world
 from presage.logs.log import Log, LoggedScan, Reading
 from presage.logs.opening import RECORDING, kind_of, open_log
-from presage.output import check_file, write_json
-from presage.progress import progress, working
-from services.estimator.building import SIGMA
-from services.recorder.accounting import Ledger, as_metadata
+from presage.terminal.output import check_file, write_json
+from presage.terminal.progress import progress, working
+from services.estimator.factory import SIGMA
+from services.recorder.files.message_counts import Ledger, as_metadata
+from services.recorder.files.writer import RecordingWriter
 from services.recorder.recording import write_answer
-from services.recorder.writer import RecordingWriter
 
 EVEN = 1e-4  # rad, by which a beam may lie beside its place
 HEAD = 50  # scans by which the rate is known

@@ -1,4 +1,4 @@
-"""What a log gives, whatever its format: one scanner's geometry, and its scans one by one with poses beside them."""
+"""A log: scanner geometry, and scans with odometry and reference poses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from common.errors import UserError
-from common.se2 import Array
+from common.geometry.se2 import Array
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class LoggedScan:
     """One scan of a log."""
 
     stamp_ns: int | None  # None: the log has no times
-    ranges: Array  # (B,) m, as `common.ranges.as_scan` has them
+    ranges: Array  # (B,) m, as `common.robot.ranges.as_scan` has them
     odom: Array | None = None  # (3,) base_link in odom at the stamp
     reference: Array | None = None  # (3,) base_link in map
 

@@ -1,4 +1,4 @@
-"""Arrays in an .npz: ranges, angles, range_max, and what else there is."""
+"""Arrays in an .npz file."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from common.errors import UserError
-from common.ranges import as_scan
-from common.se2 import Array
+from common.geometry.se2 import Array
+from common.robot.ranges import as_scan
 from presage.logs.log import Log, LoggedScan, Reading
 
 NAMES = {"ranges", "angles", "range_max", "stamps", "odom", "initial_pose", "reference"}

@@ -1,4 +1,4 @@
-"""Which format a file has, by its content; and what reads it."""
+"""Recognises the format from the content."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from presage.logs.carmen import BROKEN, open_carmen, unpacked
 from presage.logs.carmen_lines import is_laser
 from presage.logs.log import Log, Reading
 from presage.logs.npz import open_npz
-from services.recorder.chunks import MAGIC as MCAP
+from services.recorder.files.chunks import MAGIC as MCAP
+from services.recorder.files.writer import PROFILE
 from services.recorder.reader import read_recording
-from services.recorder.writer import PROFILE
 
 Kind = Literal["recording", "npz", "carmen", "ros1", "ros2"]
 KNOWN = "a presage recording, a CARMEN log, a ROS 1 or 2 bag, or an .npz of scans"

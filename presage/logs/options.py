@@ -1,4 +1,4 @@
-"""What a command line says about a log, from words to numbers."""
+"""Command-line options that describe a log."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 import numpy as np
 
 from common.errors import UserError
-from common.pose_text import NUMBER, pose_of_text
+from common.geometry.pose_text import NUMBER, pose_of_text
 from presage.logs.log import Reading
 
 

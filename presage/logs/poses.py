@@ -1,4 +1,4 @@
-"""Poses over time, looked up between two of them."""
+"""Interpolates poses over time."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from array import array
 import numpy as np
 import numpy.typing as npt
 
-from common import se2
-from common.se2 import Array
+from common.geometry import se2
+from common.geometry.se2 import Array
 
 GAP_NS = 1_000_000_000  # further apart than this two poses say nothing of what lies between
 

@@ -1,19 +1,19 @@
-"""Scans whose beams come and go, as an RPLIDAR's: each brought to the angles of the log's first, by a stated rule."""
+"""Resamples scans whose number of beams changes."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from common.ranges import NOT_MEASURED, surfaces
-from common.se2 import Array, wrap
+from common.geometry.se2 import Array, wrap
+from common.robot.ranges import NOT_MEASURED, surfaces
 
 SAME = 1e-4  # rad, by which a beam may be off and is the same
-COARSEST = 4.0  # times the first scan's spacing, as in services/estimator/fitting.py
+COARSEST = 4.0  # times the first scan's spacing, as in services/estimator/paper/beam_fitting.py
 ONE_SURFACE = 0.1  # of the nearer range, by which two neighbours differ at most
 
 
 def resampled(ranges: Array, angles: Array, wanted: Array) -> Array | None:
-    """(B,) m at ``wanted`` (B,) rad, of a scan (S,) m, as `common.ranges` has it, at ``angles`` (S,) rad, ascending.
+    """Ranges (B,) m at ``wanted`` (B,) rad, from a scan (S,) m at ``angles`` (S,) rad, ascending; see `ranges`.
 
     Between two beams on one surface linearly, else as the nearer of the two says; where none is within the scan's own
     spacing: not measured. None of a scan that cannot stand for it: too coarse, or it looks at less than half of that.

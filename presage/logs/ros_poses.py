@@ -1,4 +1,4 @@
-"""What odometry, tf and pose topics of a ROS log say of the base, looked up at the scans' times."""
+"""Odometry and reference poses in a ROS bag."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Connection
 
-from common import se2
-from common.ros_messages import read_pose, stamp_of
-from common.se2 import Array
+from common.geometry import se2
+from common.geometry.se2 import Array
+from common.messages.ros_messages import read_pose, stamp_of
 from presage.logs.frame_history import FrameHistory
 from presage.logs.log import Reading
 from presage.logs.poses import Track

@@ -1,4 +1,4 @@
-"""ROS 1 and 2 bags, read with the package rosbags: LaserScan, Odometry, tf, pose topics; no ROS needed."""
+"""ROS 1 and 2 bags."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_typestore
 
 from common.errors import UserError
-from common.ranges import as_scan
-from common.ros_messages import Mount, stamp_of
-from common.se2 import Array
+from common.geometry.se2 import Array
+from common.messages.ros_messages import Mount, stamp_of
+from common.robot.ranges import as_scan
 from presage.logs.frame_history import FrameHistory
 from presage.logs.log import Log, LoggedScan, Reading
 from presage.logs.resampling import resampled

@@ -1,0 +1,1 @@
+"""Connects a robot in ROS 2, without ROS installed."""

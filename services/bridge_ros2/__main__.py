@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from common.service import main
+from common.runtime.service import main
 from services.bridge_ros2.service import BridgeRos2Service
 from services.bridge_ros2.settings import BridgeRos2Settings
 

@@ -1,4 +1,4 @@
-"""tf and odometry: where the scanner sits on the robot, and where the odometry had the robot at a moment. Pure."""
+"""The tf tree: the scanner's mount, and odometry at a given time."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-from common import se2
-from common.ros_messages import IDENTITY, Transform, read_pose, stamp_of
-from common.se2 import Array
+from common.geometry import se2
+from common.geometry.se2 import Array
+from common.messages.ros_messages import IDENTITY, Transform, read_pose, stamp_of
 
 KEPT = 10.0  # s of odometry
 ANEW = 1.0  # s; no network delays by more, so the clock was set back; by less, and it is soon past the old time

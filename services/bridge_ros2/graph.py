@@ -1,4 +1,4 @@
-"""Who is there in the ROS graph, and what that says of messages that do not come. Pure."""
+"""Which nodes and topics exist on the ROS side."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How ROS 2 topics are called on zenoh: by rmw_zenoh, and by zenoh-bridge-ros2dds.
+"""Keys of ROS 2 topics in rmw_zenoh and zenoh-bridge-ros2dds.
 
 rmw_zenoh_cpp (github.com/ros2/rmw_zenoh: docs/design.md, liveliness_utils.cpp, attachment_helpers.cpp): data on
  ``<domain>/<topic>/<type>/<hash>``; for each node, publisher and subscription a liveliness token, from which every

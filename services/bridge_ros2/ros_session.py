@@ -1,4 +1,4 @@
-"""The session on the robot's side: a node of rmw_zenoh, or a client of zenoh-bridge-ros2dds.
+"""The session on the ROS side.
 
 It imports zenoh itself: neither keys nor rules are the bus's there.
 """
@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import zenoh
 import zenoh.ext
 
+from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
-from common.inbox import Inbox, Sample
-from common.topics import Topic
+from common.messages.topics import Topic
 from services.bridge_ros2.keys import TOKENS, Names, Node, Qos, attachment, gid_of, read_attachment
 from services.bridge_ros2.ros_types import encode
 

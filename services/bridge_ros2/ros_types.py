@@ -1,4 +1,4 @@
-"""ROS 2 messages as bytes: CDR, the names and the hashes of types. rosbags computes both; no ROS is needed.
+"""CDR encoding and type hashes of ROS 2 messages.
 
 The types used here have had the same fields in every distribution from Humble on, so one table serves all.
 """

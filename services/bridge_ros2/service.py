@@ -1,4 +1,4 @@
-"""The bridge's thin shell: two zenoh sessions, what comes from either, and what is said where something does not."""
+"""The process: two zenoh sessions."""
 
 from __future__ import annotations
 
@@ -6,21 +6,22 @@ import time
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-from common.inbox import Sample
-from common.messages import Belief, CmdVel, Goal, Stamped
-from common.raster import rasterised
-from common.requests import LocaliseRequest, Reply
-from common.ros_messages import stamp_of
-from common.se2 import Array
-from common.service import Service
-from common.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, ODOM, SCAN, STATUS, Query, Topic
-from common.world import load_world
-from services.bridge_ros2 import outward
-from services.bridge_ros2.complaints import SILENT, complaint
+from common.bus.inbox import Sample
+from common.geometry.rasterize import rasterised
+from common.geometry.se2 import Array
+from common.geometry.world import load_world
+from common.messages.definitions import Belief, CmdVel, Goal, Stamped
+from common.messages.requests import LocaliseRequest, Reply
+from common.messages.ros_messages import stamp_of
+from common.messages.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, ODOM, SCAN, STATUS, Query, Topic
+from common.runtime.service import Service
+from services.bridge_ros2 import to_ros as outward
+from services.bridge_ros2.command_gate import Wheels
+from services.bridge_ros2.diagnostics import SILENT, complaint
+from services.bridge_ros2.from_ros import dead_of, odom_of, pose_of, scan_of
 from services.bridge_ros2.graph import Graph
-from services.bridge_ros2.inward import dead_of, odom_of, pose_of, scan_of
 from services.bridge_ros2.keys import KEPT, LATEST, SENSOR, TF, TF_STATIC, Qos
-from services.bridge_ros2.motion import Motion, NoMountError
+from services.bridge_ros2.odometry import Motion, NoMountError
 from services.bridge_ros2.ros_session import RosPublisher, RosSession, open_ros_session
 from services.bridge_ros2.ros_types import (
     LASER_SCAN,
@@ -36,7 +37,6 @@ from services.bridge_ros2.ros_types import (
     decode,
 )  # fmt: skip
 from services.bridge_ros2.settings import BridgeRos2Settings
-from services.bridge_ros2.wheels import Wheels
 
 MAP_AGAIN = 10.0  # s between two messages of the map, for who has missed it; SLAM's nodes say theirs as often
 AGAIN = 1.0  # s between two looks at how things stand, and between two tries to reach the router

@@ -1,4 +1,4 @@
-"""What the bridge to ROS 2 can be told."""
+"""Settings of the bridge."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from common.errors import UserError
-from common.pose_text import POSE_TEXT, pose_of_text
-from common.robot_settings import SeenRobotSettings
-from common.ros_messages import Mount
+from common.geometry.pose_text import POSE_TEXT, pose_of_text
+from common.messages.ros_messages import Mount
+from common.runtime.robot_settings import SeenRobotSettings
 from services.bridge_ros2.keys import NAME, Names, full_name
 
 TOPIC = rf"^$|^{NAME}$"

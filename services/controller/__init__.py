@@ -1,0 +1,1 @@
+"""Beliefs and goals in, velocity commands out."""

@@ -1,6 +1,6 @@
 """`python -m services.controller`."""
 
-from common.service import main
+from common.runtime.service import main
 from services.controller.service import ControllerService
 from services.controller.settings import ControllerSettings
 

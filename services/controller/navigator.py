@@ -1,4 +1,4 @@
-"""From beliefs to commands: the goal, the limits, and what to say about it. No bus, no clock."""
+"""The goal, the limits and the status: from a belief to a command."""
 
 from __future__ import annotations
 
@@ -7,18 +7,19 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from common import safety, se2
-from common.messages import Belief, CmdVel, Drive, Goal, Scan, Status, Twist
-from common.robot import Robot
-from services.controller.action import Preference
-from services.controller.decision import Decision, Preset
-from services.controller.hand import Hand
-from services.controller.motion import moves, turn_rate
-from services.controller.straight import Straight
+from common.geometry import se2
+from common.messages.definitions import Belief, CmdVel, Drive, Goal, Scan, Status, Twist
+from common.robot.base import Robot
+from common.runtime import safety
+from services.controller.manual_drive import Hand
+from services.controller.policies.decision import Decision, Preset
+from services.controller.policies.motion_model import moves, turn_rate
+from services.controller.policies.paper_action import Preference
+from services.controller.policies.straight_line import Straight
 
 if TYPE_CHECKING:
-    from common.se2 import Array
-    from common.world import World
+    from common.geometry.se2 import Array
+    from common.geometry.world import World
 
 BLOCKED_AFTER = 2.0  # s of standing on the way
 

@@ -1,4 +1,4 @@
-"""The controller's thin shell: beliefs and goals in, commands and status out. No torch in this process."""
+"""The process."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from common.messages import Belief, CmdVel, Drive, Goal, Plan, Pose, Scan, Stamped, Status
-from common.messages import Preference as Prior
-from common.requests import PredictReply, PredictRequest, Reply
-from common.service import Service
-from common.topics import BELIEF, CMD_VEL, DRIVE, GOAL, PLAN, PREDICT, PREFERENCE, SCAN, STATUS, Query, Topic
-from common.world import load_world
-from services.controller.action import Preference
+from common.geometry.world import load_world
+from common.messages.definitions import Belief, CmdVel, Drive, Goal, Plan, Pose, Scan, Stamped, Status
+from common.messages.definitions import Preference as Prior
+from common.messages.requests import PredictReply, PredictRequest, Reply
+from common.messages.topics import BELIEF, CMD_VEL, DRIVE, GOAL, PLAN, PREDICT, PREFERENCE, SCAN, STATUS, Query, Topic
+from common.runtime.service import Service
 from services.controller.navigator import Navigator
+from services.controller.policies.paper_action import Preference
 from services.controller.settings import ControllerSettings
 
 if TYPE_CHECKING:
-    from services.controller.geodesic import Field
-    from services.controller.pilot import Pilot
+    from services.controller.policies.geodesic_field import Field
+    from services.controller.policies.planner import Pilot
 
 PREDICTED_BEAMS = 61  # of a scan expected elsewhere
 SHOWN_AGAIN = 5_000_000_000  # ns between two messages of one field
@@ -70,7 +70,7 @@ class ControllerService(Service):
         world = load_world(options.world) if options.world else None
         if options.preset == "geodesic" and world is not None:
             # scipy takes a third of a second to import; preset paper does without.
-            from services.controller.pilot import Pilot  # noqa: PLC0415
+            from services.controller.policies.planner import Pilot  # noqa: PLC0415
 
             self.pilot = Pilot(robot, world, keep_heading=options.heading == "keep", epistemic=options.epistemic)
         preference = Preference(gamma=options.gamma, reach=options.reach)

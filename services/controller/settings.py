@@ -1,4 +1,4 @@
-"""What the controller can be told."""
+"""Settings of the controller."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from common.errors import UserError
-from common.robot_settings import SeenRobotSettings
+from common.runtime.robot_settings import SeenRobotSettings
 
 
 class ControllerSettings(SeenRobotSettings):

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 # Before numpy is there: products as small as these gain nothing from a second thread, which spins while it waits.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from common.service import main
+from common.runtime.service import main
 from services.estimator.settings import EstimatorSettings
 
 if TYPE_CHECKING:
-    from common.service import Service
+    from common.runtime.service import Service
 
 
 def make(settings: EstimatorSettings) -> Service:
     """Torch is imported here, so that --help answers at once."""
     if settings.robots:
-        from services.estimator.fleet_service import FleetService  # noqa: PLC0415
+        from services.estimator.multi_robot_service import FleetService  # noqa: PLC0415
 
         return FleetService(settings)
     from services.estimator.service import EstimatorService  # noqa: PLC0415

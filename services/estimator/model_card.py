@@ -1,4 +1,4 @@
-"""What an estimator was made of, so that a recording can hold it: its map, and its weights with their card."""
+"""Which map and weights an estimator uses, for recordings."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from common.errors import UserError
-from common.requests import ModelReply
-from common.world import World, load_world
-from services.estimator.building import Choice, field_path
-from services.estimator.precise import weights as precise_weights
+from common.geometry.world import World, load_world
+from common.messages.requests import ModelReply
+from services.estimator.factory import Choice, field_path
+from services.estimator.precise.learning import weights as precise_weights
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def model_in_use(choice: Choice, beams: int | None) -> ModelInUse:
         if beams is None:
             raise UserError("no scan has come yet: how many beams, and so which weights, is not known")
         # Torch takes a second to import; the other estimators do without.
-        from services.estimator import weights as paper_weights  # noqa: PLC0415
+        from services.estimator.paper import weights as paper_weights  # noqa: PLC0415
 
         path = paper_weights.nearest(choice.models or paper_weights.FOLDER, world.name, "paper", beams)
         return _learned(choice.estimator, world, path, path.name)

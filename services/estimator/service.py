@@ -1,4 +1,4 @@
-"""The estimator's thin shell: scans in, beliefs and predictions out."""
+"""The process for one robot."""
 
 from __future__ import annotations
 
@@ -7,18 +7,31 @@ from typing import ClassVar
 import numpy as np
 
 from common.errors import UserError
-from common.messages import Belief, CmdVel, Goal, Hypothesis, Odom, Pose, Prediction, Scan, Stamped
-from common.pose_text import pose_of_text
-from common.ranges import about_place
-from common.requests import LocaliseRequest, ModelReply, ModelRequest, PredictRequest, Reply, Request
-from common.service import Service
-from common.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, MODEL, ODOM, PREDICT, PREDICTION, SCAN, STATUS, Query, Topic
-from services.estimator import predicting
-from services.estimator.building import Choice, Factory, Geometry, prepare
-from services.estimator.interface import Estimator, Observation, Posterior
+from common.geometry.pose_text import pose_of_text
+from common.messages.definitions import Belief, CmdVel, Goal, Hypothesis, Odom, Pose, Prediction, Scan, Stamped
+from common.messages.requests import LocaliseRequest, ModelReply, ModelRequest, PredictRequest, Reply, Request
+from common.messages.topics import (
+    BELIEF,
+    CMD_VEL,
+    GOAL,
+    LOCALISE,
+    MODEL,
+    ODOM,
+    PREDICT,
+    PREDICTION,
+    SCAN,
+    STATUS,
+    Query,
+    Topic,
+)
+from common.robot.ranges import about_place
+from common.runtime.service import Service
+from services.estimator import prediction_query as predicting
+from services.estimator.factory import Choice, Factory, Geometry, prepare
 from services.estimator.model_card import ModelInUse, model_in_use
-from services.estimator.perception import Descent
+from services.estimator.paper.perception import Descent
 from services.estimator.settings import EstimatorSettings
+from services.estimator.shared.interface import Estimator, Observation, Posterior
 
 
 def choice_of(settings: EstimatorSettings) -> Choice:

@@ -1,4 +1,4 @@
-"""What the estimator can be told."""
+"""Settings of the estimator."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from common.config import ServiceSettings
-from common.pose_text import POSE_TEXT
+from common.geometry.pose_text import POSE_TEXT
+from common.runtime.config import ServiceSettings
 
 ROBOT_NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 _PATTERN = r"[A-Za-z0-9_.*?-]{1,64}"

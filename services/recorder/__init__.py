@@ -1,0 +1,1 @@
+"""Every message into MCAP, and back onto the bus."""

@@ -1,4 +1,4 @@
-"""Reading a recording: raw payloads or decoded messages, metadata, the world; unfinished files as far as they go."""
+"""Reads recordings, complete or not."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from mcap.stream_reader import StreamReader
 from pydantic import ValidationError
 
 from common.errors import UserError
-from common.messages import Stamped
-from common.robot import Robot
-from common.scanner import Scanner
-from common.topics import Topic, topic_of
-from common.wire import DecodeError
-from common.world import NOT_YAML, World
-from services.recorder.chunks import MAGIC, records_of
-from services.recorder.index import in_order, summary_of
-from services.recorder.writer import PROFILE
+from common.geometry.world import NOT_YAML, World
+from common.messages.definitions import Stamped
+from common.messages.topics import Topic, topic_of
+from common.messages.wire import DecodeError
+from common.robot.base import Robot
+from common.robot.scanner import Scanner
+from services.recorder.files.chunks import MAGIC, records_of
+from services.recorder.files.index import in_order, summary_of
+from services.recorder.files.writer import PROFILE
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""One recording from its first byte to its last: its name, what describes the session, and counters of its own."""
+"""One recording from start to end, with its counters."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from contextlib import nullcontext, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 
-from common.inbox import OTHERS, Inbox, Sample
+from common.bus.inbox import OTHERS, Inbox, Sample
 from common.log import Logger
-from common.requests import RecordReply
-from common.topics import Topic
+from common.messages.requests import RecordReply
+from common.messages.topics import Topic
 from common.versions import versions
-from services.recorder.accounting import Count, Ledger, as_metadata
-from services.recorder.describing import Answer, MetadataRecord, records_of
-from services.recorder.parts import Limits, PartsWriter
+from services.recorder.files.message_counts import Count, Ledger, as_metadata
+from services.recorder.files.parts import Limits, PartsWriter
+from services.recorder.files.writer import UNFINISHED, NameTakenError, RecordingWriter, is_being_written
+from services.recorder.session_description import Answer, MetadataRecord, records_of
 from services.recorder.settings import RecorderSettings
-from services.recorder.writer import UNFINISHED, NameTakenError, RecordingWriter, is_being_written
 
 
 class OpenRecording:

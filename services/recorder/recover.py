@@ -1,4 +1,4 @@
-"""From an unfinished or damaged recording every complete chunk, in a new and whole file; and what is missing."""
+"""Rebuilds a complete file from a damaged or unfinished one."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, Message, Metadata, Schema
 
 from common.errors import UserError
-from services.recorder.accounting import Ledger, as_metadata
-from services.recorder.chunks import MAGIC, PREFIX, mcap_writer, records_of
-from services.recorder.index import summary_of
-from services.recorder.writer import PROFILE, UNFINISHED, claim, is_being_written
+from services.recorder.files.chunks import MAGIC, PREFIX, mcap_writer, records_of
+from services.recorder.files.index import summary_of
+from services.recorder.files.message_counts import Ledger, as_metadata
+from services.recorder.files.writer import PROFILE, UNFINISHED, claim, is_being_written
 
 TORN = ".torn"  # behind the name of what was recovered from
 # All records that may stand before a file's end; each is read whole, so that a damaged length or kind is noticed.

@@ -1,4 +1,4 @@
-"""The recorder's thin shell: whatever is on the bus goes into the file; what describes the session too."""
+"""The process: records all topics."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import time
 from collections import Counter
 from typing import ClassVar
 
+from common.bus.inbox import OTHERS, Sample
 from common.errors import UserError
-from common.inbox import OTHERS, Sample
-from common.requests import RecordReply, RecordRequest, Reply, Request, WorldReply
-from common.service import Service
-from common.topics import RECORDING, TOPICS, WORLD, Query, Topic
-from services.recorder.accounting import MOST
-from services.recorder.describing import Answer, Describer
-from services.recorder.parts import PartsWriter
+from common.messages.requests import RecordReply, RecordRequest, Reply, Request, WorldReply
+from common.messages.topics import RECORDING, TOPICS, WORLD, Query, Topic
+from common.runtime.service import Service
+from services.recorder.files.message_counts import MOST
+from services.recorder.files.parts import PartsWriter
+from services.recorder.files.writer import RecordingWriter
 from services.recorder.recording import OpenRecording, tell_of_unfinished, write_answer
+from services.recorder.session_description import Answer, Describer
 from services.recorder.settings import RecorderSettings
-from services.recorder.writer import RecordingWriter
 
 LINK_WITHIN = 3.0  # s; a recorder may come before the others, but should not wait for nobody in silence
 

@@ -1,4 +1,4 @@
-"""What the recorder can be told."""
+"""Settings of the recorder."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from common.config import ServiceSettings
+from common.runtime.config import ServiceSettings
 
 
 class RecorderSettings(ServiceSettings):

@@ -1,4 +1,4 @@
-"""Dead reckoning that drifts, with the four parameters of the odometry motion model (Thrun et al. 2005, ch. 5.4).
+"""Dead reckoning with drift (Thrun et al. 2005, chapter 5.4).
 
 There the variances are quadratic in one step's motion; here they grow with the distance travelled, so that the drift
 over a metre does not depend on how often the wheels are read.
@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common import se2
-from common.se2 import Array
+from common.geometry import se2
+from common.geometry.se2 import Array
 
 
 @dataclass(frozen=True)

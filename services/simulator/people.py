@@ -1,4 +1,4 @@
-"""Walking people: round bodies that go from one random place to another. No bus, no clock, no physics.
+"""Walking people as moving discs.
 
 The model. A person is a disc that walks a shortest way over free space (`Floor`) at a given speed to a random place,
 then to the next. They see all around, at once, and through walls:
@@ -26,9 +26,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.errors import UserError
-from common.se2 import Array
-from common.world import World
-from services.simulator.floor import Floor, to_segment
+from common.geometry.se2 import Array
+from common.geometry.world import World
+from services.simulator.walkable_grid import Floor, to_segment
 
 RADIUS = 0.25  # m
 KEEP = 0.1  # m between two people

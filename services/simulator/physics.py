@@ -1,4 +1,4 @@
-"""The world and the robot's body in pybullet: shapes, motion with contacts, rays. One client for each `Physics`."""
+"""The world and the robot's body in pybullet: contacts and rays."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 import pybullet
 
-from common import se2
-from common.robot import Robot
-from common.se2 import Array
-from common.world import Obstacle, World
+from common.geometry import se2
+from common.geometry.se2 import Array
+from common.geometry.world import Obstacle, World
+from common.robot.base import Robot
 
 SUBSTEP = 1 / 240  # s
 RADIUS = 0.27  # m, of robot.urdf

@@ -1,4 +1,4 @@
-"""The simulator's thin shell: pace, topics and requests around `Simulation`."""
+"""The process: pace, topics and requests around Simulation."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import ClassVar
 import numpy as np
 
 from common.errors import UserError
-from common.messages import CmdVel, Stamped
-from common.requests import (
+from common.geometry.world import load_world
+from common.messages.definitions import CmdVel, Stamped
+from common.messages.requests import (
     ObstacleRequest,
     PoseRequest,
     Reply,
@@ -21,8 +22,7 @@ from common.requests import (
     SpeedRequest,
     WorldReply,
 )
-from common.service import Service
-from common.topics import (
+from common.messages.topics import (
     CMD_VEL,
     GOAL,
     OBSTACLE,
@@ -41,7 +41,7 @@ from common.topics import (
     Query,
     Topic,
 )
-from common.world import load_world
+from common.runtime.service import Service
 from services.simulator.odometry import Drift
 from services.simulator.settings import SimulatorSettings
 from services.simulator.simulation import Setup, Simulation

@@ -1,4 +1,4 @@
-"""What the simulator can be told."""
+"""Settings of the simulator."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from common.pose_text import POSE_TEXT, pose_of_text
-from common.robot_settings import RobotSettings
-from common.scanner import SCANNERS, Scanner
-from common.scanner_choice import chosen_scanner
+from common.geometry.pose_text import POSE_TEXT, pose_of_text
+from common.robot.scanner import SCANNERS, Scanner
+from common.robot.scanner_options import chosen_scanner
+from common.runtime.robot_settings import RobotSettings
 
 
 class SimulatorSettings(RobotSettings):

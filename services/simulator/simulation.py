@@ -1,4 +1,4 @@
-"""A robot with a scanner in a world: commands in, scans, odometry and truth out. Simulation time, no clock, no bus."""
+"""A robot with a scanner in a world: commands in; scans, odometry and truth out."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import shapely
 
-from common import safety, se2
 from common.errors import UserError
-from common.messages import Odom, Pose, Scan, Truth, Twist
-from common.robot import Robot
-from common.scanner import Scanner
-from common.se2 import Array
-from common.world import Obstacle, World
+from common.geometry import se2
+from common.geometry.se2 import Array
+from common.geometry.world import Obstacle, World
+from common.messages.definitions import Odom, Pose, Scan, Truth, Twist
+from common.robot.base import Robot
+from common.robot.scanner import Scanner
+from common.runtime import safety
 from services.simulator.odometry import Drift, Odometer
 from services.simulator.physics import SUBSTEP, Physics
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from common.service import main
+from common.runtime.service import main
 from services.viewer.settings import ViewerSettings
 
 if TYPE_CHECKING:
-    from common.service import Service
+    from common.runtime.service import Service
 
 
 def make(settings: ViewerSettings) -> Service:

@@ -1,4 +1,4 @@
-"""Who may connect. Headers in, yes or no out."""
+"""Which requests may connect: host, origin, token."""
 
 from __future__ import annotations
 

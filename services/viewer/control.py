@@ -1,4 +1,4 @@
-"""What visitors ask of a robot, done over the bus and answered in words. Blocks: for threads that may wait.
+"""Goals, teleports, obstacles and driving over the bus.
 
 Every action ends in an `Answer`; what cannot be done is said by raising UserError with the reason.
 """
@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from common.bus import Bus, wait_until
+from common.bus.bus import Bus, wait_until
 from common.errors import UserError
-from common.messages import Drive, Goal, Pose, Status, Twist
-from common.requests import (
+from common.messages.definitions import Drive, Goal, Pose, Status, Twist
+from common.messages.requests import (
     LocaliseRequest,
     ObstacleRequest,
     PoseRequest,
@@ -26,7 +26,7 @@ from common.requests import (
     ResetRequest,
     SpeedRequest,
 )
-from common.topics import (
+from common.messages.topics import (
     DRIVE,
     GOAL,
     LOCALISE,
@@ -41,9 +41,9 @@ from common.topics import (
     Query,
     Topic,
 )
-from services.viewer import actions as a
-from services.viewer.pulses import how_to_start
-from services.viewer.roster import Roster
+from services.viewer import visitor_requests as a
+from services.viewer.state.health_rows import how_to_start
+from services.viewer.state.roster import Roster
 
 WITHIN = 3.0  # s, for an answer
 HEADING = 0.15  # rad, of a goal that was given one

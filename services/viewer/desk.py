@@ -1,4 +1,4 @@
-"""What visitors ask, and what they are told unasked: the world, the robots there are, how the recording stands.
+"""Carries out browsers' requests, and sends them the world, robots and recordings.
 
 Runs in the web server's loop; whatever waits for the bus or for a child does so in a thread of the pool.
 """
@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from typing import Any, ParamSpec, TypeVar
 
 from common.errors import UserError
-from common.requests import PlayerReply, PlayerRequest, Request, WorldReply
-from common.topics import PLAYER, WORLD
-from services.viewer import actions as a
+from common.messages.requests import PlayerReply, PlayerRequest, Request, WorldReply
+from common.messages.topics import PLAYER, WORLD
+from services.viewer import visitor_requests as a
 from services.viewer.control import Answer, Control
 from services.viewer.playback import Playback
-from services.viewer.roster import Roster
+from services.viewer.state.roster import Roster
 from services.viewer.visitors import Hub, Visitor
 
 WORLD_PERIOD = 5.0  # s; others may change it too

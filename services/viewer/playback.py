@@ -1,4 +1,4 @@
-"""A recording as a robot of its own: `presage replay` as a child process, which ends with the viewer."""
+"""Opens a recording as a robot of its own."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from common.bus import wait_until
+from common.bus.bus import wait_until
 from common.errors import UserError
 from common.processes import dying_with_us
 

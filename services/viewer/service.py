@@ -1,4 +1,4 @@
-"""The viewer's thin shell: what the bus brings becomes frames, once for all; the web server's thread sends them.
+"""The process: messages in, frames out to the web server's thread.
 
 Two threads meet in the hub: this loop hands it finished bytes, it says which robots are watched. A robot that nobody
 watches costs little: of its messages those are read that the charts' last minute is made of.
@@ -15,22 +15,22 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import ClassVar
 
-from common.bus import DEFAULT_ENDPOINT
-from common.inbox import Sample
-from common.messages import Health, Status
-from common.service import Service
-from common.topics import SCAN, TOPICS, Topic
+from common.bus.bus import DEFAULT_ENDPOINT
+from common.bus.inbox import Sample
+from common.messages.definitions import Health, Status
+from common.messages.topics import SCAN, TOPICS, Topic
+from common.messages.wire import DecodeError
+from common.runtime.service import Service
 from common.versions import versions
-from common.wire import DecodeError
 from services.viewer.control import Control, Sight
 from services.viewer.desk import Desk, Office
 from services.viewer.playback import Playback
-from services.viewer.pulses import Pulses, how_to_start, missing
-from services.viewer.roster import Roster
+from services.viewer.server import WebServer, create_app, link, listen
 from services.viewer.settings import ViewerSettings
-from services.viewer.view import ALWAYS, SHOWN, RobotView
+from services.viewer.state.health_rows import Pulses, how_to_start, missing
+from services.viewer.state.robot_view import ALWAYS, SHOWN, RobotView
+from services.viewer.state.roster import Roster
 from services.viewer.visitors import Hub, Visitor
-from services.viewer.web import WebServer, create_app, link, listen
 
 TICK = 1.0  # s
 SCANNING = 2.0  # s since the last scan

@@ -1,4 +1,4 @@
-"""What the viewer can be told."""
+"""Settings of the viewer."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
-from common.config import ServiceSettings
+from common.runtime.config import ServiceSettings
 
 FIRST_PORT = 8080
 

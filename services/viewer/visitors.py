@@ -1,4 +1,4 @@
-"""Who watches, and what waits to be sent to each: answers in order, news by its newest, of frames the last alone.
+"""Connected browsers and their send queues.
 
 All of it runs in the web server's loop; other threads come in through `Hub.call`. Nobody waits for anybody: a frame is
 offered to all, and whoever has not taken the last one misses it.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.messages import Belief, Hypothesis, Pose
+from common.messages.definitions import Belief, Hypothesis, Pose
 
 
 def belief(state: str = "tracking", *, covariance: bool = True, stamp_ns: int = 2_000_000_000) -> Belief:

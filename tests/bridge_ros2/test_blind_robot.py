@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from common.messages import Scan
-from common.ranges import surfaces
-from common.topics import SCAN
+from common.messages.definitions import Scan
+from common.messages.topics import SCAN
+from common.robot.ranges import surfaces
 from services.bridge_ros2.ros_types import LASER_SCAN, decode
 from services.bridge_ros2.service import BridgeRos2Service
 from services.bridge_ros2.settings import BridgeRos2Settings

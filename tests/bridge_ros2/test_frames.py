@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from common import se2
+from common.geometry import se2
 from services.bridge_ros2.frames import Dead, Odometer
-from services.bridge_ros2.motion import Motion
+from services.bridge_ros2.odometry import Motion
 from services.bridge_ros2.ros_types import TF_MESSAGE, decode
 from tests.bridge_ros2 import independent as other
 

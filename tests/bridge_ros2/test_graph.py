@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from services.bridge_ros2.complaints import complaint
+from services.bridge_ros2.diagnostics import complaint
 from services.bridge_ros2.graph import Graph
 from services.bridge_ros2.keys import Names, Node, Qos
 from services.bridge_ros2.ros_types import LASER_SCAN, OCCUPANCY_GRID, ODOMETRY, TWIST, TWIST_STAMPED, type_hash

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.ros_messages import stamp_of
+from common.messages.ros_messages import stamp_of
 from services.bridge_ros2 import ros_types as r
-from services.bridge_ros2.outward import hypotheses_message, pose_message, transform_message, twist_message
+from services.bridge_ros2.to_ros import hypotheses_message, pose_message, transform_message, twist_message
 from tests.bridge_ros2 import independent as other
 from tests.bridge_ros2.made import belief
 

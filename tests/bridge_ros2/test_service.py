@@ -10,14 +10,14 @@ import pytest
 import zenoh
 import zenoh.ext
 
-from common import se2
-from common.bus import Link, open_bus, wait_until
-from common.inbox import Inbox, Sample
-from common.messages import CmdVel, Goal, Health, Odom, Scan, Twist
-from common.raster import rasterised
-from common.requests import LocaliseRequest, Reply
-from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, LOCALISE, ODOM, SCAN
-from common.world import load_world
+from common.bus.bus import Link, open_bus, wait_until
+from common.bus.inbox import Inbox, Sample
+from common.geometry import se2
+from common.geometry.rasterize import rasterised
+from common.geometry.world import load_world
+from common.messages.definitions import CmdVel, Goal, Health, Odom, Scan, Twist
+from common.messages.requests import LocaliseRequest, Reply
+from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, LOCALISE, ODOM, SCAN
 from tests.bridge_ros2 import independent as other
 from tests.bridge_ros2.made import belief
 from tests.conftest import PATIENCE, Processes

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from common.config import load_settings
 from common.errors import UserError
+from common.runtime.config import load_settings
 from services.bridge_ros2.settings import BridgeRos2Settings
 
 

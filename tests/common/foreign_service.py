@@ -10,7 +10,7 @@ known = common.versions.versions()
 common.versions.PROTOCOL = int(os.environ.get("FOREIGN_PROTOCOL", str(common.versions.PROTOCOL)))
 common.versions.versions = lambda: {**known, "presage": os.environ.get("FOREIGN_PRESAGE", known["presage"])}
 
-from common.service import main  # noqa: E402 - what it takes from versions is set above
+from common.runtime.service import main  # noqa: E402 - what it takes from versions is set above
 from tests.common.small_service import Small, SmallSettings  # noqa: E402
 
 

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from common.messages import Belief, Hypothesis, Preference
-from common.robot import Robot
-from common.scanner import Scanner
-from common.topics import QUERIES, TOPICS
-from common.wire import Binary, Message
-from common.world import Box, Circle, Obstacle, World
+from common.geometry.world import Box, Circle, Obstacle, World
+from common.messages.definitions import Belief, Hypothesis, Preference
+from common.messages.topics import QUERIES, TOPICS
+from common.messages.wire import Binary, Message
+from common.robot.base import Robot
+from common.robot.scanner import Scanner
 
 WORLD = World(
     name="w",

@@ -7,12 +7,12 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from common.config import ServiceSettings
 from common.errors import UserError
-from common.messages import CmdVel, Goal, Pose, Scan
-from common.requests import PoseRequest, Reply
-from common.service import Service, main
-from common.topics import CMD_VEL, GOAL, HEALTH, PREDICT, SCAN, TELEPORT
+from common.messages.definitions import CmdVel, Goal, Pose, Scan
+from common.messages.requests import PoseRequest, Reply
+from common.messages.topics import CMD_VEL, GOAL, HEALTH, PREDICT, SCAN, TELEPORT
+from common.runtime.config import ServiceSettings
+from common.runtime.service import Service, main
 
 
 class SmallSettings(ServiceSettings):

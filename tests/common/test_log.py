@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from common.bus import wait_until
+from common.bus.bus import wait_until
 from common.log_capture import Line, parse_line
-from common.messages import Goal, Pose
-from common.topics import GOAL
-from presage.stack import _text_of
+from common.messages.definitions import Goal, Pose
+from common.messages.topics import GOAL
+from presage.session.stack import _text_of
 from tests.conftest import PATIENCE, ROOT
 
 HEAD = ["time", "level", "service", "robot", "event"]

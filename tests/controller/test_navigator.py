@@ -9,11 +9,11 @@ import sys
 import numpy as np
 import pytest
 
-from common import se2
-from common.messages import Belief, Goal, Pose, Scan
-from common.robot import Robot
-from common.scanner import SCANNERS
-from common.world import World
+from common.geometry import se2
+from common.geometry.world import World
+from common.messages.definitions import Belief, Goal, Pose, Scan
+from common.robot.base import Robot
+from common.robot.scanner import SCANNERS
 from services.controller.navigator import Navigator
 
 ROOM = World(name="room", boundary=[(0, 0), (10, 0), (10, 4), (0, 4)])

@@ -7,14 +7,14 @@ import itertools
 import numpy as np
 import pytest
 
-from common.blind import Blind
-from common.messages import CmdVel, Twist
-from common.robot import Robot
-from common.world import Obstacle, World
-from services.bridge_ros2.wheels import Wheels
-from services.controller.pilot import Pilot
+from common.geometry.world import Obstacle, World
+from common.messages.definitions import CmdVel, Twist
+from common.robot.base import Robot
+from common.robot.self_filter import Blind
+from services.bridge_ros2.command_gate import Wheels
+from services.controller.policies.planner import Pilot
 from services.simulator.simulation import Setup, Simulation
-from tests.controller.test_pilot import SCANNER, drive
+from tests.controller.policies.test_planner import SCANNER, drive
 
 BURGER = Robot(drive="differential", radius=0.105, max_speed=0.22, max_turn=2.84, acceleration=0.5, turn_acceleration=3)
 HEAVY = Robot(drive="differential", radius=0.4, max_speed=0.6, max_turn=0.8, acceleration=0.4, turn_acceleration=0.6)

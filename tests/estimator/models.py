@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from common import se2
-from common.scanner import SCANNERS
-from common.world import World
-from services.estimator.decoder import Normalisation
-from services.estimator.training import Data
+from common.geometry import se2
+from common.geometry.world import World
+from common.robot.scanner import SCANNERS
+from services.estimator.paper.decoder import Normalisation
+from services.estimator.paper.training import Data
 
 ROOM = World(
     name="room",

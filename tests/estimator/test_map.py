@@ -7,16 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common import se2
-from common.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from common.scanner import SCANNERS
-from common.world import World
-from services.estimator.building import Choice, Geometry, prepare
-from services.estimator.generative import RayCaster
-from services.estimator.interface import Observation
+from common.geometry import se2
+from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from common.geometry.world import World
+from common.robot.scanner import SCANNERS
+from services.estimator.factory import Choice, Geometry, prepare
 from services.estimator.particle_filter.beam_model import RangeTable
 from services.estimator.particle_filter.likelihood_field import DistanceField
-from tests.common.maps import rooms
+from services.estimator.shared.generative_models import RayCaster
+from services.estimator.shared.interface import Observation
+from tests.common.geometry.maps import rooms
 
 CRATE = {"circle": {"center": (4.0, 5.0), "radius": 0.3}}
 SCANNER = SCANNERS["tim571"].with_beams(200)

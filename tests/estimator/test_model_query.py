@@ -11,10 +11,10 @@ import pytest
 import safetensors.numpy
 
 from common.errors import UserError
-from common.requests import ModelRequest
-from common.topics import MODEL, SCAN
-from common.world import load_world, save_world
-from services.estimator import weights
+from common.geometry.world import load_world, save_world
+from common.messages.requests import ModelRequest
+from common.messages.topics import MODEL, SCAN
+from services.estimator.paper import weights
 from tests.estimator.test_service import TRUTH, a_scan, opened
 
 

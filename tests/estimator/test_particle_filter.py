@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from common import se2
-from common.world import World
-from services.estimator.interface import Observation, Posterior
+from common.geometry import se2
+from common.geometry.world import World
 from services.estimator.particle_filter import ParticleFilter, Settings
+from services.estimator.shared.interface import Observation, Posterior
 from tests.estimator.models import ROOM, SCANNER
 
 ANGLES = SCANNER.angles()

@@ -10,9 +10,9 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common import se2
 from common.errors import UserError
-from common.world import World
+from common.geometry import se2
+from common.geometry.world import World
 from services.estimator.particle_filter import Settings, motion, resampling
 from services.estimator.particle_filter.beam_model import BeamModel, RangeTable
 from services.estimator.particle_filter.clusters import hypotheses, labels, moments

@@ -7,16 +7,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from common import se2
-from common.scanner import SCANNERS, Scanner
-from presage.accuracy import bound, tasks
-from presage.accuracy.running import quick_field
-from presage.accuracy.scenes import Scene
-from services.estimator.building import SIGMA, Choice, Geometry, prepare
+from common.geometry import se2
+from common.robot.scanner import SCANNERS, Scanner
+from lab.accuracy import bound, tasks
+from lab.accuracy.runner import quick_field
+from lab.accuracy.scenes import Scene
+from services.estimator.factory import SIGMA, Choice, Geometry, prepare
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.gauss_newton import View, polish
-from services.estimator.precise.seeding import SPACING, Seeds, thin_places
+from services.estimator.precise.global_seeds import SPACING, Seeds, thin_places
 from tests.estimator.models import ROOM
 
 OFF_CENTRE = {"mount": (-0.12, 0.1, 2.0)}

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from common import se2
 from common.errors import UserError
-from common.messages import Belief, CmdVel, Goal, Odom, Pose, Prediction, Scan, Twist
-from common.requests import LocaliseRequest
-from common.scanner import SCANNERS
-from common.topics import CMD_VEL, GOAL, LOCALISE, ODOM, SCAN
-from common.world import load_world
+from common.geometry import se2
+from common.geometry.world import load_world
+from common.messages.definitions import Belief, CmdVel, Goal, Odom, Pose, Prediction, Scan, Twist
+from common.messages.requests import LocaliseRequest
+from common.messages.topics import CMD_VEL, GOAL, LOCALISE, ODOM, SCAN
+from common.robot.scanner import SCANNERS
 from services.estimator.service import EstimatorService
 from services.estimator.settings import EstimatorSettings
 

@@ -10,12 +10,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
-from common.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from common.world import World, load_world
-from presage.cli import app
-from presage.experiments.drawing import world_map
-from presage.inspection.shapes import grid, world_entities
-from tests.common.maps import values_of
+from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from common.geometry.world import World, load_world
+from presage.cli.main import app
+from presage.plotting.style import world_map
+from presage.recordings.foxglove_shapes import grid, world_entities
+from tests.common.geometry.maps import values_of
 
 VALUES = values_of("""
     ##########

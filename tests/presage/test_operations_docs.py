@@ -10,9 +10,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-from common.messages import Belief
-from common.metrics import ROWS, STATES
-from presage.doctoring import installation, judging, listening, machine
+from common.messages.definitions import Belief
+from common.runtime.metrics import ROWS, STATES
+from presage.diagnosis import bus_observation as listening
+from presage.diagnosis import installation, machine
+from presage.diagnosis import rules as judging
 from tests.conftest import ROOT
 
 FOLDER = ROOT / "docs" / "prometheus"

@@ -14,19 +14,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from common import se2
 from common.errors import UserError
-from common.messages import Belief, CmdVel, Pose, Status, Truth, Twist
-from common.topics import BELIEF, PREDICTION, SCAN, TRUTH
-from presage.replays import rerun as shell
-from presage.replays.again import words
-from presage.replays.compare import Outcome, Pairs
-from presage.replays.goals import Goals
-from presage.replays.report import Series, Track
-from presage.replays.rerun import Rerun, another_name, rerun_command
-from presage.replays.source import estimator_settings, recorded_settings, robot_of
+from common.geometry import se2
+from common.messages.definitions import Belief, CmdVel, Pose, Status, Truth, Twist
+from common.messages.topics import BELIEF, PREDICTION, SCAN, TRUTH
+from presage.replay import rerun as shell
+from presage.replay.comparison import Outcome, Pairs
+from presage.replay.goal_times import Goals
+from presage.replay.recorded_session import estimator_settings, recorded_settings, robot_of
+from presage.replay.report import Series, Track
+from presage.replay.rerun import Rerun, another_name, rerun_command
+from presage.replay.service_replay import words
+from services.recorder.files.writer import RecordingWriter
 from services.recorder.reader import read_recording
-from services.recorder.writer import RecordingWriter
 from tests.recorder import sessions as made
 
 EXACT = {"estimator": "precise", "model": "exact"}

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from common.inbox import Answer, Call, Inbox, Sample
-from common.messages import Stamped
-from common.requests import ModelReply, Reply, Request, SampleReply, WorldReply
-from common.service import Loop, Service
-from common.topics import Query, Topic
+from common.bus.inbox import Answer, Call, Inbox, Sample
+from common.messages.definitions import Stamped
+from common.messages.requests import ModelReply, Reply, Request, SampleReply, WorldReply
+from common.messages.topics import Query, Topic
+from common.runtime.service import Loop, Service
 from tests.process_replay.reference import Row, of_array, of_symmetric
 
 ROBOT = "replayed"
@@ -25,7 +25,7 @@ LEFT_OUT = {WorldReply: {"world"}, SampleReply: {"scanner"}, ModelReply: {"world
 
 @dataclass
 class FakeBus:
-    """What a service needs of `common.bus.Bus`; keeps what is put."""
+    """What a service needs of `common.bus.bus.Bus`; keeps what is put."""
 
     robot: str = ROBOT
     instance: str = "replayed"

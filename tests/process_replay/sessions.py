@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from common import se2
-from common.bus import wait_until
-from common.inbox import Inbox
-from common.messages import Belief, CmdVel, Drive, Goal, Odom, Pose, Scan, Twist
-from common.requests import (
+from common.bus.bus import wait_until
+from common.bus.inbox import Inbox
+from common.geometry import se2
+from common.geometry.world import Box, Obstacle, load_world
+from common.messages.definitions import Belief, CmdVel, Drive, Goal, Odom, Pose, Scan, Twist
+from common.messages.requests import (
     ConfigReply,
     LocaliseRequest,
     ModelReply,
@@ -29,10 +30,7 @@ from common.requests import (
     SpeedRequest,
     WorldReply,
 )
-from common.robot import Robot
-from common.scanner import SCANNERS
-from common.service import Loop
-from common.topics import (
+from common.messages.topics import (
     BELIEF,
     CMD_VEL,
     DRIVE,
@@ -51,7 +49,9 @@ from common.topics import (
     TELEPORT,
     WORLD,
 )
-from common.world import Box, Obstacle, load_world
+from common.robot.base import Robot
+from common.robot.scanner import SCANNERS
+from common.runtime.service import Loop
 from services.controller.service import ControllerService
 from services.controller.settings import ControllerSettings
 from services.estimator.service import EstimatorService

@@ -6,15 +6,27 @@ from pathlib import Path
 
 import numpy as np
 
-from common import se2
-from common.messages import Belief, Goal, Health, Pose, Prediction, Scan, Stamped, Status, TopicHealth, Truth, Twist
-from common.requests import WorldReply
-from common.robot import Robot
-from common.scanner import SCANNERS
-from common.topics import BELIEF, GOAL, HEALTH, PREDICTION, SCAN, STATUS, TRUTH, Topic
-from common.world import Box, Circle, Obstacle, Start, World
+from common.geometry import se2
+from common.geometry.world import Box, Circle, Obstacle, Start, World
+from common.messages.definitions import (
+    Belief,
+    Goal,
+    Health,
+    Pose,
+    Prediction,
+    Scan,
+    Stamped,
+    Status,
+    TopicHealth,
+    Truth,
+    Twist,
+)
+from common.messages.requests import WorldReply
+from common.messages.topics import BELIEF, GOAL, HEALTH, PREDICTION, SCAN, STATUS, TRUTH, Topic
+from common.robot.base import Robot
+from common.robot.scanner import SCANNERS
+from services.recorder.files.writer import RecordingWriter
 from services.recorder.service import write_world
-from services.recorder.writer import RecordingWriter
 
 WORLD = World(
     name="hall",

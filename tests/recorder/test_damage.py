@@ -16,18 +16,18 @@ from mcap.records import Chunk, DataEnd, Footer, Header
 from mcap.writer import Writer
 from rich.console import Console
 
+from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
-from common.inbox import Inbox, Sample
-from common.messages import CmdVel, Pose, Truth, Twist
-from common.topics import CMD_VEL, TRUTH
-from presage.inspection.info import survey
-from presage.inspection.show import info
-from services.recorder.chunks import COMPRESSION, MAGIC, MAX_CHUNK_BYTES
+from common.messages.definitions import CmdVel, Pose, Truth, Twist
+from common.messages.topics import CMD_VEL, TRUTH
+from presage.recordings.info import survey
+from presage.recordings.printing import info
+from services.recorder.files.chunks import COMPRESSION, MAGIC, MAX_CHUNK_BYTES
+from services.recorder.files.writer import PROFILE, RecordingWriter
 from services.recorder.reader import read_recording
 from services.recorder.recording import OpenRecording
 from services.recorder.recover import recover
 from services.recorder.settings import RecorderSettings
-from services.recorder.writer import PROFILE, RecordingWriter
 
 CHUNKS = 6
 EACH = 4  # messages in a chunk, of two channels in turn

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from common.bus import wait_until
-from common.inbox import Inbox
-from common.messages import Health, Odom, Pose, Twist
-from common.requests import RecordReply, RecordRequest, WorldReply
-from common.robot import Robot
-from common.scanner import SCANNERS
-from common.service import Loop, Service
-from common.topics import HEALTH, ODOM, RECORDING, WORLD
-from common.world import World
-from services.recorder.accounting import from_metadata
+from common.bus.bus import wait_until
+from common.bus.inbox import Inbox
+from common.geometry.world import World
+from common.messages.definitions import Health, Odom, Pose, Twist
+from common.messages.requests import RecordReply, RecordRequest, WorldReply
+from common.messages.topics import HEALTH, ODOM, RECORDING, WORLD
+from common.robot.base import Robot
+from common.robot.scanner import SCANNERS
+from common.runtime.service import Loop, Service
+from services.recorder.files.message_counts import from_metadata
 from services.recorder.reader import read_recording
 from services.recorder.settings import RecorderSettings
 from tests.recorder import sessions as made

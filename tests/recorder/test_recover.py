@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader, make_reader
 
 from common.errors import UserError
-from common.messages import Pose, Truth, Twist
-from common.topics import TRUTH
-from services.recorder.accounting import Count, as_metadata, from_metadata
+from common.messages.definitions import Pose, Truth, Twist
+from common.messages.topics import TRUTH
+from services.recorder.files.message_counts import Count, as_metadata, from_metadata
+from services.recorder.files.writer import RecordingWriter
 from services.recorder.reader import read_recording
 from services.recorder.recover import recover
-from services.recorder.writer import RecordingWriter
 
 KEY = "presage/r/truth"
 CHUNKS = 8

@@ -6,11 +6,11 @@ import threading
 
 import pytest
 
-from common.bus import wait_until
-from common.inbox import Inbox, Sample
-from common.requests import PlayerReply, PlayerRequest, Request, WorldReply
-from common.topics import BELIEF, PLAYER, SCAN, WORLD
-from services.recorder.replay import Choice, replay
+from common.bus.bus import wait_until
+from common.bus.inbox import Inbox, Sample
+from common.messages.requests import PlayerReply, PlayerRequest, Request, WorldReply
+from common.messages.topics import BELIEF, PLAYER, SCAN, WORLD
+from services.recorder.replaying.replay import Choice, replay
 from tests.recorder import sessions as made
 
 

@@ -13,16 +13,16 @@ from collections import Counter
 
 import pytest
 
-from common.bus import wait_until
-from common.inbox import MAX_KEYS, Inbox
-from common.messages import Health, Odom, Pose, Twist
-from common.requests import RecordReply, RecordRequest, WorldReply
-from common.robot import Robot
-from common.scanner import SCANNERS
-from common.service import Loop, Service
-from common.topics import HEALTH, ODOM, RECORDING, SCAN, TOPICS, WORLD
-from presage.inspection.info import survey
-from services.recorder.accounting import from_metadata
+from common.bus.bus import wait_until
+from common.bus.inbox import MAX_KEYS, Inbox
+from common.messages.definitions import Health, Odom, Pose, Twist
+from common.messages.requests import RecordReply, RecordRequest, WorldReply
+from common.messages.topics import HEALTH, ODOM, RECORDING, SCAN, TOPICS, WORLD
+from common.robot.base import Robot
+from common.robot.scanner import SCANNERS
+from common.runtime.service import Loop, Service
+from presage.recordings.info import survey
+from services.recorder.files.message_counts import from_metadata
 from services.recorder.reader import read_recording
 from services.recorder.recover import recover
 from services.recorder.settings import RecorderSettings

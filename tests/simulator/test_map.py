@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from common import se2
 from common.errors import UserError
-from common.messages import Twist
-from common.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
-from common.scanner import SCANNERS
-from common.world import Obstacle, World
+from common.geometry import se2
+from common.geometry.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
+from common.geometry.world import Obstacle, World
+from common.messages.definitions import Twist
+from common.robot.scanner import SCANNERS
 from services.simulator import physics
 from services.simulator.simulation import Setup, Simulation
-from tests.common.maps import rooms
+from tests.common.geometry.maps import rooms
 
 SCANNER = SCANNERS["tim571"]
 ORIGIN = (-3.0, 2.0, 0.4)

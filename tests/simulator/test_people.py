@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.errors import UserError
-from common.robot import Robot
-from common.world import Obstacle, World, load_world
-from services.simulator.floor import Floor
+from common.geometry.world import Obstacle, World, load_world
+from common.robot.base import Robot
 from services.simulator.people import APART, KEEP, LOOK, RADIUS, SIDE, People
+from services.simulator.walkable_grid import Floor
 
 PERIOD = 1 / 15  # s
 ROBOT = Robot().radius

@@ -7,11 +7,11 @@ from functools import partial
 import numpy as np
 import pytest
 
-from common import se2
-from common.messages import Twist
-from common.robot import Robot
-from common.scanner import SCANNERS
-from common.world import Circle, Obstacle, World, load_world
+from common.geometry import se2
+from common.geometry.world import Circle, Obstacle, World, load_world
+from common.messages.definitions import Twist
+from common.robot.base import Robot
+from common.robot.scanner import SCANNERS
 from services.simulator.people import RADIUS
 from services.simulator.simulation import Setup, Simulation
 

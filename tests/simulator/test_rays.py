@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common import se2
 from common.errors import UserError
-from common.scanner import SCANNERS
-from common.world import known_worlds, load_world
+from common.geometry import se2
+from common.geometry.world import known_worlds, load_world
+from common.robot.scanner import SCANNERS
 from services.simulator.simulation import Setup, Simulation
 
 SCANNER = SCANNERS["tim571"]

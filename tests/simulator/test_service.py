@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
+from common.bus.inbox import Call, Inbox
 from common.errors import UserError
-from common.inbox import Call, Inbox
-from common.messages import CmdVel, Twist
-from common.requests import Request, ResetRequest, SpeedRequest
-from common.service import Loop
-from common.topics import PAUSE, RESET, RESUME, SCAN, SPEED, STEP, TRUTH, WORLD
+from common.messages.definitions import CmdVel, Twist
+from common.messages.requests import Request, ResetRequest, SpeedRequest
+from common.messages.topics import PAUSE, RESET, RESUME, SCAN, SPEED, STEP, TRUTH, WORLD
+from common.runtime.service import Loop
 from services.simulator import service as shell
 from services.simulator.service import SimulatorService
 from services.simulator.settings import SimulatorSettings

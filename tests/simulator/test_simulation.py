@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from common.errors import UserError
-from common.messages import Twist
-from common.robot import Robot
-from common.scanner import SCANNERS
-from common.world import Obstacle, World, load_world
+from common.geometry.world import Obstacle, World, load_world
+from common.messages.definitions import Twist
+from common.robot.base import Robot
+from common.robot.scanner import SCANNERS
 from services.simulator.odometry import Drift
 from services.simulator.simulation import Setup, Simulation
 

@@ -9,7 +9,7 @@ import sys
 import uuid
 from pathlib import Path
 
-from common.bus import wait_until
+from common.bus.bus import wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 SERVICES = ("router", "simulator", "estimator", "controller", "recorder")  # that run without being asked for

@@ -18,10 +18,10 @@ import zenoh
 import zenoh.ext
 from typing_extensions import Self
 
-from common.messages import Twist
-from common.robot import Robot
-from common.scanner import SCANNERS
-from common.world import load_world
+from common.geometry.world import load_world
+from common.messages.definitions import Twist
+from common.robot.base import Robot
+from common.robot.scanner import SCANNERS
 from services.simulator.simulation import Setup, Simulation
 from tests.bridge_ros2.independent import decode, encode, header, quaternion, vector
 

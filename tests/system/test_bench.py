@@ -10,11 +10,11 @@ from contextlib import suppress
 import psutil
 import pytest
 
-from common.bus import wait_until
-from common.topics import TRUTH
-from presage.bench_recorder import _compare
-from services.recorder.accounting import Count, as_metadata
-from services.recorder.writer import RecordingWriter
+from common.bus.bus import wait_until
+from common.messages.topics import TRUTH
+from lab.benchmarks.recorder import _compare
+from services.recorder.files.message_counts import Count, as_metadata
+from services.recorder.files.writer import RecordingWriter
 
 
 def test_latency_is_measured_and_written(process, tmp_path):

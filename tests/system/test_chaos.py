@@ -9,7 +9,7 @@ import json
 
 import pytest
 
-from presage.chaos.faults import FAULTS
+from lab.fault_injection.faults import FAULTS
 from tests.conftest import Processes
 
 ROWS = (

@@ -6,7 +6,7 @@ import socket
 
 import pytest
 
-from common.bus import wait_until
+from common.bus.bus import wait_until
 from tests.conftest import Processes
 from tests.recorder import sessions as made
 

@@ -9,12 +9,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from common.bus import Link, open_bus, wait_until
-from common.messages import Belief, Scan, Status, Truth
-from common.security import credentials
-from common.topics import BELIEF, CMD_VEL, SCAN, STATUS, TRUTH
-from presage import secure
-from presage.watch import Watch
+from common.bus.bus import Link, open_bus, wait_until
+from common.bus.security import credentials
+from common.messages.definitions import Belief, Scan, Status, Truth
+from common.messages.topics import BELIEF, CMD_VEL, SCAN, STATUS, TRUTH
+from presage.live.bus_watch import Watch
+from presage.session import credentials as secure
 from services.recorder.reader import read_recording
 from tests.conftest import free_tcp_port
 from tests.system.compose import PATIENCE, SERVICES, Compose, docker, engine, say_that_nothing_was_tested

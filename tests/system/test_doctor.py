@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.bus import open_bus, wait_until
-from common.compatibility import this_service
-from common.inbox import Call, Inbox
-from common.messages import Health, Scan, TopicHealth
-from common.topics import CONFIG, HEALTH, ODOM, SCAN
+from common.bus.bus import open_bus, wait_until
+from common.bus.inbox import Call, Inbox
+from common.messages.definitions import Health, Scan, TopicHealth
+from common.messages.topics import CONFIG, HEALTH, ODOM, SCAN
+from common.runtime.protocol_check import this_service
 from common.versions import PROTOCOL
 from tests.conftest import PATIENCE, ROOT
 

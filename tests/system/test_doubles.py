@@ -7,10 +7,10 @@ import signal
 import numpy as np
 import pytest
 
-from common.bus import open_bus, wait_until
-from common.inbox import Inbox
-from common.messages import CmdVel, Goal, Health, Pose, Status, Truth, Twist
-from common.topics import CMD_VEL, GOAL, HEALTH, STATUS, TRUTH
+from common.bus.bus import open_bus, wait_until
+from common.bus.inbox import Inbox
+from common.messages.definitions import CmdVel, Goal, Health, Pose, Status, Truth, Twist
+from common.messages.topics import CMD_VEL, GOAL, HEALTH, STATUS, TRUTH
 from tests.conftest import next_of, taken
 
 PATIENCE = 60.0

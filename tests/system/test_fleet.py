@@ -7,12 +7,12 @@ import signal
 import numpy as np
 import pytest
 
-from common.bus import Link, open_bus, wait_until
-from common.inbox import Inbox, Sample
-from common.messages import Belief, Health, Truth
-from common.requests import ConfigReply, ModelReply, ModelRequest, Request
-from common.topics import BELIEF, CONFIG, HEALTH, MODEL, SCAN, TRUTH
-from services.estimator.fleet_service import key_expression
+from common.bus.bus import Link, open_bus, wait_until
+from common.bus.inbox import Inbox, Sample
+from common.messages.definitions import Belief, Health, Truth
+from common.messages.requests import ConfigReply, ModelReply, ModelRequest, Request
+from common.messages.topics import BELIEF, CONFIG, HEALTH, MODEL, SCAN, TRUTH
+from services.estimator.multi_robot_service import key_expression
 
 NUMBERS = (1, 2, 3)
 STARTS = {1: "3,1.5,90", 2: "9,1.5,0", 3: "14,1.5,180"}

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from common.bus import Link, open_bus, wait_until
+from common.bus.bus import Link, open_bus, wait_until
+from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
-from common.inbox import Inbox, Sample
-from common.messages import Health, Scan, Truth
-from common.requests import ConfigReply, Request
-from common.topics import CONFIG, HEALTH, MAX_BYTES, QUERIES, SCAN, TOPICS, TRUTH
-from common.wire import DecodeError
+from common.messages.definitions import Health, Scan, Truth
+from common.messages.requests import ConfigReply, Request
+from common.messages.topics import CONFIG, HEALTH, MAX_BYTES, QUERIES, SCAN, TOPICS, TRUTH
+from common.messages.wire import DecodeError
 from services.recorder.reader import read_recording
 from tests.common.samples import message_of
 from tests.conftest import Processes
@@ -118,7 +118,7 @@ def test_hostile_payloads_on_every_topic(system, before, topic):
     assert all(process.running for process in running.values())
 
 
-# The player answers only while a replay runs: tests/recorder/test_replay.py has its hostile requests.
+# The player answers only while a replay runs: tests/recorder/replaying/test_replay.py has its hostile requests.
 ANSWERED = [query for query in QUERIES if query.server in (*SERVICES, "every service")]
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from presage.chaos.hosts import why_no_hosts
+from lab.fault_injection.hosts import why_no_hosts
 from services.recorder.reader import read_recording
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -8,10 +8,10 @@ import signal
 import psutil
 import pytest
 
-from common.bus import wait_until
-from common.inbox import Inbox
-from common.messages import Belief, Goal, Health, Pose, Scan
-from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, PREDICTION, SCAN, STATUS, TRUTH
+from common.bus.bus import wait_until
+from common.bus.inbox import Inbox
+from common.messages.definitions import Belief, Goal, Health, Pose, Scan
+from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, PREDICTION, SCAN, STATUS, TRUTH
 from services.recorder.reader import read_recording
 from tests.conftest import next_of
 from tests.recorder import sessions as made

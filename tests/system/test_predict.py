@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from common import se2
-from common.bus import wait_until
+from common.bus.bus import wait_until
+from common.bus.inbox import Answer, Inbox
 from common.errors import UserError
-from common.inbox import Answer, Inbox
-from common.messages import Pose, Scan
-from common.requests import PredictReply, PredictRequest
-from common.scanner import SCANNERS
-from common.topics import BELIEF, PREDICT, SCAN
-from common.world import load_world
+from common.geometry import se2
+from common.geometry.world import load_world
+from common.messages.definitions import Pose, Scan
+from common.messages.requests import PredictReply, PredictRequest
+from common.messages.topics import BELIEF, PREDICT, SCAN
+from common.robot.scanner import SCANNERS
 
 PATIENCE = 60.0
 SCANNER = SCANNERS["tim571"].with_beams(180)

@@ -6,11 +6,11 @@ import json
 
 from rich.console import Console
 
-from common.messages import Belief, Pose
-from common.topics import BELIEF, topic_of
+from common.messages.definitions import Belief, Pose
+from common.messages.topics import BELIEF, topic_of
 from presage.logs.importing import Import, import_command
+from services.recorder.files.writer import RecordingWriter
 from services.recorder.reader import read_recording
-from services.recorder.writer import RecordingWriter
 from tests.presage.logs.drives import SCANS as SCANS_OF_LOG
 from tests.presage.logs.drives import Bag, write_bag
 from tests.recorder import sessions as made

@@ -16,16 +16,16 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from common import se2
-from common.bus import wait_until
-from common.inbox import Inbox, Sample
-from common.messages import Belief, CmdVel, Goal, Health, Pose, Scan
-from common.requests import PlayerReply, PlayerRequest
-from common.scanner import SCANNERS
-from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, PLAYER, SCAN
-from common.world import load_world
-from services.recorder.replay import Choice, replay
-from services.recorder.writer import RecordingWriter
+from common.bus.bus import wait_until
+from common.bus.inbox import Inbox, Sample
+from common.geometry import se2
+from common.geometry.world import load_world
+from common.messages.definitions import Belief, CmdVel, Goal, Health, Pose, Scan
+from common.messages.requests import PlayerReply, PlayerRequest
+from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, PLAYER, SCAN
+from common.robot.scanner import SCANNERS
+from services.recorder.files.writer import RecordingWriter
+from services.recorder.replaying.replay import Choice, replay
 from tests.conftest import PATIENCE, ROOT
 
 SECOND = 10**9

@@ -7,10 +7,10 @@ import math
 
 import pytest
 
-from common import se2
-from common.bus import Link, open_bus, wait_until
-from common.messages import Goal, Pose
-from common.topics import GOAL
+from common.bus.bus import Link, open_bus, wait_until
+from common.geometry import se2
+from common.messages.definitions import Goal, Pose
+from common.messages.topics import GOAL
 from tests.bridge_ros2.independent import encode, header, quaternion, vector
 from tests.conftest import PATIENCE, Processes
 from tests.system.ros2_robot import Ros

@@ -8,12 +8,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from common.bus import wait_until
-from common.inbox import Inbox
-from common.messages import Belief, CmdVel, Goal, Pose, Status, Truth, Twist
-from common.requests import ObstacleRequest, Reply
-from common.topics import BELIEF, CMD_VEL, GOAL, OBSTACLE, STATUS, TRUTH
-from common.world import Box, Obstacle
+from common.bus.bus import wait_until
+from common.bus.inbox import Inbox
+from common.geometry.world import Box, Obstacle
+from common.messages.definitions import Belief, CmdVel, Goal, Pose, Status, Truth, Twist
+from common.messages.requests import ObstacleRequest, Reply
+from common.messages.topics import BELIEF, CMD_VEL, GOAL, OBSTACLE, STATUS, TRUTH
 from tests.conftest import next_of
 
 PATIENCE = 60.0

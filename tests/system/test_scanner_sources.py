@@ -7,13 +7,13 @@ import time
 import numpy as np
 import pytest
 
-from common.bus import wait_until
-from common.healthy import fault_of
-from common.heartbeat import read_beats
-from common.inbox import Inbox
-from common.messages import Scan
-from common.topics import SCAN, TOPICS, TRUTH
-from services.recorder.writer import RecordingWriter
+from common.bus.bus import wait_until
+from common.bus.inbox import Inbox
+from common.containers.healthcheck import fault_of
+from common.messages.definitions import Scan
+from common.messages.topics import SCAN, TOPICS, TRUTH
+from common.runtime.heartbeat import read_beats
+from services.recorder.files.writer import RecordingWriter
 from tests.conftest import next_of
 
 SCANS = 4
@@ -48,7 +48,7 @@ def test_a_recording_takes_the_simulator_s_place(bus, process, recording, tmp_pa
     for topic in set(TOPICS) - {SCAN}:
         bus.subscribe(topic, all_else, keep_all=True)
     running = process(
-        "services.recorder.playing", "--directory", str(recording), "--replay", "drive.mcap", "--heartbeat",
+        "services.recorder.replaying.service", "--directory", str(recording), "--replay", "drive.mcap", "--heartbeat",
         str(tmp_path),
     )  # fmt: skip
     for _ in range(2):  # again and again
@@ -62,7 +62,7 @@ def test_a_recording_takes_the_simulator_s_place(bus, process, recording, tmp_pa
 
 @pytest.mark.parametrize(("name", "said"), [("", "no recording ''"), ("other.mcap", "no recording 'other.mcap'")])
 def test_a_recording_that_is_not_there_is_named_with_those_that_are(process, recording, name, said):
-    running = process("services.recorder.playing", "--directory", str(recording), "--replay", name)
+    running = process("services.recorder.replaying.service", "--directory", str(recording), "--replay", name)
     assert running.wait() == 2
     assert f"replay: {said} in {recording}" in running.output
     assert "there are drive.mcap" in running.output
@@ -72,13 +72,13 @@ def test_a_recording_without_scans_is_refused(process, tmp_path):
     writer = RecordingWriter(tmp_path / "drive.mcap")
     writer.write(TRUTH, "presage/other/truth", b"x", 1, 1)
     writer.finish()
-    running = process("services.recorder.playing", "--directory", str(tmp_path), "--replay", "drive.mcap")
+    running = process("services.recorder.replaying.service", "--directory", str(tmp_path), "--replay", "drive.mcap")
     assert running.wait() == 2
     assert "no scans in this recording" in running.output
 
 
 def test_one_who_waits_for_a_robot_elsewhere_says_when_its_scans_come_and_stop(bus, process, tmp_path):
-    running = process("common.remote", "--heartbeat", str(tmp_path))
+    running = process("common.containers.remote_robot", "--heartbeat", str(tmp_path))
     fault = lambda: fault_of("remote", read_beats(tmp_path, "remote"), [bus.robot], time.monotonic())  # noqa: E731
     wanted = f"{bus.robot}: no scan was received so far (no scan so far)"
     assert wait_until(lambda: fault() == wanted, PATIENCE), fault()

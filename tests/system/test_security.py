@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.bus import Link, open_bus, wait_until
+from common.bus.bus import Link, open_bus, wait_until
+from common.bus.inbox import Inbox, Sample
+from common.bus.security import credentials
 from common.errors import UserError
-from common.inbox import Inbox, Sample
-from common.messages import CmdVel, Goal, Health, Pose, Truth, Twist
-from common.requests import PoseRequest, Reply, Request, WorldReply
-from common.security import credentials
-from common.topics import CMD_VEL, GOAL, HEALTH, SCAN, TELEPORT, TRUTH, WORLD
-from presage import secure
+from common.messages.definitions import CmdVel, Goal, Health, Pose, Truth, Twist
+from common.messages.requests import PoseRequest, Reply, Request, WorldReply
+from common.messages.topics import CMD_VEL, GOAL, HEALTH, SCAN, TELEPORT, TRUTH, WORLD
+from presage.session import credentials as secure
 from tests.conftest import PATIENCE, Processes, accepts, free_tcp_port, next_of
 
 INTRUDER = Path(__file__).with_name("intruder.py")

@@ -8,10 +8,10 @@ import shutil
 import pytest
 import safetensors.numpy
 
-from common.bus import wait_until
-from common.inbox import Inbox
-from common.messages import Belief, Scan
-from common.topics import BELIEF, SCAN
+from common.bus.bus import wait_until
+from common.bus.inbox import Inbox
+from common.messages.definitions import Belief, Scan
+from common.messages.topics import BELIEF, SCAN
 from services.recorder.reader import read_recording
 from tests.conftest import ROOT, next_of
 

@@ -9,10 +9,10 @@ import time
 import pytest
 import yaml
 
-from common.bus import wait_until
-from common.inbox import Inbox, Sample
-from common.messages import CmdVel, Goal, Health, Pose, Twist
-from common.topics import BELIEF, CMD_VEL, GOAL, HEALTH, STATUS, TRUTH
+from common.bus.bus import wait_until
+from common.bus.inbox import Inbox, Sample
+from common.messages.definitions import CmdVel, Goal, Health, Pose, Twist
+from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, STATUS, TRUTH
 
 SERVICES = ("simulator", "estimator", "controller", "recorder")
 

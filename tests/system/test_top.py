@@ -7,7 +7,7 @@ import signal
 
 import pytest
 
-from common.bus import wait_until
+from common.bus.bus import wait_until
 
 NAMES = ("simulator", "estimator", "controller")
 

@@ -6,10 +6,10 @@ import signal
 
 import pytest
 
-from common.bus import wait_until
-from common.inbox import Inbox, Sample
-from common.messages import Belief
-from common.topics import BELIEF
+from common.bus.bus import wait_until
+from common.bus.inbox import Inbox, Sample
+from common.messages.definitions import Belief
+from common.messages.topics import BELIEF
 
 WORLD = """
 name: closet

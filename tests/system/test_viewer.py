@@ -9,7 +9,7 @@ import numpy as np
 import psutil
 import pytest
 
-from common.bus import Link, open_bus, wait_until
+from common.bus.bus import Link, open_bus, wait_until
 from tests.conftest import Processes
 from tests.recorder import sessions as recorded
 from tests.viewer.client import Page, page_of

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from common.processes import dying_with_us
-from presage.chaos.hosts import Network, enter_own_namespaces
+from lab.fault_injection.hosts import Network, enter_own_namespaces
 
 GOAL = ["-m", "presage", "goal", "15.5", "1.5", "--wait", "--connect", "tcp/10.77.0.1:7447"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.messages import (
+from common.messages.definitions import (
     Belief,
     CmdVel,
     Hypothesis,
@@ -18,7 +18,7 @@ from common.messages import (
     Truth,
     Twist,
 )
-from common.topics import BELIEF, CMD_VEL, ODOM, PLAN, PREDICTION, SCAN, STATUS, TRUTH
+from common.messages.topics import BELIEF, CMD_VEL, ODOM, PLAN, PREDICTION, SCAN, STATUS, TRUTH
 
 SECOND = 1_000_000_000
 PEOPLE = np.array([[5, 6], [7, 8]], np.float32)

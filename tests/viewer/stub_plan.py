@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.messages import Pose, Preference
-from common.world import World
-from services.controller.geodesic import Field, Roads
-from services.controller.grid import FreeSpace
-from services.viewer.fields import field_of
+from common.geometry.world import World
+from common.messages.definitions import Pose, Preference
+from services.controller.policies.free_space import FreeSpace
+from services.controller.policies.geodesic_field import Field, Roads
+from services.viewer.state.goal_field import field_of
 
 RADIUS = 0.27  # m
 AHEAD = 0.8  # m of the path, the point that is driven to

@@ -19,10 +19,10 @@ from starlette.routing import Mount, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from common.occupancy_grid import OccupancyGrid
-from common.robot import Robot
-from common.world import World, load_world
-from tests.common.maps import rooms
+from common.geometry.occupancy_grid import OccupancyGrid
+from common.geometry.world import World, load_world
+from common.robot.base import Robot
+from tests.common.geometry.maps import rooms
 from tests.viewer.stub_session import DT, SCANNER, SCENES, WORLDS, Session, pulses
 
 STATIC = Path(__file__).resolve().parents[2] / "services" / "viewer" / "static"

@@ -6,9 +6,9 @@ from collections import deque
 
 import numpy as np
 
-from common.scanner import SCANNERS
-from common.world import Obstacle, World
-from services.viewer.frames import encode
+from common.geometry.world import Obstacle, World
+from common.robot.scanner import SCANNERS
+from services.viewer.state.frames import encode
 from tests.viewer import stub_plan
 
 SCENES = (

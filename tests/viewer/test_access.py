@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from common.errors import UserError
 from services.viewer.access import is_token, known_host, same_origin, token_of
+from services.viewer.server import link, listen
 from services.viewer.settings import ViewerSettings
-from services.viewer.web import link, listen
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ import signal
 import numpy as np
 import pytest
 
-from common.bus import wait_until
-from common.cell_distance import signed_distance
-from common.occupancy_grid import FREE, OCCUPIED, UNKNOWN
+from common.bus.bus import wait_until
+from common.geometry.cell_distance import signed_distance
+from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from tests.conftest import PATIENCE, Processes, accepts, free_tcp_port
 from tests.viewer.stub_server import MAPPED
 

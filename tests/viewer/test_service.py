@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from common.bus import Link, open_bus, wait_until
-from common.inbox import Call, Inbox, Sample
-from common.messages import Health
-from common.requests import Reply, WorldReply
-from common.robot import Robot
-from common.scanner import SCANNERS
-from common.topics import HEALTH, PAUSE, PREFERENCE, SCAN, TOPICS, TRUTH, WORLD
-from common.world import load_world
-from services.viewer.view import SHOWN
+from common.bus.bus import Link, open_bus, wait_until
+from common.bus.inbox import Call, Inbox, Sample
+from common.geometry.world import load_world
+from common.messages.definitions import Health
+from common.messages.requests import Reply, WorldReply
+from common.messages.topics import HEALTH, PAUSE, PREFERENCE, SCAN, TOPICS, TRUTH, WORLD
+from common.robot.base import Robot
+from common.robot.scanner import SCANNERS
+from services.viewer.state.robot_view import SHOWN
 from tests.conftest import PATIENCE, taken
 from tests.viewer.client import Page, page_of
 from tests.viewer.messages import RANGES, at, preference

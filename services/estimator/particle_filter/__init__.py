@@ -1,4 +1,4 @@
-"""A particle filter of AMCL's design, for comparison on the same topics."""
+"""A particle filter like AMCL, for comparison on the same topics."""
 
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.settings import Settings

@@ -1,4 +1,4 @@
-"""Beam model: what a range finder measures given the distance to the wall (Thrun, Burgard, Fox 2005, section 6.3)."""
+"""The beam model (Thrun et al. 2005, chapter 6.3)."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.errors import UserError
-from services.estimator.generative import RayCaster
+from services.estimator.shared.generative_models import RayCaster
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from common.se2 import Array
-    from common.world import World
+    from common.geometry.se2 import Array
+    from common.geometry.world import World
 
 HEADINGS = 360  # of the table; between them ranges are interpolated
 MAX_CELLS = 20_000_000

@@ -1,4 +1,4 @@
-"""Clusters of particles as AMCL forms them: occupied bins that touch (nav2's pf_kdtree_cluster)."""
+"""Clusters of particles, as nav2's pf_kdtree_cluster forms them."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from common import se2
-from services.estimator.interface import Hypothesis
+from common.geometry import se2
 from services.estimator.particle_filter.resampling import HEADING_BINS, OFFSET, bins
+from services.estimator.shared.interface import Hypothesis
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from common.se2 import Array
+    from common.geometry.se2 import Array
 
 NEGLIGIBLE = 1e-3  # this part of the weight, carried by the lightest particles, joins no cluster
 MOST = 8  # clusters reported

@@ -1,4 +1,4 @@
-"""Particle filter of AMCL's design behind the estimator's interface: predict, weigh, cluster, resample."""
+"""The filter: predict, weigh, cluster, resample."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from common import se2
-from services.estimator.generative import RayCaster
-from services.estimator.interface import Observation, Posterior, Predicted, State
+from common.geometry import se2
 from services.estimator.particle_filter import motion, resampling
 from services.estimator.particle_filter.clusters import hypotheses
 from services.estimator.particle_filter.recovery import Recovery
 from services.estimator.particle_filter.sensor import Sensor
 from services.estimator.particle_filter.settings import Settings
+from services.estimator.shared.generative_models import RayCaster
+from services.estimator.shared.interface import Observation, Posterior, Predicted, State
 
 if TYPE_CHECKING:
-    from common.se2 import Array
-    from common.world import World
-    from services.estimator.interface import Hypothesis
+    from common.geometry.se2 import Array
+    from common.geometry.world import World
+    from services.estimator.shared.interface import Hypothesis
 
 NOMINAL_DT = 1 / 15  # s, between scans where no stamps tell; the jitter's unit
 LONGEST_DT = 1.0  # s, a random walk over a longer gap would be everywhere: that is recovery's business

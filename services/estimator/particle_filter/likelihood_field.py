@@ -1,4 +1,4 @@
-"""Likelihood field: a beam is likely where it ends near a surface (Thrun, Burgard, Fox 2005, section 6.4)."""
+"""The likelihood field model (Thrun et al. 2005, chapter 6.4)."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from common.errors import UserError
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from common.se2 import Array
-    from common.world import World
+    from common.geometry.se2 import Array
+    from common.geometry.world import World
 
     Single = npt.NDArray[np.float32]
 

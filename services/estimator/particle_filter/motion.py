@@ -1,4 +1,4 @@
-"""How particles move: AMCL's odometry models (Thrun, Burgard, Fox 2005, section 5.4), a command, or a random walk."""
+"""Motion models: odometry (Thrun et al. 2005, chapter 5.4), command, random walk."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from common import se2
+from common.geometry import se2
 
 if TYPE_CHECKING:
-    from common.se2 import Array
+    from common.geometry.se2 import Array
 
     Alphas = tuple[float, float, float, float, float]
 

@@ -1,4 +1,4 @@
-"""Noticing that scans no longer fit: augmented Monte Carlo localisation (Thrun, Burgard, Fox 2005, table 8.3)."""
+"""Augmented MCL (Thrun et al. 2005, table 8.3)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Resampling: low variance, and as many particles as the Kullback-Leibler distance asks (Fox 2003)."""
+"""Low-variance and KLD resampling (Fox 2003)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from common.se2 import Array
+    from common.geometry.se2 import Array
 
     Indices = npt.NDArray[np.int64]
 

@@ -1,4 +1,4 @@
-"""One scan against many poses: the settings' laser model, its beams, its annealed sigma, and its gradient."""
+"""Weighs particles with the chosen laser model."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from common import se2
+from common.geometry import se2
 from services.estimator.particle_filter.beam_model import BeamModel, RangeTable
 from services.estimator.particle_filter.likelihood_field import DistanceField, LikelihoodField
 
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from common.se2 import Array
-    from common.world import World
-    from services.estimator.interface import Observation
+    from common.geometry.se2 import Array
+    from common.geometry.world import World
     from services.estimator.particle_filter.settings import Settings
+    from services.estimator.shared.interface import Observation
 
 SIGMA_PER_SPREAD = 1.5  # a hit is as blurred as the particles are sparse
 SLOWEST = 0.85  # sigma shrinks by no more than this a scan: one scan must not decide a search

@@ -1,4 +1,4 @@
-"""Parameters of the particle filter under AMCL's names, with nav2's defaults, and a set tuned for laser alone."""
+"""Parameters under AMCL's names: AMCL-like defaults, and a set tuned for laser alone."""
 
 from __future__ import annotations
 

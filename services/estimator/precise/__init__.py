@@ -1,1 +1,1 @@
-"""Preset `precise`: a learned distance field and inference at the limit of the sensor."""
+"""Preset `precise`: a learned distance field and hypotheses with covariance."""

@@ -1,4 +1,4 @@
-"""Whether a robot that was tracked can have been carried off, and where it is where the model does not say.
+"""Uses scan matching to tell a changed scene from a kidnapping.
 
 A scan that fits the scans just before it was taken near them: nobody has carried the robot off meanwhile, however
 little the model explains of what is seen. What is seen behind the walls that it expects speaks against that (`DOUBT`).
@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from common import se2
+from common.geometry import se2
 from services.estimator.precise.gauss_newton import NARROW, WIDE, Prior, View, descending, polishing
-from services.estimator.precise.motion import Candidate
-from services.estimator.precise.recent import Match, RecentScans
+from services.estimator.precise.motion_model import Candidate
+from services.estimator.precise.scan_memory import Match, RecentScans
 
 if TYPE_CHECKING:
-    from common.se2 import Array
-    from services.estimator.asking import Conversation
+    from common.geometry.se2 import Array
     from services.estimator.precise.likelihood import Evidence
     from services.estimator.precise.settings import Settings
+    from services.estimator.shared.asking import Conversation
 
 BEGINS, GOES_ON = 0.75, 0.45  # least share of a scan's points that were seen before: the first that is held; others
 TURNS = np.array([-0.3, -0.15, 0.15, 0.3])  # rad, tried besides where a scan does not go on so clearly:

@@ -1,4 +1,4 @@
-"""Preset `precise`: natural-gradient descent on F from many places at once, a mixture, fusion over time."""
+"""One update: predict, match, associate, fuse, rank, publish."""
 
 from __future__ import annotations
 
@@ -7,23 +7,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from common import se2
-from services.estimator.asking import Conversation, Search, alone
-from services.estimator.generative import Expect, Expected
-from services.estimator.interface import Hypothesis, Observation, Posterior, Predicted, State
-from services.estimator.precise import continuity, mixture, obstruction, searching
+from common.geometry import se2
+from services.estimator.precise import continuity, obstruction
+from services.estimator.precise import hypotheses as mixture
+from services.estimator.precise import search as searching
 from services.estimator.precise.continuity import Continuity
 from services.estimator.precise.gauss_newton import WIDEST, Prior, View, polishing
+from services.estimator.precise.hypotheses import Mode
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.mixture import Mode
-from services.estimator.precise.motion import Candidate, candidates, fuse, unseen, within_map, within_reach
+from services.estimator.precise.motion_model import Candidate, candidates, fuse, unseen, within_map, within_reach
 from services.estimator.precise.settings import Settings
+from services.estimator.shared.asking import Conversation, Search, alone
+from services.estimator.shared.generative_models import Expect, Expected
+from services.estimator.shared.interface import Hypothesis, Observation, Posterior, Predicted, State
 
 if TYPE_CHECKING:
-    from common.se2 import Array
-    from services.estimator.generative import GenerativeModel
+    from common.geometry.se2 import Array
+    from services.estimator.precise.global_seeds import Seeds
     from services.estimator.precise.likelihood import Evidence
-    from services.estimator.precise.seeding import Seeds
+    from services.estimator.shared.generative_models import GenerativeModel
 
 FIRST_WAIT, LONGEST_WAIT = 5, 150  # scans between searches while the scan fits badly,
 LOST_WAIT, DOUBTFUL_WAIT = 2, 8  # at most that many while nothing, or little, speaks for the place

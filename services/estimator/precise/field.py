@@ -1,4 +1,4 @@
-"""The generative model of preset `precise`: a learned distance field, decoded into ranges along beams.
+"""The generative model: a learned distance field that predicts ranges.
 
 The field phi (m) is positive in free space and zero on surfaces, stored on a square grid and interpolated bilinearly.
 A beam from p in direction u ends where phi(p + r u) = 0, found by sphere tracing (Hart 1996, "Sphere tracing"), so the
@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from services.estimator import kernels
-from services.estimator.generative import Expected
+from services.estimator.shared import kernels
+from services.estimator.shared.generative_models import Expected
 
 if TYPE_CHECKING:
-    from common.se2 import Array
+    from common.geometry.se2 import Array
 
 Floats = npt.NDArray[np.float32]
 

@@ -1,4 +1,4 @@
-"""Natural-gradient descent on the free energy, many poses at once: Gauss-Newton steps with Levenberg's damping.
+"""Gauss-Newton descent on the free energy for many poses at once.
 
 The step is (H + P^-1 + lambda D)^-1 (xi + P^-1 (prior - x)), H the Gauss-Newton Hessian of accuracy (the Fisher
 information of the density), D its diagonal. A step that does not lower F is taken back and lambda raised.
@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from common import se2
-from common.ranges import surfaces
-from services.estimator.asking import Conversation, alone
-from services.estimator.generative import Expect, Expected
+from common.geometry import se2
+from common.robot.ranges import surfaces
 from services.estimator.precise.likelihood import Evidence
+from services.estimator.shared.asking import Conversation, alone
+from services.estimator.shared.generative_models import Expect, Expected
 
 if TYPE_CHECKING:
-    from common.se2 import Array
-    from services.estimator.generative import GenerativeModel
+    from common.geometry.se2 import Array
     from services.estimator.precise.likelihood import Likelihood
+    from services.estimator.shared.generative_models import GenerativeModel
 
 MAX_STEP = np.array([0.5, 0.5, 0.3])  # m, m, rad: beyond it the linearisation is not trusted
 CONVERGED = np.array([1e-4, 1e-4, 2e-5])  # m, m, rad: a tenth of what a scan can tell

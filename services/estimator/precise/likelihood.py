@@ -1,4 +1,4 @@
-"""The density of a beam, and free energy's accuracy: a sum of -ln p over beams, no gain, no 1/N.
+"""Density of a beam, and a scan's free energy with its derivatives.
 
     p(o | g) = (1 - unseen) ((1 - short - random) N(o; g, sigma² + m²) + short [o < g] / g + random / range_max)
 
@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from services.estimator import kernels
+from services.estimator.shared import kernels
 
 if TYPE_CHECKING:
-    from common.se2 import Array
-    from services.estimator.generative import Expected
+    from common.geometry.se2 import Array
+    from services.estimator.shared.generative_models import Expected
 
 
 KNOWN = 0.3  # share of the beams of which something must be expected

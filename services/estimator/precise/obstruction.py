@@ -1,4 +1,4 @@
-"""What remains of a scan when people stand around the scanner: does it contradict the place, does it still hold it."""
+"""Decides whether unexplained beams contradict a pose or are only blocked."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from common import se2
-from services.estimator.generative import CORNER
+from common.geometry import se2
+from services.estimator.shared.generative_models import CORNER
 
 if TYPE_CHECKING:
-    from common.se2 import Array
-    from services.estimator.generative import Expected
+    from common.geometry.se2 import Array
     from services.estimator.precise.gauss_newton import View
+    from services.estimator.shared.generative_models import Expected
 
 CLEARLY = 4.0  # standard deviations
 

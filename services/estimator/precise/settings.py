@@ -1,10 +1,10 @@
-"""What preset `precise` can be told."""
+"""Parameters of the precise estimator."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from services.estimator.precise.motion import MotionNoise
+from services.estimator.precise.motion_model import MotionNoise
 
 
 @dataclass(frozen=True)

@@ -9,17 +9,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common import se2
-from common.world import World
-from presage.accuracy.scenes import Scene
-from services.estimator.generative import Expected, RayCaster
+from common.geometry import se2
+from common.geometry.world import World
+from lab.accuracy.scenes import Scene
 from services.estimator.precise.continuity import BEGINS, PROVEN, Continuity
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.gauss_newton import View
+from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.motion import Candidate
-from services.estimator.precise.recent import RecentScans
-from services.estimator.precise.seeding import Seeds, thin_places
+from services.estimator.precise.motion_model import Candidate
+from services.estimator.precise.scan_memory import RecentScans
+from services.estimator.shared.generative_models import Expected, RayCaster
 from tests.estimator.models import ROOM
 
 HALL = World(

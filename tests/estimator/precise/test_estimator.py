@@ -7,16 +7,16 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from common import se2
-from common.world import World, load_world
-from presage.accuracy import bound, tasks
-from presage.accuracy.running import quick_field
-from presage.accuracy.scenes import TWINS, Scene
-from services.estimator.building import Choice, Geometry, prepare
-from services.estimator.generative import RayCaster
-from services.estimator.interface import Observation
+from common.geometry import se2
+from common.geometry.world import World, load_world
+from lab.accuracy import bound, tasks
+from lab.accuracy.runner import quick_field
+from lab.accuracy.scenes import TWINS, Scene
+from services.estimator.factory import Choice, Geometry, prepare
 from services.estimator.precise.estimator import PreciseEstimator
-from services.estimator.precise.seeding import Seeds, thin_places
+from services.estimator.precise.global_seeds import Seeds, thin_places
+from services.estimator.shared.generative_models import RayCaster
+from services.estimator.shared.interface import Observation
 from tests.estimator.models import ROOM
 
 BEAMS = 271

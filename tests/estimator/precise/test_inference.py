@@ -7,14 +7,14 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from common import se2
-from services.estimator.generative import Expected, RayCaster
-from services.estimator.kernels import FACING
+from common.geometry import se2
 from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View, descend, difference, polish
+from services.estimator.precise.global_seeds import Seeds, thin_places
+from services.estimator.precise.hypotheses import Mode, distinct, weigh
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.mixture import Mode, distinct, weigh
-from services.estimator.precise.motion import Candidate, MotionNoise, candidates, fuse
-from services.estimator.precise.seeding import Seeds, thin_places
+from services.estimator.precise.motion_model import Candidate, MotionNoise, candidates, fuse
+from services.estimator.shared.generative_models import Expected, RayCaster
+from services.estimator.shared.kernels import FACING
 from tests.estimator.models import ROOM
 
 MOUNT = np.array([0.2, 0.05, 0.3])

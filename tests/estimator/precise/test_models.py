@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.world import World
-from services.estimator.generative import RayCaster
+from common.geometry.world import World
 from services.estimator.precise.field import DistanceField, FieldModel
+from services.estimator.shared.generative_models import RayCaster
 from tests.estimator.models import ROOM
 
 ANGLES = np.deg2rad(np.linspace(-135, 135, 61))

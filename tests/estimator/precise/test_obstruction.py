@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from common.world import World, load_world
-from services.estimator.generative import Expected, RayCaster
+from common.geometry.world import World, load_world
 from services.estimator.precise import obstruction
 from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.likelihood import Likelihood
+from services.estimator.shared.generative_models import Expected, RayCaster
 from tests.estimator.precise.test_estimator import ROOM, estimator
 
 RNG = np.random.default_rng(5)

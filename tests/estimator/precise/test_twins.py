@@ -7,9 +7,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from common.world import load_world
-from presage.accuracy.scenes import Scene
-from services.estimator.building import Choice, Geometry, prepare
+from common.geometry.world import load_world
+from lab.accuracy.scenes import Scene
+from services.estimator.factory import Choice, Geometry, prepare
 
 TWIN = np.array([6.0, 0.0, 0.0])
 WORLD = load_world("twins")

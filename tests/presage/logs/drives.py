@@ -13,8 +13,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
-from common import se2
-from common.world import load_world
+from common.geometry import se2
+from common.geometry.world import load_world
 
 BEGAN_NS = 1_600_000_000_000_000_000
 PERIOD_NS = 100_000_000

@@ -9,9 +9,9 @@ import lzma
 import numpy as np
 import pytest
 
-from common import se2
 from common.errors import UserError
-from common.world import load_world
+from common.geometry import se2
+from common.geometry.world import load_world
 from presage.logs.log import Reading
 from presage.logs.opening import PEEK, kind_of, open_log
 from tests.presage.logs.drives import ANGLES, BEAMS, MOUNT, SCANS, STAMPS, carmen, odom, ranges, truth, words

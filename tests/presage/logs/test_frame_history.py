@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from common.errors import UserError
-from common.ros_messages import Transform, read_rotation
+from common.messages.ros_messages import Transform, read_rotation
 from presage.logs.frame_history import FrameHistory
 from presage.logs.poses import Track
 

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from common import se2
 from common.errors import UserError
-from common.topics import ODOM, SCAN, TRUTH
-from common.world import load_world
-from presage.figure import draw_session
-from presage.inspection.info import survey
-from presage.localize import Job, choice_of, localize
+from common.geometry import se2
+from common.geometry.world import load_world
+from common.messages.topics import ODOM, SCAN, TRUTH
 from presage.logs.importing import Import, import_command
 from presage.logs.log import Reading
 from presage.logs.options import reading_of
-from presage.scan_files import read_scans
+from presage.logs.scan_files import read_scans
+from presage.recordings.info import survey
+from presage.recordings.session_figure import draw_session
+from presage.replay.localize import Job, choice_of, localize
 from services.recorder.reader import read_recording
 from tests.presage.logs.drives import (
     ANGLES,

@@ -8,7 +8,7 @@ import pytest
 from common.errors import UserError
 from presage.logs.log import Reading
 from presage.logs.opening import kind_of, open_log
-from presage.scan_files import read_scans
+from presage.logs.scan_files import read_scans
 from tests.presage.logs.drives import ANGLES, MOUNT, SCANS, STAMPS, Bag, carmen, odom, ranges, truth, write_bag
 from tests.recorder.sessions import write as write_recording
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common import se2
 from common.errors import UserError
-from common.world import load_world
+from common.geometry import se2
+from common.geometry.world import load_world
 from presage.logs.log import Reading
 from presage.logs.opening import open_log
 from presage.logs.resampling import resampled

@@ -1,0 +1,234 @@
+"""Publish, subscribe, query and answer messages over zenoh.
+
+With session.py and presence.py the only file that imports zenoh.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from typing import Any, TypeVar
+
+import zenoh
+
+from common.bus.endpoints import not_let_in, refuse_exposure
+from common.bus.inbox import Answer, Call, Inbox, Sample
+from common.bus.liveliness import Presence, published_ns
+from common.bus.security import Credentials, may_ask, may_put
+from common.bus.session import DEFAULT_ENDPOINT, JOIN_TIMEOUT_S, LOG_FILTER, Link, open_session, wait_until
+from common.errors import UserError
+from common.messages.definitions import Stamped
+from common.messages.requests import Reply, Request
+from common.messages.topics import Query, Topic, topic_of
+from common.messages.wire import ENCODING, DecodeError, Message
+
+R = TypeVar("R", bound=Reply)
+JOIN_PAUSE_S = 0.2  # between two attempts to join a router, where it refuses at once
+
+
+class Bus(Presence):
+    """One session, bound to one robot's keys."""
+
+    def __init__(
+        self, session: zenoh.Session, robot: str, security: Credentials | None = None, *, lossless: bool = True
+    ) -> None:
+        """Use `open_bus`."""
+        super().__init__(session, robot)
+        self._security = security
+        self._congestion = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._lock = threading.Lock()
+
+    def beside(self, robot: str) -> Bus:
+        """Another robot's keys on the same session."""
+        lossless = self._congestion == zenoh.CongestionControl.BLOCK
+        return Bus(self._session, robot, self._security, lossless=lossless)
+
+    def withdraw(self) -> None:
+        """Undeclare all that was declared here: this robot is served no more."""
+        declared: list[Any] = [*self._declared, *self._publishers.values()]
+        self._declared.clear()
+        self._publishers.clear()
+        for each in reversed(declared):  # the liveliness token, which came last, first
+            each.undeclare()
+
+    def put(self, topic: Topic, payload: bytes, service: str = "*", key: str | None = None) -> None:
+        """Publish bytes on the topic's key, or on ``key`` where a replay names it."""
+        publisher = self.publisher(topic, service, key)
+        publisher.put(payload, source_info=zenoh.SourceInfo(publisher.id, 0))
+
+    def publisher(self, topic: Topic, service: str = "*", key: str | None = None) -> zenoh.Publisher:
+        """The publisher of a key, declared once."""
+        key = key or topic.key(self.robot, service)
+        if self._security is not None:
+            self._security.check(may_put, topic, key.split("/")[1])
+        with self._lock:
+            if key not in self._publishers:
+                self._publishers[key] = self._session.declare_publisher(
+                    key,
+                    encoding=zenoh.Encoding(ENCODING).with_schema(topic.message.__name__),
+                    congestion_control=self._congestion,
+                )
+            return self._publishers[key]
+
+    def wait_matching(self, topic: Topic, timeout: float, service: str = "*", key: str | None = None) -> bool:
+        """Whether somebody subscribes to the topic within ``timeout`` s; a put before that may be lost."""
+        publisher: Any = self.publisher(topic, service, key)  # zenoh's stub has the status wrong
+        return wait_until(lambda: bool(publisher.matching_status.matching), timeout)
+
+    def subscribe(
+        self, topic: Topic, inbox: Inbox, *, keep_all: bool = False, robot: str | None = None
+    ) -> Callable[[], None]:
+        """Move the topic's payloads to ``inbox`` by the topic's queue policy, or all of them; a call ends it."""
+        newest = topic.queue == "newest" and not keep_all
+
+        def move(sample: zenoh.Sample) -> None:
+            published = published_ns(sample)
+            source = _source(sample)
+            entry = Sample(topic, str(sample.key_expr), sample.payload.to_bytes(), published, time.time_ns(), source)
+            inbox.put(entry, newest_only=newest)
+
+        subscriber = self._session.declare_subscriber(topic.key(robot or self.robot), move)
+        self._declared.append(subscriber)
+
+        def end() -> None:
+            self._declared.remove(subscriber)
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+        return end
+
+    def serve(self, query: Query, inbox: Inbox, service: str = "*") -> None:
+        """Move requests to ``inbox``; the loop answers them."""
+
+        def move(call: zenoh.Query) -> None:
+            payload = call.payload.to_bytes() if call.payload is not None else b""
+            key = query.key(self.robot, service)
+
+            def reply(answer: bytes) -> None:
+                with suppress(zenoh.ZError):  # the asker may be gone
+                    call.reply(key, answer, encoding=zenoh.Encoding(ENCODING).with_schema(query.reply.__name__))
+                call.drop()  # type: ignore[no-untyped-call]
+
+            def refuse(why: str) -> None:
+                with suppress(zenoh.ZError):
+                    call.reply_err(why.encode())
+                call.drop()  # type: ignore[no-untyped-call]
+
+            inbox.put(Call(query, payload, reply, refuse))
+
+        self._declared.append(self._session.declare_queryable(query.key(self.robot, service), move, complete=True))
+
+    def ask(
+        self, query: Query, request: Request, reply: type[R], timeout: float = 5.0, service: str = "*",
+        robot: str | None = None,
+    ) -> R:  # fmt: skip
+        """The first answer; raises UserError where nobody answers, the answer is an error, or makes no sense."""
+        key = query.key(robot or self.robot, service)
+        if self._security is not None:
+            self._security.check(may_ask, query, robot or self.robot)
+        deadline = time.monotonic() + timeout
+        while (left := deadline - time.monotonic()) > 0:
+            answers = list(self._session.get(key, payload=request.encode(), encoding=ENCODING, timeout=left))
+            for answer in answers:
+                if answer.ok is not None:
+                    return _decode_reply(key, reply, answer.ok.payload.to_bytes())
+                if answer.err is not None and (why := answer.err.payload.to_string()) != "Timeout":
+                    raise UserError(f"{key}: refused: {why}")
+            if answers:
+                break
+            time.sleep(0.02)  # a session that has just opened does not know yet who is there: nothing was asked
+        who = service if service != "*" else query.server
+        raise UserError(f"nobody answers {key} within {timeout:g} s: is the {who} running? `presage doctor` looks")
+
+    def request(
+        self, query: Query, request: Request, number: int, inbox: Inbox, timeout: float = 5.0, service: str = "*"
+    ) -> None:  # fmt: skip
+        """Ask and return at once; exactly one `Answer` with ``number`` comes to ``inbox``, within ``timeout`` s or so.
+
+        Nobody is asked twice: a session that has just opened, and does not know yet who is there, hears of nobody.
+        """
+        key, owed = query.key(self.robot, service), threading.Lock()
+
+        def settle(payload: bytes, refusal: str = "") -> None:
+            if owed.acquire(blocking=False):  # the first answer counts, and is never given back
+                inbox.put(Answer(query, number, payload, refusal))
+
+        def move(answer: zenoh.Reply) -> None:
+            if answer.ok is not None:
+                settle(answer.ok.payload.to_bytes())
+            elif answer.err is not None and (why := answer.err.payload.to_string()) != "Timeout":
+                settle(b"", f"{key}: refused: {why}")
+
+        def end() -> None:
+            settle(b"", f"nobody answers {key}: is the {service if service != '*' else query.server} running?")
+
+        handler = zenoh.handlers.Callback(move, end)
+        self._session.get(key, handler, payload=request.encode(), encoding=ENCODING, timeout=timeout)
+
+    def ask_each(
+        self, query: Query, request: Request, inbox: Inbox, timeout: float = 5.0, service: str = "*",
+        robot: str | None = None,
+    ) -> threading.Event:  # fmt: skip
+        """Ask all who serve the query, also several of one name: an `Answer` each. Set once no more will come."""
+        done, number = threading.Event(), itertools.count()
+
+        def move(answer: zenoh.Reply) -> None:
+            if answer.ok is not None:
+                inbox.put(Answer(query, next(number), answer.ok.payload.to_bytes(), who=str(answer.replier_id)))
+
+        self._session.get(
+            query.key(robot or self.robot, service), zenoh.handlers.Callback(move, done.set),
+            payload=request.encode(), encoding=ENCODING, timeout=timeout,
+            target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE,
+        )  # fmt: skip
+        return done
+
+
+def _source(sample: zenoh.Sample) -> str:
+    """Whoever published it: by its own word, else by the clock that stamped it."""
+    if (info := sample.source_info) is not None:
+        return str(info.source_id.zid)
+    return str(sample.timestamp.get_id()) if sample.timestamp is not None else ""
+
+
+def _decode_reply(key: str, reply: type[R], payload: bytes) -> R:
+    try:
+        return reply.decode(payload)
+    except DecodeError as error:
+        raise UserError(f"{key}: the answer makes no sense: {error}") from None
+
+
+@contextmanager
+def open_bus(
+    link: Link, *, patience: float | None = None, give_up: Callable[[], bool] = lambda: False,
+    log_filter: str = LOG_FILTER,
+) -> Iterator[Bus]:  # fmt: skip
+    """A session for the block; raises UserError where the endpoints cannot be used, or are open to everybody.
+
+    With credentials it begins once a router has let us in: waited for until ``give_up``, or for ``patience`` s.
+    """
+    if link.security is None and not link.insecure:
+        refuse_exposure(link.listen)
+    zenoh.init_log_from_env_or(log_filter)
+    began, waiting = time.monotonic(), False
+    join_timeout = JOIN_TIMEOUT_S if patience is None else min(patience, JOIN_TIMEOUT_S)
+    while (session := open_session(link, join_timeout)) is None:
+        assert link.security is not None  # noqa: S101 - others do not wait
+        why = not_let_in(link.security.member.name, link.connect)
+        if give_up():
+            raise SystemExit(0)
+        if patience is not None and time.monotonic() - began > patience:
+            raise UserError(why)
+        if patience is None and not waiting:
+            logging.getLogger(__name__).warning("%s; waiting", why)
+        waiting = True
+        time.sleep(JOIN_PAUSE_S)
+    with closing(session):  # its own __exit__ fails while another thread is inside one of its calls; close() does not
+        yield Bus(session, link.robot, link.security, lossless=link.lossless)
+
+
+__all__ = ["DEFAULT_ENDPOINT", "Bus", "Link", "Message", "Stamped", "open_bus", "topic_of", "wait_until"]

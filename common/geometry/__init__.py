@@ -1,0 +1,1 @@
+"""Poses, worlds and maps, and exact ray casting."""

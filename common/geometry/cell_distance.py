@@ -1,0 +1,69 @@
+"""Exact distances from grid nodes to occupied cells.
+
+The squared distance to a union of squares that lie in rows and columns is separable, as Felzenszwalb and Huttenlocher
+use it (Distance Transforms of Sampled Functions, 2012): first along a column, then the least over the columns.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from common.geometry.se2 import Array
+
+
+def signed_distance(mask: npt.NDArray[np.bool_], x: Array, y: Array, most: float = np.inf) -> Array:
+    """(len(y), len(x)), in cells, from nodes (x[i], y[j]) to the edge of ``mask`` (rows, columns): positive outside it.
+
+    x and y are in cells from the lower left corner, ascending; what lies off the cells is outside. The distance is
+    not looked for beyond ``most``.
+    """
+    padded = np.pad(mask, 1)
+    outside = _to_cells(padded, x + 1, y + 1, most)
+    row, column = np.floor(y + 1).astype(int), np.floor(x + 1).astype(int)
+    rows, columns = padded.shape
+    inside = np.ix_((row >= 0) & (row < rows), (column >= 0) & (column < columns))
+    into = np.zeros_like(outside)
+    x, y = x[inside[1][0]] + 1, y[inside[0][:, 0]] + 1
+    into[inside] = _to_cells(~padded, x, y, most)
+    return outside - into
+
+
+def _to_cells(mask: npt.NDArray[np.bool_], x: Array, y: Array, most: float) -> Array:
+    """(len(y), len(x)) to the nearest True cell, 0 in one; ``most`` where none is so near."""
+    along = _along_columns(mask, y)  # (columns, len(y))
+    nearest = np.full((len(x), len(y)), float(most) ** 2)
+    if not len(x) or not len(y):
+        return np.asarray(np.sqrt(nearest.T))
+    column = np.floor(x).astype(int)
+    active, step = np.arange(len(x)), 0
+    furthest = max(int(column.max()), len(along) - 1) - min(int(column.min()), 0)
+    while len(active) and step <= furthest:
+        for side in (-step, step) if step else (0,):
+            candidate = column[active] + side
+            there = (candidate >= 0) & (candidate < len(along))
+            nodes, candidate = active[there], candidate[there]
+            gap = np.maximum(np.maximum(candidate - x[nodes], x[nodes] - candidate - 1), 0.0)
+            nearest[nodes] = np.minimum(nearest[nodes], along[candidate] + gap[:, None] ** 2)
+        # The next columns are at least `step` away.
+        active = active[nearest[active].max(axis=1) > step**2]
+        step += 1
+    return np.asarray(np.sqrt(nearest.T))
+
+
+def _along_columns(mask: npt.NDArray[np.bool_], y: Array) -> Array:
+    """(columns, len(y)) squared distance along the column to its nearest True cell; +inf where it has none."""
+    rows, nowhere = len(mask), 10**7
+    number = np.arange(rows)[:, None]
+    below = np.maximum.accumulate(np.where(mask, number, -nowhere), axis=0)
+    above = np.minimum.accumulate(np.where(mask, number, nowhere)[::-1], axis=0)[::-1]
+    row = np.clip(np.floor(y).astype(int), 0, rows - 1)
+    height = y[:, None]
+    down = np.where(height >= 0, np.maximum(height - below[row] - 1, 0.0), np.inf)
+    up = np.where(height < rows, np.maximum(above[row] - height, 0.0), np.inf)
+    gap = np.minimum(down, up)
+    return np.ascontiguousarray(np.where(gap < nowhere // 2, gap, np.inf).T ** 2)

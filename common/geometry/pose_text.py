@@ -1,0 +1,21 @@
+"""Parses poses written as x,y[,yaw_deg]."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from common.errors import UserError
+from common.geometry.se2 import Array
+
+NUMBER = r"-?(\d{1,9}\.?\d*|\.\d+)"
+POSE_TEXT = rf"^$|^{NUMBER},{NUMBER}(,{NUMBER})?$"  # or nothing
+
+
+def pose_of_text(text: str, option: str) -> Array:
+    """(3,) m, m, rad; without the yaw it is 0. Raises UserError naming ``option``."""
+    if not text or not re.fullmatch(POSE_TEXT, text):
+        raise UserError(f"{option} {text!r}: give x,y[,yaw_deg] in m and degrees, such as 0.2,0,180")
+    x, y, *yaw = (float(part) for part in text.split(","))
+    return np.array([x, y, np.deg2rad(yaw[0]) if yaw else 0.0])

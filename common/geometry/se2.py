@@ -1,0 +1,69 @@
+"""Poses in the plane, SE(2): compose, invert, transform points (REP-103 conventions)."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+def wrap(angle: npt.ArrayLike) -> Array:
+    """Angle(s) in rad brought into [-pi, pi)."""
+    a = np.asarray(angle, float)
+    wrapped = (a + np.pi) % (2 * np.pi) - np.pi
+    # The remainder of a tiny negative number rounds up to 2 pi itself.
+    return np.asarray(np.where(wrapped >= np.pi, wrapped - 2 * np.pi, wrapped))
+
+
+def compose(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
+    """Pose of c in A's parent, for a = pose of B, b = pose of c in B; shapes (..., 3) broadcast."""
+    a, b = np.broadcast_arrays(np.asarray(a, float), np.asarray(b, float))
+    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+    return np.stack(
+        [
+            a[..., 0] + cos * b[..., 0] - sin * b[..., 1],
+            a[..., 1] + sin * b[..., 0] + cos * b[..., 1],
+            wrap(a[..., 2] + b[..., 2]),
+        ],
+        axis=-1,
+    )
+
+
+def inverse(a: npt.ArrayLike) -> Array:
+    """The pose that undoes ``a``: compose(a, inverse(a)) = 0; shape (..., 3)."""
+    a = np.asarray(a, float)
+    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+    return np.stack(
+        [-cos * a[..., 0] - sin * a[..., 1], sin * a[..., 0] - cos * a[..., 1], wrap(-a[..., 2])],
+        axis=-1,
+    )
+
+
+def between(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
+    """Pose of b seen from a: compose(a, between(a, b)) = b; shapes (..., 3) broadcast."""
+    return compose(inverse(a), b)
+
+
+def compose_jacobians(a: npt.ArrayLike, b: npt.ArrayLike) -> tuple[Array, Array]:
+    """Derivatives of compose(a, b) by a and by b, each (3, 3), for poses (3,)."""
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    cos, sin = np.cos(a[2]), np.sin(a[2])
+    by_a = np.array(
+        [[1.0, 0.0, -sin * b[0] - cos * b[1]], [0.0, 1.0, cos * b[0] - sin * b[1]], [0.0, 0.0, 1.0]],
+    )
+    by_b = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    return by_a, by_b
+
+
+def rotate(yaw: float, vector: npt.ArrayLike) -> Array:
+    """Vectors (..., 2) turned by ``yaw`` rad, counter-clockwise."""
+    v = np.asarray(vector, float)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    return np.stack([cos * v[..., 0] - sin * v[..., 1], sin * v[..., 0] + cos * v[..., 1]], axis=-1)
+
+
+def transform(pose: npt.ArrayLike, points: npt.ArrayLike) -> Array:
+    """Points (..., 2) m seen from ``pose`` (3,), in its parent."""
+    p = np.asarray(pose, float)
+    return np.asarray(p[:2] + rotate(float(p[2]), points))

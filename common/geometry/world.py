@@ -1,0 +1,249 @@
+"""A world: walls and furniture in metres, or a ROS map; free space and exact ranges."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+import yaml
+from pydantic import Field, ValidationError, model_validator
+
+from common.errors import UserError
+from common.geometry import ros_map as map_file
+from common.geometry import segment_rays
+from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
+from common.geometry.shapes import Box, Circle, Model, Number, Obstacle, Ring, check_ring
+
+if TYPE_CHECKING:
+    from common.geometry.se2 import Array
+
+__all__ = ["NOT_YAML", "Box", "Circle", "Obstacle", "Start", "World", "known_worlds", "load_world", "save_world"]
+
+FOLDER = Path(__file__).resolve().parents[2] / "worlds"
+
+# What safe_load raises: a date like 2020-13-45 is a ValueError, 20 000 opening brackets end the recursion.
+NOT_YAML = (yaml.YAMLError, ValueError, RecursionError)
+
+LOOKS = 50  # in vain, before a place on a grid is taken to be nowhere
+
+
+class Start(Model):
+    """Where the robot stands at first."""
+
+    x: Number  # m
+    y: Number  # m
+    yaw_deg: Number = 0.0
+
+
+class World(Model):
+    """The boundary's inside, less the obstacles, is free; with a grid, its free cells are, and its edge is no wall."""
+
+    name: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[\w.-]+$")]
+    boundary: Ring  # m, the walls; with a grid its edge, which need not be given
+    obstacles: Annotated[list[Obstacle], Field(max_length=10_000)] = []  # noqa: RUF012 - pydantic copies it
+    start: Start | None = None
+    grid: Annotated[OccupancyGrid | None, Field(exclude_if=lambda grid: grid is None)] = None
+    # a ROS map; a world without one is sent without this field
+
+    @model_validator(mode="before")
+    @classmethod
+    def _grid_has_an_edge(cls, data: Any) -> Any:
+        if isinstance(data, dict) and data.get("grid") is not None and "boundary" not in data:
+            grid = OccupancyGrid.model_validate(data["grid"])
+            return {**data, "grid": grid, "boundary": grid.corners()}
+        return data
+
+    @model_validator(mode="after")
+    def _boundary_is_simple(self) -> World:
+        check_ring(self.boundary)
+        if self.grid is not None and not (
+            len(self.boundary) == 4 and np.allclose(self.boundary, self.grid.corners(), rtol=0, atol=1e-6)
+        ):
+            raise ValueError("with a grid the boundary is the grid's edge: leave it out")
+        return self
+
+    def with_obstacles(self, obstacles: list[Obstacle]) -> World:
+        """The same walls with other furniture; built anew, for a copy would keep the old geometry."""
+        return World(name=self.name, boundary=self.boundary, obstacles=obstacles, start=self.start, grid=self.grid)
+
+    @functools.cached_property
+    def segments(self) -> Array:
+        """(S, 4) x0, y0, x1, y1 in m of every straight edge."""
+        return self.outlines if self.grid is None else np.concatenate([self.grid.shapes.walls, self.outlines])
+
+    @functools.cached_property
+    def outlines(self) -> Array:
+        """(S, 4) those of `segments` that are not the grid's cells'."""
+        rings = [] if self.grid is not None else [np.array(self.boundary)]
+        rings += [ring for o in self.obstacles if (ring := o.ring()) is not None]
+        return np.concatenate([np.zeros((0, 4)), *(np.hstack([ring, np.roll(ring, -1, axis=0)]) for ring in rings)])
+
+    @functools.cached_property
+    def circles(self) -> Array:
+        """(C, 3) x, y, radius in m."""
+        return np.array([[*o.circle.center, o.circle.radius] for o in self.obstacles if o.circle]).reshape(-1, 3)
+
+    @functools.cached_property
+    def furniture(self) -> shapely.Geometry:
+        """What the obstacles cover."""
+        return shapely.union_all([o.shape() for o in self.obstacles])
+
+    @functools.cached_property
+    def free_space(self) -> shapely.Geometry:
+        """Where a point may be."""
+        room = shapely.Polygon(self.boundary) if self.grid is None else self.grid.shapes.free_space
+        return shapely.difference(room, self.furniture)
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """x0, y0, x1, y1 in m of the boundary."""
+        corners = np.array(self.boundary)
+        (x0, y0), (x1, y1) = corners.min(axis=0), corners.max(axis=0)
+        return float(x0), float(y0), float(x1), float(y1)
+
+    def center(self) -> Array:
+        """(2,) m, the middle of the boundary's bounding box: where the paper's belief begins."""
+        x0, y0, x1, y1 = self.bounds
+        return np.array([(x0 + x1) / 2, (y0 + y1) / 2])
+
+    def clearance(self, points: npt.ArrayLike) -> Array:
+        """(N,) m from points (N, 2) to the nearest place that is not free; negative where it is not free itself."""
+        points = np.asarray(points, float).reshape(-1, 2)
+        if self.grid is None:
+            return _signed(points, self.free_space)
+        return self._off_furniture(points, 0.0 - self.grid.shapes.distance(FREE, points))
+
+    def why_no_room(self, place: Array, radius: float) -> str | None:
+        """Why a robot of ``radius`` m cannot stand at ``place`` (2,) or a pose, or None."""
+        clearance = float(self.clearance(place[:2])[0])
+        if clearance >= radius:
+            return None
+        what = "is inside a wall or outside" if clearance < 0 else f"is {clearance:.2f} m from a wall of"
+        return f"({place[0]:.2f}, {place[1]:.2f}) {what} {self.name!r}; the robot needs {radius:g} m around it"
+
+    def clearances(self, x: Array, y: Array) -> Array:
+        """(len(y), len(x)) m: `clearance` of the nodes of a lattice in map, ascending."""
+        nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        if self.grid is None:
+            return self.clearance(nodes).reshape(len(y), len(x))
+        away = 0.0 - self.grid.shapes.lattice(FREE, x, y)  # never -0.0
+        return self._off_furniture(nodes, away.ravel()).reshape(len(y), len(x))
+
+    def surface_distances(self, x: Array, y: Array, most: float) -> Array:
+        """(len(y), len(x)) m to what a laser sees, at most ``most``; negative behind it. It sees no unknown cells."""
+        if self.grid is not None:
+            nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+            away = self._off_furniture(nodes, self.grid.shapes.lattice(OCCUPIED, x, y, most).ravel())
+            return np.clip(away, -most, most).reshape(len(y), len(x))
+        shapely.prepare(self.free_space)
+        columns = [_signed(np.column_stack([np.full(len(y), at), y]), self.free_space) for at in x]
+        return np.clip(np.stack(columns, axis=1), -most, most)
+
+    def _off_furniture(self, points: Array, away: Array) -> Array:
+        """(N,) ``away``, or what the obstacles leave of it."""
+        return np.minimum(away, -_signed(points, self.furniture)) if self.obstacles else away
+
+    def sample_free(self, count: int, rng: np.random.Generator, clearance: float = 0.0) -> Array:
+        """(count, 2) points uniform over free space, at least ``clearance`` m from everything.
+
+        Raises UserError where there is no such place.
+        """
+        if self.grid is not None:
+            return self._sample_cells(count, rng, clearance)
+        x0, y0, x1, y1 = self.bounds
+        room = self._room(clearance)
+        found: list[Array] = []
+        while sum(map(len, found)) < count:
+            points = rng.uniform([x0, y0], [x1, y1], (max(count, 256), 2))
+            found.append(points[shapely.contains(room, shapely.points(points)) & (self.clearance(points) >= clearance)])
+        return np.concatenate(found)[:count]
+
+    def _sample_cells(self, count: int, rng: np.random.Generator, clearance: float) -> Array:
+        """`sample_free` on a grid: places in cells that may be far enough from everything, those that are."""
+        assert self.grid is not None  # noqa: S101 - asked for grids alone
+        shapes = self.grid.shapes
+        cells = shapes.roomy(clearance - self.grid.resolution)  # half a diagonal and more: no place is forgotten
+        found, left = [np.zeros((0, 2))], LOOKS
+        while left and len(cells) and sum(map(len, found)) < count:
+            chosen = rng.integers(len(cells), size=max(count, 256))
+            points = shapes.within(cells[chosen], rng.random((len(chosen), 2)))
+            found.append(points[self.clearance(points) >= clearance])
+            left = left if len(found[-1]) else left - 1
+        if sum(map(len, found)) < count:
+            raise self._no_room(clearance)
+        return np.concatenate(found)[:count]
+
+    def _no_room(self, clearance: float) -> UserError:
+        return UserError(f"world {self.name!r} has no place {clearance} m clear of everything")
+
+    def start_pose(self, clearance: float) -> Array:
+        """(3,) the start, or where none is stated the free place nearest the centre."""
+        if self.start is not None:
+            return np.array([self.start.x, self.start.y, np.deg2rad(self.start.yaw_deg)])
+        if self.grid is not None:
+            shapes = self.grid.shapes
+            places = shapes.within(shapes.roomy(clearance), 0.5)
+            places = places[self._off_furniture(places, np.full(len(places), np.inf)) >= clearance]
+            if not len(places):
+                raise self._no_room(clearance)
+            return np.array([*places[np.argmin(np.hypot(*(places - self.center()).T))], 0.0])
+        nearest = shapely.shortest_line(self._room(clearance), shapely.Point(self.center()))
+        return np.array([*shapely.get_coordinates(nearest)[0], 0.0])
+
+    def _room(self, clearance: float) -> shapely.Geometry:
+        """Where a point is so far from everything; raises UserError where that is nowhere."""
+        room = shapely.buffer(self.free_space, -clearance)
+        if room.is_empty:
+            raise self._no_room(clearance)
+        return room
+
+    def ray_distances(self, poses: npt.ArrayLike, angles: npt.ArrayLike) -> Array:
+        """(N, B) m from scanner poses (N, 3) in map along ``angles`` (B,) in laser; +inf where nothing is hit.
+
+        Exact: rays against segments and circles, or against the very cells of a grid.
+        """
+        poses, angles = np.asarray(poses, float).reshape(-1, 3), np.asarray(angles, float)
+        found = segment_rays.distances(self.outlines, self.circles, poses, angles)
+        return found if self.grid is None else np.minimum(found, self.grid.shapes.ray_distances(poses, angles))
+
+
+def _signed(points: Array, area: shapely.Geometry) -> Array:
+    """(N,) m from points (N, 2) to the edge of an area; positive within it."""
+    where = shapely.points(points)
+    distance = shapely.distance(where, shapely.boundary(area))
+    return np.where(shapely.contains(area, where), distance, -distance)
+
+
+def known_worlds() -> list[str]:
+    """Names of the worlds that are shipped."""
+    return sorted(path.stem for path in FOLDER.glob("*.yaml"))
+
+
+def load_world(name: str) -> World:
+    """The shipped world of that name, or the world or ROS map in that file; UserError says what is wrong, and where."""
+    path = FOLDER / f"{name}.yaml" if name in known_worlds() else Path(name)
+    try:
+        data: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return World.model_validate(map_file.read_map(path, data) if map_file.is_map(data) else data)
+    except (FileNotFoundError, NotADirectoryError):
+        raise UserError(f"no world {name!r}: give a file or one of {', '.join(known_worlds())}") from None
+    except UnicodeDecodeError:
+        image = path.suffix.lower() in map_file.IMAGES
+        hint = f"an image: give the map.yaml that names it, such as {path.with_suffix('.yaml')}" if image else "no text"
+        raise UserError(f"world {path}: {hint}") from None
+    except OSError as error:
+        raise UserError(f"world {path}: cannot be read ({error})") from None
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise UserError(f"world {path}: {'.'.join(map(str, first['loc'])) or 'file'}: {first['msg']}") from None
+    except NOT_YAML as error:
+        raise UserError(f"world {path}: no YAML ({' '.join(str(error).split())})") from None
+
+
+def save_world(world: World) -> str:
+    """The world as YAML text that `load_world` reads."""
+    return str(yaml.safe_dump(world.model_dump(mode="json", exclude_defaults=True), sort_keys=False))

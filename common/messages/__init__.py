@@ -1,0 +1,1 @@
+"""Every message, the table of topics, and the wire format."""

@@ -1,0 +1,38 @@
+"""Pose and velocity as parts of messages."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from common.messages.wire import Finite, Message
+
+
+class Pose(Message):
+    """A pose in the plane; its frame is said where it is used."""
+
+    x: Finite  # m
+    y: Finite  # m
+    yaw: Finite = 0.0  # rad, counter-clockwise from x
+
+    def array(self) -> npt.NDArray[np.float64]:
+        """(3,) x, y, yaw."""
+        return np.array([self.x, self.y, self.yaw])
+
+    @classmethod
+    def of(cls, pose: npt.ArrayLike) -> Pose:
+        """From (3,) x, y, yaw."""
+        x, y, yaw = np.asarray(pose, float)
+        return cls(x=float(x), y=float(y), yaw=float(yaw))
+
+
+class Twist(Message):
+    """A velocity in base_link (geometry_msgs/Twist, in the plane)."""
+
+    vx: Finite = 0.0  # m/s, forward
+    vy: Finite = 0.0  # m/s, left; 0 for a differential drive
+    wz: Finite = 0.0  # rad/s, counter-clockwise
+
+    def array(self) -> npt.NDArray[np.float64]:
+        """(3,) vx, vy, wz."""
+        return np.array([self.vx, self.vy, self.wz])

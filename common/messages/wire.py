@@ -1,0 +1,116 @@
+"""Encodes messages as MessagePack maps and validates them when decoding.
+
+A class that derives from `Message` states its fields once; encoding, validation and the JSON schema follow from it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import msgpack
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
+from pydantic_core import CoreSchema, core_schema
+
+if TYPE_CHECKING:
+    from pydantic.json_schema import JsonSchemaValue
+    from typing_extensions import Self
+
+ENCODING = "application/msgpack"
+FROM_WIRE: dict[str, bool] = {"wire": True}  # validation context of a payload: arrays are binary there, never lists
+
+
+class DecodeError(ValueError):
+    """A payload that is not the message it should be; the text names the field and what is wrong with it."""
+
+
+@dataclass(frozen=True)
+class Binary:
+    """Schema of an array field: element type and the shape behind the first, free, dimension.
+
+    ``values`` says which numbers may stand in it: ``finite``, or ``ranges`` (REP-117: +inf is no return,
+    -inf too close, never NaN).
+    """
+
+    dtype: Literal["<f4", "<f8", "u1"]
+    row: tuple[int, ...] = ()
+    values: Literal["finite", "ranges"] = "finite"
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Bytes or anything numpy reads goes in, a read-only array comes out, bytes go on the wire."""
+        return core_schema.with_info_plain_validator_function(
+            self.validate,
+            serialization=core_schema.plain_serializer_function_ser_schema(lambda array: array.tobytes()),
+        )
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """MessagePack's bin type has no JSON twin; the x- keys say how to read it."""
+        return {"type": "string", "contentEncoding": "binary", "x-dtype": self.dtype, "x-shape": ["N", *self.row]}
+
+    def validate(self, value: Any, info: core_schema.ValidationInfo) -> npt.NDArray[Any]:
+        """The array, shape (N, *row); raises ValueError where length, type or numbers are wrong."""
+        dtype = np.dtype(self.dtype)
+        if isinstance(value, bytes):
+            if len(value) % (dtype.itemsize * int(np.prod(self.row))):
+                raise ValueError(f"{len(value)} bytes are no whole number of rows {self.row} of {self.dtype}")
+            array = np.frombuffer(value, dtype)
+        elif isinstance(value, np.ndarray | list | tuple) and info.context is not FROM_WIRE:
+            array = np.array(value, dtype, order="C")
+        else:
+            raise ValueError(f"binary data of {self.dtype} expected, not {type(value).__name__}")
+        array = array.reshape(-1, *self.row)
+        bad = np.isnan(array) if self.values == "ranges" else ~np.isfinite(array)
+        if bad.any():
+            raise ValueError(f"{np.count_nonzero(bad)} values are {'NaN' if self.values == 'ranges' else 'not finite'}")
+        array.setflags(write=False)
+        return array
+
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(allow_inf_nan=False, gt=0)]
+NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0)]
+Count = Annotated[int, Field(ge=0, lt=2**63)]
+Text = Annotated[str, Field(max_length=1_000_000)]
+Name = Annotated[str, Field(max_length=200)]
+
+Ranges = Annotated[npt.NDArray[np.float32], Binary("<f4", values="ranges")]
+Floats = Annotated[npt.NDArray[np.float32], Binary("<f4")]
+Bytes = Annotated[npt.NDArray[np.uint8], Binary("u1")]
+Points = Annotated[npt.NDArray[np.float32], Binary("<f4", (2,))]
+Poses = Annotated[npt.NDArray[np.float64], Binary("<f8", (3,))]
+Matrix3 = Annotated[npt.NDArray[np.float64], Binary("<f8", (3,))]
+
+
+class Message(BaseModel):
+    """Frozen, typed, validated; two messages are equal where their bytes are."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="ignore", arbitrary_types_allowed=True)
+
+    def encode(self) -> bytes:
+        """The MessagePack bytes."""
+        return bytes(msgpack.packb(self.model_dump()))
+
+    @classmethod
+    def decode(cls, payload: bytes) -> Self:
+        """The message in ``payload``; raises DecodeError and nothing else, whatever the bytes are."""
+        try:
+            return cls.model_validate(msgpack.unpackb(payload), context=FROM_WIRE)
+        except ValidationError as error:
+            first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+            field = ".".join(map(str, first["loc"])) or "payload"
+            raise DecodeError(f"{cls.__name__}.{field}: {first['msg']}") from None
+        except Exception as error:  # noqa: BLE001 - msgpack raises many kinds, and a hostile payload may find another
+            raise DecodeError(f"{cls.__name__}: no MessagePack ({type(error).__name__}: {error})") from None
+
+    @classmethod
+    def json_schema(cls) -> dict[str, Any]:
+        """JSON schema derived from the fields, for recordings, docs and other languages."""
+        return cls.model_json_schema(mode="serialization")
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and isinstance(other, Message) and self.encode() == other.encode()
+
+    def __hash__(self) -> int:
+        return hash(self.encode())

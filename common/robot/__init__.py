@@ -1,0 +1,1 @@
+"""The mobile base and its laser scanner as data."""

@@ -1,0 +1,67 @@
+"""Beam directions of a scan, for any field of view and sense of rotation."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from common.geometry.se2 import wrap
+
+if TYPE_CHECKING:
+    from common.geometry.se2 import Array
+    from common.messages.definitions import Scan
+
+
+class Sector(NamedTuple):
+    """Directions seen, in base_link."""
+
+    centre: float  # rad
+    half: float  # rad to either side; pi: all round
+
+
+ALL_ROUND = Sector(0.0, float(np.pi))
+
+
+class Sweep(NamedTuple):
+    """Evenly spaced beams."""
+
+    first: float  # rad in laser
+    increment: float  # rad, negative where they run clockwise
+    beams: int
+
+    @classmethod
+    def of(cls, scan: Scan) -> Sweep:
+        """Of a message."""
+        return cls(scan.angle_min, scan.angle_increment, len(scan.ranges))
+
+    @property
+    def spacing(self) -> float:
+        """Rad between neighbours."""
+        return abs(self.increment)
+
+    @property
+    def all_round(self) -> bool:
+        """Whether the gap from the last beam to the first is no wider than that between others."""
+        return self.beams > 2 and self.spacing * self.beams >= 2 * np.pi - self.spacing / 2
+
+    @property
+    def middle(self) -> float:
+        """Rad in laser, of the field of view."""
+        return self.first + self.increment * (self.beams - 1) / 2
+
+    def sector(self, yaw: float) -> Sector:
+        """What a scanner mounted at ``yaw`` rad looks at."""
+        if self.all_round:
+            return ALL_ROUND
+        return Sector(float(wrap(self.middle + yaw)), float(min(np.pi, self.spacing * max(self.beams - 1, 0) / 2)))
+
+    def beams_at(self, bearings: Array) -> npt.NDArray[np.intp]:
+        """(K,) index of the beam nearest to bearings (K,) rad in laser; -1 where the scanner does not look."""
+        if not self.increment or not self.beams:
+            return np.full(np.shape(bearings), -1)
+        beam = np.rint(wrap(bearings - self.middle) / self.increment + (self.beams - 1) / 2).astype(int)
+        if self.all_round:
+            return np.asarray(beam % self.beams)
+        return np.where((beam >= 0) & (beam < self.beams), beam, -1)

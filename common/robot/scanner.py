@@ -1,0 +1,148 @@
+"""Laser scanners: field of view, rate, range and noise of each known model."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from common.errors import UserError, first_fault
+
+if TYPE_CHECKING:
+    from common.geometry.se2 import Array
+
+Metres = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class Scanner(BaseModel):
+    """A planar scanner: geometry of its beams, limits, noise and mounting."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: Annotated[str, Field(min_length=1, max_length=200)]
+    beams: Annotated[int, Field(ge=2, le=100_000)]
+    fov: Annotated[float, Field(gt=0, le=2 * np.pi + 1e-9)]  # rad, from the first beam to the last
+    rate: Annotated[float, Field(gt=0, le=1000)]  # Hz
+    range_min: Metres  # m
+    range_max: Annotated[float, Field(gt=0, allow_inf_nan=False)]  # m
+    sigma: Metres  # m, standard deviation of a range
+    mount: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)  # x m, y m, yaw rad in base_link
+    sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.0  # the part that grows with the range; in quadrature
+    first: Annotated[float, Field(ge=-2 * np.pi, le=2 * np.pi)] | None = None
+    # rad, the first beam as the scanner itself counts, counter-clockwise from its x axis; None: -fov / 2
+    upside_down: bool = False  # mounted with a roll of 180 deg: seen from above the beams run clockwise
+
+    @model_validator(mode="after")
+    def _limits(self) -> Scanner:
+        if self.range_max <= self.range_min:
+            raise ValueError(f"range_max {self.range_max:g} m must be more than range_min {self.range_min:g} m")
+        return self
+
+    @property
+    def angle_min(self) -> float:
+        """First beam, rad in laser, whose z points up however the scanner is mounted."""
+        first = -self.fov / 2 if self.first is None else self.first
+        return -first if self.upside_down else first
+
+    @property
+    def angle_increment(self) -> float:
+        """Between beams, rad; negative where they run clockwise."""
+        step = self.fov / (self.beams - 1)
+        return -step if self.upside_down else step
+
+    def angles(self) -> Array:
+        """(B,) beam directions, rad in laser."""
+        return self.angle_min + self.angle_increment * np.arange(self.beams, dtype=np.float64)
+
+    def with_beams(self, beams: int | None) -> Scanner:
+        """The same scanner with another number over the same field of view; raises UserError for an impossible one."""
+        if beams is None:
+            return self
+        try:
+            return Scanner.model_validate({**self.model_dump(), "beams": beams})
+        except ValidationError as error:
+            raise UserError(f"{self.name} with {beams} beams: {first_fault(error)}") from None
+
+    def deviation(self, ranges: Array) -> Array:
+        """Standard deviation (m) of what is measured of ``ranges`` m, of any shape; +inf where that is +inf."""
+        if not self.sigma_relative:
+            return np.full(np.shape(ranges), self.sigma)
+        return np.hypot(self.sigma, self.sigma_relative * np.asarray(ranges))
+
+    def noisy(self, ranges: Array, rng: np.random.Generator) -> Array:
+        """Exact ``ranges`` m with this scanner's noise; +inf stays."""
+        draws = rng.standard_normal(np.shape(ranges))
+        seen = np.isfinite(ranges)
+        return np.asarray(ranges + np.where(seen, self.deviation(np.where(seen, ranges, 0.0)), 0.0) * draws)
+
+    def limit(self, ranges: Array) -> Array:
+        """Ranges beyond the scanner's limits as it reports them (REP-117): +inf too far, -inf too close."""
+        far = np.where(ranges > self.range_max, np.inf, ranges)
+        return np.where(far < self.range_min, -np.inf, far)
+
+    def __str__(self) -> str:
+        """One line for people."""
+        x, y, yaw = self.mount
+        relative = f" and {self.sigma_relative:.2g} of the range" if self.sigma_relative else ""
+        return (
+            f"{self.name}: {self.beams} beams over {np.rad2deg(self.fov):.4g} deg from "
+            f"{np.rad2deg(self.angle_min):.4g} deg, {self.rate:g} Hz, {self.range_min:g} to {self.range_max:g} m, "
+            f"sigma {self.sigma * 1e3:g} mm{relative}; "
+            f"mounted at ({x:g}, {y:g}) m, {np.rad2deg(yaw):.4g} deg{', upside down' if self.upside_down else ''}"
+        )
+
+
+# Figures of the makers' data sheets; where a sheet has no standard deviation, what stands for one is said.
+SCANNERS: dict[str, Scanner] = {
+    # SICK TiM571-2050101: 270 deg, 1/3 deg, 15 Hz, 0.05 to 25 m, statistical error 20 mm (1 sigma); mounted as on PAL's
+    # PMB-2.
+    "tim571": Scanner(
+        name="tim571",
+        beams=811,
+        fov=float(np.deg2rad(270)),
+        rate=15.0,
+        range_min=0.05,
+        range_max=25.0,
+        sigma=0.02,
+        mount=(0.2, 0.0, 0.0),
+    ),
+    # Hokuyo UST-10LX: 270 deg, 0.25 deg, 25 ms a scan, 0.06 to 10 m, repeated accuracy sigma < 30 mm: an upper limit.
+    "ust-10lx": Scanner(
+        name="ust-10lx",
+        beams=1081,
+        fov=float(np.deg2rad(270)),
+        rate=40.0,
+        range_min=0.06,
+        range_max=10.0,
+        sigma=0.03,
+        mount=(0.2, 0.0, 0.0),
+    ),
+    # SICK LMS 200 at 180 deg and 1 deg: 13.3 ms a scan, statistical error 5 mm (1 sigma) within 8 m in millimetre mode,
+    # whose largest number is 8.19 m. No least distance is given.
+    "lms200": Scanner(
+        name="lms200",
+        beams=181,
+        fov=float(np.deg2rad(180)),
+        rate=75.0,
+        range_min=0.0,
+        range_max=8.19,
+        sigma=0.005,
+        mount=(0.2, 0.0, 0.0),
+    ),
+    # Slamtec RPLIDAR A1M8: 360 samples a turn at 5.5 Hz, 0.15 to 12 m, "distance resolution" < 0.5 mm below 1.5 m and
+    # < 1 % of the distance everywhere. No statistical error is given: 1 % stands for it. The ROS driver publishes
+    # 360 beams from -179 to 180 deg, so the last is one step short of the first.
+    "rplidar-a1": Scanner(
+        name="rplidar-a1",
+        beams=360,
+        fov=float(np.deg2rad(359)),
+        rate=5.5,
+        range_min=0.15,
+        range_max=12.0,
+        sigma=0.0005,
+        sigma_relative=0.01,
+        first=float(np.deg2rad(-179)),
+    ),
+}

@@ -1,0 +1,106 @@
+"""Builds a scanner from command-line options or a YAML file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from common.errors import UserError, first_fault
+from common.geometry.pose_text import pose_of_text
+from common.robot.scanner import SCANNERS, Scanner
+
+UNITS = {
+    "fov_deg": "degrees", "first_deg": "degrees", "rate": "Hz", "range_min": "m", "range_max": "m", "sigma": "m",
+    "mount": "m, and yaw_deg in degrees",
+}  # fmt: skip
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _Mount(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    x: Finite = 0.0
+    y: Finite = 0.0
+    yaw_deg: Finite = 0.0
+
+
+class _File(BaseModel):
+    """A scanner as a user writes it: metres, seconds, and degrees where the key says so."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: str
+    beams: int
+    fov_deg: Annotated[float, Field(gt=0, le=360)]
+    rate: float  # Hz
+    range_min: float = 0.0  # m
+    range_max: float  # m
+    sigma: float  # m
+    sigma_relative: float = 0.0
+    first_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
+    mount: _Mount = _Mount()
+    upside_down: bool = False
+
+    def scanner(self) -> Scanner:
+        """In radians."""
+        given = self.model_dump(exclude={"fov_deg", "first_deg", "mount"})
+        return Scanner(
+            **given,
+            fov=float(np.deg2rad(self.fov_deg)),
+            first=None if self.first_deg is None else float(np.deg2rad(self.first_deg)),
+            mount=(self.mount.x, self.mount.y, float(np.deg2rad(self.mount.yaw_deg))),
+        )
+
+
+def load_scanner(name: str) -> Scanner:
+    """The scanner known by that name, or described in that YAML file; raises UserError: what is wrong, and where."""
+    if name in SCANNERS:
+        return SCANNERS[name]
+    path = Path(name)
+    try:
+        data: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return _File.model_validate(data).scanner()
+    except (FileNotFoundError, NotADirectoryError):
+        raise UserError(f"no scanner {name!r}: choose one of {', '.join(SCANNERS)}, or give a file") from None
+    except ValidationError as error:
+        key = ".".join(map(str, error.errors(include_url=False)[0]["loc"]))
+        unit = f" ({UNITS[key]})" if key in UNITS else ""
+        raise UserError(f"scanner {path}: {first_fault(error)}{unit}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"scanner {path}: cannot be read ({error})") from None
+    except (yaml.YAMLError, ValueError) as error:
+        raise UserError(f"scanner {path}: no YAML ({' '.join(str(error).split())})") from None
+
+
+def chosen_scanner(
+    name: str, beams: int | None = None, noise: float | None = None, mount: str = "", *, upside_down: bool | None = None
+) -> Scanner:
+    """A known scanner or a file's, with what was asked for instead of its own; raises UserError.
+
+    ``noise`` is the standard deviation of a range in m; ``mount`` is x,y[,yaw_deg] in base_link, in m and deg.
+    Empty or None: the scanner's own.
+    """
+    scanner = load_scanner(name).with_beams(beams)
+    changes: dict[str, Any] = {}
+    if noise is not None:
+        changes |= {"sigma": noise, "sigma_relative": 0.0}
+    if mount:
+        changes["mount"] = tuple(map(float, pose_of_text(mount, "--mount")))
+    if upside_down is not None:
+        changes["upside_down"] = upside_down
+    try:
+        return Scanner.model_validate({**scanner.model_dump(), **changes}) if changes else scanner
+    except ValidationError as error:
+        raise UserError(f"{scanner.name} with --noise {noise}: {first_fault(error)}") from None
+
+
+def scanner_arguments(name: str, beams: int | None, mount: str, *, upside_down: bool) -> tuple[str, ...]:
+    """The simulator's options for what was asked for here; raises UserError where it is no scanner."""
+    chosen_scanner(name, beams, mount=mount)
+    given = {"--beams": "" if beams is None else str(beams), "--mount": mount}
+    more = [part for option, value in given.items() if value for part in (f"{option}={value}",)]
+    return ("--scanner", name, *more, *(["--upside-down"] if upside_down else []))

@@ -1,0 +1,1 @@
+"""The zenoh router as a process: `python -m common.router`."""

@@ -1,0 +1,7 @@
+"""`python -m common.router`."""
+
+from __future__ import annotations
+
+from common.router.router import main
+
+main()

@@ -1,0 +1,63 @@
+"""The HTTP endpoint that serves metrics."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from prometheus_client import CollectorRegistry, start_http_server
+
+from common.errors import UserError
+from common.runtime.metrics import ServiceMetrics
+
+if TYPE_CHECKING:
+    from common.runtime.service_loop import Loop
+
+LOOPBACK = "127.0.0.1"
+
+
+def split_address(setting: str) -> tuple[str, int]:
+    """Host and port; loopback unless another host is named. Raises UserError for a port that cannot be."""
+    found = re.fullmatch(r"(?:(.+):)?(\d+)", setting)
+    if found is None or int(found[2]) > 65535:
+        raise UserError(f"--metrics {setting}: PORT or HOST:PORT is meant, with a port up to 65535")
+    return (found[1] or LOOPBACK).strip("[]"), int(found[2])
+
+
+@contextmanager
+def serve(registry: CollectorRegistry, setting: str) -> Iterator[str]:
+    """Answer scrapes, each in a thread of its own; gives the address. Raises UserError where it cannot listen."""
+    host, port = split_address(setting)
+    try:
+        server, thread = start_http_server(port, host, registry)
+    except OSError as error:
+        raise UserError(
+            f"--metrics {setting}: cannot listen on {host} port {port} ({error.strerror or error}); "
+            "choose another port, or 0 for any free one"
+        ) from None
+    try:
+        yield f"http://{f'[{host}]' if ':' in host else host}:{server.server_port}/metrics"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+@contextmanager
+def measure(loop: Loop, setting: str) -> Iterator[ServiceMetrics]:
+    """The metrics of a loop, served until the block ends."""
+    service = loop.service
+
+    def counts() -> dict[str, Any]:
+        """Copies: a scrape reads them from a thread of its own."""
+        return {
+            "published": loop.published.copy(), "undecodable": loop.undecodable.copy(), "failed": loop.failed,
+            "events": dict(service.counters), "began": loop.began,
+        }  # fmt: skip
+
+    metrics = ServiceMetrics(loop.bus.robot, service.name, loop.inbox, counts)
+    with serve(metrics.registry, setting) as address:
+        service.log.info("metrics", address=address)
+        yield metrics

@@ -1,0 +1,1 @@
+"""Accuracy of the estimators against the Cramér-Rao bound."""

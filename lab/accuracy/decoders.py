@@ -1,0 +1,140 @@
+"""`presage bench decoders`: other generative models."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from common.geometry.world import load_world
+from common.robot.scanner import SCANNERS
+from lab.accuracy.panorama import Shape, train_panorama
+from lab.accuracy.runner import about
+from lab.accuracy.scenes import Scene
+from presage.terminal.output import check_file, write_json
+from services.estimator.paper import decoder, training
+from services.estimator.paper.decoder import Normalisation
+from services.estimator.paper.estimator import PaperScans
+from services.estimator.precise.field import FieldModel
+from services.estimator.precise.learning.evaluation import evaluate
+from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_scales
+from services.estimator.precise.learning.surfaces import Beams
+from services.estimator.shared.generative_models import GenerativeModel
+
+COLUMNS = ("learning s", "numbers", "range median mm", "mean mm", "> 5 cm %", "position median mm", "RMS mm")
+PAPER = "the paper's decoder, L1, one heading"
+HEADING = np.pi / 2  # rad, the one heading
+TEST, CALIBRATION = 200, 300  # scans
+Learn = Callable[["Scans"], tuple[GenerativeModel, int]]  # model, numbers it stores
+
+
+class Scans:
+    """Noisy scans to learn from, clean ones to calibrate and to test with; the laser in the middle of base_link."""
+
+    def __init__(self, world: str, samples: int, seed: int, heading: float | None = None) -> None:
+        """At any heading, or at one."""
+        self.world, self.seed = load_world(world), seed
+        self.scanner = SCANNERS["tim571"].model_copy(update={"mount": (0.0, 0.0, 0.0)})
+        scene = Scene(self.world, self.scanner, np.random.default_rng(seed))
+        self.angles, self.sigma = scene.scanner.angles(), scene.scanner.sigma
+        self.poses, self.calibration, self.test = (scene.poses(n) for n in (samples, CALIBRATION, TEST))
+        if heading is not None:
+            for poses in (self.poses, self.calibration, self.test):
+                poses[:, 2] = heading
+        clean = scene.clean(self.poses)
+        self.ranges = clean + self.sigma * scene.rng.standard_normal(clean.shape)
+        self.calibration_ranges, self.test_ranges = scene.clean(self.calibration), scene.clean(self.test)
+
+
+def field(resolution: float, share: float = 1.0, sweeps: int = 10) -> Learn:
+    """A distance field, from a share of the scans."""
+
+    def learn(scans: Scans) -> tuple[GenerativeModel, int]:
+        count, still = int(share * len(scans.poses)), np.zeros(3)
+        beams = Beams.of(scans.poses[:count], still, scans.angles, scans.ranges[:count])
+        found = learn_field(beams, Recipe(resolution=resolution, sweeps=sweeps))
+        scales = learn_scales(found, scans.calibration, still, scans.angles, scans.calibration_ranges, 0.0)
+        return FieldModel(found, scales), found.phi.size
+
+    return learn
+
+
+def panorama(steps: int, **shape: Any) -> Learn:
+    """A network, trained for so many steps of 256 scans."""
+
+    def learn(scans: Scans) -> tuple[GenerativeModel, int]:
+        model = train_panorama(Shape(**shape), scans.poses, scans.angles, scans.ranges, steps, 0)
+        return model, sum(x.numel() for x in model.network.parameters())
+
+    return learn
+
+
+def paper(epochs: int) -> Learn:
+    """The paper's decoder, at one heading."""
+
+    def learn(scans: Scans) -> tuple[GenerativeModel, int]:
+        norm = Normalisation.of(scans.world.bounds, float(scans.ranges.max()))
+        recipe = training.Recipe(epochs=epochs, learning_rate=3e-3)
+        data = training.Data(scans.poses, scans.ranges)
+        held_out = training.Data(scans.calibration, scans.calibration_ranges)
+        trainer = training.Trainer(decoder.Shape(len(scans.angles), 128, 8), norm, recipe, data, held_out)
+        model = trainer.run()
+        size = sum(x.numel() for x in trainer.decoder.parameters())
+        return PaperScans(model, scans.scanner, HEADING, trainer.progress.test_l1[-1]), size
+
+    return learn
+
+
+def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: Path | None, console: Console) -> int:
+    """Learn each, measure, print, and write where asked."""
+    check_file(json_file, "--json")
+    tried: dict[str, Learn] = {
+        PAPER: paper(max(1, steps // 50)),
+        "panorama, Fourier features, SiLU, L1": panorama(steps, loss="l1"),
+        "panorama, Fourier features, SiLU, learned precision": panorama(steps),
+        "panorama, Fourier features, ReLU, learned precision": panorama(steps, activation="relu"),
+        "panorama, 3 x 1024, learned precision": panorama(steps, width=1024, layers=3),
+        "panorama, grids of 2 to 0.25 m, learned precision": panorama(steps, inputs="grid"),
+        "distance field, 0.08 m": field(0.08),
+        "distance field, 0.04 m, surfaces alone (no sweeps)": field(0.04, sweeps=0),
+        "distance field, 0.04 m, a tenth of the scans": field(0.04, share=0.1),
+        "distance field, 0.04 m": field(0.04),
+        "distance field, 0.02 m": field(0.02),
+    }
+    any_heading, one_heading = Scans(world, samples, seed), Scans(world, samples, seed, HEADING)
+    rows: list[dict[str, Any]] = []
+    for name, learn in track(list(tried.items()), "learning", console=console, transient=True):
+        scans = one_heading if name == PAPER else any_heading
+        began = time.monotonic()
+        model, size = learn(scans)
+        took = time.monotonic() - began
+        quality = evaluate(model, scans.test, np.zeros(3), scans.angles, scans.test_ranges, 25.0, scans.sigma)
+        rows.append({
+            "decoder": name, "learning_s": round(took, 1), "numbers": size,
+            "range_error_median_m": quality.range_error_median, "range_error_mean_m": quality.range_error_mean,
+            "share_above_5_cm": quality.share_above_5_cm, "position_error_median_m": quality.position_error_median,
+            "position_error_rms_m": quality.position_error_rms,
+        })  # fmt: skip
+    table = Table(title=f"{world}, {samples} scans of 811 beams with noise of 0.02 m", title_justify="left")
+    table.add_column("decoder")
+    for column in COLUMNS:
+        table.add_column(column, justify="right")
+    for row in rows:
+        table.add_row(
+            row["decoder"], f"{row['learning_s']:.0f}", f"{row['numbers'] / 1e6:.2f} M",
+            f"{row['range_error_median_m'] * 1e3:.2f}", f"{row['range_error_mean_m'] * 1e3:.1f}",
+            f"{row['share_above_5_cm'] * 100:.1f}", f"{row['position_error_median_m'] * 1e3:.2f}",
+            f"{row['position_error_rms_m'] * 1e3:.2f}",
+        )  # fmt: skip
+    console.print(table)
+    console.print(
+        "position: error of the pose found from scans without noise, begun at the truth: what the model leaves"
+    )
+    write_json(json_file, {"rows": rows, "samples": samples, "network_steps": steps, **about(seed)})
+    return 0

@@ -1,0 +1,78 @@
+"""`presage bench localisation`: preset `paper` from the map's centre."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from common.geometry import se2
+from common.robot.base import Robot
+from common.versions import commit, versions
+from services.estimator.paper import weights
+from services.estimator.paper.decoder import use_one_core
+from services.estimator.paper.perception import PaperEstimator
+from services.estimator.paper.training import usable_ranges
+
+FOUND = 1.0  # m
+
+
+def localisation(world: str, beams: int, trials: int, scans: int, seed: int, console: Console) -> dict[str, Any]:
+    """Errors in m after ``scans`` fresh noisy scans each, at places uniform over free space, exact rays plus noise."""
+    use_one_core()
+    model, card = weights.load(weights.find(weights.FOLDER, world, "paper", beams))
+    rng, scanner = np.random.default_rng(seed), card.scanner
+    places = card.world.sample_free(trials, rng, Robot().radius)
+    errors, claimed = [], []
+    for place in track(places, "localising", console=console, transient=True):
+        pose = np.array([*place, card.heading])
+        laser = se2.compose(pose, np.array(scanner.mount))
+        clean = card.world.ray_distances(laser, scanner.angles())[0]
+        start = np.array([*card.world.center(), card.heading])
+        estimator = PaperEstimator(model, card.test_l1_mean, card.world.bounds, start, metric=model.norm.metric)
+        for _ in range(scans):
+            noisy = usable_ranges(clean + scanner.sigma * rng.standard_normal(beams), scanner.range_max)
+            estimate = estimator.update(noisy)
+        errors.append(float(np.hypot(*(estimate.pose - pose)[:2])))
+        claimed.append(estimate.state == "tracking")
+    error, sure = np.array(errors), np.array(claimed)
+    return {
+        "trials": trials,
+        "scans": scans,
+        "steps_a_scan": estimator.settings.iterations,
+        "alpha_m2": estimator.settings.alpha,
+        "found_within_1_m": int((error < FOUND).sum()),
+        "position_error_median_m": float(np.median(error)),
+        "position_error_of_found_mean_m": float(error[error < FOUND].mean()) if (error < FOUND).any() else None,
+        "position_error_of_found_std_m": float(error[error < FOUND].std()) if (error < FOUND).any() else None,
+        "claimed_tracking": int(sure.sum()),
+        "claimed_tracking_but_wrong": int((sure & (error >= FOUND)).sum()),
+        "world": world,
+        "beams": beams,
+        "seed": seed,
+        "commit": commit(),
+        "versions": versions(),
+        "arguments": sys.argv[1:],
+    }
+
+
+def bench_localisation(
+    world: str, beams: int, trials: int, scans: int, seed: int, json_file: Path | None, console: Console
+) -> int:
+    """Print, and write as JSON where asked."""
+    result = localisation(world, beams, trials, scans, seed, console)
+    mean, std = (result[f"position_error_of_found_{k}_m"] for k in ("mean", "std"))
+    console.print(
+        f"found within {FOUND:g} m: {result['found_within_1_m']} of {trials}, "
+        + (f"those {mean:.3f} ± {std:.3f} m off; " if mean is not None else "")
+        + f"median of all {result['position_error_median_m']:.3f} m\n"
+        f"says it is localised: {result['claimed_tracking']}, wrongly: {result['claimed_tracking_but_wrong']}"
+    )
+    if json_file is not None:
+        json_file.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    return 0

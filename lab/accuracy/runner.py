@@ -1,0 +1,170 @@
+"""Runs every estimator through every task."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from common.geometry import se2
+from common.geometry.se2 import Array
+from common.geometry.world import World, load_world
+from common.robot.scanner import Scanner
+from common.versions import commit, versions
+from lab.accuracy import tasks
+from lab.accuracy.scenes import TWINS, Scene
+from lab.workers import pool
+from services.estimator.factory import Choice, Geometry, Name, prepare
+from services.estimator.particle_filter.filter import ParticleFilter
+from services.estimator.particle_filter.settings import Settings as ParticleSettings
+from services.estimator.precise.estimator import PreciseEstimator
+from services.estimator.precise.field import FieldModel
+from services.estimator.precise.global_seeds import SPACING, Seeds, thin_places
+from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_ripple, learn_scales
+from services.estimator.precise.learning.surfaces import Beams
+from services.estimator.shared.generative_models import RayCaster
+from services.estimator.shared.interface import Estimator
+
+# As users name them; exact is precise over the world itself.
+CHOICES: dict[str, tuple[Name, str]] = {
+    "precise": ("precise", "learned"),
+    "precise-exact": ("precise", "exact"),
+    "particle-filter": ("particle-filter", "learned"),
+    "amcl-defaults": ("amcl-defaults", "learned"),
+}
+DEGREES_OF_FREEDOM = 3
+TASKS = ("standing", "blocked", "kidnapped", "tracking", "odometry", "twins")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One estimator in one world with one scanner."""
+
+    estimator: str
+    world: str
+    scanner: Scanner
+    trials: int
+    seconds: float
+    seed: int
+    tasks: tuple[str, ...] = TASKS
+
+
+def run_all(jobs: list[Job], workers: int, console: Console) -> list[dict[str, Any]]:
+    """Rows of all jobs, in order; with progress."""
+    if workers == 1:
+        return [row for job in track(jobs, "measuring", console=console, transient=True) for row in run(job)]
+    with pool(workers) as executor:
+        done = track(executor.map(run, jobs), "measuring", total=len(jobs), console=console, transient=True)
+        return [row for rows in done for row in rows]
+
+
+def run(job: Job) -> list[dict[str, Any]]:
+    """The rows of one job."""
+    world = load_world(job.world)
+    geometry = Geometry.of(job.scanner)
+    name, model = CHOICES[job.estimator]
+    estimator = prepare(Choice(job.world, name, model, seed=job.seed))(geometry)
+    outcomes: dict[str, tasks.Outcome] = {}
+    for number, task in enumerate((tasks.standing, tasks.blocked, tasks.kidnapped)):
+        if task.__name__ in job.tasks:
+            outcomes |= task(estimator, _scene(job, world, number), job.trials, _quiet)
+    for number, name_of_task in enumerate(("tracking", "odometry")):
+        if name_of_task in job.tasks:
+            scene = _scene(job, world, 10 + number)
+            outcomes |= tasks.tracking(estimator, scene, job.seconds, _quiet, odometry=name_of_task == "odometry")
+    rows = [_row(job, job.world, task, outcome) for task, outcome in outcomes.items()]
+    if "twins" not in job.tasks:
+        return rows
+    scene = _scene(job, TWINS, 20)
+    alike = tasks.twins(_among_twins(job, geometry), scene, job.trials, _quiet)
+    return rows + [_row(job, TWINS.name, task, outcome) for task, outcome in alike.items()]
+
+
+def _quiet(poses: Iterable[Array]) -> Iterator[Array]:
+    return iter(poses)
+
+
+def _scene(job: Job, world: World, number: int) -> Scene:
+    return Scene.of(world, None, job.seed * 100 + number, job.scanner)
+
+
+def _among_twins(job: Job, geometry: Geometry) -> Estimator:
+    """The estimator in the world of two rooms alike; a field is learned for it here, from 2000 scans."""
+    name, model = CHOICES[job.estimator]
+    mount = (float(geometry.mount[0]), float(geometry.mount[1]), float(geometry.mount[2]))
+    if name == "amcl-defaults":
+        return ParticleFilter(TWINS, ParticleSettings(), mount, job.seed)
+    if name == "particle-filter":
+        return ParticleFilter(TWINS, ParticleSettings.tuned(), mount, job.seed)
+    rng = np.random.default_rng(job.seed)
+    places = thin_places(TWINS.sample_free(6000, rng, 0.05), SPACING)
+    if model == "exact":
+        exact = RayCaster(TWINS)
+        return PreciseEstimator(exact, Seeds.at(exact, places), geometry.mount, geometry.likelihood())
+    learned = quick_field(TWINS, geometry, rng, limited=True)
+    return PreciseEstimator(learned, Seeds.at(learned, places), geometry.mount, geometry.likelihood())
+
+
+def quick_field(
+    world: World, geometry: Geometry, rng: np.random.Generator, samples: int = 2000, *, limited: bool = False
+) -> FieldModel:
+    """A field learned from exact rays with the scanner's noise, ``limited`` to its longest range, and no simulator."""
+    poses = np.column_stack([world.sample_free(samples, rng, 0.27), rng.uniform(-np.pi, np.pi, samples)])
+    clean = world.ray_distances(se2.compose(poses, geometry.mount), geometry.angles)
+    split = samples // 10
+    noisy = clean[split:] + geometry.likelihood().deviation(clean[split:]) * rng.standard_normal(clean[split:].shape)
+    if limited:
+        clean, noisy = (np.where(ranges > geometry.range_max, np.inf, ranges) for ranges in (clean, noisy))
+    field = learn_field(Beams.of(poses[split:], geometry.mount, geometry.angles, noisy), Recipe(sweeps=6))
+    scales = learn_scales(field, poses[:split], geometry.mount, geometry.angles, clean[:split], 0.0)
+    ripple = learn_ripple(field, se2.compose(poses[:split], geometry.mount), geometry.angles)
+    return FieldModel(field, scales, ripple)
+
+
+def _row(job: Job, world: str, task: str, outcome: tasks.Outcome) -> dict[str, Any]:
+    """Plain names, units in them; None where nothing can be said."""
+    errors = np.array(outcome.errors).reshape(-1, 3)
+    position = np.hypot(errors[:, 0], errors[:, 1])
+    count, misfits = len(position), np.array(outcome.misfits)
+    rms = float(np.sqrt(np.mean(position**2))) if count else None
+    limit = float(np.sqrt(np.mean(np.square(outcome.bounds)))) if outcome.bounds else None
+    half = 1.96 * np.sqrt(2 * DEGREES_OF_FREEDOM / max(len(misfits), 1))
+    return {
+        "world": world,
+        "scanner": job.scanner.name,
+        "beams": job.scanner.beams,
+        "estimator": job.estimator,
+        "task": task,
+        "of": outcome.of,
+        "found": outcome.found,
+        "tracking_but_wrong": outcome.wrong,
+        "found_share_95": wilson(outcome.found, outcome.of) if outcome.independent else None,
+        "tracking_but_wrong_share_95": wilson(outcome.wrong, outcome.of) if outcome.independent else None,
+        "position_error_median_m": float(np.median(position)) if count else None,
+        "position_error_rms_m": rms,
+        "position_error_p95_m": float(np.quantile(position, 0.95)) if count else None,
+        "position_error_max_m": float(position.max()) if count else None,
+        "heading_error_median_deg": float(np.rad2deg(np.median(np.abs(errors[:, 2])))) if count else None,
+        "bound_rms_m": limit,
+        "rms_over_bound": rms / limit if rms is not None and limit else None,
+        "nees_mean": float(misfits.mean()) if len(misfits) else None,
+        "nees_band": [DEGREES_OF_FREEDOM - half, DEGREES_OF_FREEDOM + half] if len(misfits) else None,
+        "update_ms_median": float(np.median(outcome.update_ms)) if outcome.update_ms else None,
+    }
+
+
+def wilson(count: int, of: int) -> list[float]:
+    """Wilson's interval of 95 % for the probability of an event that happened ``count`` times in ``of`` trials."""
+    z2 = 1.96**2
+    middle, half = count + z2 / 2, 1.96 * np.sqrt(count * (of - count) / of + z2 / 4)
+    return [float(np.clip((middle + side * half) / (of + z2), 0, 1)) for side in (-1, 1)]
+
+
+def about(seed: int) -> dict[str, Any]:
+    """What a result needs to be repeated."""
+    return {"seed": seed, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:]}

@@ -1,0 +1,149 @@
+"""Places, paths and scans for the tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import shapely
+
+from common.geometry import se2
+from common.geometry.se2 import Array
+from common.geometry.world import World
+from common.robot.base import Robot
+from common.robot.scanner import SCANNERS, Scanner
+from services.estimator.shared.interface import Observation
+
+ROBOT = Robot()
+TIM571 = SCANNERS["tim571"]
+TURN = 1.0  # rad/s at most on the paths
+
+
+@dataclass
+class Scene:
+    """A world, a scanner, and the noise; every scan is made by exact rays."""
+
+    world: World
+    scanner: Scanner
+    rng: np.random.Generator
+
+    @classmethod
+    def of(cls, world: World, beams: int | None, seed: int | Sequence[int], scanner: Scanner = TIM571) -> Scene:
+        """With so many beams (None: its own) of a scanner."""
+        return cls(world, scanner.with_beams(beams), np.random.default_rng(seed))
+
+    def poses(self, count: int) -> Array:
+        """(count, 3) uniform over where the robot fits, any heading."""
+        places = self.world.sample_free(count, self.rng, ROBOT.radius)
+        return np.column_stack([places, self.rng.uniform(-np.pi, np.pi, count)])
+
+    def clean(self, poses: Array) -> Array:
+        """(N, B) m without noise."""
+        lasers = se2.compose(poses, np.array(self.scanner.mount))
+        return np.asarray(self.world.ray_distances(lasers, self.scanner.angles()))
+
+    def observe(self, clean: Array, stamp: float, odom: Array | None = None) -> Observation:
+        """One scan (B,) with fresh noise."""
+        scanner = self.scanner
+        return Observation(
+            scanner.limit(scanner.noisy(clean, self.rng)), scanner.angles(), scanner.range_max, stamp, odom
+        )
+
+    def blocked(self, clean: Array, share: float) -> Array:
+        """What no model knows, people say: sectors of (B,) cut short at 0.3 to 4 m, at least ``share`` of the beams."""
+        ranges, hidden = clean.copy(), np.zeros(len(clean), bool)
+        while hidden.mean() < share:
+            middle, half = self.rng.integers(len(clean)), self.rng.integers(5, 31) * len(clean) // 622
+            sector = slice(max(0, middle - half), middle + half + 1)
+            distance = self.rng.uniform(0.3, 4.0)
+            hidden[sector] |= ranges[sector] > distance
+            ranges[sector] = np.minimum(ranges[sector], distance)
+            if (ranges < 0.31).all():
+                break
+        return np.asarray(ranges)
+
+    def path(self, seconds: float, speed: float = 1.0) -> Array:
+        """(N, 3) poses, one a scan: between places in sight, with the robot's limits, turning up to 1 rad/s."""
+        dt = 1 / self.scanner.rate
+        room = shapely.buffer(self.world.free_space, -ROBOT.radius)
+        shapely.prepare(room)
+        pose, velocity, turn = self.poses(1)[0], np.zeros(2), 0.0
+        target, wanted_speed, wanted_turn = pose[:2], 0.0, 0.0
+        poses = [pose]
+        while len(poses) < seconds * self.scanner.rate:
+            if np.hypot(*(target - pose[:2])) < 0.1 or self.rng.random() < 0.005:
+                target = self._in_sight(room, pose[:2])
+                wanted_speed, wanted_turn = self.rng.uniform(0.2, speed), self.rng.uniform(-TURN, TURN)
+            towards = target - pose[:2]
+            distance = float(np.hypot(*towards))
+            wanted = towards / max(distance, 1e-9) * min(wanted_speed, np.sqrt(2 * 0.5 * distance))
+            change = wanted - velocity
+            velocity = velocity + change * min(1.0, ROBOT.acceleration * dt / max(float(np.hypot(*change)), 1e-9))
+            turn += float(np.clip(wanted_turn - turn, -ROBOT.turn_acceleration * dt, ROBOT.turn_acceleration * dt))
+            ahead = pose[:2] + velocity * dt
+            if not shapely.covers(room, shapely.Point(ahead)):  # braked too late: as at a wall
+                ahead, velocity, target = pose[:2], np.zeros(2), pose[:2]
+            pose = np.array([*ahead, float(se2.wrap(pose[2] + turn * dt))])
+            poses.append(pose)
+        return np.array(poses)
+
+    def _in_sight(self, room: shapely.Geometry, place: Array) -> Array:
+        for candidate in self.world.sample_free(200, self.rng, ROBOT.radius):
+            if shapely.covers(room, shapely.LineString(np.array([place, candidate]))):
+                return np.asarray(candidate)
+        return place
+
+
+TWIN_OFFSET = 6.1  # m along x, from one room to its twin
+TWINS = World(
+    name="twins",
+    boundary=[(0, 0), (12, 0), (12, 6), (0, 6)],
+    obstacles=[
+        # Two rooms alike, each behind a door; a corridor along both, with one thing at one end.
+        {"polygon": [(5.9, 0), (6.1, 0), (6.1, 4), (5.9, 4)]},
+        {"polygon": [(0, 4), (2.4, 4), (2.4, 4.15), (0, 4.15)]},
+        {"polygon": [(3.5, 4), (8.5, 4), (8.5, 4.15), (3.5, 4.15)]},
+        {"polygon": [(9.6, 4), (12, 4), (12, 4.15), (9.6, 4.15)]},
+        {"box": {"center": (1.0, 1.2), "size": (0.6, 0.9), "yaw_deg": 20}},
+        {"box": {"center": (7.1, 1.2), "size": (0.6, 0.9), "yaw_deg": 20}},
+        {"circle": {"center": (4.4, 2.6), "radius": 0.3}},
+        {"circle": {"center": (10.5, 2.6), "radius": 0.3}},
+        {"box": {"center": (0.4, 5.6), "size": (0.6, 0.5)}},
+    ],
+)  # fmt: skip
+
+
+def twin_path(scene: Scene) -> tuple[Array, int]:
+    """(N, 3) from a place in one of the rooms out into the corridor, and how many scans both rooms explain alike."""
+    while True:
+        pose = np.array([*scene.rng.uniform([0.6, 0.4], [5.4, 2.2]), scene.rng.uniform(-np.pi, np.pi)])
+        if scene.world.clearance(pose[:2])[0] < ROBOT.radius or not _sees_door(scene, pose):
+            continue
+        if alike(scene, pose[None])[0]:
+            break
+    side = float(scene.rng.integers(2)) * TWIN_OFFSET
+    corners = np.array([pose[:2], [2.95, 3.4], [2.95, 5.0], [4.5, 5.0]])
+    legs = [np.linspace(a, b, max(2, int(np.hypot(*(b - a)) * 30))) for a, b in pairwise(corners)]
+    places = np.concatenate([np.tile(pose[:2], (5, 1)), *legs])
+    poses = np.column_stack([places, np.full(len(places), pose[2])])
+    same = alike(scene, poses)
+    poses[:, 0] += side
+    return poses, int(np.argmin(same)) if not same.all() else len(same)
+
+
+def twin_of(poses: Array) -> Array:
+    """(..., 3) the same places and headings in the other of the two rooms."""
+    offset = np.where(poses[..., :1] < TWIN_OFFSET, TWIN_OFFSET, -TWIN_OFFSET)
+    return np.asarray(poses + offset * np.array([1.0, 0.0, 0.0]))
+
+
+def alike(scene: Scene, poses: Array) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Whether poses (N, 3) give the very scan of their twins."""
+    return np.asarray(np.abs(scene.clean(poses) - scene.clean(twin_of(poses))).max(axis=1) < 1e-6)
+
+
+def _sees_door(scene: Scene, pose: Array) -> bool:
+    line = shapely.LineString(np.array([pose[:2], [2.95, 3.4]]))
+    return bool(shapely.covers(shapely.buffer(scene.world.free_space, -ROBOT.radius), line))

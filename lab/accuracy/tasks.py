@@ -1,0 +1,156 @@
+"""The tasks: one estimator through one kind of scene."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from common.geometry import se2
+from common.geometry.se2 import Array
+from lab.accuracy import bound
+from lab.accuracy.scenes import Scene, twin_of, twin_path
+from services.estimator.shared.interface import Estimator, Observation, Posterior
+from services.simulator.odometry import Drift, Odometer
+
+FOUND_DISTANCE, FOUND_YAW = 0.2, np.deg2rad(5)  # m, rad
+STANDING = 20  # scans
+TWINS_FROM = 20  # scans: from this one on a belief must contain both rooms; no estimator can know them at once
+Watch = Callable[[Iterable[Array]], Iterator[Array]]
+
+
+def is_at(believed: Array, pose: Array) -> bool:
+    """Whether poses (3,) differ by less than the distance and the heading within which a place counts as found."""
+    dx, dy, turn = believed - pose
+    return bool(np.hypot(dx, dy) < FOUND_DISTANCE and abs(se2.wrap(turn)) < FOUND_YAW)
+
+
+@dataclass
+class Outcome:
+    """One estimator in one task."""
+
+    errors: list[Array] = field(default_factory=list)  # (3,) m, m, rad
+    misfits: list[float] = field(default_factory=list)  # squared Mahalanobis distance by the stated covariance
+    bounds: list[float] = field(default_factory=list)  # m, position
+    update_ms: list[float] = field(default_factory=list)
+    found: int = 0
+    of: int = 0
+    wrong: int = 0  # `tracking` was published, but the robot was elsewhere
+    independent: bool = True  # the counts are of separate trials, not of scans along one path
+
+    def add(self, posterior: Posterior, pose: Array, limit: float | None) -> bool:
+        """Take an estimate; whether it is at the place."""
+        error = posterior.pose - pose
+        error[2] = se2.wrap(error[2])
+        here = is_at(posterior.pose, pose)
+        self.of += 1
+        self.found += here
+        self.wrong += posterior.state == "tracking" and not here
+        if here:
+            self.errors.append(error)
+            if limit is not None:
+                self.bounds.append(limit)
+            if posterior.covariance is not None:
+                self.misfits.append(float(error @ np.linalg.solve(posterior.covariance, error)))
+        return here
+
+
+def _timed(estimator: Estimator, observation: Observation, outcome: Outcome | None = None) -> Posterior:
+    began = time.perf_counter()
+    posterior = estimator.update(observation)
+    if outcome is not None:
+        outcome.update_ms.append((time.perf_counter() - began) * 1e3)
+    return posterior
+
+
+def standing(estimator: Estimator, scene: Scene, trials: int, watch: Watch) -> dict[str, Outcome]:
+    """From nothing: after one scan, and after twenty of a robot that stands; no odometry."""
+    one, many = Outcome(), Outcome()
+    poses = scene.poses(trials)
+    limits = bound.position(bound.single(scene, poses))
+    for pose, clean, limit in zip(watch(poses), scene.clean(poses), limits, strict=True):
+        estimator.restart()
+        for k in range(STANDING):
+            first = k == 0
+            posterior = _timed(estimator, scene.observe(clean, k / scene.scanner.rate), one if first else many)
+            if first:
+                one.add(posterior, pose, limit)
+        many.add(posterior, pose, limit / np.sqrt(STANDING))
+    return {"from nothing, 1 scan": one, "standing, 20 scans": many}
+
+
+def blocked(estimator: Estimator, scene: Scene, trials: int, watch: Watch) -> dict[str, Outcome]:
+    """From nothing with 30 % of the beams cut short by what no model knows, another each time; one scan, and twenty."""
+    one, many = Outcome(), Outcome()
+    poses = scene.poses(trials)
+    for pose, clean in zip(watch(poses), scene.clean(poses), strict=True):
+        estimator.restart()
+        hidden = scene.blocked(clean, 0.3)
+        for k in range(STANDING):
+            posterior = _timed(estimator, scene.observe(hidden, k / scene.scanner.rate), one if k == 0 else many)
+            if k == 0:
+                one.add(posterior, pose, None)
+        many.add(posterior, pose, None)
+    return {"30 % blocked, 1 scan": one, "30 % blocked, 20 scans": many}
+
+
+def tracking(estimator: Estimator, scene: Scene, seconds: float, watch: Watch, *, odometry: bool) -> dict[str, Outcome]:
+    """Along a path from a known start; with the simulator's odometry or none."""
+    outcome, path = Outcome(independent=False), scene.path(seconds)
+    limits = (
+        bound.recursive(scene, path, Drift()) if odometry else bound.single(scene, path)
+    )  # without odometry the motion is not known: the bound is that of each scan alone
+    odometer = Odometer(Drift(), scene.rng)
+    estimator.restart(path[0], np.diag([0.01, 0.01, 0.01]))
+    for k, pose in enumerate(watch(path)):
+        if k:
+            odometer.move(path[k - 1], pose)
+        observation = scene.observe(
+            scene.clean(pose[None])[0], k / scene.scanner.rate, odometer.pose.copy() if odometry else None
+        )
+        outcome.add(_timed(estimator, observation, outcome), pose, float(bound.position(limits[k])))
+    return {"tracking, odometry" if odometry else "tracking, no odometry": outcome}
+
+
+def kidnapped(estimator: Estimator, scene: Scene, trials: int, watch: Watch) -> dict[str, Outcome]:
+    """Carried off while it stood: at its new place after one scan, after three, after twenty."""
+    after = {1: Outcome(), 3: Outcome(), 20: Outcome()}
+    poses, stamp = scene.poses(trials + 1), 0
+    estimator.restart()
+    for number, (pose, clean) in enumerate(zip(watch(poses), scene.clean(poses), strict=True)):
+        for k in range(1, STANDING + 1):
+            stamp += 1
+            posterior = _timed(estimator, scene.observe(clean, stamp / scene.scanner.rate))
+            if number and k in after:
+                after[k].add(posterior, pose, None)
+    return {f"kidnapped, {k} scan{'s' if k > 1 else ''}": outcome for k, outcome in after.items()}
+
+
+def holds_both(posterior: Posterior, pose: Array) -> bool:
+    """Whether hypotheses lie at ``pose`` (3,) and at its twin in the other room."""
+    return all(any(is_at(h.pose, place) for h in posterior.hypotheses) for place in (pose, twin_of(pose)))
+
+
+def twins(estimator: Estimator, scene: Scene, trials: int, watch: Watch) -> dict[str, Outcome]:
+    """Two rooms alike: both kept while no scan tells them apart, and the right one believed at the end of the path.
+
+    Kept: every belief from the 20th scan on, until a scan differs between the rooms, has a hypothesis at the true pose
+    and one at its twin, of whatever weight. Wrong: in a trial `tracking` was published at the wrong place meanwhile.
+    """
+    kept, right = Outcome(), Outcome()
+    for _ in watch(np.arange(float(trials))):
+        path, same = twin_path(scene)
+        estimator.restart()
+        both, wrong = True, False
+        for k, pose in enumerate(path):
+            posterior = _timed(estimator, scene.observe(scene.clean(pose[None])[0], k / scene.scanner.rate))
+            if k >= same:
+                continue
+            wrong |= posterior.state == "tracking" and not is_at(posterior.pose, pose)
+            if k + 1 >= TWINS_FROM:
+                both &= holds_both(posterior, pose)
+        kept.of, kept.found, kept.wrong = kept.of + 1, kept.found + both, kept.wrong + wrong
+        right.add(posterior, pose, None)
+    return {"two rooms alike: both kept": kept, "two rooms alike: right after": right}

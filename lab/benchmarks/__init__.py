@@ -1,0 +1,1 @@
+"""Latency, load and memory of the real processes."""

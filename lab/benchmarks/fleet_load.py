@@ -1,0 +1,155 @@
+"""Scans of many robots for `bench fleet`."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.bus.bus import Bus
+from common.bus.inbox import Inbox, Sample
+from common.geometry import se2
+from common.geometry.se2 import Array
+from common.geometry.world import World
+from common.messages.definitions import Belief, Pose, Scan
+from common.messages.requests import LocaliseRequest
+from common.messages.topics import BELIEF, HEALTH, LOCALISE, PREDICTION, SCAN
+from common.messages.wire import DecodeError
+from common.robot.scanner import SCANNERS, Scanner
+
+HEADING = np.pi / 2  # rad, all the time: the one that preset paper knows
+SPEED, RADIUS = 0.3, 0.25  # m/s, m of the circles that the robots drive
+CLEARANCE = 0.5  # m between a circle's centre and the walls
+AFTER = 1.0  # s in which answers may still come
+
+
+@dataclass
+class Robot:
+    """One that drives in circles; its time is its own, and stands still while nothing is played."""
+
+    name: str
+    centre: Array  # (2,) m
+    phase: float  # of the period between two scans, when its scans are sent
+    scans: int = 0  # so far
+
+    def pose(self, k: int, rate: float) -> Array:
+        """(3,) at its k-th scan."""
+        turn = SPEED / RADIUS * k / rate
+        return np.array([*(self.centre + RADIUS * np.array([np.cos(turn), np.sin(turn)])), HEADING])
+
+
+@dataclass(frozen=True)
+class Window:
+    """What came of the scans of some seconds."""
+
+    robots: int
+    sent: int
+    answered: int
+    in_time: int
+    latency_ms: Array  # (answered,)
+    tracking: int  # robots whose last belief says so
+
+    @property
+    def in_time_share(self) -> float:
+        """Of the scans that were sent."""
+        return self.in_time / max(1, self.sent)
+
+    def percentile(self, q: float) -> float | None:
+        """Latency in ms; None: nothing was answered."""
+        return float(np.percentile(self.latency_ms, q)) if len(self.latency_ms) else None
+
+
+class Load:
+    """Robots whose scans are cast before they are played, so that playing them costs little."""
+
+    def __init__(self, bus: Bus, world: World, beams: int, rate: float, count: int, seed: int) -> None:
+        """``count`` robots somewhere in the world; ``rate`` Hz each."""
+        self.world, self.rate = world, rate
+        self.scanner: Scanner = SCANNERS["tim571"].with_beams(beams)
+        self._rng = np.random.default_rng(seed)
+        centres = world.sample_free(count, self._rng, CLEARANCE)
+        self.robots = [Robot(f"bench-{k}", centre, k / count) for k, centre in enumerate(centres)]
+        self._buses = {robot.name: bus.beside(robot.name) for robot in self.robots}
+        self._inbox = Inbox(capacity=1_000_000)
+        bus.subscribe(BELIEF, self._inbox, keep_all=True, robot="*")
+
+    def wait_matching(self, count: int, timeout: float) -> bool:
+        """Whether the first robots' scans are subscribed to."""
+        deadline = time.monotonic() + timeout
+        return all(
+            self._buses[robot.name].wait_matching(SCAN, deadline - time.monotonic()) for robot in self.robots[:count]
+        )
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of each message that goes between one robot and its estimator, at most, without zenoh's own."""
+        robot, inbox = self.robots[0], Inbox()
+        ends = [
+            self._buses[robot.name].subscribe(topic, inbox, keep_all=True) for topic in (BELIEF, PREDICTION, HEALTH)
+        ]
+        self.play(1, 2.5)
+        for end in ends:
+            end()
+        found = {"scan": len(self._payload(robot, robot.scans))}
+        while isinstance(sample := inbox.get(0), Sample):
+            found[sample.topic.name] = max(found.get(sample.topic.name, 0), len(sample.payload))
+        return found
+
+    def play(self, count: int, seconds: float, rate: float | None = None, *, searching: bool = False) -> Window:
+        """Send the first robots' scans at their times, ``rate`` Hz or the usual, each robot at its own phase.
+
+        ``searching``: the first one is asked to begin from nothing each second, and the others are what is reported.
+        """
+        rate = rate or self.rate
+        schedule = sorted(
+            (((k + robot.phase) / rate, robot, robot.scans + k) for robot in self.robots[:count]
+             for k in range(max(1, int(seconds * rate)))), key=lambda row: row[0],
+        )  # fmt: skip
+        payloads = [self._payload(robot, k) for _, robot, k in schedule]
+        while self._inbox.get(0) is not None:
+            pass  # late answers to an earlier window
+        sent: dict[tuple[str, int], int] = {}
+        lost = self.robots[0] if searching else None
+        began = time.monotonic()
+        for (due, robot, k), payload in zip(schedule, payloads, strict=True):
+            time.sleep(max(0.0, began + due - time.monotonic()))
+            if robot is not lost:
+                sent[BELIEF.key(robot.name), self._stamp(k)] = time.time_ns()
+            elif k % round(rate) == 0:
+                self._buses[robot.name].request(LOCALISE, LocaliseRequest(), k, Inbox())
+            self._buses[robot.name].put(SCAN, payload)
+            robot.scans = k + 1
+        return self._window(count, sent)
+
+    def _stamp(self, k: int) -> int:
+        return int((k + 1) / self.rate * 1e9)
+
+    def _payload(self, robot: Robot, k: int) -> bytes:
+        scanner, laser = self.scanner, se2.compose(robot.pose(k, self.rate), self.scanner.mount)
+        clean = self.world.ray_distances(laser[None], scanner.angles())[0]
+        return Scan(
+            stamp_ns=self._stamp(k), seq=k, angle_min=scanner.angle_min, angle_increment=scanner.angle_increment,
+            range_min=scanner.range_min, range_max=scanner.range_max,
+            ranges=clean + scanner.sigma * self._rng.standard_normal(len(clean)),
+            mount=Pose.of(scanner.mount), scan_time=1 / self.rate,
+        ).encode()  # fmt: skip
+
+    def _window(self, count: int, sent: dict[tuple[str, int], int]) -> Window:
+        """Wait for the last answers, then match them."""
+        deadline, latency, states = time.monotonic() + AFTER, dict[tuple[str, int], float](), dict[str, str]()
+        while len(latency) < len(sent) and (left := deadline - time.monotonic()) > 0:
+            sample = self._inbox.get(left)
+            if not isinstance(sample, Sample):
+                continue
+            try:
+                belief = Belief.decode(sample.payload)
+            except DecodeError:
+                continue
+            key = sample.key, belief.stamp_ns
+            if key in sent and key not in latency:
+                latency[key] = (sample.received_ns - sent[key]) * 1e-6
+                states[sample.key] = belief.state
+        values = np.array(list(latency.values()))
+        in_time = int((values <= 1e3 / self.rate).sum()) if len(values) else 0
+        tracking = sum(state == "tracking" for state in states.values())
+        return Window(count, len(sent), len(latency), in_time, values, tracking)

@@ -1,0 +1,144 @@
+"""`presage bench latency`."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from common.bus.bus import Bus, Link, open_bus
+from common.bus.inbox import Inbox, Sample
+from common.bus.security import credentials
+from common.errors import UserError
+from common.geometry import se2
+from common.geometry.world import load_world
+from common.messages.definitions import CmdVel, Pose, Scan
+from common.messages.topics import CMD_VEL, ODOM, SCAN, TRUTH
+from common.robot.base import Robot
+from common.robot.scanner import SCANNERS
+from common.versions import commit, versions
+from presage.session.stack import Stack
+from presage.terminal.options import credentials_for
+from presage.terminal.output import check_file, write_json
+
+# The echo process speaks on keys of a robot of its own: payload out on `odom`, back on `truth`, any bytes.
+ECHO_ROBOT, ECHO = "echo", "simulator"
+WARM_UP = 30  # scans not counted
+
+
+def echo_main() -> None:
+    """Child process: every payload that comes goes back, in zenoh's own callback thread's order."""
+    inbox = Inbox()
+    folder, connect = os.environ.get("PRESAGE_SECURITY"), (os.environ["PRESAGE_CONNECT"],)
+    security = credentials(Path(folder), ("simulator",), ECHO_ROBOT) if folder else None
+    with open_bus(Link(robot=ECHO_ROBOT, connect=connect, security=security)) as bus:
+        bus.subscribe(ODOM, inbox, keep_all=True)
+        bus.publisher(TRUTH)
+        bus.declare_alive(ECHO)
+        while True:
+            sample = inbox.get(1.0)
+            if isinstance(sample, Sample):
+                bus.put(TRUTH, sample.payload)
+
+
+def latency(scans: int, rate: float, beams: int, console: Console) -> dict[str, Any]:
+    """Milliseconds: scan to command (through estimator and controller), and the same payload there and back."""
+    world, scanner = load_world("corridor"), SCANNERS["tim571"].with_beams(beams)
+    start = world.start_pose(Robot().radius)
+    clean = world.ray_distances(se2.compose(start[None], scanner.mount), scanner.angles())[0]
+    rng = np.random.default_rng(0)
+    # We are the scanner, and the echo speaks on a scanner's keys.
+    with Stack("bench", quiet=True, security=credentials_for("bench", "simulator")) as stack:
+        stack.start_router()
+        stack.start("controller")
+        stack.start("estimator", "--initial-pose", f"{start[0]},{start[1]}")
+        with open_bus(stack.link()) as bus, open_bus(replace(stack.link(), robot=ECHO_ROBOT)) as raw:
+            stack.wait_alive(bus)
+            stack.start_code("echo", "from lab.benchmarks.latency import echo_main; echo_main()")
+            _wait_echo(raw, stack)
+            return _measure(bus, raw, scanner, clean, rng, scans, rate, console)
+
+
+def _wait_echo(raw: Bus, stack: Stack) -> None:
+    deadline = time.monotonic() + 30
+    while ECHO not in raw.alive(timeout=0.5):
+        stack.check()
+        if time.monotonic() > deadline:
+            raise UserError("the echo process did not start within 30 s")
+
+
+def _measure(
+    bus: Bus, raw: Bus, scanner: Any, clean: Any, rng: np.random.Generator, scans: int, rate: float, console: Console
+) -> dict[str, Any]:
+    commands, returns = Inbox(), Inbox()
+    bus.subscribe(CMD_VEL, commands, keep_all=True)
+    raw.subscribe(TRUTH, returns, keep_all=True)
+    loop_ms, raw_ms, lost = [], [], 0
+    mount = Pose.of(scanner.mount)
+    for number in track(range(WARM_UP + scans), "scan to command", console=console, transient=True):
+        stamp = int(number / rate * 1e9)
+        noisy = clean + scanner.sigma * rng.standard_normal(len(clean))
+        payload = Scan(
+            stamp_ns=stamp, seq=number, angle_min=scanner.angle_min, angle_increment=scanner.angle_increment,
+            range_min=scanner.range_min, range_max=scanner.range_max, ranges=noisy, mount=mount, scan_time=1 / rate,
+        ).encode()  # fmt: skip
+        began = time.perf_counter()
+        bus.put(SCAN, payload)
+        there = _await(commands, lambda p, s=stamp: CmdVel.decode(p).stamp_ns == s)
+        middle = time.perf_counter()
+        raw.put(ODOM, payload)
+        back = _await(returns, lambda p, sent=payload: p == sent)
+        end = time.perf_counter()
+        if number >= WARM_UP:
+            lost += (not there) + (not back)
+            loop_ms += [(middle - began) * 1e3] if there else []
+            raw_ms += [(end - middle) * 1e3] if back else []
+        time.sleep(max(0.0, 1 / rate - (time.perf_counter() - began)))
+    return {
+        "scan_to_command_median_ms": float(np.median(loop_ms)),
+        "scan_to_command_p99_ms": float(np.percentile(loop_ms, 99)),
+        "zenoh_round_trip_median_ms": float(np.median(raw_ms)),
+        "zenoh_round_trip_p99_ms": float(np.percentile(raw_ms, 99)),
+        "payload_bytes": len(payload), "beams": len(clean), "scans": scans, "rate_hz": rate, "unanswered": lost,
+        "seed": 0, "commit": commit(), "versions": versions(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores", "arguments": sys.argv[1:],
+    }  # fmt: skip
+
+
+def _await(inbox: Inbox, wanted: Any) -> bool:
+    deadline = time.monotonic() + 2.0
+    while (left := deadline - time.monotonic()) > 0:
+        sample = inbox.get(left)
+        if isinstance(sample, Sample) and wanted(sample.payload):
+            return True
+    return False
+
+
+def bench_latency(scans: int, rate: float, beams: int, json_file: Path | None, console: Console) -> int:
+    """Print, and write as JSON where asked."""
+    check_file(json_file, "--json")
+    result = latency(scans, rate, beams, console)
+    table = Table(
+        title=f"{beams} beams ({result['payload_bytes']} bytes) at {rate:g} Hz, {scans} scans", title_justify="left"
+    )
+    for column in ("", "median ms", "p99 ms"):
+        table.add_column(column, justify="right" if column else "left")
+    for name, title in (
+        ("scan_to_command", "scan to command, through estimator and controller"),
+        ("zenoh_round_trip", "the same payload there and back, zenoh alone"),
+    ):
+        table.add_row(title, f"{result[name + '_median_ms']:.2f}", f"{result[name + '_p99_ms']:.2f}")
+    console.print(table)
+    if result["unanswered"]:
+        console.print(f"[bold]{result['unanswered']} payloads were not answered within 2 s[/]")
+    write_json(json_file, result)
+    return 1 if result["unanswered"] else 0

@@ -1,0 +1,90 @@
+"""`presage bench map`."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from common.geometry import se2
+from common.geometry.world import World, load_world
+from common.messages.requests import WorldReply
+from common.robot.base import Robot
+from common.robot.scanner import SCANNERS
+from lab.accuracy.runner import about
+from presage.learning.grid_map import rooms, write_map
+from presage.terminal.output import check_file, make_folder, write_json
+from services.controller.policies.free_space import FreeSpace
+from services.controller.policies.geodesic_field import Roads
+from services.estimator.particle_filter.likelihood_field import DistanceField
+from services.estimator.shared.generative_models import RayCaster
+from services.simulator.people import People
+from services.simulator.simulation import Setup, Simulation
+
+SCANS = 100
+
+
+def bench_map(
+    world: str, size: int, beams: int, out: Path | None, seed: int, json_file: Path | None, console: Console
+) -> int:
+    """Measure, print, and write where asked."""
+    check_file(json_file, "--json")
+    if out is not None:
+        make_folder(out, "--out")
+    with tempfile.TemporaryDirectory() as folder:
+        path = world or str(write_map(out or Path(folder), rooms(size, seed)))
+        rows = measure(path, beams, seed)
+    table = Table(title=f"{world or f'{size} x {size} cells'}, {beams} beams, processor time", title_justify="left")
+    table.add_column("what")
+    table.add_column("", justify="right")
+    for name, value, unit in rows:
+        table.add_row(name, f"{value:.3g} {unit}" if value < 1000 else f"{value:.0f} {unit}")
+    console.print(table)
+    write_json(json_file, {"rows": [{"name": n, "value": v, "unit": u} for n, v, u in rows], **about(seed)})
+    return 0
+
+
+def measure(path: str, beams: int, seed: int) -> list[tuple[str, float, str]]:
+    """What, how much, and its unit, of the world in that file; processor time, whatever else runs."""
+    rows: list[tuple[str, float, str]] = []
+
+    def timed(name: str, work: Callable[[], Any], times: int = 1) -> Any:
+        began = time.process_time()
+        result = work()
+        seconds = (time.process_time() - began) / times
+        rows.append((name, seconds * 1e3, "ms a scan") if times > 1 else (name, seconds, "s"))
+        return result
+
+    world: World = timed("load", lambda: load_world(path))
+    rows.append(("message WORLD", len(WorldReply(world=world).encode()) / 1e3, "kB"))
+    rows.append(("straight walls", float(len(timed("walls out of the cells", lambda: world.segments))), ""))
+    scanner, rng = SCANNERS["tim571"].with_beams(beams), np.random.default_rng(seed)
+    simulation = timed("simulator: start", lambda: Simulation(Setup(world, scanner)))
+    timed("simulator: drive and scan", lambda: _drive(simulation), SCANS)
+    places = timed("5000 random places", lambda: world.sample_free(5000, rng, Robot().radius))
+    poses = np.column_stack([places, rng.uniform(-np.pi, np.pi, len(places))])[:SCANS]
+    timed("simulator: scans to learn from", lambda: simulation.sample(poses, None, None), SCANS)
+    simulation.close()
+    lasers, angles = se2.compose(poses, np.array(scanner.mount)), scanner.angles()
+    world.ray_distances(lasers[:1], angles)
+    timed("exact rays, numpy", lambda: world.ray_distances(lasers, angles), SCANS)
+    RayCaster(world).expect(lasers[:1], angles)
+    timed("exact rays, compiled", lambda: RayCaster(world).expect(lasers, angles), SCANS)
+    free = timed("controller: free space", lambda: FreeSpace.of(world))
+    timed("controller: roads", lambda: Roads(free, Robot().radius))
+    timed("particle filter: likelihood field", lambda: DistanceField(world))
+    start = world.start_pose(Robot().radius)[:2]
+    timed("simulator: room for 10 people", lambda: People(world, 10, 1.0, rng, start, Robot().radius))
+    return rows
+
+
+def _drive(simulation: Simulation) -> None:
+    for _ in range(SCANS):
+        simulation.advance()
+        simulation.observe()

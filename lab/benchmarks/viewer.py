@@ -1,0 +1,188 @@
+"""`presage bench viewer`."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sys
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin
+
+from common.bus.bus import Bus, open_bus, wait_until
+from common.bus.inbox import Inbox, Sample
+from common.errors import UserError
+from common.messages.topics import CMD_VEL, SCAN
+from common.versions import commit, versions
+from presage.session.ports import free_port
+from presage.session.stack import Stack
+from presage.terminal.output import check_file, write_json
+
+WARM_UP = 3.0  # s not counted, of every round
+PATIENCE = 60.0  # s
+ROBOT = "bench"
+
+
+class Visitor:
+    """A page that takes every frame, and does nothing with it."""
+
+    def __init__(self, port: int) -> None:
+        """Connect and watch; raises UserError where the page's socket does not answer."""
+        self.frames = self.bytes = 0
+        try:
+            origin, where = Origin(f"http://127.0.0.1:{port}"), f"ws://127.0.0.1:{port}/ws"
+            self._socket: ClientConnection = connect(where, origin=origin, open_timeout=PATIENCE)
+        except (OSError, TimeoutError) as error:
+            raise UserError(f"the viewer's socket at port {port} does not answer: {error}") from None
+        self._socket.send(json.dumps({"id": 1, "do": "watch", "robot": ROBOT}))
+        self._thread = threading.Thread(target=self._read, name="visitor", daemon=True)
+        self._thread.start()
+
+    def _read(self) -> None:
+        try:
+            for message in self._socket:
+                if isinstance(message, bytes):
+                    self.frames += 1
+                    self.bytes += len(message)
+        except ConnectionClosed:
+            return
+
+    def close(self) -> None:
+        """Leave."""
+        self._socket.close()
+        self._thread.join(5)
+
+
+@dataclass
+class Cost:
+    """Of all rounds of one kind."""
+
+    latency_ms: list[float] = field(default_factory=list)
+    unanswered: int = 0
+    seconds: float = 0.0
+    cpu_s: float = 0.0  # of the viewer
+    memory_mb: float = 0.0
+    frames: int = 0
+    bytes: int = 0
+
+
+def measure(seconds: float, rounds: int, beams: int, console: Console) -> dict[str, Any]:
+    """Rounds of ``seconds`` s without the viewer and with it, in turn, in one session; what is reported."""
+    without, having = Cost(), Cost()
+    with Stack(ROBOT, quiet=True) as stack:
+        stack.start_router()
+        stack.start("controller")
+        stack.start("estimator", "--initial-pose", "3,1.5")
+        stack.start("simulator", "--beams", str(beams))
+        with open_bus(stack.link()) as bus:
+            stack.wait_alive(bus)
+            _first_command(bus, stack)
+            for number in track(range(2 * rounds), "without, with", console=console, transient=True):
+                (_with_viewer if number % 2 else _without)(bus, stack, seconds, having if number % 2 else without)
+    return _report(without, having, seconds, rounds, beams)
+
+
+def _first_command(bus: Bus, stack: Stack) -> None:
+    inbox = Inbox()
+    bus.subscribe(CMD_VEL, inbox)
+    deadline = time.monotonic() + PATIENCE
+    while inbox.get(0.5) is None:
+        stack.check()
+        if time.monotonic() > deadline:
+            raise UserError(f"no command came within {PATIENCE:g} s")
+
+
+def _without(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None:
+    time.sleep(WARM_UP)
+    _listen(bus, stack, seconds, cost)
+
+
+def _with_viewer(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None:
+    port = free_port()
+    stack.start("viewer", "--port", str(port))
+    stack.wait_alive(bus)
+    visitor = Visitor(port)
+    try:
+        if not wait_until(lambda: visitor.frames > 0, PATIENCE):
+            raise UserError(f"the viewer sent no frame within {PATIENCE:g} s")
+        time.sleep(WARM_UP)
+        process = psutil.Process(stack.processes["viewer"].child.pid)
+        before, frames, size = process.cpu_times(), visitor.frames, visitor.bytes
+        _listen(bus, stack, seconds, cost)
+        after = process.cpu_times()
+        cost.cpu_s += after.user + after.system - before.user - before.system
+        cost.memory_mb = max(cost.memory_mb, process.memory_info().rss / 1e6)
+        cost.frames, cost.bytes = cost.frames + visitor.frames - frames, cost.bytes + visitor.bytes - size
+    finally:
+        visitor.close()
+    stack.stop("viewer")
+
+
+def _listen(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None:
+    """Between a scan's publication and its command's, by the publishers' clock, which is this machine's."""
+    inbox, scans = Inbox(), dict[int, int]()
+    ends = [bus.subscribe(topic, inbox, keep_all=True) for topic in (SCAN, CMD_VEL)]
+    began = time.monotonic()
+    while (left := began + seconds - time.monotonic()) > 0:
+        sample = inbox.get(min(left, 0.5))
+        if not isinstance(sample, Sample):
+            stack.check()
+            continue
+        stamp = sample.topic.message.decode(sample.payload).stamp_ns
+        if sample.topic is SCAN:
+            scans[stamp] = sample.published_ns
+        elif stamp in scans:
+            cost.latency_ms.append((sample.published_ns - scans.pop(stamp)) * 1e-6)
+    cost.seconds += time.monotonic() - began
+    cost.unanswered += max(0, len(scans) - 1)  # the last one's command was still to come
+    for end in ends:
+        end()
+
+
+def _report(without: Cost, having: Cost, seconds: float, rounds: int, beams: int) -> dict[str, Any]:
+    numbers: dict[str, Any] = {}
+    for name, cost in (("without", without), ("with", having)):
+        if not cost.latency_ms:
+            raise UserError(f"no scan was answered {name} the viewer")
+        numbers[f"scan_to_command_median_{name}_ms"] = float(np.median(cost.latency_ms))
+        numbers[f"scan_to_command_p99_{name}_ms"] = float(np.percentile(cost.latency_ms, 99))
+        numbers[f"unanswered_{name}"] = cost.unanswered
+    return {
+        **numbers,
+        "viewer_cpu_share": having.cpu_s / having.seconds, "viewer_memory_mb": having.memory_mb,
+        "frames_hz": having.frames / having.seconds, "frame_bytes": having.bytes / max(1, having.frames),
+        "seconds": seconds, "rounds": rounds, "beams": beams, "commit": commit(), "versions": versions(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores", "arguments": sys.argv[1:],
+    }  # fmt: skip
+
+
+def bench_viewer(seconds: float, rounds: int, beams: int, json_file: Path | None, console: Console) -> int:
+    """Print, and write as JSON where asked."""
+    check_file(json_file, "--json")
+    result = measure(seconds, rounds, beams, console)
+    table = Table(title=f"{beams} beams, {rounds} x {seconds:g} s each, one visitor", title_justify="left")
+    for column in ("scan to command", "median ms", "p99 ms", "unanswered"):
+        table.add_column(column, justify="left" if column == "scan to command" else "right")
+    for name in ("without", "with"):
+        numbers = [f"{result[f'scan_to_command_{kind}_{name}_ms']:.2f}" for kind in ("median", "p99")]
+        table.add_row(f"{name} the viewer", *numbers, str(result[f"unanswered_{name}"]))
+    console.print(table)
+    console.print(
+        f"the viewer: {100 * result['viewer_cpu_share']:.1f} % of a core, {result['viewer_memory_mb']:.0f} MB; "
+        f"its visitor: {result['frames_hz']:.1f} frames/s of {result['frame_bytes'] / 1e3:.1f} kB",
+        highlight=False,
+    )
+    write_json(json_file, result)
+    return 0

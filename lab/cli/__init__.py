@@ -1,0 +1,1 @@
+"""The commands `presage bench` and `presage experiment`."""

@@ -1,0 +1,284 @@
+"""`presage experiment`."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from common.errors import UserError
+from lab.cli.navigation import navigate
+from lab.cli.options import (
+    CORES,
+    OUT,
+    Alpha,
+    Beams,
+    Estimators,
+    ExperimentSeed,
+    Out,
+    Steps,
+    Trials,
+    Workers,
+    World,
+    show,
+)
+from presage.terminal.options import console
+from presage.terminal.output import make_folder
+
+app = typer.Typer(
+    help="The experiments of Burghardt & Lanillos 2021, for presets paper and precise and the particle filter; and "
+    "navigation round walls and people.",
+    no_args_is_help=True,
+)
+
+FEWEST = 50  # samples that anything can be learned from
+
+
+@app.command("e1")
+def e1(
+    trials: Trials = 100,
+    iterations: Annotated[int, typer.Option(min=1, help="Scans of each trial.")] = 50,
+    estimators: Estimators = "",
+    alpha: Alpha = None,
+    steps: Steps = None,
+    world: World = "corridor",
+    beams: Beams = 622,
+    seed: ExperimentSeed = 1,
+    out: Out = OUT,
+    workers: Workers = CORES,
+) -> None:
+    """E1: where is a standing robot? Error against iterations.
+
+    Examples: `presage experiment e1 --trials 5`; `presage experiment e1 --alpha 5e-4 --out slow`;
+    `presage experiment e1 --estimators "paper,precise" --iterations 200`.
+    """
+    from lab.experiments.estimators import Field, chosen, descent_of  # noqa: PLC0415
+    from lab.paper import e1_localisation as localisation  # noqa: PLC0415
+
+    job = localisation.Job(0, seed, iterations, field=Field(world, beams), descent=descent_of(alpha, steps))
+    job = replace(job, estimators=chosen(estimators)) if estimators else job
+    show(localisation, lambda: localisation.run(job, trials, out, workers, console), out)
+
+
+@app.command("e2")
+def e2(
+    trials: Trials = 12,
+    step: Annotated[float, typer.Option(min=1e-3, max=1.0, help="m, of each teleport.")] = 0.05,
+    estimators: Estimators = "",
+    alpha: Alpha = None,
+    steps: Steps = None,
+    world: World = "corridor",
+    beams: Beams = 622,
+    seed: ExperimentSeed = 1,
+    out: Out = OUT,
+    workers: Workers = CORES,
+) -> None:
+    """E2: crossing the map by small teleports at one heading. Error over time, with and without odometry.
+
+    Examples: `presage experiment e2 --trials 2`; `presage experiment e2 --step 0.02 --out slower`.
+    """
+    from lab.experiments.estimators import Field, chosen, descent_of  # noqa: PLC0415
+    from lab.paper import e2_crossing as crossing  # noqa: PLC0415
+
+    job = crossing.Job(0, seed, step, field=Field(world, beams), descent=descent_of(alpha, steps))
+    job = replace(job, estimators=chosen(estimators)) if estimators else job
+    show(crossing, lambda: crossing.run(job, trials, out, workers, console), out)
+
+
+@app.command("e3")
+def e3(
+    trials: Trials = 50,
+    apart: Annotated[float, typer.Option(min=1.0, max=1000.0, help="m, between start and goal at least.")] = 12.0,
+    free: Annotated[
+        bool, typer.Option("--free/--any", help="Free straight line from start to goal, or any pair of places.")
+    ] = True,
+    estimators: Estimators = "",
+    alpha: Alpha = None,
+    steps: Steps = None,
+    world: World = "corridor",
+    beams: Beams = 622,
+    seed: ExperimentSeed = 1,
+    out: Out = OUT,
+    workers: Workers = CORES,
+) -> None:
+    """E3: navigation from a known start to a goal, through the real processes in lockstep over zenoh.
+
+    Examples: `presage experiment e3 --trials 2`; `presage experiment e3 --estimators precise --apart 5 --out near`;
+    `presage experiment e3 --any --trials 20 --estimators precise --out any`.
+    """
+    from lab.experiments.estimators import Field, chosen, descent_of  # noqa: PLC0415
+    from lab.paper import e3_navigation as navigation  # noqa: PLC0415
+
+    job = navigation.Job(0, seed, apart, free=free, field=Field(world, beams), descent=descent_of(alpha, steps))
+    job = replace(job, estimators=chosen(estimators)) if estimators else job
+    show(navigation, lambda: navigation.run(job, trials, out, workers, console), out)
+
+
+@app.command("alpha")
+def alpha_sweep(
+    trials: Trials = 25,
+    alphas: Annotated[str, typer.Option(help="Comma-separated, m²; empty: 2e-4 to 2e-2.")] = "",
+    seed: ExperimentSeed = 1,
+    out: Out = OUT,
+    workers: Workers = CORES,
+) -> None:
+    """The paper's step size α, swept on E1.
+
+    Examples: `presage experiment alpha --trials 10`; `presage experiment alpha --alphas 5e-4,1e-3,2e-3`.
+    """
+    from lab.paper import alpha_sweep as step_size  # noqa: PLC0415
+    from lab.paper import e1_localisation as localisation  # noqa: PLC0415
+
+    try:
+        wanted = tuple(float(part) for part in alphas.split(",")) if alphas else step_size.ALPHAS
+    except ValueError:
+        raise UserError(f"--alphas {alphas!r}: give numbers, such as 2e-4,4e-4") from None
+    if not all(1e-8 <= value <= 1 for value in wanted):
+        raise UserError(f"--alphas {alphas!r}: each must lie between 1e-8 and 1 m²")
+    show(step_size, lambda: step_size.run(localisation.Job(0, seed, 50), trials, out, workers, console, wanted), out)
+
+
+@app.command("steps")
+def step_sizes(trials: Trials = 10, seed: ExperimentSeed = 1, out: Out = OUT, workers: Workers = CORES) -> None:
+    """The step sizes β and γ on E3 in one process, and the paper's own loop of teleports: where 12.5 iterations lie.
+
+    Example: `presage experiment steps --trials 2`.
+    """
+    from lab.paper import step_sizes as stepping  # noqa: PLC0415
+
+    show(stepping, lambda: stepping.run(stepping.Job(0, seed), trials, out, workers, console), out)
+
+
+@app.command("samples")
+def samples_needed(
+    sizes: Annotated[str, typer.Option(help="Comma-separated; empty: 500 to 13000.")] = "",
+    places: Annotated[int, typer.Option(min=1, help="To find, after learning.")] = 50,
+    seed: ExperimentSeed = 1,
+    out: Out = OUT,
+    workers: Workers = CORES,
+) -> None:
+    """Fewer samples: error of what is predicted, and of the places found with it.
+
+    Examples: `presage experiment samples --sizes 500,2000 --places 10`.
+    """
+    from lab.paper import samples  # noqa: PLC0415
+
+    try:
+        wanted = tuple(int(part) for part in sizes.split(",")) if sizes else samples.SIZES
+    except ValueError:
+        raise UserError(f"--sizes {sizes!r}: give whole numbers, such as 500,2000") from None
+    if min(wanted) < FEWEST:
+        raise UserError(f"--sizes {sizes!r}: each must be at least {FEWEST} samples")
+    show(samples, lambda: samples.run(samples.Job(seed, places=places), out, workers, console, wanted), out)
+
+
+@app.command("aliasing")
+def similar_objects(
+    places: Annotated[int, typer.Option(min=1, help="In each world.")] = 30,
+    seed: ExperimentSeed = 1,
+    out: Out = OUT,
+    workers: Workers = CORES,
+) -> None:
+    """Similar objects, and two rooms alike: who is found, who is sure and wrong, who keeps both.
+
+    Example: `presage experiment aliasing --places 5`.
+    """
+    from lab.paper import aliasing  # noqa: PLC0415
+
+    show(aliasing, lambda: aliasing.run(aliasing.Job(seed, places=places), out, workers, console), out)
+
+
+@app.command("prediction")
+def predicted(
+    scans: Annotated[int, typer.Option(min=2, help="Whose beams are counted.")] = 500,
+    seed: ExperimentSeed = 1,
+    out: Out = OUT,
+) -> None:
+    """Predicted against measured scan on a test sample, with the stated precision (the paper's figure 2c).
+
+    Example: `presage experiment prediction --seed 7 --out other`.
+    """
+    from lab.paper import prediction  # noqa: PLC0415
+
+    show(prediction, lambda: prediction.run(prediction.Job(seed, scans), out, 1, console), out)
+
+
+@app.command("real")
+def real_drive(
+    log: Annotated[Path, typer.Option(help="Recording or log with reference poses (docs/logs.md).")],
+    world: Annotated[str, typer.Option("--map", help="ROS map or world file of the half that is learned.")],
+    name: Annotated[str, typer.Option(help="The results are called real-NAME; none: the log's.")] = "",
+    mount: Annotated[
+        str, typer.Option(help="Of the laser in base_link, x,y[,yaw_deg] (m, deg); none: as the log says.")
+    ] = "",
+    every: Annotated[int, typer.Option(min=1, help="Scans between the starts of c and d.")] = 50,
+    quick: Annotated[bool, typer.Option("--quick", help="A look: few scans, the particle filter not tuned.")] = False,
+    exchange: Annotated[
+        bool, typer.Option("--exchange", help="Learn from the second half, localise the first.")
+    ] = False,
+    seed: ExperimentSeed = 1,
+    out: Out = OUT,
+    workers: Workers = CORES,
+) -> None:
+    """A real drive: model and tuning from its first half, its second half localised; precise and the particle filter.
+
+    a: tracking with odometry; b: without; c: from nothing, every 50th scan as a start; d: carried off. Errors are
+    against the log's reference poses. Ctrl-C keeps what is done; the same command goes on there.
+    Examples: `presage map drive.npz --mount 0,0,0 --half first -o first_half.yaml`, then
+    `presage experiment real --log drive.npz --mount 0,0,0 --map first_half.yaml --quick`;
+    `presage experiment real --log fr079.mcap --map fr079.yaml --name fr079 --every 50 --out mine`.
+    """
+    from common.geometry.pose_text import pose_of_text  # noqa: PLC0415
+    from lab.real_logs import experiment as real  # noqa: PLC0415
+
+    if not re.fullmatch(r"[\w.-]*", name):
+        raise UserError(f"--name {name!r}: letters, digits, '.', '_' and '-' make a file's name")
+    sits: Any = tuple(pose_of_text(mount, "--mount").tolist()) if mount else None
+    job = real.Job(log, world, sits, every, quick, seed, name, exchange)
+    show(real, lambda: real.run(job, out, workers, console), out)
+
+
+@app.command("all")
+def all_experiments(
+    trials: Annotated[int, typer.Option(min=0, help="At most so many of each, for a look; 0: each its own.")] = 0,
+    seed: ExperimentSeed = 1,
+    out: Out = OUT,
+    workers: Workers = CORES,
+) -> None:
+    """Every experiment, one after another; after Ctrl-C the same command goes on where it was.
+
+    Examples: `presage experiment all`; `presage experiment all --trials 3 --out look`.
+    """
+    from lab.paper.suite import run_all  # noqa: PLC0415
+
+    make_folder(out, "--out")
+    run_all(trials, seed, out, workers, console)
+
+
+@app.command("tables")
+def tables(
+    out: Annotated[Path, typer.Option(help="Folder with the results.")] = OUT,
+    page: Annotated[Path | None, typer.Option(help="Markdown file whose marked tables are filled anew.")] = None,
+) -> None:
+    """The tables of results that are there, as Markdown; or a page filled with them.
+
+    Examples: `presage experiment tables`;
+    `presage experiment tables --page docs/experiments.md --out docs/experiments`.
+    """
+    from lab.experiments.tables_page import MODULES, filled, table_of  # noqa: PLC0415
+
+    if page is not None:
+        page.write_text(filled(page.read_text(encoding="utf-8"), out), encoding="utf-8")
+        return
+    found = [name for name in MODULES if (out / f"{name}.json").exists()]
+    found += sorted(path.stem for kind in ("navigation", "real") for path in out.glob(f"{kind}-*.json"))
+    if not found:
+        raise UserError(f"{out}: no results there; make them with: presage experiment all")
+    for name in found:
+        print(f"\n{name}\n\n{table_of(name, out)}")
+
+
+app.command("navigation")(navigate)

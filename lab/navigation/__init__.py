@@ -1,0 +1,1 @@
+"""Navigation around walls, furniture and people."""

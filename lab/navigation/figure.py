@@ -1,0 +1,120 @@
+"""The figure of the experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from common.geometry.world import World, load_world
+from lab.experiments import results
+from presage.plotting import style as drawing
+
+if TYPE_CHECKING:
+    from lab.navigation.experiment import Job
+
+Rows = Sequence[dict[str, Any]]
+LINES = ("-", "--", ":", "-.")
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+
+
+def describe(job: Job) -> str:
+    """What is asked of the robot, in words."""
+    parts = [f"start {job.start}", f"estimator {job.estimator}"]
+    parts += [f"{job.people} people at {job.people_speed:g} m/s"] if job.people else []
+    parts += [f"prior {job.prior}"] if job.prior != "motion" else []
+    parts += [] if job.epistemic else ["without the epistemic term"]
+    return ", ".join(parts)
+
+
+def draw(by_group: Mapping[str, Rows], worlds: Mapping[str, str], title: str) -> Figure:
+    """A map for each world and drive; below, how the paths' and times' ratios are distributed."""
+    count = len(by_group)
+    wide = min(2, count)
+    tall = -(-count // wide)
+    known = {group: load_world(world) for group, world in worlds.items()}
+    heights = [max(_height(known[group]) for group in list(known)[row * wide :][:wide]) for row in range(tall)]
+    figure = drawing.blank(6.6 * wide, 6.2 * sum(heights) + 0.5 * tall + 3.4)
+    figure.suptitle(title, fontsize=11)
+    grid = figure.add_gridspec(tall + 1, 2 * wide, height_ratios=[*(6.2 * h + 0.5 for h in heights), 2.6])
+    for number, (group, rows) in enumerate(by_group.items()):
+        row, column = divmod(number, wide)
+        _map(drawing.dress(figure.add_subplot(grid[row, 2 * column : 2 * column + 2])), known[group], group, rows)
+    left, right = (figure.add_subplot(grid[tall, part]) for part in (slice(0, wide), slice(wide, 2 * wide)))
+    for axes, quantity, label in (
+        (left, "path_over_shortest", "path over the shortest way with clearance"),
+        (right, "time_over_least", "time over the least time"),
+    ):
+        _distribution(drawing.dress(axes), by_group, quantity, label)
+    drawing.legend_below(figure, left)
+    return figure
+
+
+def _height(world: World) -> float:
+    x0, y0, x1, y1 = world.bounds
+    return (y1 - y0) / (x1 - x0)
+
+
+def _map(axes: Axes, world: World, group: str, rows: Rows) -> None:
+    drawing.world_map(axes, world)
+    for row in rows:
+        colour = drawing.GOAL if row["reached"] else drawing.PREDICTED
+        above = 3 if row["reached"] else 4
+        axes.plot(row["x_m"], row["y_m"], color=colour, linewidth=0.7, alpha=0.8, zorder=above)
+        axes.plot(*row["start"][:2], "o", color="black", markersize=2.5, zorder=5)
+        axes.plot(*row["goal"], "x", color=drawing.MEASURED if row["reached"] else colour, markersize=4, zorder=5)
+        for each in row["contact_at"]:
+            axes.plot(each["x"], each["y"], "o", color="#CC79A7", fillstyle="none", markersize=8, zorder=6)
+    reached = sum(row["reached"] for row in rows)
+    axes.set_title(f"{group}: {reached} of {len(rows)} reached", fontsize=10)
+
+
+def _distribution(axes: Axes, by_group: Mapping[str, Rows], quantity: str, label: str) -> None:
+    """The share of all trials that was reached within a ratio."""
+    last = 1.1
+    for number, (group, rows) in enumerate(by_group.items()):
+        ratios = np.sort([row[quantity] for row in rows if row["reached"]])
+        share = np.arange(1, len(ratios) + 1) / max(len(rows), 1)
+        last = max(last, float(ratios.max(initial=0.0)))
+        style = LINES[number // len(COLOURS) % len(LINES)]
+        axes.step(
+            [0.0, *ratios, 1e3], [0.0, *share, share[-1] if len(share) else 0.0], style, where="post",
+            color=COLOURS[number % len(COLOURS)], label=group,
+        )  # fmt: skip
+    axes.set(xlabel=label, ylabel="share of trials", xlim=(0.95, last * 1.03), ylim=(0, 1.02))
+
+
+def table(summary: dict[str, dict[str, Any]]) -> str:
+    """As docs/navigation.md has it."""
+    number, mm = results.number, results.millimetres
+    people = any(row["min_clearance_to_people_m"] is not None for row in summary.values())
+    heads = [
+        "world, drive", "reached", "claimed elsewhere", "trials with contact, moving; standing",
+        "path over shortest, median; max", "time over least, median; max", "least gap to walls (m)",
+        *(["to people (m)"] if people else []), "error, median; max (mm)", "localised after (s), median; max",
+        "replans, median", "blocked (s), all", "held back (scans)", "controller step (ms), mean; max",
+    ]  # fmt: skip
+    rows = [
+        [
+            name, f"{row['reached']} of {row['trials']}", str(row["trials_claimed_elsewhere"]),
+            f"{row['trials_with_contact_moving']}; {row['trials_with_contact_standing']}",
+            f"{number(row['median_path_over_shortest'])}; {number(row['max_path_over_shortest'])}",
+            f"{number(row['median_time_over_least'])}; {number(row['max_time_over_least'])}",
+            number(row["min_clearance_m"]), *([number(row["min_clearance_to_people_m"])] if people else []),
+            f"{mm(row['median_error_median_m'])}; {mm(row['max_error_max_m'])}",
+            f"{number(row['median_tracking_s'], 1)}; {number(row['max_tracking_s'], 1)}",
+            number(row["median_replans"], 0), number(row["seconds_blocked"], 1), str(row["scans_held_back"]),
+            f"{number(row['median_step_mean_ms'], 1)}; {number(row['max_step_max_ms'], 1)}",
+        ]
+        for name, row in summary.items()
+    ]  # fmt: skip
+    bad = [
+        f"- {name}, trial {each['trial']}, {each['outcome']}: {each['why']}"
+        for name, row in summary.items()
+        for each in row["worst"]
+        if each["outcome"] != "reached" or "touched" in each["why"]
+    ]
+    return "\n\n".join([results.markdown(heads, rows), *(["\n".join(bad)] if bad else [])])

@@ -1,0 +1,247 @@
+"""Similar objects.
+
+Three worlds: the corridor with its four different objects, for comparison; the same hall with four equal boxes, evenly
+spaced; and two rooms alike, at places of which no scan says which room it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from common.geometry.se2 import Array
+from common.geometry.world import World, load_world
+from lab.accuracy.scenes import ROBOT, TWIN_OFFSET, TWINS, Scene, alike, twin_of
+from lab.experiments import model_training as learning
+from lab.experiments import results
+from lab.experiments.estimators import PAPER
+from lab.experiments.trials import run_trials
+from lab.paper.e1_localisation import CLOSE, FOUND
+from presage.plotting import style as drawing
+from services.estimator.paper.perception import Descent
+from services.estimator.particle_filter.filter import ParticleFilter
+from services.estimator.particle_filter.settings import Settings as ParticleSettings
+from services.estimator.shared.interface import Estimator, Posterior
+
+NUMBER = 5  # of the experiment, in its seeds
+PLACES, LEARNING, SCANS = 0, 1, 2  # in the seeds
+HEADING = float(np.pi / 2)  # rad, the paper's one; nobody else is told
+ALIKE = World(
+    name="alike",
+    boundary=[(0, 0), (18, 0), (18, 4.5), (0, 4.5)],
+    obstacles=[{"box": {"center": (x, 3.9), "size": (0.7, 0.7)}} for x in (3.6, 7.2, 10.8, 14.4)],
+)
+TITLES = {
+    "corridor": "corridor: four different objects", "alike": "alike: four equal boxes",
+    "twins": "twins: two rooms alike",
+}  # fmt: skip
+ESTIMATORS = ("paper", "precise", "particle-filter")
+MOMENTS = (1, 10, 50)  # scans after which it is asked how well they did
+
+
+@dataclass(frozen=True)
+class Job:
+    """One estimator in one world, at all places."""
+
+    seed: int
+    world: str = "alike"
+    estimator: str = "paper"
+    places: int = 50
+    iterations: int = 50
+    beams: int = 622
+    samples: int = 13_000  # of the paper's decoder
+    steps: int = learning.STEPS
+    scans: int = 2000  # that the field is learned from
+    descent: Descent = PAPER
+
+
+def world_of(name: str) -> World:
+    """One of the three."""
+    return {"alike": ALIKE, "twins": TWINS}.get(name) or load_world(name)
+
+
+def scene_of(job: Job, *seed: int) -> Scene:
+    """The job's world; places and scans are the same for every estimator."""
+    return Scene.of(world_of(job.world), job.beams, (job.seed, NUMBER, list(TITLES).index(job.world), *seed))
+
+
+def stands(scene: Scene, count: int) -> Array:
+    """(count, 3) places at the one heading; among twins only such as give the very scan of their twin."""
+    if scene.world.name != TWINS.name:
+        poses = scene.poses(count)
+        poses[:, 2] = HEADING
+        return poses
+    found: list[Array] = []
+    while sum(map(len, found)) < count:
+        poses = np.column_stack([scene.rng.uniform([0, 0], [TWIN_OFFSET, 4.0], (500, 2)), np.full(500, HEADING)])
+        poses = poses[scene.world.clearance(poses[:, :2]) > ROBOT.radius]
+        found.append(poses[alike(scene, poses)])
+    poses = np.concatenate(found)[:count]
+    poses[:, 0] += TWIN_OFFSET * scene.rng.integers(2, size=count)
+    return np.asarray(poses)
+
+
+def trial(job: Job) -> dict[str, Any]:
+    """What the estimator learns and then believes at each place."""
+    make = _maker(job)
+    rows = []
+    for number, pose in enumerate(stands(scene_of(job, PLACES), job.places)):
+        scene = scene_of(job, SCANS, number)
+        clean = scene.clean(pose[None])[0]
+        estimator = make(number)
+        posteriors = [estimator.update(scene.observe(clean, k / scene.scanner.rate)) for k in range(job.iterations)]
+        rows.append(_row(pose, posteriors, twins=job.world == TWINS.name))
+    return {"world": job.world, "estimator": job.estimator, "places": rows}
+
+
+def _maker(job: Job) -> Callable[[int], Estimator]:
+    """New estimators that know nothing but the world, learned here; by the place's number."""
+    scene = scene_of(job, LEARNING, ESTIMATORS.index(job.estimator))
+    if job.estimator == "paper":
+        decoder = learning.train_paper(scene, HEADING, job.samples, job.steps, job.seed)
+        return lambda _: decoder.estimator(job.descent)
+    if job.estimator == "precise":
+        field = learning.learn_precise(scene, job.scans)
+        return lambda _: field.estimator(scene)
+    settings, mount = ParticleSettings.tuned(), scene.scanner.mount
+    return lambda number: ParticleFilter(scene.world, settings, mount, job.seed * 100_003 + number)
+
+
+def _row(pose: Array, posteriors: Sequence[Posterior], *, twins: bool) -> dict[str, Any]:
+    """One place: errors and wrong claims after every scan, and at the end whether both of two like places are kept."""
+    off = [round(float(np.hypot(*(p.pose - pose)[:2])), 6) for p in posteriors]
+    wrong = [int(p.state == "tracking" and error > FOUND) for p, error in zip(posteriors, off, strict=True)]
+    last = posteriors[-1]
+    found = {"pose": pose.tolist(), "believed": last.pose.tolist(), "error_m": off, "wrong": wrong, "claim": last.state}
+    if not twins:
+        return found
+    twin = twin_of(pose)
+    near = [any(np.hypot(*(h.pose - at)[:2]) < CLOSE for h in last.hypotheses) for at in (pose, twin)]
+    either = min(off[-1], float(np.hypot(*(last.pose - twin)[:2])))
+    return {**found, "both_kept": int(last.state == "ambiguous" and all(near)), "either_error_m": round(either, 6)}
+
+
+def summarise(row: dict[str, Any]) -> dict[str, Any]:
+    """Numbers of one estimator in one world."""
+    places = row["places"]
+    errors, wrong = (np.array([place[name] for place in places]) for name in ("error_m", "wrong"))
+    moments = [k for k in MOMENTS if k <= errors.shape[1]]
+    found: dict[str, Any] = {"world": row["world"], "estimator": row["estimator"], "places": len(places)}
+    found |= {f"within_0.2_m_after_{k}": int((errors[:, k - 1] < CLOSE).sum()) for k in moments}
+    found |= {f"tracking_but_wrong_after_{k}": int(wrong[:, k - 1].sum()) for k in moments}
+    found |= {
+        "tracking_but_wrong_ever": int(wrong.any(axis=1).sum()),
+        "final_error_median_m": float(np.median(errors[:, -1])),
+        "final_error_mean_m": float(errors[:, -1].mean()),
+        "claims": {claim: sum(p["claim"] == claim for p in places) for claim in sorted({p["claim"] for p in places})},
+    }
+    if "both_kept" in places[0]:
+        either = np.array([place["either_error_m"] for place in places])
+        found["both_kept"] = sum(place["both_kept"] for place in places)
+        found["at_either_within_0.2_m"] = int((either < CLOSE).sum())
+    return found
+
+
+def run(job: Job, out: Path, workers: int, console: Console, worlds: Sequence[str] = tuple(TITLES)) -> results.Result:
+    """Every estimator in every world; writes aliasing.json, .csv, .pdf and .png into ``out``."""
+    # What takes longest first: the decoders' training.
+    jobs = [replace(job, world=world, estimator=name) for name in ESTIMATORS for world in worlds]
+    rows = run_trials("aliasing", trial, jobs, out, workers, console)
+    rows = [row for world in worlds for row in rows if row["world"] == world]
+    curves: dict[str, list[Any]] = {"iteration": list(range(1, job.iterations + 1))}
+    for row in rows:
+        errors = np.array([place["error_m"] for place in row["places"]])
+        key = f"{row['world']}, {row['estimator']}"
+        curves[f"{key} median m"] = np.median(errors, axis=0).tolist()
+        curves[f"{key} share within 0.2 m"] = (errors < CLOSE).mean(axis=0).tolist()
+    summary = {f"{row['world']}, {row['estimator']}": summarise(row) for row in rows}
+    result = results.Result(
+        "aliasing", "Similar objects", job.seed, asdict(job) | {"worlds": list(worlds)}, summary, curves, rows,
+        ["twins: only places of which no scan says which room it is; to know the place is then luck, one in two"],
+    )  # fmt: skip
+    result.write(out, draw(rows, summary))
+    return result
+
+
+def draw(rows: Sequence[dict[str, Any]], summary: dict[str, dict[str, Any]]) -> Figure:
+    """A row a world: its map, with what the paper's estimator believed; shares of places as bars."""
+    worlds = list(dict.fromkeys(row["world"] for row in rows))
+    figure = drawing.blank(14, 3.5 * len(worlds))
+    panels = figure.subplots(len(worlds), 2, squeeze=False, width_ratios=(1.15, 1))
+    for name, (left, right) in zip(worlds, panels, strict=True):
+        own = {row["estimator"]: row for row in rows if row["world"] == name}
+        _map(left, world_of(name), own["paper"]["places"])
+        left.set_title(TITLES[name])
+        _bars(drawing.dress(right), {each: summary[f"{name}, {each}"] for each in own})
+    panels[0][1].set_title(f"belief within {CLOSE} m of the truth | claims at the end")
+    drawing.legend_below(figure, *panels[0])
+    return figure
+
+
+def _map(axes: Axes, world: World, places: Sequence[dict[str, Any]]) -> None:
+    """Walls, furniture, true places, and lines to where the belief ended where that is somewhere else."""
+    drawing.world_map(axes, world)
+    true, believed = (np.array([place[key] for place in places])[:, :2] for key in ("pose", "believed"))
+    off = np.hypot(*(believed - true).T) > FOUND
+    for a, b in zip(true[off], believed[off], strict=True):
+        axes.plot(*np.array([a, b]).T, color=drawing.COLOURS["paper"], linewidth=1)
+    axes.plot(*true.T, ".", color="#222222", markersize=5, label="true place")
+    axes.plot(*believed[off].T, "x", color=drawing.COLOURS["paper"], markersize=6, label="paper's belief, > 0.5 m off")
+    x0, y0, x1, y1 = world.bounds
+    axes.set(xticks=np.arange(x0, x1 + 1, 3), yticks=[y0, y1])
+    axes.spines[:].set_visible(False)
+
+
+def _bars(axes: Axes, summary: dict[str, dict[str, Any]]) -> None:
+    """Shares of places, a group for each question."""
+    one = next(iter(summary.values()))
+    asked = [
+        (f"after {k}\nscan{'s' * (k != '1')}", name)
+        for name in one
+        if name.startswith("within")
+        for k in [name.rsplit("_", 1)[1]]
+    ]
+    good = len(asked)
+    last = max(int(name.rsplit("_", 1)[1]) for name in one if name.startswith("within"))
+    asked.append((f"says: here, but\n> {FOUND} m off", f"tracking_but_wrong_after_{last}"))
+    if "both_kept" in one:
+        asked.append(("says: one of\nthese two", "both_kept"))
+    at, width = np.arange(len(asked)) + 0.35 * (np.arange(len(asked)) >= good), 0.8 / len(summary)
+    for number, (name, row) in enumerate(summary.items()):
+        shares = [row[quantity] / row["places"] for _, quantity in asked]
+        x = at + (number - (len(summary) - 1) / 2) * width
+        bars = axes.bar(x, shares, 0.92 * width, color=drawing.COLOURS[name], label=name)
+        axes.bar_label(bars, [f"{row[quantity]}" for _, quantity in asked], fontsize=9, padding=1)
+    axes.set_xticks(at, [label for label, _ in asked])
+    axes.grid(visible=False, axis="x")
+    axes.axvline(good - 0.5 + 0.17, color="#AAAAAA", linewidth=0.8)
+    if "both_kept" in one:
+        edges = (-0.45, good - 0.55)
+        axes.plot(edges, (0.5, 0.5), "--", color=drawing.BOUND, linewidth=1)
+        axes.text(edges[0], 0.52, "luck: one room in two", fontsize=9, color=drawing.BOUND)
+    axes.set(ylim=(0, 1.12), ylabel="share of places")
+
+
+def table(summary: dict[str, dict[str, Any]]) -> str:
+    """As docs/experiments.md has it."""
+    moments = [name for name in next(iter(summary.values())) if name.startswith("within")]
+    heads = (
+        "world", "estimator", *(f"within 0.2 m after {name.rsplit('_', 1)[1]}" for name in moments), "of",
+        "median error (m)", "`tracking` but > 0.5 m off, at the end; ever", "both places kept",
+    )  # fmt: skip
+    rows = []
+    for row in summary.values():
+        wrong = next(value for name, value in reversed(row.items()) if name.startswith("tracking_but_wrong_after"))
+        rows.append([
+            row["world"], row["estimator"], *(str(row[name]) for name in moments), str(row["places"]),
+            results.number(row["final_error_median_m"], 4), f"{wrong}; {row['tracking_but_wrong_ever']}",
+            f"{row['both_kept']} of {row['places']}" if "both_kept" in row else "",
+        ])  # fmt: skip
+    return results.markdown(heads, rows)

@@ -1,0 +1,168 @@
+"""E1: a standing robot.
+
+100 trials of 50 iterations at places uniform over free space; those in front of the objects, the paper's unobstructed
+middle, are told apart. An iteration is one scan with fresh noise, and one gradient step of preset paper. Its belief
+begins at the map's centre, the particle filter's particles anywhere in free space; nobody has odometry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from common.geometry.se2 import Array
+from lab.accuracy import bound
+from lab.experiments import results
+from lab.experiments.estimators import PAPER, STEPS, Field, enter, knows_heading
+from lab.experiments.trials import run_trials
+from presage.plotting import style as drawing
+from services.estimator.paper.perception import Descent
+
+NUMBER = 1  # of the experiment, in its seeds
+ESTIMATORS = (
+    "paper",
+    f"paper, {STEPS}",
+    "precise",
+    "particle-filter",
+    "particle-filter, heading known",
+    "amcl-defaults",
+)
+FOUND = 0.5  # m
+CLOSE = 0.2  # m
+
+
+@dataclass(frozen=True)
+class Job:
+    """One trial: one place, the same scans to everybody."""
+
+    index: int
+    seed: int
+    iterations: int
+    estimators: tuple[str, ...] = ESTIMATORS
+    field: Field = Field()  # noqa: RUF009 - frozen
+    descent: Descent = PAPER
+
+
+def trial(job: Job) -> dict[str, Any]:
+    """Errors in m after each iteration, and what was claimed at the end, by estimator; the bound beside them."""
+    scene = job.field.scene(job.seed, NUMBER, job.index)
+    pose = scene.poses(1)[0]
+    pose[2] = job.field.heading
+    clean = scene.clean(pose[None])[0]
+    scans = [scene.observe(clean, k / scene.scanner.rate) for k in range(job.iterations)]
+    one_scan = bound.single(scene, pose[None])
+    found: dict[str, Any] = {
+        "pose": pose.tolist(), "in_front": bool(pose[1] < job.field.front()), "bound": one_scan[0].tolist(),
+        "error_m": {}, "claim": {},
+    }  # fmt: skip
+    for name in job.estimators:
+        estimator = enter(name, job.field, scene, job.seed * 100_003 + job.index, job.descent)
+        posteriors = [estimator.update(scan) for scan in scans]
+        found["error_m"][name] = [round(float(np.hypot(*(p.pose - pose)[:2])), 6) for p in posteriors]
+        found["claim"][name] = posteriors[-1].state
+    return found
+
+
+def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
+    """Numbers of one estimator over all trials."""
+    errors = np.array([each["error_m"][name] for each in trials])
+    limit = bounds(trials, knows_heading(name)) / errors.shape[1]
+    last, claims = errors[:, -1], [each["claim"][name] == "tracking" for each in trials]
+    front = np.array([each["in_front"] for each in trials], bool)
+    # Iterations until it is close and stays so; those that never are have none.
+    far = errors >= CLOSE
+    until = np.array([np.inf if row[-1] else (np.flatnonzero(row)[-1] + 2 if row.any() else 1) for row in far])
+    return {
+        "trials": len(trials),
+        "final_error_mean_m": float(last.mean()),
+        "final_error_std_m": float(last.std()),
+        "final_error_median_m": float(np.median(last)),
+        "final_error_max_m": float(last.max()),
+        "final_error_rms_m": float(np.sqrt(np.mean(last**2))),
+        "final_rms_over_bound": float(np.sqrt(np.mean(last**2) / np.mean(bound.position(limit) ** 2))),
+        "final_median_over_bound": float(np.median(last)) / bound.median(limit),
+        "found_within_0.5_m": int((last < FOUND).sum()),
+        "found_within_0.2_m": int((last < CLOSE).sum()),
+        "first_scan_error_median_m": float(np.median(errors[:, 0])),
+        "iterations_to_0.2_m_median": float(np.median(until)) if np.isfinite(np.median(until)) else None,
+        "places_in_front": int(front.sum()),
+        "in_front_within_0.5_m": int((last[front] < FOUND).sum()),
+        "in_front_error_mean_m": float(last[front].mean()) if front.any() else None,
+        "in_front_error_std_m": float(last[front].std()) if front.any() else None,
+        "in_front_error_median_m": float(np.median(last[front])) if front.any() else None,
+        "claimed_tracking": int(np.sum(claims)),
+        "claimed_tracking_but_wrong": int(np.sum(np.array(claims) & (last >= FOUND))),
+    }
+
+
+def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
+    """All trials; writes e1.json, .csv, .pdf and .png into ``out``."""
+    jobs = [replace(job, index=index) for index in range(trials)]
+    rows = run_trials("e1", trial, jobs, out, workers, console)
+    curves: dict[str, list[Any]] = {"iteration": list(range(1, job.iterations + 1))}
+    curves |= results.curves_of(rows, job.estimators)
+    for name in job.estimators:
+        curves[f"{name} median m"] = np.median([row["error_m"][name] for row in rows], axis=0).tolist()
+    for text, known in (("", False), (", heading known", True)):
+        one = bounds(rows, known)
+        rms, median = float(np.sqrt(np.mean(bound.position(one) ** 2))), bound.median(one)
+        for what, value in (("RMS", rms), ("median", median)):
+            curves[f"bound{text} {what} m"] = [value / float(np.sqrt(k)) for k in range(1, job.iterations + 1)]
+    parameters = asdict(job) | {"trials": trials, "bound_end_m": curves["bound RMS m"][-1]}
+    result = results.Result(
+        "e1", "E1: a standing robot localised", job.seed, parameters,
+        {name: summarise(rows, name) for name in job.estimators}, curves, rows,
+    )  # fmt: skip
+    result.write(out, draw(rows, job.estimators, result.curves))
+    return result
+
+
+def bounds(rows: Sequence[dict[str, Any]], heading_known: bool) -> Array:
+    """(N, 3, 3) Cramér-Rao bound of one scan at each trial's place; of k scans it is so many times smaller."""
+    found = np.array([row["bound"] for row in rows])
+    return bound.heading_known(found) if heading_known else found
+
+
+def draw(rows: Sequence[dict[str, Any]], names: Sequence[str], curves: dict[str, list[Any]]) -> Figure:
+    """Error against iteration, as in the paper's figure 3; beside it on a logarithmic axis, where all can be seen."""
+    figure, panels = drawing.figure_of(2)
+    for axes, put in zip(panels, (drawing.band, drawing.quartiles), strict=True):
+        for name in names:
+            put(axes, curves["iteration"], [row["error_m"][name] for row in rows], name)
+        axes.set(xlabel="iteration (one scan)", ylabel="position error (m)", xlim=(1, curves["iteration"][-1]))
+    for text, style in (("", "--"), (", heading known", ":")):
+        limit = curves[f"bound{text} median m"]
+        panels[1].plot(curves["iteration"], limit, style, color=drawing.BOUND, label=f"Cramér-Rao bound{text}")
+    panels[0].set(ylim=(0, None), title="mean ± standard deviation, as the paper draws it")
+    drawing.log_metres(panels[1])
+    panels[1].set(title="median and quartiles; bound: median at best")
+    drawing.legend_below(figure, *panels)
+    return figure
+
+
+def table(summary: dict[str, dict[str, Any]]) -> str:
+    """As docs/experiments.md has it."""
+    heads = (
+        "estimator", "error at the end, mean ± std (m)", "median (mm)", "over the bound's", "RMS (mm)",
+        "over the bound's", "within 0.5 m", "in front of the objects", "error there (m)", "iterations to 0.2 m",
+        "claims to know; wrongly",
+    )  # fmt: skip
+    rows = [
+        [
+            name, results.mean_std(row, "final_error", 4),
+            results.millimetres(row["final_error_median_m"]), results.ratio(row["final_median_over_bound"]),
+            results.millimetres(row["final_error_rms_m"]), results.ratio(row["final_rms_over_bound"]),
+            f"{row['found_within_0.5_m']} of {row['trials']}",
+            f"{row['in_front_within_0.5_m']} of {row['places_in_front']}", results.mean_std(row, "in_front_error", 4),
+            results.number(row["iterations_to_0.2_m_median"], 0),
+            f"{row['claimed_tracking']}; {row['claimed_tracking_but_wrong']}",
+        ]
+        for name, row in summary.items()
+    ]  # fmt: skip
+    return results.markdown(heads, rows)

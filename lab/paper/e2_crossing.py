@@ -1,0 +1,179 @@
+"""E2: small teleports across the map.
+
+The robot is carried 5 cm between two scans (0.75 m/s at 15 Hz) from one end of the corridor to the other, at a distance
+from the objects' wall that differs from trial to trial. Everybody knows the start. Nobody has odometry but those whose
+name says so: they are told of each teleport by dead reckoning that drifts as the simulator's does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from common.errors import UserError
+from common.geometry.se2 import Array
+from common.robot.base import Robot
+from lab.accuracy import bound
+from lab.accuracy.scenes import Scene
+from lab.experiments import results
+from lab.experiments.estimators import PAPER, STEPS, Field, enter, knows_heading, uses_odometry
+from lab.experiments.trials import run_trials
+from presage.plotting import style as drawing
+from services.estimator.paper.perception import Descent
+from services.simulator.odometry import Drift, Odometer
+
+NUMBER = 2  # of the experiment, in its seeds
+ESTIMATORS = (
+    "paper", f"paper, {STEPS}", "precise", "particle-filter", "particle-filter, heading known",
+    "amcl-defaults", "precise, odometry", "particle-filter, odometry", "amcl-defaults, odometry",
+)  # fmt: skip
+START = np.diag([0.01, 0.01, 0.01])  # covariance of what is known of the start: 10 cm, 6 degrees
+LOST = 0.5  # m
+BOUNDS = ("one scan", "one scan, heading known", "all scans, odometry")
+MARGIN = 0.1  # m, between the robot and anything
+
+
+@dataclass(frozen=True)
+class Job:
+    """One crossing, the same scans to everybody."""
+
+    index: int
+    seed: int
+    step: float = 0.05  # m, of each teleport
+    estimators: tuple[str, ...] = ESTIMATORS
+    field: Field = Field()  # noqa: RUF009 - frozen
+    descent: Descent = PAPER
+
+
+def bound_of(name: str) -> str:
+    """Which of `BOUNDS` is this estimator's: those without odometry cannot tell how far they were carried."""
+    return BOUNDS[2] if uses_odometry(name) else BOUNDS[knows_heading(name)]
+
+
+def path_of(scene: Scene, heading: float, step: float) -> Array:
+    """(N, 3) poses straight across the world along x, in steps of so many m, on a free line drawn at random."""
+    x0, y0, x1, y1 = scene.world.bounds
+    away = Robot().radius + MARGIN
+    room = shapely.buffer(scene.world.free_space, -away)
+    for y in scene.rng.uniform(y0 + away, y1 - away, 1000):
+        if shapely.covers(room, shapely.LineString([(x0 + away + 1e-6, y), (x1 - away - 1e-6, y)])):
+            x = np.arange(x0 + away + 1e-6, x1 - away, step)
+            return np.column_stack([x, np.full(len(x), y), np.full(len(x), heading)])
+    raise UserError(f"world {scene.world.name!r} has no free straight line from one side to the other: take another")
+
+
+def trial(job: Job) -> dict[str, Any]:
+    """Errors in m at each scan, by estimator."""
+    scene = job.field.scene(job.seed, NUMBER, job.index)
+    path = path_of(scene, job.field.heading, job.step)
+    odometer, scans = Odometer(Drift(), np.random.default_rng((job.seed, NUMBER, job.index, 1))), []
+    for k, clean in enumerate(scene.clean(path)):
+        if k:
+            odometer.move(path[k - 1], path[k])
+        scans.append(scene.observe(clean, k / scene.scanner.rate, odometer.pose.copy()))
+    found: dict[str, Any] = {"y": float(path[0, 1]), "error_m": {}, "lost": {}}
+    one = bound.single(scene, path)
+    limits = one, bound.heading_known(one), bound.recursive(scene, path, Drift(), START)
+    found["bound_m"] = {
+        name: np.round(bound.position(each), 7).tolist() for name, each in zip(BOUNDS, limits, strict=True)
+    }
+    for name in job.estimators:
+        estimator = enter(name, job.field, scene, job.seed * 100_003 + job.index, job.descent)
+        estimator.restart(path[0], START)
+        told = scans if uses_odometry(name) else [replace(scan, odom=None) for scan in scans]
+        poses = np.array([estimator.update(scan).pose for scan in told])
+        error = np.hypot(*(poses - path)[:, :2].T)
+        found["error_m"][name] = np.round(error, 6).tolist()
+        found["lost"][name] = bool((error > LOST).any())
+    return found
+
+
+def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
+    """Numbers of one estimator over all crossings."""
+    error = np.concatenate([each["error_m"][name] for each in trials])
+    limit = np.concatenate([each["bound_m"][bound_of(name)] for each in trials])
+    return {
+        "crossings": len(trials),
+        "error_mean_m": float(error.mean()),
+        "error_std_m": float(error.std()),
+        "error_median_m": float(np.median(error)),
+        "error_rms_m": float(np.sqrt(np.mean(error**2))),
+        "error_max_m": float(error.max()),
+        "bound": bound_of(name),
+        "rms_over_bound": float(np.sqrt(np.mean(error**2) / np.mean(limit**2))),
+        "crossings_ever_0.5_m_off": int(np.sum([each["lost"][name] for each in trials])),
+    }
+
+
+def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
+    """All crossings; writes e2.json, .csv, .pdf and .png into ``out``."""
+    jobs = [replace(job, index=index) for index in range(trials)]
+    rows = run_trials("e2", trial, jobs, out, workers, console)
+    scans = len(rows[0]["bound_m"][BOUNDS[0]])
+    scanner = job.field.scene(job.seed).scanner
+    curves: dict[str, list[Any]] = {"time s": [round(k / scanner.rate, 6) for k in range(scans)]}
+    curves |= results.curves_of(rows, job.estimators)
+    for name in job.estimators:
+        curves[f"{name} RMS m"] = _rms([row["error_m"][name] for row in rows])
+    parameters = asdict(job) | {"trials": trials}
+    for name in BOUNDS:
+        limits = [row["bound_m"][name] for row in rows]
+        curves[f"bound, {name} RMS m"] = _rms(limits)
+        parameters[f"bound, {name}, rms_m"] = float(np.sqrt(np.mean(np.square(limits))))
+    result = results.Result(
+        "e2", "E2: crossing the map by small teleports", job.seed, parameters,
+        {name: summarise(rows, name) for name in job.estimators}, curves, rows,
+    )  # fmt: skip
+    result.write(out, draw(job.estimators, result.curves))
+    return result
+
+
+def _rms(rows: Sequence[Sequence[float]]) -> list[float]:
+    """Over trials (N, K), at each of K moments."""
+    return [float(value) for value in np.sqrt(np.mean(np.square(rows), axis=0))]
+
+
+def draw(names: Sequence[str], curves: dict[str, list[Any]]) -> Figure:
+    """Error over time, root mean square over the crossings as the bounds are; without odometry, and with it."""
+    figure, panels = drawing.figure_of(2)
+    told = [name for name in names if uses_odometry(name)]
+    groups = [name for name in names if name not in told], told
+    titles, limits = ("laser alone", "with odometry that drifts"), (BOUNDS[:2], BOUNDS[2:])
+    for axes, group, title, lines in zip(panels, groups, titles, limits, strict=True):
+        for name in group:
+            drawing.line(axes, curves["time s"], curves[f"{name} RMS m"], name)
+        for name, style in zip(lines, ("--", ":"), strict=False):
+            limit = curves[f"bound, {name} RMS m"]
+            axes.plot(curves["time s"], limit, style, color=drawing.BOUND, label=f"bound: {name}")
+        drawing.log_metres(axes)
+        axes.set(xlabel="time (s)", ylabel="position error, RMS of all crossings (m)", title=title)
+    low, high = zip(*(axes.get_ylim() for axes in panels), strict=True)
+    for axes in panels:
+        axes.set(ylim=(max(min(low), drawing.SMALLEST), max(high)))
+    drawing.legend_below(figure, *panels)
+    return figure
+
+
+def table(summary: dict[str, dict[str, Any]]) -> str:
+    """As docs/experiments.md has it."""
+    heads = (
+        "estimator", "error, mean ± std (m)", "median (mm)", "RMS (mm)", "over its bound's", "the bound is that of",
+        "max (mm)", "ever 0.5 m off",
+    )  # fmt: skip
+    rows = [
+        [
+            name, results.mean_std(row, "error", 4),
+            *(results.millimetres(row[f"error_{kind}_m"]) for kind in ("median", "rms")),
+            results.ratio(row["rms_over_bound"]), row["bound"], results.millimetres(row["error_max_m"]),
+            f"{row['crossings_ever_0.5_m_off']} of {row['crossings']}",
+        ]
+        for name, row in summary.items()
+    ]  # fmt: skip
+    return results.markdown(heads, rows)

@@ -1,0 +1,224 @@
+"""E3: navigation.
+
+The real processes (router, simulator, estimator, controller) run in lockstep over zenoh: one scan, one belief, one
+command is one iteration, 1/15 s. The belief begins at the true start. There is no teleport: the base has its limits of
+speed and acceleration. A trial is done when the robot truly is within 0.8 m of the goal; nobody asks it to stop there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from common.errors import UserError
+from common.geometry.se2 import Array
+from common.geometry.world import load_world
+from common.robot.base import Robot
+from lab.experiments import results
+from lab.experiments.estimators import PAPER, STEPS, Field, uses_odometry
+from lab.experiments.journeys import APART, CLEARANCE, CLOSE, Journey, draw_journey, least_time, path_ratio
+from lab.experiments.lockstep import Errand, Track, session
+from lab.experiments.lockstep import run as run_errand
+from lab.experiments.trials import run_trials
+from presage.plotting import style as drawing
+from presage.session.stack import Stack
+from services.estimator.paper.perception import Descent
+
+NUMBER = 3  # of the experiment, in its seeds
+ESTIMATORS = (f"paper, {STEPS}", "precise", "particle-filter")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One start and goal, to every estimator."""
+
+    index: int
+    seed: int
+    apart: float = APART  # m, between start and goal at least
+    limit: int = 900  # iterations after which a trial is given up: one minute
+    free: bool = True  # only pairs with a free straight line between them
+    estimators: tuple[str, ...] = ESTIMATORS
+    field: Field = Field()  # noqa: RUF009 - frozen
+    descent: Descent = PAPER  # of estimator `paper` alone
+
+
+def arguments(name: str, descent: Descent) -> tuple[str, ...]:
+    """Of the estimator's command line, by its name in the figures."""
+    kind, _, how = name.partition(", ")
+    if how not in ("", "odometry", STEPS):
+        raise UserError(f"estimator {name!r} is none that runs as a service: choose others for e3")
+    steps = ("--alpha", repr(descent.alpha), "--iterations", str(descent.iterations)) if name == "paper" else ()
+    return ("--estimator", kind, *(("--prior", "odometry") if uses_odometry(name) else ()), *steps)
+
+
+def trial(job: Job) -> dict[str, Any]:
+    """One journey; by estimator what became of it, m and s."""
+    world = load_world(job.field.world)
+    journey = draw_journey(
+        world, np.random.default_rng((job.seed, NUMBER, job.index)), Robot(), job.apart, free=job.free
+    )
+    found: dict[str, Any] = asdict(journey) | {"straight_m": journey.straight, "estimators": {}}
+    found["least_s"] = least_time(journey.straight, Robot())
+    seed = (job.seed * 100_003 + job.index) % 2**31
+    with session() as stack:
+        for name in job.estimators:
+            errand = Errand(
+                journey, job.field.heading, job.field.world, job.field.beams, seed, arguments(name, job.descent),
+                job.limit,
+            )  # fmt: skip
+            found["estimators"][name] = _run(errand, stack)
+    return found
+
+
+def _run(errand: Errand, stack: Stack) -> dict[str, Any]:
+    return measure(run_errand(errand, stack), errand.journey)
+
+
+def measure(track: Track, journey: Journey) -> dict[str, Any]:
+    """One run in numbers; what stands in lists has one entry an iteration, the first before any motion."""
+    path = track.path()
+    away = np.hypot(*(path[:, :2] - np.array(journey.goal)).T)
+    error = np.hypot(*(track.believed() - path)[:, :2].T)
+    seconds = track.truths[-1].stamp_ns * 1e-9
+    return {
+        "reached": bool(away[-1] <= CLOSE),
+        "iterations": len(path) - 1,
+        "seconds": seconds,
+        "time_over_least": seconds / least_time(journey.straight, Robot()),
+        "path_over_straight": path_ratio(path),
+        "contacts": sum(truth.contact for truth in track.truths),
+        "held_back": sum(truth.stopped for truth in track.truths),  # by the obstacle stop
+        "distance_m": np.round(away, 6).tolist(),
+        "error_m": np.round(error, 6).tolist(),
+        "x_m": np.round(path[:, 0], 4).tolist(),
+        "y_m": np.round(path[:, 1], 4).tolist(),
+    }
+
+
+def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
+    """Numbers of one estimator over all trials; times and paths are of those that arrived."""
+    every = [each["estimators"][name] for each in trials]
+    there = [each for each in every if each["reached"]]
+    error = np.concatenate([each["error_m"] for each in every])
+
+    def of(quantity: str, statistic: Any) -> float | None:
+        return float(statistic([each[quantity] for each in there])) if there else None
+
+    return {
+        "trials": len(every),
+        "reached": len(there),
+        "trials_with_contact": sum(each["contacts"] > 0 for each in every),
+        "scans_held_back": sum(each["held_back"] for each in every),
+        "iterations_mean": of("iterations", np.mean),
+        "iterations_median": of("iterations", np.median),
+        "seconds_median": of("seconds", np.median),
+        "time_over_least_median": of("time_over_least", np.median),
+        "time_over_least_max": of("time_over_least", np.max),
+        "path_over_straight_mean": of("path_over_straight", np.mean),
+        "path_over_straight_max": of("path_over_straight", np.max),
+        "error_mean_m": float(error.mean()),
+        "error_std_m": float(error.std()),
+        "error_median_m": float(np.median(error)),
+        "error_max_m": float(error.max()),
+    }
+
+
+def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
+    """All trials; writes e3.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
+    for name in job.estimators:
+        arguments(name, job.descent)
+    jobs = [replace(job, index=index) for index in range(trials)]
+    rows = run_trials("e3", trial, jobs, out, workers, console)
+    curves: dict[str, list[Any]] = {"iteration": []}
+    for name in job.estimators:
+        for what, quantity in (("distance", "distance_m"), ("error", "error_m")):
+            mean, std = results.spread(_rows(rows, name, quantity, job.estimators))
+            curves[f"{name} {what} mean m"], curves[f"{name} {what} std m"] = mean, std
+            curves["iteration"] = list(range(len(mean)))
+    straight = [row["straight_m"] for row in rows]
+    drawn = {name: sum(row[name] for row in rows) for name in ("too_near", "obstructed")}
+    parameters = asdict(job) | {
+        "trials": trials, "close_m": CLOSE, "clearance_m": CLEARANCE, "robot": Robot().model_dump(),
+        "straight_mean_m": float(np.mean(straight)), "straight_max_m": float(np.max(straight)),
+        "pairs_redrawn_too_near": drawn["too_near"], "pairs_redrawn_obstructed": drawn["obstructed"],
+    }  # fmt: skip
+    note = f"{trials} pairs at random, though this controller goes straight: what stands between holds the robot."
+    if job.free:
+        note = (
+            f"{trials} of {trials + drawn['obstructed']} pairs far enough apart were taken. Of the others the straight "
+            f"line comes nearer than {Robot().radius + CLEARANCE:.2f} m to something, and this controller goes "
+            "straight."
+        )
+    note += f" On average the goal is {np.mean(straight):.1f} m from the start (the paper: about 11 to 13.5 m)."
+    result = results.Result(
+        "e3", "E3: navigation through the real processes", job.seed, parameters,
+        {name: summarise(rows, name) for name in job.estimators}, curves, rows,
+        [note],
+    )  # fmt: skip
+    result.write(out, draw(rows, job))
+    return result
+
+
+def _rows(rows: Sequence[dict[str, Any]], name: str, quantity: str, names: Sequence[str]) -> Array:
+    """(N, K), as long as the longest of all estimators; a trial that has ended holds its last value."""
+    longest = max(len(row["estimators"][each][quantity]) for row in rows for each in names)
+    return drawing.held([row["estimators"][name][quantity] for row in rows], longest)
+
+
+def draw(rows: Sequence[dict[str, Any]], job: Job) -> Figure:
+    """Distance to the goal and error against iterations, as in the paper's figure 3; the paths below."""
+    figure = drawing.blank(13.0, 7.2)
+    grid = figure.add_gridspec(2, 2, height_ratios=(1.25, 1))
+    left, right, below = (drawing.dress(figure.add_subplot(part)) for part in (grid[0, 0], grid[0, 1], grid[1, :]))
+    for name in job.estimators:
+        colour = drawing.GOAL if name == "precise" else drawing.COLOURS[name]
+        for axes, quantity in ((left, "distance_m"), (right, "error_m")):
+            values = _rows(rows, name, quantity, job.estimators)
+            drawing.band(axes, range(values.shape[1]), values, name, colour)
+            if name == "precise" and axes is left:  # wide, for another that drives as fast may lie upon it
+                axes.lines[-1].set(linewidth=3.2, zorder=1.5)
+    left.axhline(CLOSE, linestyle="--", color=drawing.BOUND, linewidth=1)
+    left.annotate(f"{CLOSE:g} m: there", (1, CLOSE), (4, 4), textcoords="offset points", fontsize=9)
+    left.set(xlabel="iteration (one scan, 1/15 s)", ylabel="distance to the goal (m)", ylim=(0, None))
+    right.set(xlabel="iteration", ylabel="position error of the belief (m)")
+    drawing.log_metres(right)
+    # As far as somebody arrives; those that never do stand still beyond.
+    every = [each for row in rows for each in row["estimators"].values()]
+    last = max((each["iterations"] for each in every if each["reached"]), default=job.limit)
+    for axes in (left, right):
+        axes.set_xlim(0, last + 10)
+    drawing.world_map(below, load_world(job.field.world))
+    name = "precise" if "precise" in job.estimators else job.estimators[-1]
+    for row in rows:
+        one = row["estimators"][name]
+        below.plot(one["x_m"], one["y_m"], color=drawing.GOAL, linewidth=0.7, alpha=0.7)
+        below.plot(*row["start"], "o", color="black", markersize=2.5)
+        below.plot(*row["goal"], "x", color=drawing.PREDICTED, markersize=4)
+    below.set(title=f"true paths with {name}: from dots to crosses, until within {CLOSE:g} m")
+    drawing.legend_below(figure, left)
+    return figure
+
+
+def table(summary: dict[str, dict[str, Any]]) -> str:
+    """As docs/experiments.md has it."""
+    heads = (
+        "estimator", "reached", "trials with contact", "scans held back by the obstacle stop", "iterations, mean",
+        "time (s), median", "time over least, median; max", "path over straight, mean", "error, mean ± std (m)",
+    )  # fmt: skip
+    rows = [
+        [
+            name, f"{row['reached']} of {row['trials']}", str(row["trials_with_contact"]),
+            str(row["scans_held_back"]),
+            results.number(row["iterations_mean"], 1), results.number(row["seconds_median"], 1),
+            f"{results.number(row['time_over_least_median'])}; {results.number(row['time_over_least_max'])}",
+            results.number(row["path_over_straight_mean"], 5), results.mean_std(row, "error", 4),
+        ]
+        for name, row in summary.items()
+    ]  # fmt: skip
+    return results.markdown(heads, rows)

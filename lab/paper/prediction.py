@@ -1,0 +1,214 @@
+"""Predicted against measured scans.
+
+The shipped weights, as they are. The paper's decoder states no precision: the paper sets Σ_o = 1, here 1 m² for every
+beam. The field states each beam's deviation m; with the scanner's noise σ it is (σ² + m²)^½.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from common.geometry import se2
+from common.geometry.se2 import Array
+from lab.accuracy.scenes import ROBOT, Scene
+from lab.experiments import results
+from lab.experiments.estimators import Field
+from lab.experiments.trials import run_trials
+from presage.plotting import style as drawing
+from services.estimator.paper import weights as paper_weights
+from services.estimator.paper.decoder import use_one_core
+from services.estimator.paper.training import usable_ranges
+from services.estimator.precise.learning import weights as precise_weights
+
+NUMBER = 6  # of the experiment, in its seeds
+SAMPLE, TEST = 0, 1  # in the seeds
+PAPER_SIGMA = 1.0  # m, the paper's Σ_o
+FACTORS = tuple(np.round(np.arange(0.25, 4.01, 0.25), 2).tolist())  # of the stated deviation
+GAUSSIAN = {1: 0.6827, 2: 0.9545, 3: 0.9973}  # share within so many deviations
+UNSURE = float(np.sqrt(2))  # times the scanner's noise: of such beams the model says that its own error m is the larger
+FEET = 0.3  # m that the sample's robot keeps from the line of the objects
+FAR = 0.1  # m
+NAMES = ("paper", "precise")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One scan to show, and scans to count beams of."""
+
+    seed: int
+    scans: int = 500
+    field: Field = Field()  # noqa: RUF009 - frozen
+
+
+def trial(job: Job) -> dict[str, Any]:
+    """The sample as measured and as each expects it; shares of beams within the stated deviation's multiples."""
+    use_one_core()
+    sample, test = (job.field.scene(job.seed, NUMBER, part) for part in (SAMPLE, TEST))
+    pose = in_front(job.field, sample)
+    noisy = sample.observe(sample.clean(pose[None])[0], 0.0).ranges
+    found: dict[str, Any] = {
+        "pose": pose.tolist(), "angle_rad": sample.scanner.angles().tolist(), "measured_m": noisy.tolist(), "models": {}
+    }  # fmt: skip
+    poses = test.poses(job.scans)
+    clean = test.clean(poses)
+    for name in NAMES:
+        own = poses.copy()
+        if name == "paper":  # knows but one heading
+            own[:, 2] = job.field.heading
+        ranges = test.clean(own) if name == "paper" else clean
+        ranges = ranges + test.scanner.sigma * test.rng.standard_normal(ranges.shape)
+        expected, sigma = _expected(name, job.field, test, own)
+        error = np.abs(usable_ranges(test.scanner.limit(ranges), test.scanner.range_max) - expected)
+        unsure = sigma > UNSURE * test.scanner.sigma
+        one, deviation = _expected(name, job.field, sample, pose[None])
+        found["models"][name] = {
+            "expected_m": one[0].tolist(), "sigma_m": deviation[0].tolist(), "beams": error.size,
+            "within": _shares(error, sigma), "unsure_share": float(unsure.mean()),
+            "unsure_within": _shares(error[unsure], sigma[unsure]),
+            "unsure_within_noise_alone": _shares(error[unsure], np.full(unsure.sum(), test.scanner.sigma)),
+            "range_error_median_m": float(np.median(error)), "range_error_mean_m": float(error.mean()),
+            "stated_sigma_median_m": float(np.median(sigma)), "stated_sigma_p99_m": float(np.quantile(sigma, 0.99)),
+        }  # fmt: skip
+    return found
+
+
+def _shares(error: Array, sigma: Array) -> dict[str, float]:
+    """Of absolute errors within so many deviations; of none, none."""
+    return {f"{k:g}": float((error <= k * sigma).mean()) for k in FACTORS} if error.size else {}
+
+
+def in_front(field: Field, scene: Scene) -> Array:
+    """(3,) at random between the bare wall and the objects; anywhere where there are none."""
+    places = scene.world.sample_free(1000, scene.rng, ROBOT.radius)
+    front = places[places[:, 1] < field.front() - FEET]
+    return np.array([*(front if len(front) else places)[0], field.heading])
+
+
+def _expected(name: str, field: Field, scene: Scene, poses: Array) -> tuple[Array, Array]:
+    """Ranges (N, B) m and the stated deviation of what is measured, m; from the shipped weights."""
+    if name == "paper":
+        path = paper_weights.find(paper_weights.FOLDER, scene.world.name, "paper", scene.scanner.beams)
+        ranges = paper_weights.load(path)[0].ranges(poses)
+        return ranges, np.full(ranges.shape, PAPER_SIGMA)
+    model = precise_weights.load(precise_weights.find(precise_weights.FOLDER, scene.world, field.world))[0]
+    expected = model.expect(se2.compose(poses, np.array(scene.scanner.mount)), scene.scanner.angles())
+    ranges = usable_ranges(expected.ranges, scene.scanner.range_max)
+    return ranges, np.sqrt(expected.scale**2 + scene.scanner.sigma**2)
+
+
+def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
+    """Writes prediction.json, .csv, .pdf and .png into ``out``."""
+    rows = run_trials("prediction", trial, [job], out, workers, console)
+    row = rows[0]
+    summary: dict[str, dict[str, Any]] = {}
+    for name, found in row["models"].items():
+        quantities = {key: value for key, value in found.items() if np.isscalar(value)}
+        kinds = [kind for kind, value in found.items() if isinstance(value, dict) and value]
+        shares = {f"{kind}_{k}_sigma": found[kind][str(k)] for kind in kinds for k in GAUSSIAN}
+        summary[name] = {"scans": job.scans, **quantities, **shares}
+    curves = {"angle_rad": row["angle_rad"], "measured_m": row["measured_m"]}
+    for name, found in row["models"].items():
+        curves |= {f"{name} expected m": found["expected_m"], f"{name} sigma m": found["sigma_m"]}
+    x, y, yaw = row["pose"]
+    result = results.Result(
+        "prediction", "Predicted against measured scan", job.seed, asdict(job), summary, curves, rows,
+        [f"sample: seed {job.seed}, robot at ({x:.2f}, {y:.2f}) m, heading {np.rad2deg(yaw):.0f}°; drawn at random",
+         f"paper states no precision: Σ_o = 1, taken as {PAPER_SIGMA:g} m² for every beam"],
+    )  # fmt: skip
+    result.write(out, draw(result))
+    return result
+
+
+def draw(result: results.Result) -> Figure:
+    """The scan by both models, residuals below, calibration beside."""
+    row = result.trials[0]
+    figure = drawing.blank(16, 6.2)
+    grid = figure.add_gridspec(2, 3, height_ratios=(1.9, 1), width_ratios=(1, 1, 0.8))
+    tops = [drawing.dress(figure.add_subplot(grid[0, k])) for k in range(2)]
+    bottoms = [drawing.dress(figure.add_subplot(grid[1, k], sharex=tops[k])) for k in range(2)]
+    angle, measured = np.rad2deg(row["angle_rad"]), np.array(row["measured_m"])
+    titles = {"paper": "paper: states no precision (Σ_o = 1)", "precise": "precise: states ± 2σ of every beam"}
+    for name, top, bottom in zip(NAMES, tops, bottoms, strict=True):
+        found = row["models"][name]
+        expected, sigma = np.array(found["expected_m"]), np.array(found["sigma_m"])
+        top.plot(angle, measured, ".", color=drawing.MEASURED, markersize=3.5, label="measured")
+        top.plot(angle, expected, "-", color=drawing.PREDICTED, linewidth=1.1, label="expected")
+        bottom.plot(angle, measured - expected, ".", color=drawing.MEASURED, markersize=3.5)
+        if name == "precise":
+            _band(top, angle, expected, sigma)
+            _band(bottom, angle, np.zeros_like(expected), sigma)
+        share = float((np.abs(measured - expected) > FAR).mean())
+        bottom.text(0.99, 0.97, f"{share:.1%} of beams > {FAR} m off", transform=bottom.transAxes, ha="right", va="top")
+        bottom.axhline(0, color=drawing.PREDICTED, linewidth=1)
+        bottom.set_yscale("symlog", linthresh=0.1, linscale=1.5)
+        limit = 4 * max(1.0, *(np.abs(measured - np.array(m["expected_m"])).max() for m in row["models"].values()))
+        bottom.set(xlabel="beam (°)", ylim=(-limit, limit), xticks=range(-135, 136, 45))
+        bottom.set_yticks([-1, -0.1, 0, 0.1, 1], ["−1", "−0.1", "0", "0.1", "1"])
+        top.set(title=titles[name], ylim=(0, None))
+        top.tick_params(labelbottom=False)
+    tops[0].set_ylabel("range (m)")
+    bottoms[0].set_ylabel("measured − expected (m)")
+    tops[1].sharey(tops[0])
+    tops[1].legend(fontsize=9, frameon=False, loc="upper right")
+    _calibration(drawing.dress(figure.add_subplot(grid[:, 2])), row["models"]["precise"], result.parameters["scans"])
+    figure.suptitle("; ".join(result.notes[:1]), fontsize=10)
+    return figure
+
+
+def _band(axes: Axes, angle: Array, middle: Array, sigma: Array) -> None:
+    axes.fill_between(
+        angle, middle - 2 * sigma, middle + 2 * sigma, color=drawing.PREDICTED, alpha=0.25, linewidth=0,
+        label="stated ± 2σ",
+    )  # fmt: skip
+
+
+def _calibration(axes: Axes, found: dict[str, Any], scans: int) -> None:
+    """Share of beams within k stated deviations, against the Gaussian's."""
+    factors = np.array(FACTORS)
+    axes.plot(factors, _gaussian(factors), "-", color=drawing.BOUND, label="Gaussian: a true statement")
+    unsure = f"{found['unsure_share']:.1%} of beams: m > σ"
+    for key, colour, mark, label in (
+        ("within", drawing.COLOURS["precise"], "o", "all beams, stated √(σ² + m²)"),
+        ("unsure_within", drawing.GOAL, "^", f"{unsure}, stated √(σ² + m²)"),
+        ("unsure_within_noise_alone", drawing.COLOURS["particle-filter"], "s", f"{unsure}, were it σ alone"),
+    ):
+        if found[key]:
+            axes.plot(factors, [found[key][f"{k:g}"] for k in factors], mark, color=colour, markersize=5, label=label)
+    text = "\n".join(f"± {k}σ: {found['within'][str(k)]:.1%}  ({share:.1%})" for k, share in GAUSSIAN.items())
+    axes.text(0.98, 0.3, "all beams (Gaussian)\n" + text, transform=axes.transAxes, ha="right", fontsize=10)
+    axes.set(xlabel="deviations k", ylabel="share of beams within ± kσ", ylim=(0, 1.03))
+    axes.set_title(f"precise: is it true? {scans} test scans")
+    axes.legend(fontsize=9, frameon=False, loc="lower right")
+
+
+def _gaussian(factors: Array | Sequence[float]) -> Array:
+    return np.array([math.erf(k / math.sqrt(2)) for k in factors])
+
+
+def table(summary: dict[str, dict[str, Any]]) -> str:
+    """As docs/experiments.md has it."""
+    heads = ("", "range error, median (m)", "mean (m)", "stated σ, median (m)", *(f"within ± {k}σ" for k in GAUSSIAN))
+    rows = [
+        [
+            f"{name}, all beams",
+            *(results.number(row[f"range_error_{which}_m"], 4) for which in ("median", "mean")),
+            results.number(row["stated_sigma_median_m"], 4) + (" (Σ_o = 1)" if name == "paper" else ""),
+            *(f"{row[f'within_{k}_sigma']:.1%}" for k in GAUSSIAN),
+        ]
+        for name, row in summary.items()
+    ]  # fmt: skip
+    for name, row in summary.items():
+        if 0 < row["unsure_share"] < 1:
+            shares = (f"{row[f'unsure_within_{k}_sigma']:.1%}" for k in GAUSSIAN)
+            rows.append([f"{name}, the {row['unsure_share']:.1%} of beams with m > σ", "", "", "", *shares])
+    rows.append(["Gaussian", "", "", "", *(f"{share:.1%}" for share in GAUSSIAN.values())])
+    return results.markdown(heads, rows)

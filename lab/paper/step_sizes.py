@@ -1,0 +1,266 @@
+"""The step sizes β and γ.
+
+Two loops over E3's journeys, both in the cores, without processes. **Displacement**: algorithm 1 to the letter
+(`teleports.py`), where the iterations are what the step sizes make of them: 12.5 is about a fifth of the distance
+closed an iteration, ln(12 / 0.8) / 12.5. **Velocity**: our controller and the simulator's physics with preset paper,
+where iterations are scans at 15 Hz and the robot's speed limit decides.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+from rich.console import Console
+
+from common.geometry.se2 import Array
+from common.geometry.world import World
+from common.messages.definitions import Belief, Goal, Pose
+from common.robot.base import Robot
+from lab.experiments import results
+from lab.experiments.estimators import Field
+from lab.experiments.journeys import CLOSE, Journey, draw_journey, least_time
+from lab.experiments.trials import run_trials
+from lab.paper import e3_navigation as navigation
+from lab.paper.teleports import Steps, travel
+from presage.plotting import style as drawing
+from services.controller.navigator import Navigator
+from services.controller.policies.paper_action import Preference
+from services.estimator.paper import weights
+from services.estimator.paper.decoder import PaperModel, use_one_core
+from services.estimator.paper.estimator import PaperPerception
+from services.estimator.paper.perception import Descent
+from services.estimator.paper.training import usable_ranges
+from services.estimator.shared.interface import Observation
+
+NUMBER = 5  # of the experiment, in its seeds; the journeys are E3's
+PAPERS = 12.5  # iterations, the paper's mean over 50 trials
+ALPHA = 2e-3  # m² along x, in the network's own coordinates: the largest with which the belief does not swing
+GAMMAS = (1e-3, 2e-3, 3e-3, 5e-3, 8e-3)  # m²
+BETAS = (0.3, 1.0, 3.0)
+SUMS = (1e-4, 3e-4, 1e-3)
+VELOCITY_GAMMAS, VELOCITY_BETAS = (0.05, 0.1, 0.3, 0.8), (0.03, 0.1, 0.3)
+SHARE = 5  # of so many journeys one is driven with velocities as well: it takes a second per ten metres
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One column of the sweep. Of velocity only beta and gamma count, gamma without a unit."""
+
+    loop: Literal["displacement", "velocity"]
+    steps: Steps
+
+    @property
+    def name(self) -> str:
+        """In tables."""
+        steps = self.steps
+        if self.loop == "velocity":
+            return f"velocity, β {steps.beta:g}, γ {steps.gamma:g}"
+        where = "" if steps.normalised else ", in metres"
+        return f"displacement, {steps.form}{where}, β {steps.beta:g}, γ {steps.gamma:g}"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One journey with one setting."""
+
+    index: int
+    seed: int
+    limit: int = 150  # iterations of displacement
+    velocity_limit: int = 900  # iterations of velocity
+    field: Field = Field()  # noqa: RUF009 - frozen
+    setting: Setting = Setting("displacement", Steps())
+
+
+def settings() -> list[Setting]:
+    """All of the sweep."""
+    every = [Steps(ALPHA, beta, gamma) for beta in BETAS for gamma in GAMMAS]
+    every += [Steps(ALPHA, 1.0, gamma, "sum") for gamma in SUMS]
+    # In metres alpha is bounded by the short axis, along which the scan changes most.
+    every += [Steps(5e-4, 1.0, 1e-3, normalised=False), Steps(ALPHA, 1.0, 1e-3, "printed")]
+    driven = [Steps(beta=0.0, gamma=gamma) for gamma in VELOCITY_GAMMAS]
+    driven += [Steps(beta=beta, gamma=Preference().gamma) for beta in VELOCITY_BETAS]
+    return [Setting("displacement", each) for each in every] + [Setting("velocity", each) for each in driven]
+
+
+def trial(job: Job) -> dict[str, Any]:
+    """Iterations, and time over the least where the robot drives."""
+    world = job.field.scene(0).world
+    journey = draw_journey(world, np.random.default_rng((job.seed, navigation.NUMBER, job.index)), Robot())
+    found = {"setting": job.setting.name, "straight_m": journey.straight}
+    return found | (_displaced if job.setting.loop == "displacement" else _driven)(job, world, journey)
+
+
+@functools.lru_cache(maxsize=2)
+def _model(field: Field) -> tuple[PaperModel, weights.ModelCard]:
+    use_one_core()
+    return weights.load(weights.find(weights.FOLDER, field.world, "paper", field.beams))
+
+
+def _displaced(job: Job, world: World, journey: Journey) -> dict[str, Any]:
+    scene = job.field.scene(job.seed, NUMBER, job.index)
+
+    def look(pose: Array) -> Array:
+        return usable_ranges(scene.observe(scene.clean(pose[None])[0], 0.0).ranges, scene.scanner.range_max)
+
+    outcome = travel(journey, job.setting.steps, _model(job.field)[0], look, world, job.field.heading, job.limit)
+    return {
+        "reached": outcome.reached,
+        "iterations": outcome.iterations,
+        "stopped": outcome.stopped,
+        "error_m": float(outcome.error.mean()),
+        "distance_m": np.round(outcome.distance, 4).tolist(),
+    }
+
+
+def _driven(job: Job, world: World, journey: Journey) -> dict[str, Any]:
+    """As E3, but in one process and with these step sizes."""
+    from services.simulator.simulation import Setup, Simulation  # noqa: PLC0415 - pybullet, for this alone
+
+    scanner, steps = job.field.scene(0).scanner, job.setting.steps
+    pose, goal = (*journey.start, job.field.heading), np.array([*journey.goal, job.field.heading])
+    model, card = _model(job.field)
+    perception = PaperPerception(model, card, Descent(beta=steps.beta), np.array(pose))
+    navigator = Navigator(Robot(), Preference(gamma=steps.gamma), world)
+    navigator.hear_goal(Goal(stamp_ns=0, pose=Pose.of(goal)))
+    simulation = Simulation(Setup(world, scanner, Robot(), pose, job.seed * 100_003 + job.index))
+    errors, contacts = [], 0
+    try:
+        while True:
+            _, truth, scan = simulation.observe()
+            here = truth.pose.array()
+            away, contacts = float(np.hypot(*(here - goal)[:2])), contacts + truth.contact
+            if away <= CLOSE or simulation.steps >= job.velocity_limit:
+                break
+            seen = Observation(scan.ranges.astype(float), scan.angles(), scan.range_max, goal=goal)
+            found = perception.update(seen)
+            errors.append(float(np.hypot(*(found.pose - here)[:2])))
+            belief = Belief(
+                stamp_ns=scan.stamp_ns, state=found.state, pose=Pose.of(found.pose), xi=found.xi.astype(np.float32),
+                curvature=found.curvature, free_energy=found.free_energy, accuracy=found.accuracy,
+            )  # fmt: skip
+            navigator.hear_scan(scan)
+            simulation.command(scan.stamp_ns, navigator.step(belief)[0].twist)
+            simulation.advance()
+    finally:
+        simulation.close()
+    over = simulation.stamp_ns * 1e-9 / least_time(journey.straight, Robot())
+    return {
+        "reached": away <= CLOSE, "iterations": simulation.steps, "time_over_least": over, "contacts": contacts,
+        "error_m": float(np.mean(errors)), "distance_m": [away],
+    }  # fmt: skip
+
+
+def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Of one setting; iterations and times are of those that arrived."""
+    there = [row for row in rows if row["reached"]]
+    over = [row["time_over_least"] for row in there if "time_over_least" in row]
+    return {
+        "journeys": len(rows),
+        "reached": len(there),
+        "iterations_mean": float(np.mean([row["iterations"] for row in there])) if there else None,
+        "time_over_least_median": float(np.median(over)) if over else None,
+        "stopped_by_walls": sum(row.get("stopped", 0) for row in rows),
+        "error_mean_m": float(np.mean([row["error_m"] for row in rows])),
+    }
+
+
+def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
+    """Every setting over the first ``trials`` of E3's journeys; writes steps.json, .csv, .trials.jsonl, .pdf, .png."""
+    grid = settings()
+    counts = [trials if each.loop == "displacement" else max(1, trials // SHARE) for each in grid]
+    jobs = [replace(job, index=k, setting=each) for each, count in zip(grid, counts, strict=True) for k in range(count)]
+    rows = run_trials("steps", trial, jobs, out, workers, console)
+    summary = {each.name: summarise([row for row in rows if row["setting"] == each.name]) for each in grid}
+    curves: dict[str, list[Any]] = {
+        "loop": [each.loop for each in grid],
+        **{name: [getattr(each.steps, name) for each in grid] for name in ("form", "normalised", "beta", "gamma")},
+        **{
+            name: [summary[each.name][name] for each in grid]
+            for name in ("journeys", "reached", "iterations_mean", "time_over_least_median")
+        },
+    }
+    nearest = min(
+        (each for each in grid if each.loop == "displacement" and summary[each.name]["reached"] == trials),
+        key=lambda each: abs(summary[each.name]["iterations_mean"] - PAPERS), default=None,
+    )  # fmt: skip
+    note = "no setting reached every goal"
+    if nearest is not None:
+        mean = summary[nearest.name]["iterations_mean"]
+        note = f"nearest to the paper's {PAPERS:g} iterations, where every goal is reached: {nearest.name}: {mean:.1f}"
+    result = results.Result(
+        "steps", "Step sizes of action and goal", job.seed, {**asdict(job), "trials": trials, "alpha": ALPHA}, summary,
+        curves, rows, [note],
+    )  # fmt: skip
+    result.write(out, draw(grid, summary))
+    return result
+
+
+def draw(grid: Sequence[Setting], summary: dict[str, dict[str, Any]]) -> Figure:
+    """Iterations against γ for each β with 12.5 marked; time over the least where the robot drives."""
+    figure, (left, right) = drawing.figure_of(2)
+    moved = [each for each in grid if each.loop == "displacement" and each.steps.normalised]
+    for beta, colour in zip(BETAS, ("#56B4E9", "#0072B2", "#000000"), strict=True):
+        own = [each for each in moved if each.steps.form == "step" and each.steps.beta == beta]
+        _line(left, own, summary, "gamma", "iterations_mean", f"β = {beta:g}", colour)
+    summed = [each for each in moved if each.steps.form == "sum"]
+    _line(left, summed, summary, "gamma", "iterations_mean", "β = 1, action summed (eq. 4)", "#D55E00")
+    left.axhline(PAPERS, linestyle="--", color=drawing.GOAL, linewidth=1.2, label="the paper's 12.5")
+    left.set(
+        xlabel="γ (m²)",
+        ylabel="iterations until within 0.8 m, mean",
+        title="displacements (hollow: not every goal reached)",
+    )
+    _logarithmic(left, "y", "x")
+    driven = [each for each in grid if each.loop == "velocity"]
+    gammas, betas = ([each for each in driven if (each.steps.beta == 0) == plain] for plain in (True, False))
+    over = "time_over_least_median"
+    _line(right, gammas, summary, "gamma", over, "against γ, at β = 0", "#0072B2")
+    _line(right, betas, summary, "beta", over, "against β, at γ = 0.3", "#E69F00")
+    right.axhline(1, linestyle="--", color=drawing.BOUND, linewidth=1)
+    right.set(xlabel="γ, or β", ylabel="time over the least possible", title="velocities, through physics")
+    right.set(ylim=(0.99, max(1.15, right.get_ylim()[1])))
+    _logarithmic(right, "x")
+    for axes in (left, right) if right.collections else (left,):
+        axes.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def _logarithmic(axes: Axes, *names: str) -> None:
+    """Where there is anything: an empty axis has no logarithm."""
+    for name in names if axes.collections else ():
+        drawing.log_metres(axes, name)
+        (axes.yaxis if name == "y" else axes.xaxis).set_minor_formatter(NullFormatter())
+
+
+def _line(
+    axes: Axes, own: Sequence[Setting], summary: dict[str, dict[str, Any]], by: str, what: str, label: str, colour: str
+) -> None:
+    """Filled where every goal was reached, hollow where some were, absent where none was."""
+    rows = [(getattr(each.steps, by), summary[each.name]) for each in own if summary[each.name]["reached"]]
+    if not rows:
+        return
+    x, y = [step for step, _ in rows], [row[what] for _, row in rows]
+    axes.plot(x, y, color=colour, linewidth=1.4, label=label)
+    fill = [colour if row["reached"] == row["journeys"] else "white" for _, row in rows]
+    axes.scatter(x, y, color=fill, edgecolors=colour, s=30, zorder=3)
+
+
+def table(summary: dict[str, dict[str, Any]]) -> str:
+    """As docs/experiments.md has it."""
+    heads = ("step sizes", "reached", "iterations, mean", "time over least, median", "error, mean (m)")
+    rows = [
+        [
+            name, f"{row['reached']} of {row['journeys']}", results.number(row["iterations_mean"], 1),
+            results.number(row["time_over_least_median"]), results.number(row["error_mean_m"]),
+        ]
+        for name, row in summary.items()
+    ]  # fmt: skip
+    return results.markdown(heads, rows)

@@ -1,0 +1,1 @@
+"""Real logs: learn from one half, localise the other."""

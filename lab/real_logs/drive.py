@@ -1,0 +1,154 @@
+"""One estimator over one half of a drive."""
+
+from __future__ import annotations
+
+import functools
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common.geometry import se2
+from common.geometry.se2 import Array
+from common.geometry.world import load_world
+from presage.learning.train_drive import drive_of, split
+from presage.logs.scan_files import read_scans
+from services.estimator.factory import Choice, Factory, Geometry, prepare
+from services.estimator.particle_filter.filter import ParticleFilter
+from services.estimator.particle_filter.sensor import Sensor
+from services.estimator.particle_filter.settings import Settings as ParticleSettings
+from services.estimator.precise.learning.calibration import Drive
+from services.estimator.shared.interface import Estimator, Observation
+
+LIMIT = 40  # scans that a search may take
+BEFORE = 10  # scans that a robot is tracked for before it is carried off
+NEAR = np.diag([0.01, 0.01, 0.0025])  # covariance of the start that is given, m², m², rad²
+NEAR_ENOUGH = 0.5  # m, within which a scan counts as tracked
+ODOMETRY, LASER, GLOBAL, KIDNAPPED = "odometry", "laser", "global", "kidnapped"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One estimator on one stretch; plain values alone."""
+
+    log: str
+    map: str
+    mount: tuple[float, float, float] | None  # of the laser in base_link; None: as the log says
+    estimator: str  # precise, particle-filter or amcl-defaults
+    task: str
+    first: int  # scan of the drive at which it begins
+    count: int = 0  # scans to go on for
+    to: int = 0  # kidnapped: the scan it is carried to
+    model: str = ""  # of precise: file of weights
+    particles: tuple[tuple[str, float], ...] = ()  # settings of the particle filter, by name
+    seed: int = 1
+    exchanged: bool = False  # the halves of the drive
+
+    @property
+    def drive(self) -> Drive:
+        """All of it; the half that is learned comes first."""
+        return drive_at(self.log, self.mount, self.exchanged)
+
+    @property
+    def learned(self) -> int:
+        """Scans of `drive` that are learned from; the one with this number is the first of the other half."""
+        first, second = split(drive_at(self.log, self.mount))
+        return len((second if self.exchanged else first).ranges)
+
+
+@functools.lru_cache(maxsize=2)
+def drive_at(log: str, mount: tuple[float, float, float] | None, exchanged: bool = False) -> Drive:
+    """The posed scans of a log, read once in each process; ``exchanged``: its second half first."""
+    from presage.logs.log import Reading  # noqa: PLC0415
+
+    if exchanged:
+        return second_first(drive_at(log, mount))
+    path = Path(log)
+    return drive_of(read_scans(path, reading=Reading(mount=None if mount is None else np.array(mount))), path)
+
+
+def second_first(drive: Drive) -> Drive:
+    """The second half, and then the first as if it had followed at the usual interval."""
+    early, late = split(drive)
+    follows = late.stamps[-1] + float(np.median(np.diff(drive.stamps))) - early.stamps[0]
+    turned = drive.part(np.roll(np.arange(len(drive.ranges)), -len(early.ranges)))
+    return replace(turned, stamps=np.concatenate([late.stamps, early.stamps + follows]))
+
+
+def trial(job: Job) -> dict[str, Any]:
+    """What was believed after every scan."""
+    drive, estimator = job.drive, entered(job)
+    if job.task in (ODOMETRY, LASER):
+        estimator.restart(drive.poses[job.first], NEAR)
+        numbers = np.arange(job.first, job.first + job.count)
+    elif job.task == GLOBAL:
+        numbers = np.arange(job.first, min(job.first + (job.count or LIMIT), len(drive.ranges)))
+    else:
+        estimator.restart(drive.poses[job.first], NEAR)
+        after = np.arange(job.to, min(job.to + LIMIT, len(drive.ranges)))
+        numbers = np.concatenate([np.arange(job.first, job.first + BEFORE), after])
+    clock = drive.stamps[numbers]
+    odom = None if drive.odom is None or job.task == LASER else drive.odom[numbers]
+    if job.task == KIDNAPPED:  # carried in no time, as far as the sensors tell
+        clock[BEFORE:] += drive.stamps[job.first + BEFORE] - clock[BEFORE]
+        odom = None if odom is None else unaware(odom, BEFORE)
+    rows: dict[str, list[Any]] = {name: [] for name in ("stamp_s", "error_m", "yaw_error_rad", "state", "nees", "ms")}
+    for i, k in enumerate(numbers):
+        told = None if odom is None else odom[i]
+        seen = Observation(drive.ranges[k], drive.angles, drive.range_max, float(clock[i]), told)
+        began = time.process_time()
+        posterior = estimator.update(seen)
+        rows["ms"].append(round((time.process_time() - began) * 1e3, 2))
+        off = posterior.pose - drive.poses[k]
+        off[2] = se2.wrap(off[2])
+        rows["stamp_s"].append(round(float(clock[i]), 4))
+        rows["error_m"].append(round(float(np.hypot(off[0], off[1])), 5))
+        rows["yaw_error_rad"].append(round(abs(float(off[2])), 5))
+        rows["state"].append(posterior.state)
+        rows["nees"].append(_nees(off, posterior.covariance))
+    return {"estimator": job.estimator, "task": job.task, "first": job.first, "to": job.to, **rows}
+
+
+def _nees(off: Array, covariance: Array | None) -> float | None:
+    if covariance is None:
+        return None
+    return round(min(float(off @ np.linalg.pinv(covariance, hermitian=True) @ off), 1e6), 3)
+
+
+def unaware(odom: Array, carried: int) -> Array:
+    """Odometry (N, 3) of a robot that is lifted before its ``carried``-th scan: its wheels stand still meanwhile."""
+    moved = odom.copy()
+    moved[carried:] = se2.compose(odom[carried - 1], se2.between(odom[carried], odom[carried:]))
+    return np.asarray(moved)
+
+
+def entered(job: Job) -> Estimator:
+    """A new estimator that knows the place and nothing of where it is."""
+    drive = job.drive
+    if job.estimator == "precise":
+        factory = _precise(job.map, job.model)
+        return factory(Geometry(drive.angles, drive.mount, drive.range_max))
+    # A differential model cannot follow every base; AMCL has an omnidirectional one for these.
+    amcl = ParticleSettings(robot_model_type="omni")
+    settings = amcl if job.estimator == "amcl-defaults" else particle_settings(job.particles)
+    x, y, yaw = map(float, drive.mount)
+    return ParticleFilter(load_world(job.map), settings, (x, y, yaw), job.seed, sensor=_sensor(job.map, settings))
+
+
+def particle_settings(changed: tuple[tuple[str, float], ...]) -> ParticleSettings:
+    """The tuned set, with what a tuning on the first half has changed."""
+    kinds = {"max_beams": int, "keep_initial_pose": bool}
+    values = {name: kinds[name](value) if name in kinds else value for name, value in changed}
+    return replace(ParticleSettings.tuned(), **values)  # type: ignore[arg-type]
+
+
+@functools.lru_cache(maxsize=2)
+def _precise(world: str, model: str) -> Factory:
+    return prepare(Choice(world, "precise", model))
+
+
+@functools.lru_cache(maxsize=4)
+def _sensor(world: str, settings: ParticleSettings) -> Sensor:
+    return Sensor(load_world(world), settings)

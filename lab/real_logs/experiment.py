@@ -1,0 +1,288 @@
+"""`presage experiment real`.
+
+(a) tracking with odometry, (b) without, (c) from nothing, (d) carried off. The errors are against the log's reference
+poses, whose own error is among them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from common.errors import UserError
+from common.geometry.world import World, load_world
+from common.versions import commit
+from lab.experiments import results
+from lab.experiments.trials import run_trials
+from lab.real_logs.drive import (
+    BEFORE,
+    GLOBAL,
+    KIDNAPPED,
+    LASER,
+    LIMIT,
+    NEAR_ENOUGH,
+    ODOMETRY,
+    trial,
+)
+from lab.real_logs.drive import Job as Stretch
+from lab.real_logs.figure import draw
+from lab.real_logs.filter_tuning import Settings, Tuned, starting_point, tune
+from presage.learning.train_drive import Job as Training
+from presage.learning.train_drive import card_of
+from services.estimator.precise.learning import weights
+from services.estimator.precise.learning.calibration import Drive
+from services.estimator.precise.learning.drive_learning import learn_drive
+from services.estimator.precise.learning.field_learning import Recipe
+
+ESTIMATORS = ("precise", "particle-filter", "amcl-defaults")
+TASKS = {
+    ODOMETRY: "a: tracking with odometry", LASER: "b: tracking without", GLOBAL: "c: from nothing",
+    KIDNAPPED: "d: carried off",
+}  # fmt: skip
+LEAST_FREE = 0.5  # share of the poses; a map may lack what the drive saw
+FOUND = NEAR_ENOUGH  # m and
+FOUND_YAW = float(np.deg2rad(10))  # rad from the reference: tracked; beyond, `tracking` is a wrong claim
+QUICK = 120  # scans of (a) and (b), for a look
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to do."""
+
+    log: Path
+    map: str
+    mount: tuple[float, float, float] | None = None  # of the laser in base_link; None: as the log says
+    every: int = 50  # scans between the starts of (c) and (d)
+    quick: bool = False
+    seed: int = 1
+    name: str = ""  # of the result, real-NAME
+    exchange: bool = False  # learn from the second half, localise the first
+
+    @property
+    def result(self) -> str:
+        """Of the files."""
+        stem = re.sub(r"[^A-Za-z0-9_]", "_", self.log.stem) + "_exchanged" * self.exchange
+        return f"real-{self.name or stem}"
+
+
+def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
+    """Learn, tune, localise; writes real-NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
+    world = load_world(job.map)
+    plain = Stretch(str(job.log), job.map, job.mount, "precise", ODOMETRY, 0, seed=job.seed, exchanged=job.exchange)
+    drive = plain.drive
+    half = plain.learned
+    x, y, yaw = drive.mount
+    console.print(
+        f"{job.log.name}: {len(drive.ranges)} posed scans, the laser at {x:g} m, {y:g} m, {np.rad2deg(yaw):g} deg in "
+        f"base_link{'' if job.mount else ' (--mount)'}; {'first' if job.exchange else 'second'} half localised"
+    )
+    _fits(world, drive.part(np.arange(half)), job.map)
+    if len(drive.ranges) < 4 * LIMIT:
+        raise UserError(f"{job.log}: {len(drive.ranges)} posed scans; at least {4 * LIMIT} are needed")
+    model, card, tuned = _prepared(job, plain, half, out, console)
+    plain = replace(plain, first=half, model=str(model))
+    jobs = [
+        replace(each, estimator=name, particles=_settings(tuned, each.task) if name == "particle-filter" else ())
+        for each in stretches(plain, half, len(drive.ranges), job, odometry=drive.odom is not None)
+        for name in ESTIMATORS
+    ]
+    rows = run_trials(job.result, trial, jobs, out, workers, console)
+    summary = {
+        f"{TASKS[task]}, {name}": summarise([r for r in rows if (r["task"], r["estimator"]) == (task, name)])
+        for task in TASKS
+        for name in ESTIMATORS
+        if any(r["task"] == task for r in rows)
+    }
+    result = results.Result(
+        job.result, f"A real drive: {job.log.name}", job.seed,
+        {**{k: str(v) if isinstance(v, Path) else v for k, v in asdict(job).items()}, "scans": len(drive.ranges),
+         "particle_filter": {"tracking": dict(tuned.tracking), "finding": dict(tuned.finding), "tried": tuned.tried},
+         "calibration": asdict(card.calibration) if card.calibration else None},
+        summary, curves_of(rows), rows, notes(job, card, tuned),
+    )  # fmt: skip
+    result.write(out, draw(card.calibration, rows, TASKS))
+    return result
+
+
+def _fits(world: World, learned: Drive, name: str) -> None:
+    """Raises UserError where the drive cannot have been in that map."""
+    free = float((world.clearance(learned.poses[:, :2]) > 0).mean())
+    if free < LEAST_FREE:
+        raise UserError(
+            f"only {free:.0%} of the reference poses of the half that is learned are in free space of {name}: "
+            "is it a map of this place, in the frame of these poses?"
+        )
+
+
+def _prepared(
+    job: Job, stretch: Stretch, half: int, out: Path, console: Console
+) -> tuple[Path, weights.FieldCard, Tuned]:
+    """The model of the half that is learned, and the particle filter's settings for it."""
+    world = load_world(job.map)
+    path = out / f".{job.result}" / "model.safetensors"
+    kept = path.with_name("tuned.json")
+    key = json.dumps([commit(), asdict(job)], sort_keys=True, default=str)
+    with suppress(OSError, ValueError, KeyError, TypeError, UserError):  # of an interrupted run, or nothing
+        before = json.loads(kept.read_text(encoding="utf-8"))
+        if before["key"] == key:
+            tracking, finding = (tuple(before[what].items()) for what in ("tracking", "finding"))
+            return path, weights.load(path)[2], Tuned(tracking, finding, before["tried"])
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("learning", total=1.0)
+
+        def report(title: str, done: float) -> None:
+            bar.update(task, description=title, completed=done)
+
+        first = stretch.drive.part(np.arange(half))
+        training = Training(job.log, share=0.5, recipe=Recipe(resolution=0.05, seed=job.seed))
+        learned = learn_drive(first, training.recipe, None, report)
+        card = card_of(training, world, first, learned, 0.0)
+        weights.save(path, learned.model, learned.places, card)
+        start = starting_point(learned.calibration.motion)
+        tuned = (
+            Tuned(start, start, [])
+            if job.quick
+            else tune(replace(stretch, estimator="particle-filter"), half, start, path.parent, report)
+        )
+    plain = {"key": key, "tracking": dict(tuned.tracking), "finding": dict(tuned.finding), "tried": tuned.tried}
+    kept.write_text(json.dumps(plain) + "\n", encoding="utf-8")
+    return path, card, tuned
+
+
+def _settings(tuned: Tuned, task: str) -> Settings:
+    return tuned.tracking if task in (ODOMETRY, LASER) else tuned.finding
+
+
+def stretches(plain: Stretch, half: int, count: int, job: Job, *, odometry: bool) -> list[Stretch]:
+    """The trials of one estimator; what takes longest first."""
+    length = min(QUICK, count - half) if job.quick else count - half
+    whole = [replace(plain, task=task, count=length) for task in ((ODOMETRY, LASER) if odometry else (LASER,))]
+    starts = list(range(half, count - LIMIT, job.every * (4 if job.quick else 1)))
+    carried = [
+        replace(plain, task=KIDNAPPED, first=first, to=to)
+        for first in starts
+        if (to := half + (first - half + (count - half) // 2) % (count - half - LIMIT)) > first + BEFORE
+        or to + LIMIT <= first
+    ]
+    return [*whole, *(replace(plain, task=GLOBAL, first=first) for first in starts), *carried]
+
+
+def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Numbers of one estimator in one task."""
+    after = [BEFORE if row["task"] == KIDNAPPED else 0 for row in rows]
+    error, yaw, state, ms, nees = (
+        np.array([value for row, skip in zip(rows, after, strict=True) for value in row[name][skip:]])
+        for name in ("error_m", "yaw_error_rad", "state", "ms", "nees")
+    )
+    good = (error < FOUND) & (yaw < FOUND_YAW)
+    claims = state == "tracking"
+    first = [_found(row, skip) for row, skip in zip(rows, after, strict=True)]
+    reached = [k for k in first if k is not None]
+    known = np.array([value for value in nees[good & claims] if value is not None], float)
+    return {
+        "trials": len(rows), "scans": len(error), "error_median_m": float(np.median(error)),
+        "error_rms_m": float(np.sqrt(np.mean(error**2))), "error_95_m": float(np.quantile(error, 0.95)),
+        "tracked_error_rms_m": float(np.sqrt(np.mean(error[good] ** 2))) if good.any() else None,
+        "yaw_error_median_rad": float(np.median(yaw)), "tracked_share": float(good.mean()),
+        "claimed_share": float(claims.mean()), "wrong_claims_share": float((claims & ~good).mean()),
+        "wrong_claim_longest_s": max(_longest_wrong(row, skip) for row, skip in zip(rows, after, strict=True)),
+        "found": len(reached), "scans_until_found_median": float(np.median(reached)) if reached else None,
+        "scans_until_found_mean": float(np.mean(reached)) if reached else None,
+        "nees_median": float(np.median(known)) if len(known) else None,
+        "ms_median": float(np.median(ms)), "ms_95": float(np.quantile(ms, 0.95)),
+    }  # fmt: skip
+
+
+def _good(row: dict[str, Any], skip: int) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    error, yaw = np.array(row["error_m"][skip:]), np.array(row["yaw_error_rad"][skip:])
+    return np.asarray((error < FOUND) & (yaw < FOUND_YAW))
+
+
+def _found(row: dict[str, Any], skip: int) -> int | None:
+    """Scans until the estimator says `tracking` and is right."""
+    right = _good(row, skip) & (np.array(row["state"][skip:]) == "tracking")
+    return int(np.argmax(right)) + 1 if right.any() else None
+
+
+def _longest_wrong(row: dict[str, Any], skip: int) -> float:
+    """S for which it said `tracking` without a break and was elsewhere."""
+    wrong = ~_good(row, skip) & (np.array(row["state"][skip:]) == "tracking")
+    longest, since = 0.0, None
+    for stamp, is_wrong in zip(row["stamp_s"][skip:], wrong, strict=True):
+        since = (stamp if since is None else since) if is_wrong else None
+        longest = max(longest, 0.0 if since is None else stamp - since)
+    return longest
+
+
+def curves_of(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
+    """Errors of (a) and (b), scan by scan."""
+    curves: dict[str, list[Any]] = {}
+    for row in rows:
+        if row["task"] in (ODOMETRY, LASER):
+            curves.setdefault("stamp_s", row["stamp_s"])
+            curves[f"{row['estimator']}, {row['task']} m"] = row["error_m"]
+    return curves
+
+
+def notes(job: Job, card: weights.FieldCard, tuned: Tuned) -> list[str]:
+    """What the table does not say."""
+    found, learned = card.calibration, "second" if job.exchange else "first"
+    lines = [
+        (
+            f"tracked: within {FOUND} m and 10 deg of the reference, whose own error is among the errors; found: says "
+            f"`tracking` there, within {LIMIT} scans; wrong claim: says `tracking` elsewhere"
+        ),
+        *(
+            f"particle filter, tuned on the {learned} half, {what}: {_listed(each)}"
+            for what, each in (("a and b", tuned.tracking), ("c and d", tuned.finding))
+            if not job.quick
+        ),
+    ]
+    if found is not None:
+        shares = found.likelihood
+        lines.append(
+            f"held out of the {learned} half, {found.scans} scans: {found.log_likelihood:.2f} nats a beam; "
+            f"{shares.short:.1%} of the beams end early, {shares.random:.1%} anywhere; pose within "
+            f"{found.floor_position * 1e3:.0f} mm and {np.rad2deg(found.floor_heading):.2f} deg of the reference "
+            f"beyond the scan's covariance; NEES "
+            f"{found.nees_median:.2f} median (honest 2.37), {found.nees_mean:.1f} mean (3)"
+        )
+    if job.quick:
+        lines.append("quick: a look; few scans, and of the particle filter's settings only its motion noise is learned")
+    return lines
+
+
+def _listed(settings: Settings) -> str:
+    return ", ".join(f"{name} {value:.3g}" for name, value in settings)
+
+
+def table(summary: dict[str, dict[str, Any]]) -> str:
+    """As docs/experiments.md has it."""
+    heads = (
+        "task, estimator", "median (mm)", "RMS (mm)", "95 % (mm)", "tracked", "wrong claims; longest (s)", "found",
+        "scans until found", "NEES, median", "update, median; 95 % (CPU ms)",
+    )  # fmt: skip
+    table_rows: list[list[str]] = []
+    number: Callable[..., str] = results.number
+    for name, row in summary.items():
+        searched = not name.startswith(("a:", "b:"))
+        table_rows.append([
+            name, results.millimetres(row["error_median_m"]), results.millimetres(row["error_rms_m"]),
+            results.millimetres(row["error_95_m"]), f"{row['tracked_share']:.1%}",
+            f"{row['wrong_claims_share']:.1%}; {row['wrong_claim_longest_s']:.1f}",
+            f"{row['found']} of {row['trials']}" if searched else "–",
+            f"{number(row['scans_until_found_median'], 0)}; mean {number(row['scans_until_found_mean'], 1)}"
+            if searched else "–",
+            number(row["nees_median"], 2), f"{row['ms_median']:.0f}; {row['ms_95']:.0f}",
+        ])  # fmt: skip
+    return results.markdown(heads, table_rows)

@@ -1,0 +1,42 @@
+"""The figure of the experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from lab.real_logs.drive import LASER, NEAR_ENOUGH, ODOMETRY
+from presage.learning.drive_figure import calibration_curve
+from presage.plotting import style as drawing
+from services.estimator.precise.learning.calibration import Calibration
+
+LEAST = 1e-3  # m that are drawn
+
+
+def draw(found: Calibration | None, rows: Sequence[dict[str, Any]], titles: dict[str, str]) -> Figure:
+    """Shares of scans by error, calibration, and errors over time with and without odometry."""
+    figure = drawing.blank(14, 9)
+    panels = figure.subplots(2, 2, width_ratios=(1.6, 1))
+    shares = drawing.dress(panels[0, 0])
+    for axes, task, style in zip(panels[1], (ODOMETRY, LASER), ("-", "--"), strict=True):
+        drawing.dress(axes)
+        for row in (row for row in rows if row["task"] == task):
+            colour, name = drawing.COLOURS[row["estimator"]], row["estimator"]
+            error = np.maximum(row["error_m"], LEAST)
+            stamps = np.array(row["stamp_s"]) - row["stamp_s"][0]
+            axes.plot(stamps, error, linewidth=0.9, color=colour, label=name)
+            share = np.arange(1, len(error) + 1) / len(error)
+            shares.plot(np.sort(error), share, style, color=colour, label=f"{name}, {titles[task][3:]}")
+        drawing.log_metres(axes)
+        axes.axhline(NEAR_ENOUGH, color=drawing.BOUND, linestyle=":", linewidth=1)
+        axes.set(xlabel="time (s)", ylabel="position error (m)", title=titles[task])
+    drawing.log_metres(shares, "x")
+    shares.set(xlabel="position error (m)", ylabel="share of scans with less", ylim=(0, 1), title="the half localised")
+    shares.legend(frameon=False, fontsize=9)
+    if found is not None:
+        calibration_curve(drawing.dress(panels[0, 1]), found)
+    drawing.legend_below(figure, panels[1, 1])
+    return figure

@@ -1,0 +1,153 @@
+"""Tunes the particle filter on the training half.
+
+Odometry's noise is learned from the first half as it is for preset precise. Every other value is tried on stretches of
+the second quarter, in a map of the first quarter: like the half that is localised later, the second quarter sees rooms
+that the map lacks, which decides whether recovery helps or harms. For tracking, with and without odometry, the settings
+win that keep the most scans, then those with the least median error; for finding, from there on, those that find the
+most starts, from nothing and carried off, then those that need the fewest scans. Two sets, so that neither task
+suffers from what the other needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from common.geometry.world import load_world
+from lab.real_logs.drive import BEFORE, GLOBAL, KIDNAPPED, LASER, LIMIT, NEAR_ENOUGH, ODOMETRY, Job, trial
+from presage.learning.grid_map import write_map
+from presage.learning.map_of_log import cells_of
+from services.estimator.precise.motion_model import MotionNoise
+
+TRIED: dict[str, tuple[float, ...]] = {
+    "keep_initial_pose": (0.0,),
+    "sigma_hit": (0.05, 0.2),
+    "sigma_odometry": (0.0, 0.03, 0.1, 0.2),
+    "z_rand": (0.2, 0.5),
+    "max_beams": (60,),
+    "jitter_position": (0.005, 0.015),
+    "jitter_heading": (0.005, 0.015),
+    "alpha": (4.0, 16.0),
+}
+# keep_initial_pose 0: recovery after a start from a given pose; sigma_odometry 0: sigma_hit and max_beams with odometry
+# too; alpha: all five, times what the odometry says
+TRIED_TO_FIND: dict[str, tuple[float, ...]] = {
+    "recovery_alpha_fast": (0.0, 0.1),
+    "sigma_search": (0.2,),
+    "jitter_position": (0.005, 0.05),
+}
+STRETCHES, LENGTH = 3, 150  # of the second quarter: at most so many, of at most so many scans
+STARTS, TO_FIND = 4, 15  # places to find, and scans it may take from nothing
+CELL = 0.05  # m, of the first quarter's map where the drive's own map has no cells
+Settings = tuple[tuple[str, float], ...]
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Settings of the particle filter."""
+
+    tracking: Settings
+    finding: Settings
+    tried: list[str]  # share of scans kept, or of starts found; then median error (m), or mean scans
+
+
+def starting_point(motion: MotionNoise) -> Settings:
+    """Of odometry, by the first half: variances of AMCL's omnidirectional model, per square metre and radian."""
+    along = float(np.sqrt(motion.path_by_path / 0.1))  # over steps of a decimetre, AMCL's grow with the path itself
+    return (
+        ("alpha1", motion.path_by_turn), ("alpha2", motion.turn_by_path / 0.1), ("alpha3", along**2),
+        ("alpha4", motion.turn_by_turn / 0.1), ("alpha5", along**2),
+    )  # fmt: skip
+
+
+def tune(job: Job, half: int, start: Settings, folder: Path, report: Callable[[str, float], None]) -> Tuned:
+    """The best settings found; ``job``: log, map and mount; ``half``: scans of the first half.
+
+    The map of the first quarter is written into ``folder``.
+    """
+    lines: list[str] = []
+    total = sum(map(len, TRIED.values())) + sum(map(len, TRIED_TO_FIND.values())) + 2
+    quarter = half // 2
+    job = replace(job, map=str(_map_of_quarter(job, quarter, folder)))
+    length = min(LENGTH, half - quarter)
+    firsts = sorted(set(_known(job, quarter, half - length, STRETCHES)))
+
+    starts = _known(job, quarter, half - LIMIT, STARTS)
+
+    def tracking(settings: Settings) -> tuple[float, float]:
+        rows = [
+            trial(replace(job, task=task, first=first, count=length, particles=settings))
+            for task in (ODOMETRY, LASER)
+            for first in firsts
+        ]
+        return _kept(rows)
+
+    def finding(settings: Settings) -> tuple[float, float]:
+        rows = [trial(replace(job, task=GLOBAL, first=k, count=TO_FIND, particles=settings)) for k in starts]
+        carried = zip(starts, starts[len(starts) // 2 :] + starts[: len(starts) // 2], strict=True)
+        rows += [trial(replace(job, task=KIDNAPPED, first=k, to=to, particles=settings)) for k, to in carried]
+        return _found(rows)
+
+    def climb(
+        settings: Settings, tried: dict[str, tuple[float, ...]], score: Callable[[Settings], tuple[float, float]]
+    ) -> Settings:
+        best, most = settings, score(settings)
+        lines.append(f"{score.__name__}, as it begins: {most[0]:.0%}, {-most[1]:.3g}")
+        for name, values in tried.items():
+            base = best
+            for value in values:
+                changed = _with(base, name, value)
+                found = score(changed)
+                lines.append(f"{score.__name__}, {name} {value:g}: {found[0]:.0%}, {-found[1]:.3g}")
+                if found > most:
+                    best, most = changed, found
+                report(f"particle filter, {score.__name__}: {name}", len(lines) / total)
+        return best
+
+    track = climb(start, TRIED, tracking)
+    # A robot that was carried off has to give up the pose that was given.
+    return Tuned(track, climb(_with(track, "keep_initial_pose", 0.0), TRIED_TO_FIND, finding), lines)
+
+
+def _map_of_quarter(job: Job, quarter: int, folder: Path) -> Path:
+    """A ROS map of the first ``quarter`` scans, with cells like those of the job's map."""
+    grid = load_world(job.map).grid
+    cell = grid.resolution if grid is not None else CELL
+    values, (x, y) = cells_of(job.drive.part(np.arange(quarter)), cell)
+    return write_map(folder, values, name="quarter", image="quarter.pgm", resolution=cell, origin=[x, y, 0.0])
+
+
+def _known(job: Job, first: int, last: int, count: int) -> list[int]:
+    """``count`` scans from ``first`` to ``last``, evenly spaced among those whose reference pose is free in the map."""
+    free = np.flatnonzero(load_world(job.map).clearance(job.drive.poses[first : last + 1, :2]) > 0)
+    numbers = first + (free if len(free) else np.arange(last + 1 - first))
+    return [int(k) for k in numbers[np.linspace(0, len(numbers) - 1, count).astype(int)]]
+
+
+def _with(settings: Settings, name: str, value: float) -> Settings:
+    values = dict(settings)
+    if name == "alpha":
+        return tuple({**values, **{f"alpha{k}": values[f"alpha{k}"] * value for k in range(1, 6)}}.items())
+    return tuple({**values, name: value, **({"z_hit": 1 - value} if name == "z_rand" else {})}.items())
+
+
+def _kept(rows: list[dict[str, Any]]) -> tuple[float, float]:
+    """Share of scans tracked, and minus the median error (m) of those."""
+    off = np.array([value for row in rows for value in row["error_m"]])
+    tracked = off < NEAR_ENOUGH
+    return round(float(tracked.mean()), 2), -float(np.median(off[tracked])) if tracked.any() else -np.inf
+
+
+def _found(rows: list[dict[str, Any]]) -> tuple[float, float]:
+    """Share of starts found, and minus the mean of the scans until then."""
+    scans = []
+    for row in rows:
+        skip = BEFORE if row["task"] == KIDNAPPED else 0
+        right = (np.array(row["error_m"][skip:]) < NEAR_ENOUGH) & (np.array(row["state"][skip:]) == "tracking")
+        scans.append(int(np.argmax(right)) + 1 if right.any() else None)
+    found = [k for k in scans if k is not None]
+    return len(found) / len(rows), -float(np.mean([LIMIT if k is None else k for k in scans]))

@@ -1,0 +1,101 @@
+"""`presage obstacle`: furniture of a running simulator."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from pydantic import ValidationError
+
+from common.bus.bus import DEFAULT_ENDPOINT
+from common.errors import UserError, first_fault
+from presage.terminal.options import Connect, RobotName, console, link_of
+
+if TYPE_CHECKING:
+    from common.geometry.world import Obstacle
+
+app = typer.Typer(
+    help="Put boxes and pillars in a running simulator's way; the map does not know them.", no_args_is_help=True
+)
+
+NUMBERS = {"ignore_unknown_options": True}  # a coordinate may be negative
+Name = Annotated[str, typer.Argument(help="Its name, one you choose.")]
+X = Annotated[float, typer.Argument(help="m, map: its centre")]
+Y = Annotated[float, typer.Argument(help="m, map")]
+Size = Annotated[tuple[float, float], typer.Option(help="Of a box, m.")]
+Yaw = Annotated[float, typer.Option(help="Of a box, deg.")]
+Radius = Annotated[float, typer.Option(help="A disc of this radius, m; 0: a box.")]
+
+
+@app.command(context_settings=NUMBERS)
+def add(
+    name: Name,
+    x: X,
+    y: Y,
+    size: Size = (0.5, 0.5),
+    yaw: Yaw = 0.0,
+    radius: Radius = 0.0,
+    robot: RobotName = "robot",
+    connect: Connect = DEFAULT_ENDPOINT,
+) -> None:
+    """Put one there.
+
+    Examples: `presage obstacle add crate 6 1.5`; `presage obstacle add door 4 2 --size 0.9 0.05 --yaw 90`;
+    `presage obstacle add pillar 6 1 --radius 0.2`.
+    """
+    _change("add", name, _shape(x, y, size, yaw, radius), connect, robot)
+
+
+@app.command(context_settings=NUMBERS)
+def move(
+    name: Name,
+    x: X,
+    y: Y,
+    size: Size = (0.5, 0.5),
+    yaw: Yaw = 0.0,
+    radius: Radius = 0.0,
+    robot: RobotName = "robot",
+    connect: Connect = DEFAULT_ENDPOINT,
+) -> None:
+    """Put one that is there elsewhere; its shape is given anew.
+
+    Example: `presage obstacle move crate 6 2`.
+    """
+    _change("move", name, _shape(x, y, size, yaw, radius), connect, robot)
+
+
+@app.command()
+def remove(name: Name, robot: RobotName = "robot", connect: Connect = DEFAULT_ENDPOINT) -> None:
+    """Take one away, furniture of the world file too.
+
+    Example: `presage obstacle remove crate`.
+    """
+    _change("remove", name, None, connect, robot)
+
+
+def _shape(x: float, y: float, size: tuple[float, float], yaw: float, radius: float) -> Obstacle:
+    from common.geometry.world import Obstacle  # noqa: PLC0415
+
+    centre = {"center": (x, y)}
+    shape = {"circle": {**centre, "radius": radius}} if radius else {"box": {**centre, "size": size, "yaw_deg": yaw}}
+    try:
+        return Obstacle.model_validate(shape)
+    except ValidationError as error:
+        raise UserError(f"the obstacle: {first_fault(error)}") from None
+
+
+def _change(action: str, name: str, obstacle: Obstacle | None, connect: str, robot: str) -> None:
+    from common.messages.requests import ObstacleRequest, Reply  # noqa: PLC0415
+    from common.messages.topics import OBSTACLE  # noqa: PLC0415
+    from presage.live.bus_watch import session  # noqa: PLC0415
+
+    try:
+        request = ObstacleRequest.model_validate({"action": action, "name": name, "obstacle": obstacle})
+    except ValidationError as error:
+        raise UserError(f"obstacle {name!r}: {first_fault(error)}") from None
+    with session(link_of(connect, robot)) as bus:
+        reply = bus.ask(OBSTACLE, request, Reply)
+    if not reply.ok:
+        raise UserError(f"refused: {reply.reason}")
+    done = {"add": "there", "move": "moved", "remove": "gone"}[action]
+    console.print(f"{name}: {done}; nobody told the estimator or the controller")

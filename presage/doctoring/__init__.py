@@ -1,1 +1,0 @@
-"""What `presage doctor` looks at: the installation, this machine, the bus; and what it makes of it."""

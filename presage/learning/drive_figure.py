@@ -1,0 +1,52 @@
+"""The figure beside a model trained on a drive."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from services.estimator.precise.field import FieldModel
+from services.estimator.precise.learning.calibration import Calibration
+from services.estimator.precise.learning.weights import FieldCard
+
+
+def draw_learned(model: FieldModel, card: FieldCard, png: Path) -> None:
+    """Write ``png``."""
+    figure = Figure(figsize=(12, 4.8), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
+    _field(left, model, card.world.name)
+    if card.calibration is not None:
+        calibration_curve(right, card.calibration)
+    figure.savefig(png, dpi=120)
+
+
+def _field(axes: Axes, model: FieldModel, name: str) -> None:
+    field = model.field
+    ny, nx = field.phi.shape
+    x0, y0, h = *field.origin, field.resolution
+    phi = np.where(model.seen.at(field), field.phi, np.nan) if model.seen is not None else field.phi
+    extent = (x0, x0 + h * (nx - 1), y0, y0 + h * (ny - 1))
+    image = axes.imshow(phi, origin="lower", extent=extent, cmap="viridis", vmin=0)
+    axes.contour(x0 + h * np.arange(nx), y0 + h * np.arange(ny), field.phi, levels=[0.0], colors="#D55E00")
+    axes.set(
+        xlabel="x (m)", ylabel="y (m)", aspect="equal",
+        title=f"{name}: learned distance (m), its zero, white: not looked into",
+    )  # fmt: skip
+    axes.figure.colorbar(image, ax=axes, shrink=0.8)
+
+
+def calibration_curve(axes: Axes, found: Calibration) -> None:
+    """Ranges held out below the quantiles stated of them."""
+    stated, observed = np.array(found.coverage).T
+    axes.plot((0, 1), (0, 1), "--", color="#444444", linewidth=1, label="honest")
+    axes.plot(stated, observed, "o-", color="#0072B2", markersize=4, label=f"{found.scans} scans held out")
+    axes.set(
+        xlabel="probability stated", ylabel="share of ranges below that quantile", xlim=(0, 1), ylim=(0, 1),
+        title=f"{found.log_likelihood:.2f} nats a beam", aspect="equal",
+    )  # fmt: skip
+    axes.legend(frameon=False)

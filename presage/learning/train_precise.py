@@ -1,0 +1,147 @@
+"""Trains the distance field from such scans."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from common.bus.bus import Link
+from common.geometry import se2
+from common.geometry.world import World, load_world
+from common.robot.base import Robot
+from common.robot.scanner import SCANNERS, Scanner
+from common.versions import commit, versions
+from presage.learning.train_simulated import collect, scanner_on_bus
+from services.estimator.factory import LEAST_SIGMA
+from services.estimator.precise.field import FieldModel
+from services.estimator.precise.global_seeds import SPACING, thin_places
+from services.estimator.precise.learning import weights
+from services.estimator.precise.learning.evaluation import Quality, evaluate
+from services.estimator.precise.learning.field_learning import (
+    Recipe,
+    learn_field,
+    learn_ripple,
+    learn_scales,
+    reachable,
+)
+from services.estimator.precise.learning.surfaces import Beams
+
+TEST_SAMPLES = 500
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to learn."""
+
+    world: str
+    scanner: Scanner = SCANNERS["tim571"]
+    asked: tuple[str, ...] = ()  # the simulator's options for it
+    out: Path = weights.FOLDER
+    samples: int = 5000
+    recipe: Recipe = Recipe()  # noqa: RUF009 - frozen
+
+
+def train_precise(job: Job, link: Link, console: Console) -> Path:
+    """The weights' path; raises UserError in one line."""
+    world, scanner = load_world(job.world), job.scanner
+    path = weights.path_of(job.out, world.name)
+    weights.refuse_to_overwrite(path, world)
+    rng = np.random.default_rng(job.recipe.seed)
+    poses = {name: _poses(world, count, rng) for name, count in (("train", job.samples), ("test", TEST_SAMPLES))}
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as bar:
+        with scanner_on_bus(link, job.world, job.asked, world, scanner, console) as bus:
+            train = collect(bus, poses["train"], scanner, job.recipe.seed, bar, "scans to learn from")
+            test = collect(bus, poses["test"], scanner, None, bar, "scans to test with")
+        began = time.monotonic()
+        model, quality = _learn(job, scanner, poses, {"train": train, "test": test}, bar)
+    seconds = time.monotonic() - began
+    visited = se2.compose(poses["train"], np.array(scanner.mount))[:, :2]
+    places = thin_places(np.concatenate([visited, reachable(model.field, visited)]), SPACING)
+    card = _card(job, world, scanner, model, quality, seconds)
+    weights.save(path, model, places, card)
+    _draw(weights.load(path)[0], card, path.with_suffix(".png"))
+    console.print(
+        f"{path}: {path.stat().st_size / 1e6:.2f} MB, learned in {seconds:.0f} s; range error median "
+        f"{quality.range_error_median * 1e3:.2f} mm, {quality.share_above_5_cm:.2%} above 5 cm; "
+        f"position error that the model leaves {quality.position_error_rms * 1e3:.2f} mm RMS"
+    )
+    return path
+
+
+def _poses(world: World, count: int, rng: np.random.Generator) -> se2.Array:
+    places = world.sample_free(count, rng, Robot().radius)
+    return np.column_stack([places, rng.uniform(-np.pi, np.pi, count)])
+
+
+def _learn(
+    job: Job, scanner: Scanner, poses: dict[str, se2.Array], scans: dict[str, se2.Array], bar: Progress
+) -> tuple[FieldModel, Quality]:
+    mount, angles = np.array(scanner.mount), scanner.angles()
+    task: TaskID = bar.add_task("learning", total=1.0)
+
+    def report(title: str, done: float) -> None:
+        bar.update(task, description=f"learning: {title}", completed=0.9 * done)
+
+    field = learn_field(Beams.of(poses["train"], mount, angles, scans["train"]), job.recipe, report)
+    # As it will be read, in half precision.
+    field = replace(field, phi=field.phi.astype(np.float16).astype(np.float32))
+    report("precision", 1.0)
+    half = TEST_SAMPLES // 2  # precision from one half of the test scans, figures from the other
+    scales = learn_scales(field, poses["test"][:half], mount, angles, scans["test"][:half], 0.0)
+    ripple = learn_ripple(field, se2.compose(poses["test"][:half], mount), angles)
+    model = FieldModel(field, scales, ripple)
+    quality = evaluate(
+        model,
+        poses["test"][half:],
+        mount,
+        angles,
+        scans["test"][half:],
+        scanner.range_max,
+        max(scanner.sigma, LEAST_SIGMA),
+        scanner.sigma_relative,
+    )
+    bar.update(task, description="learned", completed=1.0)
+    return model, quality
+
+
+def _card(
+    job: Job, world: World, scanner: Scanner, model: FieldModel, quality: Quality, seconds: float
+) -> weights.FieldCard:
+    return weights.FieldCard(
+        world=world, scanner=scanner, samples=job.samples, seed=job.recipe.seed, resolution=job.recipe.resolution,
+        origin=model.field.origin, sweeps=job.recipe.sweeps, ripple=model.ripple, inflation=round(quality.inflation, 3),
+        test_samples=TEST_SAMPLES // 2, test_range_error_median_m=quality.range_error_median,
+        test_range_error_mean_m=quality.range_error_mean, test_share_above_5_cm=quality.share_above_5_cm,
+        test_position_error_rms_m=quality.position_error_rms, learning_s=round(seconds, 1), commit=commit(),
+        command="presage " + " ".join(sys.argv[1:]), versions=versions(),
+    )  # fmt: skip
+
+
+def _draw(model: FieldModel, card: weights.FieldCard, png: Path) -> None:
+    figure = Figure(figsize=(9, 4.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    field = model.field
+    ny, nx = field.phi.shape
+    x0, y0, h = *field.origin, field.resolution
+    image = axes.imshow(
+        field.phi, origin="lower", extent=(x0, x0 + h * (nx - 1), y0, y0 + h * (ny - 1)), cmap="viridis", vmin=0
+    )
+    axes.contour(
+        x0 + h * np.arange(nx), y0 + h * np.arange(ny), field.phi, levels=[0.0], colors="#D55E00", linewidths=0.8
+    )
+    axes.set(
+        xlabel="x (m)", ylabel="y (m)", aspect="equal",
+        title=f"{card.world.name}: learned distance (m) to what the scanner sees, and its zero",
+    )  # fmt: skip
+    figure.colorbar(image, ax=axes, shrink=0.8)
+    figure.savefig(png, dpi=120)

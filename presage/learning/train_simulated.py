@@ -1,0 +1,217 @@
+"""`presage train`: scans from random poses of a simulator, then training."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from common.bus.bus import Bus, Link, open_bus, wait_until
+from common.errors import UserError
+from common.geometry.se2 import Array
+from common.geometry.world import World, load_world
+from common.messages.requests import Request, SampleReply, SampleRequest, WorldReply
+from common.messages.topics import SAMPLE, WORLD
+from common.robot.base import Robot
+from common.robot.scanner import Scanner
+from common.versions import commit, versions
+from presage.session.stack import Stack
+from services.estimator.paper import training, weights
+from services.estimator.paper.checkpoint import Checkpoint
+from services.estimator.paper.decoder import Normalisation, PaperModel, Shape
+from services.estimator.paper.training import Data, Recipe, Trainer, usable_ranges
+from services.estimator.precise.learning.weights import same_walls
+
+TEST_SAMPLES = 1000
+BLOCK = 500  # poses a request
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to train."""
+
+    world: str
+    preset: str
+    scanner: Scanner
+    asked: tuple[str, ...]  # the simulator's options for it
+    out: Path
+    samples: int
+    recipe: Recipe
+    shape_hidden: int = 128
+    shape_channels: int = 8
+
+
+def train(job: Job, link: Link, console: Console) -> Path:
+    """The weights' path; raises UserError in one line."""
+    world, scanner = load_world(job.world), job.scanner
+    path = weights.path_of(job.out, world.name, job.preset, scanner.beams)
+    described = {"world": world.model_dump(mode="json"), "scanner": scanner.model_dump(mode="json"), "n": job.samples}
+    checkpoint = Checkpoint(job.out / f".{path.stem}.unfinished", {**described, **asdict(job.recipe)})
+    heading = float(world.start_pose(Robot().radius)[2])
+    rng = np.random.default_rng(job.recipe.seed)
+    with Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console
+    ) as bar:
+        data = {}
+        for name, count in (("train", job.samples), ("test", TEST_SAMPLES)):
+            poses = np.column_stack([world.sample_free(count, rng, Robot().radius), np.full(count, heading)])
+            kept = checkpoint.samples(name)
+            if kept is None:
+                with scanner_on_bus(link, job.world, job.asked, world, scanner, console) as bus:
+                    noise_seed = job.recipe.seed if name == "train" else None  # test against what is, not noise
+                    ranges = collect(bus, poses, scanner, noise_seed, bar, f"{name} samples")
+                kept = Data(poses, usable_ranges(ranges, scanner.range_max))
+                checkpoint.keep_samples(name, kept)
+            data[name] = kept
+        trainer, seconds = _fit(job, world, scanner, data, checkpoint, bar)
+    _write(job, world, scanner, heading, data, trainer, seconds, path)
+    checkpoint.finish()
+    _warn_if_nothing_learned(data, trainer, console)
+    card = weights.load(path)[1]
+    console.print(
+        f"{path}: {path.stat().st_size / 1e6:.2f} MB; test error mean {card.test_l1_mean:.3f} m, "
+        f"median {card.test_l1_median:.3f} m; {seconds:.0f} s"
+    )
+    return path
+
+
+@contextmanager
+def scanner_on_bus(
+    link: Link, world_name: str, asked: tuple[str, ...], world: World, scanner: Scanner, console: Console
+) -> Iterator[Bus]:
+    """A bus on which this scanner in this world answers `sample`: the one that is there, or a simulator of our own."""
+    with open_bus(link, patience=3.0) as bus:
+        if wait_until(bus.linked, 1.0) and _answers(bus, world, scanner, console):
+            yield bus
+            return
+    with Stack("training", quiet=True) as stack:
+        stack.start_router()
+        stack.start("simulator", "--world", world_name, *asked, "--pace", "realtime")
+        with open_bus(stack.link()) as bus:
+            stack.wait_alive(bus)
+            yield bus
+
+
+def _answers(bus: Bus, world: World, scanner: Scanner, console: Console) -> bool:
+    """Whether the scanner on the bus is the one asked for, in the same world; says so where not."""
+    try:
+        here = bus.ask(WORLD, Request(), WorldReply, timeout=1.0)
+    except UserError:
+        return False
+    if here.world is not None and same_walls(here.world, world) and here.scanner is not None:
+        other = {"beams", "rate"}  # it is asked for so many beams, and time plays no part
+        if here.scanner.model_dump(exclude=other) == scanner.model_dump(exclude=other):
+            console.print(f"samples come from the running scanner {here.scanner.name} in {world.name}")
+            return True
+    console.print("the running session has another world or scanner; a simulator of our own is started")
+    return False
+
+
+def collect(
+    bus: Bus,
+    poses: Array,
+    scanner: Scanner,
+    seed: int | None,
+    bar: Progress,
+    title: str,
+) -> Array:
+    """Ranges (N, B) m from ``poses`` (N, 3), in blocks; with noise of ``seed``, or none. +inf no return, -inf close."""
+    task = bar.add_task(title, total=len(poses))
+    rows = []
+    for number, start in enumerate(range(0, len(poses), BLOCK)):
+        block = poses[start : start + BLOCK]
+        request = SampleRequest(
+            poses=block, beams=scanner.beams, noise=seed is not None, seed=(seed or 0) * 100_003 + number
+        )
+        reply = bus.ask(SAMPLE, request, SampleReply, timeout=60.0)
+        if not reply.ok or reply.scanner is None:
+            raise UserError(f"the scanner refuses to be sampled: {reply.reason or 'it does not describe itself'}")
+        if len(reply.ranges) != len(block) * scanner.beams:
+            raise UserError(f"the scanner answered {len(reply.ranges)} ranges for {len(block)} x {scanner.beams}")
+        rows.append(reply.ranges.reshape(len(block), -1).astype(np.float64))
+        bar.advance(task, len(block))
+    return np.concatenate(rows)
+
+
+def _fit(
+    job: Job, world: World, scanner: Scanner, data: dict[str, Data], checkpoint: Checkpoint, bar: Progress
+) -> tuple[Trainer, float]:
+    norm = Normalisation.of(world.bounds, float(data["train"].ranges.max()))
+    shape = Shape(scanner.beams, job.shape_hidden, job.shape_channels)
+    trainer = Trainer(shape, norm, job.recipe, data["train"], data["test"])
+    if checkpoint.restore(trainer):
+        bar.console.print(f"going on after epoch {trainer.progress.epoch} of an interrupted run")
+    task = bar.add_task("epochs", total=job.recipe.epochs, completed=trainer.progress.epoch)
+    began = time.monotonic()
+
+    def report(progress: training.Progress) -> None:
+        checkpoint.save(trainer)
+        test = progress.test_l1[-1]
+        bar.update(task, completed=progress.epoch, description=f"epochs, test error {test:.3f} m")
+
+    trainer.run(report)
+    return trainer, time.monotonic() - began
+
+
+def _warn_if_nothing_learned(data: dict[str, Data], trainer: Trainer, console: Console) -> None:
+    """A network whose ReLUs have all died predicts one scan for everywhere."""
+    constant = float(np.abs(data["test"].ranges - np.median(data["train"].ranges, axis=0)).mean())
+    if trainer.progress.test_l1[-1] > 0.9 * constant:
+        console.print(
+            f"[bold red]nothing was learned[/]: one and the same scan for every place is as good ({constant:.3f} m). "
+            "Try another --seed, a smaller --learning-rate or more --epochs."
+        )
+
+
+def _write(
+    job: Job,
+    world: World,
+    scanner: Scanner,
+    heading: float,
+    data: dict[str, Data],
+    trainer: Trainer,
+    seconds: float,
+    path: Path,
+) -> None:
+    """Errors are measured on the weights as they will be read, in half precision."""
+    model_state = {name: tensor.half().float() for name, tensor in trainer.decoder.state_dict().items()}
+    trainer.decoder.load_state_dict(model_state)
+    predicted = PaperModel(trainer.decoder, trainer.norm).ranges(data["test"].poses)
+    error = np.abs(predicted - data["test"].ranges)
+    recipe = job.recipe
+    card = weights.ModelCard(
+        preset=job.preset, world=world, scanner=scanner, heading=heading, samples=job.samples, epochs=recipe.epochs,
+        batch=recipe.batch, learning_rate=recipe.learning_rate, seed=recipe.seed, hidden=job.shape_hidden,
+        channels=job.shape_channels, center=trainer.norm.center, half_size=trainer.norm.half_size,
+        range_scale=trainer.norm.range_scale, test_samples=TEST_SAMPLES, test_l1_mean=float(error.mean()),
+        test_l1_median=float(np.median(error)), curve_train_l1=[round(v, 5) for v in trainer.progress.train_l1],
+        curve_test_l1=[round(v, 5) for v in trainer.progress.test_l1], training_s=round(seconds, 1), commit=commit(),
+        command="presage " + " ".join(sys.argv[1:]), versions=versions(),
+    )  # fmt: skip
+    weights.save(path, trainer.decoder, card)
+    _draw_curve(card, path.with_suffix(".png"))
+
+
+def _draw_curve(card: weights.ModelCard, png: Path) -> None:
+    figure = Figure(figsize=(6, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    epochs = np.arange(1, len(card.curve_test_l1) + 1)
+    axes.plot(epochs, card.curve_train_l1, color="#0072B2", label=f"{card.samples} training samples")
+    axes.plot(epochs, card.curve_test_l1, color="#D55E00", label=f"{card.test_samples} test samples")
+    axes.set(
+        xlabel="epoch", ylabel="L1 error (m, mean over beams)", yscale="log",
+        title=f"{card.preset} in {card.world.name}, {card.scanner.beams} beams",
+    )  # fmt: skip
+    axes.grid(alpha=0.3, which="both")
+    axes.legend()
+    figure.savefig(png, dpi=120)

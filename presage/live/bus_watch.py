@@ -1,0 +1,61 @@
+"""The latest message of each topic."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import TypeVar
+
+from common.bus.bus import Bus, Link, open_bus, wait_until
+from common.bus.inbox import Inbox, Sample
+from common.errors import UserError
+from common.messages.definitions import Stamped
+from common.messages.topics import Topic
+from common.messages.wire import DecodeError
+
+M = TypeVar("M", bound=Stamped)
+
+
+class Watch:
+    """Subscribes to topics and keeps the newest message of each."""
+
+    def __init__(self, bus: Bus, *topics: Topic) -> None:
+        """From now on."""
+        self.bus, self.inbox = bus, Inbox()
+        self.latest: dict[str, Stamped] = {}
+        for topic in topics:
+            bus.subscribe(topic, self.inbox, keep_all=True)
+
+    def next(self, timeout: float) -> Stamped | None:
+        """The next valid message, or None within ``timeout`` s."""
+        deadline = time.monotonic() + timeout
+        while (left := deadline - time.monotonic()) > 0:
+            sample = self.inbox.get(left)
+            if isinstance(sample, Sample):
+                with suppress(DecodeError):
+                    message = sample.topic.message.decode(sample.payload)
+                    self.latest[sample.topic.name] = message
+                    return message
+        return None
+
+    def until(self, kind: type[M], condition: Callable[[M], bool], timeout: float) -> M | None:
+        """The first message of a kind that meets the condition, or None within ``timeout`` s."""
+        deadline = time.monotonic() + timeout
+        while (left := deadline - time.monotonic()) > 0:
+            message = self.next(left)
+            if isinstance(message, kind) and condition(message):
+                return message
+        return None
+
+
+@contextmanager
+def session(link: Link, timeout: float = 3.0) -> Iterator[Bus]:
+    """A bus that has reached somebody; raises UserError where nobody is there."""
+    with open_bus(link, patience=timeout) as bus:
+        if link.connect and not wait_until(bus.linked, timeout):
+            raise UserError(
+                f"nothing answers at {', '.join(link.connect)}: start a session with `presage up`, "
+                "or say where it is with --connect"
+            )
+        yield bus

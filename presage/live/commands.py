@@ -1,0 +1,197 @@
+"""goal, teleport, topics, hz and echo."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from common.bus.bus import Link
+from common.bus.inbox import Inbox, Sample
+from common.errors import UserError
+from common.messages.definitions import Goal, Pose, Status
+from common.messages.requests import LocaliseRequest, PoseRequest, Reply
+from common.messages.topics import GOAL, LOCALISE, QUERIES, STATUS, TELEPORT, TOPICS, Topic
+from common.messages.wire import DecodeError, Message
+from presage.live.bus_watch import Watch, session
+
+
+def topic_named(name: str) -> Topic:
+    """The row of that name; raises UserError with those there are."""
+    for topic in TOPICS:
+        if topic.name == name:
+            return topic
+    raise UserError(f"no topic {name!r}: choose one of {', '.join(t.name for t in TOPICS)}")
+
+
+def give_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
+    """Send the robot somewhere (or cancel); 0 when accepted, or with ``wait`` when reached."""
+    with session(link) as bus:
+        watch = Watch(bus, STATUS)
+        if not bus.wait_matching(GOAL, 3.0):
+            raise UserError("nobody listens for goals: is the controller running?")
+        status = watch.until(Status, lambda _: True, 3.0)
+        if status is None:
+            raise UserError("the controller says nothing: does it get beliefs? `presage doctor` looks")
+        bus.put(GOAL, goal.model_copy(update={"stamp_ns": status.stamp_ns}).encode())
+        if goal.cancel:
+            done = watch.until(Status, lambda s: s.state == "idle", 3.0)
+            console.print("cancelled; the robot stands" if done else "sent, but not confirmed")
+            return 0 if done else 1
+        if (status := watch.until(Status, lambda s: s.goal_seq == goal.seq, 3.0)) is None:
+            raise UserError("the controller did not take the goal within 3 s")
+        if status.state == "blocked":
+            raise UserError(status.reason)
+        console.print(f"going to ({goal.pose.x:g}, {goal.pose.y:g})")
+        return _follow(watch, goal, console) if wait else 0
+
+
+BLOCKED_FOR = 30.0  # s of stamps; who stands in the way goes on sooner, and the robot with them
+QUIET, EXCHANGED_IN = 3.0, 30.0  # s without a status until that is said, and until it is over
+NEARER = 0.3  # m; what is less is no progress
+
+
+def _follow(watch: Watch, goal: Goal, console: Console) -> int:
+    least, blocked_ns, before_ns = np.inf, 0, None  # m to go at least; how long it has been blocked since
+    with console.status("navigating") as line:
+        while (status := _heard(watch, console)) is not None:
+            if status.goal_seq != goal.seq:
+                raise UserError("another goal took its place" if status.goal else "the goal was cancelled")
+            away = f"{status.distance:.2f} m to go" if status.distance is not None else ""
+            line.update(f"{status.state} {away} {status.reason}")
+            if status.distance is not None and status.distance < least - NEARER:
+                least, blocked_ns = status.distance, 0
+            if before_ns is not None and status.state == "blocked":
+                blocked_ns += max(0, status.stamp_ns - before_ns)
+            before_ns = status.stamp_ns
+            if status.state == "reached" or status.refused or blocked_ns > BLOCKED_FOR * 1e9:
+                console.print(f"{status.state}: {status.reason}")
+                return 0 if status.state == "reached" else 1
+    raise UserError(f"the controller fell silent for {EXCHANGED_IN:g} s")
+
+
+def _heard(watch: Watch, console: Console) -> Status | None:
+    """The next status, though a service is exchanged meanwhile: without beliefs the controller says nothing."""
+    if (status := watch.until(Status, lambda _: True, QUIET)) is None:
+        console.print(f"the controller says nothing; the goal waits for it, {EXCHANGED_IN:g} s at most")
+        status = watch.until(Status, lambda _: True, EXCHANGED_IN - QUIET)
+    return status
+
+
+def teleport(link: Link, pose: Pose, console: Console) -> None:
+    """Carry the robot off; raises UserError with the reason where it is refused."""
+    with session(link) as bus:
+        reply = bus.ask(TELEPORT, PoseRequest(pose=pose), Reply)
+    if not reply.ok:
+        raise UserError(f"refused: {reply.reason}")
+    console.print(f"carried to ({pose.x:g}, {pose.y:g}), {np.rad2deg(pose.yaw):g} deg; nobody told the estimator")
+
+
+def list_topics(robot: str, console: Console) -> None:
+    """The table."""
+    table = Table(title="topics", title_justify="left")
+    for column in ("key", "message", "Hz", "publisher", "receivers keep", "recorded", "about"):
+        table.add_column(column, no_wrap=column == "key")
+    for topic in TOPICS:
+        table.add_row(
+            topic.key(robot, "SERVICE"), topic.message.__name__, f"{topic.rate:g}" if topic.rate else "-",
+            topic.publisher, topic.queue, "yes" if topic.recorded else "no", topic.about,
+        )  # fmt: skip
+    console.print(table)
+    table = Table(title="queryables", title_justify="left")
+    for column in ("key", "request", "reply", "server", "about"):
+        table.add_column(column, no_wrap=column == "key")
+    for query in QUERIES:
+        names = (query.request.__name__, query.reply.__name__)
+        table.add_row(query.key(robot, "SERVICE"), *names, query.server, query.about)
+    console.print(table)
+
+
+def measure_rates(link: Link, topics: tuple[Topic, ...], seconds: float) -> dict[str, list[int]]:
+    """Arrival times (ns, wall) by key over ``seconds`` s."""
+    with session(link) as bus:
+        inbox, times = Inbox(), defaultdict(list)
+        for topic in topics:
+            bus.subscribe(topic, inbox, keep_all=True)
+        deadline = time.monotonic() + seconds
+        while (left := deadline - time.monotonic()) > 0:
+            sample = inbox.get(left)
+            if isinstance(sample, Sample):
+                times[sample.key].append(sample.received_ns)
+        return dict(times)
+
+
+def show_rates(link: Link, name: str | None, seconds: float, console: Console) -> int:
+    """Rates of one topic or all, against the table's; 1 when nothing came."""
+    topics = (topic_named(name),) if name else TOPICS
+    with console.status(f"listening for {seconds:g} s"):
+        times = measure_rates(link, topics, seconds)
+    table = Table()
+    for column in ("key", "messages", "Hz", "nominal", "period ms: median", "longest"):
+        table.add_column(column, justify="left" if column == "key" else "right")
+    for topic in topics:
+        keys = [key for key in sorted(times) if key.split("/")[2] == topic.name]
+        for key in keys or [topic.key(link.robot)]:
+            stamps = np.array(times.get(key, []))
+            periods = np.diff(stamps) / 1e6
+            row = (
+                [f"{1000 / periods.mean():.2f}", f"{np.median(periods):.1f}", f"{periods.max():.1f}"]
+                if len(periods)
+                else ["-"] * 3
+            )
+            table.add_row(key, str(len(stamps)), row[0], f"{topic.rate:g}" if topic.rate else "-", *row[1:])
+    console.print(table)
+    return 0 if times else 1
+
+
+def plain(message: Message, *, full: bool) -> dict[str, Any]:
+    """A message as JSON-able values; long arrays by their ends unless ``full``."""
+
+    def convert(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            # Significant digits: a covariance is in millionths, a range in metres.
+            numbers = [float(f"{v:.6g}") if np.isfinite(v) else str(v) for v in value.astype(float).ravel().tolist()]
+            if full or len(numbers) <= 9:
+                return numbers
+            return [*numbers[:3], f"... {len(numbers)} ...", *numbers[-3:]]
+        if isinstance(value, Message):
+            return {name: convert(getattr(value, name)) for name in type(value).model_fields}
+        return [convert(item) for item in value] if isinstance(value, list) else value
+
+    result: dict[str, Any] = convert(message)
+    return result
+
+
+def echo(link: Link, name: str, count: int, console: Console, *, full: bool) -> int:
+    """Print messages of a topic as they come, one JSON line each; 1 when none came within 5 s."""
+    topic, seen = topic_named(name), 0
+    with session(link) as bus:
+        inbox = Inbox()
+        bus.subscribe(topic, inbox, keep_all=True)
+        while not count or seen < count:
+            sample = inbox.get(5.0)
+            if not isinstance(sample, Sample):
+                if seen == 0:
+                    raise UserError(f"nothing on {topic.key(link.robot)} within 5 s: is the {topic.publisher} running?")
+                continue
+            seen += 1
+            try:
+                line = json.dumps(plain(topic.message.decode(sample.payload), full=full))
+            except DecodeError as error:
+                line = f"undecodable, {len(sample.payload)} bytes: {error}"
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
+    return 0
+
+
+def localise(link: Link, pose: Pose | None, console: Console) -> None:
+    """Restart the estimator's belief; raises UserError with the reason where it is refused."""
+    with session(link) as bus:
+        reply = bus.ask(LOCALISE, LocaliseRequest(pose=pose), Reply)
+    if not reply.ok:
+        raise UserError(f"refused: {reply.reason}")
+    console.print("localising anew " + (f"from ({pose.x:g}, {pose.y:g})" if pose else "from its initial pose"))

@@ -1,0 +1,135 @@
+"""All scans of a log or recording in memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+
+from common.errors import UserError
+from common.geometry.se2 import Array
+from common.messages.definitions import Odom, Scan, Truth
+from common.messages.topics import ODOM, SCAN, TRUTH
+from common.robot.ranges import about_place
+from presage.logs.log import Log, Reading
+from presage.logs.opening import kind_of, open_log
+from services.estimator.factory import Geometry
+from services.estimator.shared.interface import Observation
+from services.recorder.reader import read_recording
+
+RECORDED = "the recorded truth"
+
+
+@dataclass(frozen=True)
+class Scans:
+    """N scans of B beams."""
+
+    geometry: Geometry
+    ranges: Array  # (N, B) m; +inf no return, -inf says nothing
+    stamps: Array | None = None  # (N,) s
+    odom: Array | None = None  # (N, 3) base_link in odom; NaN where not known
+    initial_pose: Array | None = None  # (3,) in map
+    truth: Array | None = None  # (N, 3) base_link in map; NaN where not known
+    world: str | None = None  # name of the world it was recorded in
+    truth_is: str = RECORDED  # or the log's reference, which is none
+    notes: tuple[str, ...] = ()  # what was taken for granted, and left out
+
+    def say_notes(self, console: Console) -> None:
+        """What was taken for granted, a line each."""
+        for note in self.notes:
+            console.print(note, highlight=False, soft_wrap=True)
+
+    def part(self, numbers: npt.NDArray[np.intp]) -> Scans:
+        """The scans of these numbers (K,), ascending; initial_pose only goes with the first of the file."""
+
+        def of(values: Array | None) -> Array | None:
+            return None if values is None else values[numbers]
+
+        return replace(
+            self, ranges=self.ranges[numbers], stamps=of(self.stamps), odom=of(self.odom), truth=of(self.truth),
+            initial_pose=self.initial_pose if numbers[0] == 0 else None,
+        )  # fmt: skip
+
+    def observation(self, k: int, *, odometry: bool = True) -> Observation:
+        """The k-th scan for an estimator."""
+        odom = self.odom[k] if odometry and self.odom is not None and np.isfinite(self.odom[k]).all() else None
+        stamp = None if self.stamps is None else float(self.stamps[k])
+        return Observation(self.ranges[k], self.geometry.angles, self.geometry.range_max, stamp, odom)
+
+
+def read_scans(path: Path, mount: Array | None = None, reading: Reading | None = None) -> Scans:
+    """Of a recording, an .npz, a CARMEN log or a ROS bag; raises UserError saying what is wrong.
+
+    ``mount`` (3,): the laser in base_link, instead of what the log says; a recording knows better. An .npz's poses
+    (odom, initial_pose, reference) are base_link's, with a mount of zero the laser's own. `Scans.truth` is the
+    recording's truth or the log's reference. ``reading``: what else is said about a log.
+    """
+    reading = reading or Reading()
+    if kind_of(path) == "recording":
+        if not reading.plain:
+            raise UserError(f"{path}: a recording says itself what its scanner is: those options are about logs")
+        return _read_recording(path)
+    return scans_of(open_log(path, reading if mount is None else replace(reading, mount=mount)))
+
+
+def seconds(stamps_ns: list[int]) -> Array:
+    """(N,) s, each the nearest number there is: 1000 s is not 1000.0000000000001."""
+    return np.array([stamp / 1_000_000_000 for stamp in stamps_ns])
+
+
+def scans_of(log: Log) -> Scans:
+    """All of a log; raises UserError where it has none of use."""
+    nothing = np.full(3, np.nan)
+    ranges, stamps, odoms, references = [], [], [], []
+    for sweep in log.sweeps():
+        ranges.append(about_place(sweep.ranges))
+        stamps.append(sweep.stamp_ns)
+        odoms.append(nothing if sweep.odom is None else sweep.odom)
+        references.append(nothing if sweep.reference is None else sweep.reference)
+    if not ranges:
+        raise UserError(f"{log.path}: no scan of use in it" + (f" ({lost})" if (lost := log.lost()) else ""))
+    times = [stamp for stamp in stamps if stamp is not None]
+    return Scans(
+        Geometry(log.angles, log.mount, log.range_max), np.array(ranges),
+        seconds(times) if len(times) == len(ranges) else None,
+        np.array(odoms) if log.odometry else None, log.initial_pose,
+        np.array(references) if log.reference else None, truth_is=log.reference or RECORDED,
+        notes=(*log.notes, *([f"left out: {lost}"] if (lost := log.lost()) else [])),
+    )  # fmt: skip
+
+
+def _read_recording(path: Path) -> Scans:
+    recording = read_recording(path)
+    scans: list[Scan] = []
+    odoms: dict[int, Array] = {}
+    truths: dict[int, Array] = {}
+    for _, message, _ in recording.messages(SCAN, ODOM, TRUTH):
+        if isinstance(message, Scan) and (not scans or message.stamp_ns > scans[-1].stamp_ns):
+            scans.append(message)
+        elif isinstance(message, Odom):
+            odoms[message.stamp_ns] = message.pose.array()
+        elif isinstance(message, Truth):
+            truths[message.stamp_ns] = message.pose.array()
+    if recording.warning:  # damage is found on the way
+        print(recording.warning)
+    if not scans:
+        raise UserError(f"{path}: no scan in it")
+    first = scans[0]
+    alike = [s for s in scans if len(s.ranges) == len(first.ranges) and s.mount == first.mount]
+    if len(alike) != len(scans):
+        raise UserError(f"{path}: the scanner changes on the way; localize takes one scanner a file")
+    nothing = np.full(3, np.nan)
+    world = recording.world()
+    return Scans(
+        Geometry.of_scan(first),
+        np.array([about_place(s.ranges) for s in scans]),
+        seconds([s.stamp_ns for s in scans]),
+        np.array([odoms.get(s.stamp_ns, nothing) for s in scans]) if odoms else None,
+        None,
+        np.array([truths.get(s.stamp_ns, nothing) for s in scans]) if truths else None,
+        world.name if world is not None else None,
+        recording.metadata.get("log", {}).get("reference") or RECORDED,
+    )

@@ -1,0 +1,1 @@
+"""Matplotlib style and map drawing."""

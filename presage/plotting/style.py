@@ -1,0 +1,111 @@
+"""Colours, marks and axes of figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+from matplotlib.ticker import FuncFormatter
+
+from common.geometry.se2 import Array
+from common.geometry.world import World
+from presage.plotting.maps import draw_cells
+
+# Okabe and Ito; the same in every figure. Green is the paper's for the distance to the goal.
+COLOURS = {
+    "paper": "#E69F00", "paper, 10 steps a scan": "#E69F00", "precise": "#0072B2", "particle-filter": "#D55E00",
+    "amcl-defaults": "#CC79A7", "particle-filter, heading known": "#000000", "precise, odometry": "#56B4E9",
+    "particle-filter, odometry": "#999999", "amcl-defaults, odometry": "#CC79A7",
+}  # fmt: skip
+DASHED = ("paper, 10 steps a scan",)  # those that share a colour with another
+MEASURED, PREDICTED, GOAL, BOUND = "#0072B2", "#D55E00", "#009E73", "#444444"
+SMALLEST = 1e-4  # m, the least a logarithmic axis shows
+
+
+def figure_of(columns: int = 1, rows: int = 1, *, width: float = 7.0, height: float = 4.2) -> tuple[Figure, list[Axes]]:
+    """An empty figure of so many panels, each ``width`` x ``height`` inches; the panels, row by row."""
+    figure = blank(width * columns, height * rows)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    return figure, [dress(each) for each in axes.ravel()]
+
+
+def blank(width: float, height: float) -> Figure:
+    """No panel yet; inches."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def dress(axes: Axes) -> Axes:
+    """Light grid, no box."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(visible=True, which="major", color="#DDDDDD", linewidth=0.6)
+    axes.set_axisbelow(True)
+    return axes
+
+
+def band(
+    axes: Axes, x: Sequence[float] | Array, rows: Sequence[Sequence[float]] | Array, name: str, colour: str = ""
+) -> None:
+    """Mean over trials (N, K) with a band of one standard deviation; on a log axis it ends where it would be <= 0."""
+    values = np.asarray(rows, float)
+    mean, std = values.mean(axis=0), values.std(axis=0)
+    _band(axes, x, mean, (np.maximum(mean - std, SMALLEST), mean + std), name, colour)
+
+
+def quartiles(axes: Axes, x: Sequence[float] | Array, rows: Sequence[Sequence[float]] | Array, name: str) -> None:
+    """Median over trials (N, K) with a band from the first to the third quartile: for a logarithmic axis."""
+    low, middle, high = np.quantile(np.asarray(rows, float), (0.25, 0.5, 0.75), axis=0)
+    _band(axes, x, middle, (low, high), name)
+
+
+def line(axes: Axes, x: Sequence[float], y: Sequence[float], name: str, colour: str = "") -> None:
+    """As this estimator's always is."""
+    colour = colour or COLOURS.get(name, GOAL)
+    axes.plot(x, y, "--" if name in DASHED else "-", color=colour, linewidth=1.6, label=name)
+
+
+def _band(
+    axes: Axes, x: Sequence[float] | Array, middle: Array, edges: tuple[Array, Array], name: str, colour: str = ""
+) -> None:
+    colour = colour or COLOURS.get(name, GOAL)
+    line(axes, x, middle, name, colour)  # type: ignore[arg-type]
+    axes.fill_between(x, *edges, color=colour, alpha=0.18, linewidth=0)
+
+
+def held(rows: Sequence[Sequence[float]], length: int) -> Array:
+    """(N, ``length``) of rows that end earlier: they hold their last value."""
+    return np.array([[*row, *[row[-1]] * (length - len(row))] for row in rows])
+
+
+def world_map(axes: Axes, world: World) -> None:
+    """Walls and furniture, m."""
+    if world.grid is not None:
+        draw_cells(axes, world.grid, "black")
+    else:
+        axes.add_patch(Polygon(np.array(world.boundary), fill=False, edgecolor="black", linewidth=1.2))
+    for obstacle in world.obstacles:
+        outline = shapely.get_coordinates(obstacle.shape())
+        axes.add_patch(Polygon(outline, facecolor="#BBBBBB", edgecolor="black", linewidth=0.6))
+    x0, y0, x1, y1 = world.bounds
+    axes.set(xlim=(x0 - 0.2, x1 + 0.2), ylim=(y0 - 0.2, y1 + 0.2), aspect="equal", xlabel="x (m)", ylabel="y (m)")
+
+
+def legend_below(figure: Figure, *panels: Axes) -> None:
+    """One legend for all panels, where it hides nothing."""
+    named = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    figure.legend(
+        named.values(), named.keys(), loc="outside lower center", ncols=min(len(named), 5), fontsize=9, frameon=False
+    )
+
+
+def log_metres(axes: Axes, axis: str = "y") -> None:
+    """A logarithmic axis that says 0.01, not 10^-2."""
+    axes.set(**{f"{axis}scale": "log"})
+    plain = FuncFormatter(lambda value, _: f"{value:g}")
+    (axes.yaxis if axis == "y" else axes.xaxis).set_major_formatter(plain)

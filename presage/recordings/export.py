@@ -1,0 +1,70 @@
+"""`presage export`: chooses the format."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from common.errors import UserError
+from presage.recordings.selection import stem_of
+from presage.terminal.output import check_file, write_json
+from services.recorder.reader import Recording, read_recording
+
+BESIDE = {"csv": "-csv", "tum": "-tum", "foxglove": "-foxglove.mcap"}
+
+
+@dataclass(frozen=True)
+class Export:
+    """What is asked for."""
+
+    file: Path
+    format: str  # csv, tum or foxglove
+    out: Path | None = None  # None: beside the recording
+    robot: str = ""  # none: the recording's own
+    arrays: bool = False
+    localised_only: bool = False
+    force: bool = False
+
+
+def run_export(job: Export, json_file: Path | None, console: Console) -> None:
+    """Write it, and print what was written; raises UserError where that cannot be."""
+    if job.format not in BESIDE:
+        raise UserError(f"no format {job.format!r}: choose {', '.join(BESIDE)}")
+    check_file(json_file, "--json")
+    out = job.out or job.file.with_name(stem_of(job.file) + BESIDE[job.format])
+    recording = read_recording(job.file)
+    began = time.monotonic()
+    written = _write(job, recording, out, console)
+    took = time.monotonic() - began
+    if recording.warning:
+        print(f"warning: {recording.warning}", file=sys.stderr)
+    if lost := sum(recording.undecodable.values()):
+        print(f"warning: {lost} messages could not be decoded and are left out", file=sys.stderr)
+    unit = "messages" if job.format == "foxglove" else "rows"
+    for name, rows in written.items():
+        console.print(f"{rows:9d} {unit}  {name}", markup=False, highlight=False)
+    console.print(f"written to {out} in {took:.1f} s", markup=False, highlight=False, soft_wrap=True)
+    numbers = {"file": str(job.file), "format": job.format, "out": str(out), "written": written, "seconds": took}
+    write_json(json_file, {**numbers, "complete": recording.complete, "undecodable": lost})
+
+
+def _write(job: Export, recording: Recording, out: Path, console: Console) -> dict[str, int]:
+    """With the writer of the format, imported when it is needed."""
+    if job.format == "csv":
+        from presage.recordings.csv_tables import export_csv  # noqa: PLC0415
+
+        return export_csv(recording, out, job.robot, console, arrays=job.arrays, force=job.force)
+    if job.format == "tum":
+        from presage.recordings.tum import export_tum  # noqa: PLC0415
+
+        only = job.localised_only
+        return export_tum(recording, out, job.robot, console, localised_only=only, force=job.force)
+    try:
+        from presage.recordings.foxglove import export_foxglove  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        raise UserError(f"{error.name} is not installed: pip install 'presage[export]' brings it") from None
+    return export_foxglove(recording, out, job.robot, console, force=job.force)

@@ -1,0 +1,165 @@
+"""Numbers for plots, with units from the schema."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from common.geometry.se2 import Array, between
+from common.messages.definitions import Belief, CmdVel, Drive, Health, Status, Truth
+
+# Channel: field: JSON type and meaning. A field that is unknown at the moment is left out.
+FIELDS: dict[str, dict[str, tuple[str, str]]] = {
+    "/belief/numbers": {
+        "stamp_s": ("number", "s, the scan's own stamp"),
+        "state": ("string", "localising, tracking, ambiguous or lost"),
+        "free_energy": ("number", "nats, accuracy + complexity"),
+        "accuracy": ("number", "nats, -ln p(o | pose)"),
+        "complexity": ("number", "nats"),
+        "hypotheses": ("integer", "Gaussians in the mixture"),
+        "weight": ("number", "of the best hypothesis"),
+        "sigma_x": ("number", "m"),
+        "sigma_y": ("number", "m"),
+        "sigma_yaw": ("number", "rad"),
+    },
+    "/error": {
+        "stamp_s": ("number", "s"),
+        "position": ("number", "m, from the belief to the truth of the same stamp"),
+        "heading": ("number", "rad, absolute"),
+        "goal_distance": ("number", "m, from the truth to the goal"),
+    },
+    "/truth/numbers": {
+        "stamp_s": ("number", "s"),
+        "vx": ("number", "m/s, base_link"),
+        "vy": ("number", "m/s, base_link"),
+        "wz": ("number", "rad/s"),
+        "contact": ("boolean", "the body touches something"),
+        "stopped": ("boolean", "the obstacle stop holds the wheels back"),
+    },
+    "/cmd_vel": {
+        "stamp_s": ("number", "s, of the scan it answers"),
+        "vx": ("number", "m/s, base_link"),
+        "vy": ("number", "m/s, base_link"),
+        "wz": ("number", "rad/s"),
+    },
+    "/drive": {
+        "stamp_s": ("number", "s"),
+        "vx": ("number", "m/s, base_link"),
+        "vy": ("number", "m/s, base_link"),
+        "wz": ("number", "rad/s"),
+    },
+    "/status": {
+        "stamp_s": ("number", "s"),
+        "state": ("string", "idle, navigating, reached, blocked or lost"),
+        "reason": ("string", ""),
+        "distance": ("number", "m, from the believed pose to the goal"),
+    },
+}
+HEALTH: dict[str, Any] = {
+    "type": "object",
+    "properties": {
+        "service": {"type": "string"},
+        "uptime": {"type": "number", "description": "s, wall time"},
+        "note": {"type": "string"},
+        "topics": {
+            "type": "array",
+            "items": {
+                "type": "object",
+                "properties": {
+                    "key": {"type": "string"},
+                    **{name: {"type": "integer"} for name in ("received", "published", "dropped", "undecodable")},
+                    "rate": {"type": "number", "description": "Hz over the last second"},
+                },
+            },
+        },
+        "counters": {
+            "type": "array",
+            "items": {"type": "object", "properties": {"name": {"type": "string"}, "value": {"type": "integer"}}},
+        },
+    },
+}
+
+
+def schema_of(topic: str) -> tuple[str, dict[str, Any]]:
+    """Name and JSON schema of a channel of numbers."""
+    if topic.startswith("/health/"):
+        return "presage.Health", HEALTH
+    properties = {name: {"type": kind, "description": about} for name, (kind, about) in FIELDS[topic].items()}
+    name = "presage." + "".join(part.capitalize() for part in topic.replace("_", "/").split("/"))
+    return name, {"type": "object", "properties": properties}
+
+
+def _known(values: dict[str, Any]) -> dict[str, Any]:
+    """Without what is unknown, and without what JSON has no number for."""
+    return {k: v for k, v in values.items() if v is not None and not (isinstance(v, float) and not np.isfinite(v))}
+
+
+def of_belief(belief: Belief) -> dict[str, Any]:
+    """Free energy and how sure the belief is."""
+    spread = [None, None, None] if belief.covariance is None else np.sqrt(np.diag(belief.covariance)).tolist()
+    weights = [hypothesis.weight for hypothesis in belief.hypotheses]
+    return _known(
+        {
+            "stamp_s": belief.stamp_ns * 1e-9,
+            "state": belief.state,
+            "free_energy": belief.free_energy,
+            "accuracy": belief.accuracy,
+            "complexity": belief.complexity,
+            "hypotheses": len(weights),
+            "weight": max(weights, default=None),
+            **dict(zip(("sigma_x", "sigma_y", "sigma_yaw"), spread, strict=True)),
+        }
+    )
+
+
+def of_error(belief: Belief, truth: Array, goal: Array | None) -> dict[str, Any]:
+    """How far off the belief is; poses (3,) in map."""
+    off = between(truth, belief.pose.array())
+    return _known(
+        {
+            "stamp_s": belief.stamp_ns * 1e-9,
+            "position": float(np.hypot(off[0], off[1])),
+            "heading": float(abs(off[2])),
+            "goal_distance": None if goal is None else float(np.hypot(*(goal - truth)[:2])),
+        }
+    )
+
+
+def of_truth(truth: Truth) -> dict[str, Any]:
+    """What moves and what touches."""
+    return {**_twist(truth), "contact": truth.contact, "stopped": truth.stopped}
+
+
+def of_command(command: CmdVel | Drive) -> dict[str, Any]:
+    """The velocity asked for."""
+    return _twist(command)
+
+
+def _twist(message: Truth | CmdVel | Drive) -> dict[str, Any]:
+    twist = message.twist
+    return {"stamp_s": message.stamp_ns * 1e-9, "vx": twist.vx, "vy": twist.vy, "wz": twist.wz}
+
+
+def of_status(status: Status) -> dict[str, Any]:
+    """What the controller does."""
+    return _known(
+        {
+            "stamp_s": status.stamp_ns * 1e-9,
+            "state": status.state,
+            "reason": status.reason,
+            "distance": status.distance,
+        }
+    )
+
+
+def of_health(health: Health) -> dict[str, Any]:
+    """Counters of a service."""
+    names = HEALTH["properties"]["topics"]["items"]["properties"]
+    return {
+        "service": health.service,
+        "uptime": health.uptime,
+        "note": health.note,
+        "topics": [{name: getattr(row, name) for name in names} for row in health.topics],
+        "counters": [{"name": name, "value": value} for name, value in health.counters.items()],
+    }

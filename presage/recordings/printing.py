@@ -1,0 +1,141 @@
+"""Prints `info` and `echo`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Collection
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from common.bus.bus import Link
+from common.errors import UserError
+from common.messages.topics import TOPICS, topic_of
+from common.messages.wire import DecodeError
+from presage.live.commands import echo, plain, topic_named
+from presage.recordings.info import Facts, survey
+from presage.terminal.output import check_file, write_json
+from services.recorder.reader import Recording, read_recording
+
+MANY = 6  # values of a metadata record; more are counted, not named
+
+
+def info(file: Path, json_file: Path | None, check: bool | None, console: Console) -> int:
+    """Print what is in a recording; 1 where it is not whole."""
+    check_file(json_file, "--json")
+    recording = read_recording(file)
+    with console.status("reading"):
+        facts = survey(recording, check)
+    _head(facts, recording, console)
+    console.print(_table(facts))
+    if facts.dropped_by_services:
+        parts = [f"{count} of {name.split(' ')[1]} by {name.split(' ')[0]}"
+                 for name, count in facts.dropped_by_services.items()]  # fmt: skip
+        console.print(f"services dropped, newest first served: {'; '.join(parts)}", highlight=False)
+    for name, keys in facts.metadata.items():
+        there = f"{len(keys)} values" if len(keys) > MANY else ", ".join(keys) or "empty"
+        console.print(f"metadata    {escape(name)}: {escape(there)}", highlight=False, soft_wrap=True)
+    for name, size in facts.attachments.items():
+        console.print(f"attachment  {escape(name)}: {_size(size)}", highlight=False)
+    if not facts.checked:
+        console.print("gaps and bytes are counted from the payloads themselves with --check", style="dim")
+    write_json(json_file, facts.as_dict())
+    return 0 if facts.complete and not facts.missing else 1
+
+
+def _head(facts: Facts, recording: Recording, console: Console) -> None:
+    state = f"readable, but {facts.missing} messages are missing" if facts.missing else "whole"
+    state += ", every chunk's checksum right" if facts.checked else ", by its index"
+    if (recovered := recording.metadata.get("recovered")) is not None:
+        state += f", recovered from {recovered.get('from', 'another file')}"
+    about = recording.metadata.get("presage", {})
+    rows = [
+        ("file", f"{facts.file}, {_size(facts.file_bytes)}"),
+        ("state", state if facts.complete else "INCOMPLETE"),
+        ("began", f"{facts.started}, {facts.duration_s:.2f} s, {facts.messages} messages"),
+        ("robot", ", ".join(facts.robots) or "unknown"),
+        ("world", facts.world or "not recorded"),
+        ("scanner", str(recording.scanner() or "not recorded")),
+        ("command", about.get("command", "unknown")),
+        ("versions", ", ".join(f"{name} {text}" for name, text in facts.versions.items()) or "unknown"),
+    ]
+    for name, text in rows:
+        console.print(f"{name:9} {escape(text)}", highlight=False, soft_wrap=True)
+    if facts.warning:
+        console.print(escape(facts.warning), style="yellow", highlight=False, soft_wrap=True)
+
+
+def _table(facts: Facts) -> Table:
+    table = Table()
+    table.add_column("key", no_wrap=True)
+    columns = ("messages", "Hz", "bytes", "gaps", "missing", "restarts", "dropped", "undecodable")
+    for name in columns:
+        table.add_column(name, justify="right")
+    for row in facts.topics:
+        numbers = (row.gaps, row.missing, row.restarts, row.dropped, row.undecodable)
+        table.add_row(
+            escape(row.key),
+            str(row.messages),
+            "-" if row.rate_hz is None else f"{row.rate_hz:.2f}",
+            "-" if row.bytes is None else _size(row.bytes),
+            *("-" if number is None else str(number) for number in numbers),
+        )
+    return table
+
+
+def _size(count: int) -> str:
+    """Bytes for a reader."""
+    if count < 1000:
+        return f"{count} B"
+    return f"{count / 1000:.1f} kB" if count < 1_000_000 else f"{count / 1e6:.1f} MB"
+
+
+def echo_either(
+    link: Link, source: str, topic: str | None, count: int, start_s: float, console: Console, *, full: bool
+) -> int:
+    """Print a topic of the bus, or a recording; raises UserError where ``source`` is neither."""
+    is_file = source.endswith((".mcap", ".mcap.active")) or Path(source).exists()
+    if source not in {row.name for row in TOPICS} and is_file:
+        return echo_file(Path(source), topic, count, start_s, console, full=full)
+    if topic is not None or start_s:
+        topic_named(source)
+        raise UserError(f"{source} is a topic on the bus: a second topic and --start are for recordings")
+    return echo(link, source, count, console, full=full)
+
+
+def echo_file(file: Path, name: str | None, count: int, start_s: float, console: Console, *, full: bool) -> int:
+    """Print a recording's messages, one JSON line each, with key and time; 1 where there is none."""
+    recording = read_recording(file)
+    keys = _keys(recording, name)
+    seen, from_ns = 0, recording.start_ns + round(start_s * 1e9)
+    for raw in recording.payloads(keys, start_ns=from_ns):
+        topic = topic_of(raw.key)
+        head = {"key": raw.key, "time_s": round((raw.logged_ns - recording.start_ns) * 1e-9, 6)}
+        try:
+            rest = plain(topic.message.decode(raw.payload), full=full) if topic else {"bytes": len(raw.payload)}
+        except DecodeError as error:
+            rest = {"undecodable": str(error), "bytes": len(raw.payload)}
+        line = json.dumps({**head, **rest})
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        seen += 1
+        if seen == count:
+            break
+    if recording.warning:
+        print(f"warning: {recording.warning}", file=sys.stderr)
+    return 0 if seen else 1
+
+
+def _keys(recording: Recording, name: str | None) -> Collection[str] | None:
+    """Keys of a topic, or all; raises UserError where the recording has none of it."""
+    if name is None:
+        return None
+    if name in recording.counts():
+        return [name]
+    keys = [key for key, topic in recording.topics().items() if topic == topic_named(name)]
+    if not keys:
+        there = [topic.name for topic in TOPICS if topic in recording.topics().values()]
+        raise UserError(f"{recording.path}: no {name} in it; it has {', '.join(there) or 'no topic of presage'}")
+    return keys

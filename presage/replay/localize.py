@@ -1,0 +1,253 @@
+"""`presage localize`: an estimator over a recording or log."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+import time
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from rich.console import Console
+
+from common.errors import UserError
+from common.geometry import se2
+from common.geometry.pose_text import pose_of_text
+from common.geometry.se2 import Array
+from common.geometry.world import load_world
+from common.versions import commit, versions
+from presage.logs.log import Reading
+from presage.logs.opening import kind_of
+from presage.logs.scan_files import Scans, read_scans
+from presage.session.stack import ignoring_interrupts
+from presage.terminal.output import check_file
+from presage.terminal.progress import progress, working
+from services.estimator.factory import Choice, Name, check_start, prepare
+from services.estimator.shared.interface import Posterior
+from services.recorder.reader import read_recording
+from services.recorder.replaying.player import span
+
+COLUMNS = (
+    "stamp", "x", "y", "yaw", "cov_xx", "cov_xy", "cov_xyaw", "cov_yy", "cov_yyaw", "cov_yawyaw",
+    "free_energy", "state", "update_ms",
+)  # fmt: skip
+STAMP_ROUNDING_S = 1e-6  # a double cannot hold a stamp of 2020 more precisely
+UPPER = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to localise, how, and where the result goes."""
+
+    file: Path
+    choice: Choice
+    mode: Literal["global", "track"] = "global"
+    fresh: bool = False
+    odometry: bool = True
+    frame: Literal["base_link", "laser"] = "base_link"
+    reading: Reading = Reading()  # noqa: RUF009 - frozen; what is said about a log
+    out: Path | None = None
+    start: float | None = None  # s from the first scan; None: from it on
+    end: float | None = None  # s from the first scan, negative: from the last; None: to it
+    every: int = 1  # of the scans between these, each N-th
+
+    @classmethod
+    def of(
+        cls, file: Path, choice: Choice, mode: str, frame: str, reading: Reading, *, fresh: bool, odometry: bool,
+        out: Path | None, start: float | None = None, end: float | None = None, every: int = 1,
+    ) -> Job:  # fmt: skip
+        """From the command line's words; raises UserError on one that is not known."""
+        if mode not in ("global", "track"):
+            raise UserError(f"no mode {mode!r}: choose global or track")
+        if frame not in ("base_link", "laser"):
+            raise UserError(f"no frame {frame!r}: choose base_link or laser")
+        if out is not None and out.suffix not in (".csv", ".json"):
+            raise UserError(f"{out}: the result is written as .csv or .json")
+        return cls(file, choice, mode, fresh, odometry, frame, reading, out, start, end, every)  # type: ignore[arg-type]
+
+
+def choice_of(
+    file: Path,
+    world: str,
+    estimator: str,
+    model: str,
+    models: Path | None,
+    sigma: float | None,
+    seed: int,
+    initial_pose: str,
+) -> Choice:
+    """From the command line's words; the world is the recording's where none is named."""
+    if estimator not in get_args(Name):
+        raise UserError(f"no estimator {estimator!r}: choose one of {', '.join(get_args(Name))}")
+    pose = pose_of_text(initial_pose, "--initial-pose") if initial_pose else None
+    if not world:
+        if kind_of(file) != "recording":
+            raise UserError(f"{file}: a log does not say which world it is of: name it with --world")
+        recorded = read_recording(file).world()
+        if recorded is None:
+            raise UserError(f"{file}: no world was recorded: name it with --world")
+        return Choice(recorded, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
+    return Choice(world, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
+
+
+def localize(job: Job, console: Console) -> list[dict[str, Any]]:
+    """A row for each scan, written as it is computed; raises UserError in one line.
+
+    Ctrl-C prints what was done, then raises KeyboardInterrupt.
+    """
+    check_file(job.out, "--out")
+    if job.choice.initial_pose is not None:
+        if job.mode == "global":
+            raise UserError("--initial-pose is where mode track begins: add --mode track, or leave it out")
+        world = job.choice.world
+        check_start(job.choice, load_world(world) if isinstance(world, str) else world)
+    laser, kind = job.frame == "laser", kind_of(job.file)
+    with working(f"preparing {job.choice.estimator} for {job.choice.asked}", console):
+        make = prepare(replace(job.choice, initial_pose=None))
+    with working(f"reading {job.file.name}", console):
+        # An .npz's poses are the laser's where that is asked for; of every other file it is known where the laser sits.
+        itself = laser and kind == "npz"
+        read = read_scans(job.file, np.zeros(3) if itself else None, job.reading)
+    read.say_notes(console)
+    scans = chosen(job, read)
+    start, count = _start(job, scans), len(scans.ranges)
+    estimator = make(scans.geometry)
+    rows: list[dict[str, Any]] = []
+    if start is not None:
+        estimator.restart(start)
+    try:
+        with _output(job, count) as write, closing(_numbers(job, count, console)) as numbers:
+            for k in numbers:
+                if job.fresh and k:
+                    estimator.restart(start)
+                observation = scans.observation(k, odometry=job.odometry)
+                began = time.perf_counter()
+                posterior = estimator.update(observation)
+                row = _row(scans, k, posterior, (time.perf_counter() - began) * 1e3, laser=laser)
+                write(row)
+                rows.append(row)
+    except KeyboardInterrupt:
+        with ignoring_interrupts():
+            _summarise(scans, rows, len(read.ranges), console, laser=laser)
+            place = "" if job.out is None else f"; {job.out} holds their rows"
+            console.print(f"interrupted after {len(rows)} of {count} scans{place}", highlight=False, soft_wrap=True)
+        raise
+    _summarise(scans, rows, len(read.ranges), console, laser=laser)
+    return rows
+
+
+def chosen(job: Job, scans: Scans) -> Scans:
+    """The scans of --start, --end and --every; UserError where there are none."""
+    if job.start is None and job.end is None and job.every == 1:
+        return scans
+    if scans.stamps is None:  # without them an estimator takes each scan for the next of a scanner's usual rate
+        raise UserError(f"{job.file}: its scans have no stamps, which --start, --end and --every need")
+    since = scans.stamps - scans.stamps[0]
+    first, last = span(float(since[-1]), job.start, job.end)
+    between = (since >= first - STAMP_ROUNDING_S) & (since <= last + STAMP_ROUNDING_S)
+    if not between.any():
+        raise UserError(f"{job.file}: no scan between {first:g} and {last:g} s (--start, --end)")
+    return scans.part(np.flatnonzero(between)[:: job.every])
+
+
+def _numbers(job: Job, count: int, console: Console) -> Generator[int]:
+    """0 to count - 1 with progress shown, but on a terminal where the rows themselves appear."""
+    if job.out is None and sys.stdout.isatty() and console.is_terminal:
+        yield from range(count)
+        return
+    yield from progress(range(count), "localising", count, console)
+
+
+def _start(job: Job, scans: Scans) -> Array | None:
+    """Mode track: the pose given on the command line, in the file, or the truth of a recording."""
+    if job.mode == "global":
+        return None
+    if job.choice.initial_pose is not None:
+        return job.choice.initial_pose
+    if scans.initial_pose is not None:
+        return scans.initial_pose
+    if scans.truth is not None and np.isfinite(scans.truth[0]).all():
+        return np.asarray(scans.truth[0])
+    raise UserError(
+        f"{job.file}: mode track needs the pose of the first scan: --initial-pose x,y,deg, or a reference in the file "
+        "(its initial_pose only counts without --start)"
+    )
+
+
+def _row(scans: Scans, k: int, posterior: Posterior, update_ms: float, *, laser: bool) -> dict[str, Any]:
+    pose, covariance = posterior.pose, posterior.covariance
+    mount = scans.geometry.mount
+    if laser and mount.any():  # a recording: inference is about base_link
+        by_pose, _ = se2.compose_jacobians(pose, mount)
+        pose = se2.compose(pose, mount)
+        covariance = None if covariance is None else by_pose @ covariance @ by_pose.T
+    values = [None if covariance is None else float(covariance[i, j]) for i, j in UPPER]
+    stamp = None if scans.stamps is None else float(scans.stamps[k])
+    numbers = [stamp, *map(float, pose), *values, posterior.free_energy, posterior.state, round(update_ms, 3)]
+    return dict(zip(COLUMNS, numbers, strict=True))
+
+
+@contextmanager
+def _output(job: Job, count: int) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """The function that writes a row: CSV at once; JSON at the end, also of an interrupted run."""
+    if job.out is not None and job.out.suffix == ".json":
+        rows: list[dict[str, Any]] = []
+        try:
+            yield rows.append
+        finally:
+            with ignoring_interrupts():
+                _write_json(job, job.out, rows, complete=len(rows) == count)
+        return
+    stream = sys.stdout if job.out is None else job.out.open("w", newline="", encoding="utf-8")
+    try:
+        writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+
+        def write(row: dict[str, Any]) -> None:
+            writer.writerow(row)
+            stream.flush()  # whatever ends the run, and however, the rows so far are in the file
+
+        yield write
+    finally:
+        if job.out is not None:
+            stream.close()
+
+
+def _write_json(job: Job, out: Path, rows: list[dict[str, Any]], *, complete: bool) -> None:
+    meta = {
+        "file": str(job.file), "world": job.choice.asked, "estimator": job.choice.estimator,
+        "model": job.choice.model, "frame": job.frame, "mode": job.mode, "fresh": job.fresh,
+        "start": job.start, "end": job.end, "every": job.every, "complete": complete,
+        "seed": job.choice.seed, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:],
+    }  # fmt: skip
+    out.write_text(json.dumps({**meta, "rows": rows}, indent=1) + "\n", encoding="utf-8")
+
+
+def _summarise(scans: Scans, rows: list[dict[str, Any]], in_file: int, console: Console, *, laser: bool) -> None:
+    """A line or two for a human, beside the table; nothing without rows."""
+    if not rows:
+        return
+    states: dict[str, int] = {}
+    for row in rows:
+        states[row["state"]] = states.get(row["state"], 0) + 1
+    scans_done = f"{len(rows)} scans" if len(rows) == in_file else f"{len(rows)} of {in_file} scans"
+    console.print(
+        f"{scans_done}: " + ", ".join(f"{count} {state}" for state, count in states.items())
+        + f"; update {np.median([row['update_ms'] for row in rows]):.2f} ms median"
+    )  # fmt: skip
+    if scans.truth is None:
+        return
+    truth = scans.truth[: len(rows)]
+    truth = se2.compose(truth, scans.geometry.mount) if laser else truth
+    error = np.hypot(*(np.array([[row["x"], row["y"]] for row in rows]) - truth[:, :2]).T)
+    error = error[np.isfinite(error)]
+    if len(error):
+        console.print(
+            f"against {scans.truth_is}: {np.median(error) * 1e3:.1f} mm median, "
+            f"{np.sqrt(np.mean(error**2)) * 1e3:.1f} mm RMS, {error.max() * 1e3:.1f} mm at most"
+        )

@@ -1,0 +1,1 @@
+"""Runs a whole system on this machine."""

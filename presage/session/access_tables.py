@@ -1,0 +1,42 @@
+"""Who may do what, as tables."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Mapping, Sequence
+
+from rich.table import Table
+
+from common.bus.security import ROLES, ROUTER, Member, may_answer, may_ask, may_put
+from common.messages.topics import QUERIES, TOPICS
+
+
+def members_table(members: Sequence[Member], ends: Mapping[str, dt.datetime], now: dt.datetime) -> Table:
+    """One row a member; ``ends`` by name, where the certificate is at hand."""
+    table = Table(title="members", title_justify="left")
+    for column in ("name", "role", "robots", "certificate ends", "days left"):
+        table.add_column(column)
+    for member in members:
+        end = ends.get(member.name)
+        when = (f"{end:%Y-%m-%d}", str((end - now).days)) if end else ("not here", "")
+        table.add_row(member.name, member.role, ", ".join(member.robots).replace("*", "all"), *when)
+    return table
+
+
+def rights_table() -> Table:
+    """One row a role: what it puts, asks and answers; all but the router may listen to everything."""
+    table = Table(title="roles (each may also listen)", title_justify="left", show_lines=True)
+    for column in ("role", "puts", "asks", "answers", "for"):
+        table.add_column(column)
+    for role, about in ROLES.items():
+        if role == ROUTER:
+            table.add_row(role, "all", "all", "all", about)
+            continue
+        table.add_row(
+            role,
+            ", ".join(t.name for t in TOPICS if may_put(role, t)) or "-",
+            ", ".join(q.name for q in QUERIES if may_ask(role, q)) or "-",
+            ", ".join(q.name for q in QUERIES if may_answer(role, q)) or "-",
+            about,
+        )
+    return table

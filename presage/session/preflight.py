@@ -1,0 +1,36 @@
+"""Checks that can be made before a process is started."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from common.errors import UserError
+from common.geometry.world import load_world
+from common.runtime.config import load_settings
+from services.controller.settings import ControllerSettings
+from services.estimator.factory import check
+from services.estimator.service import choice_of
+from services.estimator.settings import EstimatorSettings
+from services.simulator.settings import SimulatorSettings
+
+
+def check_services(
+    world: str, estimator: Sequence[str], controller: Sequence[str], simulator: Sequence[str] | None = None
+) -> None:
+    """Raises UserError for what the services would say of these arguments and of our environment; None: it is not run.
+
+    Models are looked for and read; nothing is compiled, and nobody is asked.
+    """
+    known = load_world(world)
+    perceiving = load_settings(EstimatorSettings, list(estimator))
+    load_settings(ControllerSettings, list(controller)).check()
+    if simulator is not None:
+        settings = load_settings(SimulatorSettings, list(simulator))
+        settings.the_scanner()
+        radius, start = settings.the_robot().radius, settings.start_pose()
+        pose = known.start_pose(radius) if start is None else np.array(start)
+        if (why := known.why_no_room(pose, radius)) is not None:
+            raise UserError(f"start {why} (--start, --radius)")
+    check(choice_of(perceiving), known)

@@ -1,0 +1,42 @@
+"""Checks output paths and writes JSON."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from common.errors import UserError
+
+
+def check_file(file: Path | None, option: str) -> None:
+    """Raises UserError where ``file`` cannot be written; leaves no trace."""
+    if file is None or (file.exists() and not file.is_file() and not file.is_dir()):
+        return  # a pipe is not opened twice
+    there = file.exists()
+    try:
+        with file.open("ab"):
+            pass
+    except OSError as error:
+        raise UserError(f"{file}: cannot be written to ({error.strerror}); choose another file with {option}") from None
+    if not there:
+        file.unlink()
+
+
+def make_folder(folder: Path, option: str) -> None:
+    """Raises UserError where there can be no ``folder`` or nothing can be written into it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise UserError(
+            f"{folder}: cannot be written to ({error.strerror}); choose another folder with {option}"
+        ) from None
+
+
+def write_json(file: Path | None, data: dict[str, Any]) -> None:
+    """Numbers as indented JSON, where a file was asked for."""
+    if file is not None:
+        file.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")

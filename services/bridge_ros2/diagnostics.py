@@ -1,0 +1,84 @@
+"""Explains in one line why no scan arrives."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from services.bridge_ros2.graph import named
+from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, TWIST_STAMPED
+
+if TYPE_CHECKING:
+    from services.bridge_ros2.graph import Graph
+    from services.bridge_ros2.settings import BridgeRos2Settings
+
+SILENT = 3.0  # s without a scan, then it is said why
+
+
+def complaint(
+    options: BridgeRos2Settings, graph: Graph, problem: str, *, linked: bool, quiet: float, heard: bool, reckoned: bool
+) -> str:
+    """Empty where all is well.
+
+    ``problem``: why the last scan could not be used; ``quiet``: s since the last that could, if one was ``heard``;
+    ``reckoned``: it came with odometry of its moment.
+    """
+    topic = options.topic(options.scan_topic)
+    if not linked:
+        return f"waits for the zenoh router at {options.ros_connect}: it is gone"
+    if wrong := graph.misfit(topic):
+        return wrong
+    if quiet > SILENT:
+        if problem:
+            return f"scans on {topic} cannot be used: {problem}"
+        why = graph.why_silent(topic, LASER_SCAN, "--scan-topic", nobody=_nobody(options, graph))
+        return f"no scan on {topic} for {SILENT:g} s: {why}"
+    return _with_scans(options, graph, reckoned=reckoned) if heard else f"no scan on {topic} yet"
+
+
+def _with_scans(options: BridgeRos2Settings, graph: Graph, *, reckoned: bool) -> str:
+    """What else may be wrong while scans come."""
+    if wrong := _no_odometry(options, graph):
+        return wrong
+    if options.tf == "map-odom" and not reckoned:
+        where = f"on {options.topic(options.odom_topic)} or in tf" if options.odom_topic else "in tf"
+        return (
+            f"no odometry of the scans' moments {where}, so no transform from map to odom: --odom-topic, --tf map-base"
+        )
+    chart = options.topic(options.map_topic)
+    if options.publish_map and (other := graph.publishers(chart)):
+        return f"{chart}: {other} publishes a map there as well: leave out --publish-map, or --map-topic"
+    command = options.topic(options.cmd_topic)
+    wanted = graph.twist_wanted(command) if options.commands else ""
+    if wanted and (wanted == TWIST_STAMPED) != options.stamped:
+        return f"{command}: the robot listens for {wanted}: --{'' if wanted == TWIST_STAMPED else 'no-'}stamped"
+    return ""
+
+
+def _no_odometry(options: BridgeRos2Settings, graph: Graph) -> str:
+    """Of a topic that was asked for by name and is not there, though others of its type are; tf may do, but unasked."""
+    if "odom_topic" not in options.model_fields_set or not options.odom_topic:
+        return ""
+    topic = options.topic(options.odom_topic)
+    there = graph.topics_of(ODOMETRY)
+    if not there or topic in there:
+        return ""
+    return f"no odometry on {topic}: {ODOMETRY} is on {named(there)}: --odom-topic"
+
+
+def _nobody(options: BridgeRos2Settings, graph: Graph) -> str:
+    """Where nobody of our flavour and domain is seen: who is there instead, or what to look at."""
+    elsewhere = graph.elsewhere()
+    domains = sorted({each.domain for each in elsewhere if each.flavor == "rmw_zenoh" and each.domain is not None})
+    if options.flavor == "rmw_zenoh":
+        if any(each.flavor == "ros2dds" for each in elsewhere):
+            return "there it is zenoh-bridge-ros2dds that speaks, not rmw_zenoh: --flavor ros2dds"
+        if domains:
+            others = named([str(domain) for domain in domains])
+            return f"nobody is seen in ROS domain {options.domain}, but in {others}: --domain {domains[0]}"
+    elif domains:
+        domain = "" if options.domain in domains else f" --domain {domains[0]}"
+        return f"there it is rmw_zenoh that speaks, not zenoh-bridge-ros2dds: --flavor rmw_zenoh{domain}"
+    where = f"nothing of ROS is heard at {options.ros_connect}: is that the robot's, and not presage's own router?"
+    if options.flavor == "ros2dds":
+        return f"{where} does zenoh-bridge-ros2dds run there, in the ROS_DOMAIN_ID of the robot's nodes?"
+    return f"{where} do its nodes run with RMW_IMPLEMENTATION=rmw_zenoh_cpp, and does ros2 topic list show them there?"

@@ -1,0 +1,89 @@
+"""Converts ROS messages to presage messages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from common.geometry import se2
+from common.geometry.se2 import Array
+from common.messages.definitions import Odom, Pose, Scan, Twist
+from common.messages.ros_messages import Mount, Transform, read_pose, stamp_of
+from common.robot.ranges import as_scan
+from services.bridge_ros2.frames import Dead
+
+PLANE = [0, 1, 5]  # x, y, yaw among the six of a pose's covariance
+MOST_BEAMS = 100_000
+
+
+def scan_of(message: Any, mount: Mount, stamp_ns: int) -> Scan:
+    """A sensor_msgs/LaserScan with beams that turn to the left; raises ValueError where it makes no sense.
+
+    A scanner upside down, or one that turns to the right, gives its beams in the other order. Of ranges
+    `common.robot.ranges` has the rule.
+    """
+    beams = len(message.ranges)
+    first, step = float(message.angle_min), float(message.angle_increment)
+    if not 2 <= beams <= MOST_BEAMS:
+        raise ValueError(f"a scan of {beams} beams")
+    if step == 0:  # some drivers leave it out
+        step = (float(message.angle_max) - first) / (beams - 1)
+    nearest, farthest = float(message.range_min), float(message.range_max)
+    if not np.isfinite([first, step, nearest, farthest]).all() or step == 0 or farthest <= max(nearest, 0.0):
+        raise ValueError(
+            f"angles from {first:g} by {step:g} rad, ranges from {nearest:g} to {farthest:g} m: no scanner has those"
+        )
+    ranges = np.asarray(message.ranges, np.float32)
+    side = -1.0 if mount.upside_down else 1.0
+    first, step = side * first, side * step
+    if step < 0:
+        first, step, ranges = first + step * (beams - 1), -step, ranges[::-1]
+    period = float(message.scan_time)
+    return Scan(
+        stamp_ns=stamp_ns, angle_min=float(se2.wrap(first)), angle_increment=step,
+        range_min=max(nearest, 0.0), range_max=farthest, ranges=as_scan(ranges, nearest, farthest),
+        mount=Pose.of(mount.pose), scan_time=period if 0 < period < 3600 else 0.0,
+        frame_id=(message.header.frame_id or "laser")[:64],
+    )  # fmt: skip
+
+
+def dead_of(message: Any, child_in_base: Transform | None) -> Dead:
+    """A nav_msgs/Odometry; ``child_in_base`` where its child frame is not the base itself. Raises ValueError.
+
+    The velocity is the child frame's, which is the base's but for where the child frame is turned or off the centre.
+    """
+    pose = read_pose(message.pose.pose.position, message.pose.pose.orientation).planar()
+    linear, angular = message.twist.twist.linear, message.twist.twist.angular
+    twist = np.array([linear.x, linear.y, angular.z], float)
+    if not np.isfinite(twist).all():
+        raise ValueError(f"velocity {twist.tolist()} (m/s, m/s, rad/s) is not finite")
+    if child_in_base is not None:
+        child = child_in_base.planar()
+        pose = se2.compose(pose, se2.inverse(child))
+        x, y = se2.rotate(float(child[2]), twist[:2])
+        twist = np.array([x + twist[2] * child[1], y - twist[2] * child[0], twist[2]])
+    return Dead(stamp_of(message.header), pose, twist, _covariance(message.pose.covariance))
+
+
+def _covariance(six: Any) -> Array:
+    """(3, 3) of x, y, yaw; zeros, as ROS says unknown, where a number is none."""
+    found = np.asarray(six, float).reshape(6, 6)[np.ix_(PLANE, PLANE)]
+    return found if np.isfinite(found).all() else np.zeros((3, 3))
+
+
+def odom_of(dead: Dead) -> Odom:
+    """Our message."""
+    vx, vy, wz = (float(v) for v in dead.twist)
+    return Odom(
+        stamp_ns=dead.stamp_ns, pose=Pose.of(dead.pose), twist=Twist(vx=vx, vy=vy, wz=wz), covariance=dead.covariance
+    )
+
+
+def pose_of(message: Any, frame: str) -> Pose:
+    """The pose of a PoseStamped or PoseWithCovarianceStamped in ``frame``; raises ValueError for another frame."""
+    named = message.header.frame_id.strip("/")
+    if named not in ("", frame):
+        raise ValueError(f"it is in the frame {named!r}, not {frame!r}: in rviz set the fixed frame to {frame}")
+    pose = getattr(message.pose, "pose", message.pose)
+    return Pose.of(read_pose(pose.position, pose.orientation).planar())

@@ -1,0 +1,1 @@
+"""Preset `paper`: the estimator of Burghardt & Lanillos (2021)."""

@@ -1,0 +1,110 @@
+"""Saves and resumes an interrupted training."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.torch
+
+from common.errors import UserError
+from services.estimator.paper.training import Data, Trainer
+
+DAMAGED = (zipfile.BadZipFile, zlib.error, safetensors.SafetensorError)
+
+
+class Checkpoint:
+    """A folder that exists while a training is unfinished; ``recipe`` must match for it to be taken up again."""
+
+    def __init__(self, folder: Path, recipe: dict[str, Any]) -> None:
+        """What was left for another recipe is thrown away; ``discarded`` says whether there was any."""
+        self.folder, self.recipe = folder, json.loads(json.dumps(recipe))
+        self.discarded = False
+        if folder.exists() and self._read("recipe.json") != self.recipe:
+            self.discarded = any(path.suffix in {".npz", ".safetensors"} for path in folder.iterdir())
+            shutil.rmtree(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        self._write("recipe.json", self.recipe)
+
+    def samples(self, name: str) -> Data | None:
+        """Samples that were kept, or None; raises UserError where they cannot be read."""
+        path = self.folder / f"{name}.npz"
+        if not path.exists():
+            return None
+        with self._reading(path), path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            poses, ranges = file["poses"].astype(np.float64), file["ranges"].astype(np.float64)
+            if poses.ndim != 2 or ranges.ndim != 2 or poses.shape != (len(ranges), 3):
+                raise ValueError(f"poses {poses.shape} and ranges {ranges.shape} do not fit")
+            return Data(poses, ranges)
+
+    def keep_samples(self, name: str, data: Data) -> None:
+        """Keep samples for a later run."""
+        partial = self.folder / f"{name}.partial.npz"
+        np.savez(partial, poses=data.poses, ranges=data.ranges.astype(np.float32))
+        partial.replace(self.folder / f"{name}.npz")
+
+    def save(self, trainer: Trainer) -> None:
+        """Keep where training stands; the last complete state survives an interruption."""
+        state = trainer.state()
+        tensors = {f"decoder.{name}": tensor.contiguous() for name, tensor in state["decoder"].items()}
+        for index, slots in state["optimiser"]["state"].items():
+            tensors |= {f"adam.{index}.{name}": tensor.contiguous() for name, tensor in slots.items()}
+        # One file, so that weights and progress cannot disagree.
+        meta = {"progress": json.dumps(state["progress"])}
+        partial = self.folder / "state.partial"
+        safetensors.torch.save_file(tensors, partial, metadata=meta)
+        partial.replace(self.folder / "state.safetensors")
+
+    def restore(self, trainer: Trainer) -> bool:
+        """Carry on from what was saved; False where nothing was. Raises UserError where it cannot be read."""
+        path = self.folder / "state.safetensors"
+        if not path.exists():
+            return False
+        with self._reading(path):
+            trainer.restore(self._state(path, trainer))
+        return True
+
+    def _state(self, path: Path, trainer: Trainer) -> dict[str, Any]:
+        state = trainer.state()
+        with safetensors.safe_open(path, framework="pt") as file:
+            progress = json.loads(file.metadata()["progress"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+        adam: dict[int, dict[str, Any]] = {}
+        for name, tensor in tensors.items():
+            if name.startswith("adam."):
+                _, index, slot = name.split(".")
+                adam.setdefault(int(index), {})[slot] = tensor
+        decoder = {name.removeprefix("decoder."): t for name, t in tensors.items() if name.startswith("decoder.")}
+        optimiser = {"state": adam, "param_groups": state["optimiser"]["param_groups"]}
+        return {"decoder": decoder, "optimiser": optimiser, "progress": progress}
+
+    @contextmanager
+    def _reading(self, path: Path) -> Iterator[None]:
+        """Whatever is wrong with a file, in one line."""
+        try:
+            yield
+        except (OSError, EOFError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, *DAMAGED) as error:
+            raise UserError(
+                f"{path}: the unfinished training cannot be taken up ({' '.join(str(error).split())[:200]}); "
+                f"remove {self.folder} and train from the start"
+            ) from None
+
+    def finish(self) -> None:
+        """The weights are written: nothing is left to take up."""
+        shutil.rmtree(self.folder)
+
+    def _read(self, name: str) -> Any:
+        try:
+            return json.loads((self.folder / name).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+
+    def _write(self, name: str, value: Any) -> None:
+        (self.folder / name).write_text(json.dumps(value), encoding="utf-8")

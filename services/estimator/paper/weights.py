@@ -1,0 +1,127 @@
+"""The decoder's weights and model card on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import safetensors.torch
+import torch
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from common.errors import UserError
+from common.geometry.world import World
+from common.robot.scanner import Scanner
+from services.estimator.paper.decoder import Decoder, Normalisation, PaperModel, Shape
+
+FOLDER = Path(__file__).resolve().parents[3] / "models"
+
+
+class ModelCard(BaseModel):
+    """Where a model comes from and how well it does."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+
+    preset: str
+    world: World
+    scanner: Scanner
+    heading: float  # rad, the frozen heading of the robot
+    samples: int
+    epochs: int
+    batch: int
+    learning_rate: float
+    seed: int
+    hidden: int
+    channels: int
+    center: tuple[float, float]  # m
+    half_size: tuple[float, float]  # m
+    range_scale: float  # m
+    test_samples: int
+    test_l1_mean: Annotated[float, Field(description="m, mean over beams and test samples")]
+    test_l1_median: Annotated[float, Field(description="m, median over beams and test samples")]
+    curve_train_l1: list[float]  # m, one an epoch
+    curve_test_l1: list[float]  # m
+    training_s: float  # wall time
+    commit: str
+    command: str
+    versions: dict[str, str]
+
+    def shape(self) -> Shape:
+        """Of the network."""
+        return Shape(self.scanner.beams, self.hidden, self.channels)
+
+    def normalisation(self) -> Normalisation:
+        """Of its inputs and outputs."""
+        return Normalisation(self.center, self.half_size, self.range_scale)
+
+
+def path_of(folder: Path, world: str, preset: str, beams: int) -> Path:
+    """Where the weights for a world, preset and number of beams lie."""
+    return folder / f"{world}-{preset}-{beams}.safetensors"
+
+
+def available(folder: Path, world: str, preset: str) -> dict[int, Path]:
+    """Beam count to weights, of those that lie in ``folder``."""
+    found = {}
+    for path in folder.glob(f"{world}-{preset}-*.safetensors"):
+        beams = path.stem.rsplit("-", 1)[-1]
+        if beams.isdigit():
+            found[int(beams)] = path
+    return dict(sorted(found.items()))
+
+
+def train_command(world: str, preset: str, scanner: str = "tim571", beams: int | None = None) -> str:
+    """What a user types to make missing weights."""
+    return f"presage train --world {world} --preset {preset} --scanner {scanner}" + (
+        f" --beams {beams}" if beams else ""
+    )
+
+
+def save(path: Path, decoder: Decoder, card: ModelCard) -> None:
+    """Weights in half precision and the card beside them; whole files or none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tensors = {name: tensor.detach().half().contiguous() for name, tensor in decoder.state_dict().items()}
+    partial = path.with_suffix(".partial")
+    safetensors.torch.save_file(tensors, partial)
+    partial.replace(path)
+    card_path = path.with_suffix(".json")
+    partial.write_text(card.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    partial.replace(card_path)
+
+
+def load(path: Path) -> tuple[PaperModel, ModelCard]:
+    """A trained model; raises UserError where a file is missing or is not what it should be."""
+    try:
+        card = ModelCard.model_validate_json(path.with_suffix(".json").read_text(encoding="utf-8"))
+        tensors: dict[str, Any] = safetensors.torch.load_file(path)
+        decoder = Decoder(card.shape())
+        decoder.load_state_dict({name: tensor.to(torch.float32) for name, tensor in tensors.items()})
+    except OSError as error:
+        raise UserError(f"weights {path}: cannot be read ({error})") from None
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise UserError(f"model card {path.with_suffix('.json')}: {where}: {first['msg']}") from None
+    except (safetensors.SafetensorError, RuntimeError, ValueError) as error:
+        raise UserError(f"weights {path}: not this network's ({' '.join(str(error).split())[:200]})") from None
+    return PaperModel(decoder, card.normalisation()), card
+
+
+def find(folder: Path, world: str, preset: str, beams: int) -> Path:
+    """The weights for a scan of so many beams; raises UserError with the command that makes them."""
+    known = available(folder, world, preset)
+    if beams not in known:
+        have = f"there are some for {', '.join(map(str, known))} beams" if known else f"none lie in {folder}"
+        raise UserError(
+            f"no weights of preset {preset} for world {world!r} and {beams} beams ({have}); "
+            f"make them with: {train_command(world, preset, beams=beams)}"
+        )
+    return known[beams]
+
+
+def nearest(folder: Path, world: str, preset: str, beams: int) -> Path:
+    """The weights for the number of beams nearest to that; raises UserError where there are none at all."""
+    known = available(folder, world, preset)
+    if not known:
+        return find(folder, world, preset, beams)
+    return known[min(known, key=lambda count: (abs(count - beams), -count))]

@@ -1,0 +1,1 @@
+"""Learns and calibrates the distance field."""

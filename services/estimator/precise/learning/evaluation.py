@@ -1,0 +1,65 @@
+"""Prediction error of a model on scans it has not seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from common.geometry import se2
+from services.estimator.precise.gauss_newton import View, difference, polish
+from services.estimator.precise.likelihood import Likelihood
+
+if TYPE_CHECKING:
+    from common.geometry.se2 import Array
+    from services.estimator.shared.generative_models import GenerativeModel
+
+DRAWS = 4  # of noise for each test scan
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Figures of the model card."""
+
+    range_error_median: float  # m
+    range_error_mean: float  # m
+    share_above_5_cm: float
+    position_error_median: float  # m, of the pose found from scans without noise
+    position_error_rms: float  # m
+    inflation: float  # of the covariance: mean normalised squared error of scans with noise, at least 1
+
+
+def evaluate(
+    model: GenerativeModel, poses: Array, mount: Array, angles: Array, ranges: Array, range_max: float, sigma: float,
+    relative: float = 0.0,
+) -> Quality:  # fmt: skip
+    """From scans (N, B) m without noise at base_link poses (N, 3).
+
+    ``sigma`` m is the noise of the scanner in use, ``relative`` its part that grows with the range.
+    """
+    likelihood = Likelihood(sigma, relative=relative)
+    expected = model.expect(se2.compose(poses, mount), angles)
+    both = np.isfinite(ranges) & np.isfinite(expected.ranges)
+    error = np.abs(ranges[both] - expected.ranges[both])
+    offsets, misfits, rng = [], [], np.random.default_rng(0)
+    for pose, scan in zip(poses, ranges, strict=True):
+        for draw in range(1 + DRAWS):  # the first without noise
+            noise = likelihood.deviation(scan) * rng.standard_normal(len(scan)) if draw else 0.0
+            view = View(model, likelihood, mount, angles, scan + noise, range_max)
+            found, evidence = polish(view, pose[None])
+            alone = np.linalg.inv(evidence.curvature[0] + 1e-6 * np.eye(3))
+            off = difference(found, pose[None])[0] + alone @ evidence.xi[0]  # to the very minimum
+            if draw:
+                covariance = alone @ (evidence.of_noise[0] + evidence.of_model[0]) @ alone
+                misfits.append(float(off @ np.linalg.pinv(covariance, hermitian=True) @ off) / 3)
+            else:
+                offsets.append(float(np.hypot(off[0], off[1])))
+    return Quality(
+        float(np.median(error)),
+        float(error.mean()),
+        float((error > 0.05).mean()),
+        float(np.median(offsets)),
+        float(np.sqrt(np.mean(np.square(offsets)))),
+        max(1.0, float(np.mean(misfits))),
+    )

@@ -1,0 +1,119 @@
+"""Beams of posed scans, and the surfaces where they end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+
+from common.geometry.se2 import Array, compose
+from services.estimator.precise.field import DistanceField, Floats
+from services.estimator.shared import kernels
+
+POOL = 1  # cells to each side that share their points to find a normal
+REACH = 2.0  # cells around a surface element that it shapes
+LEVEL_POINTS = 3  # points a cell needs to count as surface
+THROUGH = 0.06  # m behind a surface at which a beam has gone through it
+PRESENT = 0.3  # least share of the beams that meet a surface and end there
+STRAY_CELL = 1.0  # m
+
+
+@dataclass(frozen=True)
+class Beams:
+    """Single beams of posed scans: starts (R, 2) m in map, directions (R,) rad in map, ranges (R,) m."""
+
+    starts: Array
+    directions: Array
+    ranges: Array
+
+    @classmethod
+    def of(cls, poses: Array, mount: Array, angles: Array, ranges: Array) -> Beams:
+        """Every beam that returned, of scans ranges (N, B) from base_link poses (N, 3)."""
+        lasers = compose(poses, mount)
+        returned = np.isfinite(ranges) & (ranges > 0)
+        row, column = np.nonzero(returned)
+        return cls(lasers[row, :2], lasers[row, 2] + angles[column], ranges[returned])
+
+    def ends(self) -> Array:
+        """(R, 2) m in map."""
+        return np.asarray(self.starts + self.ranges[:, None] * self.unit())
+
+    def unit(self) -> Array:
+        """(R, 2) unit directions."""
+        return np.stack([np.cos(self.directions), np.sin(self.directions)], -1)
+
+    def part(self, which: np.ndarray) -> Beams:
+        """Some of them."""
+        return Beams(self.starts[which], self.directions[which], self.ranges[which])
+
+    def joined(self, other: Beams) -> Beams:
+        """And those of another."""
+        mine, theirs = (vars(each).values() for each in (self, other))
+        return Beams(*(np.concatenate(pair) for pair in zip(mine, theirs, strict=True)))
+
+
+def in_company(ends: Array) -> np.ndarray:
+    """(R,) which beams ended near others: a few stray ones would make the grid as large as the scanner's range."""
+    cell = np.floor(ends / STRAY_CELL).astype(np.int64)
+    cell -= cell.min(axis=0)
+    index = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
+    return np.asarray(np.bincount(index)[index] >= LEVEL_POINTS)
+
+
+def surfaces(beams: Beams, h: float) -> DistanceField:
+    """Phi (m) from the surface elements of cells of ``h`` m, less those that most beams went through."""
+    ends, unit = beams.ends(), beams.unit()
+    low = np.minimum(ends.min(0), beams.starts.min(0)) - 4 * h
+    shape = np.ceil((np.maximum(ends.max(0), beams.starts.max(0)) + 4 * h - low) / h).astype(int)[::-1] + 1
+    cell = np.floor((ends - low) / h).astype(int)
+    index = cell[:, 1] * shape[1] + cell[:, 0]
+
+    def pooled(values: Array | None) -> Array:
+        grid = np.bincount(index, values, int(shape.prod())).reshape(shape)
+        padded = np.pad(grid, POOL)
+        side = 2 * POOL + 1
+        return sum(  # type: ignore[return-value]
+            padded[i : i + shape[0], j : j + shape[1]] for i in range(side) for j in range(side)
+        )
+
+    own = np.bincount(index, minlength=int(shape.prod())).reshape(shape)
+    local = ends - low  # smaller numbers, better sums
+    count = np.maximum(pooled(None), 1)
+    mx, my = pooled(local[:, 0]) / count, pooled(local[:, 1]) / count
+    xx, yy = pooled(local[:, 0] ** 2) / count - mx**2, pooled(local[:, 1] ** 2) / count - my**2
+    xy = pooled(local[:, 0] * local[:, 1]) / count - mx * my
+    dx, dy = pooled(unit[:, 0]), pooled(unit[:, 1])
+    surface = own >= LEVEL_POINTS
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the long axis
+    nx, ny = -np.sin(angle), np.cos(angle)
+    flip = np.where(nx * dx + ny * dy > 0, -1.0, 1.0)  # against the beams: towards free space
+    nx, ny = nx * flip, ny * flip
+    crossed = np.zeros(own.shape)
+    kernels.crossings(beams.starts - low, unit, beams.ranges, h, surface, mx, my, nx, ny, THROUGH, crossed)
+    surface &= own >= PRESENT * (own + crossed)
+    return DistanceField(_distances(surface, mx, my, nx, ny, own, h), (float(low[0]), float(low[1])), h)
+
+
+def _distances(surface: np.ndarray, mx: Array, my: Array, nx: Array, ny: Array, own: Array, h: float) -> Floats:
+    """Phi at the nodes from surface elements: near them by their planes, elsewhere by the nearest."""
+    rows, columns = np.nonzero(surface)
+    ex, ey, ax, ay = (a[surface] for a in (mx, my, nx, ny))
+    total, weight = np.zeros(surface.shape), np.zeros(surface.shape)
+    span = int(np.ceil(REACH)) + 1
+    for di in range(-span, span + 1):
+        for dj in range(-span, span + 1):
+            i, j = rows + di, columns + dj
+            inside = (i >= 0) & (j >= 0) & (i < surface.shape[0]) & (j < surface.shape[1])
+            vx, vy = j * h - ex, i * h - ey
+            square = (vx**2 + vy**2) / h**2
+            w = np.where(inside & (square < REACH**2), np.exp(-1.5 * square) * np.sqrt(own[surface]), 0.0)
+            np.add.at(total, (i[inside], j[inside]), (w * (ax * vx + ay * vy))[inside])
+            np.add.at(weight, (i[inside], j[inside]), w[inside])
+    near = weight > 0
+    tree = shapely.STRtree([shapely.Point(x, y) for x, y in zip(ex, ey, strict=True)])
+    ii, jj = np.nonzero(~near)
+    nearest = tree.nearest(shapely.points(np.stack([jj * h, ii * h], -1)))
+    phi = np.divide(total, weight, out=np.zeros_like(total), where=near)
+    phi[~near] = np.hypot(jj * h - ex[nearest], ii * h - ey[nearest])
+    return phi.astype(np.float32)

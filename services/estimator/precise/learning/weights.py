@@ -1,0 +1,147 @@
+"""The field's weights and model card on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import safetensors.numpy
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from common.errors import UserError
+from common.geometry.world import World
+from common.robot.scanner import Scanner
+from services.estimator.precise.field import CLASSES, DistanceField, FieldModel, Seen
+from services.estimator.precise.learning.calibration import Calibration
+
+if TYPE_CHECKING:
+    from common.geometry.se2 import Array
+
+FOLDER = Path(__file__).resolve().parents[4] / "models"
+PRESET = "precise"
+
+
+class FieldCard(BaseModel):
+    """Where a field comes from and how well it predicts."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    preset: str = PRESET
+    world: World
+    scanner: Scanner  # it was learned with; it predicts any other
+    samples: int
+    seed: int
+    resolution: float  # m
+    origin: tuple[float, float]  # m
+    sweeps: int
+    ripple: float  # rad, by which flat surfaces are tilted
+    inflation: float  # of the covariance, for errors of the model that hang together
+    test_samples: int
+    test_range_error_median_m: float
+    test_range_error_mean_m: float
+    test_share_above_5_cm: float
+    test_position_error_rms_m: float  # of the pose found from scans without noise: what the model alone leaves
+    learning_s: float
+    source: str = "simulated scans"
+    calibration: Calibration | None = None  # on real scans; none: the estimator's defaults hold
+    commit: str
+    command: str
+    versions: dict[str, str]
+
+
+def path_of(folder: Path, world: str) -> Path:
+    """Where the field of a world lies."""
+    return folder / f"{world}-{PRESET}.safetensors"
+
+
+def save(path: Path, model: FieldModel, places: Array, card: FieldCard) -> None:
+    """The field in half precision (fine near zero, where it matters); whole files or none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tensors: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]] = {
+        "phi": model.field.phi.astype(np.float16),
+        "scales": model.scales.astype(np.float32),
+        "places": np.asarray(places, np.float32),
+    }
+    if model.seen is not None:
+        tensors |= {"seen": model.seen.cells.astype(np.uint8), "seen_origin": np.array(model.seen.origin)}
+    partial = path.with_suffix(".partial")
+    safetensors.numpy.save_file(tensors, partial)
+    partial.chmod(0o644)
+    partial.replace(path)
+    partial.write_text(card.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    partial.replace(path.with_suffix(".json"))
+
+
+def load(path: Path) -> tuple[FieldModel, Array, FieldCard]:
+    """Model, places (S, 2) of the laser in free space, card; raises UserError where a file is not what it should be."""
+    try:
+        card = FieldCard.model_validate_json(path.with_suffix(".json").read_text(encoding="utf-8"))
+        tensors = safetensors.numpy.load_file(path)
+        phi, scales, places = tensors["phi"], tensors["scales"], tensors["places"]
+    except OSError as error:
+        raise UserError(f"weights {path}: cannot be read ({error})") from None
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise UserError(f"model card {path.with_suffix('.json')}: {where}: {first['msg']}") from None
+    except (safetensors.SafetensorError, KeyError, ValueError) as error:
+        raise UserError(f"weights {path}: no field ({' '.join(str(error).split())[:200]})") from None
+    if phi.ndim != 2 or min(phi.shape) < 2 or scales.shape != (int(np.prod(CLASSES)),) or places.shape[1:] != (2,):
+        raise UserError(f"weights {path}: arrays of another shape than a field's")
+    if not all(np.isfinite(a).all() for a in (phi, scales, places)):
+        raise UserError(f"weights {path}: not all numbers are finite")
+    field = DistanceField(phi.astype(np.float32), card.origin, card.resolution)
+    model = FieldModel(field, scales.astype(np.float64), card.ripple, _seen(tensors, path))
+    return model, places.astype(np.float64), card
+
+
+def _seen(tensors: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]], path: Path) -> Seen | None:
+    if "seen" not in tensors:
+        return None
+    cells, origin = tensors["seen"], tensors.get("seen_origin", np.zeros(0))
+    if cells.ndim != 2 or origin.shape != (2,) or not np.isfinite(origin.astype(float)).all():
+        raise UserError(f"weights {path}: what was looked into has another shape than a grid's")
+    x, y = origin.astype(float)
+    return Seen(cells.astype(bool), (float(x), float(y)))
+
+
+def train_command(world: str, folder: Path = FOLDER) -> str:
+    """What a user types to make a missing field."""
+    out = "" if folder == FOLDER else f" --out {folder}"
+    return f"presage train --world {world} --preset {PRESET}{out}"
+
+
+def find(folder: Path, world: World, asked: str) -> Path:
+    """The field of a world the user named ``asked``; raises UserError with the command that makes it."""
+    path = path_of(folder, world.name)
+    if not path.exists():
+        raise UserError(
+            f"no field of world {world.name!r} in {folder}; make it with: {train_command(asked, folder)}; "
+            "or do without, by rays cast in the world itself: --model exact"
+        )
+    _, _, card = load(path)
+    if not same_walls(card.world, world):
+        raise UserError(
+            f"{path} was learned in another world of the same name {world.name!r}: its walls differ. Give your world a "
+            f"name of its own, or learn anew with: {train_command(asked, folder)}"
+        )
+    return path
+
+
+def refuse_to_overwrite(path: Path, world: World) -> None:
+    """Another world's field of the same name is not ours to throw away."""
+    try:
+        _, _, card = load(path)
+    except UserError:
+        return
+    if not same_walls(card.world, world):
+        raise UserError(
+            f"{path} belongs to another world of the same name {world.name!r}: give your world a name of its own, "
+            "or another folder with --out"
+        )
+
+
+def same_walls(a: World, b: World) -> bool:
+    """Whether two worlds look alike to a laser."""
+    return np.array_equal(a.segments, b.segments) and np.array_equal(a.circles, b.circles)

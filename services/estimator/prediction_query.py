@@ -1,0 +1,53 @@
+"""Answers `predict`: scans expected from given poses."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from common.errors import UserError
+from common.messages.requests import PredictReply, PredictRequest
+
+if TYPE_CHECKING:
+    from common.geometry.se2 import Array
+    from services.estimator.shared.interface import Estimator
+
+MAX_POSES = 1000
+MAX_RANGES = 1_000_000  # perception waits meanwhile: about half a second
+
+
+def answer(estimator: Estimator, request: PredictRequest, angles: Array, range_max: float) -> PredictReply:
+    """Predictions for the scanner with beams at ``angles`` (B,) rad; +inf beyond ``range_max`` m.
+
+    Raises UserError where the request is too large, or the model cannot answer it.
+    """
+    chosen = angles[evenly(len(angles), request.beams)]
+    count = len(request.poses)
+    if count > MAX_POSES:
+        raise UserError(f"{count} poses are too many to predict at once: ask for {MAX_POSES} at most")
+    if count * len(chosen) > MAX_RANGES:
+        raise UserError(
+            f"{count} poses of {len(chosen)} beams are too many ranges: ask for {MAX_RANGES} at most, of fewer beams"
+        )
+    if not count:
+        return PredictReply(angles=chosen.astype(np.float32))
+    found = estimator.predict(request.poses, chosen)
+    ranges = np.where(found.ranges > range_max, np.inf, found.ranges)
+    return PredictReply(
+        angles=chosen.astype(np.float32),
+        ranges=ranges.ravel().astype(np.float32),
+        sigma=found.sigma.ravel().astype(np.float32),
+    )
+
+
+def evenly(count: int, wanted: int | None) -> np.ndarray[tuple[int, ...], np.dtype[np.intp]]:
+    """(wanted,) indices of ``count`` beams, evenly spaced, first and last among them; None: all of them.
+
+    Raises UserError where there are not so many.
+    """
+    if wanted is None:
+        return np.arange(count)
+    if wanted > count:
+        raise UserError(f"the scanner has {count} beams, not {wanted}: ask for that many at most")
+    return np.round(np.linspace(0, count - 1, wanted)).astype(np.intp)

@@ -1,0 +1,1 @@
+"""The MCAP files of a recording."""

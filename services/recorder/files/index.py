@@ -1,0 +1,79 @@
+"""The summary of an MCAP file, and its messages in order of time."""
+
+from __future__ import annotations
+
+import heapq
+import os
+import zlib
+from collections.abc import Collection, Iterator
+from struct import Struct
+from typing import Any, BinaryIO
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Chunk, ChunkIndex, Message
+from mcap.summary import Summary
+
+from services.recorder.files.chunks import MAGIC, PREFIX, records_of
+
+FOOTER = Struct("<BQQQI")  # opcode, length, where the summary begins, where its offsets do, its checksum
+CRC_BYTES = 4  # the footer's last field, which the summary's checksum leaves out
+OVERHEAD = 512  # bytes of memory that a message takes beside its payload, about
+MAX_WAITING_BYTES = 1 << 28  # of messages that wait for their place in time, where chunks overlap
+
+
+def summary_of(stream: BinaryIO) -> Summary | None:
+    """The summary at a file's end; None where the file states that it has none, ValueError where it is damaged."""
+    size = stream.seek(0, os.SEEK_END)
+    at = size - len(MAGIC) - FOOTER.size
+    stream.seek(max(0, at))
+    tail = stream.read()
+    if at < len(MAGIC) or not tail.endswith(MAGIC):
+        raise ValueError("its end is missing")
+    opcode, length, start, _, crc = FOOTER.unpack_from(tail)
+    if (opcode, length) != (Opcode.FOOTER, FOOTER.size - PREFIX.size):
+        raise ValueError("its end is damaged")
+    if start == 0:
+        return None
+    stream.seek(start)
+    summary = stream.read(max(0, at + FOOTER.size - CRC_BYTES - start))
+    if crc and zlib.crc32(summary) != crc:
+        raise ValueError("its index is damaged")
+    stream.seek(0)
+    return SeekingReader(stream, record_size_limit=size).get_summary()
+
+
+def in_order(
+    stream: BinaryIO, summary: Summary, keys: Collection[str] | None, start_ns: int | None, end_ns: int | None
+) -> Iterator[tuple[Channel, Message]]:
+    """Messages of some keys and times, by their log times; raises where a chunk is damaged."""
+    ids = {number for number, channel in summary.channels.items() if keys is None or channel.topic in keys}
+    # By time, then by place in the file: a chunk stands before its messages. Of a chunk the index, of a message itself.
+    queue: list[tuple[int, int, int, Any]] = [
+        (index.message_start_time, index.chunk_start_offset, -1, index)
+        for index in summary.chunk_indexes
+        if not index.message_index_offsets or not ids.isdisjoint(index.message_index_offsets)
+    ]
+    heapq.heapify(queue)
+    waiting = 0  # bytes
+    while queue:
+        _, offset, _, entry = heapq.heappop(queue)
+        if not isinstance(entry, ChunkIndex):
+            waiting -= len(entry.data) + OVERHEAD
+            yield summary.channels[entry.channel_id], entry
+            continue
+        if (start_ns is not None and entry.message_end_time < start_ns) or (
+            end_ns is not None and entry.message_start_time >= end_ns
+        ):
+            continue
+        stream.seek(offset + PREFIX.size)
+        for number, record in enumerate(records_of(Chunk.read(ReadDataStream(stream)))):
+            if not isinstance(record, Message) or record.channel_id not in ids:
+                continue
+            at = record.log_time
+            if (start_ns is None or at >= start_ns) and (end_ns is None or at < end_ns):
+                heapq.heappush(queue, (at, offset, number, record))
+                waiting += len(record.data) + OVERHEAD
+        if waiting > MAX_WAITING_BYTES:
+            raise ValueError("too many chunks are of the same time")

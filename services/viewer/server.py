@@ -1,0 +1,200 @@
+"""The web server: files, web socket, access."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import socket
+import threading
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.middleware import Middleware
+from starlette.responses import PlainTextResponse
+from starlette.routing import Mount, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+
+from common.bus.bus import wait_until
+from common.errors import UserError
+from services.viewer.access import COOKIE, is_token, known_host, same_origin, token_of
+from services.viewer.desk import Desk
+from services.viewer.settings import FIRST_PORT, ViewerSettings
+from services.viewer.visitor_session import Session
+
+PAGE = Path(__file__).resolve().parent / "static"
+MAX_VISITORS = 100
+MAX_MESSAGE = 1 << 16  # bytes; what is longer ends the connection, what is shorter gets an answer
+SEND_BUFFER = 1 << 15  # bytes the kernel keeps for a visitor: what waits there is old when it is seen
+GONE = 30_000  # ms without a sign of what was sent, then the connection is dead
+PORTS = 20  # tried, from the first
+POLICY = (
+    "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'"
+)
+HEADERS = {
+    "content-security-policy": POLICY,
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "cache-control": "no-cache",
+}
+
+
+@dataclass(frozen=True)
+class Guard:
+    """Lets in who may: by token, host and origin; adds the headers that keep the page to itself."""
+
+    app: ASGIApp
+    token: str
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass on, or refuse."""
+        if scope["type"] == "lifespan":
+            await self.app(scope, receive, send)
+            return
+        refusal = self._refusal(scope)
+        if scope["type"] == "websocket":
+            if refusal is None:
+                await self.app(scope, receive, send)
+            else:
+                await WebSocket(scope, receive, send).send_denial_response(refusal)
+            return
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                headers.update(HEADERS)
+                if self.token and refusal is None:
+                    headers.append("set-cookie", f"{COOKIE}={self.token}; HttpOnly; SameSite=Lax; Path=/")
+            await send(message)
+
+        await (refusal or self.app)(scope, receive, with_headers)
+
+    def _refusal(self, scope: Scope) -> PlainTextResponse | None:
+        headers = Headers(scope=scope)
+        host = headers.get("host")
+        if self.token:
+            given = token_of(headers.get("cookie"), scope["query_string"].decode("latin-1"))
+            if not is_token(given, self.token):
+                return PlainTextResponse("a token is needed: open the link with ?token=... that was printed\n", 401)
+        elif not known_host(host, {socket.gethostname().lower(), f"{socket.gethostname().lower()}.local"}):
+            return PlainTextResponse("by this name a token is needed: use the machine's address, or --token\n", 403)
+        if scope["type"] == "websocket" and not same_origin(headers.get("origin"), host):
+            return PlainTextResponse("only this server's own page may connect\n", 403)
+        return None
+
+
+class Frugal(WebSocketsSansIOProtocol):
+    """A frame that the kernel has not taken holds the next one back, so that the newest goes next."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """No buffer of our own."""
+        super().connection_made(transport)
+        if isinstance(transport, asyncio.WriteTransport):
+            transport.set_write_buffer_limits(high=0)
+
+
+def create_app(desk: Desk, token: str, started: Callable[[asyncio.AbstractEventLoop], None]) -> Starlette:
+    """The application; ``started`` is called with its loop."""
+
+    @asynccontextmanager
+    async def lifespan(_app: Starlette) -> AsyncIterator[None]:
+        started(asyncio.get_running_loop())
+        work = asyncio.create_task(desk.run())
+        yield
+        work.cancel()
+        with suppress(asyncio.CancelledError):
+            await work
+
+    async def connect(websocket: WebSocket) -> None:
+        if len(desk.office.hub) >= MAX_VISITORS:
+            await websocket.send_denial_response(PlainTextResponse("too many visitors\n", 503))
+            return
+        await Session(websocket, desk).run()
+
+    routes = [WebSocketRoute("/ws", connect), Mount("/", StaticFiles(directory=PAGE, html=True))]
+    return Starlette(routes=routes, middleware=[Middleware(Guard, token=token)], lifespan=lifespan)
+
+
+class WebServer:
+    """uvicorn in a thread."""
+
+    def __init__(self, app: Starlette, listener: socket.socket) -> None:
+        """Not yet running."""
+        config = uvicorn.Config(
+            app, log_config=None, log_level="warning", access_log=False, proxy_headers=False, server_header=False,
+            ws=Frugal, ws_max_size=MAX_MESSAGE, ws_per_message_deflate=False, ws_ping_interval=10, ws_ping_timeout=20,
+            limit_concurrency=4 * MAX_VISITORS, timeout_graceful_shutdown=1, lifespan="on",
+        )  # fmt: skip
+        self._server = uvicorn.Server(config)
+        run = self._server.run
+        self._thread = threading.Thread(target=lambda: run(sockets=[listener]), name="web", daemon=True)
+
+    def start(self) -> None:
+        """Return once visitors may come; raises UserError where that fails."""
+        self._thread.start()
+        wait_until(lambda: self._server.started or not self._thread.is_alive(), 20)
+        if not self._server.started:
+            raise UserError("the web server did not start; its lines are above")
+
+    def stop(self) -> None:
+        """End it, visitors or not."""
+        self._server.should_exit = True
+        self._thread.join(5)
+
+    @property
+    def running(self) -> bool:
+        """Whether it still serves."""
+        return self._thread.is_alive()
+
+
+def listen(settings: ViewerSettings) -> socket.socket:
+    """Listens at the port asked for, or the first free one from `FIRST_PORT`; raises UserError where it cannot."""
+    wanted = [settings.port] if settings.port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS), 0]
+    for port in wanted:
+        try:
+            return _bind(settings.host, port)
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE and port != wanted[-1]:
+                continue
+            raise UserError(
+                f"{settings.host} port {port} cannot be used ({error.strerror}): choose another with --port, 0 for any "
+                "free one, or another address with --host"
+            ) from None
+    raise AssertionError
+
+
+def _bind(host: str, port: int) -> socket.socket:
+    family, kind, protocol, _, address = socket.getaddrinfo(
+        host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+    )[0]  # fmt: skip
+    listener = socket.socket(family, kind, protocol)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)  # connections inherit it
+        if hasattr(socket, "TCP_USER_TIMEOUT"):
+            listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, GONE)
+        listener.bind(address)
+        listener.listen()  # bound twice, by two viewers at once, one fails here
+    except OSError:
+        listener.close()
+        raise
+    return listener
+
+
+def link(settings: ViewerSettings, listener: socket.socket) -> str:
+    """The page's address for a browser on this machine."""
+    port = listener.getsockname()[1]
+    host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(settings.host, settings.host)  # noqa: S104 - compared with
+    host = f"[{host}]" if ":" in host and not host.startswith("[") else host
+    address = settings.address or f"http://{host}:{port}"
+    return f"{address}/" + (f"?token={settings.token}" if settings.token else "")

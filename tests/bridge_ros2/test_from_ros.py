@@ -1,0 +1,117 @@
+"""ROS's messages as ours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.messages.ros_messages import IDENTITY, Mount, Transform
+from common.runtime import safety
+from services.bridge_ros2.from_ros import dead_of, odom_of, pose_of, scan_of
+from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, POSE_STAMPED, decode
+from tests.bridge_ros2 import independent as other
+
+
+def laser(ranges, first=-1.0, step=0.5, last=1.0, nearest=0.1, farthest=10.0, scan_time=0.1):
+    payload = other.encode(LASER_SCAN, {
+        "header": other.header(5, "laser"), "angle_min": first, "angle_max": last, "angle_increment": step,
+        "time_increment": 0.0, "scan_time": scan_time, "range_min": nearest, "range_max": farthest, "ranges": ranges,
+        "intensities": [],
+    })  # fmt: skip
+    return decode(LASER_SCAN, payload)
+
+
+def test_a_scan_as_it_is():
+    scan = scan_of(laser([1, 2, 3, 4, 5]), Mount((0.2, 0.1, 0.3)), 77)
+    np.testing.assert_allclose(scan.angles(), [-1, -0.5, 0, 0.5, 1])
+    np.testing.assert_array_equal(scan.ranges, np.array([1, 2, 3, 4, 5], np.float32))
+    assert scan.mount.array().tolist() == [0.2, 0.1, 0.3]
+    assert (scan.stamp_ns, scan.frame_id, scan.range_max) == (77, "laser", 10.0)
+    assert scan.scan_time == pytest.approx(0.1)
+
+
+def test_ranges_by_the_one_rule():
+    inf, nan = np.inf, np.nan
+    scan = scan_of(laser([0.0, nan, inf, -inf, 0.05, 11.0, -1.0, 10.0, 0.1]), Mount(), 0)
+    expected = np.array([0, 0, inf, -inf, -inf, inf, 0, inf, 0.1], np.float32)
+    np.testing.assert_array_equal(scan.ranges, expected)
+
+
+@pytest.mark.parametrize("upside_down", [False, True])
+@pytest.mark.parametrize("step", [0.5, -0.5])
+def test_beams_point_where_they_pointed(upside_down, step):
+    """Whatever the order of beams and the side that is up: the same points in base_link."""
+    ranges, mount = np.array([1.0, 2.0, 3.0, 4.0], np.float32), Mount((0.5, -0.2, 0.7), upside_down)
+    scan = scan_of(laser(ranges.tolist(), first=0.2, step=step), mount, 0)
+    assert scan.angle_increment > 0
+    angles = np.float32(0.2) + step * np.arange(4)
+    in_laser = np.stack([ranges * np.cos(angles), ranges * np.sin(angles), np.zeros(4)], axis=-1)
+    roll = np.diag([1.0, -1.0, -1.0]) if upside_down else np.eye(3)
+    c, s = np.cos(0.7), np.sin(0.7)
+    expected = (np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ roll @ in_laser.T).T[:, :2] + [0.5, -0.2]
+    found = safety.scan_points(scan)
+    order = np.argsort(np.hypot(*(found - [0.5, -0.2]).T))
+    np.testing.assert_allclose(found[order], expected, atol=1e-6)
+
+
+def test_a_full_circle_from_0_to_2_pi():
+    scan = scan_of(laser([1.0] * 360, first=0.0, step=np.deg2rad(1), last=np.deg2rad(359)), Mount(), 0)
+    assert scan.angle_min == 0
+    assert len(scan.ranges) == 360
+    missing = scan_of(laser([1.0] * 5, step=0.0), Mount(), 0)  # no increment said
+    assert missing.angle_increment == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"ranges": []}, {"first": np.nan}, {"farthest": 0.0}, {"farthest": np.inf}, {"step": 0.0, "last": -1.0}],
+    ids=str,
+)
+def test_what_no_scanner_says_is_refused(wrong):
+    with pytest.raises(ValueError, match="scan"):
+        scan_of(laser(**{"ranges": [1.0, 1.0], **wrong}), Mount(), 0)
+
+
+def odometry(x=1.0, y=2.0, yaw=0.0, twist=(0.3, 0.0, 0.5), covariance=None):
+    six = [0.0] * 36 if covariance is None else covariance
+    pose = {"position": other.vector(x, y), "orientation": other.quaternion(z=np.sin(yaw / 2), w=np.cos(yaw / 2))}
+    payload = other.encode(ODOMETRY, {
+        "header": other.header(9, "odom"), "child_frame_id": "base_footprint",
+        "pose": {"pose": pose, "covariance": six},
+        "twist": {
+            "twist": {"linear": other.vector(*twist[:2]), "angular": other.vector(z=twist[2])}, "covariance": six,
+        },
+    })  # fmt: skip
+    return decode(ODOMETRY, payload)
+
+
+def test_odometry_with_the_plane_of_its_covariance():
+    six = np.arange(36.0)
+    odom = odom_of(dead_of(odometry(yaw=0.4, covariance=six.tolist()), None))
+    np.testing.assert_allclose(odom.pose.array(), [1, 2, 0.4])
+    assert (odom.twist.vx, odom.twist.wz, odom.stamp_ns) == (0.3, 0.5, 9)
+    np.testing.assert_array_equal(odom.covariance, [[0, 1, 5], [6, 7, 11], [30, 31, 35]])
+    assert not dead_of(odometry(covariance=[np.nan] * 36), None).covariance.any()
+    with pytest.raises(ValueError, match="not finite"):
+        dead_of(odometry(twist=(np.inf, 0, 0)), None)
+
+
+def test_odometry_of_a_frame_off_the_base():
+    """The child frame is 1 m ahead of the base: it swings where the base only turns."""
+    ahead = Transform(np.array([1.0, 0, 0]), np.eye(3))
+    dead = dead_of(odometry(x=0.0, y=1.0, yaw=np.pi / 2, twist=(0.0, 0.5, 0.5)), ahead)
+    np.testing.assert_allclose(dead.pose, [0, 0, np.pi / 2], atol=1e-12)
+    np.testing.assert_allclose(dead.twist, [0, 0, 0.5], atol=1e-12)
+    np.testing.assert_allclose(dead_of(odometry(), IDENTITY).pose, [1, 2, 0])
+
+
+def test_a_pose_is_of_the_map():
+    pose = {"position": other.vector(3, 4), "orientation": other.quaternion(z=np.sin(0.5), w=np.cos(0.5))}
+
+    def message(frame):
+        return decode(POSE_STAMPED, other.encode(POSE_STAMPED, {"header": other.header(0, frame), "pose": pose}))
+
+    for frame in ("map", "/map", ""):
+        np.testing.assert_allclose(pose_of(message(frame), "map").array(), [3, 4, 1])
+    with pytest.raises(ValueError, match="frame 'odom', not 'map'"):
+        pose_of(message("odom"), "map")

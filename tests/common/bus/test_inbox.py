@@ -1,0 +1,222 @@
+"""The queue between zenoh's threads and the loop, against a model of it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+
+from common.bus.inbox import MAX_KEYS, Answer, Call, Inbox, Sample
+from common.messages.requests import Reply
+from common.messages.topics import HEALTH, MAX_BYTES, SCAN, TELEPORT
+from tests.conftest import ROOT
+
+
+def sample(key="a", payload=b"", topic=SCAN) -> Sample:
+    return Sample(topic, key, payload, 0, 0)
+
+
+class Model(RuleBasedStateMachine):
+    """A list that does by search what the inbox does by slots."""
+
+    CAPACITY, BYTES = 4, 100
+
+    def __init__(self):
+        super().__init__()
+        self.inbox = Inbox(self.CAPACITY, self.BYTES)
+        self.queue: list[tuple[bool, Sample]] = []
+        self.received, self.dropped = Counter(), Counter()
+
+    @rule(key=st.sampled_from("ab"), size=st.integers(0, 60), newest=st.booleans())
+    def put(self, key, size, newest):
+        key = key if newest else key.upper()  # one policy a key
+        entry = sample(key, bytes(size))
+        self.inbox.put(entry, newest_only=newest)
+        self.received[key] += 1
+        held = sum(len(e.payload) for _, e in self.queue)
+        for i, (was_newest, old) in enumerate(self.queue):
+            if newest and was_newest and old.key == key:
+                self.queue[i] = (True, entry)
+                self.dropped[key] += 1
+                return
+        if len(self.queue) >= self.CAPACITY or held + size > self.BYTES:
+            self.dropped[key] += 1
+        else:
+            self.queue.append((newest, entry))
+
+    @rule()
+    def get(self):
+        expected = self.queue.pop(0)[1] if self.queue else None
+        assert self.inbox.get(0) is expected
+
+    @invariant()
+    def counts(self):
+        assert len(self.inbox) == len(self.queue)
+        assert self.inbox.received == self.received
+        assert self.inbox.dropped == self.dropped
+
+
+TestModel = Model.TestCase
+TestModel.settings = settings(max_examples=100, stateful_step_count=30)
+
+
+def test_newest_only_keeps_the_newest_of_each_key():
+    inbox = Inbox()
+    for i in range(100):
+        inbox.put(sample("scan", b"%d" % i), newest_only=True)
+        inbox.put(sample("odom", b"%d" % i), newest_only=True)
+    assert [(e.key, e.payload) for e in (inbox.get(0), inbox.get(0))] == [("scan", b"99"), ("odom", b"99")]
+    assert inbox.get(0) is None
+    assert inbox.dropped == {"scan": 99, "odom": 99}
+    assert inbox.received == {"scan": 100, "odom": 100}
+
+
+def test_all_keeps_order_and_loses_nothing():
+    inbox = Inbox()
+    for i in range(1000):
+        inbox.put(sample("scan", b"%d" % i))
+    assert [inbox.get(0).payload for _ in range(1000)] == [b"%d" % i for i in range(1000)]
+    assert not inbox.dropped
+
+
+def test_a_chatty_key_cannot_push_another_out():
+    inbox = Inbox(capacity=2)
+    inbox.put(sample("goal", b"there"), newest_only=True)
+    for _ in range(1000):
+        inbox.put(sample("scan"), newest_only=True)
+    assert inbox.get(0).payload == b"there"
+
+
+def test_oversized_payloads_are_counted_and_not_queued():
+    inbox = Inbox()
+    inbox.put(sample("scan", bytes(MAX_BYTES)))
+    inbox.put(sample("scan", bytes(MAX_BYTES + 1)))
+    assert len(inbox) == 1
+    assert inbox.oversized == {"scan": 1}
+    assert inbox.received == {"scan": 2}
+
+
+def test_a_request_too_many_is_refused_not_forgotten():
+    refused: list[str] = []
+    inbox = Inbox(capacity=1)
+    for _ in range(2):
+        inbox.put(Call(TELEPORT, b"", lambda _: None, refused.append))
+    assert len(inbox) == 1
+    assert refused == ["too many requests wait"]
+
+
+def test_a_request_that_is_too_large_is_refused_at_once():
+    refused: list[str] = []
+    inbox = Inbox()
+    inbox.put(Call(TELEPORT, bytes(64 * MAX_BYTES + 1), lambda _: None, refused.append))
+    assert len(inbox) == 0
+    assert len(refused) == 1
+
+
+def test_an_answer_is_owed_and_comes_even_to_a_full_inbox():
+    inbox = Inbox(capacity=1)
+    inbox.put(sample())
+    inbox.put(Answer(TELEPORT, 7, Reply(reason="here").encode()))
+    inbox.put(Answer(TELEPORT, 8, bytes(64 * MAX_BYTES + 1)))
+    inbox.get(0)
+    assert inbox.get(0).reply() == Reply(reason="here")
+    large = inbox.get(0)
+    assert (large.number, large.payload) == (8, b"")
+    assert large.reply() == Reply(ok=False, reason=f"the answer's {64 * MAX_BYTES + 1} bytes are too many")
+
+
+def test_an_answer_that_makes_no_sense_is_one_that_says_so():
+    reply = Answer(TELEPORT, 1, b"\xc1").reply()
+    assert not reply.ok
+    assert "makes no sense" in reply.reason
+
+
+def test_invented_keys_do_not_fill_memory():
+    inbox = Inbox()
+    for i in range(3 * MAX_KEYS):
+        inbox.put(sample(f"presage/robot/health/{i}", topic=HEALTH))
+    inbox.put(sample("presage/robot/health/0", topic=HEALTH))
+    assert len(inbox.received) == MAX_KEYS + 1
+    assert inbox.received["others"] == 2 * MAX_KEYS
+    assert inbox.received["presage/robot/health/0"] == 2
+
+
+def test_get_waits_for_an_entry_and_no_longer():
+    inbox = Inbox()
+    began = time.monotonic()
+    assert inbox.get(0.05) is None
+    assert 0.04 < time.monotonic() - began < 5
+    threading.Timer(0.05, lambda: inbox.put(sample("late"))).start()
+    assert inbox.get(30).key == "late"
+
+
+def test_wake_ends_a_wait():
+    inbox = Inbox()
+    began = time.monotonic()
+    threading.Timer(0.05, inbox.wake).start()
+    assert inbox.get(30) is None
+    assert time.monotonic() - began < 15
+
+
+INTERRUPTED = """
+import signal, threading, time
+from common.bus.inbox import Inbox, Sample
+from common.messages.topics import SCAN
+
+signal.signal(signal.SIGALRM, signal.default_int_handler)
+for number in range(200):
+    inbox, putting = Inbox(), True
+
+    def put():
+        while putting:
+            inbox.put(Sample(SCAN, "key", b"", 0, 0), newest_only=True)
+
+    thread = threading.Thread(target=put, daemon=True)
+    thread.start()
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.0005 + number * 2e-5)
+        while True:
+            inbox.get(0.001)
+    except (KeyboardInterrupt, RuntimeError):  # the second inside Condition.wait, in the moment before it waits
+        putting = False
+    thread.join(10)
+    assert not thread.is_alive(), "locked for ever"
+"""
+
+
+def test_ctrl_c_does_not_leave_it_locked():
+    """Zenoh's threads would wait for it, and the session, which waits for them, would never close."""
+    done = subprocess.run([sys.executable, "-c", INTERRUPTED], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_many_threads_put_and_every_entry_is_accounted_for():
+    inbox = Inbox(capacity=50)
+    threads = [
+        threading.Thread(target=lambda k=k: [inbox.put(sample(k), newest_only=k == "0") for _ in range(2000)])
+        for k in "0123"
+    ]
+    for thread in threads:
+        thread.start()
+    got = 0
+    while any(t.is_alive() for t in threads) or len(inbox):
+        got += inbox.get(0.01) is not None
+    for thread in threads:
+        thread.join()
+    assert sum(inbox.received.values()) == 8000
+    assert got + sum(inbox.dropped.values()) == 8000
+
+
+def test_the_newest_of_one_source_does_not_take_the_place_of_another_s():
+    inbox = Inbox()
+    for number in range(3):
+        for source in ("robot", "repeater"):
+            inbox.put(Sample(SCAN, "k", f"{source} {number}".encode(), 0, 0, source), newest_only=True)
+    assert [inbox.get(0).payload for _ in range(2)] == [b"robot 2", b"repeater 2"]
+    assert inbox.get(0) is None

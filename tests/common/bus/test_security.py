@@ -1,0 +1,179 @@
+"""Rules derived from the table; credentials read from a folder."""
+
+from __future__ import annotations
+
+import json
+from itertools import product
+
+import pytest
+from zenoh import KeyExpr
+
+from common.bus.endpoints import on_loopback, over_tls, refuse_exposure
+from common.bus.security import (
+    ROLES,
+    ROUTER,
+    Member,
+    client_rules,
+    credentials,
+    may_answer,
+    may_ask,
+    may_put,
+    router_rules,
+    rules_of,
+    service_of,
+)
+from common.errors import UserError
+from common.messages.topics import ANYBODY, CMD_VEL, CONTROL, HEALTH, QUERIES, SCAN, TELEPORT, TOPICS, WORLD
+from presage.session import credentials as secure
+
+
+def included(key: str, expression: str) -> bool:
+    """As zenoh looks at it: whether all that the key means, it may be an expression itself, is allowed."""
+    return KeyExpr(expression).includes(KeyExpr(key))
+
+
+def may_send(role: str, message: str, key: str, robots: tuple[str, ...] = ("*",)) -> bool:
+    member = Member(name=role, role=role, robots=robots)
+    return any(
+        message in messages and any(included(key, each) for each in expressions)
+        for messages, expressions in rules_of(member)
+    )
+
+
+def test_every_role_of_the_table_is_one_and_every_topic_has_somebody_who_puts_it():
+    named = {role for topic in TOPICS for role in topic.put_by} | {role for query in QUERIES for role in query.asked_by}
+    assert named <= set(ROLES)
+    assert set(ANYBODY) == set(ROLES) - {ROUTER}
+    for topic in TOPICS:
+        assert [role for role in ROLES if may_put(role, topic)], topic.name
+    for query in QUERIES:
+        assert [role for role in ROLES if may_answer(role, query)], query.name
+        assert [role for role in ROLES if may_ask(role, query)], query.name
+
+
+def test_one_role_drives_one_scans():
+    stands_in = {"replay"}
+    assert {role for role in ROLES if may_put(role, CMD_VEL)} - stands_in == {"controller"}
+    assert {role for role in ROLES if may_put(role, SCAN)} - stands_in == {"simulator", "bridge_ros2"}
+
+
+def test_whatever_moves_the_robot_or_changes_what_runs_takes_control():
+    free = {"sample", "world", "model", "predict", "config"}
+    rviz = {"localise": "bridge_ros2"}  # whose "2D Pose Estimate" the bridge passes on
+    others = {q.name: set(q.asked_by) - {rviz.get(q.name)} for q in QUERIES}
+    assert {name for name, roles in others.items() if roles != set(CONTROL)} == free
+    assert not {"viewer", "observer"} & set(CONTROL)
+
+
+@pytest.mark.parametrize(("role", "topic"), list(product(sorted(set(ROLES) - {ROUTER}), TOPICS)))
+def test_the_rules_say_of_puts_what_the_table_says(role, topic):
+    own = service_of(role) or "nobody"
+    key = topic.key("r1", own)
+    assert may_send(role, "put", key) == may_put(role, topic)
+    assert not may_send(role, "delete", key)
+    assert not may_send(role, "put", "presage/**")
+    assert not may_send(role, "put", "presage/r1/never-heard-of")
+
+
+def test_a_service_speaks_under_its_own_name_alone():
+    assert may_send("estimator", "put", HEALTH.key("r1", "estimator"))
+    assert not may_send("estimator", "put", HEALTH.key("r1", "simulator"))
+    assert may_send("estimator", "liveliness_token", "presage/r1/alive/estimator")
+    assert may_send("estimator", "liveliness_token", "presage/r1/alive/estimator/instance")
+    assert not may_send("estimator", "liveliness_token", "presage/r1/alive/simulator")
+    assert not may_send("observer", "liveliness_token", "presage/r1/alive/estimator")
+    assert may_send("viewer-control", "put", HEALTH.key("r1", "viewer"))
+
+
+def test_queries_are_asked_and_answered_by_role():
+    assert may_send("operator", "query", TELEPORT.key("r1"))
+    assert not may_send("observer", "query", TELEPORT.key("r1"))
+    assert may_send("observer", "query", WORLD.key("r1"))
+    assert may_send("simulator", "declare_queryable", TELEPORT.key("r1"))
+    assert not may_send("controller", "declare_queryable", TELEPORT.key("r1"))
+    assert not may_send("controller", "reply", WORLD.key("r1"))
+
+
+def test_a_member_for_one_robot_has_nothing_to_do_with_another():
+    for message, key in (("put", "cmd_vel"), ("declare_subscriber", "scan"), ("liveliness_token", "alive/controller")):
+        assert may_send("controller", message, f"presage/one/{key}", ("one",))
+        assert not may_send("controller", message, f"presage/two/{key}", ("one",))
+        assert not may_send("controller", message, f"presage/*/{key}", ("one",))
+
+
+def test_default_is_no_and_only_routers_are_heard_by_others():
+    members = [Member(name=role, role=role) for role in ROLES]
+    for access in (router_rules(members), client_rules()):
+        assert access["enabled"]
+        assert access["default_permission"] == "deny"
+        assert {rule["permission"] for rule in access["rules"]} == {"allow"}
+    assert client_rules()["subjects"] == [{"id": "router", "cert_common_names": ["router"]}]
+    subjects = {each["id"]: each for each in router_rules(members)["subjects"]}
+    assert subjects["controller"] == {
+        "id": "controller",
+        "cert_common_names": ["controller"],
+        "usernames": ["controller"],
+    }
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("keys")
+    secure.init(folder, robots=["one"])
+    return folder
+
+
+def test_a_robot_s_own_credentials_go_before_the_common_ones(keys):
+    assert credentials(keys, ("controller",), "one").member.robots == ("one",)
+    with pytest.raises(UserError, match="no credentials of 'controller', but of controller-one, estimator-one"):
+        credentials(keys, ("controller",), "two")
+    assert credentials(keys, ("nobody", "observer"), "one").member.name == "observer"
+
+
+def test_what_is_wrong_with_a_folder_is_said(keys, tmp_path):
+    with pytest.raises(UserError, match=r"no such folder \(--security"):
+        credentials(tmp_path / "none", ("observer",))
+    secure.init(tmp_path)
+    (tmp_path / "observer" / "own.key").unlink()
+    with pytest.raises(UserError, match=r"own\.key: No such file"):
+        credentials(tmp_path, ("observer",))
+    (tmp_path / "viewer" / "identity.json").write_text(json.dumps({"name": "viewer", "role": "king"}))
+    with pytest.raises(UserError, match="no role 'king'"):
+        credentials(tmp_path, ("viewer",))
+    (tmp_path / "router" / "members.json").write_text("{}")
+    with pytest.raises(UserError, match="members"):
+        credentials(tmp_path, ("router",))
+
+
+def test_a_password_is_not_in_what_is_printed(keys):
+    mine = credentials(keys, ("observer",))
+    assert mine.password not in repr(mine)
+
+
+def test_a_role_s_limits_are_said_before_the_router_is_silent(keys):
+    mine = credentials(keys, ("controller",), "one")
+    mine.check(may_put, CMD_VEL, "one")
+    with pytest.raises(UserError, match="'controller-one' is for one, not for robot 'two'"):
+        mine.check(may_put, CMD_VEL, "two")
+    with pytest.raises(UserError, match="may not put scan: it takes one of simulator"):
+        mine.check(may_put, SCAN, "one")
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "here"),
+    [
+        ("tcp/127.0.0.1:7447", True), ("tcp/127.1.2.3:0", True), ("tcp/[::1]:7447", True), ("tcp/localhost:0", True),
+        ("unixsock-stream//tmp/x", True), ("tcp/0.0.0.0:0", False), ("tcp/[::]:0", False), ("tcp/10.0.0.1:1", False),
+        ("udp/0.0.0.0:1", False), ("tcp/robot.lan:7447", False), ("tls/:::7447", False),
+    ],
+)  # fmt: skip
+def test_what_is_open_to_others_is_refused(endpoint, here):
+    assert on_loopback(endpoint) == here
+    if not here:
+        with pytest.raises(UserError, match="--insecure"):
+            refuse_exposure(["tcp/127.0.0.1:0", endpoint])
+
+
+def test_nothing_goes_in_the_clear():
+    assert over_tls("tcp/host:1") == "tls/host:1"
+    assert over_tls("quic/host:1") == "quic/host:1"

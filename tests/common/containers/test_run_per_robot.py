@@ -1,0 +1,104 @@
+"""A process for each robot: real children, told apart by what they write."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import psutil
+import pytest
+
+from common.bus.bus import wait_until
+from common.containers.run_per_robot import main, names
+
+PATIENCE = 30.0
+CHILD = """
+import os, signal, sys, time
+from pathlib import Path
+signal.signal(signal.SIGTERM, lambda *_: (print("bye", flush=True), os._exit(0)))
+robot, folder = os.environ["PRESAGE_ROBOT"], Path(sys.argv[1])
+with (folder / robot).open("a") as file:
+    file.write(f"{os.getpid()}\\n")
+if sys.argv[2:]:
+    sys.exit(int(sys.argv[2]) if robot.endswith("-2") else 0)
+print("here", os.environ.get("PRESAGE_ROBOTS"), flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.fixture
+def fleet(process, tmp_path):
+    """Starts the launcher over the child above."""
+    (tmp_path / "child.py").write_text(CHILD)
+
+    def start(mode, count, *args):
+        path = os.pathsep.join([str(tmp_path), str(Path(__file__).resolve().parents[3])])
+        environment = {"PRESAGE_FLEET": count, "PRESAGE_ROBOT": "robot", "PYTHONPATH": path}
+        return process("common.containers.run_per_robot", mode, "child", str(tmp_path), *args, env=environment)
+
+    return start
+
+
+def started(folder, robot):
+    """Process ids, one a start."""
+    path = folder / robot
+    return [int(line) for line in path.read_text().split()] if path.exists() else []
+
+
+def test_names_of_robots():
+    assert names({}) == names({"PRESAGE_FLEET": "1"}) == names({"PRESAGE_FLEET": ""}) == ["robot"]
+    assert names({"PRESAGE_FLEET": "3"}) == ["robot-1", "robot-2", "robot-3"]
+    assert names({"PRESAGE_FLEET": "2", "PRESAGE_ROBOT": "truck"}) == ["truck-1", "truck-2"]
+    assert names({"PRESAGE_ROBOT": "truck"}) == ["truck"]
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "three", "1000", "101", "1.5"])
+def test_a_number_that_is_none_is_refused(text):
+    with pytest.raises(ValueError, match="how many robots, 1 to 100"):
+        names({"PRESAGE_FLEET": text})
+
+
+@pytest.mark.parametrize("argv", [["every", "child"], ["each"]])
+def test_words_that_make_no_sense_are_refused(argv, capsys):
+    assert main(argv) == 2
+    assert "say each, together or once" in capsys.readouterr().err
+
+
+def test_one_that_dies_is_started_again_and_the_others_stay(fleet, tmp_path):
+    running = fleet("each", "3")
+    robots = ["robot-1", "robot-2", "robot-3"]
+    assert wait_until(lambda: all(started(tmp_path, robot) for robot in robots), PATIENCE), running.output
+    running.wait_for("robot-3 | here None")
+    os.kill(started(tmp_path, "robot-2")[0], signal.SIGKILL)
+    assert wait_until(lambda: len(started(tmp_path, "robot-2")) == 2, PATIENCE), running.output
+    assert "robot-2 | ended with status -9; started again in 1 s" in running.output
+    assert len(started(tmp_path, "robot-1")) == len(started(tmp_path, "robot-3")) == 1
+    assert running.stop()[0] == 0
+    assert running.output.count("bye") >= 2  # the one just started may not have come to its handler
+    assert not [pid for robot in robots for pid in started(tmp_path, robot) if psutil.pid_exists(pid)]
+
+
+def test_children_end_with_the_launcher_even_where_it_is_killed(fleet, tmp_path):
+    running = fleet("each", "2")
+    running.wait_for("robot-1 | here")
+    running.wait_for("robot-2 | here")
+    children = started(tmp_path, "robot-1") + started(tmp_path, "robot-2")
+    running.kill()
+    assert wait_until(lambda: not any(psutil.pid_exists(pid) for pid in children), PATIENCE)
+
+
+def test_once_ends_with_the_worst_status(fleet, tmp_path):
+    running = fleet("once", "3", "7")
+    assert running.wait() == 7
+    assert [len(started(tmp_path, f"robot-{number}")) for number in (1, 2, 3)] == [1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("mode", "count", "told"), [("together", "2", "here robot-1,robot-2"), ("each", "1", "here None")]
+)
+def test_one_process_takes_the_launcher_s_place(fleet, tmp_path, mode, count, told):
+    running = fleet(mode, count)
+    running.wait_for(told)
+    assert started(tmp_path, "robot-1" if count == "2" else "robot") == [running.child.pid]
+    assert running.stop()[0] == 0

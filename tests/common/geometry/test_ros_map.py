@@ -1,0 +1,159 @@
+"""map.yaml by map_server's rules, written out pixel by pixel; image formats; files that are wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from common.errors import UserError
+from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN
+from common.geometry.ros_map import MapFile, percentages
+from common.geometry.world import load_world
+from tests.common.geometry.maps import values_of, write_map, write_yaml
+
+SHADES = np.arange(256, dtype=np.uint8).reshape(16, 16)
+ALPHAS = np.random.default_rng(0).choice([0, 1, 128, 254, 255], (16, 16)).astype(np.uint8)
+
+
+def expected(shade, alpha, mode, negate, low, high):
+    """One pixel, 0 to 255, as nav2_map_server's map_io.cpp has it: 0 to 100, or -1."""
+    level = shade / 255 if mode != "trinary" or alpha is None else (3 * shade + alpha) / 4 / 255
+    occupied = level if negate else 1 - level
+    if mode == "raw":
+        return round(level * 255) if round(level * 255) <= 100 else -1
+    if mode == "scale" and alpha is not None and alpha < 255:
+        return -1
+    if occupied > high:
+        return 100
+    if occupied < low:
+        return 0
+    return -1 if mode == "trinary" else round((occupied - low) / (high - low) * 100)
+
+
+@pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
+@pytest.mark.parametrize("negate", [False, True])
+@pytest.mark.parametrize("alpha", [None, ALPHAS])
+@pytest.mark.parametrize("thresholds", [(0.25, 0.65), (0.196, 0.9)])
+def test_percentages_are_map_servers(mode, negate, alpha, thresholds):
+    low, high = thresholds
+    described = MapFile(
+        image="x", resolution=1, origin=(0, 0, 0), negate=negate, mode=mode, free_thresh=low, occupied_thresh=high
+    )
+    colours = np.repeat(SHADES[..., None], 3, axis=-1) / 255
+    found = percentages(described, colours, None if alpha is None else alpha / 255)
+    one_by_one = [
+        expected(int(s), None if alpha is None else int(a), mode, negate, low, high)
+        for s, a in zip(SHADES.ravel(), ALPHAS.ravel(), strict=True)
+    ]
+    assert found.ravel().tolist() == one_by_one
+
+
+def cells_of(folder, image, **keys):
+    return load_world(str(write_yaml(folder, image=image, **keys))).grid.values
+
+
+def test_what_map_saver_writes_is_read_whatever_its_thresholds(tmp_path):
+    values = values_of("#?. ..# ?.#")
+    for low in (0.25, 0.196):
+        world = load_world(str(write_map(tmp_path, values, free_thresh=low, origin=[-1, 2.5, 0], resolution=0.1)))
+        assert np.array_equal(world.grid.values, values)
+        assert world.name == "map"
+        assert world.bounds == pytest.approx((-1, 2.5, -0.7, 2.8))
+    # In an image that map_saver did not write, 205 is a grey like others.
+    Image.fromarray(np.array([[0, 205, 254, 250]], np.uint8)).save(tmp_path / "own.png")
+    assert cells_of(tmp_path, "own.png", free_thresh=0.25).tolist() == [[OCCUPIED, FREE, FREE, FREE]]
+
+
+def test_what_is_between_free_and_occupied(tmp_path):
+    Image.fromarray(np.array([[0, 100, 150, 255]], np.uint8)).save(tmp_path / "m.png")
+    assert cells_of(tmp_path, "m.png", mode="scale").tolist() == [[OCCUPIED, UNKNOWN, UNKNOWN, FREE]]
+    assert cells_of(tmp_path, "m.png", mode="Trinary", negate=1).tolist() == [[FREE, UNKNOWN, UNKNOWN, OCCUPIED]]
+    Image.fromarray(np.array([[0, 10, 50, 66, 100, 101]], np.uint8)).save(tmp_path / "m.png")
+    raw = cells_of(tmp_path, "m.png", mode="raw").tolist()
+    assert raw == [[FREE, FREE, UNKNOWN, OCCUPIED, OCCUPIED, UNKNOWN]]
+
+
+KINDS = [
+    "P2",
+    "P2 of 16 bits",
+    "P5 of 16 bits",
+    "L.png",
+    "1.png",
+    "RGB.png",
+    "RGBA.png",
+    "LA.png",
+    "P.png",
+    "16.png",
+    "L.bmp",
+]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_images_of_every_kind_say_the_same(tmp_path, kind):
+    dark = np.array([[0, 255, 255], [0, 0, 255]], np.uint8)
+    path = tmp_path / f"map.{kind.split('.')[-1] if '.' in kind else 'pgm'}"
+    if kind.startswith("P2"):
+        most = 65535 if "16" in kind else 255
+        path.write_text(
+            f"P2\n# made by hand\n3 2\n{most}\n" + " ".join(str(v * most // 255) for v in dark.ravel().tolist())
+        )
+    elif kind.startswith("P5"):
+        path.write_bytes(b"P5 3 2 65535\n" + (dark.astype(">u2") * 257).tobytes())
+    elif kind.startswith("16"):
+        Image.fromarray(dark.astype(np.uint16) * 257).save(path)
+    else:
+        Image.fromarray(dark).convert(kind.split(".")[0]).save(path)
+    assert cells_of(tmp_path, path.name).tolist() == [[OCCUPIED, OCCUPIED, FREE], [OCCUPIED, FREE, FREE]]
+
+
+def test_keys_left_out_are_map_savers_defaults_and_presages_own_are_taken(tmp_path):
+    Image.fromarray(np.full((40, 40), 254, np.uint8)).save(tmp_path / "hall.png")
+    path = tmp_path / "the hall.yaml"
+    plain = {"image": "hall.png", "resolution": 0.1, "origin": [0, 0, 0.5], "somebody": "else's"}
+    path.write_text(yaml.safe_dump(plain))
+    assert load_world(str(path)).name == "the-hall"
+    own = {"name": "hall", "start": {"x": -0.5, "y": 2.0}, "obstacles": [{"circle": {"center": [0, 1], "radius": 0.3}}]}
+    path.write_text(yaml.safe_dump(plain | own))
+    hall = load_world(str(path))
+    assert (hall.name, hall.start_pose(0.3).tolist()[:2], len(hall.circles)) == ("hall", [-0.5, 2.0], 1)
+
+
+@pytest.mark.parametrize(
+    ("keys", "why"),
+    [
+        ({"image": "none.pgm"}, "none.pgm: no such file"),
+        ({"image": "map.yaml"}, "no image"),
+        ({"image": "cut.png"}, "cut.png: cannot be read"),
+        ({"image": ""}, "image: .*at least 1 character"),
+        ({"mode": "quaternary"}, "mode: .*'trinary', 'scale' or 'raw'"),
+        ({"origin": [0, 0]}, "origin.2: Field required"),
+        ({"origin": [0, float("nan"), 0]}, "origin.1: .*finite"),
+        ({"resolution": 0}, "resolution: .*greater than 0"),
+        ({"resolution": float("inf")}, "resolution: "),
+        ({"resolution": "five"}, "resolution: .*valid number"),
+        ({"negate": "perhaps"}, "negate: "),
+        ({"free_thresh": 0.7}, "free_thresh 0.7 is not below occupied_thresh 0.65"),
+        ({"occupied_thresh": 1.2}, "occupied_thresh: .*less than or equal to 1"),
+        ({"image": "huge.png"}, "5000 x 4000 pixels are more than 16000000"),
+        ({"start": {"x": 1}}, "start.y: Field required"),
+    ],
+)
+def test_a_wrong_map_says_what_is_wrong(tmp_path, keys, why):
+    path = write_map(tmp_path, values_of("#.? ..."))
+    Image.new("1", (5000, 4000)).save(tmp_path / "huge.png")
+    Image.fromarray(ALPHAS).save(tmp_path / "cut.png")
+    whole = (tmp_path / "cut.png").read_bytes()
+    (tmp_path / "cut.png").write_bytes(whole[: len(whole) // 2])
+    path = write_yaml(tmp_path, **({"image": "map.pgm"} | keys))
+    with pytest.raises(UserError, match=why):
+        load_world(str(path))
+
+
+def test_the_image_itself_is_no_world(tmp_path):
+    write_map(tmp_path, values_of("#.? ..."))
+    with pytest.raises(UserError, match=r"map.pgm: an image: give the map.yaml that names it, such as .*map.yaml"):
+        load_world(str(tmp_path / "map.pgm"))
+    with pytest.raises(UserError, match="image: Field required"):
+        load_world(str(write_yaml(tmp_path)))

@@ -1,0 +1,158 @@
+"""Worlds as data: exact rays against hand-computed ranges and shapely, free space, files and their errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.errors import UserError
+from common.geometry import se2
+from common.geometry.world import World, known_worlds, load_world, save_world
+from common.robot.base import Robot
+from common.robot.scanner import SCANNERS
+
+ROOM = World(
+    name="room",
+    boundary=[(0, 0), (8, 0), (8, 5), (4, 5), (4, 6), (0, 6)],
+    obstacles=[
+        {"name": "l", "polygon": [(1, 1), (3, 1), (3, 1.5), (1.5, 1.5), (1.5, 3), (1, 3)]},
+        {"name": "b", "box": {"center": (6, 2), "size": (1, 0.5), "yaw_deg": 30}},
+        {"name": "c", "circle": {"center": (3, 4.5), "radius": 0.6}},
+    ],
+)
+
+
+def test_known_ranges():
+    here = [[5.0, 4.0, 0.0]]
+    assert ROOM.ray_distances(here, [0, np.pi / 2, -np.pi / 2]) == pytest.approx(np.array([[3.0, 1.0, 4.0]]))
+    assert ROOM.ray_distances([[5.0, 4.5, np.pi]], [0.0])[0, 0] == pytest.approx(1.4)  # the circle
+    assert ROOM.ray_distances([[0.5, 2.0, 0.0]], [0.0])[0, 0] == pytest.approx(0.5)
+
+
+def test_outside_looking_away_nothing_is_hit():
+    assert np.isposinf(ROOM.ray_distances([[20.0, 3.0, 0.0]], [0.0])).all()
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_rays_agree_with_shapely(seed):
+    """Where a ray ends there is a surface, and before it there is none."""
+    rng = np.random.default_rng(seed)
+    (x, y), angle = ROOM.sample_free(1, rng, 0.01)[0], rng.uniform(-np.pi, np.pi)
+    distance = float(ROOM.ray_distances([[x, y, 0.0]], [angle])[0, 0])
+    end = shapely.Point(x + distance * np.cos(angle), y + distance * np.sin(angle))
+    assert shapely.distance(shapely.boundary(ROOM.free_space), end) < 1e-3  # the circle is many-sided in free space
+    short = 0.999 * distance - 1e-3
+    if short > 0:
+        line = shapely.LineString([(x, y), (x + short * np.cos(angle), y + short * np.sin(angle))])
+        assert ROOM.free_space.buffer(1e-3).contains(line)
+
+
+def test_many_poses_are_the_same_as_one_by_one():
+    rng = np.random.default_rng(0)
+    poses = np.column_stack([ROOM.sample_free(50, rng), rng.uniform(-3, 3, 50)])
+    angles = np.linspace(-2, 2, 811)
+    together = ROOM.ray_distances(poses, angles)
+    assert np.array_equal(together, np.concatenate([ROOM.ray_distances(pose, angles) for pose in poses]))
+    assert ROOM.ray_distances(np.zeros((0, 3)), angles).shape == (0, 811)
+
+
+def test_clearance_is_negative_where_nothing_can_be():
+    inside, wall, outside = ROOM.clearance([[5, 4], [3, 4.5], [7, 5.5]])
+    assert inside == pytest.approx(1.0)
+    assert wall == pytest.approx(-0.6, abs=1e-3)
+    assert outside < 0
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0, 0.4))
+def test_samples_are_free_and_seeded(seed, clearance):
+    points = ROOM.sample_free(20, np.random.default_rng(seed), clearance)
+    assert (ROOM.clearance(points) >= clearance).all()
+    assert np.array_equal(points, ROOM.sample_free(20, np.random.default_rng(seed), clearance))
+
+
+def test_no_room_is_said():
+    with pytest.raises(UserError, match="no place 4 m clear"):
+        ROOM.sample_free(1, np.random.default_rng(0), 4)
+
+
+def test_a_world_without_a_start_has_one_near_its_middle():
+    start = ROOM.start_pose(0.3)
+    assert ROOM.clearance(start[:2])[0] >= 0.3 - 1e-9
+    assert np.hypot(*(start[:2] - ROOM.center())) < 1
+
+
+@pytest.mark.parametrize("name", known_worlds())
+def test_shipped_worlds_are_one_room_for_the_robot(name):
+    world = load_world(name)
+    room = shapely.buffer(world.free_space, -(Robot().radius + Robot().margin))
+    assert room.geom_type == "Polygon"
+    assert room.contains(shapely.Point(world.start_pose(0)[:2]))
+    assert world.name == name
+    assert all(o.name for o in world.obstacles)
+    assert all(not o.shape().disjoint(shapely.Polygon(world.boundary)) for o in world.obstacles)
+
+
+def test_the_corridor_is_the_paper_s():
+    world = load_world("corridor")
+    assert world.bounds == (0, 0, 18, 4.5)
+    along = np.column_stack([np.linspace(0.5, 17.5, 100), np.full(100, 1.5)])
+    assert (world.clearance(along) > 0.45).all()  # the middle is free
+    assert all(o.shape().bounds[1] > 3 for o in world.obstacles)  # all along one wall
+
+
+def test_the_twins_look_alike_inside_and_their_corridor_tells():
+    """A scan from most of a room is the very scan of its twin; from the doorway on a fifth of the beams differ."""
+    world, scanner, twin = load_world("twins"), SCANNERS["tim571"].with_beams(271), np.array([6.0, 0, 0])
+
+    def differ(poses):
+        scans = [
+            world.ray_distances(se2.compose(each, scanner.mount), scanner.angles()) for each in (poses, poses + twin)
+        ]
+        return (np.abs(scans[0] - scans[1]) > 3 * scanner.sigma).mean(axis=1)
+
+    rng = np.random.default_rng(0)
+    places = world.sample_free(600, rng, Robot().radius)
+    places = places[(places[:, 0] < 5.8) & (places[:, 1] < 4.4)]
+    assert (differ(np.column_stack([places, rng.uniform(-np.pi, np.pi, len(places))])) == 0).mean() > 0.75
+    assert differ(np.array([[2.0, 2.2, yaw] for yaw in np.linspace(-3, 3, 7)])).max() == 0
+    assert differ(np.array([[2.95, y, np.pi / 2] for y in (4.5, 4.8, 5.4)])).min() > 0.2
+
+
+def test_what_is_saved_loads(tmp_path):
+    path = tmp_path / "w.yaml"
+    path.write_text(save_world(ROOM))
+    assert load_world(str(path)) == ROOM
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("name: [", "no YAML"),
+        ("name: x", "boundary: Field required"),
+        ("{name: x, boundary: [[0, 0], [1, 1]]}", "at least 3"),
+        ("{name: x, boundary: [[0, 0], [2, 2], [2, 0], [0, 2]]}", "not simple"),
+        ("{name: x, boundary: [[0, 0], [1, 0], [.nan, 1]]}", "finite"),
+        ("{name: x, boundary: [[0, 0], [1, 0], [1, 1]], obstacles: [{}]}", "exactly one of"),
+        ("{name: x, boundary: [[0, 0], [1, 0], [1, 1]], walls: 3}", "walls"),
+        ("{name: ../x, boundary: [[0, 0], [1, 0], [1, 1]]}", "name"),
+        ("3", "file"),
+        ("{name: x, since: 2020-13-45}", "month"),
+        ("[" * 20_000, "recursion"),
+    ],
+)
+def test_a_bad_file_is_one_line_that_says_where(tmp_path, text, why):
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(UserError) as error:
+        load_world(str(path))
+    assert why in str(error.value)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_an_unknown_world_names_those_there_are():
+    with pytest.raises(UserError, match="corridor, maze, office, twins"):
+        load_world("nowhere")

@@ -1,0 +1,97 @@
+"""The messages' own small methods, and schemas that agree with the bytes."""
+
+from __future__ import annotations
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from common.messages.definitions import Pose, Scan, Stamped, Twist
+from common.messages.topics import QUERIES, TOPICS
+from tests.common.samples import all_messages
+
+CLASSES = list(
+    dict.fromkeys([*(t.message for t in TOPICS), *(c for query in QUERIES for c in (query.request, query.reply))])
+)
+JSON_TYPES = {
+    bool: "boolean", int: "integer", float: "number", str: "string", bytes: "string", list: "array", dict: "object",
+    type(None): "null",
+}  # fmt: skip
+
+
+def allowed(schema: dict, root: dict) -> list[dict]:
+    """The alternatives of a schema, references followed."""
+    if "$ref" in schema:
+        return allowed(root["$defs"][schema["$ref"].rsplit("/", 1)[-1]], root)
+    if "anyOf" in schema:
+        return [a for option in schema["anyOf"] for a in allowed(option, root)]
+    return [schema]
+
+
+def check(value, schema: dict, root: dict, where: str) -> None:
+    """As much of JSON schema as messages use; a bin value is the string of ``contentEncoding: binary``."""
+    kind = JSON_TYPES[type(value)]
+    options = allowed(schema, root)
+    fitting = [o for o in options if o.get("type") in (kind, None) or (kind == "integer" and o.get("type") == "number")]
+    assert fitting, f"{where}: {kind} is none of {options}"
+    assert isinstance(value, bytes) == any(o.get("contentEncoding") == "binary" for o in fitting), where
+    schema = fitting[0]
+    if "enum" in schema:
+        assert value in schema["enum"], where
+    if kind == "object" and "properties" in schema:
+        assert value.keys() >= set(schema.get("required", ())), where
+        assert value.keys() <= schema["properties"].keys(), f"{where}: fields the schema does not know"
+        for name, part in value.items():
+            check(part, schema["properties"][name], root, f"{where}.{name}")
+    if kind == "object" and isinstance(schema.get("additionalProperties"), dict):
+        for name, part in value.items():
+            check(part, schema["additionalProperties"], root, f"{where}.{name}")
+    if kind == "array" and "items" in schema:
+        for i, part in enumerate(value):
+            check(part, schema["items"], root, f"{where}[{i}]")
+
+
+@settings(max_examples=300)
+@given(all_messages())
+def test_what_goes_on_the_wire_is_what_the_schema_says(message):
+    schema = type(message).json_schema()
+    check(msgpack.unpackb(message.encode()), schema, schema, type(message).__name__)
+
+
+def test_the_check_above_can_fail():
+    schema = Scan.json_schema()
+    with pytest.raises(AssertionError, match="stamp_ns"):
+        check({"stamp_ns": "now"}, {**schema, "required": []}, schema, "Scan")
+    with pytest.raises(AssertionError):
+        check({}, schema, schema, "Scan")
+
+
+@pytest.mark.parametrize("cls", CLASSES, ids=lambda c: c.__name__)
+def test_a_schema_knows_every_field_and_how_to_read_its_arrays(cls):
+    schema = cls.json_schema()
+    assert schema["type"] == "object"
+    assert schema.get("properties", {}).keys() == cls.model_fields.keys()
+    for part in schema.get("properties", {}).values():
+        for option in allowed(part, schema):
+            if option.get("contentEncoding") == "binary":
+                assert option["x-dtype"] in ("<f4", "<f8", "u1")
+                assert option["x-shape"][0] == "N"
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda t: t.name)
+def test_a_topic_s_message_begins_with_stamp_and_sequence(topic):
+    assert issubclass(topic.message, Stamped)
+    assert list(topic.message.model_fields)[:2] == ["stamp_ns", "seq"]
+
+
+def test_poses_and_twists_are_arrays_and_back():
+    assert Pose.of([1, 2, 3]).array().tolist() == [1.0, 2.0, 3.0]
+    assert Twist(vx=1.0, wz=-1.0).array().tolist() == [1.0, 0.0, -1.0]
+    with pytest.raises(ValueError, match="finite"):
+        Pose.of([1, 2, np.nan])
+
+
+def test_beam_angles_follow_laserscan():
+    scan = Scan(stamp_ns=0, angle_min=-1.0, angle_increment=0.25, range_min=0.0, range_max=9.0, ranges=np.ones(5))
+    assert scan.angles().tolist() == [-1.0, -0.75, -0.5, -0.25, 0.0]

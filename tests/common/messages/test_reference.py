@@ -1,0 +1,35 @@
+"""The page of messages says what the source says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from common.messages.definitions import Belief, Scan
+from common.messages.reference import page
+from common.messages.topics import QUERIES, TOPICS
+
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "messages.md"
+
+
+def test_the_page_is_current():
+    assert PAGE.read_text(encoding="utf-8") == page(), "run: python -m common.messages.reference > docs/messages.md"
+
+
+def test_every_row_and_field_is_on_it_with_what_the_source_says():
+    text = page()
+    for row in (*TOPICS, *QUERIES):
+        assert f"| `{row.key('<robot>', '<service>')}` |" in text
+        assert row.about in text
+    for cls in (Scan, Belief):
+        section = text.split(f"### {cls.__name__}\n")[1].split("###")[0]
+        assert all(f"| `{name}` |" in section for name in cls.model_fields)
+    said = "(B,) m; +inf nothing within range_max, -inf too close (REP-117), 0 not measured"
+    assert f"| `ranges` | binary `<f4` (N,) | required | {said} |" in text
+    assert "the negative gradient of accuracy" in text  # a comment below its field
+
+
+def test_links_lead_somewhere():
+    text = page()
+    anchors = {line[4:].lower() for line in text.splitlines() if line.startswith("### ")}
+    linked = {part.split(")")[0] for part in text.split("](#")[1:]}
+    assert linked <= anchors

@@ -1,0 +1,58 @@
+"""The table of topics is consistent with itself."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.messages.topics import QUERIES, ROOT, TOPICS, alive_key, topic_of
+from common.runtime.config import ServiceSettings
+
+ROBOTS = st.from_regex(r"[A-Za-z0-9_.-]{1,64}", fullmatch=True)  # what the settings let through
+CHUNK = re.compile(r"[A-Za-z0-9_.-]+")
+
+
+def test_names_and_keys_are_unique():
+    rows = [*TOPICS, *QUERIES]
+    assert len({row.name for row in rows}) == len(rows)
+    assert len({row.key("robot", "simulator") for row in rows} | {alive_key("robot", "simulator")}) == len(rows) + 1
+
+
+@pytest.mark.parametrize("row", [*TOPICS, *QUERIES], ids=lambda row: row.name)
+def test_a_row_is_whole(row):
+    assert CHUNK.fullmatch(row.name)
+    assert row.name == row.name.lower()
+    assert row.about
+    assert not hasattr(row, "rate") or 0 <= row.rate <= 1000
+    assert row.key("r2", "x").split("/")[:3] == [ROOT, "r2", row.name]
+    assert ("*" in row.key("r2")) == row.per_service
+
+
+@given(ROBOTS, st.sampled_from(TOPICS))
+def test_topic_of_is_the_inverse_of_key(robot, topic):
+    key = topic.key(robot, "simulator")
+    assert all(CHUNK.fullmatch(chunk) for chunk in key.split("/"))
+    assert topic_of(key) is topic
+
+
+@given(ROBOTS, st.sampled_from(TOPICS))
+def test_keys_that_only_resemble_one_belong_to_nobody(robot, topic):
+    key = topic.key(robot, "simulator")
+    for other in (key + "/more", "other" + key, key.rsplit("/", 1)[0], key + "x", "/" + key, ""):
+        assert topic_of(other) in (None, *(t for t in TOPICS if t.per_service and other == key + "x"))
+
+
+def test_robot_names_are_those_a_key_can_hold():
+    pattern = next(m.pattern for m in ServiceSettings.model_fields["robot"].metadata if getattr(m, "pattern", None))
+    for bad in ("", "a/b", "*", "**", "a b", "@x", "$*", "x" * 65, "a#b", "a?b"):
+        assert not re.search(pattern, bad), bad
+    assert re.search(pattern, "pmb2-7.lab_A")
+
+
+def test_commands_and_goals_are_newest_only_and_health_is_not():
+    policy = {topic.name: topic.queue for topic in TOPICS}
+    assert policy["cmd_vel"] == policy["scan"] == policy["belief"] == "newest"
+    assert policy["health"] == "all"

@@ -1,0 +1,240 @@
+"""Bytes to messages and back, and whatever else may come."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import struct
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.messages import definitions as messages
+from common.messages.definitions import Belief, CmdVel, Odom, Pose, Prediction, Scan, Twist
+from common.messages.requests import SampleReply
+from common.messages.topics import QUERIES, TOPICS
+from common.messages.wire import DecodeError
+from tests.common.samples import all_messages, message_of
+
+CLASSES = [*(topic.message for topic in TOPICS), *(c for query in QUERIES for c in (query.request, query.reply))]
+CLASSES = list(dict.fromkeys(CLASSES))
+
+
+@pytest.mark.parametrize("cls", CLASSES, ids=lambda c: c.__name__)
+def test_any_message_survives_the_wire(cls):
+    @settings(max_examples=40)
+    @given(message_of(cls))
+    def check(message):
+        payload = message.encode()
+        again = cls.decode(payload)
+        assert again == message
+        assert again.encode() == payload
+        assert hash(again) == hash(message)
+
+    check()
+
+
+def a_scan(**changes) -> Scan:
+    fields = {"stamp_ns": 7, "angle_min": -1.0, "angle_increment": 0.5, "range_min": 0.05, "range_max": 25.0}
+    return Scan(**{**fields, "ranges": np.array([1.5, np.inf, -np.inf, 0.1], np.float32), **changes})
+
+
+def test_arrays_arrive_bit_for_bit_and_read_only():
+    ranges = np.array([1.1, np.inf, -np.inf, 1e-45, -0.0], np.float32)
+    got = Scan.decode(a_scan(ranges=ranges).encode()).ranges
+    assert got.dtype == np.dtype("<f4")
+    assert got.tobytes() == ranges.tobytes()
+    for held in (got, a_scan(ranges=ranges).ranges):
+        with pytest.raises(ValueError, match="read-only"):
+            held[0] = 2.0
+
+
+def test_a_message_does_not_change_with_the_array_it_was_made_from():
+    ranges = np.ones(3, np.float32)
+    scan = a_scan(ranges=ranges)
+    ranges[:] = 9.0
+    assert scan.ranges.tolist() == [1.0, 1.0, 1.0]
+
+
+def test_numbers_on_the_wire_are_little_endian():
+    packed = msgpack.unpackb(a_scan(ranges=[1.0, 2.0]).encode())["ranges"]
+    assert packed == struct.pack("<2f", 1.0, 2.0)
+
+
+def changed(message, **changes) -> bytes:
+    data = msgpack.unpackb(message.encode())
+    for name, value in changes.items():
+        if value is ...:
+            del data[name]
+        else:
+            data[name] = value
+    return msgpack.packb(data)
+
+
+ODOM = Odom(stamp_ns=1, pose=Pose(x=0.0, y=0.0), twist=Twist(), covariance=np.eye(3))
+BELIEF = Belief(
+    stamp_ns=1,
+    state="tracking",
+    pose=Pose(x=0.0, y=0.0),
+    xi=np.zeros(3),
+    covariance=np.eye(3),
+    free_energy=1.0,
+    accuracy=1.0,
+)
+COMMAND = CmdVel(stamp_ns=1, twist=Twist(vx=0.5))
+BAD = {
+    "a missing field": changed(COMMAND, twist=...),
+    "a missing stamp": changed(COMMAND, stamp_ns=...),
+    "a negative stamp": changed(COMMAND, stamp_ns=-1),
+    "a stamp that is a float": changed(COMMAND, stamp_ns=1.0),
+    "a stamp that is a bool": changed(COMMAND, stamp_ns=True),
+    "a stamp of 64 bits": changed(COMMAND, stamp_ns=2**64 - 1),
+    "NaN as velocity": changed(COMMAND, twist={"vx": math.nan, "vy": 0.0, "wz": 0.0}),
+    "infinity as velocity": changed(COMMAND, twist={"vx": math.inf, "vy": 0.0, "wz": 0.0}),
+    "text as velocity": changed(COMMAND, twist={"vx": "1", "vy": 0.0, "wz": 0.0}),
+    "None as velocity": changed(COMMAND, twist={"vx": None, "vy": 0.0, "wz": 0.0}),
+    "a list for a map": changed(COMMAND, twist=[0.0, 0.0, 0.0]),
+    "no map at all": msgpack.packb([1, 2, 3]),
+    "nil": msgpack.packb(None),
+    "keys that are numbers": msgpack.packb({1: 2}),
+    "two messages": COMMAND.encode() * 2,
+    "half a message": COMMAND.encode()[:-5],
+    "nothing": b"",
+    "text that is no UTF-8": msgpack.packb({"stamp_ns": 1}) + b"\xa3\xff\xff\xff",
+    "broken UTF-8 in a name": b"\x81\xa3\xff\xfe\xfd\x01",
+    "deep nesting": b"\x91" * 100_000 + b"\xc0",
+    "a deep map": b"\x81\xa1a" * 100_000 + b"\xc0",
+    "four gigabytes announced": b"\xc6\xff\xff\xff\xff",
+    "four billion elements announced": b"\xdd\xff\xff\xff\xff",
+    "four billion entries announced": b"\xdf\xff\xff\xff\xff",
+    "an extension type": b"\xc7\x04\x05abcd",
+    "a time stamp": b"\xd6\xff\x00\x00\x00\x00",
+    "an impossible time stamp": b"\xc7\x0c\xff" + b"\xff" * 12,
+    "a reserved byte": b"\xc1",
+}
+BAD_ARRAYS = {
+    "bytes that are no whole number": (Scan, changed(a_scan(), ranges=b"12345")),
+    "NaN in a scan": (Scan, changed(a_scan(), ranges=np.float32([1, np.nan]).tobytes())),
+    "a list for an array": (Scan, changed(a_scan(), ranges=[1.0, 2.0])),
+    "text for an array": (Scan, changed(a_scan(), ranges="1234")),
+    "infinity in a covariance": (Odom, changed(ODOM, covariance=np.full((3, 3), np.inf).tobytes())),
+    "rows of the wrong length": (Odom, changed(ODOM, covariance=np.zeros(4).tobytes())),
+    "a gradient of four": (Belief, changed(BELIEF, xi=np.zeros(4, np.float32).tobytes())),
+    "a covariance of two rows": (Belief, changed(BELIEF, covariance=np.zeros((2, 3)).tobytes())),
+    "an unknown state": (Belief, changed(BELIEF, state="asleep")),
+    "a range_max of nought": (Scan, changed(a_scan(), range_max=0.0)),
+    "a negative range_min": (Scan, changed(a_scan(), range_min=-0.1)),
+    "a name without end": (Scan, changed(a_scan(), frame_id="x" * 201)),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+@pytest.mark.parametrize("cls", CLASSES, ids=lambda c: c.__name__)
+def test_nothing_but_a_decode_error_comes_out(cls, what):
+    said = ""
+    try:
+        cls.decode(BAD[what])
+    except DecodeError as error:
+        said = str(error)
+    assert not said or (cls.__name__ in said and "\n" not in said)
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_a_bad_command_is_refused(what):
+    with pytest.raises(DecodeError):
+        CmdVel.decode(BAD[what])
+
+
+@pytest.mark.parametrize("what", BAD_ARRAYS)
+def test_bad_arrays_and_values_are_refused(what):
+    cls, payload = BAD_ARRAYS[what]
+    with pytest.raises(DecodeError):
+        cls.decode(payload)
+
+
+def test_the_error_names_the_field():
+    with pytest.raises(DecodeError, match=r"CmdVel\.twist\.vx: .*finite"):
+        CmdVel.decode(BAD["NaN as velocity"])
+    with pytest.raises(DecodeError, match=r"Scan\.ranges: .*1 values are NaN"):
+        Scan.decode(BAD_ARRAYS["NaN in a scan"][1])
+
+
+def test_a_field_from_the_future_is_ignored_and_one_from_the_past_has_its_default():
+    assert CmdVel.decode(changed(COMMAND, colour="red")) == COMMAND
+    assert Scan.decode(changed(a_scan(), scan_time=..., mount=..., seq=...)) == a_scan()
+
+
+@settings(max_examples=2000)
+@given(st.sampled_from(CLASSES), st.binary(max_size=200))
+def test_random_bytes(cls, payload):
+    with contextlib.suppress(DecodeError):
+        cls.decode(payload)
+
+
+values = st.recursive(
+    st.one_of(
+        st.none(),
+        st.booleans(),
+        st.integers(-(2**63), 2**64 - 1),
+        st.floats(),
+        st.text(max_size=5),
+        st.binary(max_size=30),
+    ),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=5,
+)
+
+
+@settings(max_examples=800)
+@given(all_messages(), st.data())
+def test_any_one_field_replaced_by_anything(message, data):
+    fields = msgpack.unpackb(message.encode())
+    if fields:
+        fields[data.draw(st.sampled_from(sorted(fields)))] = data.draw(values)
+    try:
+        again = type(message).decode(msgpack.packb(fields))
+    except DecodeError:
+        return
+    type(message).decode(again.encode())  # what was accepted is a whole message
+
+
+@settings(max_examples=800)
+@given(all_messages(), st.data())
+def test_cut_or_flipped_bytes(message, data):
+    payload = bytearray(message.encode())
+    at = data.draw(st.integers(0, len(payload) - 1))
+    if data.draw(st.booleans()):
+        with pytest.raises(DecodeError):
+            type(message).decode(bytes(payload[:at]))
+    else:
+        payload[at] ^= 1 << data.draw(st.integers(0, 7))
+        with contextlib.suppress(DecodeError):
+            type(message).decode(bytes(payload))
+
+
+def test_equality_is_that_of_the_bytes_and_of_the_class():
+    assert a_scan() == a_scan()
+    assert a_scan() != a_scan(seq=1)
+    assert Pose(x=0.0, y=0.0) != Twist()
+    assert len({a_scan(), a_scan(), a_scan(seq=1)}) == 2
+
+
+def test_messages_are_frozen():
+    with pytest.raises(ValueError, match="frozen"):
+        COMMAND.seq = 3
+
+
+def test_empty_arrays_are_messages_too():
+    reply = SampleReply(ok=False, reason="no")
+    assert SampleReply.decode(reply.encode()).ranges.shape == (0,)
+    assert Prediction.decode(
+        Prediction(stamp_ns=0, angle_min=0.0, angle_increment=0.1, ranges=np.zeros(0)).encode()
+    ).sigma.shape == (0,)
+
+
+def test_every_message_class_is_tested_here():
+    stamped = {c for c in vars(messages).values() if isinstance(c, type) and issubclass(c, messages.Stamped)}
+    assert stamped - {messages.Stamped} == {topic.message for topic in TOPICS}

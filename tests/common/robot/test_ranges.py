@@ -1,0 +1,51 @@
+"""The one rule for what a scanner's numbers say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from common.robot.ranges import about_place, as_scan, surfaces
+
+NUMBERS = st.one_of(
+    st.floats(width=32), st.sampled_from([0.0, -0.0, -1.0, np.nan, np.inf, -np.inf, 0.1, 8.3, 1e-30, 65.533])
+)
+RANGES = arrays(np.float32, st.integers(0, 20), elements=NUMBERS)
+LIMITS = st.tuples(st.floats(0, 1, width=32), st.floats(1.5, 100, width=32))
+
+
+@given(RANGES, LIMITS)
+def test_each_number_says_one_of_four_things(ranges, limits):
+    least, most = limits
+    scan = as_scan(ranges, least, most)
+    assert scan.dtype == ranges.dtype
+    for said, found in zip(ranges.tolist(), scan.tolist(), strict=True):
+        if np.isnan(said) or -np.inf < said <= 0:
+            assert found == 0
+        elif said >= most:
+            assert found == np.inf
+        elif said < least:
+            assert found == -np.inf
+        else:
+            assert found == said
+    np.testing.assert_array_equal(as_scan(scan, least, most), scan)  # a scan is one already
+
+
+@given(RANGES, LIMITS)
+def test_what_is_read_from_a_scan(ranges, limits):
+    scan = as_scan(ranges, *limits)
+    hit, place = surfaces(scan), about_place(scan)
+    assert ((scan[hit] >= limits[0]) & (scan[hit] < limits[1])).all()
+    assert not np.isfinite(place[~hit]).any()
+    np.testing.assert_array_equal(place[hit], scan[hit])
+    np.testing.assert_array_equal(place == np.inf, scan == np.inf)  # nothing within range_max says something
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_longest_range_is_the_same_number_in_either_precision(dtype):
+    for most in (0.7, 8.1, 8.3, 25.0):
+        row = np.array([np.float32(most), most, most * 0.999], dtype)
+        assert np.isposinf(as_scan(row, 0.0, most)).tolist() == [True, True, False]

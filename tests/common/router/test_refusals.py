@@ -1,0 +1,79 @@
+"""What zenoh's log says of refusals; the lines are zenoh 1.10's own."""
+
+from __future__ import annotations
+
+from common.router.refusals import Reader, Refusal
+
+AT = "2026-01-01T00:00:00.000000Z"
+ACCESS = "zenoh::net::routing::interceptor::access_control"
+SHOWN = (
+    f"{AT} DEBUG acc-0 ThreadId(05) zenoh_link_tls::unicast: Accepted TLS connection on 10.0.0.1:7447: "
+    "10.0.0.2:50998. Common Name: observer."
+)
+LET_IN = (
+    f"{AT} DEBUG acc-0 ThreadId(05) zenoh_transport::unicast::establishment::accept: New transport link accepted from "
+    "9e87 to 607b: TransportLinkUnicast { link: Link { src: tls/10.0.0.1:7447, dst: tls/10.0.0.2:50998, mtu: 1 } }"
+)
+
+
+def denied(what, key, zid="9e87", how="Using cached result: ", flow="ingress"):
+    return f"{AT} TRACE  rx-1 ThreadId(09) {ACCESS}: {how}{zid} is unauthorized to {what} ({flow}) on {key}"
+
+
+def read(*lines):
+    reader = Reader()
+    return [found for line in lines if (found := reader.read(line)) is not None]
+
+
+def test_a_message_is_named_with_the_certificate_it_came_under():
+    assert read(SHOWN, LET_IN, denied("Put", "presage/r/cmd_vel")) == [Refusal("put", "observer", "presage/r/cmd_vel")]
+    assert read(denied("Put", "presage/r/cmd_vel")) == [Refusal("put", "", "presage/r/cmd_vel")]
+
+
+def test_working_out_rights_is_no_refusal_but_what_comes_after_is():
+    planned = [f"{AT} TRACE  rx-1 ThreadId(09) {ACCESS}: ACL (ingress): caching permissions for `presage/r/goal` ..."]
+    subject = "9e87 on Interface(lo)+CertCommonName(observer)+Username(observer)"
+    planned += [denied(f"Kind{what}", "presage/r/goal", subject, how="") for what in range(9)]
+    asked = denied("Query", "presage/r/teleport", subject, how="")
+    assert read(SHOWN, LET_IN, *planned, asked) == [Refusal("query", "observer", "presage/r/teleport")]
+
+
+def test_what_we_do_not_send_on_is_nobody_s_attempt():
+    assert read(denied("Put", "presage/r/goal", flow="egress")) == []
+    assert read(denied("Put", "presage/r/goal").replace("unauthorized", "authorized")) == []
+
+
+def test_colours_are_no_hindrance():
+    coloured = denied("Put", "presage/r/goal").replace("TRACE", "\x1b[35mTRACE\x1b[0m")
+    assert read(coloured) == [Refusal("put", "", "presage/r/goal")]
+
+
+def test_handshakes():
+    accept = f"{AT} DEBUG acc-0 ThreadId(05) zenoh_transport::unicast::establishment::accept: "
+    tls = f"{AT}  WARN acc-1 ThreadId(07) zenoh_link_tls::unicast: "
+    assert read(
+        SHOWN, accept + "UsrPwd extension - Recv OpenSyn. Invalid password. at /src/x.rs:1.",
+        accept + "UsrPwd extension - Recv InitSyn. Expected extension. at /src/x.rs:1.",
+        tls + "invalid peer certificate: BadSignature. Hint: increase the system open file limit.",
+        tls + "peer sent no certificates. Hint: increase the system open file limit.",
+        tls + "received corrupt message of type InvalidContentType. Hint: increase the system open file limit.",
+        tls + "Timeout during TLS handshake. Hint: increase the system open file limit.",
+        tls + "tls handshake eof. Hint: increase the system open file limit.",
+    ) == [
+        Refusal("wrong password", "observer"), Refusal("no password", "observer"),
+        Refusal("certificate of another authority, or expired"), Refusal("no certificate"), Refusal("no TLS"),
+        Refusal("no TLS handshake in time"),
+    ]  # fmt: skip
+
+
+def test_what_else_zenoh_complains_of_is_passed_on():
+    line = f"{AT} ERROR rx-0 ThreadId(12) zenoh::something: went wrong"
+    assert read(line) == [line]
+    assert read("") == []
+
+
+def test_strangers_do_not_fill_memory():
+    reader = Reader()
+    for number in range(5000):
+        reader.read(SHOWN.replace("10.0.0.2:50998", f"10.0.0.2:{number}"))
+    assert len(reader._names) <= 1000

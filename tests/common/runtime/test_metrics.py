@@ -1,0 +1,210 @@
+"""The Prometheus endpoint: of real processes, scraped as Prometheus does, and of a loop that serves several robots."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+from prometheus_client.exposition import generate_latest
+from prometheus_client.parser import text_string_to_metric_families
+
+from common.bus.bus import Link, open_bus, wait_until
+from common.bus.inbox import Inbox, Sample
+from common.errors import UserError
+from common.messages.definitions import Belief, Health, Pose, Scan, Status, TopicHealth
+from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, SCAN, STATUS
+from common.runtime.metrics import ROWS, ServiceMetrics, table
+from common.runtime.metrics_server import split_address
+from tests.conftest import PATIENCE, ROOT
+
+SMALL = Path(__file__).parents[1] / "small_service.py"
+SAMPLES = {row.sample: row for row in ROWS}
+
+
+def read(text: str) -> dict[tuple[str, frozenset], float]:
+    """Value by sample and labels; the text must be what the table says it is."""
+    found = {}
+    for metric in text_string_to_metric_families(text):
+        if metric.name.startswith(("process_", "python_")):
+            continue
+        for sample in metric.samples:
+            row = SAMPLES.get(sample.name) or next(r for r in ROWS if r.kind == "histogram" and r.name == metric.name)
+            assert metric.documentation == row.about
+            assert set(sample.labels) - {"le"} == set(row.labels), sample
+            found[sample.name, frozenset(sample.labels.items())] = sample.value
+    return found
+
+
+def value(found, name: str, **labels) -> float | None:
+    """Of the one sample with these labels among its own."""
+    fits = [number for (n, own), number in found.items() if n == name and labels.items() <= dict(own).items()]
+    assert len(fits) <= 1
+    return fits[0] if fits else None
+
+
+def address_of(running) -> str:
+    running.wait_for("/metrics")
+    return "http://" + running.output.split("http://", 1)[1].split()[0].strip("\x1b[0m'\"")
+
+
+def scrape(address: str) -> str:
+    with urllib.request.urlopen(address, timeout=10) as answer:
+        return answer.read().decode()
+
+
+def scan(stamp: int) -> bytes:
+    ranges = np.ones(5)
+    return Scan(stamp_ns=stamp, angle_min=0, angle_increment=0.1, range_min=0, range_max=9, ranges=ranges).encode()
+
+
+def test_a_service_s_numbers_are_those_of_what_happened(bus, process):
+    running = process(SMALL, "--metrics", "0")
+    address = address_of(running)
+    assert address.startswith("http://127.0.0.1:")
+    assert wait_until(lambda: "small" in bus.alive(), PATIENCE), running.output
+    commands = Inbox()
+    bus.subscribe(CMD_VEL, commands, keep_all=True)
+    assert bus.wait_matching(SCAN, PATIENCE)
+    assert bus.wait_matching(HEALTH, PATIENCE, key=HEALTH.key(bus.robot, "intruder"))
+    for number in range(5):
+        bus.put(SCAN, scan(number))
+        assert wait_until(lambda n=number: commands.received.total() == n + 1, PATIENCE)
+    bus.put(HEALTH, b"\xc1", key=HEALTH.key(bus.robot, "intruder"))
+    found = {}
+
+    def settled() -> bool:
+        found.update(read(scrape(address)))
+        bad = value(found, "presage_messages_undecodable_total", topic="health/intruder")
+        rate = value(found, "presage_message_rate_hertz", topic="health/small")
+        return bad == 1 and bool(rate)
+
+    assert wait_until(settled, PATIENCE), found
+    whose = {"robot": bus.robot, "service": "small"}
+    assert value(found, "presage_messages_received_total", **whose, topic="scan") == 5
+    assert value(found, "presage_messages_published_total", **whose, topic="cmd_vel") == 5
+    assert value(found, "presage_messages_dropped_total", **whose, topic="scan") == 0
+    assert value(found, "presage_step_duration_seconds_count", **whose, topic="scan") == 5
+    assert value(found, "presage_message_latency_seconds_count", **whose, topic="scan") == 5
+    assert value(found, "presage_message_latency_seconds_bucket", topic="scan", le="+Inf") == 5
+    assert value(found, "presage_events_total", **whose, event="scans") == 5
+    assert value(found, "presage_steps_failed_total", **whose) == 0
+    assert value(found, "presage_build_info", **whose) == 1
+    assert value(found, "presage_uptime_seconds", **whose) > 0
+    assert "process_cpu_seconds_total" in scrape(address)
+    assert running.stop()[0] == 0
+    assert "Traceback" not in running.output
+
+
+def test_without_being_asked_the_client_is_not_even_loaded():
+    program = "import sys, common.runtime.service, common.router; print('prometheus_client' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_a_taken_port_is_one_line(process):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        running = process(SMALL, env={"PRESAGE_METRICS": str(taken.getsockname()[1])})
+        assert running.wait() == 2
+    (line,) = running.output.splitlines()
+    assert line.startswith("small: --metrics")
+    assert "choose another port" in line
+
+
+def test_the_router_has_some_too(processes, free_port):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    running = processes.start("common.router", "--listen", endpoint, "--metrics", "127.0.0.1:0")
+    address = address_of(running)
+    with open_bus(Link(connect=(endpoint,))) as bus:
+        assert wait_until(bus.linked, PATIENCE)
+        assert wait_until(lambda: value(read(scrape(address)), "presage_router_sessions") == 1, PATIENCE)
+    assert value(read(scrape(address)), "presage_build_info", service="router") == 1
+    assert running.stop()[0] == 0
+
+
+@pytest.fixture
+def metrics():
+    counts = {"published": {}, "undecodable": {}, "failed": 0, "events": {}, "began": time.monotonic()}
+    made = ServiceMetrics("robot", "estimator", Inbox(), lambda: counts)
+    made.told = counts
+    return made
+
+
+def belief(state: str, energy: float) -> Belief:
+    pose = Pose(x=0.0, y=0.0)
+    return Belief(stamp_ns=0, state=state, pose=pose, xi=np.zeros(3), free_energy=energy, accuracy=0.0)
+
+
+def numbers(metrics) -> dict:
+    return read(generate_latest(metrics.registry).decode())
+
+
+def test_several_robots_of_one_process_are_told_apart(metrics):
+    for robot, state, energy in (("one", "tracking", 5.5), ("two", "lost", -2.0)):
+        metrics.published(BELIEF.key(robot), belief(state, energy))
+        metrics.told["published"][BELIEF.key(robot)] = 7
+        with metrics.step(Sample(SCAN, SCAN.key(robot), b"", time.time_ns(), 0)):
+            pass
+    found = numbers(metrics)
+    assert value(found, "presage_free_energy_nats", robot="one") == 5.5
+    assert value(found, "presage_free_energy_nats", robot="two") == -2.0
+    assert value(found, "presage_estimator_state", robot="one", state="tracking") == 1
+    assert value(found, "presage_estimator_state", robot="two", state="tracking") == 0
+    assert value(found, "presage_estimator_state", robot="two", state="lost") == 1
+    assert value(found, "presage_messages_published_total", robot="two", topic="belief") == 7
+    assert value(found, "presage_step_duration_seconds_count", robot="two", topic="scan") == 1
+
+
+def test_a_controller_s_state_and_a_recorder_s_counters(metrics):
+    metrics.published(STATUS.key("robot"), Status(stamp_ns=0, state="blocked"))
+    metrics.service = "recorder"
+    rows = [TopicHealth(key=SCAN.key("robot"), written=9, missing=2, rate=15.0)]
+    metrics.published(HEALTH.key("robot", "recorder"), Health(stamp_ns=0, service="recorder", uptime=1, topics=rows))
+    metrics.told["events"] |= {"written": 9, "written_bytes": 900}
+    found = numbers(metrics)
+    assert value(found, "presage_controller_state", state="blocked") == 1
+    assert value(found, "presage_controller_state", state="navigating") == 0
+    assert value(found, "presage_recorder_messages_written_total", topic="scan") == 9
+    assert value(found, "presage_recorder_messages_missing_total", topic="scan") == 2
+    assert value(found, "presage_recorder_written_bytes_total") == 900
+    assert value(found, "presage_message_rate_hertz", topic="scan") == 15
+    assert value(found, "presage_events_total", event="written_bytes") is None
+
+
+def test_a_failing_step_is_timed_and_keys_that_are_none_of_ours_are_nobody_s(metrics):
+    with pytest.raises(ValueError, match="bug"), metrics.step(Sample(GOAL, "odd", b"", 0, 0)):
+        raise ValueError("bug")
+    found = numbers(metrics)
+    assert value(found, "presage_step_duration_seconds_count", robot="", topic="odd") == 1
+    assert value(found, "presage_message_latency_seconds_count", topic="odd") == 0  # nobody said when it was sent
+
+
+def test_a_clock_that_is_ahead_makes_no_negative_latency(metrics):
+    with metrics.step(Sample(SCAN, SCAN.key("robot"), b"", time.time_ns() + 10**10, 0)):
+        pass
+    assert value(numbers(metrics), "presage_message_latency_seconds_sum", topic="scan") == 0
+
+
+@pytest.mark.parametrize(
+    ("setting", "address"),
+    [("9100", ("127.0.0.1", 9100)), ("0.0.0.0:0", ("0.0.0.0", 0)), ("[::1]:9", ("::1", 9)), ("box:80", ("box", 80))],
+)
+def test_an_address_is_a_port_or_a_host_and_a_port(setting, address):
+    assert split_address(setting) == address
+
+
+@pytest.mark.parametrize("setting", ["70000", "box", "", "-1"])
+def test_what_is_no_address_is_said(setting):
+    with pytest.raises(UserError, match="PORT or HOST:PORT"):
+        split_address(setting)
+
+
+def test_the_table_of_the_docs_is_the_code_s():
+    assert table() in (ROOT / "docs" / "operations.md").read_text(), "python -m common.runtime.metrics prints it"

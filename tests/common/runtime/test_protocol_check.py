@@ -1,0 +1,171 @@
+"""Services of another protocol or version meet: real processes, whichever comes first."""
+
+from __future__ import annotations
+
+import platform
+import signal
+import threading
+from pathlib import Path
+
+import pytest
+
+from common.bus.bus import open_bus, wait_until
+from common.bus.inbox import Answer, Call, Inbox
+from common.errors import UserError
+from common.log import logger
+from common.messages.definitions import Health
+from common.messages.requests import ConfigReply, Request
+from common.messages.topics import CONFIG, HEALTH
+from common.runtime.protocol_check import TOGETHER, Compatibility, came_later, difference, fits, this_service
+from common.versions import PROTOCOL
+from tests.conftest import PATIENCE, next_of
+
+SMALL = Path(__file__).parents[1] / "small_service.py"
+FOREIGN = Path(__file__).parents[1] / "foreign_service.py"
+OTHER = PROTOCOL + 1
+
+
+def said(name="x", protocol=PROTOCOL, uptime=0.0, **versions) -> ConfigReply:
+    return ConfigReply(service=name, protocol=protocol, uptime=uptime, versions=versions)
+
+
+def started_long_ago(small, bus):
+    """Nobody doubts that who comes now came later."""
+    assert wait_until(lambda: "small" in bus.alive(), PATIENCE), small.output
+    pulses = Inbox()
+    bus.subscribe(HEALTH, pulses, keep_all=True)
+    next_of(pulses, Health, lambda h: h.uptime > 1.5 * TOGETHER)
+
+
+def test_a_newcomer_of_another_protocol_ends_and_says_why_in_one_line(process, bus):
+    small = process(SMALL)
+    started_long_ago(small, bus)
+    foreign = process(FOREIGN, env={"FOREIGN_PROTOCOL": str(OTHER), "FOREIGN_PRESAGE": "9.9"})
+    assert foreign.wait() == 2
+    host = platform.node()
+    *ready, line = foreign.output.splitlines()  # it starts where nobody answers in time, on a busy machine
+    assert all("ready" in each for each in ready)
+    assert line.startswith(f"foreign: protocol {OTHER} here (presage 9.9 on {host}), protocol {PROTOCOL} in the small")
+    assert line.endswith(
+        f"on {host}): they would misread each other's messages; install the same version of presage on both"
+    )
+    assert "foreign" not in bus.alive()
+    assert small.running
+    assert small.stop()[0] == 0
+    assert "misread" not in small.output
+
+
+class LateBus:
+    """Linked, but the first questions find nobody to ask: the session does not know yet who is there."""
+
+    def __init__(self, found_nobody, other):
+        self.found_nobody, self.other = found_nobody, other
+
+    def linked(self):
+        return True
+
+    def ask_each(self, query, _request, inbox, _timeout):
+        if self.found_nobody:
+            self.found_nobody -= 1
+        else:
+            inbox.put(Answer(query, 0, self.other.encode()))
+        done = threading.Event()
+        done.set()
+        return done
+
+
+def test_a_newcomer_does_not_start_though_it_does_not_know_at_once_who_is_there():
+    bus = LateBus(2, said("small", OTHER))
+    with pytest.raises(UserError, match=f"protocol {OTHER} in the small"):
+        Compatibility(bus, "foreign", logger("foreign")).at_start(said("foreign"))
+
+
+def test_who_comes_while_the_other_is_too_busy_to_answer_ends_once_it_does(process, bus):
+    small = process(SMALL)
+    started_long_ago(small, bus)
+    small.send(signal.SIGSTOP)  # it answers nobody
+    foreign = process(FOREIGN, env={"FOREIGN_PROTOCOL": str(OTHER)})
+    foreign.wait_for("ready")
+    small.send(signal.SIGCONT)
+    assert foreign.wait() == 2
+    assert f"protocol {PROTOCOL} in the small" in foreign.output.splitlines()[-1]
+    assert small.running
+
+
+def test_who_is_there_names_a_newcomer_that_does_not_look_and_goes_on(process, bus, link):
+    small = process(SMALL)
+    assert wait_until(lambda: "small" in bus.alive(), PATIENCE), small.output
+    calls = Inbox()
+    with open_bus(link) as newcomer:
+        newcomer.serve(CONFIG, calls, "careless")
+        newcomer.declare_alive("careless")
+        call = calls.get(PATIENCE)
+        assert isinstance(call, Call)
+        call.reply(said("careless", OTHER).encode())
+        small.wait_for(f"protocol {OTHER} in the careless")
+    assert small.stop()[0] == 0
+    assert small.output.count("careless") == 1
+
+
+def test_another_version_is_one_warning(process, bus):
+    foreign = process(FOREIGN, env={"FOREIGN_PRESAGE": "9.9"})
+    assert wait_until(lambda: "foreign" in bus.alive(), PATIENCE), foreign.output
+    small = process(SMALL)
+    small.wait_for("other versions in the foreign")
+    small.wait_for("ready")
+    inbox = Inbox()
+    assert bus.ask_each(CONFIG, Request(), inbox).wait(PATIENCE)  # both have turned since
+    replies = {answer.reply().service: answer.reply() for answer in iter(lambda: inbox.get(0), None)}
+    assert replies["foreign"].versions["presage"] == "9.9"
+    assert replies["small"].protocol == PROTOCOL
+    assert 0 < replies["small"].uptime < replies["foreign"].uptime
+    assert small.stop()[0] == foreign.stop()[0] == 0
+    assert small.output.count("other versions") == 1
+    assert "presage 9.9 there" not in foreign.output
+
+
+def test_of_two_that_do_not_fit_exactly_one_came_later():
+    for apart in (0.0, TOGETHER / 2, -TOGETHER / 2, 2 * TOGETHER, -2 * TOGETHER):
+        one, two = said(protocol=1, uptime=10.0), said(protocol=2, uptime=10.0 + apart)
+        assert came_later(one, two) != came_later(two, one)
+    assert came_later(said(protocol=2, uptime=1.0), said(protocol=1, uptime=10.0))
+
+
+def test_who_does_not_say_its_protocol_is_no_stranger():
+    assert fits(said(), said(protocol=0))
+    assert not fits(said(), said(protocol=OTHER))
+
+
+def test_only_what_both_say_is_compared():
+    mine = said(presage="1", python="3.11")
+    assert not difference(mine, said(presage="1", python="3.10"))
+    assert not difference(mine, said())
+    assert difference(mine, said(presage="2")) == "presage 1 here, 2 there"
+
+
+def test_a_service_says_what_it_is():
+    reply = this_service("x", "{}", 3.0)
+    assert (reply.protocol, reply.host, reply.uptime) == (PROTOCOL, platform.node(), 3.0)
+    assert reply.versions["presage"]
+
+
+def test_the_bus_asks_each_of_two_of_one_name(link, bus):
+    with open_bus(link) as one, open_bus(link) as two:
+        inboxes = [Inbox(), Inbox()]
+        for session, inbox in zip((one, two), inboxes, strict=True):
+            session.serve(CONFIG, inbox, "twice")
+        answers = Inbox()
+
+        def asked() -> bool:
+            done = bus.ask_each(CONFIG, Request(), answers, 1.0, "twice")
+            calls = [inbox.get(2.0) for inbox in inboxes]
+            for call in calls:
+                if call is not None:
+                    call.reply(this_service("twice", "{}").encode())
+            assert done.wait(PATIENCE)
+            return None not in calls
+
+        assert wait_until(asked, PATIENCE)
+        assert len({answer.who for answer in iter(lambda: answers.get(0), None)}) == 2
+    with pytest.raises(UserError, match="nobody answers"):
+        bus.ask(CONFIG, Request(), ConfigReply, timeout=0.1, service="nobody")

@@ -1,0 +1,252 @@
+"""The loop every service runs, in a process of its own, over real zenoh."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from common.bus.bus import wait_until
+from common.bus.inbox import Inbox
+from common.errors import UserError
+from common.messages.definitions import CmdVel, Goal, Health, Pose, Scan
+from common.messages.requests import ConfigReply, PoseRequest, Reply, Request
+from common.messages.topics import CMD_VEL, CONFIG, GOAL, HEALTH, MAX_BYTES, SCAN, TELEPORT
+
+PATIENCE = 30.0
+SMALL = Path(__file__).parents[1] / "small_service.py"
+
+
+class Beside:
+    """What a test sees of a running service."""
+
+    def __init__(self, bus, running):
+        self.bus, self.running = bus, running
+        self.health, self.commands = Inbox(), Inbox()
+        self.latest: Health | None = None
+        bus.subscribe(HEALTH, self.health)
+        bus.subscribe(CMD_VEL, self.commands, keep_all=True)
+        assert wait_until(lambda: "small" in bus.alive(), PATIENCE), running.output
+        assert bus.wait_matching(SCAN, PATIENCE)
+        assert bus.wait_matching(GOAL, PATIENCE)
+        assert self.until(lambda h: True)
+
+    def until(self, fits) -> bool:
+        """Whether a pulse that ``fits`` comes."""
+
+        def look() -> bool:
+            while (sample := self.health.get(0)) is not None:
+                if sample.key == HEALTH.key(self.bus.robot, "small"):
+                    self.latest = Health.decode(sample.payload)
+                    if fits(self.latest):
+                        return True
+            return False
+
+        return wait_until(look, PATIENCE)
+
+    def row(self, health: Health, topic):
+        return next((row for row in health.topics if row.key == topic.key(self.bus.robot)), None)
+
+    def goal(self, x: float, y: float = 0.0, *, cancel: bool = False) -> None:
+        self.bus.put(GOAL, Goal(stamp_ns=0, pose=Pose(x=x, y=y), cancel=cancel).encode())
+
+
+@pytest.fixture
+def small(bus, process):
+    return Beside(bus, process(SMALL))
+
+
+def scan(stamp: int) -> bytes:
+    return Scan(
+        stamp_ns=stamp, angle_min=0.0, angle_increment=0.1, range_min=0.0, range_max=9.0, ranges=np.ones(5)
+    ).encode()
+
+
+def test_messages_come_in_answers_go_out_numbered_and_health_counts_both(small):
+    for i in range(20):
+        small.bus.put(SCAN, scan(i))
+        assert wait_until(lambda i=i: small.commands.received.total() == i + 1, PATIENCE)
+    commands = [CmdVel.decode(small.commands.get(0).payload) for _ in range(20)]
+    assert [c.stamp_ns for c in commands] == list(range(20))
+    assert [c.seq for c in commands] == list(range(20))
+    assert small.until(lambda h: h.counters["scans"] == 20)
+    health = small.latest
+    assert small.row(health, SCAN).received == 20
+    assert small.row(health, CMD_VEL).published == 20
+    assert health.service == "small"
+    assert health.uptime > 0
+    assert health.counters["failed"] == 0
+
+
+def test_the_pulse_comes_once_a_second(small):
+    first = small.latest
+    assert small.until(lambda h: h.seq >= first.seq + 3)
+    assert small.latest.uptime - first.uptime == pytest.approx(small.latest.seq - first.seq, abs=0.9)
+
+
+def test_a_pulse_has_a_rate(small):
+    for i in range(30):
+        small.bus.put(SCAN, scan(i))
+        assert wait_until(lambda i=i: small.commands.received.total() == i + 1, PATIENCE)
+    assert small.until(lambda h: (small.row(h, SCAN) or h.topics[0]).rate > 0)
+    assert small.row(small.latest, SCAN).rate <= 30 / 0.9
+    assert small.until(lambda h: small.row(h, SCAN).rate == 0)
+
+
+def test_what_cannot_be_decoded_is_counted_logged_once_a_second_and_dropped(small):
+    # On health, where every payload is kept: on a newest-only key one may take the place of another before it is read.
+    key = HEALTH.key(small.bus.robot, "intruder")
+    assert small.bus.wait_matching(HEALTH, PATIENCE, key=key)
+    began = time.monotonic()
+    for payload in [b"", b"\xc1", b"x" * 100, scan(1)[:-3], bytes(MAX_BYTES + 1)] * 10:
+        small.bus.put(HEALTH, payload, key=key)
+    assert small.until(lambda h: any(row.key == key and row.received == 50 for row in h.topics))
+    took = time.monotonic() - began
+    assert small.until(lambda h: any(row.key == key and row.undecodable == 50 for row in h.topics))
+    assert 1 <= small.running.output.count("payload dropped") <= 1 + took
+    small.bus.put(SCAN, scan(5))
+    assert small.until(lambda h: h.counters.get("scans") == 1)
+    assert small.latest.counters["failed"] == 0
+
+
+def test_a_bug_is_counted_logged_with_its_traceback_and_survived(small):
+    small.goal(-1)
+    assert small.until(lambda h: h.counters["failed"] == 1)
+    assert "a bug in on_message" in small.running.output
+    assert "Traceback" in small.running.output
+    small.bus.put(SCAN, scan(5))
+    assert wait_until(lambda: len(small.commands) == 1, PATIENCE)
+
+
+def test_a_user_error_in_a_step_ends_it_with_one_line(small):
+    small.goal(101)
+    assert small.running.wait() == 2
+    assert "small: the map ends before that" in small.running.output
+    assert "Traceback" not in small.running.output
+    assert "closed" in small.running.output
+
+
+def test_a_service_asks_without_waiting_even_itself(small):
+    asked = [
+        (3.0, 0.0, "1 teleport True at 3"),
+        (-3.0, 0.0, "2 teleport False inside a wall"),
+        (101.0, 0.0, "refused: small failed: ValueError: a bug in on_request"),
+        (1.0, 1.0, "4 predict False nobody answers"),
+    ]
+    for count, (x, y, text) in enumerate(asked, 1):
+        small.goal(x, y, cancel=True)
+        assert small.until(lambda h, n=count: h.counters.get("replies") == n), small.running.output
+        assert text in small.latest.note
+
+
+def test_it_ends_though_an_answer_is_owed(small):
+    small.goal(1.0, 1.0, cancel=True)
+    status, seconds = small.running.stop()
+    assert status == 0, small.running.output
+    assert seconds < 5
+    assert "Traceback" not in small.running.output
+
+
+def test_requests_are_answered_refused_and_survived(small):
+    def ask(x: float) -> Reply:
+        return small.bus.ask(TELEPORT, PoseRequest(pose=Pose(x=x, y=0.0)), Reply)
+
+    assert ask(3.0) == Reply(reason="at 3")
+    assert ask(-3.0) == Reply(ok=False, reason="inside a wall")
+    with pytest.raises(UserError, match="refused: small failed: ValueError: a bug in on_request"):
+        ask(101.0)
+    with pytest.raises(UserError, match=r"refused: PoseRequest\.pose"):
+        small.bus.ask(TELEPORT, Request(), Reply)
+    assert small.until(lambda h: any(row.key == "teleport" and row.undecodable == 1 for row in h.topics))
+    assert small.latest.counters["failed"] == 1
+    assert ask(4.0).ok
+
+
+def test_its_configuration_can_be_asked_for(small):
+    reply = small.bus.ask(CONFIG, Request(), ConfigReply, service="small")
+    config = json.loads(reply.config)
+    assert reply.service == "small"
+    assert config["robot"] == small.bus.robot
+    assert config["connect"].startswith("tcp/127.0.0.1:")
+    assert reply.versions["python"]
+
+
+def test_after_a_long_step_one_pulse_comes_not_all_that_were_missed(small):
+    before = small.latest
+    small.goal(2.5)
+    assert small.until(lambda h: h.uptime > before.uptime + 2.5)
+    assert small.latest.seq <= before.seq + 2
+    first = small.latest
+    assert small.until(lambda h: True)
+    assert small.latest.uptime - first.uptime > 0.5
+
+
+def test_a_timer_that_always_fails_does_not_silence_the_service(bus, process):
+    beside = Beside(bus, process(SMALL, "--fail", "timer"))
+    beside.bus.put(SCAN, scan(5))
+    assert wait_until(lambda: len(beside.commands) == 1, PATIENCE)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_it_with_status_0(small, number):
+    status, seconds = small.running.stop(number)
+    assert status == 0, small.running.output
+    assert seconds < PATIENCE / 3  # at once, but for a busy machine
+    assert "closed" in small.running.output
+    assert small.running.output.rstrip().endswith("ended")
+    assert "Traceback" not in small.running.output
+    assert wait_until(lambda: small.bus.alive() == set(), PATIENCE)
+
+
+def test_a_signal_in_the_middle_of_a_step_ends_it_after_that_step(small):
+    small.goal(1.0)
+    began = time.monotonic()
+    status, _ = small.running.stop()
+    assert status == 0
+    assert time.monotonic() - began < 5
+    assert "closed" in small.running.output
+
+
+@pytest.mark.parametrize(("when", "says"), [("making", "in the making"), ("opening", "opening")])
+def test_a_signal_before_the_loop_is_not_lost(process, when, says):
+    running = process(SMALL, "--slow", when)
+    running.wait_for(says)
+    status, seconds = running.stop()
+    assert status == 0, running.output
+    assert 0.5 < seconds < 5
+    assert "closed" in running.output
+
+
+def test_without_a_router_it_runs_and_ends(process, free_port):
+    running = process(SMALL, env={"PRESAGE_CONNECT": f"tcp/127.0.0.1:{free_port()}"})
+    running.wait_for("ready")
+    status, seconds = running.stop()
+    assert status == 0, running.output
+    assert seconds < PATIENCE / 3  # at once, but for a busy machine
+
+
+def test_what_the_user_can_mend_in_open_is_one_line_and_status_2(process):
+    running = process(SMALL, "--fail", "open")
+    assert running.wait() == 2
+    assert running.output.splitlines() == ["small: no weights in that folder; train some"]
+
+
+def test_a_taken_port_is_one_line_and_status_2(router, process):
+    running = process(SMALL, "--listen", f"tcp/127.0.0.1:{router}")
+    assert running.wait() == 2
+    assert running.output.splitlines() == [f"small: port in use: tcp/127.0.0.1:{router}; choose another with --listen"]
+
+
+def test_two_robots_share_a_network(bus, process, link):
+    beside = Beside(bus, process(SMALL))
+    other = process(SMALL, env={"PRESAGE_ROBOT": link.robot + "b"})
+    other.wait_for("ready")
+    assert beside.bus.wait_matching(SCAN, PATIENCE, key=SCAN.key(link.robot + "b"))
+    beside.bus.put(SCAN, scan(1))
+    assert wait_until(lambda: len(beside.commands) == 1, PATIENCE)
+    assert beside.until(lambda h: h.counters.get("scans") == 1)
+    assert wait_until(lambda: beside.bus.alive() == {"small"}, PATIENCE)  # one look may come too early

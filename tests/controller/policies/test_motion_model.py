@@ -1,0 +1,141 @@
+"""Where an action leads, as the robot's own limits have it; and which action is chosen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.geometry import se2
+from common.robot.base import Robot
+from common.robot.scan_geometry import Sector
+from common.runtime import safety
+from services.controller.policies.motion_model import HOLD, braking_speed, candidates, facing, rollouts, turn_rate
+from services.controller.policies.policy import Around, choose, to_go
+
+DRIVES = [Robot(), Robot(drive="differential")]
+PERIOD = 1 / 15
+speeds = st.floats(-1, 1).map(lambda v: round(v, 3))
+
+
+def nothing(places):
+    return np.full(places.shape[:-1], np.inf)
+
+
+def around(points=(), moving=(), known=nothing, **more):
+    points = np.array(points, float).reshape(-1, 2)
+    return Around(known, points, np.array(moving, bool).reshape(-1), 0.3, 0.33, **more)
+
+
+@settings(max_examples=15)
+@given(speeds, speeds, speeds, speeds)
+def test_a_differential_rollout_is_what_the_ramp_makes_of_it(v0, w0, v, w):
+    robot = Robot(drive="differential")
+    poses, times, stands = rollouts(np.array([v0, 0, w0]), np.array([[v, 0, w]]), robot)
+    fine, velocity, pose, count = 1e-3, np.array([v0, 0.0, w0]), np.zeros(3), 0
+    for number in range(round(times[-1] / fine)):
+        wanted = np.array([v, 0, w]) if (number + 0.5) * fine < HOLD else np.zeros(3)
+        velocity = safety.ramp(velocity, wanted, robot, fine)
+        pose = se2.compose(pose, velocity * fine)
+        if count < len(times) and abs((number + 1) * fine - times[count]) < fine / 2:
+            np.testing.assert_allclose(poses[0, count, :2], pose[:2], atol=0.02)
+            assert abs(se2.wrap(poses[0, count, 2] - pose[2])) < 0.06
+            count += 1
+    after = poses[0, times > stands[0] + 1 / 15, :2]
+    assert not len(after) or np.hypot(*(after - after[-1]).T).max() < 1e-9
+
+
+@given(st.floats(0.01, 20))
+def test_the_braking_speed_ends_where_it_should(distance):
+    robot = Robot()
+    v = braking_speed(distance, robot)
+    assert v <= robot.max_speed
+    if v < robot.max_speed:
+        assert v * HOLD + v**2 / (2 * robot.acceleration) == pytest.approx(distance)
+
+
+@given(st.floats(-np.pi, np.pi))
+def test_a_turn_is_braked_in_time(angle):
+    robot, left, rate = Robot(), angle, 0.0
+    for _ in range(120):
+        wanted = turn_rate(left, robot)
+        rate += float(np.clip(wanted - rate, -robot.turn_acceleration * PERIOD, robot.turn_acceleration * PERIOD))
+        left -= rate * PERIOD
+        assert abs(left) <= abs(angle) + 1e-9
+        assert np.sign(left) * np.sign(angle) >= 0 or abs(left) < 0.12  # hardly over it
+    assert abs(left) < 0.02
+
+
+@pytest.mark.parametrize("robot", DRIVES, ids=lambda robot: robot.drive)
+@given(x=st.floats(-4, 4), y=st.floats(-4, 4), v=speeds, w=speeds)
+def test_the_choice_never_leaves_the_robot_farther_off(robot, x, y, v, w):
+    current, goal = np.array([v, 0.0, w]), np.array([x, y])
+    choice = choose(current, goal, around(), robot)
+    poses, _, _ = rollouts(current, np.zeros((1, 3)), robot)
+    assert to_go(choice.way[-1], goal, robot) <= to_go(poses[0, -1], goal, robot) + 1e-9
+    assert np.hypot(*choice.action[:2]) <= robot.max_speed + 1e-9
+    assert abs(choice.action[2]) <= robot.max_turn + 1e-9
+    assert not choice.held
+    assert robot.drive == "holonomic" or choice.action[1] == 0
+
+
+@pytest.mark.parametrize("robot", DRIVES, ids=lambda robot: robot.drive)
+def test_the_speed_does_not_die_away_before_the_goal(robot):
+    """The weak point of a quadratic prior: its slope, and with it the speed, shrinks as the goal comes near."""
+    pose, velocity, taken = np.zeros(3), np.zeros(3), 0
+    goal = np.array([4.0, 0.0])
+    while np.hypot(*(goal - pose[:2])) > 0.05 and taken < 200:
+        choice = choose(velocity, se2.rotate(-pose[2], goal - pose[:2]), around(), robot)
+        velocity = safety.ramp(velocity, choice.action, robot, PERIOD)
+        pose, taken = se2.compose(pose, velocity * PERIOD), taken + 1
+    least = 4.0 / robot.max_speed + robot.max_speed / robot.acceleration  # accelerate, cruise, brake
+    assert taken * PERIOD < 1.12 * least
+    assert pose[0] < 4.06  # and it does not run past it
+
+
+@pytest.mark.parametrize("robot", DRIVES, ids=lambda robot: robot.drive)
+@given(st.lists(st.tuples(st.floats(-2, 2), st.floats(-2, 2)), max_size=12), st.integers(0, 100))
+def test_a_chosen_way_is_free_until_the_robot_stands(robot, points, seed):
+    points = [p for p in points if np.hypot(*p) > 0.35]
+    v, w = np.random.default_rng(seed).uniform([0, -1], [0.5, 1])
+    here = around(points, [False] * len(points))
+    choice = choose(np.array([v, 0, w]), np.array([1.5, 0.7]), here, robot)
+    if choice.action.any():
+        gaps = here.gaps(choice.way[None], np.zeros(len(choice.way)))
+        assert gaps.min() >= -1e-3
+
+
+def test_somebody_who_walks_is_given_room_to_and_furniture_is_not():
+    robot, current, goal = Robot(), np.array([0.6, 0.0, 0.0]), np.array([3.0, 0.0])
+    still = choose(current, goal, around([(1.6, 0.0)], [False]), robot)
+    walking = choose(current, goal, around([(1.6, 0.0)], [True]), robot)
+    assert np.hypot(*still.action[:2]) > 0.6
+    assert np.hypot(*walking.action[:2]) < 0.6  # straight at them it would have to stand before they come
+    assert walking.held
+    assert not still.held
+    beside = choose(current, goal, around([(0.0, 0.5)], [False]), robot)
+    assert beside.action[0] > 0.6
+
+
+def test_a_wall_across_the_way_is_waited_at():
+    wall = [(0.4, y) for y in np.linspace(-2, 2, 81)]
+    choice = choose(np.zeros(3), np.array([3.0, 0.0]), around(wall, [False] * 81), Robot(drive="differential"))
+    assert choice.held
+    assert choice.way[-1, 0] < 0.4 - 0.33 + 1e-3
+
+
+def test_where_the_scanner_does_not_look_it_turns_first_or_goes_slowly():
+    behind, view = np.array([-3.0, 0.0]), Sector(0.0, np.deg2rad(135))
+    choice = choose(np.zeros(3), behind, around(view=view), Robot())
+    assert abs(np.arctan2(choice.action[1], choice.action[0])) <= np.pi / 2 + 1e-9  # the body is wide
+    assert abs(facing(choice.action, behind, Robot(), turns=True)[2]) > 1.0
+    kept = choose(np.zeros(3), behind, around(view=view, turns=False), Robot())
+    assert 0 < np.hypot(*kept.action[:2]) <= 0.25 + 1e-9
+
+
+def test_candidates_hold_standing_and_going_on():
+    for robot in DRIVES:
+        many = candidates(np.array([0.3, 0.0, 0.1]), np.array([1.0, 0.2]), robot)
+        np.testing.assert_array_equal(many[:2], [[0, 0, 0], [0.3, 0, 0.1]])
+        assert len(many) < 130

@@ -1,0 +1,80 @@
+"""Equation 4 as arithmetic on a belief: gradients against finite differences, and where it leads."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.controller.policies.paper_action import (
+    MAX_CORRECTION,
+    Preference,
+    action_free_energy,
+    action_gradient,
+    next_action,
+    observed_position,
+    preferred_position,
+)
+
+number = st.floats(-5, 5)
+pair = st.tuples(number, number).map(np.array)
+preferences = st.builds(
+    Preference, gamma=st.floats(0.01, 0.45), horizon=st.floats(0.2, 2.0), reach=st.floats(0.1, 3.0),
+    action_precision=st.floats(0.1, 3.0),
+)  # fmt: skip
+
+
+@given(pair, pair, pair, st.floats(-np.pi, np.pi), preferences)
+def test_gradient_agrees_with_finite_differences(action, observed, preferred, yaw, preference):
+    found = action_gradient(action, observed, preferred, yaw, preference)
+    h = 1e-5
+    for axis in range(2):
+        step = h * np.eye(2)[axis]
+        f = [action_free_energy(action + s * step, observed, preferred, yaw, preference) for s in (1, -1)]
+        assert found[axis] == pytest.approx((f[0] - f[1]) / (2 * h), rel=1e-5, abs=1e-5)
+
+
+@given(pair, pair, pair, st.floats(-np.pi, np.pi), st.floats(0.01, 0.45))
+def test_each_step_lowers_the_free_energy_of_action(action, observed, preferred, yaw, gamma):
+    preference = Preference(gamma=gamma)
+    after = next_action(action, observed, preferred, yaw, preference)
+    f = [action_free_energy(a, observed, preferred, yaw, preference) for a in (action, after)]
+    assert f[1] <= f[0]
+    if np.linalg.norm(action_gradient(action, observed, preferred, yaw, preference)) > 1e-3:
+        assert f[1] < f[0]
+
+
+@given(pair, pair, st.floats(-np.pi, np.pi))
+def test_action_settles_at_the_minimum_and_points_to_what_is_preferred(observed, preferred, yaw):
+    preference, action = Preference(), np.zeros(2)
+    for _ in range(100):
+        action = next_action(action, observed, preferred, yaw, preference)
+    in_map = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ action
+    assert in_map == pytest.approx((preferred - observed) / 2, abs=1e-6)  # half: as precise a wish to stand
+
+
+def test_the_scan_corrects_the_belief_to_first_order():
+    """Where g is linear, the belief plus H^-1 xi is the truth."""
+    J = np.random.default_rng(0).normal(size=(50, 3))
+    J[:, 2] = 0
+    truth, pose = np.array([2.0, 1.0, 0.0]), np.array([1.9, 1.1, 0.0])
+    found = observed_position(pose, J.T @ (J @ (truth - pose)), J.T @ J)
+    assert found == pytest.approx(truth[:2], abs=1e-3)
+
+
+def test_without_curvature_or_information_the_belief_stands():
+    pose = np.array([1.0, 2.0, 0.0])
+    assert observed_position(pose, np.array([100.0, 0, 0]), None) == pytest.approx(pose[:2])
+    blind = np.diag([400.0, 0.0, 0.0])  # a bare corridor says nothing along y
+    found = observed_position(pose, np.array([40.0, 0.0, 0.0]), blind)
+    assert found == pytest.approx([1.1, 2.0], abs=1e-3)
+
+
+@given(pair, st.floats(1e-3, 1e6))
+def test_corrections_and_attraction_are_bounded(xi, scale):
+    pose = np.zeros(3)
+    found = observed_position(pose, np.array([*xi, 0]) * scale, np.diag([1.0, 1.0, 0.0]))
+    assert np.linalg.norm(found) <= MAX_CORRECTION + 1e-9
+    assert np.linalg.norm(preferred_position(found, np.array([100.0, 50.0, 0]), 1.0) - found) == pytest.approx(1.0)
+    assert preferred_position(found, np.array([*found, 0]), 1.0) == pytest.approx(found)

@@ -1,0 +1,223 @@
+"""Driving in the simulator's physics with a belief that is the truth: round walls and what no map knows, no contact."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.geometry.world import Obstacle, World, load_world
+from common.messages.definitions import Belief, Goal, Pose
+from common.robot.base import Robot
+from common.robot.scanner import SCANNERS
+from services.controller.navigator import Navigator
+from services.controller.policies.planner import Pilot
+from services.simulator.simulation import Setup, Simulation
+
+SCANNER = SCANNERS["tim571"].with_beams(271)
+DRIVES = ("holonomic", "differential")
+
+
+def belief_at(pose, stamp_ns, state="tracking", hypotheses=()):
+    return Belief(
+        stamp_ns=stamp_ns, state=state, pose=Pose.of(pose), xi=np.zeros(3, np.float32), free_energy=0, accuracy=0,
+        hypotheses=list(hypotheses),
+    )  # fmt: skip
+
+
+def drive(
+    world, robot, start, goal, limit=900, *, known=None, change=None, more=None, seed=0, stop=True, scanner=SCANNER,
+    seen=None,
+):  # fmt: skip
+    """Scans until it is there: true poses, statuses, contacts, scans held back. ``known`` is the controller's map.
+
+    Without ``stop`` nobody holds the wheels back but the controller. ``seen``: what it is shown of a scan.
+    """
+    simulation = Simulation(Setup(world, scanner, robot, start, seed, obstacle_stop=stop))
+    navigator = Navigator(robot, world=known or world, preset=Pilot(robot, known or world))
+    navigator.hear_goal(
+        Goal(stamp_ns=0, pose=Pose(x=goal[0], y=goal[1], yaw=(more or {}).pop("yaw", 0)), **(more or {}))
+    )
+    poses, said, contacts = [], [], 0
+    try:
+        while simulation.steps < limit:
+            if change is not None:
+                change(simulation)
+            _, truth, scan = simulation.observe()
+            poses.append(truth.pose.array())
+            contacts += truth.contact
+            navigator.hear_scan(seen(scan) if seen else scan)
+            command, status = navigator.step(belief_at(poses[-1], scan.stamp_ns))
+            said.append(status)
+            if status.state == "reached" and not np.any(simulation.physics.twist().round(3)):
+                break
+            simulation.command(scan.stamp_ns, command.twist)
+            simulation.advance()
+    finally:
+        simulation.close()
+    return np.array(poses), said, contacts
+
+
+@pytest.mark.parametrize("kind", DRIVES)
+@pytest.mark.parametrize("name", ["maze", "office"])
+def test_it_goes_round_walls_without_touching_them(name, kind):
+    world, robot, rng = load_world(name), Robot(drive=kind), np.random.default_rng(3)
+    pilot = Pilot(robot, world)
+    for number in range(2):
+        start, goal = world.sample_free(2, rng, 0.32)
+        field = pilot.roads.from_(goal)
+        shortest = float(np.hypot(*np.diff(field.path(start), axis=0).T).sum())
+        poses, said, contacts = drive(world, robot, (*start, rng.uniform(-np.pi, np.pi)), goal, seed=number)
+        assert said[-1].state == "reached", (start, goal, said[-1])
+        assert contacts == 0
+        assert np.hypot(*(poses[-1][:2] - goal)) <= 0.2
+        assert np.hypot(*np.diff(poses[:, :2], axis=0).T).sum() <= 1.1 * shortest + 0.2
+
+
+@pytest.mark.parametrize("kind", DRIVES)
+def test_a_heading_is_taken_where_one_is_asked_for(kind):
+    world = load_world("corridor")
+    asked = {"yaw": 2.0, "yaw_tolerance": 0.1}
+    poses, said, _ = drive(world, Robot(drive=kind), (3.0, 1.5, 0.0), (5.0, 1.5), more=asked)
+    assert said[-1].state == "reached"
+    assert abs(poses[-1][2] - 2.0) <= 0.1
+    turning = [status for status in said if "turning into" in status.reason]
+    assert turning  # and not reached before
+    assert {status.state for status in turning} == {"navigating"}
+
+
+@pytest.mark.parametrize("kind", DRIVES)
+def test_a_box_that_no_map_knows_is_gone_round_and_said(kind):
+    world = World(name="hall", boundary=[(0, 0), (10, 0), (10, 5), (0, 5)])
+    box = {"name": "box", "box": {"center": (5, 2.5), "size": (0.6, 1.2)}}
+    changed = World(name="hall", boundary=world.boundary, obstacles=[box])
+    poses, said, contacts = drive(changed, Robot(drive=kind), (1.5, 2.5, 0.0), (8.5, 2.5), known=world)
+    assert said[-1].state == "reached"
+    assert contacts == 0
+    assert np.abs(poses[:, 1] - 2.5).max() > 0.8
+    assert np.hypot(*np.diff(poses[:, :2], axis=0).T).sum() < 9.0
+
+
+def test_a_box_just_put_in_the_way_may_move_until_it_has_stood_for_a_second():
+    hall = World(name="hall", boundary=[(0, 0), (10, 0), (10, 3), (0, 3)])
+    far, near = (Obstacle(name="box", box={"center": (x, 1.5), "size": (0.6, 1.2)}) for x in (9.5, 3.9))
+    world = hall.model_copy(update={"obstacles": [far]})
+
+    def move(simulation):
+        if simulation.steps == 30:
+            simulation.change("move", "box", near)
+
+    _, said, _ = drive(world, Robot(), (1.5, 1.5, 0.0), (8.5, 1.5), 60, known=hall, change=move)
+    nearby = [status.reason.split(",")[0] for status in said[30:]]
+    assert {"waiting: something that may move"} == set(nearby[:15])
+    assert not any("may move" in reason for reason in nearby[15:])
+
+
+def test_a_door_that_was_shut_is_said_and_once_it_opens_it_goes_on():
+    walls = [
+        {"name": "left", "box": {"center": (5, 1), "size": (0.2, 2)}},
+        {"name": "right", "box": {"center": (5, 4.1), "size": (0.2, 1.8)}},
+    ]
+    known = World(name="door", boundary=[(0, 0), (10, 0), (10, 5), (0, 5)], obstacles=walls)
+    door = {"name": "door", "box": {"center": (5, 2.6), "size": (0.1, 1.3)}}
+    shut = World(name="door", boundary=known.boundary, obstacles=[*walls, door])
+
+    def change(simulation):
+        if simulation.steps == 300:
+            simulation.change("remove", "door", None)
+
+    poses, said, contacts = drive(shut, Robot(), (2.0, 2.5, 0.0), (8.0, 2.5), known=known, change=change)
+    blocked = [status for status in said[:300] if status.state == "blocked"]
+    assert blocked
+    assert any("no way" in status.reason for status in blocked)
+    assert (poses[:300, 0] < 5).all()
+    assert said[-1].state == "reached"
+    assert contacts == 0
+
+
+def test_goals_that_cannot_be_are_refused_with_the_nearest_that_can():
+    walls = [{"name": "wall", "box": {"center": (5, 2.5), "size": (0.2, 5)}}]
+    world = World(name="two", boundary=[(0, 0), (10, 0), (10, 5), (0, 5)], obstacles=walls)
+    navigator = Navigator(world=world, preset=Pilot(Robot(), world))
+    navigator.hear_goal(Goal(stamp_ns=0, pose=Pose(x=5.0, y=2.5)))
+    assert (navigator.state, "is inside something" in navigator.reason) == ("blocked", True)
+    navigator.hear_goal(Goal(stamp_ns=0, pose=Pose(x=0.2, y=2.5)))
+    assert "is 0.20 m from a wall; the nearest place that can be reached is (0.35, 2." in navigator.reason
+    # The other room: refused as soon as it is known in which one the robot is.
+    navigator.hear_goal(Goal(stamp_ns=0, pose=Pose(x=8.0, y=2.5)))
+    simulation = Simulation(Setup(world, SCANNER, Robot(), (2.0, 2.5, 0.0)))
+    try:
+        _, truth, scan = simulation.observe()
+    finally:
+        simulation.close()
+    navigator.hear_scan(scan)
+    command, status = navigator.step(belief_at(truth.pose.array(), 0))
+    assert status.state == "blocked"
+    assert "cannot be reached from here; the nearest place that can be reached is (4.5" in status.reason
+    assert not command.twist.array().any()
+
+
+@pytest.mark.parametrize("kind", DRIVES)
+def test_the_controller_alone_touches_nothing_though_its_map_is_empty(kind):
+    """The base's obstacle stop is off, and every wall within the boundary is a surprise."""
+    world, robot, rng = load_world("maze"), Robot(drive=kind), np.random.default_rng(5)
+    empty = World(name="empty", boundary=world.boundary)
+    fastest = 0.0
+    for number in range(3):
+        start, goal = world.sample_free(2, rng, 0.45)
+        poses, _, contacts = drive(
+            world, robot, (*start, rng.uniform(-np.pi, np.pi)), goal, 200, known=empty, seed=number, stop=False
+        )
+        assert contacts == 0, (start, goal)
+        fastest = max(fastest, np.hypot(*np.diff(poses[:, :2], axis=0).T).max() * 15)
+    assert fastest > 0.9  # m/s: there was something to brake
+
+
+@pytest.mark.parametrize("kind", DRIVES)
+def test_before_a_closed_door_it_is_blocked_and_backs_off_and_stays_blocked_meanwhile(kind):
+    walls = [
+        {"name": "left", "box": {"center": (5, 1), "size": (0.2, 2)}},
+        {"name": "right", "box": {"center": (5, 4.1), "size": (0.2, 1.8)}},
+    ]
+    known = World(name="door", boundary=[(0, 0), (10, 0), (10, 5), (0, 5)], obstacles=walls)
+    shut = World(
+        name="door", boundary=known.boundary,
+        obstacles=[*walls, {"name": "door", "box": {"center": (5, 2.6), "size": (0.1, 1.3)}}],
+    )  # fmt: skip
+    _, said, contacts = drive(shut, Robot(drive=kind), (2.0, 2.5, 0.0), (8.0, 2.5), known=known, limit=600)
+    assert contacts == 0
+    backing = [status for status in said if status.reason == "stuck: backing off"]
+    assert {status.state for status in backing} == {"blocked"}
+    blocked = sum(status.state == "blocked" for status in said)
+    assert blocked > 0.4 * (len(said) - 150)  # after ten seconds to go there; between, it goes back to the door
+
+
+def test_who_is_held_by_the_limits_alone_is_stuck_too():
+    """A doorway that the plan takes and the limits do not: returns of the scan hold the robot, whatever it wishes."""
+    pilot = Pilot(Robot(), load_world("corridor"))
+    pilot.aim(np.array([15.0, 1.5]))
+    reasons = [
+        pilot.decide(belief_at(np.array([5.0, 1.5, 0.0]), k * 66_000_000), np.zeros(3)).reason for k in range(60)
+    ]
+    assert reasons[0] == ""
+    assert reasons[-1] == "stuck: backing off"
+
+
+@pytest.mark.parametrize("kind", DRIVES)
+def test_who_does_not_know_where_it_is_goes_slowly(kind):
+    world, robot = load_world("office"), Robot(drive=kind)
+    simulation = Simulation(Setup(world, SCANNER, robot, (6.0, 4.0, 0.0), 0))
+    navigator = Navigator(robot, world=world, preset=Pilot(robot, world))
+    navigator.hear_goal(Goal(stamp_ns=0, pose=Pose(x=15.0, y=4.0)))
+    speeds = []
+    try:
+        for _ in range(120):
+            scan = simulation.observe()[2]
+            navigator.hear_scan(scan)
+            command, status = navigator.step(belief_at(np.array([6.0, 4.0, 0.0]), scan.stamp_ns, "localising"))
+            speeds.append(float(np.hypot(command.twist.vx, command.twist.vy)))
+            simulation.command(scan.stamp_ns, command.twist)
+            simulation.advance()
+    finally:
+        simulation.close()
+    assert status.state == "exploring"
+    assert 0.2 < max(speeds) <= 0.5 + 1e-6

@@ -1,0 +1,47 @@
+"""Navigation on a ROS map: free space from its cells, ways through doors, goals that are refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.geometry.occupancy_grid import FREE, UNKNOWN, OccupancyGrid
+from common.geometry.world import World
+from common.robot.base import Robot
+from services.controller.policies.free_space import FreeSpace
+from services.controller.policies.planner import Pilot
+from services.controller.policies.straight_line import Straight
+from tests.common.geometry.maps import rooms
+
+WORLD = World(name="rooms", grid=OccupancyGrid.of(rooms(400), 0.05, (-10.0, -10.0, 0.0)))
+
+
+@pytest.mark.parametrize("origin", [(-10.0, -10.0, 0.0), (3.0, 1.0, 0.5)])
+def test_free_space_is_that_of_the_cells(origin):
+    world = World(name="rooms", grid=OccupancyGrid.of(rooms(200), 0.05, origin))
+    free = FreeSpace.of(world)
+    centres = free.grid.centres()
+    inner = np.abs(free.clearance.ravel()) > 1e-6  # not at the edge itself
+    assert np.array_equal((free.clearance.ravel() > 0)[inner], (world.grid.at(centres) == FREE)[inner])
+    np.testing.assert_allclose(free.clearance.ravel(), world.clearance(centres), atol=1e-9)
+
+
+def test_a_way_from_room_to_room_keeps_clear_of_every_cell():
+    pilot = Pilot(Robot(), WORLD)
+    start, goal = np.array([-6.5, -6.5]), np.array([5.0, 5.0])
+    start, goal = (pilot.free.grid.centres([pilot.roads.nearest_free(place)])[0] for place in (start, goal))
+    assert pilot.refusal(goal) is None
+    field = pilot.roads.from_(goal)
+    way = field.path(start)
+    assert len(way) > 20
+    between = np.linspace(way[:-1], way[1:], 5).reshape(-1, 2)
+    assert WORLD.clearance(between).min() > Robot().radius - 0.01
+
+
+def test_goals_in_unknown_cells_and_walls_are_refused():
+    row, column = np.argwhere(WORLD.grid.values == UNKNOWN)[0]
+    nowhere = WORLD.grid.shapes.within(np.array([[column, row]]), 0.5)[0]
+    pilot, straight = Pilot(Robot(), WORLD), Straight(Robot(), None, WORLD)
+    for goal in (nowhere, np.array([50.0, 50.0])):
+        assert "is inside something, or off the map; the nearest place that can be reached is" in pilot.refusal(goal)
+        assert "is inside something" in straight.refusal(goal)

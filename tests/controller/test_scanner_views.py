@@ -1,0 +1,162 @@
+"""Scanners that do not look ahead, all round, or the usual way round: where it drives, and what it takes for free."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.geometry import se2
+from common.geometry.world import World
+from common.messages.definitions import Goal, Pose, Scan
+from common.robot.base import Robot
+from common.robot.scan_geometry import ALL_ROUND, Sector, Sweep
+from common.robot.scanner import SCANNERS
+from services.controller.navigator import Navigator
+from services.controller.policies.active_localisation import Seeker
+from services.controller.policies.free_space import FreeSpace
+from services.controller.policies.motion_model import facing
+from services.controller.policies.obstacles import TemporaryObstacles
+from services.controller.policies.planner import BLIND, Pilot
+from services.controller.policies.policy import ASIDE, Around, choose
+from services.simulator.simulation import Setup, Simulation
+from tests.controller.policies.test_planner import belief_at
+
+HALL = World(name="hall", boundary=[(0, 0), (8, 0), (8, 6), (0, 6)])
+BOX = {"name": "new", "box": {"center": (4.0, 1.5), "size": (0.5, 0.5)}}
+LMS = SCANNERS["lms200"].model_copy(update={"rate": 15.0})  # its own rate is five times the work
+BACKWARDS = LMS.model_copy(update={"mount": (-0.2, 0.0, np.pi)})
+A1 = SCANNERS["rplidar-a1"]
+TURNED = {
+    "0 to 359 deg": A1.model_copy(update={"first": 0.0}),
+    "upside down": A1.model_copy(update={"upside_down": True}),
+    "half, upside down": LMS.model_copy(update={"upside_down": True}),
+}
+
+
+def scan_of(scanner, world, pose, stamp_ns=0):
+    ranges = world.ray_distances(se2.compose(pose, np.array(scanner.mount))[None], scanner.angles())[0]
+    return Scan(
+        stamp_ns=stamp_ns, angle_min=scanner.angle_min, angle_increment=scanner.angle_increment,
+        range_min=scanner.range_min, range_max=scanner.range_max, ranges=scanner.limit(ranges).astype(np.float32),
+        mount=Pose.of(scanner.mount),
+    )  # fmt: skip
+
+
+def around(view, **more):
+    return Around(
+        lambda p: np.full(p.shape[:-1], np.inf), np.zeros((0, 2)), np.zeros(0, bool), 0.0, 0.33, view=view, **more
+    )
+
+
+@pytest.mark.parametrize(
+    ("scanner", "sector"),
+    [
+        (SCANNERS["tim571"], Sector(0.0, np.deg2rad(135))),
+        (LMS, Sector(0.0, np.pi / 2)),
+        (BACKWARDS, Sector(-np.pi, np.pi / 2)),
+        (A1, ALL_ROUND),
+        *((scanner, ALL_ROUND) for name, scanner in TURNED.items() if "half" not in name),
+        (LMS.model_copy(update={"first": 0.0}), Sector(np.pi / 2, np.pi / 2)),
+        (LMS.model_copy(update={"first": 0.0, "upside_down": True}), Sector(-np.pi / 2, np.pi / 2)),
+    ],
+)
+def test_what_a_scanner_sees_of_base_link(scanner, sector):
+    scan = scan_of(scanner, HALL, np.array([4.0, 3.0, 1.0]))
+    found = Sweep.of(scan).sector(scan.mount.yaw)
+    assert found.half == pytest.approx(sector.half)
+    assert np.cos(found.centre - sector.centre) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("half_deg", [30, 60, 90, 135])
+@pytest.mark.parametrize("centre", [0.0, np.pi, 1.0])
+def test_no_action_leads_to_where_the_scanner_does_not_look(centre, half_deg):
+    view = Sector(centre, np.deg2rad(half_deg))
+    for goal in np.arange(0, 2 * np.pi, 0.5):
+        attractor = 3 * np.array([np.cos(goal), np.sin(goal)])
+        action = choose(np.zeros(3), attractor, around(view), Robot()).action
+        if np.hypot(*action[:2]) > 0.02:
+            off = abs(float(se2.wrap(np.arctan2(action[1], action[0]) - centre)))
+            assert off <= max(view.half - ASIDE, view.half / 3) + 1e-6
+        else:
+            turned = facing(action, attractor, Robot(), turns=True, front=around(view).front)
+            assert abs(turned[2]) > 0.1  # it turns until it sees
+
+
+@pytest.mark.parametrize("name", TURNED)
+def test_what_went_away_is_forgotten_whichever_way_the_beams_run(name):
+    scanner, pose = TURNED[name], np.array([2.0, 1.5, 0.4])
+    changed = World(name="hall", boundary=HALL.boundary, obstacles=[BOX])
+    layer = TemporaryObstacles(FreeSpace.of(HALL))
+    layer.see(scan_of(scanner, changed, pose), pose)
+    assert len(layer.points()) >= 4
+    assert np.abs(layer.points() - [3.75, 1.5]).max() < 0.4
+    layer.see(scan_of(scanner, HALL, pose, 10**9), pose)
+    assert len(layer.points()) == 0
+
+
+@pytest.mark.parametrize("name", TURNED)
+def test_lost_it_goes_where_there_is_room_whichever_way_the_beams_run(name):
+    pilot, pose = Pilot(Robot(), HALL), np.array([1.0, 3.0, 0.0])
+    scan = scan_of(TURNED[name], HALL, pose, 2 * 10**9)
+    pilot.see(scan, belief_at(pose, scan.stamp_ns, "lost"))
+    seeker: Seeker = pilot.seeker
+    for stamp in (0, 2 * 10**9):
+        decision = seeker.act(belief_at(pose, stamp, "lost"), scan, np.zeros((0, 2)), np.zeros(3), pilot._view)
+    assert decision.state == "exploring"
+    assert decision.action[0] > 0.1  # the hall lies ahead
+    assert abs(decision.action[1]) < decision.action[0]
+
+
+def test_beams_that_measured_nothing_are_neither_room_nor_wall():
+    """Every other beam has no return: the way is the same; where none has measured anything there is no room."""
+    pose, none = np.array([1.0, 3.0, 0.0]), np.zeros((0, 2))
+    whole = scan_of(TURNED["0 to 359 deg"], HALL, pose)
+    found = []
+    for silent in (slice(0, 0), slice(0, None, 2), slice(None)):
+        ranges = np.array(whole.ranges)
+        ranges[silent] = 0.0
+        scan, pilot = whole.model_copy(update={"ranges": ranges, "stamp_ns": 2 * 10**9}), Pilot(Robot(), HALL)
+        pilot.see(scan, belief_at(pose, scan.stamp_ns, "lost"))
+        for stamp in (0, 2 * 10**9):
+            decision = pilot.seeker.act(belief_at(pose, stamp, "lost"), scan, none, np.zeros(3), pilot._view)
+        assert decision.state == "exploring"
+        found.append(decision.action)
+    np.testing.assert_allclose(found[1], found[0], atol=0.05)
+    assert not found[2][:2].any()  # it turns on the spot
+
+
+@pytest.mark.parametrize("scanner", [LMS, BACKWARDS])
+def test_with_half_a_view_it_turns_before_it_drives_and_touches_nothing(scanner):
+    """The goal lies behind, and in the way a box that the map does not know: the wheels are held by nobody else."""
+    world = World(name="hall", boundary=HALL.boundary, obstacles=[BOX])
+    start, goal = (6.0, 1.5, scanner.mount[2]), (2.0, 1.5)
+    simulation = Simulation(Setup(world, scanner, Robot(), start, 0, obstacle_stop=False))
+    navigator = Navigator(Robot(), world=HALL, preset=Pilot(Robot(), HALL))
+    navigator.hear_goal(Goal(stamp_ns=0, pose=Pose(x=goal[0], y=goal[1])))
+    try:
+        while simulation.steps < 400:
+            _, truth, scan = simulation.observe()
+            assert not truth.contact
+            pose = truth.pose.array()
+            navigator.hear_scan(scan)
+            command, status = navigator.step(belief_at(pose, scan.stamp_ns))
+            speed = np.hypot(command.twist.vx, command.twist.vy)
+            if simulation.steps < 5:  # it has not turned yet
+                assert speed < 0.05
+            if status.state == "reached":
+                break
+            simulation.command(scan.stamp_ns, command.twist)
+            simulation.advance()
+    finally:
+        simulation.close()
+    assert status.state == "reached", status
+
+
+def test_a_base_that_only_goes_forward_says_that_it_is_blind():
+    robot, pose = Robot(drive="differential"), np.array([4.0, 3.0, 0.0])
+    pilot = Pilot(robot, HALL)
+    pilot.aim(np.array([6.0, 3.0]))
+    pilot.see(scan_of(BACKWARDS, HALL, pose), belief_at(pose, 0))
+    decision = pilot.decide(belief_at(pose, 0), np.zeros(3))
+    assert decision.reason == BLIND
+    assert not decision.action[:2].any()

@@ -1,0 +1,104 @@
+"""A scan brought to a model's beams: exactly where it can be, within the rule elsewhere, refused beyond it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.errors import UserError
+from common.geometry import se2
+from common.robot.scanner import SCANNERS, Scanner
+from services.estimator.factory import Choice, Geometry, prepare
+from services.estimator.paper.beam_fitting import fit
+from services.estimator.shared.interface import Observation
+from tests.estimator.models import ROOM
+
+TIM571 = SCANNERS["tim571"].with_beams(271)
+POSE = np.array([2.8, 1.6, 0.4])
+
+
+def like_tim571(**changes) -> Scanner:
+    return TIM571.model_copy(update=changes)
+
+
+def seen(scanner):
+    return ROOM.ray_distances(se2.compose(POSE, scanner.mount)[None], scanner.angles())[0]
+
+
+def fitted(scanner, model=TIM571):
+    return fit(model, scanner.angles(), np.array(scanner.mount), "train")
+
+
+def test_its_own_scan_is_left_as_it_is():
+    same = fitted(TIM571)
+    assert same.same
+    ranges = seen(TIM571)
+    assert same.ranges(ranges) is ranges
+
+
+@pytest.mark.parametrize(
+    "scanner",
+    [
+        like_tim571(beams=541),
+        like_tim571(upside_down=True),
+        like_tim571(mount=(0.2, 0.0, 0.5), first=float(np.deg2rad(-135) - 0.5)),
+        SCANNERS["rplidar-a1"].model_copy(update={"mount": (0.2, 0.0, np.pi)}),
+        SCANNERS["rplidar-a1"].model_copy(update={"mount": (0.2, 0.0, 0.0), "first": 0.0, "upside_down": True}),
+    ],
+)
+def test_other_beams_in_the_same_directions_give_the_same_scan(scanner):
+    found = fitted(scanner)
+    assert found.ranges(seen(scanner)) == pytest.approx(seen(TIM571), abs=1e-6)
+    back = found.predicted(seen(TIM571), scanner.angles())[0]
+    known = np.isfinite(back)
+    assert np.count_nonzero(known) >= 270
+    assert np.median(np.abs(back - seen(scanner))[known]) < 1e-3
+
+
+def test_between_beams_it_is_linear_and_round_the_back_too():
+    model = SCANNERS["rplidar-a1"]
+    scanner = model.model_copy(update={"first": model.angle_min + 0.25 * model.angle_increment})
+    ranges = np.arange(360.0)
+    expected = ranges - 0.25
+    expected[0] = 0.75 * 0 + 0.25 * 359
+    assert fitted(scanner, model).ranges(ranges) == pytest.approx(expected)
+
+
+def test_a_beam_is_made_of_both_its_neighbours():
+    model = SCANNERS["rplidar-a1"]
+    scanner = model.model_copy(update={"first": model.angle_min + 0.25 * model.angle_increment})
+    says = np.ones(360, bool)
+    says[7] = False
+    assert np.flatnonzero(~fitted(scanner, model).of_all(says)).tolist() == [7, 8]
+    assert np.flatnonzero(~fitted(model, model).of_all(says)).tolist() == [7]
+
+
+@pytest.mark.parametrize(
+    ("scanner", "why"),
+    [
+        (SCANNERS["lms200"], "does not look towards -135 deg of base_link"),
+        (like_tim571(mount=(0.2, 0.0, 0.2)), "does not look towards -135 deg"),
+        (like_tim571(fov=7.0), "its beams go round more than once, 401 deg from"),
+        (like_tim571(beams=61), r"beams are 4.50 deg apart, theirs 1.00, and 4 times"),
+        (like_tim571(mount=(0.2, 0.1, 0.0)), r"mounted at \(0.2, 0.1\) m, theirs at \(0.2, 0\) m"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_the_reason(scanner, why):
+    with pytest.raises(UserError, match=f"trained for tim571 with 271 beams: .*{why}.*; train for it: train"):
+        fitted(scanner)
+
+
+def test_the_shipped_paper_weights_take_a_scanner_that_looks_all_round():
+    scanner = SCANNERS["rplidar-a1"].model_copy(update={"mount": SCANNERS["tim571"].mount, "sigma_relative": 0.0})
+    made = prepare(Choice("corridor", "paper"))(Geometry.of(scanner))
+    world, pose = made.card.world, np.array([9.0, 1.5, made.card.heading])
+    ranges = world.ray_distances(se2.compose(pose, scanner.mount)[None], scanner.angles())[0]
+    made.restart(pose)
+    for _ in range(10):
+        posterior = made.update(Observation(scanner.limit(ranges), scanner.angles(), scanner.range_max))
+    assert np.hypot(*(posterior.pose - pose)[:2]) < 0.3  # the decoder's own error is some decimetres
+    blind = np.abs(scanner.angles()) > np.deg2rad(136)
+    assert np.isposinf(posterior.predicted[blind]).all()
+    assert np.isfinite(posterior.predicted[np.abs(scanner.angles()) < np.deg2rad(134)]).all()
+    both = made.predict(pose[None], scanner.angles()[::10])
+    assert both.ranges.shape == (1, 36)

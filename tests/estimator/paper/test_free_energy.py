@@ -1,0 +1,89 @@
+"""F and its descent directions against finite differences, and the paper's printed signs against both."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.estimator.paper.free_energy import accuracy, attraction, gradient
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def scene(seed: int):
+    """A smooth random generative model g(x) = A sin(Bx + c), its derivative, a scan and precisions."""
+    rng = np.random.default_rng(seed)
+    beams = 40
+    A, B, c = rng.normal(0, 2, beams), rng.normal(0, 0.5, (beams, 3)), rng.uniform(0, 6, beams)
+
+    def g(x):
+        return A * np.sin(B @ x + c)
+
+    def dg(x):
+        return (A * np.cos(B @ x + c))[:, None] * B
+
+    truth, belief, goal = rng.normal(0, 0.5, (3, 3))
+    precision = rng.uniform(0.2, 5.0, beams)
+    return g, dg, g(truth) + 0.02 * rng.normal(size=beams), precision, belief, goal
+
+
+def free_energy(g, o, precision, x, goal, beta):
+    return accuracy(o, g(x), precision) + attraction(g(x), g(goal), precision, beta)
+
+
+@given(seeds, st.floats(0.01, 2.0))
+def test_descent_is_minus_the_gradient_of_f(seed, beta):
+    g, dg, o, precision, belief, goal = scene(seed)
+    found = gradient(o, g(belief), dg(belief), precision, g(goal), beta)
+    h = 1e-6
+    for axis in range(3):
+        step = h * np.eye(3)[axis]
+        f = [free_energy(g, o, precision, belief + s * step, goal, beta) for s in (1, -1)]
+        assert found.descent[axis] == pytest.approx(-(f[0] - f[1]) / (2 * h), rel=1e-4, abs=1e-4)
+
+
+@given(seeds, st.floats(0.01, 2.0))
+def test_a_short_step_along_the_descent_lowers_f(seed, beta):
+    g, dg, o, precision, belief, goal = scene(seed)
+    found = gradient(o, g(belief), dg(belief), precision, g(goal), beta)
+    length = 1e-4 / max(np.linalg.norm(found.descent), 1e-9)
+    if np.linalg.norm(found.descent) < 1e-3:
+        return  # at a stationary point there is nothing to descend
+    after = free_energy(g, o, precision, belief + length * found.descent, goal, beta)
+    assert after < free_energy(g, o, precision, belief, goal, beta)
+
+
+@given(seeds)
+def test_curvature_is_the_gauss_newton_hessian(seed):
+    g, dg, o, precision, belief, _ = scene(seed)
+    found = gradient(g(belief), g(belief), dg(belief), precision)  # where the misfit is 0 it is the whole Hessian
+    h = 1e-4
+    for i in range(3):
+        for j in range(3):
+            ei, ej = h * np.eye(3)[i], h * np.eye(3)[j]
+            f = {(a, b): accuracy(g(belief), g(belief + a * ei + b * ej), precision) for a in (1, -1) for b in (1, -1)}
+            numeric = (f[1, 1] - f[1, -1] - f[-1, 1] + f[-1, -1]) / (4 * h * h)
+            assert found.curvature[i, j] == pytest.approx(numeric, rel=1e-3, abs=1e-2)
+    assert o.shape == (40,)
+
+
+def test_accuracy_is_a_density():
+    """exp(-accuracy) integrates to one over what may be measured: no gain, no 1/N."""
+    for precision in (0.25, 1.0, 2500.0):
+        sigma = precision**-0.5
+        o = np.linspace(-12 * sigma, 12 * sigma, 20001)
+        density = [np.exp(-accuracy(np.array([v]), np.zeros(1), np.array([precision]))) for v in o[::10]]
+        assert np.sum(density) * (o[10] - o[0]) == pytest.approx(1.0, rel=1e-6)
+
+
+@given(seeds)
+def test_the_printed_goal_term_points_away_from_the_goal(seed):
+    """Equation 3 as printed adds beta dg' Pi (o - g_goal); near the goal, belief at the truth, that is uphill."""
+    g, dg, _, precision, belief, _ = scene(seed)
+    goal = belief + 1e-3 * np.random.default_rng(seed).normal(size=3)
+    o = g(belief)
+    printed = (dg(belief).T * precision) @ (o - g(goal))
+    ours = gradient(o, g(belief), dg(belief), precision, g(goal), 1.0).xi_goal
+    assert printed @ (goal - belief) < 0 < ours @ (goal - belief)

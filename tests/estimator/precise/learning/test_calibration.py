@@ -1,0 +1,132 @@
+"""What is learned of real scans beside the field: shares, noise, motion, precision; what nobody looked into."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from services.estimator.precise.estimator import PreciseEstimator
+from services.estimator.precise.gauss_newton import View
+from services.estimator.precise.global_seeds import Seeds
+from services.estimator.precise.learning.calibration import learn_motion, learn_shares, noise_of
+from services.estimator.precise.learning.drive_learning import learn_drive
+from services.estimator.precise.learning.field_learning import Recipe, learn_field, looked_into
+from services.estimator.precise.learning.surfaces import Beams
+from services.estimator.precise.likelihood import Likelihood
+from services.estimator.shared.generative_models import Expected
+from tests.lab.real_logs import drives as real_drive
+from tests.lab.real_logs.drives import ANGLES, BEFORE, LONG, NONE, POSED, RANGE_MAX, SHORT, SIGMA, disturbed
+
+RECIPE = Recipe(resolution=0.05, sweeps=5, beams_a_sweep=60_000)
+SCANS = 160
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return real_drive.drive(SCANS)
+
+
+@pytest.fixture(scope="module")
+def learned(drive):
+    return learn_drive(drive.part(np.arange(SCANS // 2)), RECIPE, None, lambda *_: None)
+
+
+def test_expectation_maximisation_recovers_the_shares():
+    rng = np.random.default_rng(3)
+    surface = rng.uniform(2, 8, (200, 121))
+    expected = Expected(surface, np.full(surface.shape, 1e-3), np.zeros((*surface.shape, 3)))
+    measured = disturbed(surface + SIGMA * rng.standard_normal(surface.shape), rng)
+    found = learn_shares(measured, expected, RANGE_MAX, Likelihood(SIGMA))
+    assert found.short == pytest.approx(SHORT / (1 - NONE), abs=0.005)
+    assert found.random == pytest.approx(LONG / (1 - NONE), abs=0.004)
+    assert found.unseen == pytest.approx(NONE, abs=0.002)
+
+
+def test_the_noise_is_told_from_scans_alone():
+    rng = np.random.default_rng(1)
+    clean = BEFORE.ray_distances(np.array([[3.0, 3.0, yaw] for yaw in np.linspace(0, 6, 40)]), ANGLES)
+    blocked = np.where(np.abs(ANGLES - 0.3) < 0.1, 0.7, clean)
+    blocked[:, 5] = np.inf
+    for sigma in (0.005, 0.03):
+        found = noise_of(blocked + sigma * rng.standard_normal(clean.shape), ANGLES)
+        assert found == pytest.approx(sigma, rel=0.25)
+
+
+def test_motion_is_learned_from_the_drive(drive):
+    found = learn_motion(drive.stamps, drive.poses, drive.odom)
+    assert found.period == pytest.approx(0.25)
+    assert 0.3 < found.speed < 0.8  # m/s: it drives at 0.4 to 0.5
+    without = learn_motion(drive.stamps, drive.poses, None)
+    assert without.path_by_path != found.path_by_path
+
+
+def test_what_beams_go_through_is_no_surface():
+    """A person who stood there for a tenth of the scans leaves nothing behind."""
+    poses = np.array([[3.0, 3.0, yaw] for yaw in np.linspace(-np.pi, np.pi, 100)])
+    ranges = BEFORE.ray_distances(poses, ANGLES)
+    rng = np.random.default_rng(0)
+    person = (rng.random(100) < 0.1)[:, None] & (np.abs(ANGLES) < 0.1)
+    blocked = np.where(person, 1.0, ranges) + SIGMA * rng.standard_normal(ranges.shape)
+    field = learn_field(Beams.of(poses, np.zeros(3), ANGLES, blocked), RECIPE)
+    error = np.abs(field.trace(poses, ANGLES).ranges - ranges)
+    assert (error > 0.3).mean() < 0.02
+
+
+def test_nothing_is_expected_where_nobody_looked():
+    """Beams into the part that no scan has seen are neither explained nor contradicted by what comes back."""
+    poses = np.array([[2.0, 4.0, yaw] for yaw in np.linspace(2.8, 3.5, 100)])  # never towards the right
+    ranges = BEFORE.ray_distances(poses, ANGLES)
+    beams = Beams.of(poses, np.zeros(3), ANGLES, ranges)
+    seen = looked_into(beams)
+    assert seen.contains(np.array([[1.0, 4.0]]))[0]
+    assert not seen.contains(np.array([[8.5, 1.0], [50.0, 0.0]])).any()
+    from services.estimator.precise.field import FieldModel  # noqa: PLC0415
+
+    model = FieldModel(learn_field(beams, RECIPE), seen=seen)
+    right = np.array([[2.0, 4.0, 0.0]])
+    expected = model.expect(right, np.zeros(1))
+    assert np.isinf(expected.scale[0, 0])
+    assert not expected.jacobian.any()
+    likelihood = Likelihood()
+    near, far = (likelihood.evaluate(np.array([r]), RANGE_MAX, expected).accuracy[0] for r in (5.0, 9.0))
+    assert near == pytest.approx(far)
+
+
+def test_the_stated_precision_is_honest(learned):
+    """Poses found in scans held out, against references that are 2 cm off: NEES in a band, floors of that size."""
+    found = learned.calibration
+    assert found.scans == 16
+    assert 1.2 < found.nees_median < 3.6
+    assert found.nees_mean < 6
+    assert POSED[0] / 2 < found.floor_position < 2 * POSED[0]
+    assert POSED[2] / 3 < found.floor_heading < 3 * POSED[2]
+    assert found.likelihood.short == pytest.approx(SHORT, abs=0.05)
+    assert all(abs(observed - stated) < 0.12 for stated, observed in found.coverage)
+
+
+def test_it_localises_the_second_half_among_moved_furniture(drive, learned):
+    """With and without odometry from a known start, and from nothing."""
+    settings = learned.calibration.settings()
+    made = PreciseEstimator(
+        learned.model, Seeds.at(learned.model, learned.places), drive.mount, learned.calibration.likelihood, settings
+    )
+    half = SCANS // 2
+    view = View(made.model, made.likelihood, drive.mount, ANGLES, drive.ranges[half], RANGE_MAX)
+    assert view.evidence(drive.poses[half : half + 1]).explained[0] > settings.believable
+    for odometry, start in ((True, drive.poses[half]), (False, drive.poses[half]), (True, None)):
+        made.restart(start, None if start is None else np.diag([0.01, 0.01, 0.0025]))
+        errors, wrong = [], 0
+        for k in range(half, SCANS, 1 if start is not None else 6):
+            posterior = made.update(observation(drive, k, odometry=odometry))
+            errors.append(np.hypot(*(posterior.pose - drive.poses[k])[:2]))
+            wrong += posterior.state == "tracking" and errors[-1] > 0.5
+        assert np.median(errors) < 0.05  # the references are 0.02 m off in x and in y
+        assert np.mean(np.array(errors) < 0.5) > 0.95
+        assert not wrong
+
+
+def observation(drive, k, *, odometry):
+    from services.estimator.shared.interface import Observation  # noqa: PLC0415
+
+    odom = drive.odom[k] if odometry else None
+    return Observation(drive.ranges[k], ANGLES, RANGE_MAX, float(drive.stamps[k]), odom)

@@ -1,0 +1,136 @@
+"""A field learned in seconds from noisy scans of a small room: it predicts, knows where it errs, is repeatable."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.errors import UserError
+from common.geometry.world import World
+from services.estimator.precise.field import CLASSES, FieldModel
+from services.estimator.precise.learning import weights
+from services.estimator.precise.learning.evaluation import evaluate
+from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_scales
+from services.estimator.precise.learning.surfaces import Beams
+from tests.estimator.models import ROOM, SCANNER
+
+ANGLES = np.deg2rad(np.linspace(-135, 135, 271))
+NONE = np.zeros(3)
+RECIPE = Recipe(resolution=0.05, sweeps=4, beams_a_sweep=60_000)
+
+
+def scans(count, seed, sigma):
+    rng = np.random.default_rng(seed)
+    poses = np.column_stack([ROOM.sample_free(count, rng, 0.2), rng.uniform(-np.pi, np.pi, count)])
+    return poses, ROOM.ray_distances(poses, ANGLES) + sigma * rng.standard_normal((count, len(ANGLES)))
+
+
+def learned(seed=0):
+    poses, ranges = scans(400, seed, 0.02)
+    return learn_field(Beams.of(poses, NONE, ANGLES, ranges), RECIPE)
+
+
+@pytest.fixture(scope="module")
+def model():
+    field = learned()
+    poses, ranges = scans(150, 1, 0.0)
+    return FieldModel(field, learn_scales(field, poses, NONE, ANGLES, ranges, 0.0))
+
+
+def test_it_predicts_scans_it_has_not_seen(model):
+    poses, clean = scans(100, 2, 0.0)
+    error = np.abs(model.expect(poses, ANGLES).ranges - clean)
+    assert np.median(error) < 0.003  # the scans it learned from had noise of 0.02 m
+    assert (error > 0.05).mean() < 0.02
+
+
+def test_it_states_less_precision_where_it_errs(model):
+    poses, clean = scans(100, 3, 0.0)
+    expected = model.expect(poses, ANGLES)
+    error = np.abs(expected.ranges - clean)
+    sure = expected.scale < 0.01
+    assert sure.mean() > 0.7
+    assert error[~sure].mean() > 10 * error[sure].mean()
+    # Most errors are within three of the stated deviations of model and scanner.
+    assert (error < 3 * np.hypot(expected.scale, 0.02)).mean() > 0.97
+
+
+def test_the_same_seed_gives_the_same_field():
+    assert np.array_equal(learned().phi, learned().phi)
+    assert not np.array_equal(learned().phi, learned(seed=5).phi)
+
+
+def test_what_it_leaves_of_position_error_is_small(model):
+    poses, clean = scans(60, 4, 0.0)
+    quality = evaluate(model, poses, NONE, ANGLES, clean, 25.0, 0.02)
+    assert quality.position_error_rms < 0.003
+    assert 1 <= quality.inflation < 1.5
+    assert quality.range_error_median < 0.003
+
+
+def test_beams_without_return_are_left_out():
+    ranges = np.array([[1.0, np.inf, -np.inf, 2.0]])
+    beams = Beams.of(np.array([[1.0, 2.0, np.pi / 2]]), NONE, np.array([0.0, 0.1, 0.2, 0.3]), ranges)
+    assert beams.ranges.tolist() == [1.0, 2.0]
+    assert beams.ends()[0] == pytest.approx([1.0, 3.0])
+
+
+def card(model, **changes):
+    values = {
+        "world": ROOM, "scanner": SCANNER, "samples": 400, "seed": 0, "resolution": model.field.resolution,
+        "origin": model.field.origin, "sweeps": 4, "ripple": 0.01, "inflation": 1.1, "test_samples": 60,
+        "test_range_error_median_m": 0.001, "test_range_error_mean_m": 0.01, "test_share_above_5_cm": 0.01,
+        "test_position_error_rms_m": 0.001, "learning_s": 1.0, "commit": "c", "command": "presage train",
+        "versions": {},
+    }  # fmt: skip
+    return weights.FieldCard(**{**values, **changes})
+
+
+def saved(model, folder):
+    path = weights.path_of(folder, "room")
+    weights.save(path, model, np.array([[1.0, 1.0]]), card(model))
+    return path
+
+
+def test_what_is_saved_comes_back(model, tmp_path):
+    path = saved(model, tmp_path)
+    back, places, read = weights.load(path)
+    assert read == card(model)
+    assert places.tolist() == [[1.0, 1.0]]
+    assert np.array_equal(back.field.phi, model.field.phi.astype(np.float16).astype(np.float32))
+    poses, _ = scans(20, 6, 0.0)
+    off = np.abs(back.expect(poses, ANGLES).ranges - model.expect(poses, ANGLES).ranges)
+    assert np.quantile(off, 0.98) < 5e-4  # half precision is fine near zero
+    assert weights.find(tmp_path, ROOM, "room") == path
+
+
+def test_a_field_of_other_walls_is_not_taken(model, tmp_path):
+    saved(model, tmp_path)
+    other = World(name="room", boundary=ROOM.boundary, obstacles=ROOM.obstacles[:1])
+    with pytest.raises(UserError, match="another world of the same name 'room'"):
+        weights.find(tmp_path, other, "mine.yaml")
+    with pytest.raises(UserError, match=f"presage train --world mine.yaml --preset precise --out {tmp_path}"):
+        weights.find(tmp_path, World(name="hall", boundary=ROOM.boundary), "mine.yaml")
+
+
+@pytest.mark.parametrize("damage", ["cut", "garbage", "no card", "bad card", "other arrays", "not finite"])
+def test_damaged_files_are_one_clear_line(model, tmp_path, damage):
+    path = saved(model, tmp_path)
+    beside = path.with_suffix(".json")
+    if damage == "cut":
+        path.write_bytes(path.read_bytes()[:-100])
+    elif damage == "garbage":
+        path.write_bytes(b"\x00" * 64)
+    elif damage == "no card":
+        beside.unlink()
+    elif damage == "bad card":
+        beside.write_text('{"preset": 3}')
+    elif damage == "other arrays":
+        weights.save(path, FieldModel(model.field, np.ones(3)), np.zeros((1, 2)), card(model))
+    else:
+        scales = np.full(int(np.prod(CLASSES)), np.nan)
+        weights.save(path, FieldModel(model.field, scales), np.zeros((1, 2)), card(model))
+    with pytest.raises(UserError) as error:
+        weights.load(path)
+    assert str(path.with_suffix("")) in str(error.value)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,207 @@
+"""The benches' own parts: paths a robot can drive, a bound that is one, rows that say what was measured."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from common.errors import UserError
+from common.geometry import se2
+from common.geometry.world import load_world
+from common.robot.base import Robot
+from lab.accuracy import bound, tasks
+from lab.accuracy.report import _markdown, bench_accuracy, scanners_of
+from lab.accuracy.runner import Job, _row, wilson
+from lab.accuracy.scenes import TWINS, Scene, alike, twin_of, twin_path
+from services.estimator.shared.interface import Hypothesis, Posterior
+from services.simulator.odometry import Drift
+
+CONSOLE = Console(quiet=True)
+
+
+@pytest.mark.parametrize("world", ["office", "maze"])
+def test_a_path_is_one_a_robot_can_drive(world):
+    scene = Scene.of(load_world(world), 60, 0)
+    path = scene.path(60)
+    assert len(path) == 900
+    step = np.diff(path, axis=0)
+    speed = np.hypot(step[:, 0], step[:, 1]) * scene.scanner.rate
+    assert speed.max() < 1.0 + 1e-6
+    assert speed.mean() > 0.2
+    assert np.abs(se2.wrap(step[:, 2])).max() * scene.scanner.rate < 1.0 + 1e-6
+    assert scene.world.clearance(path[:, :2]).min() > Robot().radius - 1e-6
+
+
+def test_the_bound_is_that_of_the_exact_rays_by_finite_differences():
+    scene = Scene.of(load_world("maze"), 200, 0)
+    pose, step = scene.poses(1)[0], 1e-5
+    columns = []
+    for axis in range(3):
+        offset = step * np.eye(3)[axis]
+        ahead, back = scene.clean(np.array([pose + offset, pose - offset]))
+        columns.append((ahead - back) / (2 * step))
+    J = np.array(columns).T
+    J = J[np.abs(J).max(axis=1) < 50]  # a beam that jumps within the step has no derivative
+    by_hand = J.T @ J / scene.scanner.sigma**2
+    assert bound.information(scene, pose[None])[0] == pytest.approx(by_hand, rel=0.05, abs=0.02 * by_hand.max())
+
+
+def test_odometry_only_tightens_the_bound_and_standing_adds_up():
+    scene = Scene.of(load_world("maze"), 200, 0)
+    path = scene.path(3)
+    alone, along = bound.single(scene, path), bound.recursive(scene, path, Drift())
+    assert (bound.position(along) <= bound.position(alone) + 1e-12).all()
+    still = np.tile(path[:1], (20, 1))
+    last = bound.recursive(scene, still, Drift(0, 0, 0, 0))[-1]
+    assert last == pytest.approx(bound.single(scene, path[:1], 20)[0], rel=1e-3)
+
+
+def test_what_is_known_before_tightens_the_bound_and_nothing_beats_a_known_heading():
+    scene = Scene.of(load_world("maze"), 200, 0)
+    path = scene.path(2)
+    one = bound.single(scene, path)
+    start = np.diag([1e-3, 1e-3, 1e-3]) ** 2
+    first = bound.recursive(scene, path, Drift(), start)[0]
+    assert np.linalg.inv(first) == pytest.approx(np.linalg.inv(one[0]) + np.linalg.inv(start), rel=1e-6)
+    known = bound.heading_known(one)
+    assert (bound.position(known) <= bound.position(one)).all()
+    assert known[0, :2, :2] == pytest.approx(np.linalg.inv(bound.information(scene, path[:1])[0, :2, :2]), rel=1e-6)
+
+
+def test_the_median_of_errors_at_the_bound():
+    assert bound.median(np.tile(np.diag([1.0, 1.0, 1.0]), (3, 1, 1))) == pytest.approx(np.sqrt(np.log(4)), rel=0.03)
+
+
+def test_blocked_is_at_least_the_share_asked_for_and_only_shorter():
+    scene = Scene.of(load_world("office"), 622, 0)
+    for clean in scene.clean(scene.poses(10)):
+        blocked = scene.blocked(clean, 0.3)
+        assert (blocked <= clean).all()
+        assert (blocked < clean).mean() >= 0.3
+
+
+def test_twins_are_twins_until_the_corridor():
+    scene = Scene.of(TWINS, 200, 1)
+    path, same = twin_path(scene)
+    assert 5 <= same < len(path)
+    assert alike(scene, path)[:same].all()
+    assert not alike(scene, path)[-1]
+    assert twin_of(twin_of(path)) == pytest.approx(path)
+    assert abs(twin_of(path) - path) == pytest.approx(np.tile([6.1, 0, 0], (len(path), 1)))
+    assert TWINS.clearance(path[:, :2]).min() > Robot().radius
+
+
+class Believes:
+    """An estimator that publishes what a function of the number of scans and of the true poses makes."""
+
+    def __init__(self, paths, believe):
+        self.paths, self.believe, self.trial = iter(paths), believe, 0
+
+    def restart(self):
+        self.path, self.scans = next(self.paths), 0
+
+    def update(self, observation):
+        pose = self.path[self.scans]
+        self.scans += 1
+        state, poses = self.believe(self.scans, pose, twin_of(pose))
+        hypotheses = tuple(Hypothesis(np.array(each), np.eye(3), 1 / len(poses)) for each in poses)
+        return Posterior(state, hypotheses, 0.0, 0.0, np.zeros(3), np.eye(3), np.zeros(1))
+
+
+def nothing_at_first(scans, pose, twin):
+    return ("ambiguous", [pose, twin]) if scans >= 20 else ("localising", [np.array([3.0, 5.0, 0.0])])
+
+
+def nothing_until_later(scans, pose, twin):
+    return ("ambiguous", [pose, twin]) if scans >= 21 else ("localising", [pose])
+
+
+def the_true_room_alone(scans, pose, twin):
+    return "tracking", [pose]
+
+
+def the_other_room_alone(scans, pose, twin):
+    return "tracking", [twin]
+
+
+def another_heading_in_the_twin(scans, pose, twin):
+    return "ambiguous", [pose, twin + np.array([0, 0, np.deg2rad(6)])]
+
+
+@pytest.mark.parametrize(
+    ("believe", "kept", "wrong"),
+    [
+        (nothing_at_first, 2, 0),
+        (nothing_until_later, 0, 0),
+        (the_true_room_alone, 0, 0),
+        (the_other_room_alone, 0, 2),
+        (another_heading_in_the_twin, 0, 0),
+    ],
+)
+def test_both_rooms_must_be_believed_from_scan_20_on(believe, kept, wrong):
+    paths = [twin_path(scene)[0] for scene in [Scene.of(TWINS, 60, 4)] for _ in range(2)]
+    scene = Scene.of(TWINS, 60, 4)
+    scene.observe = lambda clean, stamp: None  # the noise would change the paths drawn after it
+    found = tasks.twins(Believes(paths, believe), scene, 2, iter)["two rooms alike: both kept"]
+    assert (found.found, found.of, found.wrong) == (kept, 2, wrong)
+
+
+def test_the_short_table_shows_wrong_claims_beside_what_was_found(capsys):
+    outcome = tasks.Outcome(found=1, of=3, wrong=2, errors=[np.array([0.003, 0.004, 0.0])], misfits=[2.5])
+    nothing = tasks.Outcome(of=3, wrong=1)
+    tim = scanners_of("tim571", "")[0]
+    job = Job("precise", "office", tim, 3, 1.0, 0)
+    rows = [_row(job, "office", task, each) for task, each in (("kidnapped", outcome), ("blocked", nothing))]
+    assert "| kidnapped | 5.00 / 5.00 mm, 1/3, 2 wrong, NEES 2.50 |" in _markdown(rows, "office")
+    assert "| blocked | 0/3, 1 wrong |" in _markdown(rows, "office")
+    assert rows[0]["found_share_95"] == pytest.approx([0.061, 0.792], abs=1e-3)
+
+
+def test_counts_have_an_interval_unless_they_are_of_one_path():
+    assert wilson(294, 300) == pytest.approx([0.9570, 0.9908], abs=1e-3)
+    assert wilson(0, 100) == pytest.approx([0.0, 0.0370], abs=1e-3)
+    assert wilson(100, 100) == pytest.approx([0.9630, 1.0], abs=1e-3)
+    tim = scanners_of("tim571", "")[0]
+    along = tasks.Outcome(found=9, of=9, independent=False)
+    assert _row(Job("precise", "office", tim, 3, 1.0, 0), "office", "tracking", along)["found_share_95"] is None
+
+
+def test_rows_say_what_was_measured(tmp_path):
+    file, figure = tmp_path / "a.json", tmp_path / "a.png"
+    code = bench_accuracy("maze", "200", "precise-exact", "standing,odometry", 3, 0.1, 5, 1, file, figure, CONSOLE)
+    assert code == 0
+    data = json.loads(file.read_text())
+    rows = {row["task"]: row for row in data["rows"]}
+    assert set(rows) == {"from nothing, 1 scan", "standing, 20 scans", "tracking, odometry"}
+    assert rows["tracking, odometry"]["of"] == 90
+    assert 0 < rows["tracking, odometry"]["position_error_rms_m"] < 0.02
+    assert rows["standing, 20 scans"]["bound_rms_m"] == pytest.approx(
+        rows["from nothing, 1 scan"]["bound_rms_m"] / np.sqrt(20)
+    )
+    assert {"seed", "commit", "arguments"} <= set(data)
+    assert figure.stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("nowhere", "622", "precise", ""), "no world"),
+        (("office", "many", "precise", ""), "--beams"),
+        (("office", "622", "best", ""), "no estimator"),
+        (("office", "622", "precise", "running"), "no task"),
+    ],
+)
+def test_words_that_are_not_known(words, why):
+    with pytest.raises(UserError, match=why):
+        bench_accuracy(*words, 2, 0.1, 0, 1, None, None, CONSOLE)
+
+
+def test_scanners_are_named_with_their_beams():
+    named = [(one.name, one.beams) for one in scanners_of("tim571,lms200", "")]
+    assert named == [("tim571", 622), ("lms200", 181)]
+    assert [one.beams for one in scanners_of("tim571", "622,811")] == [622, 811]
+    with pytest.raises(UserError, match="no scanner 'sonar'"):
+        scanners_of("sonar", "")

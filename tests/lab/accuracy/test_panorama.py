@@ -1,0 +1,77 @@
+"""Networks behind the generative model's interface: they learn, their derivatives are theirs, a seed repeats them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from common.errors import UserError
+from lab.accuracy.panorama import Shape, train_panorama
+from services.estimator.paper.decoder import Decoder, PaperModel, use_one_core
+from services.estimator.paper.decoder import Shape as PaperShape
+from services.estimator.paper.estimator import PaperScans
+from tests.estimator.models import HEADING, ROOM, SCANNER, normalisation
+
+ANGLES = np.deg2rad(np.linspace(-135, 135, 91))
+use_one_core()  # threads that wait for one another on a busy machine take minutes over what one does in seconds
+SMALL = {"bins": 120, "width": 64, "layers": 2, "frequencies": 16}
+
+
+def lasers(count, seed):
+    rng = np.random.default_rng(seed)
+    return np.column_stack([ROOM.sample_free(count, rng, 0.2), rng.uniform(-np.pi, np.pi, count)])
+
+
+def trained(steps=150, seed=0, **shape):
+    poses = lasers(300, 0)
+    return train_panorama(Shape(**{**SMALL, **shape}), poses, ANGLES, ROOM.ray_distances(poses, ANGLES), steps, seed)
+
+
+@pytest.mark.parametrize("shape", [{}, {"inputs": "grid"}, {"activation": "relu", "loss": "l1"}])
+def test_it_learns(shape):
+    poses = lasers(100, 1)
+    exact = ROOM.ray_distances(poses, ANGLES)
+    error = np.abs(trained(**shape).expect(poses, ANGLES).ranges - exact)
+    assert error.mean() < 0.6 * np.abs(exact - np.median(exact)).mean()
+
+
+def test_its_precision_is_learned():
+    poses = lasers(100, 1)
+    expected = trained(400).expect(poses, ANGLES)
+    error = np.abs(expected.ranges - ROOM.ray_distances(poses, ANGLES))
+    surer = expected.scale < np.median(expected.scale)
+    assert error[~surer].mean() > 1.5 * error[surer].mean()
+
+
+def test_a_seed_repeats_it():
+    poses = lasers(5, 2)
+    first, again, other = (trained(20, seed).expect(poses, ANGLES).ranges for seed in (0, 0, 1))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_its_derivatives_are_those_of_its_ranges():
+    model = trained(100)
+    pose = lasers(1, 3)[0]
+    found = model.expect(pose[None], ANGLES).jacobian[0]
+    for axis, step in enumerate((2e-3, 2e-3, 2 * np.pi / 120)):  # by yaw it is that of whole directions
+        offset = step * np.eye(3)[axis]
+        ahead, back = model.expect(np.array([pose + offset, pose - offset]), ANGLES).ranges
+        assert found[:, axis] == pytest.approx((ahead - back) / (2 * step), rel=1e-2, abs=1e-2)
+
+
+def test_the_papers_decoder_behind_the_same_interface():
+    torch.manual_seed(0)
+    model = PaperModel(Decoder(PaperShape(SCANNER.beams, 16, 4)).double(), normalisation())
+    scans = PaperScans(model, SCANNER, HEADING, 0.3)
+    laser = np.array([[2.0, 1.5, HEADING + 1.0]])  # another heading is ignored: it knows one
+    expected = scans.expect(laser, SCANNER.angles())
+    base = np.array([2.0, 1.5, 0.0]) - [*(np.array([np.cos(HEADING + 1), np.sin(HEADING + 1)]) * SCANNER.mount[0]), 0]
+    ranges, jacobian = model.predict(np.array([*base[:2], HEADING]))
+    assert expected.ranges[0] == pytest.approx(ranges)
+    assert expected.jacobian[0] == pytest.approx(jacobian)
+    assert (expected.scale == 0.3).all()
+    assert np.array_equal(scans.expect(laser, SCANNER.angles()[::2]).ranges[0], ranges[::2])
+    with pytest.raises(UserError, match="beams of its training"):
+        scans.expect(laser, np.array([3.0]))

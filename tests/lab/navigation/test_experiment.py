@@ -1,0 +1,412 @@
+"""Navigation round walls: shortest ways, the least time, what is measured, and a small run through real processes."""
+
+from __future__ import annotations
+
+import json
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+
+from common.bus.bus import wait_until
+from common.errors import UserError
+from common.geometry.world import Box, Obstacle, World, load_world, save_world
+from common.messages.definitions import Belief, Health, Pose, Status, Truth, Twist
+from common.robot.base import Robot
+from common.runtime import safety
+from lab.experiments import tables_page as page
+from lab.experiments.journeys import Journey
+from lab.experiments.lockstep import Errand, Track, _over, _take
+from lab.navigation import drive as driven
+from lab.navigation import experiment as driving
+from lab.navigation import shortest_path as shortest
+from lab.navigation.shortest_path import Trip, Ways, draw_trip, least_trip, least_turn, length, ways_of
+
+QUIET = Console(quiet=True)
+ROBOT, TURNING = Robot(), Robot(drive="differential")
+HALL = World(name="hall", boundary=[(0, 0), (10, 0), (10, 6), (0, 6)])
+
+
+def block(*boxes, boundary=HALL.boundary, name="block"):
+    obstacles = [Obstacle(box=Box(center=(x, y), size=(w, h))) for x, y, w, h in boxes]
+    return World(name=name, boundary=boundary, obstacles=obstacles)
+
+
+def test_where_nothing_stands_between_the_way_is_straight():
+    way = Ways(HALL, 0.3).way(np.array([1.0, 1.0]), np.array([9.0, 5.0]))
+    assert way.tolist() == [[1.0, 1.0], [9.0, 5.0]]
+
+
+def test_round_a_box_two_tangents_and_two_quarters_of_a_circle():
+    """A box from (4, 0) to (6, 3), start and goal as high as its top: up along a tangent, round, along, down."""
+    r = 0.4
+    ways = Ways(block((5.0, 1.5, 2.0, 3.0)), r)
+    start, goal = np.array([1.0, 3.0]), np.array([9.0, 3.0])
+    tangent = np.sqrt(3.0**2 - r**2)
+    turned = np.arcsin(r / 3.0)
+    expected = 2 * tangent + 2 * turned * r + 2.0
+    assert length(ways.way(start, goal)) == pytest.approx(expected, abs=2e-3)
+
+
+def test_of_two_ways_round_it_takes_the_shorter():
+    ways = Ways(block((5.0, 2.5, 0.2, 3.0)), 0.3)  # from 1 to 4 of 6
+    assert ways.way(np.array([2.0, 2.0]), np.array([8.0, 2.0]))[1:-1, 1].max() < 1.01
+    assert ways.way(np.array([2.0, 3.0]), np.array([8.0, 3.0]))[1:-1, 1].min() > 3.99
+
+
+def test_a_door_too_narrow_is_none():
+    start, goal = np.array([1.0, 3.0]), np.array([9.0, 3.0])
+    wall = block((5.0, 1.2, 0.2, 2.4), (5.0, 4.5, 0.2, 3.0))  # 0.6 m between
+    assert len(Ways(wall, 0.29).way(start, goal)) >= 3
+    assert Ways(wall, 0.31).way(start, goal).shape == (0, 2)
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=20, deadline=None)
+def test_a_shortest_way_keeps_its_clearance_and_there_is_no_short_cut(seed):
+    world, ways = ways_of("maze")
+    rng = np.random.default_rng(seed)
+    start, middle, goal = world.sample_free(3, rng, ROBOT.radius + shortest.SPARE)
+    way = ways.way(start, goal)
+    keeps = shapely.distance(shapely.LineString(way), shapely.boundary(world.free_space))
+    assert keeps >= ROBOT.radius + shortest.GAP - shortest.EXACT - 1e-5
+    assert length(way) >= np.hypot(*(goal - start)) - 1e-9
+    assert length(way) == pytest.approx(length(ways.way(goal, start)))
+    assert length(way) <= length(ways.way(start, middle)) + length(ways.way(middle, goal)) + 1e-9
+    # Pulled tight: nothing is gained by leaving out a corner.
+    for k in range(1, len(way) - 1):
+        direct = shapely.LineString(way[[k - 1, k + 1]])
+        if shapely.covers(ways.room, direct):
+            assert direct.length == pytest.approx(length(way[k - 1 : k + 2]), abs=1e-6)
+
+
+def test_shortest_ways_are_no_longer_than_those_over_a_fine_grid():
+    """An entirely different computation: 16 neighbours on a grid of 5 cm are never shorter."""
+    from services.controller.policies.free_space import FreeSpace  # noqa: PLC0415
+    from services.controller.policies.geodesic_field import Roads  # noqa: PLC0415
+
+    world, ways = ways_of("office")
+    roads = Roads(FreeSpace.of(world), ROBOT.radius)
+    for start, goal in world.sample_free(12, np.random.default_rng(3), 0.5).reshape(-1, 2, 2):
+        field = roads.from_(goal)
+        exact, grid = length(ways.way(start, goal)), length(field.path(start))
+        assert exact <= grid + 1e-6
+        assert grid < 1.25 * exact + 0.1  # it costs what is near walls more, and so goes round them farther
+
+
+@pytest.mark.parametrize("world", ["maze", "office", "twins"])
+def test_a_trip_fits_is_long_enough_and_the_same_for_every_drive(world):
+    known, _ = ways_of(world)
+    trips = [draw_trip(world, np.random.default_rng((1, k)), ROBOT) for k in range(25)]
+    for k, trip in enumerate(trips):
+        assert trip == draw_trip(world, np.random.default_rng((1, k)), TURNING)
+        ends = [trip.start[:2], trip.goal]
+        assert known.clearance(ends).min() >= ROBOT.radius + shortest.SPARE - 1e-3
+        assert length(np.array(trip.shortest)) >= shortest.APART - 1e-3
+        assert trip.shortest[0] == trip.start[:2]
+        assert trip.shortest[-1] == trip.goal
+        assert world != "twins" or trip.start[1] < 4.4
+    assert len({trip.start for trip in trips}) == 25
+    assert np.ptp([trip.start[2] for trip in trips]) > 4  # any heading
+
+
+def test_where_the_robot_cannot_drive_far_it_is_said(tmp_path):
+    cell = tmp_path / "cell.yaml"
+    cell.write_text(save_world(World(name="cell", boundary=[(0, 0), (1.5, 0), (1.5, 1.5), (0, 1.5)])))
+    with pytest.raises(UserError, match="no two places 2 m apart"):
+        draw_trip(str(cell), np.random.default_rng(0), ROBOT)
+
+
+@given(st.floats(0.3, np.pi), st.floats(0.5, 4.0), st.floats(0.5, 6.0))
+@settings(max_examples=12, deadline=None)
+def test_no_base_within_its_limits_turns_sooner(angle, speed, acceleration):
+    """By the simulator's own ramp, braking as late as possible, until it stands."""
+    robot, dt = Robot(max_turn=speed, turn_acceleration=acceleration), 4e-3
+    v, turned, seconds = np.zeros(3), 0.0, 0.0
+    while seconds == 0 or v[2] > 0:
+        brakes = turned + v[2] ** 2 / (2 * acceleration) >= angle
+        before, v = v, safety.ramp(v, np.array([0, 0, 0.0 if brakes else speed]), robot, dt)
+        turned, seconds = turned + (before[2] + v[2]) / 2 * dt, seconds + dt
+    assert turned == pytest.approx(angle, abs=speed * 2 * dt)
+    assert seconds == pytest.approx(least_turn(-angle, robot), abs=6 * dt)
+
+
+def test_the_least_time_known_cases():
+    way = [(0.0, 0.0), (0.0, 4.0), (3.0, 4.0)]
+    robot = Robot(max_speed=1.0, acceleration=1.0, max_turn=2.0, turn_acceleration=3.0)
+    turning = robot.model_copy(update={"drive": "differential"})
+    straight = 7.0 - 0.2 + 0.5
+    assert least_trip(way, 0.0, robot, 0.2) == pytest.approx(straight)
+    assert least_trip(way, np.pi / 2, turning, 0.2) == pytest.approx(straight)
+    quarter = np.pi / 2 / 2 + 2 / 3  # 1.57 rad, more than w^2/a = 1.33: it turns at its limit for a while
+    assert least_trip(way, np.pi, turning, 0.2) == pytest.approx(straight + quarter)
+    assert least_turn(0.75, robot) == pytest.approx(1.0)
+
+
+def truth(number, x, speed=0.0, **more):
+    return Truth(stamp_ns=number * 100_000_000, pose=Pose(x=x, y=1.0), twist=Twist(vx=speed), **more)
+
+
+def belief(number, x, state="tracking"):
+    return Belief(
+        stamp_ns=number * 100_000_000, state=state, pose=Pose(x=x, y=1.0), xi=np.zeros(3), free_energy=0.0, accuracy=0.0
+    )
+
+
+def status(number, state, reason="", goal_seq=1, *, refused=False):
+    return Status(stamp_ns=number * 100_000_000, state=state, reason=reason, goal_seq=goal_seq, refused=refused)
+
+
+TRIP = Trip((1.0, 1.0, 0.0), (5.0, 1.0), ((1.0, 1.0), (5.0, 1.0)))
+
+
+def a_track(last="reached", ends_at=4.9):
+    people = np.array([[3.0, 2.0], [9.0, 5.0]], np.float32)
+    truths = [
+        truth(0, 1.0),
+        truth(1, 2.0, 0.5, people=people, stopped=True),
+        truth(2, 3.0, 0.0, contact=True, people=people),  # it stands now, for it drove into something
+        truth(3, 3.0, contact=True),
+        truth(4, ends_at, 0.4),
+    ]
+    beliefs = [belief(0, 8.0, "ambiguous"), belief(1, 2.01), belief(2, 3.0), belief(3, 3.02), belief(4, ends_at)]
+    states = [
+        status(0, "exploring", "2 places are possible"),
+        status(1, "navigating"),
+        status(2, "blocked", "waiting: something that moves, 0.8 m away at (1.0, -3.4)"),
+        status(3, "blocked", "waiting: something that moves, 0.7 m away at (1.0, -3.4)"),
+        status(4, last),
+    ]
+    health = Health(
+        stamp_ns=9, service="controller", uptime=1.0, counters={"steps": 4, "step_us": 8000, "step_us_max": 5000}
+    )
+    return Track(truths, beliefs, {each.stamp_ns: each for each in states}, [0, 0, 3], health)
+
+
+def test_what_is_measured():
+    found = driven.measure(a_track(), TRIP, HALL, ROBOT)
+    assert found["outcome"] == "reached"
+    assert found["driven_m"] == pytest.approx(3.9)
+    assert found["path_over_shortest"] == pytest.approx(1.0)  # stopping short saves nothing
+    assert found["time_over_least"] == pytest.approx(0.4 / (4.0 - 0.2 + 0.5))
+    assert (found["contacts_moving"], found["contacts_standing"]) == (1, 1)
+    first = {"s": 0.2, "x": 3.0, "y": 1.0, "yaw": 0.0, "speed": 0.0, "person": [3.0, 2.0]}
+    assert found["contact_at"][0] == first
+    assert found["contact_at"][1]["person"] is None
+    assert found["held_back"] == 1
+    assert found["clearance_m"] == pytest.approx(1.0 - ROBOT.radius)
+    assert found["clearance_to_people_m"] == pytest.approx(1.0 - ROBOT.radius - 0.25)
+    assert found["tracking_s"] == pytest.approx(0.1)
+    assert found["error_max_m"] == pytest.approx(0.02)
+    assert found["error_median_m"] == pytest.approx(0.005)
+    assert found["untracked_s"] == 0
+    assert found["replans"] == 1
+    assert found["state_s"] == {"exploring": 0.1, "navigating": 0.1, "blocked": 0.2}
+    assert found["reason_s"]["blocked: waiting: something that moves"] == 0.2
+    assert (found["step_mean_ms"], found["step_max_ms"]) == (2.0, 5.0)
+    assert len(found["events"]) == 4  # another distance is no other reason
+
+
+def test_errors_of_what_is_claimed_are_told_from_those_of_a_belief_that_is_lost():
+    track = a_track()
+    track.beliefs[3] = belief(3, 7.0, "localising")
+    found = driven.measure(track, TRIP, HALL, ROBOT)
+    assert found["error_max_m"] == pytest.approx(4.0)
+    assert found["claimed_error_max_m"] == pytest.approx(0.01)
+    assert found["untracked_s"] == pytest.approx(0.3 / 4)  # of four scans since 0.1 s one
+    never = driven.measure(Track(track.truths, [belief(k, 9.0, "lost") for k in range(5)]), TRIP, HALL, ROBOT)
+    assert never["tracking_s"] is never["error_max_m"] is None
+
+
+def test_reasons_differ_in_what_not_in_where():
+    for place in ("", ", 0.8 m away at (1.2, -3.4)", " at (-1.0, 2.0)"):
+        assert driven.plain(f"waiting: something{place}: until it clears") == "waiting: something: until it clears"
+    assert driven.plain("2 places are possible: going to (1.0, 2.0) to tell them apart") == (
+        "2 places are possible: going to tell them apart"
+    )
+
+
+def test_a_path_past_a_corner_is_as_near_as_its_straight_pieces():
+    world = block((5.0, 3.0, 0.2, 0.2))
+    path = np.array([[4.0, 3.5, 0.0], [6.0, 3.5, 0.0]])  # no scan was taken beside the box
+    assert driven._clearance(world, path).min() == pytest.approx(0.4)
+
+
+def test_what_is_claimed_refused_late_or_broken_is_not_reached():
+    far = driven.measure(a_track(ends_at=4.69), TRIP, HALL, ROBOT)
+    assert far["outcome"] == "claimed elsewhere"
+    assert not far["reached"]
+    late = driven.measure(a_track("blocked"), TRIP, HALL, ROBOT)
+    assert late["outcome"] == "too late"
+    assert "0.10 m from the goal after 0.4 s; at last blocked" in late["why"]
+    track = a_track("blocked")
+    track.failure = "controller ended with status 1: x"
+    broken = driven.measure(track, TRIP, HALL, ROBOT)
+    assert (broken["outcome"], broken["why"]) == ("failed", track.failure)
+    track = a_track()
+    why = "goal refused: (5.00, 1.00) in hall is inside something, or off the map"
+    track.statuses[400_000_000] = status(4, "blocked", why, refused=True)
+    assert driven.measure(track, TRIP, HALL, ROBOT)["outcome"] == "refused"
+    track.health = None
+    assert driven.measure(track, TRIP, HALL, ROBOT)["step_mean_ms"] is None
+
+
+def test_summary_tells_reached_from_safe_and_names_the_worst():
+    rows = []
+    for number, track in enumerate([a_track(), a_track(ends_at=4.0), a_track()]):
+        rows.append({"trial": number, **driven.measure(track, TRIP, HALL, ROBOT)})
+    rows[2] |= {"contacts_moving": 0, "contacts_standing": 0, "contact_at": [], "time_over_least": 3.0}
+    summary = driving.summarise(rows)
+    assert (summary["trials"], summary["reached"], summary["trials_claimed_elsewhere"]) == (3, 2, 1)
+    assert summary["trials_with_contact_moving"] == 2
+    assert summary["max_time_over_least"] == 3.0
+    assert summary["min_clearance_to_people_m"] == pytest.approx(0.48)
+    assert [each["trial"] for each in summary["worst"]] == [1, 0, 2]
+    assert "touched something in 2 scans, first at 0.2 s" in summary["worst"][1]["why"]
+    table = driving.table({"hall, holonomic": summary})
+    assert "| hall, holonomic | 2 of 3 | 1 | 2; 2 |" in table
+    assert "trial 1, claimed elsewhere: 1.00 m from the goal" in table
+    assert "trial 0, reached: touched something" in table
+    assert "trial 2" not in table
+    none = driving.summarise([rows[1]])
+    assert none["median_time_over_least"] is None
+    assert "–" in driving.table({"x": none})
+
+
+def test_the_drive_ends_when_the_controller_says_so_and_that_scan_is_its_last():
+    errand = Errand(Journey((1.0, 1.0), (5.0, 1.0)), 0.0, "maze", 101, 0, (), 100, told=True)
+    track, end = Track(), None
+    # As they may come: another process's messages of the next scan before the status of this one.
+    order = [truth(0, 1.0), status(0, "navigating"), belief(0, 1.0), truth(1, 5.0), belief(1, 5.0), truth(2, 5.0),
+             status(1, "reached"), belief(2, 5.0), status(2, "reached")]  # fmt: skip
+    for message in order:
+        _take(message, track, end)
+        if end is None and _over(message, track, errand):
+            end = message.stamp_ns
+    assert end == 100_000_000
+    track.cut(end)
+    assert len(track.truths) == len(track.beliefs) == len(track.statuses) == 2
+    assert not _over(truth(1, 5.0), Track(), errand)  # being there is not enough
+    assert _over(truth(1, 5.0), Track(), replace(errand, told=False))
+    assert _over(status(0, "blocked", "goal refused: no", refused=True), Track(), errand)
+    assert not _over(status(0, "reached", goal_seq=0), Track(), errand)
+
+
+def test_a_name_for_each_question():
+    job = driving.Job(0, 1)
+    assert driving.name_of(job, driving.WORLDS, driving.DRIVES) == "navigation"
+    assert driving.name_of(replace(job, seed=7, limit=9.0), driving.WORLDS, driving.DRIVES) == "navigation"
+    odd = replace(job, start="unknown", people=10, epistemic=False, estimator="particle-filter", prior="odometry")
+    name = driving.name_of(odd, ("folder/my.yaml",), ("differential",))
+    assert name == "navigation-my-differential-unknown-people10-particle-filter-odometry-no-epistemic"
+    assert driving.name_of(replace(job, people=3, people_speed=0.5), ("office",), driving.DRIVES) == (
+        "navigation-office-people3-0.5mps"
+    )
+
+
+def test_the_services_are_told_what_was_asked_for():
+    job = driving.Job(3, 2, "office", "differential", "unknown", 4, 0.5, "particle-filter", "odometry", epistemic=False)
+    errand = job.errand(Journey((1.0, 1.0), (5.0, 1.0)), 0.5)
+    assert errand.controller == ("--preset", "geodesic", "--drive", "differential", "--no-epistemic")
+    assert errand.simulator == ("--drive", "differential", "--people", "4", "--people-speed", "0.5")
+    assert errand.estimator == ("--estimator", "particle-filter", "--prior", "odometry")
+    assert not errand.known
+    assert errand.limit == 1800
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (("--worlds", "moon"), "no world 'moon'"),
+        (("--worlds", ""), "--worlds ''"),
+        (("--drives", "legs"), "--drives 'legs': choose from holonomic, differential"),
+        (("--drives", "holonomic,holonomic"), "give each once"),
+        (("--start", "maybe"), "--start 'maybe': choose from known, unknown"),
+        (("--estimator", "paper"), "--estimator 'paper': choose from precise, particle-filter"),
+        (("--prior", "command"), "--prior 'command'"),
+    ],
+)
+def test_bad_arguments_are_refused_in_one_line(args, says):
+    from typer.testing import CliRunner  # noqa: PLC0415
+
+    from lab.cli import experiment as cli_experiment  # noqa: PLC0415
+
+    result = CliRunner().invoke(cli_experiment.app, ["navigation", *args])
+    assert isinstance(result.exception, UserError)
+    assert says in str(result.exception)
+    assert "\n" not in str(result.exception)
+
+
+def test_from_anywhere_through_real_processes_the_same_again_and_all_files(tmp_path):
+    job = driving.Job(0, 1, beams=101, limit=30.0)
+    result = driving.run(job, 1, tmp_path, 2, QUIET, worlds=("maze",))
+    assert {path.name for path in tmp_path.iterdir()} == {
+        f"navigation-maze-beams101{suffix}" for suffix in (".json", ".csv", ".trials.jsonl", ".pdf", ".png")
+    }
+    told = json.loads((tmp_path / "navigation-maze-beams101.json").read_text())
+    assert told["parameters"]["beams"] == 101
+    assert {"seed", "commit", "command", "versions"} <= set(told)
+    for drive in driving.DRIVES:
+        summary = result.summary[f"maze, {drive}"]
+        assert summary["reached"] == 1, summary["worst"]
+        assert summary["trials_with_contact_moving"] == summary["trials_with_contact_standing"] == 0
+        assert 0.98 < summary["median_path_over_shortest"] < 1.5
+        assert 0.9 < summary["median_time_over_least"] < 2.0
+        assert summary["max_error_max_m"] < 0.1
+    holonomic, differential = result.trials
+    assert holonomic["goal"] == differential["goal"]
+    assert holonomic["x_m"] != differential["x_m"]
+    again = driving.trial(replace(job, drive="differential"))
+    timing = ("step_mean_ms", "step_max_ms")
+    assert {k: v for k, v in again.items() if k not in timing} == {
+        k: tuple(map(tuple, v)) if k == "shortest" else tuple(v) if k in ("start", "goal") else v
+        for k, v in differential.items() if k not in timing
+    }  # fmt: skip
+    text = page.filled("<!-- table navigation-maze-beams101 -->\n<!-- end -->", tmp_path)
+    assert "| maze, differential | 1 of 1 | 0 | 0; 0 |" in text
+
+
+def test_a_run_cut_short_goes_on_and_nobody_is_left(process, tmp_path):
+    args = ("presage.__main__", "experiment", "navigation", "--worlds", "maze", "--drives", "holonomic",
+            "--beams", "101", "--trials", "3", "--workers", "1", "--out", str(tmp_path))  # fmt: skip
+    store = tmp_path / ".navigation-maze-holonomic-beams101.unfinished.jsonl"
+    run = process(*args)
+    assert wait_until(lambda: store.exists() and len(store.read_text().splitlines()) > 1, 90), run.output
+    run.send(signal.SIGINT)
+    # Python forgets an interrupt that comes while it forks; then one presses it again.
+    wait_until(lambda: not run.running, 5)
+    if run.running and "are kept" not in run.output:
+        run.send(signal.SIGINT)
+    assert run.wait(30) == 130, run.output
+    done = len(store.read_text().splitlines()) - 1
+    assert done < 3
+    run = process(*args)
+    assert run.wait(120) == 0, run.output
+    assert f"going on after {done} of 3" in run.output
+    rows = (tmp_path / "navigation-maze-holonomic-beams101.trials.jsonl").read_text().splitlines()
+    assert [json.loads(row)["trial"] for row in rows] == [0, 1, 2]
+
+
+def test_the_page_has_the_numbers_of_the_results_beside_it():
+    docs = Path(__file__).resolve().parents[3] / "docs"
+    text = (docs / "navigation.md").read_text(encoding="utf-8")
+    assert page.filled(text, docs / "experiments") == text
+    assert "<!-- table navigation -->" in text
+
+
+def test_worlds_with_rooms_are_there():
+    for name, rooms in shortest.ROOMS.items():
+        free = load_world(name).free_space
+        for room in rooms:
+            assert shapely.intersection(free, shapely.box(*room)).area > 10
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        trip = shortest.draw_trip("twins", rng, Robot())
+        places = shapely.points([trip.start[:2], trip.goal])
+        assert all(any(shapely.box(*room).covers(place) for room in shortest.ROOMS["twins"]) for place in places)

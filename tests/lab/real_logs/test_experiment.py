@@ -1,0 +1,218 @@
+"""`presage train --from` and `presage experiment real`, on a small drive that is made here."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from common.errors import UserError
+from common.geometry import se2
+from common.geometry.world import World, load_world, save_world
+from lab.experiments import tables_page as page
+from lab.real_logs import experiment as real
+from lab.real_logs import filter_tuning as real_tuning
+from lab.real_logs.drive import KIDNAPPED, LASER, LIMIT, Job, drive_at, entered, second_first, unaware
+from lab.real_logs.drive import trial as one_trial
+from lab.real_logs.filter_tuning import starting_point
+from presage.learning.train_drive import Job as Training
+from presage.learning.train_drive import split, train_from_drive
+from presage.logs.log import Reading
+from services.estimator.particle_filter import Settings as ParticleSettings
+from services.estimator.precise.learning import weights
+from services.estimator.precise.learning.field_learning import Recipe
+from services.estimator.precise.motion_model import MotionNoise
+from tests.lab.real_logs import drives as real_drive
+
+HERE = Reading(mount=np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The log, the map of its first half, and what was learned from that half."""
+    made = tmp_path_factory.mktemp("drive")
+    real_drive.save(made / "drive.npz", real_drive.drive(200))
+    (made / "before.yaml").write_text(save_world(real_drive.BEFORE), encoding="utf-8")
+    recipe = Recipe(resolution=0.05, sweeps=4, beams_a_sweep=40_000)
+    job = Training(made / "drive.npz", str(made / "before.yaml"), made, 100, recipe, 0.5, HERE)
+    train_from_drive(job, Console(quiet=True))
+    return made
+
+
+def test_the_card_says_where_the_model_comes_from_and_how_good_it_is(folder):
+    _, places, card = weights.load(folder / "before-precise.safetensors")
+    assert card.source == "100 posed scans of drive.npz; elsewhere 100 simulated scans in map before"
+    assert card.calibration is not None
+    assert card.calibration.scans == 20
+    assert card.test_range_error_median_m < 0.03
+    assert len(places) > 50
+    assert (folder / "before-precise.png").stat().st_size > 10_000
+    raw = json.loads((folder / "before-precise.json").read_text(encoding="utf-8"))
+    assert raw["calibration"]["log_likelihood"] == pytest.approx(card.calibration.log_likelihood)
+
+
+def test_without_reference_poses_there_is_nothing_to_learn_from(tmp_path):
+    real_drive.save(tmp_path / "bare.npz", real_drive.drive(60), reference=False)
+    with pytest.raises(UserError, match="no reference poses"):
+        train_from_drive(Training(tmp_path / "bare.npz", out=tmp_path, reading=HERE), Console(quiet=True))
+    real_drive.save(tmp_path / "short.npz", real_drive.drive(60))
+    with pytest.raises(UserError, match="30 scans with a reference pose; 50 are the least"):
+        train_from_drive(Training(tmp_path / "short.npz", out=tmp_path, share=0.5, reading=HERE), Console(quiet=True))
+
+
+@pytest.mark.parametrize("estimator", ["precise", "particle-filter"])
+def test_a_robot_that_is_carried_off_finds_itself(folder, estimator):
+    job = Job(
+        str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), estimator, KIDNAPPED, 100, to=155,
+        model=str(folder / "before-precise.safetensors"),
+        particles=(
+            *starting_point(MotionNoise()), ("keep_initial_pose", 0.0), ("max_particles", 4000), ("min_particles", 500),
+        ),
+    )  # fmt: skip
+    row = one_trial(job)
+    assert len(row["error_m"]) == 10 + min(LIMIT, 45)
+    assert np.median(row["error_m"][:10]) < 0.2
+    found = real.summarise([row])
+    assert found["found"] == 1
+    if estimator == "precise":
+        assert found["error_median_m"] < 0.06
+        assert found["wrong_claim_longest_s"] <= 2
+
+
+def test_tuning_uses_the_second_quarter_in_a_map_of_the_first(folder, tmp_path, monkeypatch):
+    """What is evaluated later must not decide the settings, and the map must lack rooms as it does later."""
+    tried = []
+
+    def fake(job):
+        tried.append(job)
+        error = [0.1 if dict(job.particles).get("keep_initial_pose", 1.0) else 9.0] * 20
+        return {"task": job.task, "error_m": error, "state": ["tracking"] * 20}
+
+    monkeypatch.setattr(real_tuning, "trial", fake)
+    job = Job(str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "particle-filter", LASER, 0)
+    tuned = real_tuning.tune(job, 100, starting_point(MotionNoise()), tmp_path, lambda *_: None)
+    assert dict(tuned.tracking).get("keep_initial_pose", 1.0) == 1.0  # recovery was tried, and lost
+    assert dict(tuned.finding)["keep_initial_pose"] == 0.0
+    assert any(dict(each.particles).get("keep_initial_pose") == 0.0 for each in tried if each.task == LASER)
+    for each in tried:
+        assert each.first >= 50
+        assert max(each.first + each.count, each.to + LIMIT * (each.task == KIDNAPPED)) <= 100
+    mapped = load_world(tried[0].map)
+    poses = job.drive.poses[:50, :2]
+    assert mapped.grid is not None
+    assert (mapped.clearance(poses) > 0).mean() > 0.9
+
+
+def test_amcl_follows_a_base_that_moves_sideways(folder):
+    job = Job(str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "amcl-defaults", LASER, 100)
+    assert entered(job).settings == ParticleSettings(robot_model_type="omni")
+
+
+def test_odometry_does_not_tell_of_being_carried_off():
+    rng = np.random.default_rng(0)
+    odom = np.cumsum(rng.normal(0, 0.1, (20, 3)), axis=0)
+    told = unaware(odom, 12)
+    assert told[:12] == pytest.approx(odom[:12])
+    assert told[12] == pytest.approx(odom[11])
+    assert se2.between(told[12], told[15]) == pytest.approx(se2.between(odom[12], odom[15]))
+
+
+def test_time_goes_on_while_a_robot_is_carried_back(folder):
+    job = Job(
+        str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "precise", KIDNAPPED, 155, to=100,
+        model=str(folder / "before-precise.safetensors"),
+    )  # fmt: skip
+    stamps = np.array(one_trial(job)["stamp_s"])
+    assert (np.diff(stamps) > 0).all()
+    assert np.diff(stamps).max() < 3 * np.median(np.diff(stamps))
+
+
+@pytest.mark.parametrize("count", [20, 21])
+def test_halves_are_disjoint_and_complete(count):
+    drive = real_drive.drive(count)
+    first, second = split(drive)
+    assert len(first.ranges) == count // 2
+    assert np.concatenate([first.stamps, second.stamps]) == pytest.approx(drive.stamps)
+
+
+@pytest.mark.parametrize("count", [20, 21])
+def test_halves_exchanged_are_a_drive_whose_time_goes_on(count):
+    drive = real_drive.drive(count)
+    first, second = split(drive)
+    turned = second_first(drive)
+    late = len(second.ranges)
+    assert turned.poses[:late] == pytest.approx(second.poses)
+    assert turned.ranges[late:] == pytest.approx(first.ranges)
+    assert turned.odom[late:] == pytest.approx(first.odom)
+    assert np.diff(turned.stamps) == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("count", [100, 101])
+@pytest.mark.parametrize("exchanged", [False, True])
+def test_no_scan_is_both_learned_and_localised(tmp_path, count, exchanged):
+    log = tmp_path / "drive.npz"
+    real_drive.save(log, real_drive.drive(count))
+    first, second = split(drive_at(str(log), None))
+    learned, localised = (second, first) if exchanged else (first, second)
+    job = Job(str(log), "", None, "precise", LASER, 0, exchanged=exchanged)
+    assert job.drive.poses[: job.learned] == pytest.approx(learned.poses)
+    assert job.drive.poses[job.learned :] == pytest.approx(localised.poses)
+    assert job.drive.odom[job.learned :] == pytest.approx(localised.odom)
+    steps = se2.between(job.drive.poses[job.learned : -1], job.drive.poses[job.learned + 1 :])
+    assert np.hypot(steps[:, 0], steps[:, 1]).max() < 0.4  # the robot drives at most 0.2 m between two scans
+
+
+def test_with_halves_exchanged_the_first_scans_are_localised(folder):
+    where, mount = str(folder / "drive.npz"), (0.0, 0.0, 0.0)
+    job = Job(
+        where, str(folder / "before.yaml"), mount, "precise", LASER, 100, 30,
+        model=str(folder / "before-precise.safetensors"), exchanged=True,
+    )  # fmt: skip
+    found = real.summarise([one_trial(job)])  # by a model of these very scans
+    assert found["error_median_m"] < 0.05
+    assert job.drive.poses[100] == pytest.approx(drive_at(where, mount).poses[0])
+    assert real.Job(folder / "drive.npz", "map.yaml", exchange=True).result == "real-drive_exchanged"
+
+
+def row(task, error, state, stamps=None):
+    count = len(error)
+    return {
+        "task": task, "estimator": "precise", "error_m": error, "yaw_error_rad": [0.0] * count, "state": state,
+        "stamp_s": stamps or [0.5 * k for k in range(count)], "nees": [3.0] * count, "ms": [1.0] * count,
+    }  # fmt: skip
+
+
+def test_wrong_claims_are_counted_while_they_last():
+    t, lost = "tracking", "lost"
+    found = real.summarise([row("odometry", [0, 9, 9, 9, 9, 0, 9], [t, t, t, t, lost, t, t])])
+    assert found["wrong_claim_longest_s"] == pytest.approx(1.0)  # from the second to the fourth scan
+    assert found["wrong_claims_share"] == pytest.approx(4 / 7)
+    assert found["tracked_share"] == pytest.approx(2 / 7)
+    searched = real.summarise([row("global", [9, 9, 0.1, 0], [lost, t, lost, t]), row("global", [9, 9], [lost, lost])])
+    assert searched["found"] == 1
+    assert searched["scans_until_found_median"] == 4
+
+
+def test_its_table_is_one_of_the_page(tmp_path):
+    assert page.MODULES["real"] == "real"
+    summary = {"a: tracking with odometry, precise": real.summarise([row("odometry", [0.01, 0.02], ["tracking"] * 2)])}
+    table = real.table(summary)
+    assert "| a: tracking with odometry, precise | 15.0 |" in table
+
+
+def test_a_log_too_short_is_refused(folder, tmp_path):
+    real_drive.save(tmp_path / "few.npz", real_drive.drive(100))
+    job = real.Job(tmp_path / "few.npz", str(folder / "before.yaml"))
+    with pytest.raises(UserError, match="100 posed scans; at least 160"):
+        real.run(job, tmp_path, 1, Console(quiet=True))
+
+
+def test_a_map_of_another_place_is_refused(folder, tmp_path):
+    job = real.Job(folder / "drive.npz", "office", (0.0, 0.0, 0.0))
+    elsewhere = World(name="elsewhere", boundary=[(50, 50), (60, 50), (60, 60), (50, 60)])
+    (tmp_path / "elsewhere.yaml").write_text(save_world(elsewhere), encoding="utf-8")
+    with pytest.raises(UserError, match=r"only 0% of the reference poses .* in free space"):
+        real.run(replace(job, map=str(tmp_path / "elsewhere.yaml")), tmp_path, 1, Console(quiet=True))

@@ -1,0 +1,106 @@
+"""`presage map`: where beams of known poses ended is occupied, where they went through is free."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from common.errors import UserError
+from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN
+from common.geometry.world import load_world
+from presage.learning.map_of_log import Job, cells_of, map_command
+from presage.logs.log import Reading
+from services.estimator.precise.learning.calibration import Drive
+from services.estimator.shared.generative_models import RayCaster
+from tests.lab.real_logs import drives as real_drive
+from tests.recorder import sessions as recorded
+
+QUIET = Console(quiet=True)
+HERE = Reading(mount=np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    path = tmp_path_factory.mktemp("log") / "drive.npz"
+    real_drive.save(path, real_drive.drive(200))
+    return path
+
+
+def made(log, tmp_path, half=""):
+    return load_world(str(map_command(Job(log, tmp_path / "made.yaml", half, reading=HERE), QUIET, QUIET)))
+
+
+@pytest.mark.parametrize(("half", "world"), [("first", real_drive.BEFORE), ("second", real_drive.AFTER)])
+def test_a_map_of_a_half_is_the_room_of_that_time(log, tmp_path, half, world):
+    mapped = made(log, tmp_path, half)
+    other = real_drive.AFTER if world is real_drive.BEFORE else real_drive.BEFORE
+    x, y = np.meshgrid(np.arange(0.5, 8.9, 0.1), np.arange(0.5, 5.9, 0.1))
+    places = np.stack([x, y], axis=-1).reshape(-1, 2)
+    values, room, away = mapped.grid.at(places), world.clearance(places), other.clearance(places)
+    looked = values != UNKNOWN
+    assert (values[looked & (room > 0.15)] == FREE).mean() > 0.99
+    assert looked[room > 0.15].mean() > 0.9
+    # Where the box was at the other time, nothing is in the way.
+    assert (values[(away < -0.05) & (room > 0.15)] == FREE).mean() > 0.9
+    rays, seen = (
+        RayCaster(each).expect(np.array([[3.0, 3.0, 0.0]]), real_drive.ANGLES).ranges for each in (world, mapped)
+    )
+    assert np.median(np.abs(seen - rays)) < 0.06
+    assert abs(np.median(seen - rays)) < 0.025  # half a cell
+
+
+def test_who_walks_through_is_not_in_the_map():
+    count, angles = 20, np.deg2rad(np.arange(-90, 91.0))
+    ranges = np.full((count, len(angles)), 4.0)
+    for k in range(count):
+        ranges[k, 8 * k : 8 * k + 8] = 2.0
+    drive = Drive(np.arange(count) * 0.1, np.zeros((count, 3)), ranges, angles, np.zeros(3), 30.0)
+    cells, (x0, y0) = cells_of(drive, 0.05)
+
+    def at(radius):
+        column, row = np.floor((radius * np.array([np.cos(angles), np.sin(angles)]) - [[x0], [y0]]) / 0.05).astype(int)
+        return cells[row, column]
+
+    assert (at(4.0) == OCCUPIED).mean() > 0.95
+    assert (at(2.0) == FREE).all()
+    assert (at(4.3) == UNKNOWN).all()
+
+
+def test_what_cannot_be_is_said(log, tmp_path):
+    with pytest.raises(UserError, match="no half 'third'"):
+        map_command(Job(log, tmp_path / "a.yaml", "third", reading=HERE), QUIET, QUIET)
+    with pytest.raises(UserError, match=r"give NAME\.yaml"):
+        map_command(Job(log, tmp_path / "a.png", reading=HERE), QUIET, QUIET)
+    (tmp_path / "a.pgm").write_bytes(b"mine")
+    with pytest.raises(UserError, match=r"a\.pgm is there already"):
+        map_command(Job(log, tmp_path / "a.yaml", reading=HERE), QUIET, QUIET)
+    bare = tmp_path / "bare.npz"
+    real_drive.save(bare, real_drive.drive(20), reference=False)
+    with pytest.raises(UserError, match="no reference poses"):
+        map_command(Job(bare, tmp_path / "b.yaml", reading=HERE), QUIET, QUIET)
+    with pytest.raises(UserError, match="larger --cell"):
+        cells_of(real_drive.drive(20), 0.0005)
+    assert not list(tmp_path.glob("*.yaml"))
+
+
+def test_a_recording_says_itself_where_its_laser_sits(tmp_path):
+    recorded.write(tmp_path / "run.mcap")
+    with pytest.raises(UserError, match="says itself what its scanner is"):
+        map_command(Job(tmp_path / "run.mcap", tmp_path / "r.yaml", reading=HERE), QUIET, QUIET)
+
+
+def test_a_map_needs_no_stamps(log, tmp_path):
+    with np.load(log) as arrays:
+        np.savez(tmp_path / "bare.npz", **{name: values for name, values in arrays.items() if name != "stamps"})
+    bare = map_command(Job(tmp_path / "bare.npz", tmp_path / "bare.yaml", reading=HERE), QUIET, QUIET)
+    assert load_world(str(bare)).grid.values.tolist() == made(log, tmp_path).grid.values.tolist()
+
+
+def test_a_log_without_returns_is_refused(tmp_path):
+    path, drive = tmp_path / "empty.npz", real_drive.drive(20)
+    real_drive.save(path, replace(drive, ranges=np.full_like(drive.ranges, np.inf)))
+    with pytest.raises(UserError, match="no beam of the scans"):
+        map_command(Job(path, tmp_path / "e.yaml", reading=HERE), QUIET, QUIET)

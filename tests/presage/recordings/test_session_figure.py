@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+from io import BytesIO
+
+import pytest
+from matplotlib.image import imread
+
+from common.errors import UserError
+from common.messages.topics import BELIEF, GOAL, HEALTH, PREDICTION, SCAN, STATUS, TOPICS, TRUTH
+from presage.recordings.session_figure import draw_session, figure_of
+from presage.recordings.session_summary import load_session
+from tests.recorder import sessions as made
+
+
+def texts(figure):
+    return " | ".join(text.get_text() for axes in figure.axes for text in axes.texts)
+
+
+def labels(axes):
+    legend = axes.get_legend()
+    return {text.get_text() for text in legend.get_texts()} if legend else set()
+
+
+def test_the_whole_picture(tmp_path):
+    png = tmp_path / "run.png"
+    draw_session(made.write(tmp_path / "run.mcap"), png, title="a run")
+    image = imread(BytesIO(png.read_bytes()))
+    height, width = image.shape[:2]
+    assert width == 12 * 150
+    assert 0.6 < height / width < 1.0
+    assert image[..., :3].std() > 0.1  # something is drawn
+    for part in (image[: height // 2], image[height // 2 :, : width // 3], image[height // 2 :, -width // 3 :]):
+        assert part[..., :3].std() > 0.05
+
+
+def test_every_panel_has_its_lines(tmp_path):
+    figure = figure_of(load_session(made.write(tmp_path / "run.mcap")), "run")
+    plan, scan, energy, errors = figure.axes
+    assert {"last scan", "goal and tolerance", "believed path", "true path", "true start"} <= labels(plan)
+    assert labels(scan) == {"measured", "predicted", "± 2σ"}
+    assert {"free energy F", "complexity"} <= labels(energy)
+    assert energy.get_yscale() == "log"  # it spans decades
+    assert labels(errors) == {"position error", "distance to goal", "localised", "goal reached"}
+    drawn = next(line for line in errors.lines if line.get_label() == "position error")
+    assert drawn.get_ydata() == pytest.approx([made.error(i) for i in range(made.SCANS)])
+    away = next(line for line in errors.lines if line.get_label() == "distance to goal")
+    assert away.get_ydata() == pytest.approx([8 - made.true_x(i) for i in range(made.MOVED, made.SCANS)])
+    measured = next(line for line in scan.lines if line.get_label() == "measured")
+    assert len(measured.get_xdata()) == made.SCANNER.beams
+    assert texts(figure) == ""
+
+
+@pytest.mark.parametrize(
+    ("missing", "world", "said"),
+    [
+        (TOPICS, False, ["world and no path", "predicted scan", "belief", "truth beside beliefs"]),
+        ((TRUTH,), True, ["truth beside beliefs"]),
+        ((BELIEF,), True, ["belief", "truth beside beliefs"]),
+        ((PREDICTION,), True, ["predicted scan"]),
+        ((SCAN,), True, ["predicted scan"]),
+        ((GOAL, STATUS, HEALTH), True, []),
+        ((), False, []),
+    ],
+    ids=["everything", "truth", "belief", "prediction", "scan", "goal", "world"],
+)
+def test_a_panel_says_what_is_missing(tmp_path, missing, world, said):
+    figure = figure_of(load_session(made.write(tmp_path / "part.mcap", *missing, world=world)), "part")
+    png = BytesIO()
+    figure.savefig(png, dpi=30)
+    png.seek(0)
+    assert imread(png)[..., :3].std() > 0.01
+    assert texts(figure) == " | ".join(f"no {what} in this recording" for what in said)
+
+
+def test_a_place_that_cannot_be_written_to(tmp_path):
+    recording = made.write(tmp_path / "run.mcap")
+    with pytest.raises(UserError, match="cannot be written"):
+        draw_session(recording, tmp_path / "nowhere" / "run.png")

@@ -1,0 +1,289 @@
+"""`presage localize` over files made here: npz in every form, a recording, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+import json
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from common.bus.bus import wait_until
+from common.errors import UserError
+from common.geometry import se2
+from common.geometry.world import load_world
+from common.robot.scanner import SCANNERS
+from presage.logs.log import Reading
+from presage.logs.scan_files import Scans, read_scans
+from presage.replay.localize import COLUMNS, Job, choice_of, chosen, localize
+from tests.conftest import PATIENCE
+from tests.recorder.sessions import write
+
+SCANNER = SCANNERS["tim571"].with_beams(200)
+WORLD = load_world("corridor")
+PATH = np.column_stack([np.linspace(4, 4.6, 10), np.full(10, 1.5), np.linspace(1, 1.2, 10)])
+CONSOLE = Console(quiet=True)
+
+
+def npz(folder: Path, mount=SCANNER.mount, **changes) -> Path:
+    rng = np.random.default_rng(0)
+    lasers = se2.compose(PATH, np.array(mount))
+    ranges = WORLD.ray_distances(lasers, SCANNER.angles()) + 0.02 * rng.standard_normal((10, 200))
+    values = {
+        "ranges": ranges, "angles": SCANNER.angles(), "range_max": 25.0, "stamps": np.arange(10) / 15,
+        "odom": PATH - PATH[0], "initial_pose": PATH[0],
+    }  # fmt: skip
+    values = {name: value for name, value in {**values, **changes}.items() if value is not None}
+    file = folder / "scans.npz"
+    np.savez(file, **values)
+    return file
+
+
+def job(file, mode="global", frame="base_link", estimator="precise", model="learned", world="corridor", **more):
+    out = more.pop("out", None)
+    choice = choice_of(file, world, estimator, model, None, 0.02, 0, more.pop("initial_pose", ""))
+    given = {"fresh": False, "odometry": True, "out": out, **more}
+    return Job.of(file, choice, mode, frame, given.pop("reading", Reading()), **given)
+
+
+def errors(rows, path=PATH):
+    return np.hypot(*(np.array([[r["x"], r["y"]] for r in rows]) - path[:, :2]).T)
+
+
+@pytest.mark.parametrize("fresh", [False, True])
+@pytest.mark.parametrize("model", ["learned", "exact"])
+def test_a_csv_with_a_row_for_each_scan(tmp_path, fresh, model):
+    out = tmp_path / "poses.csv"
+    localize(job(npz(tmp_path), fresh=fresh, model=model, out=out), CONSOLE)
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == COLUMNS
+    assert len(rows) == 10
+    numbers = [{k: float(v) for k, v in row.items() if k != "state"} for row in rows]
+    assert errors(numbers).max() < 0.02
+    assert {row["state"] for row in rows} == {"tracking"}
+    assert all(row["cov_xx"] > 0 and row["update_ms"] > 0 for row in numbers)
+
+
+def test_json_says_what_was_run(tmp_path):
+    out = tmp_path / "poses.json"
+    localize(job(npz(tmp_path), out=out), CONSOLE)
+    data = json.loads(out.read_text())
+    assert {"world", "estimator", "model", "frame", "seed", "commit", "rows"} <= set(data)
+    assert len(data["rows"]) == 10
+
+
+def test_the_laser_frame_is_that_of_the_files_poses_too(tmp_path):
+    file = npz(tmp_path, mount=(0, 0, 0))  # PATH is the laser's
+    assert errors(localize(job(file, frame="laser"), CONSOLE)).max() < 0.02
+    assert errors(localize(job(file, frame="base_link"), CONSOLE)).min() > 0.15
+
+
+def test_only_what_is_needed(tmp_path):
+    file = npz(tmp_path, stamps=None, odom=None, initial_pose=None)
+    assert errors(localize(job(file), CONSOLE)).max() < 0.02
+    with pytest.raises(UserError, match="mode track needs the pose of the first scan"):
+        localize(job(file, mode="track"), CONSOLE)
+    assert errors(localize(job(file, mode="track", initial_pose="4,1.5,57"), CONSOLE)).max() < 0.02
+
+
+def test_a_reference_is_what_errors_are_against_and_where_tracking_begins(tmp_path, capsys):
+    reference = PATH.copy()
+    reference[5:] = np.nan  # not known throughout
+    file = npz(tmp_path, mount=(0, 0, 0), reference=reference, initial_pose=None)
+    np.testing.assert_array_equal(read_scans(file, np.zeros(3)).truth, reference)
+    rows = localize(job(file, mode="track", frame="laser"), Console(width=150))
+    assert errors(rows).max() < 0.02
+    assert "against the file's reference: " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("estimator", ["particle-filter", "amcl-defaults"])
+def test_the_particle_filter_over_the_same_file(tmp_path, estimator):
+    rows = localize(job(npz(tmp_path), mode="track", estimator=estimator), CONSOLE)
+    assert errors(rows).max() < 0.5
+
+
+def test_the_standard_output_is_csv_alone(tmp_path, capsys):
+    localize(job(npz(tmp_path)), Console(stderr=True))
+    out = capsys.readouterr().out.splitlines()
+    assert out[0] == ",".join(COLUMNS)
+    assert len(out) == 11
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"ranges": None}, "lacks ranges"),
+        ({"angles": np.zeros(3)}, "angles has the shape"),
+        ({"odom": np.zeros((3, 3))}, "odom has the shape"),
+        ({"reference": np.zeros((9, 3))}, "reference has the shape"),
+        ({"stamps": -np.arange(10.0)}, "not sorted"),
+        ({"range_max": -1.0}, "range_max"),
+        ({"initial_pose": np.full(3, np.nan)}, "not finite"),
+        ({"ranges": np.zeros((2, 3, 4))}, "not \\(N, B\\)"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_said(tmp_path, changes, why):
+    with pytest.raises(UserError, match=why) as error:
+        localize(job(npz(tmp_path, **changes)), CONSOLE)
+    assert "scans.npz" in str(error.value)
+
+
+def test_files_that_are_none(tmp_path):
+    garbage = tmp_path / "x.npz"
+    garbage.write_bytes(b"PK\x03\x04 not really")
+    foreign = tmp_path / "x.npz.txt"
+    foreign.write_text("ranges, angles\n")
+    for file, why in (
+        (garbage, "not an .npz"),
+        (tmp_path / "no.npz", "no such file"),
+        (foreign, "not a presage recording, a CARMEN log"),
+    ):
+        with pytest.raises(UserError, match=why):
+            read_scans(file, np.zeros(3))
+    pickled = tmp_path / "p.npz"
+    np.savez(pickled, ranges=np.array([{}], dtype=object), angles=np.zeros(3), range_max=1.0)
+    with pytest.raises(UserError, match="plain arrays"):
+        read_scans(pickled, np.zeros(3))
+
+
+def test_stamps_are_the_numbers_they_were(tmp_path):
+    stamps = [1000.0, 1000.1, 1600000000.3]
+    values = {"ranges": np.ones((3, 6)), "angles": np.arange(6) / 10, "range_max": 25.0}
+    np.savez(tmp_path / "scan.npz", stamps=np.array(stamps), **values)
+    assert read_scans(tmp_path / "scan.npz", np.zeros(3)).stamps.tolist() == stamps
+
+
+def test_what_says_nothing_about_the_place_is_minus_infinity(tmp_path):
+    row = np.array([[1.0, 25.0, np.inf, 0.0, np.nan, -np.inf]])
+    np.savez(tmp_path / "scan.npz", ranges=row, angles=np.arange(6) / 10, range_max=25.0)
+    found = read_scans(tmp_path / "scan.npz", np.zeros(3)).ranges
+    assert found.tolist() == [[1.0, np.inf, np.inf, -np.inf, -np.inf, -np.inf]]
+
+
+def plain(rows):
+    return [{name: value for name, value in row.items() if name != "update_ms"} for row in rows]
+
+
+@pytest.mark.parametrize("estimator", ["precise", "particle-filter"])
+def test_chosen_scans_give_the_rows_of_a_file_with_only_these(tmp_path, estimator):
+    whole, stamps = npz(tmp_path), 1.6e9 + np.arange(10) / 10
+    data = dict(np.load(whole))
+    chosen = slice(2, 9, 3)  # between 0.2 and 0.8 s each third scan: 2, 5, 8
+    np.savez(whole, **{**data, "stamps": stamps, "reference": PATH})
+    few = {name: data[name][chosen] for name in ("ranges", "odom")}
+    part = tmp_path / "part.npz"
+    np.savez(part, **{**data, **few, "stamps": stamps[chosen], "reference": PATH[chosen], "initial_pose": PATH[2]})
+    given = {"mode": "track", "estimator": estimator, "start": 0.2, "end": 0.8, "every": 3}
+    rows = localize(job(whole, **given), CONSOLE)
+    assert [row["stamp"] for row in rows] == stamps[chosen].tolist()
+    assert plain(rows) == plain(localize(job(part, mode="track", estimator=estimator), CONSOLE))
+    rows = localize(job(whole, **{**given, "end": -0.1}), CONSOLE)
+    assert [row["stamp"] for row in rows] == stamps[chosen].tolist()
+
+
+def test_the_summary_counts_the_chosen_scans(tmp_path, capsys):
+    reference = np.column_stack([PATH[:, :2] + np.arange(10)[:, None], PATH[:, 2]])  # 0 m off at the first, then more
+    out = tmp_path / "poses.json"
+    file = npz(tmp_path, reference=reference)
+    rows = localize(job(file, start=0.1, every=4, out=out), Console(width=150))  # scans 2 and 6
+    said = capsys.readouterr().out
+    assert "2 of 10 scans: 2 tracking" in said
+    middle, most = (float(said.split("reference: ")[1].split(",")[k].split()[0]) for k in (0, 2))
+    assert [middle, most] == pytest.approx([4e3 * 2**0.5, 6e3 * 2**0.5], abs=20)  # mm
+    data = json.loads(out.read_text())
+    assert data["rows"] == rows
+    assert (data["start"], data["end"], data["every"], data["complete"]) == (0.1, None, 4, True)
+
+
+def test_choices_that_leave_nothing(tmp_path):
+    file = npz(tmp_path)
+    scans, unstamped = read_scans(file), replace(read_scans(file), stamps=None)
+    for wrong, why in (
+        ({"start": 2.0}, "--start 2: the recording lasts 0.60 s"),
+        ({"start": 0.4, "end": 0.2}, "nothing lies between"),
+        ({"start": 0.21, "end": 0.25}, r"scans.npz: no scan between 0.21 and 0.25 s"),
+    ):
+        with pytest.raises(UserError, match=why):
+            chosen(job(file, **wrong), scans)
+    for choice in ({"start": 0.2}, {"end": 0.2}, {"every": 2}):
+        with pytest.raises(UserError, match="no stamps, which --start, --end and --every need"):
+            chosen(job(file, **choice), unstamped)
+    with pytest.raises(UserError, match="mode track needs the pose of the first scan"):  # initial_pose is of another
+        localize(job(file, start=0.2, mode="track"), CONSOLE)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "json"])
+def test_an_interrupted_run_keeps_its_rows(tmp_path, capsys, monkeypatch, suffix):
+    file, out, given = npz(tmp_path), tmp_path / f"poses.{suffix}", Scans.observation
+
+    def interrupted_at_the_fifth(scans, k, **how):
+        if k < 4:
+            return given(scans, k, **how)
+        if suffix == "csv":  # also of a run that is killed
+            assert len(out.read_text().splitlines()) == 1 + 4
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Scans, "observation", interrupted_at_the_fifth)
+    with pytest.raises(KeyboardInterrupt):
+        localize(job(file, out=out), Console(width=500))
+    last = capsys.readouterr().out.splitlines()[-2:]
+    assert last[0].startswith("4 of 10 scans: 4 tracking")
+    assert last[1] == f"interrupted after 4 of 10 scans; {out} holds their rows"
+    if suffix == "json":
+        data = json.loads(out.read_text())
+        assert not data["complete"]
+        assert len(data["rows"]) == 4
+        return
+    with out.open() as stream:
+        assert len([float(row["update_ms"]) for row in csv.DictReader(stream)]) == 4
+
+
+def test_ctrl_c_ends_with_a_table_and_status_130(tmp_path, processes):
+    data = dict(np.load(npz(tmp_path)))
+    many = {name: np.tile(data[name], (300, 1)) for name in ("ranges", "odom")}
+    np.savez(tmp_path / "long.npz", **{**data, **many, "stamps": np.arange(3000) / 10})
+    out = tmp_path / "poses.csv"
+    arguments = ["localize", str(tmp_path / "long.npz"), "--world", "corridor", "--fresh", "--out", str(out)]
+    running = processes.start("presage.__main__", *arguments)
+    wait_until(lambda: not running.running or (out.exists() and len(out.read_text().splitlines()) > 3), 4 * PATIENCE)
+    assert running.stop(signal.SIGINT)[0] == 130
+    lines = running.output.splitlines()
+    assert "reading long.npz" in lines
+    assert lines[-1].startswith("interrupted after ")
+    assert lines[-1].endswith(f" of 3000 scans; {out} holds their rows")
+    with out.open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == int(lines[-1].split()[2])
+    assert all(None not in row.values() and row["update_ms"] for row in rows)
+
+
+def test_words_that_are_not_known(tmp_path):
+    file = npz(tmp_path)
+    for wrong, why in (
+        ({"mode": "best"}, "no mode"), ({"frame": "map"}, "no frame"), ({"estimator": "kalman"}, "no estimator"),
+        ({"world": ""}, "--world"), ({"model": "best"}, "no model"), ({"initial_pose": "1"}, "initial-pose"),
+        ({"initial_pose": "4,1.5"}, "add --mode track"),
+        ({"initial_pose": "400,1.5", "mode": "track"}, r"\(400, 1.5\) is off the map: .* goes from"),
+        ({"out": tmp_path / "x.txt"}, "csv or .json"), ({"out": tmp_path / "no" / "x.csv"}, "cannot be written"),
+    ):  # fmt: skip
+        with pytest.raises(UserError, match=why):
+            localize(job(file, **wrong), CONSOLE)
+
+
+def test_a_recording_says_its_world_and_its_truth(tmp_path):
+    file = tmp_path / "run.mcap"
+    write(file)
+    scans = read_scans(file, np.zeros(3))
+    assert scans.truth is not None
+    assert len(scans.stamps) == len(scans.ranges) == len(scans.truth)
+    rows = localize(job(file, world="", model="exact"), CONSOLE)
+    assert errors(rows, scans.truth).max() < 0.03
+    with pytest.raises(UserError, match="those options are about logs"):
+        localize(job(file, world="", model="exact", reading=Reading(mount=np.zeros(3))), CONSOLE)
+    with pytest.raises(UserError, match="presage train --world hall"):  # no field was learned of that world
+        localize(job(file, world=""), CONSOLE)

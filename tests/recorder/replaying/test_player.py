@@ -1,0 +1,172 @@
+"""A replay's position against a made-up clock; which keys, and beside whom."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.errors import UserError
+from common.messages.requests import PlayerRequest
+from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, SCAN, TOPICS
+from services.recorder.replaying.player import GAP, LATE, Player, conflicts, renamed, selected, span
+
+TIMES = st.lists(st.floats(0, 100), min_size=1, max_size=30).map(sorted)
+RATES = st.floats(0.01, 100)
+
+
+def play(player, times, now=0.0):
+    """The wall's times at which messages go out; nobody asks for anything."""
+    went = []
+    for at in times:
+        now += player.wait(at, now)
+        player.sent(at, now, whole=True)
+        went.append(now)
+    return went
+
+
+def ask(player, action, value=0.0, now=0.0):
+    return player.handle(PlayerRequest(action=action, value=value), now)
+
+
+@given(TIMES, RATES)
+def test_the_original_distances_divided_by_the_rate(times, rate):
+    went = play(Player(0.0, 100.0, rate), times)
+    assert went == pytest.approx([at / rate for at in times], abs=1e-6)
+
+
+@given(TIMES, st.sampled_from([0.0, -1.0, math.inf]))
+def test_no_rate_is_as_fast_as_it_goes(times, rate):
+    player = Player(0.0, 100.0, rate)
+    assert play(player, times, 5.0) == [5.0] * len(times)
+    assert player.position(9.0) == times[-1]
+
+
+@given(times=TIMES, rate=RATES, at=st.floats(0, 100), length=st.floats(0, 1e4))
+def test_a_pause_moves_what_comes_after_it_and_nothing_else(times, rate, at, length):
+    player = Player(0.0, 100.0, rate)
+    now = at / rate
+    before = [t for t in times if t <= at]
+    play(player, before)
+    ask(player, "pause", now=now)
+    assert player.wait(100.0, now) == math.inf
+    assert player.position(now + length) == pytest.approx(player.position(now))
+    ask(player, "resume", now=now + length)
+    after = play(player, [t for t in times if t > at], now + length)
+    assert after == pytest.approx([t / rate + length for t in times if t > at], abs=1e-4)
+
+
+@given(rate=RATES, place=st.floats(-50, 150), now=st.floats(0, 1000))
+def test_a_seek_goes_there_or_to_the_nearest_end(rate, place, now):
+    player = Player(10.0, 90.0, rate)
+    reply = ask(player, "seek", place, now)
+    there = min(max(place, 10.0), 90.0)
+    assert reply.position_s == pytest.approx(there)
+    assert player.jumped
+    assert player.jump() == there
+    assert not player.jumped
+    assert player.wait(there, now) == 0.0
+    assert player.wait(there + rate, now) == pytest.approx(1.0)
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=40), st.integers(1, 5))
+def test_a_step_goes_on_to_the_next_scan_and_stands(scans, steps):
+    """``scans`` says of each message whether it is one."""
+    player = Player(0.0, 100.0)
+    for _ in range(steps):
+        ask(player, "step")
+    sent = []
+    for number, scan in enumerate(scans):
+        if player.wait(float(number), 0.0):
+            break
+        player.sent(float(number), 0.0, whole=scan)
+        sent.append(scan)
+    assert player.paused
+    assert sum(sent) == min(steps, sum(scans))
+    assert sent[-1] or sum(scans) < steps  # the last one is the scan, unless there were too few
+    assert player.position(99.0) == len(sent) - 1
+
+
+@given(first=RATES, then=RATES, when=st.floats(0, 10))
+def test_another_rate_holds_from_now_on(first, then, when):
+    player = Player(0.0, 1e6, first)
+    here = player.position(when)
+    assert ask(player, "rate", then, when).position_s == pytest.approx(here)
+    assert player.position(when + 1) == pytest.approx(here + then)
+    assert not ask(player, "rate", -1.0, when).ok
+    assert player.rate == then
+
+
+def test_who_was_held_up_goes_on_from_there_and_does_not_hurry():
+    player = Player(0.0, 100.0, 2.0)
+    assert play(player, [0.0, 2.0]) == [0.0, 1.0]
+    late = 1.0 + LATE * 50
+    assert player.wait(4.0, late) == 0.0
+    player.sent(4.0, late, whole=True)
+    assert player.wait(6.0, late) == pytest.approx(1.0)
+
+
+def test_a_little_late_is_caught_up():
+    player = Player(0.0, 100.0)
+    player.sent(4.0, 4.0 + LATE / 2, whole=True)
+    assert player.wait(5.0, 4.0 + LATE / 2) == pytest.approx(1.0 - LATE / 2)
+
+
+def test_a_loop_begins_anew_a_moment_later():
+    player = Player(3.0, 8.0, loop=True)
+    player.again(50.0)
+    assert player.jump() == 3.0
+    assert player.wait(3.0, 50.0) == pytest.approx(GAP)
+    assert player.state(50.0).position_s == 3.0
+    assert player.state(50.0).loop
+
+
+def test_a_span_is_of_the_recording():
+    assert span(20.0, None, None) == (0.0, 20.0)
+    assert span(20.0, 5.0, -5.0) == (5.0, 15.0)
+    assert span(20.0, 5.0, 99.0) == (5.0, 20.0)
+    with pytest.raises(UserError, match=r"--start 21: the recording lasts 20\.00 s"):
+        span(20.0, 21.0, None)
+    with pytest.raises(UserError, match="nothing lies between"):
+        span(20.0, 10.0, 9.0)
+
+
+KEYS = {topic.key("r", "estimator"): topic for topic in TOPICS}
+
+
+def test_topics_are_selected_by_name_and_health_only_when_asked_for():
+    there = {key: KEYS[key] for key in KEYS if KEYS[key] in (SCAN, ODOM, HEALTH)}
+    assert set(selected(there, None).values()) == {SCAN, ODOM}
+    assert set(selected(there, {"odom", "health"}).values()) == {ODOM, HEALTH}
+    assert set(selected(there, None, {"odom", "belief"}).values()) == {SCAN}  # belief is none to begin with
+    with pytest.raises(UserError, match="no belief; it has health, odom, scan"):
+        selected(there, {"belief", "scan"})
+    with pytest.raises(UserError, match="no topic smell: choose from belief"):
+        selected(there, None, {"smell"})
+
+
+def test_a_key_gets_another_robot():
+    assert renamed("presage/robot/health/estimator", "ghost") == "presage/ghost/health/estimator"
+    assert renamed("presage/robot/scan", "") == "presage/robot/scan"
+
+
+def test_beside_whom_keys_are_not_published():
+    assert conflicts(KEYS, {"r": set()}) == ""
+    assert conflicts(KEYS, {"other": {"estimator", "simulator"}}) == ""
+    assert conflicts(KEYS, {"r": {"recorder", "viewer"}}) == ""
+    why = conflicts({key: KEYS[key] for key in KEYS if KEYS[key] is not HEALTH}, {"r": {"estimator", "recorder"}})
+    assert "the estimator of 'r' is alive and publishes presage/r/belief, presage/r/prediction" in why
+    assert "--except belief,prediction" in why
+    assert "--force" in why
+    assert "presage/r/health/estimator" in conflicts(KEYS, {"r": {"estimator"}})
+    assert conflicts({SCAN.key("r"): SCAN}, {"r": {"estimator"}}) == ""
+    assert "simulator" in conflicts({SCAN.key("r"): SCAN}, {"r": {"simulator"}})
+    assert "the replay of 'r'" in conflicts({BELIEF.key("r"): BELIEF}, {"r": {"replay"}})
+
+
+def test_commands_do_not_drive_a_live_simulator_and_goals_belong_to_nobody():
+    assert "would drive the live simulator" in conflicts({CMD_VEL.key("r"): CMD_VEL}, {"r": {"simulator"}})
+    assert conflicts({CMD_VEL.key("r"): CMD_VEL}, {"r": {"estimator"}}) == ""
+    assert conflicts({GOAL.key("r"): GOAL}, {"r": {"simulator", "controller", "viewer"}}) == ""

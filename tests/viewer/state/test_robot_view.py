@@ -1,0 +1,401 @@
+"""Which moment a frame shows, when it is sent, and its bytes."""
+
+from __future__ import annotations
+
+import json
+import struct
+from random import Random
+
+import numpy as np
+import pytest
+
+from common.messages.definitions import Goal, Plan, Pose, Twist
+from common.messages.topics import BELIEF, CMD_VEL, GOAL, PLAN, PREDICTION, PREFERENCE, SCAN, STATUS, TRUTH
+from services.viewer.state.frames import encode
+from services.viewer.state.history import History, Sample
+from services.viewer.state.replay_moments import QUIET
+from services.viewer.state.robot_view import PATIENCE, RobotView
+from tests.viewer.client import read_frame
+from tests.viewer.messages import MOTION, PATH, PEOPLE, RANGES, UNMAPPED, at, preference
+
+PERIOD = 1 / 15
+REST = (BELIEF, PREDICTION, STATUS, CMD_VEL, PLAN)  # what answers a scan
+
+
+def feed(view, stamp, now=None, *leave_out, **how):
+    """All messages of a stamp; the frames that came of them."""
+    now = stamp if now is None else now
+    sent = [view.hear(t, m, now, round(now * 1e9)) for t, m in at(stamp, **how).items() if t not in leave_out]
+    return [read_frame(frame) for frame in sent if frame is not None]
+
+
+def test_a_frame_is_one_moment():
+    view = RobotView("robot")
+    feed(view, 1.0)
+    (frame,) = feed(view, 1.0 + PERIOD, x=3.0)
+    header = frame.header
+    assert header["type"] == "frame"
+    assert header["robot"] == "robot"
+    assert header["stamp_ns"] == round((1.0 + PERIOD) * 1e9)
+    assert header["t"] == pytest.approx(1.0 + PERIOD)
+    assert header["truth"] == {"x": 3.0, "y": 2.0, "yaw": 0.25, "contact": True, "stopped": False}
+    assert (header["belief"]["x"], header["belief"]["state"]) == (3.5, "tracking")
+    assert header["belief"]["cov"] == [0.01, 0, 0, 0, 0.04, 0, 0, 0, 0.09]
+    (hypothesis,) = header["belief"]["hypotheses"]
+    assert hypothesis == {"x": 3.5, "y": 2.0, "yaw": 0.25, "weight": 0.75, "cov": header["belief"]["cov"]}
+    assert [header["belief"][k] for k in ("free_energy", "accuracy", "complexity", "estimator")] == [
+        12.0, 10.0, 2.0, "precise",
+    ]  # fmt: skip
+    assert header["odom"]["x"] == 3.0
+    assert header["status"] == {
+        "state": "navigating", "reason": "", "distance": 8.0, "goal": {"x": 9.0, "y": 2.0, "yaw": 0.0},
+    }  # fmt: skip
+    assert header["cmd"] == {"vx": 0.3, "vy": 0.4, "wz": 0.0}
+    assert header["error"] == pytest.approx(0.5)
+    assert header["speed"] == pytest.approx(0.5)
+    assert header["latency_ms"] == 0.0
+    assert header["scan"] == {
+        "angle_min": -1.0, "angle_increment": 0.5, "range_max": 25.0, "mount": {"x": 0.2, "y": 0.0, "yaw": 0.0},
+    }  # fmt: skip
+    np.testing.assert_array_equal(frame.arrays["ranges"], RANGES)
+    np.testing.assert_array_equal(frame.arrays["predicted"], np.arange(5))
+    np.testing.assert_allclose(frame.arrays["sigma"], 0.1)
+    for name, points in (("path", PATH), ("motion", MOTION), ("obstacles", UNMAPPED), ("people", PEOPLE)):
+        np.testing.assert_array_equal(frame.arrays[name], points.ravel(), err_msg=name)
+    assert frame.data == view.frame
+
+
+@pytest.mark.parametrize("name", ["a", "ab", "abc", "abcd"])
+def test_the_layout_is_aligned_whatever_the_header(name):
+    data = encode({name: "ü"}, {"ranges": np.array([1, np.inf], np.float32), "sigma": np.array([-np.inf], np.float32)})
+    (length,) = struct.unpack_from("<I", data)
+    assert (4 + length) % 4 == 0
+    header = json.loads(data[4 : 4 + length])
+    assert header == {name: "ü", "arrays": {"ranges": [0, 2], "sigma": [2, 1]}}
+    assert data[4 + length :] == struct.pack("<3f", 1, float("inf"), -float("inf"))
+
+
+def test_a_number_that_json_does_not_have_is_not_sent():
+    with pytest.raises(ValueError, match="JSON"):
+        encode({"error": float("nan")}, {})
+
+
+def test_it_waits_for_those_who_spoke_lately_and_no_longer_than_its_patience():
+    view = RobotView("robot")
+    feed(view, 1.0)
+    late = {BELIEF, PREDICTION, STATUS, CMD_VEL, PLAN}
+    assert feed(view, 1.1, 1.1, *late) == []
+    assert view.due(1.1) == pytest.approx(PATIENCE)
+    assert view.overdue(1.1 + PATIENCE / 2) is None
+    frame = read_frame(view.overdue(1.1 + PATIENCE))
+    assert frame.header["stamp_ns"] == 1_100_000_000
+    assert frame.header["belief"]["stamp_ns"] == 1_000_000_000  # the last there is, and it says so
+    assert frame.header["error"] == pytest.approx(0.5)  # against the truth of its own stamp
+    assert view.due(2.0) is None
+    # The belief that comes after all makes no second frame of that scan.
+    assert view.hear(BELIEF, at(1.1)[BELIEF], 1.2) is None
+
+
+def test_the_next_scan_ends_the_wait_and_the_old_one_is_shown_as_it_was():
+    view = RobotView("robot")
+    feed(view, 1.0)
+    feed(view, 1.1, 1.1, BELIEF, x=5.0)
+    (old, new) = feed(view, 1.2, 1.2, x=7.0)
+    assert (old.header["stamp_ns"], old.header["truth"]["x"]) == (1_100_000_000, 5.0)
+    assert (new.header["stamp_ns"], new.header["truth"]["x"]) == (1_200_000_000, 7.0)
+
+
+def test_who_fell_silent_is_not_shown_and_not_waited_for():
+    view = RobotView("robot")
+    for i in range(60):
+        feed(view, i * 0.1, i * 0.1, *({BELIEF, PREDICTION} if i else set()))
+        view.overdue(i * 0.1 + PATIENCE)
+    (frame,) = feed(view, 6.0, 6.0, BELIEF, PREDICTION)
+    assert frame.header["belief"] is None
+    assert frame.header["error"] is None
+    assert len(frame.arrays["predicted"]) == len(frame.arrays["sigma"]) == 0
+    assert frame.header["cmd"] is not None
+
+
+def test_while_time_stands_still_nobody_falls_silent():
+    view = RobotView("robot")
+    feed(view, 1.0)
+    assert feed(view, 1.1, 100.0, *REST) == []  # one step after a long pause: it waits
+    rest = {topic: message for topic, message in at(1.1).items() if topic in REST}
+    frames = [view.hear(topic, message, 100.01) for topic, message in rest.items()]
+    assert read_frame(frames[-1]).header["belief"]["stamp_ns"] == 1_100_000_000
+
+
+def shown(view, now):
+    """The frame of a replay once it is quiet."""
+    frame = view.overdue(now + QUIET)
+    return frame if frame is None else read_frame(frame)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_replay_shows_the_whole_moment_whatever_the_order(seed):
+    view, random = RobotView("ghost", live=False), Random(seed)
+    for step in range(1, 5):  # to the end of the next scan: the answers to the last one, and the scan
+        sent = [(t, m) for t, m in at(step - 1.0).items() if t in REST] if step > 1 else []
+        sent += [(t, m) for t, m in at(float(step)).items() if t not in REST]
+        keys = {topic: [m for t, m in sent if t is topic] for topic, _ in sent}
+        order = random.sample([topic for topic, _ in sent], len(sent))  # each key keeps its own order
+        assert [view.hear(topic, keys[topic].pop(0), float(step)) for topic in order] == [None] * len(sent)
+        assert shown(view, step - 0.01) is None  # more may come
+        frame = shown(view, float(step))
+        assert frame.header["t"] == (1.0 if step == 1 else step - 1.0)
+        assert (frame.header["belief"] is None) == (step == 1)
+        if step > 1:
+            assert frame.header["belief"]["stamp_ns"] == frame.header["stamp_ns"]
+            assert frame.header["error"] == pytest.approx(0.5)
+            assert len(frame.arrays["predicted"]) == 5
+            assert frame.header["latency_ms"] is None  # of the replay, not of the robot
+        assert shown(view, float(step) + 1) is None  # once
+
+
+def test_a_replay_that_jumps_shows_where_it_is():
+    view = RobotView("ghost", live=False)
+    for stamp in (5.0, 5.1):
+        feed(view, stamp, stamp, *(REST if stamp > 5 else ()))
+    assert shown(view, 5.1).header["t"] == 5.0
+    for stamp in (9.0, 9.1):  # forward
+        feed(view, stamp, 6.0, *(REST if stamp > 9 else ()))
+    assert shown(view, 6.0).header["t"] == 9.0
+    feed(view, 2.0, 7.0)  # back, to the last of its file, say: no other scan follows
+    frame = shown(view, 7.0)
+    assert frame.header["stamp_ns"] == frame.header["belief"]["stamp_ns"] == 2_000_000_000
+    assert view.began_anew
+
+
+def test_a_replay_that_never_pauses_is_shown_all_the_same():
+    view, times = RobotView("ghost", live=False), []
+    for i in range(200):  # ten times as fast
+        now = i / 150
+        feed(view, i / 15, now)
+        frame = view.overdue(now)
+        if frame is not None:
+            times.append(read_frame(frame).header["t"])
+    assert 15 <= len(times) <= 25
+    assert times == sorted(times)
+    assert times[-1] > 198 / 15 - 1.0
+
+
+def test_a_replay_of_scans_alone_is_shown():
+    view = RobotView("ghost", live=False)
+    seen = []
+    for i in range(4):
+        view.hear(SCAN, at(float(i))[SCAN], float(i))
+        seen.append(shown(view, float(i)).header["t"])
+    assert seen == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_a_scanner_alone_is_shown():
+    view = RobotView("bare")
+    view.hear(SCAN, at(1.0)[SCAN], 1.0)
+    frame = read_frame(view.overdue(1.0 + PATIENCE))
+    assert frame.header["truth"] is frame.header["belief"] is frame.header["status"] is frame.header["cmd"] is None
+    assert len(frame.arrays["ranges"]) == 5
+
+
+def test_latency_is_from_the_scan_to_its_own_command():
+    view = RobotView("robot")
+    feed(view, 1.0)
+    for topic, message in at(1.1).items():
+        frame = view.hear(topic, message, 1.1, 1_100_000_000 + (7_500_000 if topic is CMD_VEL else 0))
+    assert read_frame(frame).header["latency_ms"] == pytest.approx(7.5)
+
+
+def test_time_that_goes_back_begins_anew():
+    view = RobotView("robot")
+    for i in range(5):
+        feed(view, 10.0 + i)
+    assert view.history.columns()["t"] == [10.0, 11.0, 12.0, 13.0, 14.0]
+    assert not view.began_anew
+    (frame, *_) = [*feed(view, 2.0), *feed(view, 3.0)]
+    assert view.began_anew
+    assert frame.header["stamp_ns"] <= 3_000_000_000
+    assert view.history.columns()["t"] == [2.0, 3.0]
+
+
+def test_history_is_the_last_minute():
+    history = History()
+    for i in range(100):
+        history.add(Sample(float(i), i, i, 0.0, None, 0.1))
+    columns = history.columns()
+    assert columns["t"] == [float(i) for i in range(39, 100)]
+    assert {len(column) for column in columns.values()} == {61}
+    assert columns["error"] == [None] * 61
+    history.add(Sample(99.0, -1, -1, 0.0, 0.5, 0.1))  # sent again: it takes the place of the first
+    assert history.columns()["free_energy"][-2:] == [98, -1]
+
+
+def test_history_remembers_what_beliefs_said():
+    view = RobotView("robot")
+    feed(view, 1.0)
+    assert view.history.columns() == {
+        "t": [1.0], "free_energy": [12.0], "accuracy": [10.0], "complexity": [2.0],
+        "error": [pytest.approx(0.5)], "speed": [pytest.approx(0.5)],
+    }  # fmt: skip
+
+
+def test_a_truth_that_comes_after_its_belief_still_gives_the_error():
+    view, messages = RobotView("robot"), at(1.0)
+    for topic in (SCAN, BELIEF, TRUTH):
+        view.hear(topic, messages[topic], 1.0)
+    assert view.history.columns()["error"] == [pytest.approx(0.5)]
+
+
+def test_an_empty_plan_is_the_last_one_and_nobody_waits_for_another():
+    view = RobotView("robot")
+    feed(view, 1.0)
+    assert feed(view, 1.1, 1.1, PLAN) == []  # there was one
+    view.hear(PLAN, Plan(stamp_ns=1_100_000_000), 1.11)
+    (frame,) = feed(view, 1.2, 1.2, PLAN)
+    assert len(frame.arrays["path"]) == len(frame.arrays["obstacles"]) == 0
+    assert view.due(1.2) is None
+
+
+def test_what_a_goal_asks_for_is_shown_with_it():
+    view, goal = RobotView("robot"), Pose(x=9.0, y=2.0)
+    said = at(1.0)[STATUS].model_copy(update={"goal_seq": 7})
+
+    def shown_goal(number, **asks):
+        view.hear(GOAL, Goal(stamp_ns=0, seq=number, pose=goal, **asks), 1.0)
+        view.hear(STATUS, said, 1.0)
+        (frame,) = feed(view, view.stamp_ns * 1e-9 + 0.1, 1.0, STATUS)
+        return frame.header["status"]["goal"]
+
+    assert "tolerance" not in shown_goal(3, tolerance=0.5)  # another goal's
+    assert shown_goal(7, tolerance=0.5)["yaw_tolerance"] is None
+    asked = shown_goal(7, tolerance=0.4, yaw_tolerance=0.15)
+    assert (asked["tolerance"], asked["yaw_tolerance"]) == (0.4, 0.15)
+
+
+def told_field(view):
+    data = view.fields.change(view.stamp_ns, live=view.live)
+    return data if data is None else read_frame(data)
+
+
+def test_a_field_is_told_once_and_outlives_a_reset():
+    view = RobotView("robot")
+    feed(view, 5.0)
+    assert told_field(view) is None
+    view.hear(PREFERENCE, preference(5.0), 5.0)
+    field = told_field(view)
+    assert field.header == {
+        "type": "field", "robot": "robot", "t": 5.0, "goal": {"x": 9.0, "y": 2.0, "yaw": 0.0},
+        "origin": {"x": -1.0, "y": -2.0}, "resolution": 0.5, "width": 3, "height": 2, "arrays": {"distance": [0, 6]},
+    }  # fmt: skip
+    np.testing.assert_array_equal(field.arrays["distance"], [0, 1, 2, 3, 4, np.inf])
+    feed(view, 6.0)
+    assert told_field(view) is None
+    feed(view, 1.0)  # the simulation began anew; its goal is the same
+    assert view.began_anew
+    assert view.fields.shown == field.data
+    view.hear(PREFERENCE, preference(1.0, x=3.0), 7.0)
+    assert told_field(view).header["goal"]["x"] == 3.0
+
+
+def test_a_replay_shows_the_field_of_its_time():
+    view = RobotView("ghost", live=False)
+    for stamp, x in ((1.0, 1.0), (5.0, 5.0)):
+        view.hear(PREFERENCE, preference(stamp, x), stamp)
+        feed(view, stamp)
+        assert told_field(view).header["goal"]["x"] == x
+    feed(view, 3.0)  # back
+    assert told_field(view).header["goal"]["x"] == 1.0
+    feed(view, 0.5)
+    assert told_field(view) is None
+    feed(view, 6.0)
+    assert told_field(view).header["goal"]["x"] == 5.0
+
+
+def test_a_large_field_is_thinned_out_and_its_cells_stay_where_they_were():
+    view, side = RobotView("robot"), 401
+    view.hear(PREFERENCE, preference(1.0, width=side, height=side), 1.0)
+    field = told_field(view)
+    header, values = field.header, field.arrays["distance"]
+    assert header["width"] == header["height"] == 134
+    assert header["resolution"] == 1.5
+    for cell in (0, 77, 134 * 50 + 3):
+        row, column = divmod(cell, 134)
+        x, y = (header["origin"][k] + (n + 0.5) * 1.5 for k, n in (("x", column), ("y", row)))
+        old = int((y + 2) / 0.5) * side + int((x + 1) / 0.5)
+        assert values[cell] == old
+        assert (x + 1) / 0.5 % 1 == pytest.approx(0.5)  # the middle of a cell
+
+
+def test_the_journal_has_a_row_for_each_change_of_mind():
+    view = RobotView("robot")
+
+    def say(stamp, state, reason=""):
+        view.hear(STATUS, at(stamp)[STATUS].model_copy(update={"state": state, "reason": reason}), stamp)
+        grew, view.new_row = view.new_row, False
+        return grew
+
+    assert say(1.0, "navigating")
+    assert not say(1.1, "navigating")
+    assert say(2.0, "blocked", "somebody stands 0.52 m ahead")
+    assert not say(2.1, "blocked", "somebody stands 0.49 m ahead")  # numbers go on changing
+    assert say(3.0, "blocked", "no way round")
+    assert not say(3.1, "blocked")
+    assert not say(3.2, "blocked", "no way round")
+    assert [(row["t"], row["state"], row["reason"]) for row in view.journal.rows()] == [
+        (1.0, "navigating", ""), (2.0, "blocked", "somebody stands 0.52 m ahead"), (3.0, "blocked", "no way round"),
+    ]  # fmt: skip
+    for i in range(50):
+        assert say(4.0 + i, ("idle", "navigating")[i % 2])
+    assert len(view.journal.rows()) == 20
+    feed(view, 60.0)
+    feed(view, 1.0)  # back
+    assert [row["t"] for row in view.journal.rows()] == [1.0]
+
+
+@pytest.mark.parametrize(
+    ("x", "yaw", "seconds", "carried"),
+    [
+        (1.05, 0.25, 0.1, False),  # driven, at 0.5 m/s
+        (1.45, 0.25, 0.5, False),  # driven, faster towards the end
+        (1.3, 0.25, 0.1, True),
+        (9.0, 0.25, 0.1, True),
+        (1.0, 0.4, 0.1, False),
+        (1.0, 3.0, 0.1, True),  # turned on the spot by hand
+        (1e308, 0.25, 0.1, True),
+    ],
+)
+def test_a_robot_carried_off_is_an_event(x, yaw, seconds, carried):
+    view = RobotView("robot")
+    feed(view, 1.0)
+    later = at(1.0 + seconds)
+    truth = later[TRUTH].model_copy(update={"pose": Pose(x=x, y=2.0, yaw=yaw)})
+    view.hear(TRUTH, truth, 1.0 + seconds)
+    view.hear(STATUS, later[STATUS], 1.0 + seconds)
+    rows = view.journal.rows()
+    assert [row["state"] for row in rows] == ["navigating", *["carried"] * carried]
+    if x == 9.0:
+        assert rows[-1]["t"] == pytest.approx(1.1)
+        assert rows[-1]["reason"].startswith("8.0 m, to (9.00, 2.00)")
+
+
+def test_numbers_that_no_robot_has_are_shown_as_none():
+    view, messages = RobotView("robot"), at(1.1)
+    feed(view, 1.0)
+    far = Pose(x=1e308, y=0.0)
+    messages[BELIEF] = messages[BELIEF].model_copy(update={"pose": far, "hypotheses": []})
+    messages[TRUTH] = messages[TRUTH].model_copy(
+        update={"pose": Pose(x=-1e308, y=0.0), "twist": Twist(vx=1.5e308, vy=1.5e308)}
+    )
+    for topic, message in messages.items():
+        view.hear(topic, message, 1.1)
+    header = read_frame(view.frame).header
+    assert (header["error"], header["speed"], header["belief"]["x"]) == (None, None, 1e308)
+    huge = preference(1.0, width=401, height=401).model_copy(update={"resolution": 1e308})
+    view.hear(PREFERENCE, huge, 1.0)
+    assert told_field(view) is None
+
+
+def test_a_replay_shows_the_last_moment_though_it_has_no_plan_any_more():
+    view = RobotView("ghost", live=False)
+    feed(view, 1.0)
+    feed(view, 1.1, 1.0, PLAN)
+    assert shown(view, 1.0).header["t"] == pytest.approx(1.1)

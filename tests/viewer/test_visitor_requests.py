@@ -1,0 +1,123 @@
+"""What comes over the socket is an action or is refused with a reason; nothing else."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.viewer import visitor_requests as a
+
+BOX = {"box": {"center": [1, 2], "size": [1, 0.5], "yaw_deg": 30}}
+GOOD = [
+    ({"do": "watch", "robot": "robot-2"}, a.Watch(do="watch", robot="robot-2")),
+    ({"do": "goal", "x": 1, "y": 2.5}, a.GoTo(do="goal", x=1.0, y=2.5)),
+    ({"do": "goal", "x": 1, "y": 2, "yaw": -1.5, "tolerance": 0.1}, a.GoTo(do="goal", x=1, y=2, yaw=-1.5, tolerance=0.1)),  # noqa: E501
+    ({"do": "cancel"}, a.Cancel(do="cancel")),
+    ({"do": "teleport", "x": 1, "y": 2, "yaw": 3}, a.Carry(do="teleport", x=1, y=2, yaw=3)),
+    ({"do": "localise"}, a.Localise(do="localise")),
+    ({"do": "localise", "x": 1, "y": 2, "yaw": None}, a.Localise(do="localise", x=1, y=2)),
+    ({"do": "obstacle", "action": "remove", "name": "crate"}, a.Furnish(do="obstacle", action="remove", name="crate")),
+    ({"do": "pause"}, a.Clock(do="pause")),
+    ({"do": "step"}, a.Clock(do="step")),
+    ({"do": "reset", "seed": 7}, a.Reset(do="reset", seed=7)),
+    ({"do": "speed", "factor": 2}, a.Pace(do="speed", factor=2)),
+    ({"do": "drive", "vx": 0.5, "vy": 0, "wz": -1}, a.Steer(do="drive", vx=0.5, vy=0, wz=-1)),
+    ({"do": "record", "action": "start"}, a.Record(do="record", action="start")),
+    ({"do": "recordings"}, a.Recordings(do="recordings")),
+    ({"do": "open", "name": "run.mcap"}, a.Open(do="open", name="run.mcap")),
+    ({"do": "close"}, a.Close(do="close")),
+    ({"do": "player", "action": "seek", "value": 3.5}, a.Play(do="player", action="seek", value=3.5)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("message", "action"), GOOD)
+def test_every_action_is_understood(message, action):
+    assert a.parse(json.dumps({"id": 5, **message, "later": "field"})) == (5, action)
+
+
+def test_an_obstacle_is_one_as_in_a_world_file():
+    _, action = a.parse(json.dumps({"id": 1, "do": "obstacle", "action": "add", "name": "crate", "obstacle": BOX}))
+    assert action.obstacle.box.center == (1.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "no JSON"),
+        ("{", "no JSON"),
+        ("[" * 4000, "no JSON"),
+        ("9" * 4090, ""),
+        ("[]", "a JSON object"),
+        ("null", "a JSON object"),
+        ("{}", "nothing is done by that name; there are: watch, goal"),
+        ('{"do": ["goal"]}', "nothing is done"),
+        ('{"do": "explode"}', "nothing is done"),
+        ('{"do": "goal", "x": 1}', "y: Field required"),
+        ('{"do": "goal", "x": "1", "y": 2}', "x: "),
+        ('{"do": "goal", "x": true, "y": 2}', "x: "),
+        ('{"do": "goal", "x": NaN, "y": 2}', "x: "),
+        ('{"do": "goal", "x": 1e999, "y": 2}', "x: "),
+        ('{"do": "goal", "x": 1' + "0" * 400 + ', "y": 2}', ""),
+        ('{"do": "goal", "x": 1, "y": 2, "tolerance": 0}', "tolerance: "),
+        ('{"do": "watch", "robot": "a/../b"}', "robot: "),
+        ('{"do": "watch", "robot": "*"}', "robot: "),
+        ('{"do": "obstacle", "action": "add", "name": "x", "obstacle": {}}', "exactly one of"),
+        (
+            '{"do": "obstacle", "action": "add", "name": "x", "obstacle": {"polygon": [[0,0],[1,1],[1,0],[0,1]]}}',
+            "not simple",
+        ),
+        ('{"do": "drive", "vx": 1e9}', "vx: "),
+        ('{"do": "player", "action": "eject"}', "action: "),
+        ('{"do": "goal", "x": 1, "y": 2, "pad": "' + "x" * 4096 + '"}', "too long"),
+    ],
+)
+def test_what_is_none_is_refused_with_a_reason(text, says):
+    with pytest.raises(a.Refused) as refused:
+        a.parse(text)
+    assert says in str(refused.value)
+    assert str(refused.value)
+
+
+@pytest.mark.parametrize("number", [3, None])
+def test_a_refusal_bears_the_number_of_what_it_refuses(number):
+    with pytest.raises(a.Refused) as refused:
+        a.parse(json.dumps({"id": number, "do": "goal"}))
+    assert refused.value.number == number
+
+
+@pytest.mark.parametrize("number", ["5", 1.5, True, [1], {"a": 1}, 2**60])
+def test_a_number_that_is_none_is_not_repeated(number):
+    assert a.parse(json.dumps({"id": number, "do": "cancel"}))[0] is None
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
+    max_leaves=12,
+)
+FIELDS = ["id", "x", "y", "yaw", "robot", "action", "name", "obstacle", "value", "seed", "factor", "tolerance", "vx"]
+SHAPES = st.fixed_dictionaries({}, optional=dict.fromkeys(("box", "circle", "polygon", "name"), VALUES))
+
+
+@given(
+    st.text(max_size=200)
+    | VALUES.map(json.dumps)
+    | st.builds(
+        lambda do, fields, obstacle: json.dumps({"do": do, **fields, "obstacle": obstacle}),
+        st.sampled_from([message["do"] for message, _ in GOOD]),
+        st.dictionaries(st.sampled_from(FIELDS), VALUES),
+        VALUES | SHAPES,
+    )
+)
+def test_whatever_comes_is_an_action_or_refused(text):
+    try:
+        number, action = a.parse(text)
+    except a.Refused as refused:
+        reason, number, action = str(refused), refused.number, None
+    else:
+        reason = ""
+    assert bool(reason) != isinstance(action, a.Action)
+    assert number is None or isinstance(number, int)

@@ -1,0 +1,49 @@
+"""One socket's end: a connection that is gone is no error; an error of ours is one."""
+
+from __future__ import annotations
+
+import asyncio
+from types import SimpleNamespace
+
+import pytest
+from starlette.websockets import WebSocket
+
+from services.viewer.visitor_session import Session
+from services.viewer.visitors import Hub
+
+
+def talk(send, messages, act=None):
+    """Run a session that is sent ``messages`` and then nothing more."""
+    coming = iter([{"type": "websocket.connect"}, *messages])
+
+    async def receive():
+        for message in coming:
+            return message
+        return await asyncio.Event().wait()
+
+    async def whole():
+        office = SimpleNamespace(hub=Hub(), roster=SimpleNamespace(robot="robot"))
+        desk = SimpleNamespace(office=office, act=act, greet=lambda visitor, _robot: visitor.say("hello"))
+        websocket = WebSocket({"type": "websocket"}, receive, send)
+        await asyncio.wait_for(Session(websocket, desk).run(), 30.0)
+
+    asyncio.run(whole())
+
+
+def test_a_socket_that_the_server_has_closed_already_is_gone_and_no_error():
+    async def send(message):
+        if message["type"] == "websocket.send":  # as uvicorn says it, after a frame too long
+            raise RuntimeError("Unexpected ASGI message 'websocket.send', after sending 'websocket.close'.")
+
+    talk(send, [])
+
+
+def test_an_error_of_ours_is_not_hidden():
+    async def send(_message):
+        pass
+
+    async def act(_visitor, _action):
+        raise RuntimeError("ours")
+
+    with pytest.raises(RuntimeError, match="ours"):
+        talk(send, [{"type": "websocket.receive", "text": '{"id": 1, "do": "recordings"}'}], act)
