@@ -51,6 +51,7 @@ ALSO_SHELL = {
     "services/recorder/recover.py",
     "services/recorder/session_description.py",
     "services/recorder/replaying/replay.py",
+    "services/recorder/files/chunks.py",
     "services/recorder/files/index.py",
     "services/recorder/files/parts.py",
     "services/recorder/files/writer.py",
