@@ -33,6 +33,11 @@ def signed_distance(mask: npt.NDArray[np.bool_], x: Array, y: Array, most: float
     return outside - into
 
 
+def inner_distance(mask: npt.NDArray[np.bool_], x: Array, y: Array, most: float = np.inf) -> Array:
+    """(len(y), len(x)), in cells, from nodes on the cells to the nearest place outside ``mask``; 0 outside it."""
+    return _to_cells(~np.pad(mask, 1), x + 1, y + 1, most)
+
+
 def _to_cells(mask: npt.NDArray[np.bool_], x: Array, y: Array, most: float) -> Array:
     """(len(y), len(x)) to the nearest True cell, 0 in one; ``most`` where none is so near."""
     along = _along_columns(mask, y)  # (columns, len(y))

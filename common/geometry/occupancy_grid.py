@@ -18,9 +18,10 @@ import numpy.typing as npt
 import shapely
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from common.geometry.cell_distance import signed_distance
+from common.geometry.cell_distance import inner_distance, signed_distance
 from common.geometry.cell_rays import CellRays
 from common.geometry.se2 import rotate
+from common.limits import Angle, Coordinate
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -33,8 +34,6 @@ FREE, OCCUPIED, UNKNOWN = 0, 100, 255  # as in nav_msgs/OccupancyGrid, whose -1 
 MOST_CELLS = 16_000_000  # 4000 by 4000
 KEPT = 4  # maps whose shapes are remembered
 
-Coordinate = Annotated[float, Field(allow_inf_nan=False, ge=-1e5, le=1e5)]
-
 
 class OccupancyGrid(BaseModel):
     """A map of square cells."""
@@ -44,14 +43,14 @@ class OccupancyGrid(BaseModel):
     width: Annotated[int, Field(ge=1, le=MOST_CELLS)]  # cells along the map's own x
     height: Annotated[int, Field(ge=1, le=MOST_CELLS)]  # cells along its y
     resolution: Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e3)]  # m, a cell's edge
-    origin: tuple[Coordinate, Coordinate, Coordinate]  # m, m, rad: lower left corner of the first cell, in map
+    origin: tuple[Coordinate, Coordinate, Angle]  # m, m, rad: lower left corner of the first cell, in map
     cells: Annotated[str, Field(max_length=4 * MOST_CELLS)]
     # base64 of zlib of a byte a cell, row by row from the lower left: 0 free, 100 occupied, 255 unknown
 
     @classmethod
     def of(cls, values: Cells, resolution: float, origin: tuple[float, float, float]) -> OccupancyGrid:
         """From (rows, columns) of FREE, OCCUPIED, UNKNOWN, the lowest row first; ValueError for other values."""
-        packed = base64.b64encode(zlib.compress(np.ascontiguousarray(values, np.uint8).tobytes(), 9)).decode()
+        packed = base64.b64encode(zlib.compress(np.ascontiguousarray(values, np.uint8).tobytes())).decode()
         height, width = values.shape
         return cls(width=width, height=height, resolution=resolution, origin=origin, cells=packed)
 
@@ -183,7 +182,7 @@ class GridShapes:
         if clearance <= size / 2:
             return np.argwhere(free)[:, ::-1]
         x, y = (np.arange(side, dtype=float) + 0.5 for side in (self.grid.width, self.grid.height))
-        return np.argwhere(-signed_distance(free, x, y, clearance / size + 1) * size >= clearance)[:, ::-1]
+        return np.argwhere(inner_distance(free, x, y, clearance / size + 1) * size >= clearance)[:, ::-1]
 
     def within(self, cells: npt.NDArray[np.int_], shares: npt.ArrayLike) -> Array:
         """(N, 2) m in map, at ``shares`` (N, 2) of the edges of cells (N, 2) column, row."""

@@ -15,7 +15,8 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from common.errors import UserError
-from common.geometry.occupancy_grid import FREE, MOST_CELLS, OCCUPIED, UNKNOWN, Coordinate, OccupancyGrid
+from common.geometry.occupancy_grid import FREE, MOST_CELLS, OCCUPIED, UNKNOWN, OccupancyGrid
+from common.limits import Angle, Coordinate
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -37,7 +38,7 @@ class MapFile(BaseModel):
 
     image: Annotated[str, Field(min_length=1)]  # path, from the folder of map.yaml
     resolution: Annotated[float, Field(gt=0, le=1e3)]  # m, a pixel's edge
-    origin: tuple[Coordinate, Coordinate, Coordinate]  # m, m, rad: lower left corner of the lower left pixel
+    origin: tuple[Coordinate, Coordinate, Angle]  # m, m, rad: lower left corner of the lower left pixel
     negate: bool = False  # white is occupied
     occupied_thresh: Share = 0.65  # darker is occupied
     free_thresh: Share = 0.25  # lighter is free
@@ -120,6 +121,8 @@ def _pixels(path: Path) -> tuple[Array, Array | None]:
         from PIL import Image, UnidentifiedImageError  # noqa: PLC0415
     except ImportError:
         raise UserError(f"map image {path}: reading it needs the package Pillow: pip install pillow") from None
+    if path.exists() and not path.is_file():  # opening a pipe would wait for its other end
+        raise UserError(f"map image {path}: not a file but a folder, a pipe or a device")
     try:
         with Image.open(path) as image:
             if image.width * image.height > MOST_CELLS:

@@ -8,14 +8,15 @@ import numpy as np
 import shapely
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from common.limits import Coordinate, PositiveDistance
+
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
 
 CIRCLE_SEGMENTS = 64  # a quarter circle in free space: 0.04 mm off at a radius of 0.5 m
 
-Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e5, le=1e5)]
-Length = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e5)]
-Point = tuple[Number, Number]
+Degrees = Annotated[float, Field(allow_inf_nan=False, ge=-1e5, le=1e5)]
+Point = tuple[Coordinate, Coordinate]
 Ring = Annotated[list[Point], Field(min_length=3, max_length=10_000)]
 
 
@@ -29,8 +30,8 @@ class Box(Model):
     """A rectangle."""
 
     center: Point  # m
-    size: tuple[Length, Length]  # m, along its own x and y
-    yaw_deg: Number = 0.0
+    size: tuple[PositiveDistance, PositiveDistance]  # m, along its own x and y
+    yaw_deg: Degrees = 0.0
 
     def corners(self) -> Array:
         """(4, 2) m, counter-clockwise."""
@@ -44,7 +45,7 @@ class Circle(Model):
     """A disc."""
 
     center: Point  # m
-    radius: Length  # m
+    radius: PositiveDistance  # m
 
 
 class Obstacle(Model):

@@ -16,7 +16,9 @@ from common.errors import UserError
 from common.geometry import ros_map as map_file
 from common.geometry import segment_rays
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
-from common.geometry.shapes import Box, Circle, Model, Number, Obstacle, Ring, check_ring
+from common.geometry.shapes import Box, Circle, Degrees, Model, Obstacle, Ring, check_ring
+from common.geometry.yaml_text import TooLargeError, parse_yaml
+from common.limits import Coordinate
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -25,18 +27,19 @@ __all__ = ["NOT_YAML", "Box", "Circle", "Obstacle", "Start", "World", "known_wor
 
 FOLDER = Path(__file__).resolve().parents[2] / "worlds"
 
-# What safe_load raises: a date like 2020-13-45 is a ValueError, 20 000 opening brackets end the recursion.
-NOT_YAML = (yaml.YAMLError, ValueError, RecursionError)
+# What `parse_yaml` raises.
+NOT_YAML = (yaml.YAMLError, ValueError)
 
+POINTS = 100_000  # at once: as shapely's objects they need a few hundred bytes each
 LOOKS = 50  # in vain, before a place on a grid is taken to be nowhere
 
 
 class Start(Model):
     """Where the robot stands at first."""
 
-    x: Number  # m
-    y: Number  # m
-    yaw_deg: Number = 0.0
+    x: Coordinate  # m
+    y: Coordinate  # m
+    yaw_deg: Degrees = 0.0
 
 
 class World(Model):
@@ -98,6 +101,21 @@ class World(Model):
         room = shapely.Polygon(self.boundary) if self.grid is None else self.grid.shapes.free_space
         return shapely.difference(room, self.furniture)
 
+    @functools.cached_property
+    def _free_area(self) -> _Area:
+        return _Area(self.free_space)
+
+    @functools.cached_property
+    def _furniture_area(self) -> _Area:
+        return _Area(self.furniture)
+
+    @property
+    def free_area(self) -> float:
+        """m²; of a grid all its free cells, whether or not obstacles cover them."""
+        if self.grid is None:
+            return float(shapely.area(self.free_space))
+        return float(np.count_nonzero(self.grid.values == FREE)) * self.grid.resolution**2
+
     @property
     def bounds(self) -> tuple[float, float, float, float]:
         """x0, y0, x1, y1 in m of the boundary."""
@@ -114,7 +132,7 @@ class World(Model):
         """(N,) m from points (N, 2) to the nearest place that is not free; negative where it is not free itself."""
         points = np.asarray(points, float).reshape(-1, 2)
         if self.grid is None:
-            return _signed(points, self.free_space)
+            return self._free_area.signed(points)
         return self._off_furniture(points, 0.0 - self.grid.shapes.distance(FREE, points))
 
     def why_no_room(self, place: Array, radius: float) -> str | None:
@@ -139,13 +157,12 @@ class World(Model):
             nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
             away = self._off_furniture(nodes, self.grid.shapes.lattice(OCCUPIED, x, y, most).ravel())
             return np.clip(away, -most, most).reshape(len(y), len(x))
-        shapely.prepare(self.free_space)
-        columns = [_signed(np.column_stack([np.full(len(y), at), y]), self.free_space) for at in x]
+        columns = [self._free_area.signed(np.column_stack([np.full(len(y), at), y])) for at in x]
         return np.clip(np.stack(columns, axis=1), -most, most)
 
     def _off_furniture(self, points: Array, away: Array) -> Array:
         """(N,) ``away``, or what the obstacles leave of it."""
-        return np.minimum(away, -_signed(points, self.furniture)) if self.obstacles else away
+        return np.minimum(away, -self._furniture_area.signed(points)) if self.obstacles else away
 
     def sample_free(self, count: int, rng: np.random.Generator, clearance: float = 0.0) -> Array:
         """(count, 2) points uniform over free space, at least ``clearance`` m from everything.
@@ -156,6 +173,7 @@ class World(Model):
             return self._sample_cells(count, rng, clearance)
         x0, y0, x1, y1 = self.bounds
         room = self._room(clearance)
+        shapely.prepare(room)
         found: list[Array] = []
         while sum(map(len, found)) < count:
             points = rng.uniform([x0, y0], [x1, y1], (max(count, 256), 2))
@@ -211,11 +229,27 @@ class World(Model):
         return found if self.grid is None else np.minimum(found, self.grid.shapes.ray_distances(poses, angles))
 
 
-def _signed(points: Array, area: shapely.Geometry) -> Array:
-    """(N,) m from points (N, 2) to the edge of an area; positive within it."""
-    where = shapely.points(points)
-    distance = shapely.distance(where, shapely.boundary(area))
-    return np.where(shapely.contains(area, where), distance, -distance)
+class _Area:
+    """A geometry with an index of its edges: what a distance costs hardly grows with their number."""
+
+    def __init__(self, area: shapely.Geometry) -> None:
+        shapely.prepare(area)
+        ends, ring = shapely.get_coordinates(shapely.get_parts(shapely.boundary(area)), return_index=True)
+        joined = ring[1:] == ring[:-1]
+        self._area = area
+        self._edges = shapely.STRtree(shapely.linestrings(np.stack([ends[:-1], ends[1:]], axis=1)[joined]))
+
+    def signed(self, points: Array) -> Array:
+        """(N,) m from points (N, 2) to the edge; positive within."""
+        blocks = [points[begin : begin + POINTS] for begin in range(0, len(points), POINTS)]
+        return np.concatenate([self._signed(block) for block in blocks]) if blocks else np.zeros(0)
+
+    def _signed(self, points: Array) -> Array:
+        where, distance = shapely.points(points), np.full(len(points), np.inf)
+        if len(self._edges):
+            found, near = self._edges.query_nearest(where, return_distance=True, all_matches=False)
+            distance[found[0]] = near
+        return np.where(shapely.contains(self._area, where), distance, -distance)
 
 
 def known_worlds() -> list[str]:
@@ -227,7 +261,7 @@ def load_world(name: str) -> World:
     """The shipped world of that name, or the world or ROS map in that file; UserError says what is wrong, and where."""
     path = FOLDER / f"{name}.yaml" if name in known_worlds() else Path(name)
     try:
-        data: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data: Any = parse_yaml(path.read_text(encoding="utf-8"))
         return World.model_validate(map_file.read_map(path, data) if map_file.is_map(data) else data)
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"no world {name!r}: give a file or one of {', '.join(known_worlds())}") from None
@@ -240,6 +274,8 @@ def load_world(name: str) -> World:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         raise UserError(f"world {path}: {'.'.join(map(str, first['loc'])) or 'file'}: {first['msg']}") from None
+    except TooLargeError as error:
+        raise UserError(f"world {path}: {error}") from None
     except NOT_YAML as error:
         raise UserError(f"world {path}: no YAML ({' '.join(str(error).split())})") from None
 

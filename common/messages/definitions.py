@@ -12,21 +12,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
+from common.limits import Angle, Distance, PositiveAngle, PositiveDistance
 from common.messages.pose import Pose as Pose  # noqa: PLC0414 - most take it from here
 from common.messages.pose import Twist as Twist  # noqa: PLC0414
-from common.messages.wire import (
-    Count,
-    Finite,
-    Floats,
-    Matrix3,
-    Message,
-    Name,
-    NotNegative,
-    Points,
-    Positive,
-    Ranges,
-    Text,
-)
+from common.messages.wire import Beams, Costs, Count, Finite, Floats, Matrix3, Message, Name, NotNegative, Points, Text
 
 
 class Stamped(Message):
@@ -39,15 +28,15 @@ class Stamped(Message):
 class Scan(Stamped):
     """One sweep of the scanner (sensor_msgs/LaserScan)."""
 
-    angle_min: Finite  # rad, first beam, laser: counter-clockwise seen from above, however the scanner is mounted
-    angle_increment: Finite  # rad, between beams; negative: they run clockwise, as of a scanner mounted upside down
-    range_min: NotNegative  # m
-    range_max: Positive  # m
-    ranges: Ranges  # (B,) m; +inf nothing within range_max, -inf too close (REP-117), 0 not measured
+    angle_min: Angle  # rad, first beam, laser: counter-clockwise seen from above, however the scanner is mounted
+    angle_increment: Angle  # rad, between beams; negative: they run clockwise, as of a scanner mounted upside down
+    range_min: Distance  # m
+    range_max: PositiveDistance  # m
+    ranges: Beams  # (B,) m; +inf nothing within range_max, -inf too close (REP-117), 0 not measured
     mount: Pose = Pose(x=0.0, y=0.0)  # the scanner's pose in base_link
     scan_time: NotNegative = 0.0  # s, between scans
     frame_id: Name = "laser"
-    sigma: NotNegative = 0.0  # m, standard deviation of a range; 0 with the next: not stated
+    sigma: Distance = 0.0  # m, standard deviation of a range; 0 with the next: not stated
     sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.0  # the part that grows with the range, in quadrature
 
     def angles(self) -> npt.NDArray[np.float64]:
@@ -120,9 +109,9 @@ class Belief(Stamped):
 class Prediction(Stamped):
     """The scan the estimator expected, beam for beam beside the scan of the same stamp."""
 
-    angle_min: Finite  # rad, laser
-    angle_increment: Finite  # rad
-    ranges: Ranges  # (B,) m, g(pose)
+    angle_min: Angle  # rad, laser
+    angle_increment: Angle  # rad
+    ranges: Beams  # (B,) m, g(pose)
     sigma: Floats = np.zeros(0, np.float32)  # (B,) m, stated standard deviation; empty: none stated
     frame_id: Name = "laser"
 
@@ -131,8 +120,8 @@ class Goal(Stamped):
     """Where the robot prefers to be."""
 
     pose: Pose  # base_link in map
-    tolerance: Positive = 0.2  # m, reached within it
-    yaw_tolerance: Positive | None = None  # rad, of the heading once it is there; None: any heading will do
+    tolerance: PositiveDistance = 0.2  # m, reached within it
+    yaw_tolerance: PositiveAngle | None = None  # rad, of the heading once it is there; None: any heading will do
     cancel: bool = False  # forget the goal and stand
 
 
@@ -157,7 +146,7 @@ class Status(Stamped):
     refused: bool = False  # blocked for good: the goal cannot be; blocked otherwise, the way may clear
     goal: Pose | None = None  # base_link in map
     goal_seq: Count = 0  # which goal this is about
-    distance: NotNegative | None = None  # m, from the believed pose to the goal
+    distance: Distance | None = None  # m, from the believed pose to the goal
 
 
 class Plan(Stamped):
@@ -174,10 +163,10 @@ class Preference(Stamped):
 
     goal: Pose  # base_link in map
     origin: Pose  # lower left corner of the first cell, in map; yaw 0
-    resolution: Positive  # m, a cell's edge
+    resolution: PositiveDistance  # m, a cell's edge
     width: Annotated[int, Field(ge=1, le=4096)]  # cells along x
     height: Annotated[int, Field(ge=1, le=4096)]  # cells along y
-    distance: Ranges  # (height * width,) m to go with clearance, row by row along x; +inf: out of reach
+    distance: Costs  # (height * width,) m to go with clearance, row by row along x; +inf: out of reach
     frame_id: Name = "map"
 
     @model_validator(mode="after")

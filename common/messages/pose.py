@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from common.messages.wire import Finite, Message
+from common.limits import Angle, Coordinate, Speed
+from common.messages.wire import Message
 
 
 class Pose(Message):
     """A pose in the plane; its frame is said where it is used."""
 
-    x: Finite  # m
-    y: Finite  # m
-    yaw: Finite = 0.0  # rad, counter-clockwise from x
+    x: Coordinate  # m
+    y: Coordinate  # m
+    yaw: Angle = 0.0  # rad, counter-clockwise from x
 
     def array(self) -> npt.NDArray[np.float64]:
         """(3,) x, y, yaw."""
@@ -29,9 +30,9 @@ class Pose(Message):
 class Twist(Message):
     """A velocity in base_link (geometry_msgs/Twist, in the plane)."""
 
-    vx: Finite = 0.0  # m/s, forward
-    vy: Finite = 0.0  # m/s, left; 0 for a differential drive
-    wz: Finite = 0.0  # rad/s, counter-clockwise
+    vx: Speed = 0.0  # m/s, forward
+    vy: Speed = 0.0  # m/s, left; 0 for a differential drive
+    wz: Speed = 0.0  # rad/s, counter-clockwise
 
     def array(self) -> npt.NDArray[np.float64]:
         """(3,) vx, vy, wz."""

@@ -11,6 +11,7 @@ from pydantic import BaseModel
 
 from common.geometry import occupancy_grid, world
 from common.geometry import shapes as furniture
+from common.limits import MAX_BEAMS, MAX_COORDINATE_M, MAX_DISTANCE_M
 from common.messages import definitions as messages
 from common.messages import pose, requests
 from common.messages.topics import MAX_BYTES, QUERIES, ROOT, TOPICS, alive_key
@@ -27,6 +28,10 @@ default may be left out, an unknown one is ignored. *Binary* fields are MessageP
 type shown (`<f4` is float32, `<f8` float64, `u1` a byte), row after row. Payloads above {MAX_BYTES >> 20} MiB
 ({64 * MAX_BYTES >> 20} MiB for requests) are not read. zenoh's encoding is `application/msgpack` with the message's
 name as schema. While a service runs, the liveliness token `{alive_key("<robot>", "<service>", "<instance>")}` stands.
+
+Positions are within ±{MAX_COORDINATE_M:g} m of their frame's origin, distances up to {MAX_DISTANCE_M:g} m, and a scan
+has at most {MAX_BEAMS} beams (`common/limits.py`). A message with a value outside a field's limits is dropped and
+counted as undecodable.
 
 Units are SI. Frames: `map` is the world, `odom` drifts, `base_link` is the robot's centre, `laser` the scanner.
 Times are ns of simulation or sensor time, except in health.
@@ -86,7 +91,23 @@ def _fields(model: type[BaseModel]) -> list[str]:
     return [*lines, "| field | type | default | meaning |", "|---|---|---|---|", *rows, ""]
 
 
-def _kind(schema: dict[str, Any]) -> str:  # noqa: PLR0911 - one line a kind
+def _kind(schema: dict[str, Any]) -> str:
+    """Type, and the limits that the schema sets."""
+    return _type(schema) + _limits(schema)
+
+
+def _limits(schema: dict[str, Any]) -> str:
+    """Of a number or of an array's values, such as ", -10000 to 10000"."""
+    if (largest := schema.get("x-largest")) is not None:
+        rows = f", N at most {schema['x-max-rows']}" if "x-max-rows" in schema else ""
+        return f"{rows}, finite values within ±{largest:g}"
+    low, high = schema.get("minimum"), schema.get("maximum")
+    if high is None or schema.get("type") not in ("number", "integer"):
+        return ""
+    return f", {low:g} to {high:g}" if low is not None else f", above {schema['exclusiveMinimum']:g}, up to {high:g}"
+
+
+def _type(schema: dict[str, Any]) -> str:  # noqa: PLR0911 - one line a kind
     if "$ref" in schema:
         name = str(schema["$ref"]).rsplit("/", 1)[-1]
         return f"[{name}](#{name.lower()})"

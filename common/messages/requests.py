@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from common.geometry.world import Obstacle, World
+from common.limits import MAX_BEAMS
 from common.messages.pose import Pose
 from common.messages.wire import Bytes, Count, Finite, Floats, Message, Name, NotNegative, Poses, Ranges, Text
 from common.robot.base import Robot
@@ -64,7 +65,7 @@ class SampleRequest(Request):
     """Ask what the scanner would see from poses."""
 
     poses: Poses  # (N, 3) base_link in map
-    beams: Annotated[int, Field(ge=2, le=100_000)] | None = None  # None: the scanner's own count
+    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)] | None = None  # None: the scanner's own count
     noise: bool = False
     seed: Count = 0  # of the noise
 
@@ -80,7 +81,7 @@ class PredictRequest(Request):
     """Ask the estimator what it expects the scanner to see from poses."""
 
     poses: Poses  # (N, 3) base_link in map, N at most 1000
-    beams: Annotated[int, Field(ge=2, le=100_000)] | None = None  # of the scanner's, evenly chosen; None: all
+    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)] | None = None  # of the scanner's, evenly chosen; None: all
 
 
 class PredictReply(Reply):

@@ -14,6 +14,8 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
 from pydantic_core import CoreSchema, core_schema
 
+from common.limits import MAX_BEAMS, MAX_COORDINATE_M, MAX_DISTANCE_M
+
 if TYPE_CHECKING:
     from pydantic.json_schema import JsonSchemaValue
     from typing_extensions import Self
@@ -31,12 +33,14 @@ class Binary:
     """Schema of an array field: element type and the shape behind the first, free, dimension.
 
     ``values`` says which numbers may stand in it: ``finite``, or ``ranges`` (REP-117: +inf is no return,
-    -inf too close, never NaN).
+    -inf too close, never NaN). ``largest`` limits the size of the finite ones, ``max_rows`` the number of rows.
     """
 
     dtype: Literal["<f4", "<f8", "u1"]
     row: tuple[int, ...] = ()
     values: Literal["finite", "ranges"] = "finite"
+    largest: float | None = None
+    max_rows: int | None = None
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Bytes or anything numpy reads goes in, a read-only array comes out, bytes go on the wire."""
@@ -47,7 +51,11 @@ class Binary:
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         """MessagePack's bin type has no JSON twin; the x- keys say how to read it."""
-        return {"type": "string", "contentEncoding": "binary", "x-dtype": self.dtype, "x-shape": ["N", *self.row]}
+        limits = {"x-largest": self.largest, "x-max-rows": self.max_rows}
+        return {
+            "type": "string", "contentEncoding": "binary", "x-dtype": self.dtype, "x-shape": ["N", *self.row],
+            **{name: limit for name, limit in limits.items() if limit is not None},
+        }  # fmt: skip
 
     def validate(self, value: Any, info: core_schema.ValidationInfo) -> npt.NDArray[Any]:
         """The array, shape (N, *row); raises ValueError where length, type or numbers are wrong."""
@@ -61,25 +69,30 @@ class Binary:
         else:
             raise ValueError(f"binary data of {self.dtype} expected, not {type(value).__name__}")
         array = array.reshape(-1, *self.row)
+        if self.max_rows is not None and len(array) > self.max_rows:
+            raise ValueError(f"{len(array)} values are more than {self.max_rows}")
         bad = np.isnan(array) if self.values == "ranges" else ~np.isfinite(array)
         if bad.any():
             raise ValueError(f"{np.count_nonzero(bad)} values are {'NaN' if self.values == 'ranges' else 'not finite'}")
+        if self.largest is not None and (wide := np.isfinite(array) & (np.abs(array) > self.largest)).any():
+            raise ValueError(f"{np.count_nonzero(wide)} values are beyond {self.largest:g}")
         array.setflags(write=False)
         return array
 
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(allow_inf_nan=False, gt=0)]
 NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0)]
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Text = Annotated[str, Field(max_length=1_000_000)]
 Name = Annotated[str, Field(max_length=200)]
 
-Ranges = Annotated[npt.NDArray[np.float32], Binary("<f4", values="ranges")]
+Ranges = Annotated[npt.NDArray[np.float32], Binary("<f4", values="ranges", largest=MAX_DISTANCE_M)]
+Beams = Annotated[npt.NDArray[np.float32], Binary("<f4", values="ranges", largest=MAX_DISTANCE_M, max_rows=MAX_BEAMS)]
+Costs = Annotated[npt.NDArray[np.float32], Binary("<f4", values="ranges")]
 Floats = Annotated[npt.NDArray[np.float32], Binary("<f4")]
 Bytes = Annotated[npt.NDArray[np.uint8], Binary("u1")]
-Points = Annotated[npt.NDArray[np.float32], Binary("<f4", (2,))]
-Poses = Annotated[npt.NDArray[np.float64], Binary("<f8", (3,))]
+Points = Annotated[npt.NDArray[np.float32], Binary("<f4", (2,), largest=MAX_COORDINATE_M)]
+Poses = Annotated[npt.NDArray[np.float64], Binary("<f8", (3,), largest=MAX_COORDINATE_M)]
 Matrix3 = Annotated[npt.NDArray[np.float64], Binary("<f8", (3,))]
 
 

@@ -8,12 +8,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from common.errors import UserError, first_fault
+from common.limits import MAX_BEAMS, Angle, Coordinate, Distance, PositiveDistance
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
-
-Metres = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Scanner(BaseModel):
@@ -22,13 +20,13 @@ class Scanner(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: Annotated[str, Field(min_length=1, max_length=200)]
-    beams: Annotated[int, Field(ge=2, le=100_000)]
+    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)]
     fov: Annotated[float, Field(gt=0, le=2 * np.pi + 1e-9)]  # rad, from the first beam to the last
     rate: Annotated[float, Field(gt=0, le=1000)]  # Hz
-    range_min: Metres  # m
-    range_max: Annotated[float, Field(gt=0, allow_inf_nan=False)]  # m
-    sigma: Metres  # m, standard deviation of a range
-    mount: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)  # x m, y m, yaw rad in base_link
+    range_min: Distance  # m
+    range_max: PositiveDistance  # m
+    sigma: Distance  # m, standard deviation of a range
+    mount: tuple[Coordinate, Coordinate, Angle] = (0.0, 0.0, 0.0)  # x m, y m, yaw rad in base_link
     sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.0  # the part that grows with the range; in quadrature
     first: Annotated[float, Field(ge=-2 * np.pi, le=2 * np.pi)] | None = None
     # rad, the first beam as the scanner itself counts, counter-clockwise from its x axis; None: -fov / 2

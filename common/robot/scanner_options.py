@@ -11,21 +11,22 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from common.errors import UserError, first_fault
 from common.geometry.pose_text import pose_of_text
+from common.geometry.shapes import Degrees
+from common.limits import Coordinate
 from common.robot.scanner import SCANNERS, Scanner
 
 UNITS = {
     "fov_deg": "degrees", "first_deg": "degrees", "rate": "Hz", "range_min": "m", "range_max": "m", "sigma": "m",
     "mount": "m, and yaw_deg in degrees",
 }  # fmt: skip
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class _Mount(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
-    x: Finite = 0.0
-    y: Finite = 0.0
-    yaw_deg: Finite = 0.0
+    x: Coordinate = 0.0
+    y: Coordinate = 0.0
+    yaw_deg: Degrees = 0.0
 
 
 class _File(BaseModel):

@@ -11,6 +11,8 @@ import typer
 
 from common.bus.bus import DEFAULT_ENDPOINT
 from common.errors import UserError
+from common.geometry import se2
+from common.limits import MAX_COORDINATE_M
 from presage.terminal.options import Connect, Json, RobotName, WorldName, console, link_of
 
 if TYPE_CHECKING:
@@ -96,7 +98,9 @@ def _pose(x: float, y: float, yaw: float = 0.0) -> Pose:
     if not np.isfinite([x, y, yaw]).all():
         given = f"{x:g} {y:g}" + (f" {yaw:g}" if yaw else "")
         raise UserError(f"{given}: a place is finite numbers, X Y in m (and for teleport YAW in deg)")
-    return Pose(x=x, y=y, yaw=float(np.deg2rad(yaw)))
+    if max(abs(x), abs(y)) > MAX_COORDINATE_M:
+        raise UserError(f"{x:g} {y:g}: X and Y are within {MAX_COORDINATE_M:g} m of the origin")
+    return Pose(x=x, y=y, yaw=float(se2.wrap(np.deg2rad(yaw))))
 
 
 @app.command()

@@ -71,10 +71,11 @@ def open_carmen(path: Path, reading: Reading) -> Log:
     first = survey.firsts[name][0]
     angles, range_max = _angles(path, name, first, reading, notes), _range_max(survey, name, reading, notes)
     clock = _clock(survey.firsts[name], reading, notes)
-    mount, corrected = _mount(survey, name, reading, notes)
+    mount, corrected, assumed = _mount(survey, name, reading, notes)
     log = Log(
-        path, f"CARMEN log ({name})", angles, mount, range_max, survey.lasers[name], lambda: iter(()), notes=notes
-    )
+        path, f"CARMEN log ({name})", angles, mount, range_max, survey.lasers[name], lambda: iter(()), notes=notes,
+        mount_assumed=assumed,
+    )  # fmt: skip
     odom = survey.odom[clock] if first.robot is None or reading.odom_topic == "ODOM" else None
     true = survey.true[clock] if len(survey.true[clock]) and reading.reference is not False else None
     if odom is None or len(odom):
@@ -146,25 +147,26 @@ def _clock(lines: list[LaserLine], reading: Reading, notes: list[str]) -> int:
     return 0
 
 
-def _mount(survey: _Survey, name: str, reading: Reading, notes: list[str]) -> tuple[Array, bool]:
-    """(3,) laser in base_link, and whether its poses are corrected ones: those do not stay with the odometry."""
+def _mount(survey: _Survey, name: str, reading: Reading, notes: list[str]) -> tuple[Array, bool, bool]:
+    """(3,) laser in base_link, whether its poses are corrected (do not stay with the odometry), and whether assumed."""
     least, largest = survey.mounts.get(name, (np.zeros(3), np.full(3, np.inf)))
     bolted = bool((largest - least <= 2 * SAME).all())
     corrected = name in survey.mounts and not bolted
     if reading.mount is not None:
-        return reading.mount, corrected
+        return reading.mount, corrected, False
     if bolted:
-        return (least + largest) / 2, corrected
-    side, parts = _side(name), ("offset", "side_offset", "angular_offset")
+        return (least + largest) / 2, corrected, False
+    side = _side(name)
+    names = [f"robot_{side}laser_{part}" for part in ("offset", "side_offset", "angular_offset")]
     try:
-        mount = np.array([float(survey.params.get(f"robot_{side}laser_{part}", 0)) if side else 0.0 for part in parts])
+        mount = np.array([float(survey.params.get(each, 0)) if side else 0.0 for each in names])
     except ValueError:
         mount = np.zeros(3)
     if side == "rear":
         mount[2] += np.pi
     words = ",".join(f"{number:g}" for number in (*mount[:2], np.rad2deg(mount[2])))
     notes.append(f"the laser is taken to sit at {words} in base_link (--mount says where it does)")
-    return mount, corrected
+    return mount, corrected, not survey.params.keys() & set(names)
 
 
 def _side(name: str) -> str:

@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.geometry.se2 import Array
+from common.limits import MAX_BEAMS
 
 OLD = re.compile(r"(FLASER|RLASER|LASER\d)$")
 ROBOT, RAW = re.compile(r"ROBOTLASER\d$"), re.compile(r"RAWLASER\d$")
 WORD = re.compile(r"[A-Z][A-Z0-9_]*$")
 HEADER = 8  # words of ROBOTLASER1 and RAWLASER1 before the readings, the number of them included
-LARGEST = 100_000  # readings
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def _readings(words: list[str], at: int, *, wanted: bool) -> tuple[Array, list[s
 
 def _count(word: str) -> int:
     count = int(word)
-    if not 0 <= count <= LARGEST:
+    if not 0 <= count <= MAX_BEAMS:
         raise ValueError(f"{count} readings")
     return count
 

@@ -15,10 +15,11 @@ import numpy as np
 from pydantic import ValidationError
 from rich.console import Console
 
-from common.errors import UserError
+from common.errors import UserError, first_fault
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import World, load_world
+from common.limits import MAX_SPEED
 from common.messages.definitions import Odom, Pose, Scan, Stamped, Truth, Twist
 from common.messages.requests import WorldReply
 from common.messages.topics import ODOM, SCAN, TRUTH, Topic
@@ -87,7 +88,7 @@ def open_for(job: Import) -> Log:
         for sweep in log.read():
             yield replace(sweep, odom=of_laser(sweep.odom), reference=of_laser(sweep.reference))
 
-    return replace(log, mount=np.zeros(3), read=sweeps)
+    return replace(log, mount=np.zeros(3), mount_assumed=False, read=sweeps)
 
 
 @dataclass
@@ -108,7 +109,8 @@ class Written:
             "beams": len(log.angles), "duration_s": (self.last_ns - (self.first_ns or 0)) * 1e-9,
             "odometry": log.odometry, "odometry_poses": self.odoms,
             "reference": log.reference, "reference_poses": self.references,
-            "mount": log.mount.tolist(), "left_out": dict(log.left_out + log.left_out_beside), "notes": log.notes,
+            "mount": log.mount.tolist(), "mount_assumed": log.mount_assumed,
+            "left_out": dict(log.left_out + log.left_out_beside), "notes": log.notes,
         }  # fmt: skip
 
 
@@ -137,8 +139,10 @@ def write_recording(job: Import, log: Log, world: World | None, sweeps: Iterator
         counts = written.ledger.written
         writer.metadata("counters", as_metadata(written.ledger.counts(counts, {}, {})))
         writer.finish()
-    except BaseException:
+    except BaseException as error:
         writer.finish().unlink(missing_ok=True)
+        if isinstance(error, ValidationError):
+            raise UserError(f"{log.path}: cannot be a recording ({first_fault(error)})") from None
         raise
     return written
 
@@ -197,7 +201,7 @@ class _Sender:
             self._put(TRUTH, Truth(stamp_ns=stamp_ns, seq=written.references, pose=pose, twist=twist), stamp_ns + 1)
             written.references += 1
         ranges = np.asarray(sweep.ranges, np.float32)
-        scan = template.model_copy(update={"stamp_ns": stamp_ns, "seq": written.scans, "ranges": ranges})
+        scan = Scan(**{**dict(template), "stamp_ns": stamp_ns, "seq": written.scans, "ranges": ranges})
         self._put(SCAN, scan, stamp_ns + 2)
         written.scans += 1
         written.last_ns = stamp_ns
@@ -208,7 +212,10 @@ class _Sender:
         self._last[topic] = stamp_ns, pose
         if before is None or not 0 < (seconds := (stamp_ns - before[0]) * 1e-9) <= STANDSTILL:
             return Pose.of(pose), Twist()
-        vx, vy, wz = map(float, se2.between(before[1], pose) / seconds)
+        velocity = se2.between(before[1], pose) / seconds
+        if np.abs(velocity).max() > MAX_SPEED:  # the pose was set anew, or two stamps are almost the same
+            return Pose.of(pose), Twist()
+        vx, vy, wz = map(float, velocity)
         return Pose.of(pose), Twist(vx=vx, vy=vy, wz=wz)
 
     def _put(self, topic: Topic, message: Stamped, at_ns: int) -> None:

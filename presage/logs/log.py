@@ -55,6 +55,7 @@ class Log:
     scans: int  # that are in it, the unusable included
     read: Callable[[], Iterator[LoggedScan]]  # from the beginning; UserError where the file is damaged
     range_min: float = 0.0  # m
+    mount_assumed: bool = False  # neither the log nor the user states the mount
     odometry: str = ""  # where it comes from; empty: there is none
     reference: str = ""  # what it is; empty: there is none
     initial_pose: Array | None = None  # (3,) in map

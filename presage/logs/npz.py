@@ -40,7 +40,7 @@ def open_npz(path: Path, reading: Reading) -> Log:
         path, "npz", data["angles"], np.array(MOUNT) if reading.mount is None else reading.mount, range_max,
         len(ranges), lambda: _sweeps(ranges, range_max, data.get("stamps"), data.get("odom"), reference),
         odometry="odom" if "odom" in data else "", reference="" if reference is None else "the file's reference",
-        initial_pose=data.get("initial_pose"), notes=notes,
+        initial_pose=data.get("initial_pose"), notes=notes, mount_assumed=reading.mount is None,
     )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from presage.logs.log import Log, Reading
 from presage.logs.opening import kind_of, open_log
 from services.estimator.factory import Geometry
 from services.estimator.shared.interface import Observation
-from services.recorder.reader import read_recording
+from services.recorder.reader import Recording, read_recording
 
 RECORDED = "the recorded truth"
 
@@ -93,12 +93,17 @@ def scans_of(log: Log) -> Scans:
         raise UserError(f"{log.path}: no scan of use in it" + (f" ({lost})" if (lost := log.lost()) else ""))
     times = [stamp for stamp in stamps if stamp is not None]
     return Scans(
-        Geometry(log.angles, log.mount, log.range_max), np.array(ranges),
+        Geometry(log.angles, log.mount, log.range_max, mount_assumed=log.mount_assumed), np.array(ranges),
         seconds(times) if len(times) == len(ranges) else None,
         np.array(odoms) if log.odometry else None, log.initial_pose,
         np.array(references) if log.reference else None, truth_is=log.reference or RECORDED,
         notes=(*log.notes, *([f"left out: {lost}"] if (lost := log.lost()) else [])),
     )  # fmt: skip
+
+
+def mount_assumed(recording: Recording) -> bool:
+    """Whether it was imported from a log that did not state where the laser sits."""
+    return recording.metadata.get("log", {}).get("mount_assumed") == "true"
 
 
 def _read_recording(path: Path) -> Scans:
@@ -124,7 +129,7 @@ def _read_recording(path: Path) -> Scans:
     nothing = np.full(3, np.nan)
     world = recording.world()
     return Scans(
-        Geometry.of_scan(first),
+        replace(Geometry.of_scan(first), mount_assumed=mount_assumed(recording)),
         np.array([about_place(s.ranges) for s in scans]),
         seconds([s.stamp_ns for s in scans]),
         np.array([odoms.get(s.stamp_ns, nothing) for s in scans]) if odoms else None,

@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from common.errors import UserError
-from common.messages.topics import ROOT
+from common.messages.definitions import Scan
+from common.messages.topics import ROOT, SCAN
 from common.runtime.config import ServiceSettings
 from common.versions import versions
 from services.controller.settings import ControllerSettings
@@ -76,6 +77,17 @@ def estimator_settings(recording: Recording, folder: Path, values: dict[str, Any
     return Unpacked(values)
 
 
+def check_mount(recording: Recording, settings: EstimatorSettings) -> None:
+    """Raises UserError where a recording's mount is only assumed and the weights were trained with another."""
+    from presage.logs.scan_files import mount_assumed  # noqa: PLC0415 - numba takes its time
+    from services.estimator.factory import Geometry  # noqa: PLC0415
+    from services.estimator.service import Models  # noqa: PLC0415
+
+    if mount_assumed(recording):
+        scan = next(message for _, message, _ in recording.messages(SCAN) if isinstance(message, Scan))
+        Models(settings).factory(replace(Geometry.of_scan(scan), mount_assumed=True))
+
+
 def world_file(recording: Recording, folder: Path) -> Path | None:
     """The estimator's map, else the world of the session, as a file; None where neither was recorded."""
     text = recording.attachments.get("model/world.yaml", recording.attachments.get("world.yaml"))
@@ -124,8 +136,10 @@ def _from_disk(recording: Recording, values: dict[str, Any], model: dict[str, st
 
 def _same(path: Path, model: dict[str, str]) -> bool:
     try:
-        card = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+        cards = [json.loads(text) for text in (path.with_suffix(".json").read_text(encoding="utf-8"), model["card"])]
+        for card in cards:
+            card.pop("weights_sha256", None)  # the same weights had a card without it before it existed
         digest = hashlib.sha256(path.read_bytes()).hexdigest() if model.get("sha256") else ""
-        return bool(card == json.loads(model["card"])) and digest == model.get("sha256", "")
-    except (OSError, ValueError, KeyError):
+        return bool(cards[0] == cards[1]) and digest == model.get("sha256", "")
+    except (OSError, ValueError, KeyError, AttributeError):
         return False

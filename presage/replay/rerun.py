@@ -30,7 +30,7 @@ from common.messages.definitions import Belief, Stamped, Truth
 from common.messages.topics import BELIEF, SCAN, TRUTH, Topic, topic_of
 from common.messages.wire import DecodeError
 from common.versions import commit, versions
-from presage.replay.recorded_session import estimator_settings, recorded_settings, robot_of
+from presage.replay.recorded_session import check_mount, estimator_settings, recorded_settings, robot_of
 from presage.replay.report import Comparison, Series, Track, draw, table
 from presage.terminal.output import check_file, write_json
 from services.estimator.service import EstimatorService
@@ -123,7 +123,9 @@ def settings_of(recording: Recording, chosen: dict[str, Any], folder: Path, cons
         raise UserError(f"{recording.path}: no world was recorded: name it with --world")
     for note in (*(recorded.notes if recorded else ()), *unpacked.notes):
         console.print(note, highlight=False)
-    return EstimatorSettings(**values)
+    settings = EstimatorSettings(**values)
+    check_mount(recording, settings)
+    return settings
 
 
 def write_both(recording: Recording, robot: str, service: Offline, out: Path, console: Console) -> Track:

@@ -28,6 +28,7 @@ from presage.replay.feed import Feed
 from presage.replay.recorded_session import (
     SETTINGS,
     Unpacked,
+    check_mount,
     estimator_settings,
     other_versions,
     recorded_settings,
@@ -36,6 +37,7 @@ from presage.replay.recorded_session import (
 )
 from presage.session.stack import Stack
 from presage.terminal.output import check_file, write_json
+from services.estimator.settings import EstimatorSettings
 from services.recorder.reader import Recording, read_recording
 
 
@@ -122,6 +124,7 @@ def configure(recording: Recording, names: tuple[str, ...], folder: Path, notes:
             imported = "log" in recording.metadata
             unpacked = estimator_settings(recording, folder, recorded.values, weights=not imported)
             notes += unpacked.notes
+            check_mount(recording, EstimatorSettings(**unpacked.values))
         elif recorded.values.get("world") and (world := world_file(recording, folder)) is not None:
             unpacked = replace(recorded, values={**recorded.values, "world": str(world)})
         notes += recorded.notes

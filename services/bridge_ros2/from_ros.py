@@ -5,16 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
+from common.errors import first_fault
 from common.geometry import se2
 from common.geometry.se2 import Array
+from common.limits import MAX_BEAMS, MAX_COORDINATE_M, MAX_DISTANCE_M, MAX_SPEED
 from common.messages.definitions import Odom, Pose, Scan, Twist
 from common.messages.ros_messages import Mount, Transform, read_pose, stamp_of
 from common.robot.ranges import as_scan
 from services.bridge_ros2.frames import Dead
 
 PLANE = [0, 1, 5]  # x, y, yaw among the six of a pose's covariance
-MOST_BEAMS = 100_000
 
 
 def scan_of(message: Any, mount: Mount, stamp_ns: int) -> Scan:
@@ -25,8 +27,8 @@ def scan_of(message: Any, mount: Mount, stamp_ns: int) -> Scan:
     """
     beams = len(message.ranges)
     first, step = float(message.angle_min), float(message.angle_increment)
-    if not 2 <= beams <= MOST_BEAMS:
-        raise ValueError(f"a scan of {beams} beams")
+    if not 2 <= beams <= MAX_BEAMS:
+        raise ValueError(f"a scan of {beams} beams, not 2 to {MAX_BEAMS}")
     if step == 0:  # some drivers leave it out
         step = (float(message.angle_max) - first) / (beams - 1)
     nearest, farthest = float(message.range_min), float(message.range_max)
@@ -34,6 +36,7 @@ def scan_of(message: Any, mount: Mount, stamp_ns: int) -> Scan:
         raise ValueError(
             f"angles from {first:g} by {step:g} rad, ranges from {nearest:g} to {farthest:g} m: no scanner has those"
         )
+    farthest = min(farthest, MAX_DISTANCE_M)  # some drivers write the largest float for "no limit"
     ranges = np.asarray(message.ranges, np.float32)
     side = -1.0 if mount.upside_down else 1.0
     first, step = side * first, side * step
@@ -56,13 +59,16 @@ def dead_of(message: Any, child_in_base: Transform | None) -> Dead:
     pose = read_pose(message.pose.pose.position, message.pose.pose.orientation).planar()
     linear, angular = message.twist.twist.linear, message.twist.twist.angular
     twist = np.array([linear.x, linear.y, angular.z], float)
-    if not np.isfinite(twist).all():
-        raise ValueError(f"velocity {twist.tolist()} (m/s, m/s, rad/s) is not finite")
+    if not (np.abs(twist) <= MAX_SPEED).all():
+        raise ValueError(f"velocity {twist.tolist()} (m/s, m/s, rad/s) is not finite, or above {MAX_SPEED:g}")
     if child_in_base is not None:
         child = child_in_base.planar()
         pose = se2.compose(pose, se2.inverse(child))
         x, y = se2.rotate(float(child[2]), twist[:2])
         twist = np.array([x + twist[2] * child[1], y - twist[2] * child[0], twist[2]])
+    if not (np.abs(pose[:2]) <= MAX_COORDINATE_M).all():
+        x, y = pose[:2]
+        raise ValueError(f"the odometry is at ({x:g}, {y:g}) m, more than {MAX_COORDINATE_M:g} m from its origin")
     return Dead(stamp_of(message.header), pose, twist, _covariance(message.pose.covariance))
 
 
@@ -86,4 +92,7 @@ def pose_of(message: Any, frame: str) -> Pose:
     if named not in ("", frame):
         raise ValueError(f"it is in the frame {named!r}, not {frame!r}: in rviz set the fixed frame to {frame}")
     pose = getattr(message.pose, "pose", message.pose)
-    return Pose.of(read_pose(pose.position, pose.orientation).planar())
+    try:
+        return Pose.of(read_pose(pose.position, pose.orientation).planar())
+    except ValidationError as error:
+        raise ValueError(first_fault(error)) from None

@@ -67,6 +67,8 @@ class ControllerService(Service):
         options = self.options
         options.check()
         robot = options.the_robot()
+        if options.world:
+            self.log.info("loading the world", world=options.world)
         world = load_world(options.world) if options.world else None
         if options.preset == "geodesic" and world is not None:
             # scipy takes a third of a second to import; preset paper does without.

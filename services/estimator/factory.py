@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
-import shapely
 
 from common.errors import UserError
+from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import World, known_worlds, load_world
 from common.messages.definitions import Scan
@@ -30,6 +30,7 @@ from services.estimator.shared.generative_models import GenerativeModel, RayCast
 from services.estimator.shared.interface import Estimator
 
 SIGMA = 0.02  # m, the noise of a scanner that states none
+SAME_MOUNT = 1e-3  # m and rad
 LEAST_SIGMA = 1e-3  # m, of one that states less: no surface is known better
 MAP_LEVER = 5.0  # m, typical distance of walls: an error of the map there turns the pose by error / distance
 Name = Literal["precise", "paper", "particle-filter", "amcl-defaults"]
@@ -65,6 +66,7 @@ class Geometry:
     range_max: float  # m
     sigma: float = 0.0  # m, the scanner's noise, and
     sigma_relative: float = 0.0  # its part that grows with the range; both 0: not stated
+    mount_assumed: bool = False  # neither the file nor the user states the mount
 
     @classmethod
     def of(cls, scanner: Scanner) -> Geometry:
@@ -144,6 +146,8 @@ def _precise(choice: Choice, world: World) -> Factory:
     _compile(model, seeds, Likelihood())
 
     def make(geometry: Geometry) -> Estimator:
+        if card:
+            check_mount(geometry, card.scanner)
         likelihood = geometry.likelihood(choice.sigma)
         if calibration and choice.sigma is None:
             likelihood = calibration.likelihood
@@ -159,7 +163,7 @@ def _precise(choice: Choice, world: World) -> Factory:
 def generative_model(choice: Choice, world: World) -> tuple[GenerativeModel, Array, weights.FieldCard | None]:
     """The model of that name, places (S, 2) m a laser may be at, and the card of what was learned."""
     if choice.model == "exact":
-        places = world.sample_free(max(4000, int(60 * shapely.area(world.free_space))), np.random.default_rng(0), 0.05)
+        places = world.sample_free(max(4000, int(60 * world.free_area)), np.random.default_rng(0), 0.05)
         return RayCaster(world), thin_places(places, SPACING), None
     return weights.load(field_path(choice, world))
 
@@ -197,6 +201,22 @@ def check_start(choice: Choice, world: World) -> None:
         )
 
 
+def check_mount(geometry: Geometry, trained: Scanner) -> None:
+    """Raises UserError where the mount is only assumed, and the weights were ``trained`` with another.
+
+    A distance field predicts scans of a laser mounted anywhere, so a mount that is stated may differ.
+    """
+    off = geometry.mount - np.array(trained.mount)
+    off[2] = se2.wrap(off[2])
+    if geometry.mount_assumed and np.abs(off).max() > SAME_MOUNT:
+        (here, there) = (f"{x:g},{y:g},{np.rad2deg(yaw):g}" for x, y, yaw in (geometry.mount, trained.mount))
+        raise UserError(
+            f"the scans do not state where the laser sits in base_link: {here} was assumed, but the weights were "
+            f"trained with {there}; give --mount x,y[,yaw_deg] (for an imported recording, import its log again with "
+            "--mount)"
+        )
+
+
 def _compile(model: GenerativeModel, seeds: Seeds, likelihood: Likelihood) -> None:
     """Once through every compiled loop, so that no scan waits for it."""
     angles = np.linspace(-1, 1, 16)
@@ -226,6 +246,7 @@ def _paper(choice: Choice, world: World) -> Factory:
 
     def make(geometry: Geometry) -> Estimator:
         model, card = load(paper_weights.nearest(folder, world.name, "paper", len(geometry.angles)))
+        check_mount(geometry, card.scanner)
         found = fit(card.scanner, geometry.angles, geometry.mount, f"{without} {_options(geometry)}")
         return PaperPerception(model, card, choice.descent, choice.initial_pose, found)
 

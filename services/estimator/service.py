@@ -91,6 +91,7 @@ class EstimatorService(Service):
         """Fail now, not at the first scan, where a world has no weights."""
         options = self.options
         if self.models is None:
+            self.log.info("loading the world", world=options.world)
             self.models = Models(options)
         self.model = self.models.in_use(None)
         self.log.info("estimator", name=options.estimator, world=options.world, prior=options.prior)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
-import yaml
 from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Chunk, Header, Metadata
 from mcap.records import Message as McapMessage
@@ -17,6 +16,7 @@ from pydantic import ValidationError
 
 from common.errors import UserError
 from common.geometry.world import NOT_YAML, World
+from common.geometry.yaml_text import parse_yaml
 from common.messages.definitions import Stamped
 from common.messages.topics import Topic, topic_of
 from common.messages.wire import DecodeError
@@ -124,7 +124,7 @@ class Recording:
         """The world the session ran in, where it was recorded."""
         text = self.attachments.get("world.yaml")
         try:
-            return World.model_validate(yaml.safe_load(text)) if text is not None else None
+            return World.model_validate(parse_yaml(text)) if text is not None else None
         except NOT_YAML:  # a ValidationError is a ValueError too
             return None
 

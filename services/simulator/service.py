@@ -85,6 +85,7 @@ class SimulatorService(Service):
         options = self.options
         drift = Drift(options.turn_by_turn, options.turn_by_path, options.path_by_path, options.path_by_turn)
         robot = options.the_robot()
+        self.log.info("loading the world", world=options.world)
         scanner = options.the_scanner()
         self.setup = Setup(
             load_world(options.world), scanner, robot, options.start_pose(), options.seed, drift,

@@ -7,6 +7,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from common.geometry.pose_text import POSE_TEXT, pose_of_text
+from common.limits import MAX_BEAMS
 from common.robot.scanner import SCANNERS, Scanner
 from common.robot.scanner_options import chosen_scanner
 from common.runtime.robot_settings import RobotSettings
@@ -31,7 +32,7 @@ class SimulatorSettings(RobotSettings):
 
     world: Annotated[str, Field(description="shipped world, world file or ROS map.yaml")] = "corridor"
     scanner: Annotated[str, Field(description=f"one of {', '.join(SCANNERS)}, or a file")] = "tim571"
-    beams: Annotated[int | None, Field(ge=2, le=100_000, description="instead of the scanner's own number")] = None
+    beams: Annotated[int | None, Field(ge=2, le=MAX_BEAMS, description="instead of the scanner's own number")] = None
     noise: Annotated[float | None, Field(ge=0, le=1, description="instead of the scanner's own sigma, m")] = None
     mount: Annotated[
         str, Field(pattern=POSE_TEXT, description="x,y[,yaw_deg] of the laser in base_link; none: the scanner's own")

@@ -9,11 +9,10 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from common.errors import first_fault
 from common.geometry.world import Obstacle
+from common.limits import Angle, Coordinate
 
 MAX_TEXT = 4096  # characters; an obstacle of a hundred corners fits
 
-Metres = Annotated[float, Field(allow_inf_nan=False, ge=-1e5, le=1e5)]
-Radians = Annotated[float, Field(allow_inf_nan=False, ge=-1e3, le=1e3)]
 Speed = Annotated[float, Field(allow_inf_nan=False, ge=-100, le=100)]
 RobotName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 
@@ -44,9 +43,9 @@ class GoTo(Action):
     """Set a goal."""
 
     do: Literal["goal"]
-    x: Metres
-    y: Metres
-    yaw: Radians | None = None
+    x: Coordinate
+    y: Coordinate
+    yaw: Angle | None = None
     tolerance: Annotated[float, Field(allow_inf_nan=False, gt=0, le=100)] | None = None
 
 
@@ -60,18 +59,18 @@ class Carry(Action):
     """Teleport the robot."""
 
     do: Literal["teleport"]
-    x: Metres
-    y: Metres
-    yaw: Radians = 0.0
+    x: Coordinate
+    y: Coordinate
+    yaw: Angle = 0.0
 
 
 class Localise(Action):
     """Begin localisation anew, from a place or from nothing."""
 
     do: Literal["localise"]
-    x: Metres | None = None
-    y: Metres | None = None
-    yaw: Radians | None = None
+    x: Coordinate | None = None
+    y: Coordinate | None = None
+    yaw: Angle | None = None
 
 
 class Furnish(Action):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from common.limits import MAX_DISTANCE_M
 from common.messages.ros_messages import IDENTITY, Mount, Transform
 from common.runtime import safety
 from services.bridge_ros2.from_ros import dead_of, odom_of, pose_of, scan_of
@@ -62,10 +63,23 @@ def test_a_full_circle_from_0_to_2_pi():
     assert missing.angle_increment == pytest.approx(0.5)
 
 
+def test_the_largest_float_as_range_max_is_no_limit():
+    scan = scan_of(laser([1.0, 2.0, np.inf], farthest=float(np.finfo(np.float32).max)), Mount(), 0)
+    assert scan.range_max == MAX_DISTANCE_M
+    assert scan.ranges.tolist() == [1.0, 2.0, np.inf]
+
+
 @pytest.mark.parametrize(
     "wrong",
-    [{"ranges": []}, {"first": np.nan}, {"farthest": 0.0}, {"farthest": np.inf}, {"step": 0.0, "last": -1.0}],
-    ids=str,
+    [
+        {"ranges": []},
+        {"ranges": [1.0] * 32_769},
+        {"first": np.nan},
+        {"farthest": 0.0},
+        {"farthest": np.inf},
+        {"step": 0.0, "last": -1.0},
+    ],
+    ids=lambda wrong: str(wrong)[:40],
 )
 def test_what_no_scanner_says_is_refused(wrong):
     with pytest.raises(ValueError, match="scan"):
@@ -94,6 +108,8 @@ def test_odometry_with_the_plane_of_its_covariance():
     assert not dead_of(odometry(covariance=[np.nan] * 36), None).covariance.any()
     with pytest.raises(ValueError, match="not finite"):
         dead_of(odometry(twist=(np.inf, 0, 0)), None)
+    with pytest.raises(ValueError, match=r"at \(500000, 2\) m, more than 10000 m from its origin"):
+        dead_of(odometry(x=5e5), None)
 
 
 def test_odometry_of_a_frame_off_the_base():

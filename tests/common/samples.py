@@ -119,7 +119,14 @@ def _array(binary: Binary) -> st.SearchStrategy:
     width = 32 if binary.dtype == "<f4" else 64
     number: st.SearchStrategy = st.integers(0, 255)
     if binary.dtype != "u1":
-        number = st.floats(allow_nan=False, allow_infinity=binary.values == "ranges", width=width)
+        limit = binary.largest
+        number = (
+            st.floats(-limit, limit, width=width)
+            if limit
+            else st.floats(allow_nan=False, allow_infinity=False, width=width)
+        )
+        if binary.values == "ranges":
+            number |= st.sampled_from([np.inf, -np.inf])
     columns = int(np.prod(binary.row))
     rows = st.integers(0, 20 // columns)
     flat = rows.flatmap(lambda n: st.lists(number, min_size=n * columns, max_size=n * columns))

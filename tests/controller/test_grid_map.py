@@ -45,3 +45,10 @@ def test_goals_in_unknown_cells_and_walls_are_refused():
     for goal in (nowhere, np.array([50.0, 50.0])):
         assert "is inside something, or off the map; the nearest place that can be reached is" in pilot.refusal(goal)
         assert "is inside something" in straight.refusal(goal)
+
+
+def test_a_map_of_one_cell_has_no_goals_and_stops_nothing():
+    world = World(name="dot", grid=OccupancyGrid.of(np.array([[FREE]], np.uint8), 0.05, (0.0, 0.0, 0.0)))
+    pilot = Pilot(Robot(), world)
+    assert "goal refused" in pilot.refusal(np.array([0.02, 0.02]))
+    assert pilot.roads.from_(np.array([0.02, 0.02])) is None

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import safetensors.numpy
 
 from common.errors import UserError
 from common.geometry.world import load_world, save_world
 from common.messages.requests import ModelRequest
 from common.messages.topics import MODEL, SCAN
 from services.estimator.paper import weights
+from tests.estimator.models import change_weights
 from tests.estimator.test_service import TRUTH, a_scan, opened
 
 
@@ -51,10 +51,7 @@ def beliefs(service):
 )
 def test_the_answer_makes_the_very_same_estimator(settings, file, shipped, tmp_path):
     # Weights that nobody ships: whoever falls back on the shipped ones is found out.
-    changed = shipped / f"{file}.safetensors"
-    tensors = safetensors.numpy.load_file(changed)
-    safetensors.numpy.save_file({k: (v * 1.02).astype(v.dtype) for k, v in tensors.items()}, changed)
-    data = changed.read_bytes()
+    data = change_weights(shipped / f"{file}.safetensors")
     service = opened(models=shipped, **settings)
     first = beliefs(service)
     reply = ask(service)

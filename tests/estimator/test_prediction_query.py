@@ -22,7 +22,7 @@ from services.estimator.shared.interface import Predicted
 from tests.estimator.test_service import SCANNER, TRUTH, a_scan, opened
 
 HEADING = np.pi / 2  # the paper's
-FAR = [[-500.0, 3.0, 0.0], [1e300, -1e300, 1e5], [6.8, 3.95, 1.0], [0.0, 0.0, 0.0], [18.0, 4.5, 3.0]]  # and in walls
+FAR = [[-500.0, 3.0, 0.0], [1e4, -1e4, 1e4], [6.8, 3.95, 1.0], [0.0, 0.0, 0.0], [18.0, 4.5, 3.0]]  # and in walls
 
 
 def ready(**settings):

@@ -6,7 +6,6 @@ import json
 import shutil
 
 import pytest
-import safetensors.numpy
 
 from common.bus.bus import wait_until
 from common.bus.inbox import Inbox
@@ -14,6 +13,7 @@ from common.messages.definitions import Belief, Scan
 from common.messages.topics import BELIEF, SCAN
 from services.recorder.reader import read_recording
 from tests.conftest import ROOT, next_of
+from tests.estimator.models import change_weights
 
 SCANS = 15  # a second
 SERVICES = {"recorder", "controller", "estimator", "simulator"}
@@ -22,10 +22,9 @@ SERVICES = {"recorder", "controller", "estimator", "simulator"}
 def other_weights(folder, file):
     """Weights that nobody ships, so that whoever falls back on the shipped ones is found out."""
     folder.mkdir()
-    tensors = safetensors.numpy.load_file(ROOT / "models" / f"{file}.safetensors")
-    other = {name: (tensor * 1.02).astype(tensor.dtype) for name, tensor in tensors.items()}
-    safetensors.numpy.save_file(other, folder / f"{file}.safetensors")
-    shutil.copy(ROOT / "models" / f"{file}.json", folder)
+    for suffix in ("safetensors", "json"):
+        shutil.copy(ROOT / "models" / f"{file}.{suffix}", folder)
+    change_weights(folder / f"{file}.safetensors")
     return folder
 
 

@@ -205,7 +205,9 @@ def _edges(free: npt.NDArray[np.bool_], resolution: float) -> csr_matrix:
         height, width = rows - abs(d), columns - abs(r)
         return values[top + down : top + down + height, left + right : left + right + width]
 
-    starts, ends, lengths = [], [], []
+    # A map of one cell has no moves at all.
+    starts, ends = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    lengths = [np.zeros(0)]
     for move in MOVES:
         d, r = move
         if abs(d) >= rows or abs(r) >= columns:

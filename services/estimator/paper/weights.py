@@ -13,6 +13,7 @@ from common.errors import UserError
 from common.geometry.world import World
 from common.robot.scanner import Scanner
 from services.estimator.paper.decoder import Decoder, Normalisation, PaperModel, Shape
+from services.estimator.shared.digest import check_digest, sha256
 
 FOLDER = Path(__file__).resolve().parents[3] / "models"
 
@@ -45,6 +46,7 @@ class ModelCard(BaseModel):
     commit: str
     command: str
     versions: dict[str, str]
+    weights_sha256: str = ""  # of the file beside the card, hexadecimal; empty in older cards
 
     def shape(self) -> Shape:
         """Of the network."""
@@ -82,8 +84,10 @@ def save(path: Path, decoder: Decoder, card: ModelCard) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     tensors = {name: tensor.detach().half().contiguous() for name, tensor in decoder.state_dict().items()}
     partial = path.with_suffix(".partial")
-    safetensors.torch.save_file(tensors, partial)
+    data = safetensors.torch.save(tensors)
+    partial.write_bytes(data)
     partial.replace(path)
+    card = card.model_copy(update={"weights_sha256": sha256(data)})
     card_path = path.with_suffix(".json")
     partial.write_text(card.model_dump_json(indent=1) + "\n", encoding="utf-8")
     partial.replace(card_path)
@@ -93,7 +97,9 @@ def load(path: Path) -> tuple[PaperModel, ModelCard]:
     """A trained model; raises UserError where a file is missing or is not what it should be."""
     try:
         card = ModelCard.model_validate_json(path.with_suffix(".json").read_text(encoding="utf-8"))
-        tensors: dict[str, Any] = safetensors.torch.load_file(path)
+        data = path.read_bytes()
+        check_digest(path, data, card.weights_sha256, card.command)
+        tensors: dict[str, Any] = safetensors.torch.load(data)
         decoder = Decoder(card.shape())
         decoder.load_state_dict({name: tensor.to(torch.float32) for name, tensor in tensors.items()})
     except OSError as error:

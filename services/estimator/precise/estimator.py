@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 FIRST_WAIT, LONGEST_WAIT = 5, 150  # scans between searches while the scan fits badly,
 LOST_WAIT, DOUBTFUL_WAIT = 2, 8  # at most that many while nothing, or little, speaks for the place
 UNKNOWN = 100.0  # m, stated where nothing is known
+ENOUGH_BEAMS = 2000  # of a scan with twice as many or more, every k-th is used: a search takes time for each beam
 
 
 class PreciseEstimator:
@@ -81,7 +82,7 @@ class PreciseEstimator:
         """The same as a conversation: see `asking`."""
         view = View(
             self.model, self.likelihood, self.mount, observation.angles, observation.ranges, observation.range_max
-        )
+        ).thinned(ENOUGH_BEAMS)
         self._continuity.passed(self.settings.motion.speed * self._period(observation.stamp))
         if self.modes:
             yield from self._track(view, observation)
@@ -94,7 +95,7 @@ class PreciseEstimator:
         self._remember(view, best)
         self._usual += 0.1 * (best.explained - self._usual)
         self._energy += 0.1 * (best.accuracy - self._energy)
-        return (yield from self._posterior(view, best))
+        return (yield from self._posterior(view, best, observation.angles))
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
         """See Estimator; sigma is the scanner's noise and the model's stated error together."""
@@ -267,8 +268,8 @@ class PreciseEstimator:
             return self.settings.motion.period
         return stamp - self._stamp
 
-    def _posterior(self, view: View, best: Mode) -> Conversation[Posterior]:
-        seen: Expected = yield Expect(self.model, se2.compose(best.pose[None], self.mount), view.angles)
+    def _posterior(self, view: View, best: Mode, angles: Array) -> Conversation[Posterior]:
+        seen: Expected = yield Expect(self.model, se2.compose(best.pose[None], self.mount), angles)
         expected = self._with_noise(seen)
         believable = self._believable(view)
         self._believed = believable or self._held

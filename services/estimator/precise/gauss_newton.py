@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from common.geometry import se2
 from common.robot.ranges import surfaces
@@ -152,7 +153,7 @@ def _steps(poses: Array, evidence: Evidence, prior: Prior | None, damping: Array
     return limited(np.linalg.solve(H, slope[..., None])[..., 0], MAX_STEP)
 
 
-def limited(steps: Array, largest: Array) -> Array:
+def limited(steps: npt.NDArray[np.floating[Any]], largest: Array) -> Array:
     """Steps (..., 3) made shorter, in their direction, so that no component exceeds ``largest`` (3,)."""
     return np.asarray(steps / np.maximum((np.abs(steps) / largest).max(axis=-1, keepdims=True), 1.0))
 

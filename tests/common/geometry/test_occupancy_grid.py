@@ -117,6 +117,14 @@ def test_a_lattice_over_cells_all_alike():
     assert signed_distance(np.ones((2, 2), bool), x, x) == pytest.approx(np.array([[1.5 * 2**0.5, 1.5], [1.5, -0.5]]))
 
 
+@given(st.integers(0, 2**32 - 1), st.floats(0.1, 1.5))
+def test_roomy_cells_have_their_middle_clear(seed, clearance):
+    world = world_of(speckled(seed))
+    cells = np.argwhere(world.grid.values == FREE)[:, ::-1]
+    clear = world.clearance(world.grid.shapes.within(cells, 0.5)) >= clearance
+    assert world.grid.shapes.roomy(clearance).tolist() == cells[clear].tolist()
+
+
 def test_faces_in_line_are_one():
     assert sorted(outline(np.ones((3, 5), bool)).tolist()) == [[0, 0, 0, 3], [0, 0, 5, 0], [0, 3, 5, 3], [5, 0, 5, 3]]
     touching = np.array([[True, False], [False, True]])  # two cells that touch with a corner: eight faces

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 import yaml
@@ -149,6 +151,12 @@ def test_a_wrong_map_says_what_is_wrong(tmp_path, keys, why):
     path = write_yaml(tmp_path, **({"image": "map.pgm"} | keys))
     with pytest.raises(UserError, match=why):
         load_world(str(path))
+
+
+def test_an_image_that_is_a_pipe_is_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "pipe.pgm")
+    with pytest.raises(UserError, match=r"map image .*pipe.pgm: not a file but a folder, a pipe or a device"):
+        load_world(str(write_yaml(tmp_path, image="pipe.pgm")))
 
 
 def test_the_image_itself_is_no_world(tmp_path):

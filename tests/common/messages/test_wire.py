@@ -12,9 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from common.limits import MAX_BEAMS, MAX_COORDINATE_M, MAX_DISTANCE_M
 from common.messages import definitions as messages
-from common.messages.definitions import Belief, CmdVel, Odom, Pose, Prediction, Scan, Twist
-from common.messages.requests import SampleReply
+from common.messages.definitions import Belief, CmdVel, Goal, Odom, Plan, Pose, Prediction, Scan, Status, Twist
+from common.messages.requests import PredictRequest, SampleReply
 from common.messages.topics import QUERIES, TOPICS
 from common.messages.wire import DecodeError
 from tests.common.samples import all_messages, message_of
@@ -84,6 +85,7 @@ BELIEF = Belief(
     free_energy=1.0,
     accuracy=1.0,
 )
+GOAL = Goal(stamp_ns=1, pose=Pose(x=0.0, y=0.0))
 COMMAND = CmdVel(stamp_ns=1, twist=Twist(vx=0.5))
 BAD = {
     "a missing field": changed(COMMAND, twist=...),
@@ -127,6 +129,21 @@ BAD_ARRAYS = {
     "an unknown state": (Belief, changed(BELIEF, state="asleep")),
     "a range_max of nought": (Scan, changed(a_scan(), range_max=0.0)),
     "a negative range_min": (Scan, changed(a_scan(), range_min=-0.1)),
+    "a scan of more beams than any scanner has": (Scan, changed(a_scan(), ranges=bytes(4 * (MAX_BEAMS + 1)))),
+    "a range of a million kilometres": (Scan, changed(a_scan(), ranges=np.float32([1, 1e9]).tobytes())),
+    "an absurd range_max": (Scan, changed(a_scan(), range_max=1e300)),
+    "an absurd sigma": (Scan, changed(a_scan(), sigma=1e308)),
+    "an absurd angle": (Scan, changed(a_scan(), angle_increment=1e300)),
+    "a scanner mounted outside the solar system": (Scan, changed(a_scan(), mount={"x": 1e300, "y": 0.0, "yaw": 0.0})),
+    "a goal beyond all maps": (Goal, changed(GOAL, pose={"x": 0.0, "y": -1e300, "yaw": 0.0})),
+    "a goal's absurd heading": (Goal, changed(GOAL, pose={"x": 0.0, "y": 0.0, "yaw": 1e300})),
+    "a goal's absurd tolerance": (Goal, changed(GOAL, tolerance=1e300)),
+    "an absurd velocity": (Odom, changed(ODOM, twist={"vx": 1e300})),
+    "a path beyond all maps": (Plan, changed(Plan(stamp_ns=1), path=np.float32([0, 1e20]).tobytes())),
+    "poses beyond all maps": (
+        PredictRequest,
+        changed(PredictRequest(poses=np.zeros((1, 3))), poses=np.full(3, 1e300).tobytes()),
+    ),
     "a name without end": (Scan, changed(a_scan(), frame_id="x" * 201)),
 }
 
@@ -155,11 +172,25 @@ def test_bad_arrays_and_values_are_refused(what):
         cls.decode(payload)
 
 
+def test_values_at_the_limits_are_taken():
+    far = Pose(x=-MAX_COORDINATE_M, y=MAX_COORDINATE_M, yaw=7.0)
+    assert Goal.decode(Goal(stamp_ns=1, pose=far).encode()).pose == far
+    ranges = np.full(MAX_BEAMS, MAX_DISTANCE_M, np.float32)
+    scan = a_scan(ranges=ranges, range_max=MAX_DISTANCE_M, sigma=MAX_DISTANCE_M)
+    assert Scan.decode(scan.encode()) == scan
+    from_corner_to_corner = Status(stamp_ns=1, state="idle", distance=float(np.hypot(*(far.array() * 2)[:2])))
+    assert Status.decode(from_corner_to_corner.encode()) == from_corner_to_corner
+
+
 def test_the_error_names_the_field():
     with pytest.raises(DecodeError, match=r"CmdVel\.twist\.vx: .*finite"):
         CmdVel.decode(BAD["NaN as velocity"])
     with pytest.raises(DecodeError, match=r"Scan\.ranges: .*1 values are NaN"):
         Scan.decode(BAD_ARRAYS["NaN in a scan"][1])
+    with pytest.raises(DecodeError, match=rf"Scan\.ranges: .*{MAX_BEAMS + 1} values are more than {MAX_BEAMS}"):
+        Scan.decode(BAD_ARRAYS["a scan of more beams than any scanner has"][1])
+    with pytest.raises(DecodeError, match=r"Goal\.pose\.y: .*greater than or equal to -10000"):
+        Goal.decode(BAD_ARRAYS["a goal beyond all maps"][1])
 
 
 def test_a_field_from_the_future_is_ignored_and_one_from_the_past_has_its_default():

@@ -87,6 +87,11 @@ def test_what_is_no_pose_is_refused(text):
         pose_of_text(text, "--mount")
 
 
+def test_a_pose_beyond_all_maps_is_refused():
+    with pytest.raises(UserError, match=r"--start '999999999,1': x and y are within 10000 m of the origin"):
+        pose_of_text("999999999,1", "--start")
+
+
 def test_a_pose_is_in_radians_and_may_lack_its_yaw():
     np.testing.assert_allclose(pose_of_text("1,-2.5", "--start"), [1, -2.5, 0])
     np.testing.assert_allclose(pose_of_text("1,2,-90", "--start"), [1, 2, -np.pi / 2])

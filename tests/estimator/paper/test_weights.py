@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from common.errors import UserError
 from services.estimator.paper import weights
 from services.estimator.paper.decoder import Decoder
+from services.estimator.shared.digest import sha256
 from tests.estimator.models import ROOM, SCANNER
 
 
@@ -33,7 +36,7 @@ def saved(folder) -> tuple:
 def test_what_is_saved_comes_back_in_half_precision(tmp_path):
     path, decoder = saved(tmp_path)
     model, read = weights.load(path)
-    assert read == card()
+    assert read == card().model_copy(update={"weights_sha256": sha256(path.read_bytes())})
     for a, b in zip(decoder.parameters(), model.decoder.parameters(), strict=True):
         assert torch.equal(a.half().float(), b)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["room-paper-64.json", "room-paper-64.safetensors"]
@@ -47,6 +50,26 @@ def test_available_and_find(tmp_path):
         weights.find(tmp_path, "room", "paper", 99)
     with pytest.raises(UserError, match="none lie in"):
         weights.find(tmp_path / "empty", "room", "paper", 64)
+
+
+@given(data=st.data())
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_flipped_bit_is_found(tmp_path, data):
+    path = saved(tmp_path)[0]
+    whole = bytearray(path.read_bytes())
+    whole[data.draw(st.integers(0, len(whole) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(whole)
+    with pytest.raises(UserError, match=rf"weights {path}: the file is damaged.*{path.stem}\.json.*presage train"):
+        weights.load(path)
+
+
+def test_a_card_without_digest_is_taken_with_a_warning(tmp_path, caplog):
+    path = saved(tmp_path)[0]
+    old = path.with_suffix(".json")
+    old.write_text(card().model_dump_json(exclude={"weights_sha256"}))
+    weights.load(path)
+    assert "no digest" in caplog.text
+    assert str(path) in caplog.text
 
 
 @pytest.mark.parametrize("damage", ["cut", "garbage", "no card", "bad card", "other shape"])

@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 
 from common.geometry import se2
 from common.geometry.world import World, load_world
+from common.limits import MAX_BEAMS
 from lab.accuracy import bound, tasks
 from lab.accuracy.runner import quick_field
 from lab.accuracy.scenes import TWINS, Scene
 from services.estimator.factory import Choice, Geometry, prepare
-from services.estimator.precise.estimator import PreciseEstimator
+from services.estimator.precise.estimator import ENOUGH_BEAMS, PreciseEstimator
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.interface import Observation
@@ -38,6 +39,23 @@ def off(posterior, pose):
     error = posterior.pose - pose
     error[2] = se2.wrap(error[2])
     return error
+
+
+def test_the_cost_of_a_search_does_not_grow_with_the_beams(monkeypatch):
+    made, scene = estimator(ROOM, beams=MAX_BEAMS)
+    looked_at = []
+
+    def expect(self, lasers, angles):
+        looked_at.append((len(lasers), len(angles)))
+        return cast(self, lasers, angles)
+
+    cast = RayCaster.expect
+    monkeypatch.setattr(RayCaster, "expect", expect)
+    pose = scene.poses(1)[0]
+    posterior = feed(made, scene, pose, 1)[0]
+    assert np.abs(off(posterior, pose)).max() < 0.01
+    assert posterior.predicted.shape == posterior.sigma.shape == (MAX_BEAMS,)
+    assert max(beams for poses, beams in looked_at if poses > 1) < 2 * ENOUGH_BEAMS
 
 
 def test_one_scan_finds_the_place_and_twenty_are_worth_more():

@@ -153,6 +153,7 @@ def test_params_are_of_the_front_and_the_rear_laser(tmp_path, name, range_max):
     log, _ = read(write(tmp_path, [*params, line.format(1), line.format(2)]))
     assert log.range_max == range_max
     assert log.mount[0] == {"FLASER": 0.3, "RLASER": -0.4, "LASER3": 0.0}[name]
+    assert log.mount_assumed == (name == "LASER3")  # no PARAM states it
 
 
 def test_garbled_poses_are_counted_and_cost_no_scan(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -17,9 +18,12 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import load_world
 from common.robot.scanner import SCANNERS
+from presage.logs.importing import Import, import_command
 from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
 from presage.replay.localize import COLUMNS, Job, choice_of, chosen, localize
+from presage.replay.rerun import Rerun, rerun_command
+from services.estimator.precise.learning.weights import FOLDER
 from tests.conftest import PATIENCE
 from tests.recorder.sessions import write
 
@@ -27,6 +31,7 @@ SCANNER = SCANNERS["tim571"].with_beams(200)
 WORLD = load_world("corridor")
 PATH = np.column_stack([np.linspace(4, 4.6, 10), np.full(10, 1.5), np.linspace(1, 1.2, 10)])
 CONSOLE = Console(quiet=True)
+CORRIDOR = ("corridor-precise.json", "corridor-precise.safetensors")
 
 
 def npz(folder: Path, mount=SCANNER.mount, **changes) -> Path:
@@ -45,7 +50,8 @@ def npz(folder: Path, mount=SCANNER.mount, **changes) -> Path:
 
 def job(file, mode="global", frame="base_link", estimator="precise", model="learned", world="corridor", **more):
     out = more.pop("out", None)
-    choice = choice_of(file, world, estimator, model, None, 0.02, 0, more.pop("initial_pose", ""))
+    models = more.pop("models", None)
+    choice = choice_of(file, world, estimator, model, models, 0.02, 0, more.pop("initial_pose", ""))
     given = {"fresh": False, "odometry": True, "out": out, **more}
     return Job.of(file, choice, mode, frame, given.pop("reading", Reading()), **given)
 
@@ -81,6 +87,28 @@ def test_the_laser_frame_is_that_of_the_files_poses_too(tmp_path):
     file = npz(tmp_path, mount=(0, 0, 0))  # PATH is the laser's
     assert errors(localize(job(file, frame="laser"), CONSOLE)).max() < 0.02
     assert errors(localize(job(file, frame="base_link"), CONSOLE)).min() > 0.15
+
+
+def test_a_mount_that_is_only_assumed_must_be_that_of_the_weights(tmp_path):
+    """The file does not state it, and 0.2,0,0 is assumed: a forgotten --mount would put every pose off by 0.2 m."""
+    folder = shutil.copytree(FOLDER, tmp_path / "models", ignore=lambda _, names: set(names) - set(CORRIDOR))
+    card = json.loads((folder / CORRIDOR[0]).read_text())
+    card["scanner"]["mount"] = [0.0, 0.0, 0.0]
+    (folder / CORRIDOR[0]).write_text(json.dumps(card))
+    file = npz(tmp_path, mount=(0, 0, 0))
+    with pytest.raises(UserError, match=r"0.2,0,0 was assumed, but .* trained with 0,0,0; give --mount"):
+        localize(job(file, models=folder), CONSOLE)
+    stated = Reading(mount=np.zeros(3))
+    assert errors(localize(job(file, models=folder, reading=stated), CONSOLE)).max() < 0.02
+    out = tmp_path / "imported.mcap"
+    import_command(Import(file, out, world="corridor"), None, CONSOLE)
+    again = {"models": str(folder), "model": "learned"}
+    with pytest.raises(UserError, match="import its log again with --mount"):
+        localize(job(out, models=folder), CONSOLE)
+    with pytest.raises(UserError, match="import its log again with --mount"):
+        rerun_command(Rerun(out, again), None, CONSOLE)
+    elsewhere = Reading(mount=np.array([0.2, 0, 0]))  # a field serves a laser mounted anywhere
+    assert errors(localize(job(npz(tmp_path), models=folder, reading=elsewhere), CONSOLE)).max() < 0.02
 
 
 def test_only_what_is_needed(tmp_path):

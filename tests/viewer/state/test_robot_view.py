@@ -380,10 +380,13 @@ def test_a_robot_carried_off_is_an_event(x, yaw, seconds, carried):
 def test_numbers_that_no_robot_has_are_shown_as_none():
     view, messages = RobotView("robot"), at(1.1)
     feed(view, 1.0)
-    far = Pose(x=1e308, y=0.0)
+    far = Pose.model_construct(x=1e308, y=0.0, yaw=0.0)  # no message from the wire can hold it
     messages[BELIEF] = messages[BELIEF].model_copy(update={"pose": far, "hypotheses": []})
     messages[TRUTH] = messages[TRUTH].model_copy(
-        update={"pose": Pose(x=-1e308, y=0.0), "twist": Twist(vx=1.5e308, vy=1.5e308)}
+        update={
+            "pose": Pose.model_construct(x=-1e308, y=0.0, yaw=0.0),
+            "twist": Twist.model_construct(vx=1.5e308, vy=1.5e308, wz=0.0),
+        }
     )
     for topic, message in messages.items():
         view.hear(topic, message, 1.1)

@@ -14,6 +14,7 @@ from common.geometry.world import World
 from common.robot.scanner import Scanner
 from services.estimator.precise.field import CLASSES, DistanceField, FieldModel, Seen
 from services.estimator.precise.learning.calibration import Calibration
+from services.estimator.shared.digest import check_digest, sha256
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -48,6 +49,7 @@ class FieldCard(BaseModel):
     commit: str
     command: str
     versions: dict[str, str]
+    weights_sha256: str = ""  # of the file beside the card, hexadecimal; empty in older cards
 
 
 def path_of(folder: Path, world: str) -> Path:
@@ -66,9 +68,11 @@ def save(path: Path, model: FieldModel, places: Array, card: FieldCard) -> None:
     if model.seen is not None:
         tensors |= {"seen": model.seen.cells.astype(np.uint8), "seen_origin": np.array(model.seen.origin)}
     partial = path.with_suffix(".partial")
-    safetensors.numpy.save_file(tensors, partial)
+    data = safetensors.numpy.save(tensors)
+    partial.write_bytes(data)
     partial.chmod(0o644)
     partial.replace(path)
+    card = card.model_copy(update={"weights_sha256": sha256(data)})
     partial.write_text(card.model_dump_json(indent=1) + "\n", encoding="utf-8")
     partial.replace(path.with_suffix(".json"))
 
@@ -77,7 +81,9 @@ def load(path: Path) -> tuple[FieldModel, Array, FieldCard]:
     """Model, places (S, 2) of the laser in free space, card; raises UserError where a file is not what it should be."""
     try:
         card = FieldCard.model_validate_json(path.with_suffix(".json").read_text(encoding="utf-8"))
-        tensors = safetensors.numpy.load_file(path)
+        data = path.read_bytes()
+        check_digest(path, data, card.weights_sha256, card.command)
+        tensors = safetensors.numpy.load(data)
         phi, scales, places = tensors["phi"], tensors["scales"], tensors["places"]
     except OSError as error:
         raise UserError(f"weights {path}: cannot be read ({error})") from None

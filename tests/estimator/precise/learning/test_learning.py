@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from common.errors import UserError
 from common.geometry.world import World
@@ -12,6 +14,7 @@ from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.evaluation import evaluate
 from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_scales
 from services.estimator.precise.learning.surfaces import Beams
+from services.estimator.shared.digest import sha256
 from tests.estimator.models import ROOM, SCANNER
 
 ANGLES = np.deg2rad(np.linspace(-135, 135, 271))
@@ -95,7 +98,7 @@ def saved(model, folder):
 def test_what_is_saved_comes_back(model, tmp_path):
     path = saved(model, tmp_path)
     back, places, read = weights.load(path)
-    assert read == card(model)
+    assert read == card(model).model_copy(update={"weights_sha256": sha256(path.read_bytes())})
     assert places.tolist() == [[1.0, 1.0]]
     assert np.array_equal(back.field.phi, model.field.phi.astype(np.float16).astype(np.float32))
     poses, _ = scans(20, 6, 0.0)
@@ -111,6 +114,26 @@ def test_a_field_of_other_walls_is_not_taken(model, tmp_path):
         weights.find(tmp_path, other, "mine.yaml")
     with pytest.raises(UserError, match=f"presage train --world mine.yaml --preset precise --out {tmp_path}"):
         weights.find(tmp_path, World(name="hall", boundary=ROOM.boundary), "mine.yaml")
+
+
+@given(data=st.data())
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_flipped_bit_is_found(model, tmp_path, data):
+    path = saved(model, tmp_path)
+    whole = bytearray(path.read_bytes())
+    whole[data.draw(st.integers(0, len(whole) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(whole)
+    with pytest.raises(UserError, match=rf"weights {path}: the file is damaged.*{path.stem}\.json.*presage train"):
+        weights.load(path)
+
+
+def test_a_card_without_digest_is_taken_with_a_warning(model, tmp_path, caplog):
+    path = saved(model, tmp_path)
+    old = path.with_suffix(".json")
+    old.write_text(card(model).model_dump_json(exclude={"weights_sha256"}))
+    weights.load(path)
+    assert "no digest" in caplog.text
+    assert str(path) in caplog.text
 
 
 @pytest.mark.parametrize("damage", ["cut", "garbage", "no card", "bad card", "other arrays", "not finite"])
