@@ -243,7 +243,7 @@ def test_life_and_death_are_seen(bus, link):
         # What was there before and what comes may both be told: once or twice, but nothing else.
         assert wait_until(lambda: set(late) == {("estimator", True)}, PATIENCE)
     assert wait_until(lambda: changes[-1] == ("estimator", False), PATIENCE)
-    assert bus.alive() == set()
+    assert wait_until(lambda: bus.alive() == set(), PATIENCE)
 
 
 def test_a_session_closes_while_other_threads_use_it(link):
