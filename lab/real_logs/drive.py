@@ -26,6 +26,8 @@ LIMIT = 40  # scans that a search may take
 BEFORE = 10  # scans that a robot is tracked for before it is carried off
 NEAR = np.diag([0.01, 0.01, 0.0025])  # covariance of the start that is given, m², m², rad²
 NEAR_ENOUGH = 0.5  # m, within which a scan counts as tracked
+# A differential model cannot follow every base; AMCL has an omnidirectional one for these.
+AMCL = ParticleSettings(robot_model_type="omni")
 ODOMETRY, LASER, GLOBAL, KIDNAPPED = "odometry", "laser", "global", "kidnapped"
 
 
@@ -130,18 +132,17 @@ def entered(job: Job) -> Estimator:
     if job.estimator == "precise":
         factory = _precise(job.map, job.model)
         return factory(Geometry(drive.angles, drive.mount, drive.range_max))
-    # A differential model cannot follow every base; AMCL has an omnidirectional one for these.
-    amcl = ParticleSettings(robot_model_type="omni")
-    settings = amcl if job.estimator == "amcl-defaults" else particle_settings(job.particles)
+    settings = AMCL if job.estimator == "amcl-defaults" else particle_settings(job.particles)
     x, y, yaw = map(float, drive.mount)
     return ParticleFilter(load_world(job.map), settings, (x, y, yaw), job.seed, sensor=_sensor(job.map, settings))
 
 
 def particle_settings(changed: tuple[tuple[str, float], ...]) -> ParticleSettings:
-    """The tuned set, with what a tuning on the first half has changed."""
+    """The tuned set, or AMCL's own, with what a tuning on the first half has changed."""
     kinds = {"max_beams": int, "keep_initial_pose": bool}
     values = {name: kinds[name](value) if name in kinds else value for name, value in changed}
-    return replace(ParticleSettings.tuned(), **values)  # type: ignore[arg-type]
+    base = AMCL if values.pop("amcl_defaults", 0.0) else ParticleSettings.tuned()
+    return replace(base, **values)  # type: ignore[arg-type]
 
 
 @functools.lru_cache(maxsize=2)

@@ -105,7 +105,7 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
     result = results.Result(
         job.result, f"A real drive: {job.log.name}", job.seed,
         {**{k: str(v) if isinstance(v, Path) else v for k, v in asdict(job).items()}, "scans": len(drive.ranges),
-         "particle_filter": {"tracking": dict(tuned.tracking), "finding": dict(tuned.finding), "tried": tuned.tried},
+         "particle_filter": {**{name: dict(each) for name, each in _sets(tuned).items()}, "tried": tuned.tried},
          "calibration": asdict(card.calibration) if card.calibration else None},
         summary, curves_of(rows), rows, notes(job, card, tuned),
     )  # fmt: skip
@@ -134,8 +134,8 @@ def _prepared(
     with suppress(OSError, ValueError, KeyError, TypeError, UserError):  # of an interrupted run, or nothing
         before = json.loads(kept.read_text(encoding="utf-8"))
         if before["key"] == key:
-            tracking, finding = (tuple(before[what].items()) for what in ("tracking", "finding"))
-            return path, weights.load(path)[2], Tuned(tracking, finding, before["tried"])
+            odometry, laser, finding = (tuple(before[what].items()) for what in ("odometry", "laser", "finding"))
+            return path, weights.load(path)[2], Tuned(odometry, laser, finding, before["tried"])
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("learning", total=1.0)
@@ -150,17 +150,21 @@ def _prepared(
         weights.save(path, learned.model, learned.places, card)
         start = starting_point(learned.calibration.motion)
         tuned = (
-            Tuned(start, start, [])
+            Tuned(start, start, (*start, ("keep_initial_pose", 0.0)), [])
             if job.quick
             else tune(replace(stretch, estimator="particle-filter"), half, start, path.parent, report)
         )
-    plain = {"key": key, "tracking": dict(tuned.tracking), "finding": dict(tuned.finding), "tried": tuned.tried}
+    plain = {"key": key, **{name: dict(each) for name, each in _sets(tuned).items()}, "tried": tuned.tried}
     kept.write_text(json.dumps(plain) + "\n", encoding="utf-8")
     return path, card, tuned
 
 
 def _settings(tuned: Tuned, task: str) -> Settings:
-    return tuned.tracking if task in (ODOMETRY, LASER) else tuned.finding
+    return _sets(tuned).get(task, tuned.finding)
+
+
+def _sets(tuned: Tuned) -> dict[str, Settings]:
+    return {ODOMETRY: tuned.odometry, LASER: tuned.laser, "finding": tuned.finding}
 
 
 def stretches(plain: Stretch, half: int, count: int, job: Job, *, odometry: bool) -> list[Stretch]:
@@ -244,7 +248,7 @@ def notes(job: Job, card: weights.FieldCard, tuned: Tuned) -> list[str]:
         ),
         *(
             f"particle filter, tuned on the {learned} half, {what}: {_listed(each)}"
-            for what, each in (("a and b", tuned.tracking), ("c and d", tuned.finding))
+            for what, each in (("a", tuned.odometry), ("b", tuned.laser), ("c and d", tuned.finding))
             if not job.quick
         ),
     ]

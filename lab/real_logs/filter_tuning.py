@@ -2,16 +2,17 @@
 
 Odometry's noise is learned from the first half as it is for preset precise. Every other value is tried on stretches of
 the second quarter, in a map of the first quarter: like the half that is localised later, the second quarter sees rooms
-that the map lacks, which decides whether recovery helps or harms. For tracking, with and without odometry, the settings
-win that keep the most scans, then those with the least median error; for finding, from there on, those that find the
-most starts, from nothing and carried off, then those that need the fewest scans. Two sets, so that neither task
-suffers from what the other needs.
+that the map lacks, which decides whether recovery helps or harms. For tracking the settings win that keep the most
+scans, then those with the least median error; for finding, those that find the most starts, from nothing and carried
+off, then those that need the fewest scans. Three sets, for tracking with odometry, without, and for finding, so that no
+task suffers from what another needs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from presage.learning.map_of_log import cells_of
 from services.estimator.precise.motion_model import MotionNoise
 
 TRIED: dict[str, tuple[float, ...]] = {
+    "amcl_defaults": (1.0,),
     "keep_initial_pose": (0.0,),
     "sigma_hit": (0.05, 0.2),
     "sigma_odometry": (0.0, 0.03, 0.1, 0.2),
@@ -33,8 +35,9 @@ TRIED: dict[str, tuple[float, ...]] = {
     "jitter_heading": (0.005, 0.015),
     "alpha": (4.0, 16.0),
 }
-# keep_initial_pose 0: recovery after a start from a given pose; sigma_odometry 0: sigma_hit and max_beams with odometry
-# too; alpha: all five, times what the odometry says
+# amcl_defaults 1: nav2's values in place of the tuned set's where no other is listed; keep_initial_pose 0: recovery
+# after a start from a given pose; sigma_odometry 0: sigma_hit and max_beams with odometry too; alpha: all five, times
+# what the odometry says
 TRIED_TO_FIND: dict[str, tuple[float, ...]] = {
     "recovery_alpha_fast": (0.0, 0.1),
     "sigma_search": (0.2,),
@@ -50,9 +53,12 @@ Settings = tuple[tuple[str, float], ...]
 class Tuned:
     """Settings of the particle filter."""
 
-    tracking: Settings
+    odometry: Settings  # to track with odometry
+    laser: Settings  # to track without
     finding: Settings
-    tried: list[str]  # share of scans kept, or of starts found; then median error (m), or mean scans
+    tried: list[
+        str
+    ]  # task, what was tried: share of scans kept, or of starts found; then median error (m), or mean scans
 
 
 def starting_point(motion: MotionNoise) -> Settings:
@@ -70,7 +76,7 @@ def tune(job: Job, half: int, start: Settings, folder: Path, report: Callable[[s
     The map of the first quarter is written into ``folder``.
     """
     lines: list[str] = []
-    total = sum(map(len, TRIED.values())) + sum(map(len, TRIED_TO_FIND.values())) + 2
+    total = 2 * sum(map(len, TRIED.values())) + sum(map(len, TRIED_TO_FIND.values())) + 3
     quarter = half // 2
     job = replace(job, map=str(_map_of_quarter(job, quarter, folder)))
     length = min(LENGTH, half - quarter)
@@ -78,13 +84,10 @@ def tune(job: Job, half: int, start: Settings, folder: Path, report: Callable[[s
 
     starts = _known(job, quarter, half - LIMIT, STARTS)
 
-    def tracking(settings: Settings) -> tuple[float, float]:
-        rows = [
-            trial(replace(job, task=task, first=first, count=length, particles=settings))
-            for task in (ODOMETRY, LASER)
-            for first in firsts
-        ]
-        return _kept(rows)
+    def tracking(task: str, settings: Settings) -> tuple[float, float]:
+        return _kept(
+            [trial(replace(job, task=task, first=first, count=length, particles=settings)) for first in firsts]
+        )
 
     def finding(settings: Settings) -> tuple[float, float]:
         rows = [trial(replace(job, task=GLOBAL, first=k, count=TO_FIND, particles=settings)) for k in starts]
@@ -93,24 +96,30 @@ def tune(job: Job, half: int, start: Settings, folder: Path, report: Callable[[s
         return _found(rows)
 
     def climb(
-        settings: Settings, tried: dict[str, tuple[float, ...]], score: Callable[[Settings], tuple[float, float]]
+        title: str,
+        settings: Settings,
+        tried: dict[str, tuple[float, ...]],
+        score: Callable[[Settings], tuple[float, float]],
     ) -> Settings:
         best, most = settings, score(settings)
-        lines.append(f"{score.__name__}, as it begins: {most[0]:.0%}, {-most[1]:.3g}")
+        lines.append(f"{title}, as it begins: {most[0]:.0%}, {-most[1]:.3g}")
         for name, values in tried.items():
             base = best
             for value in values:
                 changed = _with(base, name, value)
                 found = score(changed)
-                lines.append(f"{score.__name__}, {name} {value:g}: {found[0]:.0%}, {-found[1]:.3g}")
+                lines.append(f"{title}, {name} {value:g}: {found[0]:.0%}, {-found[1]:.3g}")
                 if found > most:
                     best, most = changed, found
-                report(f"particle filter, {score.__name__}: {name}", len(lines) / total)
+                report(f"particle filter, {title}: {name}", len(lines) / total)
         return best
 
-    track = climb(start, TRIED, tracking)
-    # A robot that was carried off has to give up the pose that was given.
-    return Tuned(track, climb(_with(track, "keep_initial_pose", 0.0), TRIED_TO_FIND, finding), lines)
+    odometry, laser = start, climb(LASER, start, TRIED, partial(tracking, LASER))
+    if job.drive.odom is not None:
+        odometry = climb(ODOMETRY, start, TRIED, partial(tracking, ODOMETRY))
+    # A robot that was carried off has to give up the pose that was given; nav2's few particles would not find it.
+    found = _with(_with(odometry, "keep_initial_pose", 0.0), "amcl_defaults", 0.0)
+    return Tuned(odometry, laser, climb("finding", found, TRIED_TO_FIND, finding), lines)
 
 
 def _map_of_quarter(job: Job, quarter: int, folder: Path) -> Path:

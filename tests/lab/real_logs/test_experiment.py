@@ -94,7 +94,8 @@ def test_tuning_uses_the_second_quarter_in_a_map_of_the_first(folder, tmp_path, 
     monkeypatch.setattr(real_tuning, "trial", fake)
     job = Job(str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "particle-filter", LASER, 0)
     tuned = real_tuning.tune(job, 100, starting_point(MotionNoise()), tmp_path, lambda *_: None)
-    assert dict(tuned.tracking).get("keep_initial_pose", 1.0) == 1.0  # recovery was tried, and lost
+    for each in (tuned.odometry, tuned.laser):
+        assert dict(each).get("keep_initial_pose", 1.0) == 1.0  # recovery was tried, and lost
     assert dict(tuned.finding)["keep_initial_pose"] == 0.0
     assert any(dict(each.particles).get("keep_initial_pose") == 0.0 for each in tried if each.task == LASER)
     for each in tried:
