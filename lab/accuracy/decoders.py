@@ -15,7 +15,7 @@ from rich.table import Table
 from common.geometry.world import load_world
 from common.robot.scanner import SCANNERS
 from lab.accuracy.panorama import Shape, train_panorama
-from lab.accuracy.runner import about
+from lab.accuracy.runner import provenance
 from lab.accuracy.scenes import Scene
 from presage.terminal.output import check_file, write_json
 from services.estimator.paper import decoder, training
@@ -29,21 +29,23 @@ from services.estimator.shared.generative_models import GenerativeModel
 
 COLUMNS = ("learning s", "numbers", "range median mm", "mean mm", "> 5 cm %", "position median mm", "RMS mm")
 PAPER = "the paper's decoder, L1, one heading"
-HEADING = np.pi / 2  # rad, the one heading
-TEST, CALIBRATION = 200, 300  # scans
-Learn = Callable[["Scans"], tuple[GenerativeModel, int]]  # model, numbers it stores
+HEADING = np.pi / 2  # rad, of all scans for the paper's decoder, which has no heading input
+TEST_SCANS, CALIBRATION_SCANS = 200, 300
+Learn = Callable[["Scans"], tuple[GenerativeModel, int]]  # returns the model and how many numbers it stores
 
 
 class Scans:
-    """Noisy scans to learn from, clean ones to calibrate and to test with; the laser in the middle of base_link."""
+    """Noisy scans for training, and noise-free ones for calibration and testing; the laser is at base_link's origin."""
 
     def __init__(self, world: str, samples: int, seed: int, heading: float | None = None) -> None:
-        """At any heading, or at one."""
+        """Cast scans at random poses: all with the given ``heading`` (rad), or by default with random headings."""
         self.world, self.seed = load_world(world), seed
         self.scanner = SCANNERS["tim571"].model_copy(update={"mount": (0.0, 0.0, 0.0)})
         scene = Scene(self.world, self.scanner, np.random.default_rng(seed))
         self.angles, self.sigma = scene.scanner.angles(), scene.scanner.sigma
-        self.poses, self.calibration, self.test = (scene.poses(n) for n in (samples, CALIBRATION, TEST))
+        self.poses, self.calibration, self.test = (
+            scene.poses(count) for count in (samples, CALIBRATION_SCANS, TEST_SCANS)
+        )
         if heading is not None:
             for poses in (self.poses, self.calibration, self.test):
                 poses[:, 2] = heading
@@ -53,20 +55,20 @@ class Scans:
 
 
 def field(resolution: float, share: float = 1.0, sweeps: int = 10) -> Learn:
-    """A distance field, from a share of the scans."""
+    """Returns a function that learns a distance field from the given share of the scans."""
 
     def learn(scans: Scans) -> tuple[GenerativeModel, int]:
-        count, still = int(share * len(scans.poses)), np.zeros(3)
-        beams = Beams.of(scans.poses[:count], still, scans.angles, scans.ranges[:count])
-        found = learn_field(beams, Recipe(resolution=resolution, sweeps=sweeps))
-        scales = learn_scales(found, scans.calibration, still, scans.angles, scans.calibration_ranges, 0.0)
-        return FieldModel(found, scales), found.phi.size
+        count, mount = int(share * len(scans.poses)), np.zeros(3)
+        beams = Beams.of(scans.poses[:count], mount, scans.angles, scans.ranges[:count])
+        learned = learn_field(beams, Recipe(resolution=resolution, sweeps=sweeps))
+        scales = learn_scales(learned, scans.calibration, mount, scans.angles, scans.calibration_ranges, 0.0)
+        return FieldModel(learned, scales), learned.phi.size
 
     return learn
 
 
 def panorama(steps: int, **shape: Any) -> Learn:
-    """A network, trained for so many steps of 256 scans."""
+    """Returns a function that trains a panorama network for ``steps`` batches of 256 scans."""
 
     def learn(scans: Scans) -> tuple[GenerativeModel, int]:
         model = train_panorama(Shape(**shape), scans.poses, scans.angles, scans.ranges, steps, 0)
@@ -76,7 +78,7 @@ def panorama(steps: int, **shape: Any) -> Learn:
 
 
 def paper(epochs: int) -> Learn:
-    """The paper's decoder, at one heading."""
+    """Returns a function that trains the paper's decoder on scans of one heading."""
 
     def learn(scans: Scans) -> tuple[GenerativeModel, int]:
         norm = Normalisation.of(scans.world.bounds, float(scans.ranges.max()))
@@ -92,9 +94,9 @@ def paper(epochs: int) -> Learn:
 
 
 def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: Path | None, console: Console) -> int:
-    """Learn each, measure, print, and write where asked."""
+    """Train and evaluate every model, print the table and write it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
-    tried: dict[str, Learn] = {
+    learners: dict[str, Learn] = {
         PAPER: paper(max(1, steps // 50)),
         "panorama, Fourier features, SiLU, L1": panorama(steps, loss="l1"),
         "panorama, Fourier features, SiLU, learned precision": panorama(steps),
@@ -109,7 +111,7 @@ def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: P
     }
     any_heading, one_heading = Scans(world, samples, seed), Scans(world, samples, seed, HEADING)
     rows: list[dict[str, Any]] = []
-    for name, learn in track(list(tried.items()), "learning", console=console, transient=True):
+    for name, learn in track(list(learners.items()), "learning", console=console, transient=True):
         scans = one_heading if name == PAPER else any_heading
         began = time.monotonic()
         model, size = learn(scans)
@@ -134,7 +136,8 @@ def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: P
         )  # fmt: skip
     console.print(table)
     console.print(
-        "position: error of the pose found from scans without noise, begun at the truth: what the model leaves"
+        "position: error of the pose estimated from noise-free scans, starting at the true pose. It is due to the "
+        "model alone"
     )
-    write_json(json_file, {"rows": rows, "samples": samples, "network_steps": steps, **about(seed)})
+    write_json(json_file, {"rows": rows, "samples": samples, "network_steps": steps, **provenance(seed)})
     return 0

@@ -20,24 +20,24 @@ from services.estimator.shared.generative_models import Expected
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
 
-LEAST_LOG_SCALE = -9.0
-BATCH = 256
-STEP = 2e-3  # m, of the differences that stand for derivatives: torch has none of its own for grids
+MIN_LOG_SCALE = -9.0
+BATCH_SIZE = 256
+DIFFERENCE_STEP = 2e-3  # m; finite differences, because torch has no such derivative for the grids
 
 
 @dataclass(frozen=True)
 class Shape:
-    """What fixes the network."""
+    """Hyperparameters of the network."""
 
     inputs: Literal["fourier", "grid"] = "fourier"
     activation: Literal["silu", "relu"] = "silu"
     loss: Literal["laplace", "l1"] = "laplace"
-    bins: int = 1080  # directions, from +x of the map counter-clockwise
+    bins: int = 1080  # directions, counter-clockwise from the map's +x axis
     width: int = 512
     layers: int = 4
     frequencies: int = 128
-    cells: tuple[float, ...] = (2.0, 1.0, 0.5, 0.25)  # m, of the grids, coarse to fine
-    features: int = 16  # of each grid
+    cells: tuple[float, ...] = (2.0, 1.0, 0.5, 0.25)  # cell sizes of the grids in m, coarse to fine
+    features: int = 16  # per grid
 
 
 class Fourier(nn.Module):
@@ -51,7 +51,7 @@ class Fourier(nn.Module):
         self.out = 2 * count + 2
 
     def forward(self, p: torch.Tensor) -> torch.Tensor:
-        """(N, 2) to (N, 2 count + 2)."""
+        """Maps positions (N, 2) to features (N, 2 count + 2)."""
         z = p @ self.projection
         return torch.cat([p, z.sin(), z.cos()], -1)
 
@@ -71,14 +71,14 @@ class Grids(nn.Module):
         self.out = shape.features * len(shape.cells) + 2
 
     def forward(self, p: torch.Tensor) -> torch.Tensor:
-        """(N, 2) to (N, features * grids + 2)."""
-        where = (p * self.stretch)[None, :, None, :]
-        found = [nn.functional.grid_sample(g, where, align_corners=True)[0, :, :, 0].T for g in self.grids]
-        return torch.cat([p, *found], -1)
+        """Maps positions (N, 2) to features (N, features * grids + 2)."""
+        at = (p * self.stretch)[None, :, None, :]
+        features = [nn.functional.grid_sample(g, at, align_corners=True)[0, :, :, 0].T for g in self.grids]
+        return torch.cat([p, *features], -1)
 
 
 class Panorama(nn.Module):
-    """Position (N, 2), the longer side of the world in [-1, 1], to ranges and log scales (N, bins), normalised."""
+    """Maps positions (N, 2) to normalised ranges and log scales (N, bins); the world's longer side is [-1, 1]."""
 
     def __init__(self, shape: Shape, size: tuple[float, float]) -> None:
         super().__init__()
@@ -94,63 +94,68 @@ class Panorama(nn.Module):
         nn.init.constant_(self.scale.bias, -1.5)
 
     def forward(self, p: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean and log scale."""
+        """Returns the expected ranges and the log scales."""
         hidden = self.trunk(self.inputs(p))
-        return self.mean(hidden), self.scale(hidden).clamp(LEAST_LOG_SCALE, 2)
+        return self.mean(hidden), self.scale(hidden).clamp(MIN_LOG_SCALE, 2)
 
 
 @dataclass(frozen=True)
 class PanoramaModel:
-    """A trained panorama in metres."""
+    """A trained panorama, in metres."""
 
     network: Panorama
     center: Array  # (2,) m
-    half: float  # m, of the longer side
+    half: float  # m, half the world's longer side
     range_scale: float  # m
     bins: int
-    ripple: float = 0.0  # not known
+    ripple: float = 0.0  # not measured for this model
 
     def expect(self, lasers: Array, angles: Array) -> Expected:
-        """See GenerativeModel; between directions by linear interpolation."""
+        """See GenerativeModel. Interpolates linearly interpolate the network's directions."""
         lasers = np.asarray(lasers, float).reshape(-1, 3)
-        offsets = np.array([[0, 0], [STEP, 0], [-STEP, 0], [0, STEP], [0, -STEP]])[:, None, :]
+        offsets = np.array(
+            [[0, 0], [DIFFERENCE_STEP, 0], [-DIFFERENCE_STEP, 0], [0, DIFFERENCE_STEP], [0, -DIFFERENCE_STEP]]
+        )[:, None, :]
         p = torch.as_tensor((lasers[:, :2] + offsets - self.center) / self.half, dtype=torch.float32)
         with torch.no_grad():
             means, scales = self.network(p.reshape(-1, 2))
         shape = (len(offsets), len(lasers), self.bins)
         mean, *shifted = means.reshape(shape).double().numpy() * self.range_scale
-        slopes = [(shifted[k] - shifted[k + 1]) / (2 * STEP) for k in (0, 2)]
-        # The deviation of Laplace's density is sqrt(2) times its scale.
+        slopes = [(shifted[k] - shifted[k + 1]) / (2 * DIFFERENCE_STEP) for k in (0, 2)]
+        # The standard deviation of a Laplace distribution is sqrt(2) times its scale.
         scale = np.exp(scales.reshape(shape)[0].double().numpy()) * self.range_scale * math.sqrt(2)
         u = (lasers[:, 2:3] + angles) * self.bins / (2 * np.pi)
         low = np.floor(u).astype(int)
         share, low, high = u - low, low % self.bins, (low + 1) % self.bins
 
-        def between(values: Array) -> Array:
+        def interpolate(values: Array) -> Array:
             a, b = np.take_along_axis(values, low, 1), np.take_along_axis(values, high, 1)
             return np.asarray(a + share * (b - a))
 
         turn = (np.roll(mean, -1, 1) - np.roll(mean, 1, 1)) * self.bins / (4 * np.pi)
-        jacobian = np.stack([between(slopes[0]), between(slopes[1]), between(turn)], -1)
-        return Expected(np.maximum(between(mean), 0.0), between(scale), jacobian)
+        jacobian = np.stack([interpolate(slopes[0]), interpolate(slopes[1]), interpolate(turn)], -1)
+        return Expected(np.maximum(interpolate(mean), 0.0), interpolate(scale), jacobian)
 
 
 def train_panorama(shape: Shape, lasers: Array, angles: Array, ranges: Array, steps: int, seed: int) -> PanoramaModel:
-    """From scans (N, B) m at laser poses (N, 3), in ``steps`` of 256 scans; a cosine takes the rate to zero."""
+    """Train on scans ``ranges`` (N, B), m, taken at ``lasers`` (N, 3), the laser's poses.
+
+    Takes ``steps`` steps of 256 scans each; the learning rate decays to zero along a cosine.
+    """
     torch.manual_seed(seed)
     low, high = lasers[:, :2].min(0), lasers[:, :2].max(0)
     center, size = (low + high) / 2, (float(high[0] - low[0]), float(high[1] - low[1]))
     half, range_scale = max(size) / 2, float(ranges.max())
     network = Panorama(shape, size)
-    target, seen = _all_around(shape.bins, lasers[:, 2], angles, ranges / range_scale)
+    target, seen = _panoramas(shape.bins, lasers[:, 2], angles, ranges / range_scale)
     p = torch.as_tensor((lasers[:, :2] - center) / half, dtype=torch.float32)
     grids = [x for name, x in network.named_parameters() if "grids" in name]
     rest = [x for name, x in network.named_parameters() if "grids" not in name]
     optimiser = torch.optim.Adam([{"params": rest, "lr": 1e-3}] + [{"params": grids, "lr": 1e-2}] * bool(grids))
-    first = [group["lr"] for group in optimiser.param_groups]
+    initial_rates = [group["lr"] for group in optimiser.param_groups]
     for step in range(steps):
-        batch = torch.randint(len(p), (BATCH,))
-        for group, rate in zip(optimiser.param_groups, first, strict=True):
+        batch = torch.randint(len(p), (BATCH_SIZE,))
+        for group, rate in zip(optimiser.param_groups, initial_rates, strict=True):
             group["lr"] = rate * 0.5 * (1 + math.cos(math.pi * step / steps))
         mean, log_scale = network(p[batch])
         error = (mean - target[batch]).abs()
@@ -161,8 +166,8 @@ def train_panorama(shape: Shape, lasers: Array, angles: Array, ranges: Array, st
     return PanoramaModel(network.eval(), center, half, range_scale, shape.bins)
 
 
-def _all_around(bins: int, yaw: Array, angles: Array, ranges: Array) -> tuple[torch.Tensor, torch.Tensor]:
-    """Scans (N, B) as panoramas (N, bins) by linear interpolation, and 1 where something was seen."""
+def _panoramas(bins: int, yaw: Array, angles: Array, ranges: Array) -> tuple[torch.Tensor, torch.Tensor]:
+    """Scans (N, B) resampled linearly to panoramas (N, bins), and a mask that is 1 inside the scanner's view."""
     target, seen = np.zeros((len(yaw), bins), np.float32), np.zeros((len(yaw), bins), np.float32)
     directions = np.arange(bins) * 2 * np.pi / bins
     for k, heading in enumerate(yaw):

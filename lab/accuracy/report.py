@@ -16,21 +16,22 @@ from common.errors import UserError
 from common.geometry.world import load_world
 from common.robot.scanner import Scanner
 from common.robot.scanner_options import chosen_scanner
-from lab.accuracy.runner import CHOICES, TASKS, Job, about, run_all
-from lab.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW, TWINS_FROM
+from lab.accuracy.runner import ESTIMATORS, TASKS, Job, provenance, run_all
+from lab.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW, TWINS_REQUIRED_FROM_SCAN
 from presage.terminal.output import check_file, write_json
 
-# Colours and marks that the colour-blind can tell apart (Okabe & Ito), and where words stand: points above the mark.
+# Colour-blind safe colours (Okabe & Ito), marker, and the vertical offset of the annotation in points.
 MARKS = {
     "precise": ("#0072B2", "o", 7), "precise-exact": ("#56B4E9", "s", -14), "particle-filter": ("#D55E00", "^", 7),
     "amcl-defaults": ("#CC79A7", "v", -14),
 }  # fmt: skip
-# Below each table of --markdown: the errors alone would hide the trials that failed.
-LEGEND = f"""Position error median / RMS; found of all (within {FOUND_DISTANCE:g} m and {np.rad2deg(FOUND_YAW):g}°);
-wrong: how many of all published `tracking` while the robot was elsewhere; NEES, 3 is honest. Errors and NEES are of
-those found alone. The bound is Cramér-Rao's, RMS in mm. Both kept: from scan {TWINS_FROM} on, until a scan tells the
-rooms apart, every belief has a hypothesis at the true pose and one at its twin; wrong there: trials with such a claim
-meanwhile."""
+# Printed below each --markdown table, because the errors alone would hide the trials that failed.
+LEGEND = f"""Each cell: median / RMS position error of the trials that were found, i.e. within {FOUND_DISTANCE:g} m and
+{np.rad2deg(FOUND_YAW):g}° of the true pose; how many of all trials were found; wrong: how many of all trials published
+`tracking` while the robot was elsewhere; NEES of the trials found (3 means a consistent covariance). The bound is the
+Cramér-Rao bound, RMS in mm. "Both kept": from scan {TWINS_REQUIRED_FROM_SCAN} until a scan distinguishes the two rooms,
+every belief contains a hypothesis at the true pose and one at its twin; wrong counts trials that published `tracking`
+at the wrong place during that time."""
 
 
 def bench_accuracy(
@@ -38,11 +39,11 @@ def bench_accuracy(
     workers: int, json_file: Path | None, figure: Path | None, console: Console, *, markdown: bool = False,
     scanner: str = "tim571",
 ) -> int:  # fmt: skip
-    """Measure, print, and write where asked."""
+    """Run the benchmark, print a table per world and scanner, and write ``json_file`` and ``figure`` if given."""
     chosen = estimators.split(",")
-    unknown = [name for name in chosen if name not in CHOICES]
+    unknown = [name for name in chosen if name not in ESTIMATORS]
     if unknown:
-        raise UserError(f"no estimator {unknown[0]!r}: choose from {', '.join(CHOICES)}")
+        raise UserError(f"no estimator {unknown[0]!r} in this benchmark: choose from {', '.join(ESTIMATORS)}")
     scanners = scanners_of(scanner, beams)
     wanted = tuple(tasks.split(",")) if tasks else TASKS
     if missing := [name for name in wanted if name not in TASKS]:
@@ -63,31 +64,34 @@ def bench_accuracy(
             print(LEGEND)
         else:
             console.print(_table(own, title))
-    write_json(json_file, {"rows": rows, "trials": trials, "minutes": minutes, **about(seed)})
+    write_json(json_file, {"rows": rows, "trials": trials, "minutes": minutes, **provenance(seed)})
     if figure is not None:
         _draw(rows, figure)
     return 0
 
 
 def scanners_of(names: str, beams: str) -> list[Scanner]:
-    """Each scanner with each number of beams; none: its own, of tim571 the paper's 622. Raises UserError."""
+    """Every named scanner with every number of beams. Raises UserError for unknown names or malformed numbers.
+
+    If ``beams`` is empty, a scanner keeps its own number of beams; tim571 gets 622, as in the paper.
+    """
     try:
         counts = [int(part) for part in beams.split(",") if part]
     except ValueError:
-        raise UserError(f"--beams {beams!r}: give numbers, such as 622,811") from None
-    found = []
+        raise UserError(f"--beams {beams!r}: give comma-separated whole numbers, such as 622,811") from None
+    scanners = []
     for name in names.split(","):
-        own: list[int | None] = [*counts] or [622 if name == "tim571" else None]
-        found += [chosen_scanner(name, count) for count in own]
-    return found
+        name_counts: list[int | None] = [*counts] or [622 if name == "tim571" else None]
+        scanners += [chosen_scanner(name, count) for count in name_counts]
+    return scanners
 
 
 def _by_title(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    found: dict[str, list[dict[str, Any]]] = {}
+    groups: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         scanner = "" if row["scanner"] == "tim571" else f"{row['scanner']}, "
-        found.setdefault(f"{row['world']}, {scanner}{row['beams']} beams", []).append(row)
-    return found
+        groups.setdefault(f"{row['world']}, {scanner}{row['beams']} beams", []).append(row)
+    return groups
 
 
 def _number(value: float | None, scale: float = 1.0, digits: int = 2) -> str:
@@ -96,7 +100,8 @@ def _number(value: float | None, scale: float = 1.0, digits: int = 2) -> str:
 
 def _table(rows: list[dict[str, Any]], title: str) -> Table:
     table = Table(
-        title=f"{title}; errors and NEES of the found alone; wrong: `tracking` elsewhere", title_justify="left"
+        title=f"{title}; errors and NEES: only of trials found; wrong: reported `tracking` at a wrong pose",
+        title_justify="left",
     )
     heads = "task|estimator|found|wrong|median mm|RMS mm|95 % mm|yaw deg|bound mm|RMS/bound|NEES|band|update ms"
     for column in heads.split("|"):
@@ -114,7 +119,7 @@ def _table(rows: list[dict[str, Any]], title: str) -> Table:
 
 
 def _markdown(rows: list[dict[str, Any]], title: str) -> str:
-    """A line for each task; `LEGEND` says what the cells hold."""
+    """A Markdown table with one line per task; `LEGEND` explains the cells."""
     names = list(dict.fromkeys(row["estimator"] for row in rows))
     lines = [f"| {title} | " + " | ".join(names) + " | bound |", "|---" * (len(names) + 2) + "|"]
     for task in dict.fromkeys(row["task"] for row in rows):
@@ -135,7 +140,7 @@ def _cell(row: dict[str, Any]) -> str:
 
 
 def _draw(rows: list[dict[str, Any]], file: Path) -> None:
-    """Root mean square position error of each task; the bound as a bar beside."""
+    """Figure of the RMS position error of each task, with the Cramér-Rao bound as a vertical bar."""
     title, rows = next(iter(_by_title(rows).items()))
     rows = [row for row in rows if row["position_error_rms_m"] is not None]
     tasks = list(dict.fromkeys(row["task"] for row in rows))
@@ -164,7 +169,7 @@ def _draw(rows: list[dict[str, Any]], file: Path) -> None:
     axes.invert_yaxis()
     axes.set(
         xscale="log", xlabel="position error, RMS (mm)",
-        title=f"{title}; numbers: found of all, where not all",
+        title=f"{title}; numbers: trials found, where some were not",
     )  # fmt: skip
     axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")

@@ -30,8 +30,8 @@ from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.interface import Estimator
 
-# As users name them; exact is precise over the world itself.
-CHOICES: dict[str, tuple[Name, str]] = {
+# Estimator and generative model by the name that users give; "exact" casts rays in the world itself.
+ESTIMATORS: dict[str, tuple[Name, str]] = {
     "precise": ("precise", "learned"),
     "precise-exact": ("precise", "exact"),
     "particle-filter": ("particle-filter", "learned"),
@@ -55,7 +55,7 @@ class Job:
 
 
 def run_all(jobs: list[Job], workers: int, console: Console) -> list[dict[str, Any]]:
-    """Rows of all jobs, in order; with progress."""
+    """Rows of all jobs, in the order of the jobs; shows a progress bar."""
     if workers == 1:
         return [row for job in track(jobs, "measuring", console=console, transient=True) for row in run(job)]
     with pool(workers) as executor:
@@ -64,28 +64,28 @@ def run_all(jobs: list[Job], workers: int, console: Console) -> list[dict[str, A
 
 
 def run(job: Job) -> list[dict[str, Any]]:
-    """The rows of one job."""
+    """Runs the job's tasks. Returns one row for each result."""
     world = load_world(job.world)
     geometry = Geometry.of(job.scanner)
-    name, model = CHOICES[job.estimator]
+    name, model = ESTIMATORS[job.estimator]
     estimator = prepare(Choice(job.world, name, model, seed=job.seed))(geometry)
     outcomes: dict[str, tasks.Outcome] = {}
     for number, task in enumerate((tasks.standing, tasks.blocked, tasks.kidnapped)):
         if task.__name__ in job.tasks:
-            outcomes |= task(estimator, _scene(job, world, number), job.trials, _quiet)
+            outcomes |= task(estimator, _scene(job, world, number), job.trials, _no_progress)
     for number, name_of_task in enumerate(("tracking", "odometry")):
         if name_of_task in job.tasks:
             scene = _scene(job, world, 10 + number)
-            outcomes |= tasks.tracking(estimator, scene, job.seconds, _quiet, odometry=name_of_task == "odometry")
+            outcomes |= tasks.tracking(estimator, scene, job.seconds, _no_progress, odometry=name_of_task == "odometry")
     rows = [_row(job, job.world, task, outcome) for task, outcome in outcomes.items()]
     if "twins" not in job.tasks:
         return rows
     scene = _scene(job, TWINS, 20)
-    alike = tasks.twins(_among_twins(job, geometry), scene, job.trials, _quiet)
-    return rows + [_row(job, TWINS.name, task, outcome) for task, outcome in alike.items()]
+    outcomes = tasks.twins(_estimator_for_twins(job, geometry), scene, job.trials, _no_progress)
+    return rows + [_row(job, TWINS.name, task, outcome) for task, outcome in outcomes.items()]
 
 
-def _quiet(poses: Iterable[Array]) -> Iterator[Array]:
+def _no_progress(poses: Iterable[Array]) -> Iterator[Array]:
     return iter(poses)
 
 
@@ -93,9 +93,9 @@ def _scene(job: Job, world: World, number: int) -> Scene:
     return Scene.of(world, None, job.seed * 100 + number, job.scanner)
 
 
-def _among_twins(job: Job, geometry: Geometry) -> Estimator:
-    """The estimator in the world of two rooms alike; a field is learned for it here, from 2000 scans."""
-    name, model = CHOICES[job.estimator]
+def _estimator_for_twins(job: Job, geometry: Geometry) -> Estimator:
+    """The job's estimator for the world of two identical rooms; trains its field from 2000 scans if it needs one."""
+    name, model = ESTIMATORS[job.estimator]
     mount = (float(geometry.mount[0]), float(geometry.mount[1]), float(geometry.mount[2]))
     if name == "amcl-defaults":
         return ParticleFilter(TWINS, ParticleSettings(), mount, job.seed)
@@ -113,7 +113,10 @@ def _among_twins(job: Job, geometry: Geometry) -> Estimator:
 def quick_field(
     world: World, geometry: Geometry, rng: np.random.Generator, samples: int = 2000, *, limited: bool = False
 ) -> FieldModel:
-    """A field learned from exact rays with the scanner's noise, ``limited`` to its longest range, and no simulator."""
+    """A distance field trained on exact rays with the scanner's noise, without a simulator.
+
+    With ``limited``, ranges beyond the scanner's maximum count as no return.
+    """
     poses = np.column_stack([world.sample_free(samples, rng, 0.27), rng.uniform(-np.pi, np.pi, samples)])
     clean = world.ray_distances(se2.compose(poses, geometry.mount), geometry.angles)
     split = samples // 10
@@ -127,7 +130,7 @@ def quick_field(
 
 
 def _row(job: Job, world: str, task: str, outcome: tasks.Outcome) -> dict[str, Any]:
-    """Plain names, units in them; None where nothing can be said."""
+    """Row of the report; None where a quantity is not defined for this task."""
     errors = np.array(outcome.errors).reshape(-1, 3)
     position = np.hypot(errors[:, 0], errors[:, 1])
     count, misfits = len(position), np.array(outcome.misfits)
@@ -143,8 +146,8 @@ def _row(job: Job, world: str, task: str, outcome: tasks.Outcome) -> dict[str, A
         "of": outcome.of,
         "found": outcome.found,
         "tracking_but_wrong": outcome.wrong,
-        "found_share_95": wilson(outcome.found, outcome.of) if outcome.independent else None,
-        "tracking_but_wrong_share_95": wilson(outcome.wrong, outcome.of) if outcome.independent else None,
+        "found_share_95": wilson_interval(outcome.found, outcome.of) if outcome.independent else None,
+        "tracking_but_wrong_share_95": wilson_interval(outcome.wrong, outcome.of) if outcome.independent else None,
         "position_error_median_m": float(np.median(position)) if count else None,
         "position_error_rms_m": rms,
         "position_error_p95_m": float(np.quantile(position, 0.95)) if count else None,
@@ -158,13 +161,13 @@ def _row(job: Job, world: str, task: str, outcome: tasks.Outcome) -> dict[str, A
     }
 
 
-def wilson(count: int, of: int) -> list[float]:
-    """Wilson's interval of 95 % for the probability of an event that happened ``count`` times in ``of`` trials."""
+def wilson_interval(count: int, of: int) -> list[float]:
+    """Wilson's 95 % interval for the probability of an event that happened ``count`` times in ``of`` trials."""
     z2 = 1.96**2
     middle, half = count + z2 / 2, 1.96 * np.sqrt(count * (of - count) / of + z2 / 4)
     return [float(np.clip((middle + side * half) / (of + z2), 0, 1)) for side in (-1, 1)]
 
 
-def about(seed: int) -> dict[str, Any]:
-    """What a result needs to be repeated."""
+def provenance(seed: int) -> dict[str, Any]:
+    """What one needs to reproduce a result: seed, commit, versions and command-line arguments."""
     return {"seed": seed, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:]}

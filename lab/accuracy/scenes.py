@@ -18,12 +18,12 @@ from services.estimator.shared.interface import Observation
 
 ROBOT = Robot()
 TIM571 = SCANNERS["tim571"]
-TURN = 1.0  # rad/s at most on the paths
+MAX_TURN_RATE = 1.0  # rad/s, on the paths
 
 
 @dataclass
 class Scene:
-    """A world, a scanner, and the noise; every scan is made by exact rays."""
+    """A world, a scanner and a random generator; scans are exact rays in the world plus noise."""
 
     world: World
     scanner: Scanner
@@ -31,28 +31,31 @@ class Scene:
 
     @classmethod
     def of(cls, world: World, beams: int | None, seed: int | Sequence[int], scanner: Scanner = TIM571) -> Scene:
-        """With so many beams (None: its own) of a scanner."""
+        """A scene with ``beams`` beams of the scanner, or the scanner's own number if None."""
         return cls(world, scanner.with_beams(beams), np.random.default_rng(seed))
 
     def poses(self, count: int) -> Array:
-        """(count, 3) uniform over where the robot fits, any heading."""
+        """Random poses (count, 3): uniform over places where the robot fits, with uniform headings."""
         places = self.world.sample_free(count, self.rng, ROBOT.radius)
         return np.column_stack([places, self.rng.uniform(-np.pi, np.pi, count)])
 
     def clean(self, poses: Array) -> Array:
-        """(N, B) m without noise."""
+        """Noise-free ranges (N, B), m, at base_link poses (N, 3)."""
         lasers = se2.compose(poses, np.array(self.scanner.mount))
         return np.asarray(self.world.ray_distances(lasers, self.scanner.angles()))
 
     def observe(self, clean: Array, stamp: float, odom: Array | None = None) -> Observation:
-        """One scan (B,) with fresh noise."""
+        """Observation of noise-free ranges (B,) with fresh noise added."""
         scanner = self.scanner
         return Observation(
             scanner.limit(scanner.noisy(clean, self.rng)), scanner.angles(), scanner.range_max, stamp, odom
         )
 
     def blocked(self, clean: Array, share: float) -> Array:
-        """What no model knows, people say: sectors of (B,) cut short at 0.3 to 4 m, at least ``share`` of the beams."""
+        """Ranges (B,) with unknown obstacles, such as people, in at least ``share`` of the beams.
+
+        Each obstacle limits a random sector to a distance between 0.3 and 4 m.
+        """
         ranges, hidden = clean.copy(), np.zeros(len(clean), bool)
         while hidden.mean() < share:
             middle, half = self.rng.integers(len(clean)), self.rng.integers(5, 31) * len(clean) // 622
@@ -65,7 +68,10 @@ class Scene:
         return np.asarray(ranges)
 
     def path(self, seconds: float, speed: float = 1.0) -> Array:
-        """(N, 3) poses, one a scan: between places in sight, with the robot's limits, turning up to 1 rad/s."""
+        """Poses (N, 3), one per scan, of a drive between random places along free straight lines.
+
+        Speeds are up to ``speed`` m/s and 1 rad/s, and accelerations are within the robot's limits.
+        """
         dt = 1 / self.scanner.rate
         room = shapely.buffer(self.world.free_space, -ROBOT.radius)
         shapely.prepare(room)
@@ -74,8 +80,11 @@ class Scene:
         poses = [pose]
         while len(poses) < seconds * self.scanner.rate:
             if np.hypot(*(target - pose[:2])) < 0.1 or self.rng.random() < 0.005:
-                target = self._in_sight(room, pose[:2])
-                wanted_speed, wanted_turn = self.rng.uniform(0.2, speed), self.rng.uniform(-TURN, TURN)
+                target = self._random_visible_place(room, pose[:2])
+                wanted_speed, wanted_turn = (
+                    self.rng.uniform(0.2, speed),
+                    self.rng.uniform(-MAX_TURN_RATE, MAX_TURN_RATE),
+                )
             towards = target - pose[:2]
             distance = float(np.hypot(*towards))
             wanted = towards / max(distance, 1e-9) * min(wanted_speed, np.sqrt(2 * 0.5 * distance))
@@ -83,25 +92,26 @@ class Scene:
             velocity = velocity + change * min(1.0, ROBOT.acceleration * dt / max(float(np.hypot(*change)), 1e-9))
             turn += float(np.clip(wanted_turn - turn, -ROBOT.turn_acceleration * dt, ROBOT.turn_acceleration * dt))
             ahead = pose[:2] + velocity * dt
-            if not shapely.covers(room, shapely.Point(ahead)):  # braked too late: as at a wall
+            if not shapely.covers(room, shapely.Point(ahead)):  # braked too late; stop as at a wall
                 ahead, velocity, target = pose[:2], np.zeros(2), pose[:2]
             pose = np.array([*ahead, float(se2.wrap(pose[2] + turn * dt))])
             poses.append(pose)
         return np.array(poses)
 
-    def _in_sight(self, room: shapely.Geometry, place: Array) -> Array:
+    def _random_visible_place(self, room: shapely.Geometry, place: Array) -> Array:
         for candidate in self.world.sample_free(200, self.rng, ROBOT.radius):
             if shapely.covers(room, shapely.LineString(np.array([place, candidate]))):
                 return np.asarray(candidate)
         return place
 
 
-TWIN_OFFSET = 6.1  # m along x, from one room to its twin
+TWIN_OFFSET = 6.1  # m along x from one room to the identical one
 TWINS = World(
     name="twins",
     boundary=[(0, 0), (12, 0), (12, 6), (0, 6)],
     obstacles=[
-        # Two rooms alike, each behind a door; a corridor along both, with one thing at one end.
+        # Two identical rooms, each with a door to a common corridor; an object at one end of the corridor breaks the
+        # symmetry.
         {"polygon": [(5.9, 0), (6.1, 0), (6.1, 4), (5.9, 4)]},
         {"polygon": [(0, 4), (2.4, 4), (2.4, 4.15), (0, 4.15)]},
         {"polygon": [(3.5, 4), (8.5, 4), (8.5, 4.15), (3.5, 4.15)]},
@@ -116,10 +126,13 @@ TWINS = World(
 
 
 def twin_path(scene: Scene) -> tuple[Array, int]:
-    """(N, 3) from a place in one of the rooms out into the corridor, and how many scans both rooms explain alike."""
+    """A path (N, 3) from inside one of the rooms into the corridor.
+
+    Also returns the number of scans at its start that would be identical in the other room.
+    """
     while True:
         pose = np.array([*scene.rng.uniform([0.6, 0.4], [5.4, 2.2]), scene.rng.uniform(-np.pi, np.pi)])
-        if scene.world.clearance(pose[:2])[0] < ROBOT.radius or not _sees_door(scene, pose):
+        if scene.world.clearance(pose[:2])[0] < ROBOT.radius or not _has_free_line_to_door(scene, pose):
             continue
         if alike(scene, pose[None])[0]:
             break
@@ -134,16 +147,16 @@ def twin_path(scene: Scene) -> tuple[Array, int]:
 
 
 def twin_of(poses: Array) -> Array:
-    """(..., 3) the same places and headings in the other of the two rooms."""
+    """Poses (..., 3) at the same place and heading in the other room."""
     offset = np.where(poses[..., :1] < TWIN_OFFSET, TWIN_OFFSET, -TWIN_OFFSET)
     return np.asarray(poses + offset * np.array([1.0, 0.0, 0.0]))
 
 
 def alike(scene: Scene, poses: Array) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Whether poses (N, 3) give the very scan of their twins."""
+    """Whether the noise-free scans at ``poses`` (N, 3) are identical to those at their twins; (N,)."""
     return np.asarray(np.abs(scene.clean(poses) - scene.clean(twin_of(poses))).max(axis=1) < 1e-6)
 
 
-def _sees_door(scene: Scene, pose: Array) -> bool:
+def _has_free_line_to_door(scene: Scene, pose: Array) -> bool:
     line = shapely.LineString(np.array([pose[:2], [2.95, 3.4]]))
     return bool(shapely.covers(shapely.buffer(scene.world.free_space, -ROBOT.radius), line))

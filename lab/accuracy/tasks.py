@@ -15,49 +15,52 @@ from lab.accuracy.scenes import Scene, twin_of, twin_path
 from services.estimator.shared.interface import Estimator, Observation, Posterior
 from services.simulator.odometry import Drift, Odometer
 
-FOUND_DISTANCE, FOUND_YAW = 0.2, np.deg2rad(5)  # m, rad
-STANDING = 20  # scans
-TWINS_FROM = 20  # scans: from this one on a belief must contain both rooms; no estimator can know them at once
-Watch = Callable[[Iterable[Array]], Iterator[Array]]
+FOUND_DISTANCE, FOUND_YAW = 0.2, np.deg2rad(5)  # m, rad; an estimate with smaller errors counts as found
+STANDING_SCANS = 20
+# From this scan on, a belief must contain both of two identical rooms. Before, an estimator may still be searching.
+TWINS_REQUIRED_FROM_SCAN = 20
+ProgressWrapper = Callable[[Iterable[Array]], Iterator[Array]]
 
 
 def is_at(believed: Array, pose: Array) -> bool:
-    """Whether poses (3,) differ by less than the distance and the heading within which a place counts as found."""
+    """Whether the poses (3,) differ by less than `FOUND_DISTANCE` and `FOUND_YAW`."""
     dx, dy, turn = believed - pose
     return bool(np.hypot(dx, dy) < FOUND_DISTANCE and abs(se2.wrap(turn)) < FOUND_YAW)
 
 
 @dataclass
 class Outcome:
-    """One estimator in one task."""
+    """Results of one estimator in one task."""
 
     errors: list[Array] = field(default_factory=list)  # (3,) m, m, rad
-    misfits: list[float] = field(default_factory=list)  # squared Mahalanobis distance by the stated covariance
-    bounds: list[float] = field(default_factory=list)  # m, position
+    misfits: list[float] = field(
+        default_factory=list
+    )  # NEES: error' covariance^-1 error, with the estimate's covariance
+    bounds: list[float] = field(default_factory=list)  # m, Cramér-Rao bound of the position
     update_ms: list[float] = field(default_factory=list)
     found: int = 0
     of: int = 0
-    wrong: int = 0  # `tracking` was published, but the robot was elsewhere
-    independent: bool = True  # the counts are of separate trials, not of scans along one path
+    wrong: int = 0  # estimates in state `tracking` while the robot was elsewhere
+    independent: bool = True  # whether the counts are of separate trials, not of scans along one path
 
     def add(self, posterior: Posterior, pose: Array, limit: float | None) -> bool:
-        """Take an estimate; whether it is at the place."""
+        """Record an estimate. Returns whether it is at the true ``pose``; ``limit`` is the position bound in m."""
         error = posterior.pose - pose
         error[2] = se2.wrap(error[2])
-        here = is_at(posterior.pose, pose)
+        found_here = is_at(posterior.pose, pose)
         self.of += 1
-        self.found += here
-        self.wrong += posterior.state == "tracking" and not here
-        if here:
+        self.found += found_here
+        self.wrong += posterior.state == "tracking" and not found_here
+        if found_here:
             self.errors.append(error)
             if limit is not None:
                 self.bounds.append(limit)
             if posterior.covariance is not None:
                 self.misfits.append(float(error @ np.linalg.solve(posterior.covariance, error)))
-        return here
+        return found_here
 
 
-def _timed(estimator: Estimator, observation: Observation, outcome: Outcome | None = None) -> Posterior:
+def _timed_update(estimator: Estimator, observation: Observation, outcome: Outcome | None = None) -> Posterior:
     began = time.perf_counter()
     posterior = estimator.update(observation)
     if outcome is not None:
@@ -65,64 +68,68 @@ def _timed(estimator: Estimator, observation: Observation, outcome: Outcome | No
     return posterior
 
 
-def standing(estimator: Estimator, scene: Scene, trials: int, watch: Watch) -> dict[str, Outcome]:
-    """From nothing: after one scan, and after twenty of a robot that stands; no odometry."""
+def standing(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, Outcome]:
+    """Global localisation of a standing robot, without odometry: after one scan and after twenty."""
     one, many = Outcome(), Outcome()
     poses = scene.poses(trials)
     limits = bound.position(bound.single(scene, poses))
-    for pose, clean, limit in zip(watch(poses), scene.clean(poses), limits, strict=True):
+    for pose, clean, limit in zip(progress(poses), scene.clean(poses), limits, strict=True):
         estimator.restart()
-        for k in range(STANDING):
+        for k in range(STANDING_SCANS):
             first = k == 0
-            posterior = _timed(estimator, scene.observe(clean, k / scene.scanner.rate), one if first else many)
+            posterior = _timed_update(estimator, scene.observe(clean, k / scene.scanner.rate), one if first else many)
             if first:
                 one.add(posterior, pose, limit)
-        many.add(posterior, pose, limit / np.sqrt(STANDING))
+        many.add(posterior, pose, limit / np.sqrt(STANDING_SCANS))
     return {"from nothing, 1 scan": one, "standing, 20 scans": many}
 
 
-def blocked(estimator: Estimator, scene: Scene, trials: int, watch: Watch) -> dict[str, Outcome]:
-    """From nothing with 30 % of the beams cut short by what no model knows, another each time; one scan, and twenty."""
+def blocked(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, Outcome]:
+    """Global localisation with 30 % of the beams shortened by unknown obstacles: after one scan and after twenty.
+
+    The obstacles are drawn once per trial.
+    """
     one, many = Outcome(), Outcome()
     poses = scene.poses(trials)
-    for pose, clean in zip(watch(poses), scene.clean(poses), strict=True):
+    for pose, clean in zip(progress(poses), scene.clean(poses), strict=True):
         estimator.restart()
         hidden = scene.blocked(clean, 0.3)
-        for k in range(STANDING):
-            posterior = _timed(estimator, scene.observe(hidden, k / scene.scanner.rate), one if k == 0 else many)
+        for k in range(STANDING_SCANS):
+            posterior = _timed_update(estimator, scene.observe(hidden, k / scene.scanner.rate), one if k == 0 else many)
             if k == 0:
                 one.add(posterior, pose, None)
         many.add(posterior, pose, None)
     return {"30 % blocked, 1 scan": one, "30 % blocked, 20 scans": many}
 
 
-def tracking(estimator: Estimator, scene: Scene, seconds: float, watch: Watch, *, odometry: bool) -> dict[str, Outcome]:
-    """Along a path from a known start; with the simulator's odometry or none."""
+def tracking(
+    estimator: Estimator, scene: Scene, seconds: float, progress: ProgressWrapper, *, odometry: bool
+) -> dict[str, Outcome]:
+    """Tracking along a path from a known start, with the simulator's odometry or without."""
     outcome, path = Outcome(independent=False), scene.path(seconds)
-    limits = (
-        bound.recursive(scene, path, Drift()) if odometry else bound.single(scene, path)
-    )  # without odometry the motion is not known: the bound is that of each scan alone
+    # Without odometry the motion is unknown, so the bound is that of each scan alone.
+    limits = bound.recursive(scene, path, Drift()) if odometry else bound.single(scene, path)
     odometer = Odometer(Drift(), scene.rng)
     estimator.restart(path[0], np.diag([0.01, 0.01, 0.01]))
-    for k, pose in enumerate(watch(path)):
+    for k, pose in enumerate(progress(path)):
         if k:
             odometer.move(path[k - 1], pose)
         observation = scene.observe(
             scene.clean(pose[None])[0], k / scene.scanner.rate, odometer.pose.copy() if odometry else None
         )
-        outcome.add(_timed(estimator, observation, outcome), pose, float(bound.position(limits[k])))
+        outcome.add(_timed_update(estimator, observation, outcome), pose, float(bound.position(limits[k])))
     return {"tracking, odometry" if odometry else "tracking, no odometry": outcome}
 
 
-def kidnapped(estimator: Estimator, scene: Scene, trials: int, watch: Watch) -> dict[str, Outcome]:
-    """Carried off while it stood: at its new place after one scan, after three, after twenty."""
+def kidnapped(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, Outcome]:
+    """Teleports of a standing robot every 20 scans: whether it is found after one, three and twenty scans."""
     after = {1: Outcome(), 3: Outcome(), 20: Outcome()}
     poses, stamp = scene.poses(trials + 1), 0
     estimator.restart()
-    for number, (pose, clean) in enumerate(zip(watch(poses), scene.clean(poses), strict=True)):
-        for k in range(1, STANDING + 1):
+    for number, (pose, clean) in enumerate(zip(progress(poses), scene.clean(poses), strict=True)):
+        for k in range(1, STANDING_SCANS + 1):
             stamp += 1
-            posterior = _timed(estimator, scene.observe(clean, stamp / scene.scanner.rate))
+            posterior = _timed_update(estimator, scene.observe(clean, stamp / scene.scanner.rate))
             if number and k in after:
                 after[k].add(posterior, pose, None)
     return {f"kidnapped, {k} scan{'s' if k > 1 else ''}": outcome for k, outcome in after.items()}
@@ -133,23 +140,24 @@ def holds_both(posterior: Posterior, pose: Array) -> bool:
     return all(any(is_at(h.pose, place) for h in posterior.hypotheses) for place in (pose, twin_of(pose)))
 
 
-def twins(estimator: Estimator, scene: Scene, trials: int, watch: Watch) -> dict[str, Outcome]:
-    """Two rooms alike: both kept while no scan tells them apart, and the right one believed at the end of the path.
+def twins(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, Outcome]:
+    """A path out of one of two identical rooms: both kept while ambiguous, and the right one believed at the end.
 
-    Kept: every belief from the 20th scan on, until a scan differs between the rooms, has a hypothesis at the true pose
-    and one at its twin, of whatever weight. Wrong: in a trial `tracking` was published at the wrong place meanwhile.
+    "Both kept" counts trials in which every belief from the 20th scan until the first scan that distinguishes the rooms
+    has a hypothesis at the true pose and one at its twin, of any weight. Its ``wrong`` counts trials that published
+    `tracking` at the wrong place during that time.
     """
     kept, right = Outcome(), Outcome()
-    for _ in watch(np.arange(float(trials))):
+    for _ in progress(np.arange(float(trials))):
         path, same = twin_path(scene)
         estimator.restart()
         both, wrong = True, False
         for k, pose in enumerate(path):
-            posterior = _timed(estimator, scene.observe(scene.clean(pose[None])[0], k / scene.scanner.rate))
+            posterior = _timed_update(estimator, scene.observe(scene.clean(pose[None])[0], k / scene.scanner.rate))
             if k >= same:
                 continue
             wrong |= posterior.state == "tracking" and not is_at(posterior.pose, pose)
-            if k + 1 >= TWINS_FROM:
+            if k + 1 >= TWINS_REQUIRED_FROM_SCAN:
                 both &= holds_both(posterior, pose)
         kept.of, kept.found, kept.wrong = kept.of + 1, kept.found + both, kept.wrong + wrong
         right.add(posterior, pose, None)

@@ -17,7 +17,7 @@ from common.geometry.world import World, load_world
 from common.messages.requests import WorldReply
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
-from lab.accuracy.runner import about
+from lab.accuracy.runner import provenance
 from presage.learning.grid_map import rooms, write_map
 from presage.terminal.output import check_file, make_folder, write_json
 from services.controller.policies.free_space import FreeSpace
@@ -46,7 +46,7 @@ def bench_map(
     for name, value, unit in rows:
         table.add_row(name, f"{value:.3g} {unit}" if value < 1000 else f"{value:.0f} {unit}")
     console.print(table)
-    write_json(json_file, {"rows": [{"name": n, "value": v, "unit": u} for n, v, u in rows], **about(seed)})
+    write_json(json_file, {"rows": [{"name": n, "value": v, "unit": u} for n, v, u in rows], **provenance(seed)})
     return 0
 
 

@@ -20,7 +20,7 @@ from common.geometry.se2 import Array
 from common.messages.definitions import Belief, Goal, Health, Pose, Preference, Stamped, Status, Truth
 from common.messages.topics import BELIEF, GOAL, HEALTH, PREFERENCE, STATUS, TRUTH
 from lab.experiments.journeys import CLOSE, Journey
-from lab.workers import ONE_CORE
+from lab.workers import THREAD_COUNT_VARIABLES
 from presage.live.bus_watch import Watch
 from presage.session.stack import Stack
 
@@ -81,7 +81,7 @@ def session() -> Iterator[Stack]:
     """A router of our own for runs one after another; whatever happens, no process is left."""
     # Nobody's own settings change the experiment; one thread each, for sums depend on how they are split.
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PRESAGE_")}
-    environment = clean | dict.fromkeys(ONE_CORE, "1")
+    environment = clean | dict.fromkeys(THREAD_COUNT_VARIABLES, "1")
     for left in reversed(range(ROUTERS)):
         with Stack("e3", quiet=True, environment=environment) as stack:
             try:

@@ -14,7 +14,7 @@ from common.geometry.world import load_world
 from common.robot.base import Robot
 from lab.accuracy import bound, tasks
 from lab.accuracy.report import _markdown, bench_accuracy, scanners_of
-from lab.accuracy.runner import Job, _row, wilson
+from lab.accuracy.runner import Job, _row, wilson_interval
 from lab.accuracy.scenes import TWINS, Scene, alike, twin_of, twin_path
 from services.estimator.shared.interface import Hypothesis, Posterior
 from services.simulator.odometry import Drift
@@ -161,9 +161,9 @@ def test_the_short_table_shows_wrong_claims_beside_what_was_found(capsys):
 
 
 def test_counts_have_an_interval_unless_they_are_of_one_path():
-    assert wilson(294, 300) == pytest.approx([0.9570, 0.9908], abs=1e-3)
-    assert wilson(0, 100) == pytest.approx([0.0, 0.0370], abs=1e-3)
-    assert wilson(100, 100) == pytest.approx([0.9630, 1.0], abs=1e-3)
+    assert wilson_interval(294, 300) == pytest.approx([0.9570, 0.9908], abs=1e-3)
+    assert wilson_interval(0, 100) == pytest.approx([0.0, 0.0370], abs=1e-3)
+    assert wilson_interval(100, 100) == pytest.approx([0.9630, 1.0], abs=1e-3)
     tim = scanners_of("tim571", "")[0]
     along = tasks.Outcome(found=9, of=9, independent=False)
     assert _row(Job("precise", "office", tim, 3, 1.0, 0), "office", "tracking", along)["found_share_95"] is None
