@@ -30,7 +30,7 @@ def begin_logging(service: str, argv: Sequence[str] | None = None) -> None:
         set_up_logging(as_json=True, service=service)
 
 
-def say_failure(service: str, error: Exception) -> None:
+def report_failure(service: str, error: Exception) -> None:
     """Why a process ends, in one line."""
     if _captured:
         logger(service).error(str(error))
@@ -119,7 +119,7 @@ def logger(service: str) -> Logger:
     return bound
 
 
-class OncePerSecond:
+class LogRateLimiter:
     """Says yes at most once a second for each subject, and counts what it silenced."""
 
     def __init__(self) -> None:

@@ -8,7 +8,7 @@ import signal
 from collections.abc import Callable
 
 
-def die_with(parent: int, how: int = signal.SIGTERM) -> None:
+def end_with_parent(parent: int, how: int = signal.SIGTERM) -> None:
     """Linux: end this process by the signal ``how`` when its parent ends, even by SIGKILL.
 
     The kernel looks at the thread that made the child: it has to live as long as the parent.
@@ -21,7 +21,7 @@ def die_with(parent: int, how: int = signal.SIGTERM) -> None:
             os._exit(1)
 
 
-def dying_with_us(how: int = signal.SIGTERM) -> Callable[[], None]:
+def end_with_this_process(how: int = signal.SIGTERM) -> Callable[[], None]:
     """For a child's ``preexec_fn``."""
     parent = os.getpid()
-    return lambda: die_with(parent, how)
+    return lambda: end_with_parent(parent, how)

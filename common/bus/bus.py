@@ -17,7 +17,7 @@ import zenoh
 
 from common.bus.endpoints import not_let_in, refuse_exposure
 from common.bus.inbox import Answer, Call, Inbox, Sample
-from common.bus.liveliness import Presence, published_ns
+from common.bus.liveliness import Liveliness, published_ns
 from common.bus.security import Credentials, may_ask, may_put
 from common.bus.session import DEFAULT_ENDPOINT, JOIN_TIMEOUT_S, LOG_FILTER, Link, open_session, wait_until
 from common.errors import UserError
@@ -30,7 +30,7 @@ R = TypeVar("R", bound=Reply)
 JOIN_PAUSE_S = 0.2  # between two attempts to join a router, where it refuses at once
 
 
-class Bus(Presence):
+class Bus(Liveliness):
     """One session, bound to one robot's keys."""
 
     def __init__(
@@ -43,12 +43,12 @@ class Bus(Presence):
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._lock = threading.Lock()
 
-    def beside(self, robot: str) -> Bus:
+    def for_robot(self, robot: str) -> Bus:
         """Another robot's keys on the same session."""
         lossless = self._congestion == zenoh.CongestionControl.BLOCK
         return Bus(self._session, robot, self._security, lossless=lossless)
 
-    def withdraw(self) -> None:
+    def undeclare_all(self) -> None:
         """Undeclare all that was declared here: this robot is served no more."""
         declared: list[Any] = [*self._declared, *self._publishers.values()]
         self._declared.clear()

@@ -34,7 +34,7 @@ class Instance:
         return f"{self.started_ms:012x}~{host}~{self.pid}~{self.zid[:8]}"
 
 
-def spoken(name: str) -> str:
+def describe_instance(name: str) -> str:
     """For people."""
     instance = Instance.parse(name)
     return name if instance is None else f"process {instance.pid} on {instance.host}"
@@ -76,7 +76,7 @@ class Instances:
         return bool(leaders) and leaders[0] < self.me
 
 
-class OneSource:
+class SourceSelector:
     """Of several that publish what one should, only one is heard.
 
     That is the service's own instance, where one says that it leads, of two the elder; where none does (a replay, a

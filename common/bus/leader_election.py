@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from common.bus.bus import Bus, wait_until
-from common.bus.instances import Instances, spoken
+from common.bus.instances import Instances, describe_instance
 from common.errors import UserError
 from common.log import Logger
 
 LINKED_WITHIN = 0.5  # s that a service waits for its first link before it looks who else is there
 
 
-class Lead:
+class LeaderElection:
     """Waits for the lead, and gives it up to an elder."""
 
     def __init__(self, bus: Bus, service: str, log: Logger, wake: Callable[[], None]) -> None:
@@ -31,7 +31,7 @@ class Lead:
                 self._stands_by = self._bus.stand_by(self._service)
                 self._log.warning(
                     "standing by: another was there first; this one takes over when it is gone",
-                    leads=[spoken(name) for name in self._others.leaders()],
+                    leads=[describe_instance(name) for name in self._others.leaders()],
                 )
             return False
         if self._stands_by is not None:
@@ -49,6 +49,6 @@ class Lead:
         """Raises UserError where an elder instance leads as well: two halves of a network have met."""
         if self._others is not None and self._others.must_yield():
             raise UserError(
-                f"another {self._service} of {self._bus.robot!r}, {spoken(self._others.leaders()[0])}, was started "
+                f"another {self._service} of {self._bus.robot!r}, {describe_instance(self._others.leaders()[0])}, was started "
                 f"before this one and leads: this one ends. Started again, it stands by"
             )

@@ -18,7 +18,7 @@ from common.messages.wire import ENCODING
 TOLD_WITHIN = 0.3  # s for a subscriber to hear of those who were there before it
 
 
-class Presence:
+class Liveliness:
     """One robot's services on one session."""
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
@@ -177,9 +177,9 @@ class Presence:
 
     def linked(self) -> bool:
         """Whether any other session is reached."""
-        return self.links() > 0
+        return self.count_links() > 0
 
-    def links(self) -> int:
+    def count_links(self) -> int:
         """How many other sessions are reached directly."""
         return len(list(self._session.info.routers_zid())) + len(list(self._session.info.peers_zid()))
 

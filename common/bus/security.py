@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from common.errors import UserError, first_fault
-from common.messages.topics import ANYBODY, QUERIES, ROOT, TOPICS, Query, Topic
+from common.messages.topics import ALL_ROLES, QUERIES, ROOT, TOPICS, Query, Topic
 
 ROUTER = "router"
 IDENTITY, AUTHORITY, CERTIFICATE, KEY, PASSWORD = "identity.json", "ca.crt", "own.crt", "own.key", "password"
@@ -69,12 +69,12 @@ def may_put(role: str, topic: Topic) -> bool:
     """Whether the role may publish the topic."""
     if topic.per_service:
         return bool(service_of(role))
-    return role in (topic.put_by or (topic.publisher,)) or (role == "replay" and topic.recorded)
+    return role in (topic.publisher_roles or (topic.publisher,)) or (role == "replay" and topic.recorded)
 
 
 def may_ask(role: str, query: Query) -> bool:
     """Whether the role may ask the query."""
-    return role in query.asked_by
+    return role in query.requester_roles
 
 
 def may_answer(role: str, query: Query) -> bool:
@@ -94,7 +94,7 @@ def rules_of(member: Member) -> list[Rule]:
         return [row.key(robot, who) for robot in member.robots for row in rows]
 
     # A kept topic is told by services that heard it to those that come later.
-    kept = [t for t in TOPICS if t.kept] if service else []
+    kept = [t for t in TOPICS if t.latched] if service else []
     # A replay's health is that of the services it speaks for.
     own = "*" if role == "replay" else service
     rules: list[Rule] = [
@@ -184,7 +184,7 @@ class Credentials:
         if member.robots != EVERY_ROBOT and robot not in member.robots:
             raise UserError(f"{member.name!r} is for {', '.join(member.robots)}, not for robot {robot!r}")
         if member.role != ROUTER and not allowed(member.role, row):
-            what, who = ("ask", row.asked_by) if isinstance(row, Query) else ("put", row.put_by or (row.publisher,))
+            what, who = ("ask", row.requester_roles) if isinstance(row, Query) else ("put", row.publisher_roles or (row.publisher,))
             raise UserError(
                 f"role {member.role!r} may not {what} {row.name}: "
                 f"it takes one of {', '.join(who)} (--role, PRESAGE_ROLE; `presage secure show` lists all)"
@@ -230,7 +230,7 @@ def _read(folder: Path) -> Credentials:
         ) from None
     except ValidationError as error:
         raise UserError(f"{folder / IDENTITY}: {first_fault(error)}") from None
-    if member.role not in (ROUTER, *ANYBODY):
+    if member.role not in (ROUTER, *ALL_ROLES):
         raise UserError(f"{folder / IDENTITY}: no role {member.role!r}; there are {', '.join(ROLES)}")
     return Credentials(folder.resolve(), member, password, members)
 

@@ -18,7 +18,7 @@ import time
 from collections.abc import Collection
 from pathlib import Path
 
-from common.containers.run_per_robot import names
+from common.containers.run_per_robot import robot_names
 from common.runtime.heartbeat import Beat, read_beats
 
 STALE = 4.0  # s without a heartbeat, one comes each second
@@ -50,7 +50,7 @@ def main(service: str) -> None:
     if service == "router":
         _reach_router()
         return
-    folder, robots = Path(os.environ.get("PRESAGE_HEARTBEAT") or "/tmp"), names(os.environ)  # noqa: S108 - the images'
+    folder, robots = Path(os.environ.get("PRESAGE_HEARTBEAT") or "/tmp"), robot_names(os.environ)  # noqa: S108 - the images'
     if fault := fault_of(service, read_beats(folder, service), robots, time.monotonic()):
         raise ValueError(fault)
     if service == "viewer":

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import FrameType
 
-from common.processes import dying_with_us
+from common.processes import end_with_this_process
 
 HELP = """usage: python -m common.containers.run_per_robot each|together|once MODULE [ARGUMENT ...]
 
@@ -35,7 +35,7 @@ LOOK = 0.1  # s between two looks at the processes
 GRACE = 12.0  # s between asking and killing; compose kills us after 15
 
 
-def names(environment: Mapping[str, str]) -> list[str]:
+def robot_names(environment: Mapping[str, str]) -> list[str]:
     """The robots; raises ValueError where their number is none."""
     base, text = environment.get("PRESAGE_ROBOT") or "robot", environment.get("PRESAGE_FLEET") or "1"
     if not re.fullmatch(r"[0-9]{1,3}", text) or not 1 <= int(text) <= MOST:
@@ -50,7 +50,7 @@ def main(argv: list[str]) -> int:
         return 0
     mode, *module = argv
     try:
-        robots = names(os.environ)
+        robots = robot_names(os.environ)
     except ValueError as error:
         return _refuse(str(error))
     if mode not in MODES or not module:
@@ -131,7 +131,7 @@ class Fleet:
             text=True,
             errors="replace",
             start_new_session=True,  # a terminal's Ctrl-C is ours to pass on
-            preexec_fn=dying_with_us(),  # noqa: PLW1509 - one call, before any thread of the child
+            preexec_fn=end_with_this_process(),  # noqa: PLW1509 - one call, before any thread of the child
         )
         member.began, member.due = now, None
         member.passing = threading.Thread(target=_pass_on, args=(member.robot, member.child), daemon=True)

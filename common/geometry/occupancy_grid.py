@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 Cells = npt.NDArray[np.uint8]
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, 255  # as in nav_msgs/OccupancyGrid, whose -1 is 255 in a byte without a sign
-MOST_CELLS = 16_000_000  # 4000 by 4000
+MAX_CELLS = 16_000_000  # 4000 by 4000
 KEPT = 4  # maps whose shapes are remembered
 
 
@@ -40,11 +40,11 @@ class OccupancyGrid(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    width: Annotated[int, Field(ge=1, le=MOST_CELLS)]  # cells along the map's own x
-    height: Annotated[int, Field(ge=1, le=MOST_CELLS)]  # cells along its y
+    width: Annotated[int, Field(ge=1, le=MAX_CELLS)]  # cells along the map's own x
+    height: Annotated[int, Field(ge=1, le=MAX_CELLS)]  # cells along its y
     resolution: Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e3)]  # m, a cell's edge
     origin: tuple[Coordinate, Coordinate, Angle]  # m, m, rad: lower left corner of the first cell, in map
-    cells: Annotated[str, Field(max_length=4 * MOST_CELLS)]
+    cells: Annotated[str, Field(max_length=4 * MAX_CELLS)]
     # base64 of zlib of a byte a cell, row by row from the lower left: 0 free, 100 occupied, 255 unknown
 
     @classmethod
@@ -56,8 +56,8 @@ class OccupancyGrid(BaseModel):
 
     @model_validator(mode="after")
     def _cells_are_cells(self) -> OccupancyGrid:
-        if self.width * self.height > MOST_CELLS:
-            raise ValueError(f"{self.width} x {self.height} cells are more than {MOST_CELLS}")
+        if self.width * self.height > MAX_CELLS:
+            raise ValueError(f"{self.width} x {self.height} cells are more than {MAX_CELLS}")
         _unpacked(self.cells, self.width, self.height)
         return self
 
@@ -167,7 +167,7 @@ class GridShapes:
             away[found[0]] = distance
         return np.where(within, -away, away)
 
-    def lattice(self, kind: int, x: Array, y: Array, most: float = np.inf) -> Array:
+    def lattice_distances(self, kind: int, x: Array, y: Array, most: float = np.inf) -> Array:
         """(len(y), len(x)) m: `distance` of nodes in map, ascending, as far as ``most``; fast on a map not turned."""
         grid = self.grid
         if grid.origin[2]:
@@ -176,7 +176,7 @@ class GridShapes:
         x, y = (x - grid.origin[0]) / grid.resolution, (y - grid.origin[1]) / grid.resolution
         return signed_distance(grid.values == kind, x, y, most / grid.resolution) * grid.resolution
 
-    def roomy(self, clearance: float) -> npt.NDArray[np.int_]:
+    def cells_with_clearance(self, clearance: float) -> npt.NDArray[np.int_]:
         """(K, 2) column and row of the free cells with ``clearance`` m or more from middle to edge of free space."""
         free, size = self.grid.values == FREE, self.grid.resolution
         if clearance <= size / 2:
@@ -184,7 +184,7 @@ class GridShapes:
         x, y = (np.arange(side, dtype=float) + 0.5 for side in (self.grid.width, self.grid.height))
         return np.argwhere(inner_distance(free, x, y, clearance / size + 1) * size >= clearance)[:, ::-1]
 
-    def within(self, cells: npt.NDArray[np.int_], shares: npt.ArrayLike) -> Array:
+    def points_in_cells(self, cells: npt.NDArray[np.int_], shares: npt.ArrayLike) -> Array:
         """(N, 2) m in map, at ``shares`` (N, 2) of the edges of cells (N, 2) column, row."""
         return self.grid.to_map((cells + np.asarray(shares)) * self.grid.resolution)
 

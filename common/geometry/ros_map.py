@@ -15,7 +15,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from common.errors import UserError
-from common.geometry.occupancy_grid import FREE, MOST_CELLS, OCCUPIED, UNKNOWN, OccupancyGrid
+from common.geometry.occupancy_grid import FREE, MAX_CELLS, OCCUPIED, UNKNOWN, OccupancyGrid
 from common.limits import Angle, Coordinate
 
 if TYPE_CHECKING:
@@ -125,9 +125,9 @@ def _pixels(path: Path) -> tuple[Array, Array | None]:
         raise UserError(f"map image {path}: not a file but a folder, a pipe or a device")
     try:
         with Image.open(path) as image:
-            if image.width * image.height > MOST_CELLS:
+            if image.width * image.height > MAX_CELLS:
                 raise UserError(
-                    f"map image {path}: {image.width} x {image.height} pixels are more than {MOST_CELLS}; "
+                    f"map image {path}: {image.width} x {image.height} pixels are more than {MAX_CELLS}; "
                     "crop it, or scale it down and make the resolution coarser"
                 )
             return _shares(image)

@@ -148,14 +148,14 @@ class World(Model):
         nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         if self.grid is None:
             return self.clearance(nodes).reshape(len(y), len(x))
-        away = 0.0 - self.grid.shapes.lattice(FREE, x, y)  # never -0.0
+        away = 0.0 - self.grid.shapes.lattice_distances(FREE, x, y)  # never -0.0
         return self._off_furniture(nodes, away.ravel()).reshape(len(y), len(x))
 
     def surface_distances(self, x: Array, y: Array, most: float) -> Array:
         """(len(y), len(x)) m to what a laser sees, at most ``most``; negative behind it. It sees no unknown cells."""
         if self.grid is not None:
             nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-            away = self._off_furniture(nodes, self.grid.shapes.lattice(OCCUPIED, x, y, most).ravel())
+            away = self._off_furniture(nodes, self.grid.shapes.lattice_distances(OCCUPIED, x, y, most).ravel())
             return np.clip(away, -most, most).reshape(len(y), len(x))
         columns = [self._free_area.signed(np.column_stack([np.full(len(y), at), y])) for at in x]
         return np.clip(np.stack(columns, axis=1), -most, most)
@@ -184,11 +184,11 @@ class World(Model):
         """`sample_free` on a grid: places in cells that may be far enough from everything, those that are."""
         assert self.grid is not None  # noqa: S101 - asked for grids alone
         shapes = self.grid.shapes
-        cells = shapes.roomy(clearance - self.grid.resolution)  # half a diagonal and more: no place is forgotten
+        cells = shapes.cells_with_clearance(clearance - self.grid.resolution)  # half a diagonal and more: no place is forgotten
         found, left = [np.zeros((0, 2))], LOOKS
         while left and len(cells) and sum(map(len, found)) < count:
             chosen = rng.integers(len(cells), size=max(count, 256))
-            points = shapes.within(cells[chosen], rng.random((len(chosen), 2)))
+            points = shapes.points_in_cells(cells[chosen], rng.random((len(chosen), 2)))
             found.append(points[self.clearance(points) >= clearance])
             left = left if len(found[-1]) else left - 1
         if sum(map(len, found)) < count:
@@ -204,7 +204,7 @@ class World(Model):
             return np.array([self.start.x, self.start.y, np.deg2rad(self.start.yaw_deg)])
         if self.grid is not None:
             shapes = self.grid.shapes
-            places = shapes.within(shapes.roomy(clearance), 0.5)
+            places = shapes.points_in_cells(shapes.cells_with_clearance(clearance), 0.5)
             places = places[self._off_furniture(places, np.full(len(places), np.inf)) >= clearance]
             if not len(places):
                 raise self._no_room(clearance)

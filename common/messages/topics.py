@@ -10,12 +10,12 @@ from common.messages import requests as r
 
 ROOT = "presage"
 # Roles, as they stand in certificates; what each is for: common/bus/security.py. Services have the role of their name.
-CONTROL = ("operator", "viewer-control")  # may move the robot, delete, or change what runs
-SERVICES = ("simulator", "bridge_ros2", "estimator", "controller", "recorder", "viewer", "viewer-control")
-ROBOT = ("simulator", "bridge_ros2")  # speaks for the robot
-ASKS = (*CONTROL, "bridge_ros2")  # whoever sits at rviz
-WORKING = (*SERVICES, "operator")  # may ask for work that costs time
-ANYBODY = (*SERVICES, "operator", "observer", "replay", "remote")
+CONTROL_ROLES = ("operator", "viewer-control")  # may move the robot, delete, or change what runs
+SERVICE_ROLES = ("simulator", "bridge_ros2", "estimator", "controller", "recorder", "viewer", "viewer-control")
+ROBOT_ROLES = ("simulator", "bridge_ros2")  # speaks for the robot
+GOAL_ROLES = (*CONTROL_ROLES, "bridge_ros2")  # whoever sits at rviz
+COMPUTE_ROLES = (*SERVICE_ROLES, "operator")  # may ask for work that costs time
+ALL_ROLES = (*SERVICE_ROLES, "operator", "observer", "replay", "remote")
 MAX_BYTES = 1 << 20  # a larger payload is not even queued
 
 
@@ -30,9 +30,9 @@ class Topic:
     queue: Literal["newest", "all"]  # what a receiver keeps that falls behind; the recorder keeps all of everything
     recorded: bool = True
     per_service: bool = False  # one key a service, beneath the topic's own
-    many: bool = False  # several may publish it at once; else the first counts until it is silent
-    kept: bool = False  # whoever hears it tells the last one to services that come later
-    put_by: tuple[str, ...] = ()  # roles; none: the publisher's, and of a per-service topic each service its own
+    multiple_publishers: bool = False  # several may publish it at once; else the first counts until it is silent
+    latched: bool = False  # whoever hears it tells the last one to services that come later
+    publisher_roles: tuple[str, ...] = ()  # roles; none: the publisher's, and of a per-service topic each service its own
     about: str = ""
 
     def key(self, robot: str, service: str = "*") -> str:
@@ -49,7 +49,7 @@ class Query:
     reply: type[r.Reply]
     server: str
     per_service: bool = False
-    asked_by: tuple[str, ...] = CONTROL  # roles
+    requester_roles: tuple[str, ...] = CONTROL_ROLES  # roles
     about: str = ""
 
     def key(self, robot: str, service: str = "*") -> str:
@@ -57,19 +57,19 @@ class Query:
         return f"{ROOT}/{robot}/{self.name}" + (f"/{service}" if self.per_service else "")
 
 
-SCAN = Topic("scan", m.Scan, "simulator", 15, "newest", put_by=ROBOT, about="what the laser sees")
-ODOM = Topic("odom", m.Odom, "simulator", 15, "newest", put_by=ROBOT, about="dead reckoning, drifts")
+SCAN = Topic("scan", m.Scan, "simulator", 15, "newest", publisher_roles=ROBOT_ROLES, about="what the laser sees")
+ODOM = Topic("odom", m.Odom, "simulator", 15, "newest", publisher_roles=ROBOT_ROLES, about="dead reckoning, drifts")
 TRUTH = Topic("truth", m.Truth, "simulator", 15, "newest", about="where the robot really is")
 BELIEF = Topic("belief", m.Belief, "estimator", 15, "newest", about="where the estimator believes it is, and F")
 PREDICTION = Topic("prediction", m.Prediction, "estimator", 15, "newest", about="the scan expected at the belief")
 CMD_VEL = Topic("cmd_vel", m.CmdVel, "controller", 15, "newest", about="velocity command")
 GOAL = Topic(
-    "goal", m.Goal, "presage goal, viewer", 0, "newest", many=True, kept=True, put_by=ASKS, about="where to go"
+    "goal", m.Goal, "presage goal, viewer", 0, "newest", multiple_publishers=True, latched=True, publisher_roles=GOAL_ROLES, about="where to go"
 )
 DRIVE = Topic(
-    "drive", m.Drive, "viewer", 0, "newest", many=True, put_by=CONTROL, about="velocity by hand, before any goal"
+    "drive", m.Drive, "viewer", 0, "newest", multiple_publishers=True, publisher_roles=CONTROL_ROLES, about="velocity by hand, before any goal"
 )
-STATUS = Topic("status", m.Status, "controller", 15, "newest", kept=True, about="what the controller does, and why")
+STATUS = Topic("status", m.Status, "controller", 15, "newest", latched=True, about="what the controller does, and why")
 PLAN = Topic("plan", m.Plan, "controller", 0, "newest", about="the way ahead, and what the map does not know")
 PREFERENCE = Topic(
     "preference",
@@ -80,7 +80,7 @@ PREFERENCE = Topic(
     about="the goal prior, on change and every 5 s",
 )
 HEALTH = Topic(
-    "health", m.Health, "every service", 1, "all", per_service=True, many=True, about="counters of a service"
+    "health", m.Health, "every service", 1, "all", per_service=True, multiple_publishers=True, about="counters of a service"
 )
 
 TOPICS: tuple[Topic, ...] = (
@@ -110,22 +110,22 @@ SAMPLE = Query(
     r.SampleRequest,
     r.SampleReply,
     "simulator",
-    asked_by=WORKING,
+    requester_roles=COMPUTE_ROLES,
     about="the scans seen from a batch of poses",
 )
-WORLD = Query("world", r.Request, r.WorldReply, "simulator", asked_by=ANYBODY, about="world, scanner and robot as data")
-LOCALISE = Query("localise", r.LocaliseRequest, r.Reply, "estimator", asked_by=ASKS, about="begin localisation anew")
+WORLD = Query("world", r.Request, r.WorldReply, "simulator", requester_roles=ALL_ROLES, about="world, scanner and robot as data")
+LOCALISE = Query("localise", r.LocaliseRequest, r.Reply, "estimator", requester_roles=GOAL_ROLES, about="begin localisation anew")
 PLAYER = Query("player", r.PlayerRequest, r.PlayerReply, "replay", about="pause, step, seek a replay")
 RECORDING = Query("recording", r.RecordRequest, r.RecordReply, "recorder", about="begin or end a recording")
 MODEL = Query(
-    "model", r.ModelRequest, r.ModelReply, "estimator", asked_by=ANYBODY, about="the model in use: card, map, weights"
+    "model", r.ModelRequest, r.ModelReply, "estimator", requester_roles=ALL_ROLES, about="the model in use: card, map, weights"
 )
 PREDICT = Query(
     "predict",
     r.PredictRequest,
     r.PredictReply,
     "estimator",
-    asked_by=WORKING,
+    requester_roles=COMPUTE_ROLES,
     about="the scans expected from poses",
 )
 CONFIG = Query(
@@ -134,7 +134,7 @@ CONFIG = Query(
     r.ConfigReply,
     "every service",
     per_service=True,
-    asked_by=ANYBODY,
+    requester_roles=ALL_ROLES,
     about="effective configuration",
 )
 

@@ -17,7 +17,7 @@ Numbers = TypeVar("Numbers", np.float32, np.float64)
 NOT_MEASURED = 0.0  # m
 
 
-def as_scan(ranges: npt.NDArray[Numbers], range_min: float, range_max: float) -> npt.NDArray[Numbers]:
+def normalise_driver_ranges(ranges: npt.NDArray[Numbers], range_min: float, range_max: float) -> npt.NDArray[Numbers]:
     """A driver's numbers (...) m as a scan message has them; limits in m.
 
     From ``range_max`` on nothing is within it: drivers give that very number, or a greater one, where nothing came
@@ -37,6 +37,6 @@ def surfaces(ranges: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
     return np.asarray(np.isfinite(ranges) & (ranges > 0))
 
 
-def about_place(ranges: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+def ranges_for_localisation(ranges: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     """(...) m as estimators take them: whatever says nothing about the place, too close or not measured, is -inf."""
     return np.where(surfaces(ranges) | np.isposinf(ranges), ranges, -np.inf).astype(np.float64)

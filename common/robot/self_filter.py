@@ -19,11 +19,11 @@ from common.robot.scan_geometry import Sweep
 if TYPE_CHECKING:
     from common.messages.definitions import Scan
 
-WIDE = float(np.deg2rad(30))  # a blind sector wider than this is taken out of the field of view; a post is not
+MIN_TRIMMED_SECTOR_RAD = float(np.deg2rad(30))  # a blind sector wider than this is taken out of the field of view; a post is not
 
 
 @dataclass(frozen=True)
-class Blind:
+class SelfFilter:
     """Of one scanner; nothing is cut out unless told."""
 
     sectors: tuple[tuple[float, float], ...] = ()  # rad, lower and upper bound, in laser, seen from above
@@ -34,11 +34,11 @@ class Blind:
         """Whether there is anything to cut out."""
         return bool(self.sectors) or self.radius > 0
 
-    def silenced(self, scan: Scan) -> Scan:
+    def mask_for_bus(self, scan: Scan) -> Scan:
         """For the bus: beams cut out are not measured."""
         return self._with(scan, self._cut(scan), NOT_MEASURED) if self.anything else scan
 
-    def seen(self, scan: Scan) -> Scan:
+    def mask_for_planning(self, scan: Scan) -> Scan:
         """For who brakes and plans, never for the bus: beams cut out are NaN; a wide sector is no more in the sweep.
 
         In the middle of a scan that does not go all round it cannot be left out: there the beams are NaN alone.
@@ -51,7 +51,7 @@ class Blind:
         if sweep.all_round and cut.any() and not cut.all():
             shift = _after_longest(cut)  # the longest run goes to the end, where it can be left out
             cut = np.roll(cut, -shift)
-        least = max(1, round(WIDE / sweep.spacing)) if sweep.spacing else len(cut) + 1
+        least = max(1, round(MIN_TRIMMED_SECTOR_RAD / sweep.spacing)) if sweep.spacing else len(cut) + 1
         first, last = _run(cut), _run(cut[::-1])
         first, last = (run if run >= least else 0 for run in (first, last))
         if first + last >= len(cut) or not (first or last):

@@ -27,4 +27,4 @@ class RouterMetrics(Collector):
         """At a scrape."""
         yield build_info("", "router")
         yield family("presage_router_uptime_seconds", [((), time.monotonic() - self._began)])
-        yield family("presage_router_sessions", [((), self._bus.links())])
+        yield family("presage_router_sessions", [((), self._bus.count_links())])

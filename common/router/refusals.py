@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
-from common.log import Logger, OncePerSecond
+from common.log import Logger, LogRateLimiter
 from common.messages.topics import QUERIES, TOPICS
 
 # Level error, as everywhere, and those lines that tell of refusals.
@@ -54,7 +54,7 @@ class Refusal:
 
 
 @dataclass
-class Reader:
+class ZenohLogParser:
     """Makes sense of zenoh's log, line by line."""
 
     _names: dict[str, str] = field(default_factory=dict)  # by address, then by zenoh's id
@@ -105,7 +105,7 @@ class Refusals:
     def __init__(self, log: Logger) -> None:
         """Nothing yet."""
         self.counts: Counter[str] = Counter()  # by why
-        self._log, self._may_log, self._reader = log, OncePerSecond(), Reader()
+        self._log, self._may_log, self._reader = log, LogRateLimiter(), ZenohLogParser()
 
     def take(self, line: str) -> None:
         """One line of zenoh's log."""

@@ -16,7 +16,7 @@ from pydantic_settings import CliSuppress
 
 from common.bus.bus import DEFAULT_ENDPOINT, Link, open_bus
 from common.errors import UserError
-from common.log import Logger, begin_logging, logger, say_failure, set_up_logging
+from common.log import Logger, begin_logging, logger, report_failure, set_up_logging
 from common.router.refusals import LOG_FILTER, Refusals, listening_to_zenoh
 from common.runtime.config import ServiceSettings, load_settings, split_endpoints
 
@@ -70,7 +70,7 @@ def main(argv: list[str] | None = None) -> None:
         log = logger(RouterSettings.service)
         route(settings.link(), log, settings.metrics)
     except UserError as error:
-        say_failure(RouterSettings.service, error)
+        report_failure(RouterSettings.service, error)
         sys.exit(2)
 
 

@@ -23,29 +23,29 @@ COMPARED = ("presage", "eclipse-zenoh")  # packages whose versions should be the
 WITHIN = 0.3  # s, that a start waits for a link, and then for answers; who answers later is judged later
 ANSWER = 5.0  # s, for an answer to come while the service works
 ATTEMPTS = 3
-TOGETHER = 1.0  # s between two starts of which nobody can say which was first
+SIMULTANEOUS_START_S = 1.0  # s between two starts of which nobody can say which was first
 
 
-def this_service(name: str, config: str, uptime: float = 0.0) -> ConfigReply:
+def build_config_reply(name: str, config: str, uptime: float = 0.0) -> ConfigReply:
     """What a service says of itself; ``config`` is JSON, ``uptime`` s."""
     return ConfigReply(
         service=name, config=config, versions=versions(), protocol=PROTOCOL, host=platform.node()[:200], uptime=uptime
     )
 
 
-def fits(mine: ConfigReply, other: ConfigReply) -> bool:
+def same_protocol(mine: ConfigReply, other: ConfigReply) -> bool:
     """Whether both speak the same protocol; who does not say is believed to."""
     return not other.protocol or not mine.protocol or other.protocol == mine.protocol
 
 
-def came_later(mine: ConfigReply, other: ConfigReply) -> bool:
+def started_later(mine: ConfigReply, other: ConfigReply) -> bool:
     """Whether we are the one that came to the other; the older protocol where both came at once."""
-    if abs(mine.uptime - other.uptime) < TOGETHER:
+    if abs(mine.uptime - other.uptime) < SIMULTANEOUS_START_S:
         return mine.protocol < other.protocol
     return mine.uptime < other.uptime
 
 
-def difference(mine: ConfigReply, other: ConfigReply) -> str:
+def describe_version_differences(mine: ConfigReply, other: ConfigReply) -> str:
     """Both sides' packages where they differ: ``presage 0.1.0 here, 0.2.0 there``; empty: they do not."""
     pairs = [(name, mine.versions.get(name), other.versions.get(name)) for name in COMPARED]
     return "; ".join(
@@ -53,7 +53,7 @@ def difference(mine: ConfigReply, other: ConfigReply) -> str:
     )
 
 
-def misfit(mine: ConfigReply, other: ConfigReply) -> str:
+def describe_mismatch(mine: ConfigReply, other: ConfigReply) -> str:
     """One line that names both protocols and hosts, and what to do."""
     return (
         f"protocol {mine.protocol} here ({_at(mine)}), "
@@ -66,7 +66,7 @@ def _at(service: ConfigReply) -> str:
     return f"presage {service.versions.get('presage', 'unknown')} on {service.host or 'an unknown host'}"
 
 
-class Compatibility:
+class ProtocolCheck:
     """One service's look at the others."""
 
     def __init__(self, bus: Bus, me: str, log: Logger) -> None:
@@ -77,14 +77,14 @@ class Compatibility:
         self._asked: dict[str, tuple[float, int]] = {}  # who owes an answer: when asked, how often
         self._warned: set[str] = set()
 
-    def at_start(self, mine: ConfigReply) -> None:
+    def check_at_start(self, mine: ConfigReply) -> None:
         """Before we are there for others; raises UserError where one that is there speaks another protocol."""
         if not wait_until(self._bus.linked, WITHIN):
             return
         wait_until(self._asked_somebody, WITHIN)  # a session that has just opened does not know yet who is there
         for other in self._answers():
-            if not fits(mine, other):
-                raise UserError(misfit(mine, other))
+            if not same_protocol(mine, other):
+                raise UserError(describe_mismatch(mine, other))
             self._compare(mine, other)
 
     def _asked_somebody(self) -> bool:
@@ -96,18 +96,18 @@ class Compatibility:
         self._bus.watch_alive(lambda name, there: self._came.put(name) if there else None)
 
     def look(self, mine: Callable[[], ConfigReply]) -> None:
-        """Now and then: ask who came, judge who answered; raises UserError as `at_start` where we came later."""
+        """Now and then: ask who came, judge who answered; raises UserError as `check_at_start` where we came later."""
         self._ask()
         if not len(self._inbox):
             return
         me = mine()
         for other in self._answers():
             self._asked.pop(other.service, None)
-            if not fits(me, other):
-                if came_later(me, other):
-                    raise UserError(misfit(me, other))
-                self._log.error(misfit(me, other))
-            elif came_later(me, other):
+            if not same_protocol(me, other):
+                if started_later(me, other):
+                    raise UserError(describe_mismatch(me, other))
+                self._log.error(describe_mismatch(me, other))
+            elif started_later(me, other):
                 self._compare(me, other)
 
     def _ask(self) -> None:
@@ -133,7 +133,7 @@ class Compatibility:
 
     def _compare(self, mine: ConfigReply, other: ConfigReply) -> None:
         """Other packages may work; it is worth one line."""
-        if (text := difference(mine, other)) and text not in self._warned:
+        if (text := describe_version_differences(mine, other)) and text not in self._warned:
             self._warned.add(text)
             there = f"{other.service} on {other.host or 'an unknown host'}"
             self._log.warning(f"other versions in the {there}: {text}", here=mine.host)

@@ -10,7 +10,7 @@ from pydantic import Field
 from common.errors import UserError
 from common.geometry.pose_text import NUMBER
 from common.robot.base import Robot
-from common.robot.self_filter import Blind
+from common.robot.self_filter import SelfFilter
 from common.runtime.config import ServiceSettings
 
 BOUNDS = rf"{NUMBER}:{NUMBER}"
@@ -50,7 +50,7 @@ class RobotSettings(ServiceSettings):
         Field(gt=0, le=100, allow_inf_nan=False, description="rad/s², the same of turning"),
     ] = 3.0
 
-    def the_robot(self) -> Robot:
+    def build_robot(self) -> Robot:
         """Its limits; raises UserError where they do not go together."""
         for speed, acceleration, unit in (
             ("max_speed", "acceleration", "m/s"),
@@ -89,7 +89,7 @@ class SeenRobotSettings(RobotSettings):
         ),
     ] = 0.0  # fmt: skip
 
-    def the_blind(self) -> Blind:
+    def build_self_filter(self) -> SelfFilter:
         """What is cut out of each scan; raises UserError where bounds are none."""
         sectors = []
         for text in filter(None, self.ignore_angles.split(",")):
@@ -104,4 +104,4 @@ class SeenRobotSettings(RobotSettings):
             raise UserError(
                 f"--ignore-angles {self.ignore_angles}: that is all round, and nothing would be seen at all"
             )
-        return Blind(tuple(sectors), self.blind_radius)
+        return SelfFilter(tuple(sectors), self.blind_radius)

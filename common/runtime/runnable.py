@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 
-class Runs(Protocol):
+class Runnable(Protocol):
     """Whatever runs until it is told to stop."""
 
     def run(self) -> None:

@@ -10,7 +10,7 @@ from common.messages.definitions import Scan
 from common.robot.base import Robot
 from common.robot.ranges import surfaces
 
-LATENCY = 2 / 15  # s: the scan is up to one period old, and the command holds for another
+REACTION_TIME_S = 2 / 15  # s: the scan is up to one period old, and the command holds for another
 SIDE = 0.01  # m beside the footprint that must be free as well
 STEP = 1 / 60  # s between the points of a way looked at: 17 mm at 1 m/s, 0.1 mm off between two of them
 
@@ -52,7 +52,7 @@ def ramp(current: Array, wanted: Array, robot: Robot, dt: float, *, hard: bool =
 
 
 def limit_velocity(
-    twist: Array, points: Array, robot: Robot, current: Array | None = None, hold: float = LATENCY
+    twist: Array, points: Array, robot: Robot, current: Array | None = None, hold: float = REACTION_TIME_S
 ) -> tuple[Array, bool]:
     """The twist (3,) slowed so that the robot can brake before any of ``points`` (K, 2) m in base_link; whether it was.
 
@@ -94,8 +94,8 @@ def _straight_scale(twist: Array, points: Array, robot: Robot) -> float:
         return 1.0
     reach = np.sqrt(np.maximum((robot.radius + SIDE) ** 2 - aside[in_way] ** 2, 0.0))
     gap = max(0.0, float(np.min(along[in_way] - reach)) - robot.margin)
-    # v LATENCY + v² / 2a <= gap
-    allowed = robot.acceleration * (np.sqrt(LATENCY**2 + 2 * gap / robot.acceleration) - LATENCY)
+    # v REACTION_TIME_S + v² / 2a <= gap
+    allowed = robot.acceleration * (np.sqrt(REACTION_TIME_S**2 + 2 * gap / robot.acceleration) - REACTION_TIME_S)
     return min(1.0, float(allowed) / speed)
 
 

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, ClassVar, TypeVar
 from common.bus.bus import Bus, open_bus
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
-from common.log import Logger, begin_logging, logger, say_failure, set_up_logging
+from common.log import Logger, begin_logging, logger, report_failure, set_up_logging
 from common.messages.definitions import Stamped
 from common.messages.requests import Reply, Request
 from common.messages.topics import Query, Topic
 from common.messages.wire import DecodeError
 from common.runtime.config import ServiceSettings, load_settings
-from common.runtime.runnable import Runs
+from common.runtime.runnable import Runnable
 from common.runtime.service_loop import Loop
 
 if TYPE_CHECKING:
@@ -36,8 +36,8 @@ class Service(ABC):
     keep_all: ClassVar[bool] = False  # every payload of every input, whatever the queue policy
     all_robots: ClassVar[bool] = False  # it hears more than its own robot
     single: ClassVar[bool] = False  # one instance leads; others wait until it is gone
-    keeps: ClassVar[tuple[Topic, ...]] = ()  # kept topics it remembers for those who come later
-    recalls: ClassVar[tuple[Topic, ...]] = ()  # kept topics whose last message it wants before anything else
+    serves_latched: ClassVar[tuple[Topic, ...]] = ()  # kept topics it remembers for those who come later
+    restores_latched: ClassVar[tuple[Topic, ...]] = ()  # kept topics whose last message it wants before anything else
 
     def __init__(self, settings: ServiceSettings) -> None:
         """Keep the settings; whatever may fail belongs in `open`."""
@@ -66,14 +66,14 @@ class Service(ABC):
             return
         self.on_message(sample.topic, message)
 
-    def counted(self, key: str) -> dict[str, int]:  # noqa: ARG002
+    def extra_counts(self, key: str) -> dict[str, int]:  # noqa: ARG002
         """More fields of this key's row in health."""
         return {}
 
     def on_message(self, topic: Topic, message: Stamped) -> None:
         """A valid message came."""
 
-    def on_kept(self, last: dict[Topic, Stamped]) -> None:
+    def on_restored(self, last: dict[Topic, Stamped]) -> None:
         """What others remember of the topics it ``recalls``, once, before anything else comes."""
 
     def on_request(self, query: Query, request: Request) -> Reply:
@@ -97,7 +97,7 @@ class Service(ABC):
         """Send a message with the next sequence number of its key."""
         self.loop.publish(topic, message)
 
-    def loop_on(self, bus: Bus) -> Runs:
+    def make_loop(self, bus: Bus) -> Runnable:
         """What runs this service on a session."""
         return Loop(self, bus, Inbox())
 
@@ -111,14 +111,14 @@ class _Ending:
 
     def __init__(self) -> None:
         self.asked = False
-        self.loop: Runs | None = None
+        self.loop: Runnable | None = None
 
     def __call__(self, _signal: int, _frame: FrameType | None) -> None:
         self.asked = True
         if self.loop is not None:
             self.loop.stop()
 
-    def run(self, loop: Runs) -> None:
+    def run(self, loop: Runnable) -> None:
         self.loop = loop
         if self.asked:
             loop.stop()
@@ -138,8 +138,8 @@ def main(settings_class: type[S], make: Callable[[S], Service], argv: list[str] 
         )
         service = make(settings)
         with open_bus(settings.link(), give_up=lambda: ending.asked) as bus:
-            ending.run(service.loop_on(bus))
+            ending.run(service.make_loop(bus))
         service.log.info("ended")
     except UserError as error:
-        say_failure(settings_class.service, error)
+        report_failure(settings_class.service, error)
         sys.exit(2)

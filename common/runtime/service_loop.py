@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING
 
 from common.bus.bus import Bus
 from common.bus.inbox import Answer, Call, Inbox, Sample
-from common.bus.instances import OneSource
-from common.bus.leader_election import Lead
+from common.bus.instances import SourceSelector
+from common.bus.leader_election import LeaderElection
 from common.errors import UserError
-from common.log import OncePerSecond
+from common.log import LogRateLimiter
 from common.messages.definitions import Health, Stamped, TopicHealth
 from common.messages.requests import ConfigReply, Request
 from common.messages.topics import CONFIG, HEALTH, Query, Topic
 from common.messages.wire import DecodeError
 from common.runtime.heartbeat import Heartbeat
-from common.runtime.protocol_check import Compatibility, this_service
+from common.runtime.protocol_check import ProtocolCheck, build_config_reply
 
 if TYPE_CHECKING:
     from common.runtime.metrics import ServiceMetrics
@@ -41,16 +41,16 @@ class Loop:
         self.undecodable: Counter[str] = Counter()
         self.failed = 0
         self._asked = 0
-        self._may_log = OncePerSecond()
+        self._may_log = LogRateLimiter()
         self._heart = Heartbeat(service.settings.heartbeat, service.name, bus.robot)
         self._stopping = False
         self.began = self._health_at = self._counted_at = time.monotonic()
         self._before: Counter[str] = Counter()
-        self._sources = OneSource(SOURCE_SILENT)
+        self._sources = SourceSelector(SOURCE_SILENT)
         self._recall_until = 0.0
-        self._lead = Lead(bus, service.name, service.log, inbox.wake) if service.single else None
+        self._lead = LeaderElection(bus, service.name, service.log, inbox.wake) if service.single else None
         self._metrics: ServiceMetrics | None = None
-        self._others = Compatibility(bus, service.name, service.log)
+        self._others = ProtocolCheck(bus, service.name, service.log)
         service._loop = self  # noqa: SLF001 - the two halves of one thing
 
     def run(self) -> None:
@@ -66,7 +66,7 @@ class Loop:
     def _run(self) -> None:
         self.open()
         try:
-            while not self._stopping and not self.begins():
+            while not self._stopping and not self.try_start():
                 self.inbox.get(HEALTH_PERIOD / 2)
                 self._heart.beat({}, linked=self.bus.linked(), note="standing by")
             while not self._stopping:
@@ -76,17 +76,17 @@ class Loop:
 
     def open(self) -> None:
         """Before anything is heard; raises UserError where others speak another protocol, or the service cannot."""
-        self._others.at_start(self._config())
+        self._others.check_at_start(self._config())
         self.service.open()
 
-    def begins(self) -> bool:
+    def try_start(self) -> bool:
         """Hear, answer, and say last that the service is there; False while another instance leads."""
         if self._lead is not None and not self._lead.takes():
             return False
         service, bus = self.service, self.bus
         if not service.keep_all:
             bus.watch_instances(self._sources.change, "*" if service.all_robots else None)
-        for kept in service.keeps:
+        for kept in service.serves_latched:
             bus.keep(kept)
         self._recall_until = time.monotonic() + RECALL_WITHIN
         self._recall()
@@ -103,13 +103,13 @@ class Loop:
 
     def _recall(self) -> None:
         """Once somebody knows: after a router's death all have to find one another first."""
-        if self.service.recalls and time.monotonic() < self._recall_until and (found := self._recalled()):
+        if self.service.restores_latched and time.monotonic() < self._recall_until and (found := self._recalled()):
             self._recall_until = 0.0
-            self.guard(lambda: self.service.on_kept(found))
+            self.guard(lambda: self.service.on_restored(found))
 
     def _recalled(self) -> dict[Topic, Stamped]:
         found: dict[Topic, Stamped] = {}
-        for topic in self.service.recalls:
+        for topic in self.service.restores_latched:
             if (payload := self.bus.kept(topic)) is not None:
                 try:
                     found[topic] = topic.message.decode(payload)
@@ -182,9 +182,9 @@ class Loop:
 
     def _counts(self, sample: Sample) -> bool:
         """Not where a second source publishes beside the one that is heard."""
-        if sample.topic.many or self.service.keep_all:
+        if sample.topic.multiple_publishers or self.service.keep_all:
             return True
-        if self._sources.takes(sample.key, sample.topic.publisher, sample.source, time.monotonic()):
+        if self._sources.accepts(sample.key, sample.topic.publisher, sample.source, time.monotonic()):
             return True
         self.service.counters["other_sources"] += 1
         if self._may_log(f"other {sample.key}"):
@@ -225,7 +225,7 @@ class Loop:
 
     def _config(self) -> ConfigReply:
         config = json.dumps(self.service.settings.effective())
-        return this_service(self.service.name, config, time.monotonic() - self.began)
+        return build_config_reply(self.service.name, config, time.monotonic() - self.began)
 
     def _health(self, now: float) -> Health:
         inbox, total = self.inbox, Counter[str]()
@@ -240,7 +240,7 @@ class Loop:
                 dropped=inbox.dropped[key],
                 undecodable=self.undecodable[key] + inbox.oversized[key],
                 rate=max(0, total[key] - self._before[key]) / elapsed,
-                **self.service.counted(key),
+                **self.service.extra_counts(key),
             )
             for key in sorted(total)[:200]
         ]

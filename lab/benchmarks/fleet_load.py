@@ -70,7 +70,7 @@ class Load:
         self._rng = np.random.default_rng(seed)
         centres = world.sample_free(count, self._rng, CLEARANCE)
         self.robots = [Robot(f"bench-{k}", centre, k / count) for k, centre in enumerate(centres)]
-        self._buses = {robot.name: bus.beside(robot.name) for robot in self.robots}
+        self._buses = {robot.name: bus.for_robot(robot.name) for robot in self.robots}
         self._inbox = Inbox(capacity=1_000_000)
         bus.subscribe(BELIEF, self._inbox, keep_all=True, robot="*")
 

@@ -18,7 +18,7 @@ from typing_extensions import Self
 
 from common.bus.bus import wait_until
 from common.errors import UserError
-from common.processes import die_with
+from common.processes import end_with_parent
 
 INSIDE = "PRESAGE_CHAOS_INSIDE"  # set in a process that has its own namespaces
 SWITCH = "switch0"
@@ -165,5 +165,5 @@ def _child(*command: str) -> subprocess.Popen[bytes]:
     parent = os.getpid()
     return subprocess.Popen(  # noqa: S603 - our own words
         command, stdin=subprocess.DEVNULL, start_new_session=True,
-        preexec_fn=lambda: die_with(parent, signal.SIGKILL),  # noqa: PLW1509 - one call, before any thread of the child
+        preexec_fn=lambda: end_with_parent(parent, signal.SIGKILL),  # noqa: PLW1509 - one call, before any thread of the child
     )  # fmt: skip

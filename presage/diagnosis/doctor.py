@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from common.bus.bus import Link
-from common.runtime.protocol_check import this_service
+from common.runtime.protocol_check import build_config_reply
 from common.versions import PROTOCOL, versions
 from presage.diagnosis.bus_observation import Observed, listen
 from presage.diagnosis.findings import Finding
@@ -30,7 +30,7 @@ def running(link: Link, seconds: float) -> Iterator[Finding]:
     if isinstance(seen, Observed):
         where = ", ".join(link.connect)
         yield Finding("no_router", True, f"session at {where}", where)
-        for finding in judge(seen, this_service("doctor", "{}")):
+        for finding in judge(seen, build_config_reply("doctor", "{}")):
             yield finding
             if finding.code == "missing" and not finding.ok:
                 yield from look_for_stopped(finding.where)

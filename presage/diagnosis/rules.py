@@ -11,7 +11,7 @@ from common.messages.definitions import Health, TopicHealth
 from common.messages.requests import ConfigReply
 from common.messages.topics import CMD_VEL, SCAN, TOPICS, TRUTH, expected_rate, topic_of
 from common.robot.scan_geometry import Sweep
-from common.runtime.protocol_check import difference, fits
+from common.runtime.protocol_check import describe_version_differences, same_protocol
 from presage.diagnosis.bus_observation import Observed
 from presage.diagnosis.findings import Finding
 from presage.diagnosis.health_board import SLOW, SOURCE, STANDS_IN, replaced
@@ -72,10 +72,10 @@ def _versions(seen: Observed, mine: ConfigReply) -> Iterator[Finding]:
     for service, replies in sorted(seen.replies.items()):
         for reply in replies:
             where = f"{service} on {reply.host or 'an unknown host'}"
-            if not fits(mine, reply):
+            if not same_protocol(mine, reply):
                 what = f"{where}: protocol {reply.protocol}, {mine.protocol} here: they misread each other's messages"
                 yield Finding("protocol", False, what, where, "install the same version of presage everywhere")
-            if text := difference(mine, reply):
+            if text := describe_version_differences(mine, reply):
                 advice = "install the same versions everywhere: `make install`, or the same image"
                 yield Finding("versions", False, f"{where}: {text}", where, advice)
 

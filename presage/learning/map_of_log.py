@@ -16,7 +16,7 @@ from rich.progress import track
 
 from common.errors import UserError
 from common.geometry import se2
-from common.geometry.occupancy_grid import FREE, MOST_CELLS, OCCUPIED, UNKNOWN, Cells
+from common.geometry.occupancy_grid import FREE, MAX_CELLS, OCCUPIED, UNKNOWN, Cells
 from common.geometry.se2 import Array
 from common.robot.ranges import surfaces
 from presage.learning.grid_map import write_map
@@ -78,8 +78,8 @@ def cells_of(drive: Drive, cell: float, progress: Console | None = None) -> tupl
     seen = np.concatenate([ends[in_company(ends)], drive.poses[:, :2]])
     corner = np.floor((seen.min(axis=0) - MARGIN) / cell) * cell
     columns, rows = (int(n) for n in np.ceil((seen.max(axis=0) + MARGIN - corner) / cell))
-    if columns * rows > MOST_CELLS:
-        raise UserError(f"{columns} x {rows} cells are more than {MOST_CELLS}: a larger --cell than {cell:g} m")
+    if columns * rows > MAX_CELLS:
+        raise UserError(f"{columns} x {rows} cells are more than {MAX_CELLS}: a larger --cell than {cell:g} m")
     ended, through = np.zeros(rows * columns, np.int64), np.zeros(rows * columns, np.int64)
     lasers = se2.compose(drive.poses, drive.mount)
     for laser, ranges in track(

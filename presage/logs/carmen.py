@@ -17,7 +17,7 @@ import numpy as np
 from common.errors import UserError
 from common.geometry import se2
 from common.geometry.se2 import Array
-from common.robot.ranges import as_scan
+from common.robot.ranges import normalise_driver_ranges
 from presage.logs.carmen_lines import WORD, LaserLine, is_laser, laser_line, pose_line
 from presage.logs.log import Log, LoggedScan, Reading
 from presage.logs.poses import Track
@@ -223,7 +223,7 @@ def _sweeps(
         except (ValueError, IndexError):
             log.left_out["garbled lines"] += 1
             continue
-        own = as_scan(line.ranges, 0.0, log.range_max)
+        own = normalise_driver_ranges(line.ranges, 0.0, log.range_max)
         ranges = _at_beams_of(first, line, own, log.angles, fixed=fixed)
         if ranges is None:
             log.left_out["scans of other beams"] += 1

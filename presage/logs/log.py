@@ -38,7 +38,7 @@ class LoggedScan:
     """One scan of a log."""
 
     stamp_ns: int | None  # None: the log has no times
-    ranges: Array  # (B,) m, as `common.robot.ranges.as_scan` has them
+    ranges: Array  # (B,) m, as `common.robot.ranges.normalise_driver_ranges` has them
     odom: Array | None = None  # (3,) base_link in odom at the stamp
     reference: Array | None = None  # (3,) base_link in map
 

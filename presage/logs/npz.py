@@ -11,7 +11,7 @@ import numpy as np
 
 from common.errors import UserError
 from common.geometry.se2 import Array
-from common.robot.ranges import as_scan
+from common.robot.ranges import normalise_driver_ranges
 from presage.logs.log import Log, LoggedScan, Reading
 
 NAMES = {"ranges", "angles", "range_max", "stamps", "odom", "initial_pose", "reference"}
@@ -68,7 +68,7 @@ def _sweeps(
     for k, row in enumerate(ranges):
         seen = None if reference is None or not np.isfinite(reference[k]).all() else reference[k]
         stamp = None if stamps is None else round(float(stamps[k]) * 1e9)
-        yield LoggedScan(stamp, as_scan(row, 0.0, range_max), None if odom is None else odom[k], seen)
+        yield LoggedScan(stamp, normalise_driver_ranges(row, 0.0, range_max), None if odom is None else odom[k], seen)
 
 
 def _arrays(path: Path) -> dict[str, Array]:

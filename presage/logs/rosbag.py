@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from common.errors import UserError
 from common.geometry.se2 import Array
 from common.messages.ros_messages import Mount, stamp_of
-from common.robot.ranges import as_scan
+from common.robot.ranges import normalise_driver_ranges
 from presage.logs.frame_history import FrameHistory
 from presage.logs.log import Log, LoggedScan, Reading
 from presage.logs.resampling import resampled
@@ -183,7 +183,7 @@ def _scans(
                 log.left_out["scans without beams"] += 1
                 continue
             said = np.asarray(scan.ranges[:: -1 if turned else 1], np.float64)
-            own = as_scan(said, log.range_min, log.range_max)
+            own = normalise_driver_ranges(said, log.range_min, log.range_max)
             ranges = resampled(own, angles, log.angles)
             if ranges is None:
                 log.left_out["scans of other beams"] += 1

@@ -13,7 +13,7 @@ from common.errors import UserError
 from common.geometry.se2 import Array
 from common.messages.definitions import Odom, Scan, Truth
 from common.messages.topics import ODOM, SCAN, TRUTH
-from common.robot.ranges import about_place
+from common.robot.ranges import ranges_for_localisation
 from presage.logs.log import Log, Reading
 from presage.logs.opening import kind_of, open_log
 from services.estimator.factory import Geometry
@@ -85,7 +85,7 @@ def scans_of(log: Log) -> Scans:
     nothing = np.full(3, np.nan)
     ranges, stamps, odoms, references = [], [], [], []
     for sweep in log.sweeps():
-        ranges.append(about_place(sweep.ranges))
+        ranges.append(ranges_for_localisation(sweep.ranges))
         stamps.append(sweep.stamp_ns)
         odoms.append(nothing if sweep.odom is None else sweep.odom)
         references.append(nothing if sweep.reference is None else sweep.reference)
@@ -130,7 +130,7 @@ def _read_recording(path: Path) -> Scans:
     world = recording.world()
     return Scans(
         replace(Geometry.of_scan(first), mount_assumed=mount_assumed(recording)),
-        np.array([about_place(s.ranges) for s in scans]),
+        np.array([ranges_for_localisation(s.ranges) for s in scans]),
         seconds([s.stamp_ns for s in scans]),
         np.array([odoms.get(s.stamp_ns, nothing) for s in scans]) if odoms else None,
         None,

@@ -239,8 +239,8 @@ def _slabs(ring: Array, rgb: Sequence[float], *, outside: bool) -> list[CubePrim
 
 def grid(world: World, ns: int) -> Grid:
     """The map: red, green, blue, alpha and occupancy (0 free, 100 occupied, 255 outside: unknown), a byte each."""
-    (x0, y0), cell, x, y = raster.lattice(world)
-    free, wall = raster.kinds(world, x, y, cell)
+    (x0, y0), cell, x, y = raster.cell_centres(world)
+    free, wall = raster.classify_points(world, x, y, cell)
     columns = x.shape[1]
     data = np.zeros((*x.shape, 5), np.uint8)
     data[..., 4] = 255

@@ -29,7 +29,7 @@ def check_services(
     if simulator is not None:
         settings = load_settings(SimulatorSettings, list(simulator))
         settings.the_scanner()
-        radius, start = settings.the_robot().radius, settings.start_pose()
+        radius, start = settings.build_robot().radius, settings.start_pose()
         pose = known.start_pose(radius) if start is None else np.array(start)
         if (why := known.why_no_room(pose, radius)) is not None:
             raise UserError(f"start {why} (--start, --radius)")

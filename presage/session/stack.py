@@ -20,7 +20,7 @@ from typing_extensions import Self
 from common.bus.bus import Bus, Link
 from common.bus.security import Credentials
 from common.errors import UserError
-from common.processes import dying_with_us
+from common.processes import end_with_this_process
 from presage.session.ports import accepts, check_port, free_port
 
 COLOURS = {"router": 37, "simulator": 36, "estimator": 35, "controller": 33, "recorder": 32, "viewer": 34}
@@ -185,7 +185,7 @@ class Stack:
             text=True,
             errors="replace",
             start_new_session=True,  # Ctrl-C is ours to pass on, in order
-            preexec_fn=dying_with_us(self.orphans_get),  # noqa: PLW1509 - one call, before any thread of the child
+            preexec_fn=end_with_this_process(self.orphans_get),  # noqa: PLW1509 - one call, before any thread of the child
         )
         process = Process(name, child, threading.Thread(target=lambda: self._pass_on(process), daemon=True))
         process.args = args

@@ -74,7 +74,7 @@ class Wheels:
         self.stopped = False
         if self.obstacle_stop:
             current = self._velocity[0] if self._velocity and now - self._velocity[1] < 0.5 else None
-            hold = max(safety.LATENCY, 2 * self._period)
+            hold = max(safety.REACTION_TIME_S, 2 * self._period)
             twist, self.stopped = safety.limit_velocity(twist, self._points, self.robot, current, hold)
         twist = np.where(np.abs(twist) < SLOWEST, 0.0, twist)
         if twist.any():

@@ -13,7 +13,7 @@ from common.geometry.se2 import Array
 from common.limits import MAX_BEAMS, MAX_COORDINATE_M, MAX_DISTANCE_M, MAX_SPEED
 from common.messages.definitions import Odom, Pose, Scan, Twist
 from common.messages.ros_messages import Mount, Transform, read_pose, stamp_of
-from common.robot.ranges import as_scan
+from common.robot.ranges import normalise_driver_ranges
 from services.bridge_ros2.frames import Dead
 
 PLANE = [0, 1, 5]  # x, y, yaw among the six of a pose's covariance
@@ -45,7 +45,7 @@ def scan_of(message: Any, mount: Mount, stamp_ns: int) -> Scan:
     period = float(message.scan_time)
     return Scan(
         stamp_ns=stamp_ns, angle_min=float(se2.wrap(first)), angle_increment=step,
-        range_min=max(nearest, 0.0), range_max=farthest, ranges=as_scan(ranges, nearest, farthest),
+        range_min=max(nearest, 0.0), range_max=farthest, ranges=normalise_driver_ranges(ranges, nearest, farthest),
         mount=Pose.of(mount.pose), scan_time=period if 0 < period < 3600 else 0.0,
         frame_id=(message.header.frame_id or "laser")[:64],
     )  # fmt: skip

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 from common.bus.inbox import Sample
-from common.geometry.rasterize import rasterised
+from common.geometry.rasterize import rasterise
 from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from common.messages.definitions import Belief, CmdVel, Goal, Stamped
@@ -48,7 +48,7 @@ class BridgeRos2Service(Service):
 
     name: ClassVar[str] = "bridge_ros2"
     single: ClassVar[bool] = True
-    keeps: ClassVar[tuple[Topic, ...]] = (GOAL, STATUS)
+    serves_latched: ClassVar[tuple[Topic, ...]] = (GOAL, STATUS)
     inputs: ClassVar[tuple[Topic, ...]] = (BELIEF, CMD_VEL)
 
     def __init__(self, settings: BridgeRos2Settings) -> None:
@@ -57,8 +57,8 @@ class BridgeRos2Service(Service):
         self.options = settings
         self.graph = Graph(settings.names())
         self.motion = Motion(settings.base_frame, settings.odom_frame, settings.the_mount())
-        self.wheels = Wheels(settings.the_robot(), obstacle_stop=settings.obstacle_stop)
-        self.blind = settings.the_blind()
+        self.wheels = Wheels(settings.build_robot(), obstacle_stop=settings.obstacle_stop)
+        self.blind = settings.build_self_filter()
         self.note = f"waits for the zenoh router at {settings.ros_connect}"
         self._ros: RosSession | None = None
         self._out: dict[str, RosPublisher] = {}
@@ -78,7 +78,7 @@ class BridgeRos2Service(Service):
         """Declared before anybody asks: the first message on a key just declared may be lost."""
         self.options.check()
         if self.options.publish_map:
-            self._map = outward.map_message(rasterised(load_world(self.options.world)), self.options.map_frame)
+            self._map = outward.map_message(rasterise(load_world(self.options.world)), self.options.map_frame)
         for topic in (ODOM, SCAN):
             self.loop.bus.publisher(topic, self.name)
 
@@ -219,8 +219,8 @@ class BridgeRos2Service(Service):
             self.publish(ODOM, odom_of(dead))
         else:
             self.counters["scans_without_odometry"] += 1
-        self.wheels.hear_scan(self.blind.seen(scan), now)
-        self.publish(SCAN, self.blind.silenced(scan))
+        self.wheels.hear_scan(self.blind.mask_for_planning(scan), now)
+        self.publish(SCAN, self.blind.mask_for_bus(scan))
         self._scan_at, self._problem = now, ""
 
     def _hear_initial_pose(self, message: Any) -> None:
@@ -297,4 +297,4 @@ class BridgeRos2Service(Service):
 
 def _row(name: str, *, newest: bool = False) -> Topic:
     """A topic of ROS as the inbox has it."""
-    return Topic(f"ros {name}", Stamped, "ros", 0, "newest" if newest else "all", recorded=False, many=True)
+    return Topic(f"ros {name}", Stamped, "ros", 0, "newest" if newest else "all", recorded=False, multiple_publishers=True)

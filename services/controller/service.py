@@ -42,7 +42,7 @@ class ControllerService(Service):
 
     name: ClassVar[str] = "controller"
     single: ClassVar[bool] = True
-    recalls: ClassVar[tuple[Topic, ...]] = (GOAL, STATUS)
+    restores_latched: ClassVar[tuple[Topic, ...]] = (GOAL, STATUS)
     inputs: ClassVar[tuple[Topic, ...]] = (SCAN, BELIEF, GOAL, DRIVE)
 
     def __init__(self, settings: ControllerSettings) -> None:
@@ -51,7 +51,7 @@ class ControllerService(Service):
         self.options = settings
         self.navigator = Navigator()
         self.pilot: Pilot | None = None
-        self.blind = settings.the_blind()
+        self.blind = settings.build_self_filter()
         self._last: tuple[int, CmdVel, Status] | None = None
         self._waiting: Belief | None = None  # for predictions
         self._questioning_ns = 0
@@ -66,7 +66,7 @@ class ControllerService(Service):
         """Know the robot's limits, and where walls are."""
         options = self.options
         options.check()
-        robot = options.the_robot()
+        robot = options.build_robot()
         if options.world:
             self.log.info("loading the world", world=options.world)
         world = load_world(options.world) if options.world else None
@@ -81,7 +81,7 @@ class ControllerService(Service):
         for topic in (STATUS, CMD_VEL, PLAN, PREFERENCE):
             self.loop.bus.publisher(topic, self.name)
 
-    def on_kept(self, last: dict[Topic, Stamped]) -> None:
+    def on_restored(self, last: dict[Topic, Stamped]) -> None:
         """The goal that a controller before this one was on its way to, unless told to begin with none."""
         goal, status = last.get(GOAL), last.get(STATUS)
         if not self.options.resume or not isinstance(goal, Goal) or not isinstance(status, Status) or goal.cancel:
@@ -96,7 +96,7 @@ class ControllerService(Service):
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
         """A belief is answered by a command of the same stamp; a goal by a status, at once."""
         if isinstance(message, Scan):
-            self.navigator.hear_scan(self.blind.seen(message))
+            self.navigator.hear_scan(self.blind.mask_for_planning(message))
             if self._early is not None and self._early.stamp_ns <= message.stamp_ns:
                 self._take_early()
             # A hand needs no belief, and so no estimator.

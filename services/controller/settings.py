@@ -45,8 +45,8 @@ class ControllerSettings(SeenRobotSettings):
 
     def check(self) -> None:
         """Raises UserError where settings do not go together."""
-        self.the_robot()
-        self.the_blind()
+        self.build_robot()
+        self.build_self_filter()
         if self.preset == "geodesic" and not self.world:
             raise UserError("preset geodesic needs a map: give --world, or --preset paper")
         if self.preset == "paper" and self.drive != "holonomic":

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
-from common.log import OncePerSecond, logger
+from common.log import LogRateLimiter, logger
 from common.messages.topics import SCAN
-from common.runtime.runnable import Runs
+from common.runtime.runnable import Runnable
 from common.runtime.service import Service
 from common.runtime.service_loop import Loop
 from services.estimator.multi_robot import Fleet, Outcome
@@ -80,7 +80,7 @@ class FleetService(Service):
         if settings.initial_pose:
             raise UserError("--initial-pose is of one robot: leave it out with --robots, or ask `localise` of each")
 
-    def loop_on(self, bus: Bus) -> Runs:
+    def make_loop(self, bus: Bus) -> Runnable:
         """See Service."""
         return FleetLoop(self.options, bus)
 
@@ -121,7 +121,7 @@ class FleetLoop:
         self._news: SimpleQueue[tuple[str, str, bool]] = SimpleQueue()
         self._strangers = Inbox(capacity=10 * settings.max_robots)  # scans of whoever matches no name
         self._changed = threading.Condition()
-        self._may_log = OncePerSecond()
+        self._may_log = LogRateLimiter()
         self._pulse_at = self._look_at = 0.0
         self._stopping = False
 
@@ -192,7 +192,7 @@ class FleetLoop:
                 self._welcome(name, now)
         for name, member in list(self._members.items()):
             if not member.begun:
-                member.begun = member.loop.begins()
+                member.begun = member.loop.try_start()
             count = member.loop.inbox.received[SCAN.key(name)]
             if count != member.scans or "simulator" in self._there.get(name, ()):
                 member.scans, member.heard = count, now
@@ -220,10 +220,10 @@ class FleetLoop:
         self._members[name].heard = now
 
     def _take_on(self, name: str, *, named: bool) -> None:
-        service, bus = FleetRobot(self.settings, name, self.models, self.fleet), self.bus.beside(name)
+        service, bus = FleetRobot(self.settings, name, self.models, self.fleet), self.bus.for_robot(name)
         loop = Loop(service, bus, Inbox(WAITING, WAITING_BYTES, self._changed))
         loop.open()
-        self._members[name] = Member(service, loop, bus, named, loop.begins(), heard=time.monotonic())
+        self._members[name] = Member(service, loop, bus, named, loop.try_start(), heard=time.monotonic())
         self._count()
 
     def _dismiss(self, member: Member) -> None:
@@ -231,7 +231,7 @@ class FleetLoop:
         name = member.service.robot
         member.service.forget()
         del self._members[name]
-        member.bus.withdraw()
+        member.bus.undeclare_all()
         if member.named:
             self._take_on(name, named=True)
         self._count()
@@ -244,7 +244,7 @@ class FleetLoop:
         member.heard = time.monotonic()
         if not member.named:
             del self._members[name]
-            member.bus.withdraw()
+            member.bus.undeclare_all()
             self._count()
 
     def _count(self) -> None:

@@ -24,7 +24,7 @@ from common.messages.topics import (
     Query,
     Topic,
 )
-from common.robot.ranges import about_place
+from common.robot.ranges import ranges_for_localisation
 from common.runtime.service import Service
 from services.estimator import prediction_query as predicting
 from services.estimator.factory import Choice, Factory, Geometry, prepare
@@ -67,7 +67,7 @@ class EstimatorService(Service):
 
     name: ClassVar[str] = "estimator"
     single: ClassVar[bool] = True
-    keeps: ClassVar[tuple[Topic, ...]] = (GOAL, STATUS)
+    serves_latched: ClassVar[tuple[Topic, ...]] = (GOAL, STATUS)
     inputs: ClassVar[tuple[Topic, ...]] = (SCAN, GOAL)
     queries: ClassVar[tuple[Query, ...]] = (LOCALISE, MODEL, PREDICT)
 
@@ -186,7 +186,7 @@ class EstimatorService(Service):
             self.counters["scans_without_odometry"] += 1
         command = self.command if prior == "command" else None
         return Observation(
-            about_place(scan.ranges),
+            ranges_for_localisation(scan.ranges),
             scan.angles(),
             scan.range_max,
             scan.stamp_ns * 1e-9,

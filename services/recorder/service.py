@@ -126,7 +126,7 @@ class RecorderService(Service):
             counts = {"messages": state.messages, "dropped": dropped, "missing": missing}
             self.log.info("recorded", file=str(path), **counts, **parts)
 
-    def counted(self, key: str) -> dict[str, int]:
+    def extra_counts(self, key: str) -> dict[str, int]:
         """For health: what was written of a key, and what never came."""
         written, missing = self._written[key], self._missing[key]
         if self.recording is not None:

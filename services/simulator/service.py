@@ -55,7 +55,7 @@ class SimulatorService(Service):
 
     name: ClassVar[str] = "simulator"
     single: ClassVar[bool] = True
-    keeps: ClassVar[tuple[Topic, ...]] = (GOAL, STATUS)
+    serves_latched: ClassVar[tuple[Topic, ...]] = (GOAL, STATUS)
     inputs: ClassVar[tuple[Topic, ...]] = (CMD_VEL,)
     queries: ClassVar[tuple[Query, ...]] = (TELEPORT, RESET, PAUSE, RESUME, STEP, SPEED, OBSTACLE, SAMPLE, WORLD)
 
@@ -84,7 +84,7 @@ class SimulatorService(Service):
         """Build world and robot; begin once those waited for are there."""
         options = self.options
         drift = Drift(options.turn_by_turn, options.turn_by_path, options.path_by_path, options.path_by_turn)
-        robot = options.the_robot()
+        robot = options.build_robot()
         self.log.info("loading the world", world=options.world)
         scanner = options.the_scanner()
         self.setup = Setup(

@@ -14,7 +14,7 @@ from typing import IO, Any
 
 from common.bus.bus import wait_until
 from common.errors import UserError
-from common.processes import dying_with_us
+from common.processes import end_with_this_process
 
 START_WITHIN = 30.0  # s; a large file without an index is read through
 END_WITHIN = 5.0  # s
@@ -102,7 +102,7 @@ class Playback:
             stdout=subprocess.DEVNULL,
             stderr=complaints,
             start_new_session=True,
-            preexec_fn=dying_with_us(),  # noqa: PLW1509 - one call, before any thread of the child
+            preexec_fn=end_with_this_process(),  # noqa: PLW1509 - one call, before any thread of the child
         )
         return Child(process, complaints, name)
 

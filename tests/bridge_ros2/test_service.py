@@ -13,7 +13,7 @@ import zenoh.ext
 from common.bus.bus import Link, open_bus, wait_until
 from common.bus.inbox import Inbox, Sample
 from common.geometry import se2
-from common.geometry.rasterize import rasterised
+from common.geometry.rasterize import rasterise
 from common.geometry.world import load_world
 from common.messages.definitions import CmdVel, Goal, Health, Odom, Scan, Twist
 from common.messages.requests import LocaliseRequest, Reply
@@ -217,7 +217,7 @@ def test_the_map_is_there_for_who_comes_later(beside):
     sample = heard[0]
     assert len(sample.attachment.to_bytes()) == 33
     said = other.decode("nav_msgs/msg/OccupancyGrid", sample.payload.to_bytes())
-    grid = rasterised(load_world("maze"))
+    grid = rasterise(load_world("maze"))
     assert (said.info.width, said.info.height, said.header.frame_id) == (grid.width, grid.height, "map")
     np.testing.assert_array_equal(np.array(said.data, np.int8).view(np.uint8), grid.values.ravel())
     tokens = beside.node.session.liveliness().get("@ros2_lv/0/**")

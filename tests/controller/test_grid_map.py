@@ -40,7 +40,7 @@ def test_a_way_from_room_to_room_keeps_clear_of_every_cell():
 
 def test_goals_in_unknown_cells_and_walls_are_refused():
     row, column = np.argwhere(WORLD.grid.values == UNKNOWN)[0]
-    nowhere = WORLD.grid.shapes.within(np.array([[column, row]]), 0.5)[0]
+    nowhere = WORLD.grid.shapes.points_in_cells(np.array([[column, row]]), 0.5)[0]
     pilot, straight = Pilot(Robot(), WORLD), Straight(Robot(), None, WORLD)
     for goal in (nowhere, np.array([50.0, 50.0])):
         assert "is inside something, or off the map; the nearest place that can be reached is" in pilot.refusal(goal)

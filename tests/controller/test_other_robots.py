@@ -10,7 +10,7 @@ import pytest
 from common.geometry.world import Obstacle, World
 from common.messages.definitions import CmdVel, Twist
 from common.robot.base import Robot
-from common.robot.self_filter import Blind
+from common.robot.self_filter import SelfFilter
 from services.bridge_ros2.command_gate import Wheels
 from services.controller.policies.planner import Pilot
 from services.simulator.simulation import Setup, Simulation
@@ -65,7 +65,7 @@ def with_posts(scan):
 
 
 @pytest.mark.parametrize(
-    "blind", [Blind(tuple(tuple(np.deg2rad([at - 3, at + 3])) for at, _ in POSTS)), Blind(radius=0.2)]
+    "blind", [SelfFilter(tuple(tuple(np.deg2rad([at - 3, at + 3])) for at, _ in POSTS)), SelfFilter(radius=0.2)]
 )
 @pytest.mark.parametrize("kind", ["holonomic", "differential"])
 def test_who_sees_himself_drives_once_told(kind, blind):
@@ -77,7 +77,7 @@ def test_who_sees_himself_drives_once_told(kind, blind):
     def run(limit, seen):
         return drive(found, robot, (1.0, 2.0, 0.0), (7.0, 2.0), limit, known=world, seen=seen, stop=False)
 
-    _, said, contacts = run(600, lambda scan: blind.seen(with_posts(scan)))
+    _, said, contacts = run(600, lambda scan: blind.mask_for_planning(with_posts(scan)))
     assert said[-1].state == "reached", said[-1]
     assert not contacts
     poses, said, _ = run(150, with_posts)
@@ -90,8 +90,8 @@ def test_the_bridges_stop_knows_it_too():
     simulation = Simulation(Setup(world, SCANNER, robot, (1.0, 2.0, 0.0)))
     scan = with_posts(simulation.observe()[2])
     simulation.close()
-    command, blind, driven = CmdVel(stamp_ns=scan.stamp_ns, twist=Twist(vx=0.3)), Blind(radius=0.2), []
-    for shown in (scan, blind.silenced(scan), blind.seen(scan)):
+    command, blind, driven = CmdVel(stamp_ns=scan.stamp_ns, twist=Twist(vx=0.3)), SelfFilter(radius=0.2), []
+    for shown in (scan, blind.mask_for_bus(scan), blind.mask_for_planning(scan)):
         wheels = Wheels(robot)
         wheels.hear_scan(shown, 0.0)
         driven.append(wheels.command(command, 0.01))

@@ -63,7 +63,7 @@ def test_the_robot_is_stopped_by_cells(world, simulation):
 def test_nobody_is_put_into_walls_or_what_is_unknown(world, simulation):
     for kind in (OCCUPIED, UNKNOWN):
         row, column = np.argwhere(world.grid.values == kind)[7]
-        x, y = world.grid.shapes.within(np.array([[column, row]]), 0.5)[0]
+        x, y = world.grid.shapes.points_in_cells(np.array([[column, row]]), 0.5)[0]
         with pytest.raises(UserError, match="inside a wall or outside"):
             simulation.teleport(np.array([x, y, 0.0]))
         with pytest.raises(UserError, match="inside a wall or outside"):

@@ -20,7 +20,7 @@ from common.bus.bus import open_bus, wait_until
 from common.bus.inbox import Call, Inbox
 from common.messages.definitions import Health, Scan, TopicHealth
 from common.messages.topics import CONFIG, HEALTH, ODOM, SCAN
-from common.runtime.protocol_check import this_service
+from common.runtime.protocol_check import build_config_reply
 from common.versions import PROTOCOL
 from tests.conftest import PATIENCE, ROOT
 
@@ -46,7 +46,7 @@ class Participant:
                 if self.frozen:
                     continue
                 if isinstance(call := calls.get(0.25), Call):
-                    call.reply(this_service(self.name, "{}").model_copy(update=self.said).encode())
+                    call.reply(build_config_reply(self.name, "{}").model_copy(update=self.said).encode())
                 number += 1
                 bus.put(HEALTH, self.health(number).encode(), self.name)
                 if self.scans:

@@ -92,7 +92,7 @@ def test_three_robots_one_estimator(process, bus, link, names, simulate):
         assert bus.ask(MODEL, ModelRequest(), ModelReply, robot=ear.robot).ok
 
     # What one robot's scanner gets wrong is counted there, and the others do not notice.
-    garbage, before = bus.beside(names[2]), Inbox()
+    garbage, before = bus.for_robot(names[2]), Inbox()
     assert garbage.wait_matching(SCAN, 10)
     bus.subscribe(BELIEF, before, keep_all=True, robot=names[1])
     for k in range(1000):
@@ -178,7 +178,7 @@ def test_a_pattern_hears_of_a_robot_by_its_scans_alone(bus, link, pattern, hears
     bus.subscribe(SCAN, inbox, keep_all=True, robot=key_expression(prefix + pattern))
     with open_bus(link) as other:
         for robot in filter(None, (not_heard, hears)):
-            there = other.beside(prefix + robot)
+            there = other.for_robot(prefix + robot)
             if robot == hears:
                 assert there.wait_matching(SCAN, 10)
             there.put(SCAN, b"x")

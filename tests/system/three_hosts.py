@@ -12,7 +12,7 @@ import sys
 import time
 from pathlib import Path
 
-from common.processes import dying_with_us
+from common.processes import end_with_this_process
 from lab.fault_injection.hosts import Network, enter_own_namespaces
 
 GOAL = ["-m", "presage", "goal", "15.5", "1.5", "--wait", "--connect", "tcp/10.77.0.1:7447"]
@@ -40,7 +40,7 @@ def main(page: Path, folder: Path) -> int:
                         [*prefix, "bash", "-c", script],
                         env=environment,
                         cwd=folder,
-                        preexec_fn=dying_with_us(),  # noqa: PLW1509 - one call, before any thread of the child
+                        preexec_fn=end_with_this_process(),  # noqa: PLW1509 - one call, before any thread of the child
                     )
                 )
             return patient(GOAL, environment, folder)

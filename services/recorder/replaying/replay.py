@@ -23,7 +23,7 @@ from common.errors import UserError
 from common.messages.requests import PlayerReply, PlayerRequest, WorldReply
 from common.messages.topics import CONFIG, PLAYER, SCAN, WORLD, Topic
 from common.messages.wire import DecodeError
-from common.runtime.protocol_check import this_service
+from common.runtime.protocol_check import build_config_reply
 from services.recorder.reader import Raw, Recording, read_recording
 from services.recorder.replaying.player import Player, conflicts, renamed, robots, selected, span
 
@@ -170,7 +170,7 @@ class Replay:
         if call.query is CONFIG:
             config = {"file": str(self.recording.path), **asdict(self.choice)}
             plain = json.dumps(config, default=sorted)
-            call.reply(this_service(NAME, plain).encode())
+            call.reply(build_config_reply(NAME, plain).encode())
             return
         if call.query is WORLD:
             call.reply(self._world().encode())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hypothesis.strategies as st
 from hypothesis import given
 
-from common.bus.instances import Instance, Instances, OneSource, spoken
+from common.bus.instances import Instance, Instances, SourceSelector, describe_instance
 
 names = st.builds(
     Instance, st.integers(0, 2**48 - 1), st.text(min_size=1, max_size=80), st.integers(1, 2**22),
@@ -21,7 +21,7 @@ def test_a_name_is_one_chunk_of_a_key_and_can_be_read_again(instance):
     assert again is not None
     assert again.name == name
     assert (again.started_ms, again.pid) == (instance.started_ms, instance.pid)
-    assert f"process {instance.pid} on " in spoken(name)
+    assert f"process {instance.pid} on " in describe_instance(name)
 
 
 @given(names, names)
@@ -31,7 +31,7 @@ def test_names_in_order_are_instances_by_age(one, other):
 
 def test_what_is_no_name_is_said_as_it_is():
     assert Instance.parse("estimator") is None
-    assert spoken("estimator") == "estimator"
+    assert describe_instance("estimator") == "estimator"
 
 
 EVERYBODY = [Instance(k, "host", 1, f"{k}").name for k in range(5)]
@@ -65,10 +65,10 @@ def test_what_this_session_said_before_is_nobody_else(me, other):
 
 
 def test_where_nobody_leads_the_first_source_is_heard_until_it_is_silent():
-    sources = OneSource(0.3)
+    sources = SourceSelector(0.3)
 
     def takes(source, now, robot="robot"):
-        return sources.takes(f"presage/{robot}/scan", "simulator", source, now)
+        return sources.accepts(f"presage/{robot}/scan", "simulator", source, now)
 
     assert takes("a", 0.0)
     assert not takes("b", 0.1)
@@ -80,16 +80,16 @@ def test_where_nobody_leads_the_first_source_is_heard_until_it_is_silent():
 
 
 def test_the_instance_that_leads_is_heard_and_nobody_else_however_silent_it_is():
-    sources = OneSource(0.3)
+    sources = SourceSelector(0.3)
     leader = Instance(1, "host", 2, "0123456789ab")
     sources.change("robot", "simulator", leader.name, True)
-    assert not sources.takes("presage/robot/scan", "simulator", "repeater", 0.0)
-    assert sources.takes("presage/robot/scan", "simulator", "0123456789abcdef", 5.0)
-    assert not sources.takes("presage/robot/scan", "simulator", "repeater", 50.0)
-    assert sources.takes("presage/robot/belief", "estimator", "anybody", 50.0)  # nobody leads there
+    assert not sources.accepts("presage/robot/scan", "simulator", "repeater", 0.0)
+    assert sources.accepts("presage/robot/scan", "simulator", "0123456789abcdef", 5.0)
+    assert not sources.accepts("presage/robot/scan", "simulator", "repeater", 50.0)
+    assert sources.accepts("presage/robot/belief", "estimator", "anybody", 50.0)  # nobody leads there
     younger = Instance(2, "host", 1, "ba9876543210")
     sources.change("robot", "simulator", younger.name, True)  # two halves of a network have met
-    assert not sources.takes("presage/robot/scan", "simulator", "ba9876543210", 50.0)
+    assert not sources.accepts("presage/robot/scan", "simulator", "ba9876543210", 50.0)
     sources.change("robot", "simulator", younger.name, False)
     sources.change("robot", "simulator", leader.name, False)
-    assert sources.takes("presage/robot/scan", "simulator", "repeater", 50.0)
+    assert sources.accepts("presage/robot/scan", "simulator", "repeater", 50.0)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import zenoh
 
-from common.bus.liveliness import Presence
+from common.bus.liveliness import Liveliness
 from common.messages.topics import alive_key
 
 
@@ -42,7 +42,7 @@ def sample(key, kind):
 
 
 def test_who_was_told_of_is_there_though_a_query_leaves_it_out(session):
-    presence = Presence(session, "robot")
+    presence = Liveliness(session, "robot")
     old, new = (alive_key("robot", "estimator", f"{age:012x}~host~1~ab") for age in (1, 2))
     assert presence.alive() == set()
     session.tell[0](sample(old, zenoh.SampleKind.PUT))

@@ -23,7 +23,7 @@ from common.bus.security import (
     service_of,
 )
 from common.errors import UserError
-from common.messages.topics import ANYBODY, CMD_VEL, CONTROL, HEALTH, QUERIES, SCAN, TELEPORT, TOPICS, WORLD
+from common.messages.topics import ALL_ROLES, CMD_VEL, CONTROL_ROLES, HEALTH, QUERIES, SCAN, TELEPORT, TOPICS, WORLD
 from presage.session import credentials as secure
 
 
@@ -41,9 +41,9 @@ def may_send(role: str, message: str, key: str, robots: tuple[str, ...] = ("*",)
 
 
 def test_every_role_of_the_table_is_one_and_every_topic_has_somebody_who_puts_it():
-    named = {role for topic in TOPICS for role in topic.put_by} | {role for query in QUERIES for role in query.asked_by}
+    named = {role for topic in TOPICS for role in topic.publisher_roles} | {role for query in QUERIES for role in query.requester_roles}
     assert named <= set(ROLES)
-    assert set(ANYBODY) == set(ROLES) - {ROUTER}
+    assert set(ALL_ROLES) == set(ROLES) - {ROUTER}
     for topic in TOPICS:
         assert [role for role in ROLES if may_put(role, topic)], topic.name
     for query in QUERIES:
@@ -60,9 +60,9 @@ def test_one_role_drives_one_scans():
 def test_whatever_moves_the_robot_or_changes_what_runs_takes_control():
     free = {"sample", "world", "model", "predict", "config"}
     rviz = {"localise": "bridge_ros2"}  # whose "2D Pose Estimate" the bridge passes on
-    others = {q.name: set(q.asked_by) - {rviz.get(q.name)} for q in QUERIES}
-    assert {name for name, roles in others.items() if roles != set(CONTROL)} == free
-    assert not {"viewer", "observer"} & set(CONTROL)
+    others = {q.name: set(q.requester_roles) - {rviz.get(q.name)} for q in QUERIES}
+    assert {name for name, roles in others.items() if roles != set(CONTROL_ROLES)} == free
+    assert not {"viewer", "observer"} & set(CONTROL_ROLES)
 
 
 @pytest.mark.parametrize(("role", "topic"), list(product(sorted(set(ROLES) - {ROUTER}), TOPICS)))

@@ -10,7 +10,7 @@ import psutil
 import pytest
 
 from common.bus.bus import wait_until
-from common.containers.run_per_robot import main, names
+from common.containers.run_per_robot import main, robot_names
 
 PATIENCE = 30.0
 CHILD = """
@@ -47,16 +47,16 @@ def started(folder, robot):
 
 
 def test_names_of_robots():
-    assert names({}) == names({"PRESAGE_FLEET": "1"}) == names({"PRESAGE_FLEET": ""}) == ["robot"]
-    assert names({"PRESAGE_FLEET": "3"}) == ["robot-1", "robot-2", "robot-3"]
-    assert names({"PRESAGE_FLEET": "2", "PRESAGE_ROBOT": "truck"}) == ["truck-1", "truck-2"]
-    assert names({"PRESAGE_ROBOT": "truck"}) == ["truck"]
+    assert robot_names({}) == robot_names({"PRESAGE_FLEET": "1"}) == robot_names({"PRESAGE_FLEET": ""}) == ["robot"]
+    assert robot_names({"PRESAGE_FLEET": "3"}) == ["robot-1", "robot-2", "robot-3"]
+    assert robot_names({"PRESAGE_FLEET": "2", "PRESAGE_ROBOT": "truck"}) == ["truck-1", "truck-2"]
+    assert robot_names({"PRESAGE_ROBOT": "truck"}) == ["truck"]
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "three", "1000", "101", "1.5"])
 def test_a_number_that_is_none_is_refused(text):
     with pytest.raises(ValueError, match="how many robots, 1 to 100"):
-        names({"PRESAGE_FLEET": text})
+        robot_names({"PRESAGE_FLEET": text})
 
 
 @pytest.mark.parametrize("argv", [["every", "child"], ["each"]])

@@ -121,8 +121,8 @@ def test_a_lattice_over_cells_all_alike():
 def test_roomy_cells_have_their_middle_clear(seed, clearance):
     world = world_of(speckled(seed))
     cells = np.argwhere(world.grid.values == FREE)[:, ::-1]
-    clear = world.clearance(world.grid.shapes.within(cells, 0.5)) >= clearance
-    assert world.grid.shapes.roomy(clearance).tolist() == cells[clear].tolist()
+    clear = world.clearance(world.grid.shapes.points_in_cells(cells, 0.5)) >= clearance
+    assert world.grid.shapes.cells_with_clearance(clearance).tolist() == cells[clear].tolist()
 
 
 def test_faces_in_line_are_one():

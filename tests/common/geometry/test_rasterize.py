@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from common.geometry.rasterize import rasterised
+from common.geometry.rasterize import rasterise
 from common.geometry.world import Obstacle, World, load_world
 from tests.common.geometry.maps import values_of
 
@@ -23,15 +23,15 @@ def of_map(**rest):
 
 
 def test_a_ros_map_is_its_own():
-    assert rasterised(of_map()) is not None
-    assert rasterised(of_map()) == of_map().grid
+    assert rasterise(of_map()) is not None
+    assert rasterise(of_map()) == of_map().grid
 
 
 def test_furniture_on_a_ros_map_is_in_it():
     grid = of_map().grid
     at = grid.to_map(np.array([[1.25, 0.75]]))[0]  # the third cell of the second row from below
     box = Obstacle(circle={"center": tuple(at), "radius": 0.01})
-    values = rasterised(of_map(obstacles=[box])).values
+    values = rasterise(of_map(obstacles=[box])).values
     changed = values != PLAN
     assert np.argwhere(changed).tolist() == [[1, 2]]
     assert values[1, 2] == OCCUPIED
@@ -41,7 +41,7 @@ def test_furniture_on_a_ros_map_is_in_it():
 def test_polygons_are_free_where_the_world_is_and_walled_in(name):
     """Away from edges each cell says what the world says; from no free cell does one step lead into the unknown."""
     world = load_world(name)
-    grid = rasterised(world)
+    grid = rasterise(world)
     rng = np.random.default_rng(0)
     x0, y0, x1, y1 = world.bounds
     places = rng.uniform([x0 - 0.05, y0 - 0.05], [x1 + 0.05, y1 + 0.05], (2000, 2))
@@ -58,7 +58,7 @@ def test_polygons_are_free_where_the_world_is_and_walled_in(name):
 
 def test_a_wall_thinner_than_a_cell_is_not_lost():
     thin = Obstacle(box={"center": (2.013, 1.0), "size": (0.004, 2.0)})
-    values = rasterised(World(name="w", boundary=[(0, 0), (4, 0), (4, 2), (0, 2)], obstacles=[thin])).values
+    values = rasterise(World(name="w", boundary=[(0, 0), (4, 0), (4, 2), (0, 2)], obstacles=[thin])).values
     inside = (values == FREE).any(axis=1)
     middle = values[:, 30:-30]
     assert (middle[inside] == OCCUPIED).any(axis=1).all()

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from common.robot.ranges import about_place, as_scan, surfaces
+from common.robot.ranges import normalise_driver_ranges, ranges_for_localisation, surfaces
 
 NUMBERS = st.one_of(
     st.floats(width=32), st.sampled_from([0.0, -0.0, -1.0, np.nan, np.inf, -np.inf, 0.1, 8.3, 1e-30, 65.533])
@@ -20,7 +20,7 @@ LIMITS = st.tuples(st.floats(0, 1, width=32), st.floats(1.5, 100, width=32))
 @given(RANGES, LIMITS)
 def test_each_number_says_one_of_four_things(ranges, limits):
     least, most = limits
-    scan = as_scan(ranges, least, most)
+    scan = normalise_driver_ranges(ranges, least, most)
     assert scan.dtype == ranges.dtype
     for said, found in zip(ranges.tolist(), scan.tolist(), strict=True):
         if np.isnan(said) or -np.inf < said <= 0:
@@ -31,13 +31,13 @@ def test_each_number_says_one_of_four_things(ranges, limits):
             assert found == -np.inf
         else:
             assert found == said
-    np.testing.assert_array_equal(as_scan(scan, least, most), scan)  # a scan is one already
+    np.testing.assert_array_equal(normalise_driver_ranges(scan, least, most), scan)  # a scan is one already
 
 
 @given(RANGES, LIMITS)
 def test_what_is_read_from_a_scan(ranges, limits):
-    scan = as_scan(ranges, *limits)
-    hit, place = surfaces(scan), about_place(scan)
+    scan = normalise_driver_ranges(ranges, *limits)
+    hit, place = surfaces(scan), ranges_for_localisation(scan)
     assert ((scan[hit] >= limits[0]) & (scan[hit] < limits[1])).all()
     assert not np.isfinite(place[~hit]).any()
     np.testing.assert_array_equal(place[hit], scan[hit])
@@ -48,4 +48,4 @@ def test_what_is_read_from_a_scan(ranges, limits):
 def test_the_longest_range_is_the_same_number_in_either_precision(dtype):
     for most in (0.7, 8.1, 8.3, 25.0):
         row = np.array([np.float32(most), most, most * 0.999], dtype)
-        assert np.isposinf(as_scan(row, 0.0, most)).tolist() == [True, True, False]
+        assert np.isposinf(normalise_driver_ranges(row, 0.0, most)).tolist() == [True, True, False]

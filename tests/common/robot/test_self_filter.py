@@ -12,7 +12,7 @@ from common.geometry import se2
 from common.messages.definitions import Scan
 from common.robot.ranges import surfaces
 from common.robot.scan_geometry import ALL_ROUND, Sweep
-from common.robot.self_filter import WIDE, Blind
+from common.robot.self_filter import MIN_TRIMMED_SECTOR_RAD, SelfFilter
 from common.runtime import safety
 from common.runtime.config import load_settings
 from services.bridge_ros2.settings import BridgeRos2Settings
@@ -28,7 +28,7 @@ def scan(beams=360, first=-180.0, step=1.0, ranges=None):
 
 
 def blind(**settings):
-    return ControllerSettings(**settings).the_blind()
+    return ControllerSettings(**settings).build_self_filter()
 
 
 def degrees(found):
@@ -38,36 +38,36 @@ def degrees(found):
 def test_off_unless_told():
     for settings in (ControllerSettings(), BridgeRos2Settings()):
         whole = scan()
-        assert settings.the_blind().seen(whole) is settings.the_blind().silenced(whole) is whole
+        assert settings.build_self_filter().mask_for_planning(whole) is settings.build_self_filter().mask_for_bus(whole) is whole
 
 
 def test_a_post_says_nothing():
     """To either bound, both included; on the bus not measured, in the process no beam."""
     cut = blind(ignore_angles="-92:-88,44:46")
-    for found, value in ((cut.silenced(scan()), 0.0), (cut.seen(scan()), np.nan)):
+    for found, value in ((cut.mask_for_bus(scan()), 0.0), (cut.mask_for_planning(scan()), np.nan)):
         hidden = ~surfaces(found.ranges)
         np.testing.assert_allclose(degrees(found)[hidden], [-92, -91, -90, -89, -88, 44, 45, 46])
         np.testing.assert_array_equal(found.ranges[hidden], np.float32(value))
         np.testing.assert_array_equal(found.ranges[~hidden], scan().ranges[~hidden])
         assert Sweep.of(found).sector(0.0) == ALL_ROUND  # a post makes nobody blind
-    assert Scan.decode(cut.silenced(scan()).encode()) == cut.silenced(scan())
-    assert len(safety.scan_points(cut.seen(scan()))) == 360 - 8
+    assert Scan.decode(cut.mask_for_bus(scan()).encode()) == cut.mask_for_bus(scan())
+    assert len(safety.scan_points(cut.mask_for_planning(scan()))) == 360 - 8
 
 
 def test_a_blind_radius():
     ranges = [-np.inf, 0.1, 0.19, 0.2, 0.25, 3.0, np.inf]
-    found = blind(blind_radius=0.2).seen(scan(7, ranges=ranges))
+    found = blind(blind_radius=0.2).mask_for_planning(scan(7, ranges=ranges))
     np.testing.assert_array_equal(found.ranges, np.float32([np.nan, np.nan, np.nan, 0.2, 0.25, 3, np.inf]))
-    zero = blind(blind_radius=0.2).silenced(scan(3, ranges=[0.0, 0.1, 1.0]))
+    zero = blind(blind_radius=0.2).mask_for_bus(scan(3, ranges=[0.0, 0.1, 1.0]))
     np.testing.assert_array_equal(zero.ranges, np.float32([0, 0, 1]))  # 0 is no distance
-    found = blind(ignore_angles="1:2").seen(scan(7, ranges=ranges))
+    found = blind(ignore_angles="1:2").mask_for_planning(scan(7, ranges=ranges))
     np.testing.assert_array_equal(found.ranges, np.float32(ranges))  # nothing too close is cut out without
 
 
 @pytest.mark.parametrize("text", ["135:225", "-225:-135", "135:180,-180:-135"])
 def test_a_wide_sector_behind_is_out_of_view(text):
     """All round, however it is written: the robot is then blind behind, and knows it."""
-    found = blind(ignore_angles=text).seen(scan())
+    found = blind(ignore_angles=text).mask_for_planning(scan())
     view = Sweep.of(found).sector(0.0)
     assert view.centre == pytest.approx(0, abs=0.02)
     assert np.rad2deg(view.half) == pytest.approx(134.5, abs=1)
@@ -76,9 +76,9 @@ def test_a_wide_sector_behind_is_out_of_view(text):
 
 
 def test_a_wide_end_is_out_of_view_and_a_wide_middle_is_silent():
-    found = blind(ignore_angles="90:140").seen(scan(271, -135))
+    found = blind(ignore_angles="90:140").mask_for_planning(scan(271, -135))
     assert degrees(found)[[0, -1]] == pytest.approx([-135, 89])
-    found = blind(ignore_angles="-25:25").seen(scan(271, -135))
+    found = blind(ignore_angles="-25:25").mask_for_planning(scan(271, -135))
     assert len(found.ranges) == 271
     assert np.isnan(found.ranges).sum() == 51
 
@@ -90,7 +90,7 @@ bounds = st.tuples(st.floats(-300, 300), st.floats(0.1, 59)).map(lambda pair: (p
 def test_no_beam_is_turned_and_none_outside_is_lost(sectors, sweep):
     """What is left is where it was, and every direction that was not cut out is left."""
     whole = scan(*sweep)
-    found = Blind(tuple(tuple(np.deg2rad(each)) for each in sectors)).seen(whole)
+    found = SelfFilter(tuple(tuple(np.deg2rad(each)) for each in sectors)).mask_for_planning(whole)
     before = {round(at, 3) % 360: r for at, r in zip(degrees(whole), whole.ranges, strict=True)}
     after = {round(at, 3) % 360: r for at, r in zip(degrees(found), found.ranges, strict=True)}
     assert after.keys() <= before.keys()
@@ -98,14 +98,14 @@ def test_no_beam_is_turned_and_none_outside_is_lost(sectors, sweep):
         inside = any((at - low + 1e-4) % 360 <= high - low + 2e-4 for low, high in sectors)
         assert after[at] == r if at in after and not np.isnan(after[at]) else inside, at
     gone = len(before) - len(after)
-    assert not gone or gone * abs(whole.angle_increment) > 0.9 * WIDE
+    assert not gone or gone * abs(whole.angle_increment) > 0.9 * MIN_TRIMMED_SECTOR_RAD
 
 
 @pytest.mark.parametrize("text", ["10:5", "0:0", "0:400", "-170:0,0:190", "1", "1:2:3", "a:b", "nan:1"])
 @pytest.mark.parametrize("settings", [ControllerSettings, BridgeRos2Settings])
 def test_bounds_that_are_none_are_refused(settings, text):
     with pytest.raises(UserError, match=r"ignore.angles"):
-        load_settings(settings, [f"--ignore-angles={text}"]).the_blind()
+        load_settings(settings, [f"--ignore-angles={text}"]).build_self_filter()
 
 
 @pytest.mark.parametrize("radius", ["-1", "nan", "inf", "6"])

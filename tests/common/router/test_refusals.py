@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from common.router.refusals import Reader, Refusal
+from common.router.refusals import Refusal, ZenohLogParser
 
 AT = "2026-01-01T00:00:00.000000Z"
 ACCESS = "zenoh::net::routing::interceptor::access_control"
@@ -21,7 +21,7 @@ def denied(what, key, zid="9e87", how="Using cached result: ", flow="ingress"):
 
 
 def read(*lines):
-    reader = Reader()
+    reader = ZenohLogParser()
     return [found for line in lines if (found := reader.read(line)) is not None]
 
 
@@ -73,7 +73,7 @@ def test_what_else_zenoh_complains_of_is_passed_on():
 
 
 def test_strangers_do_not_fill_memory():
-    reader = Reader()
+    reader = ZenohLogParser()
     for number in range(5000):
         reader.read(SHOWN.replace("10.0.0.2:50998", f"10.0.0.2:{number}"))
     assert len(reader._names) <= 1000

@@ -16,7 +16,14 @@ from common.log import logger
 from common.messages.definitions import Health
 from common.messages.requests import ConfigReply, Request
 from common.messages.topics import CONFIG, HEALTH
-from common.runtime.protocol_check import TOGETHER, Compatibility, came_later, difference, fits, this_service
+from common.runtime.protocol_check import (
+    SIMULTANEOUS_START_S,
+    ProtocolCheck,
+    build_config_reply,
+    describe_version_differences,
+    same_protocol,
+    started_later,
+)
 from common.versions import PROTOCOL
 from tests.conftest import PATIENCE, next_of
 
@@ -34,7 +41,7 @@ def started_long_ago(small, bus):
     assert wait_until(lambda: "small" in bus.alive(), PATIENCE), small.output
     pulses = Inbox()
     bus.subscribe(HEALTH, pulses, keep_all=True)
-    next_of(pulses, Health, lambda h: h.uptime > 1.5 * TOGETHER)
+    next_of(pulses, Health, lambda h: h.uptime > 1.5 * SIMULTANEOUS_START_S)
 
 
 def test_a_newcomer_of_another_protocol_ends_and_says_why_in_one_line(process, bus):
@@ -77,7 +84,7 @@ class LateBus:
 def test_a_newcomer_does_not_start_though_it_does_not_know_at_once_who_is_there():
     bus = LateBus(2, said("small", OTHER))
     with pytest.raises(UserError, match=f"protocol {OTHER} in the small"):
-        Compatibility(bus, "foreign", logger("foreign")).at_start(said("foreign"))
+        ProtocolCheck(bus, "foreign", logger("foreign")).check_at_start(said("foreign"))
 
 
 def test_who_comes_while_the_other_is_too_busy_to_answer_ends_once_it_does(process, bus):
@@ -125,26 +132,26 @@ def test_another_version_is_one_warning(process, bus):
 
 
 def test_of_two_that_do_not_fit_exactly_one_came_later():
-    for apart in (0.0, TOGETHER / 2, -TOGETHER / 2, 2 * TOGETHER, -2 * TOGETHER):
+    for apart in (0.0, SIMULTANEOUS_START_S / 2, -SIMULTANEOUS_START_S / 2, 2 * SIMULTANEOUS_START_S, -2 * SIMULTANEOUS_START_S):
         one, two = said(protocol=1, uptime=10.0), said(protocol=2, uptime=10.0 + apart)
-        assert came_later(one, two) != came_later(two, one)
-    assert came_later(said(protocol=2, uptime=1.0), said(protocol=1, uptime=10.0))
+        assert started_later(one, two) != started_later(two, one)
+    assert started_later(said(protocol=2, uptime=1.0), said(protocol=1, uptime=10.0))
 
 
 def test_who_does_not_say_its_protocol_is_no_stranger():
-    assert fits(said(), said(protocol=0))
-    assert not fits(said(), said(protocol=OTHER))
+    assert same_protocol(said(), said(protocol=0))
+    assert not same_protocol(said(), said(protocol=OTHER))
 
 
 def test_only_what_both_say_is_compared():
     mine = said(presage="1", python="3.11")
-    assert not difference(mine, said(presage="1", python="3.10"))
-    assert not difference(mine, said())
-    assert difference(mine, said(presage="2")) == "presage 1 here, 2 there"
+    assert not describe_version_differences(mine, said(presage="1", python="3.10"))
+    assert not describe_version_differences(mine, said())
+    assert describe_version_differences(mine, said(presage="2")) == "presage 1 here, 2 there"
 
 
 def test_a_service_says_what_it_is():
-    reply = this_service("x", "{}", 3.0)
+    reply = build_config_reply("x", "{}", 3.0)
     assert (reply.protocol, reply.host, reply.uptime) == (PROTOCOL, platform.node(), 3.0)
     assert reply.versions["presage"]
 
@@ -161,7 +168,7 @@ def test_the_bus_asks_each_of_two_of_one_name(link, bus):
             calls = [inbox.get(2.0) for inbox in inboxes]
             for call in calls:
                 if call is not None:
-                    call.reply(this_service("twice", "{}").encode())
+                    call.reply(build_config_reply("twice", "{}").encode())
             assert done.wait(PATIENCE)
             return None not in calls
 

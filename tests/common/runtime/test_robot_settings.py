@@ -18,12 +18,12 @@ BURGER = ["--drive=differential", "--radius=0.105", "--max-speed=0.22", "--max-t
 
 @pytest.mark.parametrize("settings", ALL)
 def test_unless_told_it_is_the_shipped_robot(settings):
-    assert load_settings(settings, []).the_robot() == Robot()
+    assert load_settings(settings, []).build_robot() == Robot()
 
 
 @pytest.mark.parametrize("settings", ALL)
 def test_what_is_told_is_the_robots(settings):
-    told = load_settings(settings, [*BURGER, "--turn-acceleration=3.2"]).the_robot()
+    told = load_settings(settings, [*BURGER, "--turn-acceleration=3.2"]).build_robot()
     assert told == Robot(
         drive="differential", radius=0.105, max_speed=0.22, max_turn=2.84, acceleration=0.5, turn_acceleration=3.2
     )
@@ -33,7 +33,7 @@ def test_the_environment_tells_all_at_once(monkeypatch):
     for name, value in {"RADIUS": "0.105", "MAX_SPEED": "0.22", "MAX_TURN": "2.84", "DRIVE": "differential"}.items():
         monkeypatch.setenv(f"PRESAGE_{name}", value)
     monkeypatch.setenv("PRESAGE_ACCELERATION", "")  # as compose passes what is not set
-    one, two, three = (load_settings(each, []).the_robot() for each in ALL)
+    one, two, three = (load_settings(each, []).build_robot() for each in ALL)
     assert one == two == three
     assert (one.radius, one.max_speed, one.max_turn, one.acceleration) == (0.105, 0.22, 2.84, 1.0)
 
@@ -47,6 +47,6 @@ def test_what_is_no_limit_is_named(field, value):
 
 def test_who_could_not_stop_is_refused():
     with pytest.raises(UserError, match=r"--max-speed 1 m/s with --acceleration 0.01 m/s²: .* 100 s to stop"):
-        RobotSettings(acceleration=0.01).the_robot()
+        RobotSettings(acceleration=0.01).build_robot()
     with pytest.raises(UserError, match="--turn-acceleration"):
-        RobotSettings(turn_acceleration=0.1).the_robot()
+        RobotSettings(turn_acceleration=0.1).build_robot()

@@ -48,7 +48,7 @@ def test_the_limited_speed_can_be_braked_before_any_point(twist, points):
     assert held == (speed < np.hypot(*twist[:2]) - 1e-12)
     if speed < 1e-9:
         return
-    stop = speed * safety.LATENCY + speed**2 / (2 * ROBOT.acceleration)
+    stop = speed * safety.REACTION_TIME_S + speed**2 / (2 * ROBOT.acceleration)
     ahead = limited[:2] / speed
     for travelled in np.linspace(0, stop, 20):
         gaps = np.hypot(*(points - ahead * travelled).T)

@@ -61,7 +61,7 @@ def test_an_answer_is_counted_once_and_only_where_its_scan_was_sent(bus, link):
     """Somebody answers every scan of the first robot twice, and once with a stamp that nobody sent."""
     load = Load(bus, load_world("corridor"), 16, 15.0, 2, 1)
     with open_bus(link) as other:
-        answering = other.beside(load.robots[0].name)
+        answering = other.for_robot(load.robots[0].name)
         inbox = Inbox()
         other.subscribe(SCAN, inbox, keep_all=True, robot=load.robots[0].name)
 

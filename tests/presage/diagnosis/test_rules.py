@@ -9,7 +9,7 @@ import pytest
 
 from common.messages.definitions import Health, Pose, Scan, TopicHealth
 from common.messages.topics import BELIEF, CMD_VEL, SCAN, TOPICS, TRUTH
-from common.runtime.protocol_check import this_service
+from common.runtime.protocol_check import build_config_reply
 from presage.diagnosis.bus_observation import Observed, reach
 from presage.diagnosis.rules import CLOCKS, SILENT, judge
 from services.recorder.files.message_counts import Sequence
@@ -28,7 +28,7 @@ def well() -> Observed:
     seen = Observed("robot", 3.0, alive={*NAMES}, robots={"robot"})
     seen.arrivals = Counter({t.key("robot"): int(t.rate * 3) for t in TOPICS if t.rate and not t.per_service})
     for name in NAMES:
-        seen.replies[name] = [this_service(name, "{}", 5.0)]
+        seen.replies[name] = [build_config_reply(name, "{}", 5.0)]
         seen.pulses[name] = [pulse(name, n * SECOND, received=100 + 15 * n) for n in (1, 2, 3)]
     numbers = seen.sequences[SCAN.key("robot")] = Sequence()
     for number in (7, 8, 9, 0, 1, 2):  # it began anew
@@ -65,14 +65,14 @@ def test_a_slow_scanner_is_no_fault_and_one_slower_than_it_says_is():
 def test_the_scanner_is_described_and_judged(changes, ok, words):
     seen = well()
     seen.scan = a_scan(**changes)
-    (finding,) = [f for f in judge(seen, this_service("doctor", "{}")) if f.code == "scanner"]
+    (finding,) = [f for f in judge(seen, build_config_reply("doctor", "{}")) if f.code == "scanner"]
     assert finding.ok is ok
     assert words in finding.what
     assert bool(finding.advice) == (ok is not True)
 
 
 def faults(seen: Observed) -> set[str]:
-    return {finding.code for finding in judge(seen, this_service("doctor", "{}")) if finding.ok is False}
+    return {finding.code for finding in judge(seen, build_config_reply("doctor", "{}")) if finding.ok is False}
 
 
 def test_where_all_is_well_nothing_is_found():
@@ -126,7 +126,7 @@ def test_a_replay_stands_for_the_others():
 
 def test_another_robot_s_name_is_said():
     seen = Observed("robot", 3.0, robots={"two"})
-    found = [finding for finding in judge(seen, this_service("doctor", "{}")) if finding.code == "no_such_robot"]
+    found = [finding for finding in judge(seen, build_config_reply("doctor", "{}")) if finding.code == "no_such_robot"]
     assert "two" in found[0].what
 
 
