@@ -32,7 +32,7 @@ from presage.terminal.progress import progress, working
 from services.estimator.factory import SIGMA
 from services.recorder.files.message_counts import Ledger, as_metadata
 from services.recorder.files.writer import RecordingWriter
-from services.recorder.recording import write_answer
+from services.recorder.recording import write_description
 
 EVEN = 1e-4  # rad, by which a beam may lie beside its place
 HEAD = 50  # scans by which the rate is known
@@ -125,7 +125,7 @@ def write_recording(job: Import, log: Log, world: World | None, sweeps: Iterator
     try:
         writer.metadata("presage", {"robot": job.robot, "command": " ".join(sys.argv), **versions()})
         scanner = scanner_of(log, start, step, period, job.sigma)
-        write_answer(writer, "simulator", WorldReply(world=world, scanner=scanner))
+        write_description(writer, "simulator", WorldReply(world=world, scanner=scanner))
         sender = _Sender(writer, job.robot, written)
         template = Scan(
             stamp_ns=0, angle_min=start, angle_increment=step, range_min=log.range_min, range_max=log.range_max,

@@ -16,17 +16,17 @@ from common.errors import UserError
 from common.messages.requests import PlayerReply
 from presage.live.bus_watch import session
 from presage.replay.keyboard import HELP, keyboard
-from services.recorder.replaying.replay import Choice, Remote, names_of, replay
+from services.recorder.replaying.replay import ReplayControl, ReplayOptions, names_of, replay
 
 PERIOD = 0.1  # s between two looks of the bar
 ROBOT = r"[A-Za-z0-9_.-]{1,64}"
 
 
-def run_replay(file: Path, link: Link, choice: Choice, console: Console) -> None:
+def run_replay(file: Path, link: Link, choice: ReplayOptions, console: Console) -> None:
     """Replay until the end, q or Ctrl-C."""
 
     @contextmanager
-    def steering(remote: Remote) -> Iterator[None]:
+    def steering(remote: ReplayControl) -> Iterator[None]:
         with keyboard(remote) as there:
             if there:
                 console.print(HELP, style="dim", highlight=False)
@@ -63,9 +63,11 @@ def checked_robot(name: str) -> str:
 def choice_of(
     only: str, leave_out: str, rate: float | None, start: float | None, end: float | None, robot: str, *,
     loop: bool, force: bool, paused: bool = False, stay: bool = False,
-) -> Choice:  # fmt: skip
+) -> ReplayOptions:  # fmt: skip
     """From the command line's words; raises UserError on a robot no key can hold."""
     if robot:
         checked_robot(robot)
     names, without = names_of(only), names_of(leave_out)
-    return Choice(names or None, without, 1.0 if rate is None else rate, start, end, loop, robot, force, paused, stay)
+    return ReplayOptions(
+        names or None, without, 1.0 if rate is None else rate, start, end, loop, robot, force, paused, stay
+    )

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from common.messages.requests import PlayerReply, PlayerRequest
-from services.recorder.replaying.replay import Remote
+from services.recorder.replaying.replay import ReplayControl
 
 HELP = "space pause/go on, . one scan, left/right or h/l 5 s back/on, down/up slower/faster, q quit"
 JUMP = 5.0  # s
@@ -50,7 +50,7 @@ def request_of(key: str, state: PlayerReply) -> PlayerRequest | None:
 
 
 @contextmanager
-def keyboard(remote: Remote) -> Iterator[bool]:
+def keyboard(remote: ReplayControl) -> Iterator[bool]:
     """Keys of the terminal on standard input, if it is one, steer the replay; whether it is."""
     try:
         terminal = sys.stdin.fileno()
@@ -75,7 +75,7 @@ def keyboard(remote: Remote) -> Iterator[bool]:
         os.close(wake)
 
 
-def _listen(terminal: int, wake: int, remote: Remote) -> None:
+def _listen(terminal: int, wake: int, remote: ReplayControl) -> None:
     while True:
         ready, _, _ = select.select([terminal, wake], [], [])
         data = b"" if wake in ready else os.read(terminal, 64)

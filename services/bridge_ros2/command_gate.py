@@ -14,12 +14,12 @@ from common.messages.definitions import CmdVel, Scan
 from common.robot.base import Robot
 from common.runtime import safety
 
-SLOWEST = 1e-3  # m/s and rad/s; less is none
-STANDING = 0.5  # s for which a stop is said again; then the topic is left to others (a joystick, nav2)
-REMIND = 0.1  # s between two of those that nobody asked for
+MIN_SPEED = 1e-3  # m/s and rad/s; less is none
+STOP_REPEAT_S = 0.5  # s for which a stop is said again; then the topic is left to others (a joystick, nav2)
+STOP_REPEAT_PERIOD_S = 0.1  # s between two of those that nobody asked for
 
 
-class Wheels:
+class CommandGate:
     """Judges each command by the scan it answers."""
 
     def __init__(self, robot: Robot, *, obstacle_stop: bool = True) -> None:
@@ -43,11 +43,11 @@ class Wheels:
         return float(np.median(self._periods)) if self._periods else 0.0
 
     @property
-    def patience(self) -> float:
+    def timeout(self) -> float:
         """S without a newer command after which the robot stops; a slow scanner's commands come less often."""
         return max(self.robot.command_timeout, 1.5 * self._period)
 
-    def hear_scan(self, scan: Scan, now: float) -> None:
+    def add_scan(self, scan: Scan, now: float) -> None:
         """What commands are about, and what is in the way."""
         if self._scan is not None:
             before, _ = self._scan
@@ -58,7 +58,7 @@ class Wheels:
         self._scan = (scan.stamp_ns, now)
         self._points = safety.scan_points(scan)
 
-    def hear_velocity(self, twist: Array, now: float) -> None:
+    def add_velocity(self, twist: Array, now: float) -> None:
         """(3,) how the robot moves, by its odometry."""
         self._velocity = (twist, now)
 
@@ -76,14 +76,14 @@ class Wheels:
             current = self._velocity[0] if self._velocity and now - self._velocity[1] < 0.5 else None
             hold = max(safety.REACTION_TIME_S, 2 * self._period)
             twist, self.stopped = safety.limit_velocity(twist, self._points, self.robot, current, hold)
-        twist = np.where(np.abs(twist) < SLOWEST, 0.0, twist)
+        twist = np.where(np.abs(twist) < MIN_SPEED, 0.0, twist)
         if twist.any():
             if self.due(now) <= 0:  # said again after the time was up
-                return self.silence(now)
+                return self.stop_for_silence(now)
             self._moving, self._moved, self._ended = True, now, -1e9
             return twist
         self._moving = False
-        return twist if now - self._moved <= STANDING else None
+        return twist if now - self._moved <= STOP_REPEAT_S else None
 
     def _fresh(self, stamp_ns: int, now: float) -> bool:
         """Whether it answers a scan of lately, and none before the last one's."""
@@ -94,27 +94,27 @@ class Wheels:
 
     def due(self, now: float) -> float:
         """S until a moving robot has to be stopped."""
-        return self._heard + self.patience - now
+        return self._heard + self.timeout - now
 
     @property
     def moving(self) -> bool:
         """Whether the last that was passed on moves the robot."""
         return self._moving
 
-    def silence(self, now: float) -> Array | None:
-        """(3,) zeros where commands have ended under way; `remind` says them again."""
+    def stop_for_silence(self, now: float) -> Array | None:
+        """(3,) zeros where commands have ended under way; `repeat_stop` says them again."""
         moving, self._moving = self._moving, False
         if moving:
             self._ended = self._reminded = now
         return np.zeros(3) if moving else None
 
-    def reminds_in(self, now: float) -> float | None:
+    def repeat_due(self, now: float) -> float | None:
         """S until a stop for silence is to be said again: one message may get lost, and links fail just then."""
-        return None if now - self._ended > STANDING else self._reminded + REMIND - now
+        return None if now - self._ended > STOP_REPEAT_S else self._reminded + STOP_REPEAT_PERIOD_S - now
 
-    def remind(self, now: float) -> Array | None:
+    def repeat_stop(self, now: float) -> Array | None:
         """(3,) zeros, where it is time for them."""
-        due = self.reminds_in(now)
+        due = self.repeat_due(now)
         if due is None or due > 0:
             return None
         self._reminded = now

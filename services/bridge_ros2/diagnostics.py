@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from services.bridge_ros2.graph import named
+from services.bridge_ros2.graph import join_names
 from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, TWIST_STAMPED
 
 if TYPE_CHECKING:
     from services.bridge_ros2.graph import Graph
     from services.bridge_ros2.settings import BridgeRos2Settings
 
-SILENT = 3.0  # s without a scan, then it is said why
+SCAN_TIMEOUT_S = 3.0  # s without a scan, then it is said why
 
 
-def complaint(
+def diagnose(
     options: BridgeRos2Settings, graph: Graph, problem: str, *, linked: bool, quiet: float, heard: bool, reckoned: bool
 ) -> str:
     """Empty where all is well.
@@ -25,13 +25,13 @@ def complaint(
     topic = options.topic(options.scan_topic)
     if not linked:
         return f"waits for the zenoh router at {options.ros_connect}: it is gone"
-    if wrong := graph.misfit(topic):
+    if wrong := graph.distro_mismatch(topic):
         return wrong
-    if quiet > SILENT:
+    if quiet > SCAN_TIMEOUT_S:
         if problem:
             return f"scans on {topic} cannot be used: {problem}"
-        why = graph.why_silent(topic, LASER_SCAN, "--scan-topic", nobody=_nobody(options, graph))
-        return f"no scan on {topic} for {SILENT:g} s: {why}"
+        why = graph.why_silent(topic, LASER_SCAN, "--scan-topic", no_endpoints=_no_endpoint_reason(options, graph))
+        return f"no scan on {topic} for {SCAN_TIMEOUT_S:g} s: {why}"
     return _with_scans(options, graph, reckoned=reckoned) if heard else f"no scan on {topic} yet"
 
 
@@ -48,7 +48,7 @@ def _with_scans(options: BridgeRos2Settings, graph: Graph, *, reckoned: bool) ->
     if options.publish_map and (other := graph.publishers(chart)):
         return f"{chart}: {other} publishes a map there as well: leave out --publish-map, or --map-topic"
     command = options.topic(options.cmd_topic)
-    wanted = graph.twist_wanted(command) if options.commands else ""
+    wanted = graph.expected_twist_type(command) if options.commands else ""
     if wanted and (wanted == TWIST_STAMPED) != options.stamped:
         return f"{command}: the robot listens for {wanted}: --{'' if wanted == TWIST_STAMPED else 'no-'}stamped"
     return ""
@@ -62,18 +62,20 @@ def _no_odometry(options: BridgeRos2Settings, graph: Graph) -> str:
     there = graph.topics_of(ODOMETRY)
     if not there or topic in there:
         return ""
-    return f"no odometry on {topic}: {ODOMETRY} is on {named(there)}: --odom-topic"
+    return f"no odometry on {topic}: {ODOMETRY} is on {join_names(there)}: --odom-topic"
 
 
-def _nobody(options: BridgeRos2Settings, graph: Graph) -> str:
+def _no_endpoint_reason(options: BridgeRos2Settings, graph: Graph) -> str:
     """Where nobody of our flavour and domain is seen: who is there instead, or what to look at."""
-    elsewhere = graph.elsewhere()
-    domains = sorted({each.domain for each in elsewhere if each.flavor == "rmw_zenoh" and each.domain is not None})
+    other_endpoints = graph.other_endpoints()
+    domains = sorted(
+        {each.domain for each in other_endpoints if each.flavor == "rmw_zenoh" and each.domain is not None}
+    )
     if options.flavor == "rmw_zenoh":
-        if any(each.flavor == "ros2dds" for each in elsewhere):
+        if any(each.flavor == "ros2dds" for each in other_endpoints):
             return "there it is zenoh-bridge-ros2dds that speaks, not rmw_zenoh: --flavor ros2dds"
         if domains:
-            others = named([str(domain) for domain in domains])
+            others = join_names([str(domain) for domain in domains])
             return f"nobody is seen in ROS domain {options.domain}, but in {others}: --domain {domains[0]}"
     elif domains:
         domain = "" if options.domain in domains else f" --domain {domains[0]}"

@@ -14,7 +14,7 @@ from common.limits import MAX_BEAMS, MAX_COORDINATE_M, MAX_DISTANCE_M, MAX_SPEED
 from common.messages.definitions import Odom, Pose, Scan, Twist
 from common.messages.ros_messages import Mount, Transform, read_pose, stamp_of
 from common.robot.ranges import normalise_driver_ranges
-from services.bridge_ros2.frames import Dead
+from services.bridge_ros2.frames import DeadReckoning
 
 PLANE = [0, 1, 5]  # x, y, yaw among the six of a pose's covariance
 
@@ -51,7 +51,7 @@ def scan_of(message: Any, mount: Mount, stamp_ns: int) -> Scan:
     )  # fmt: skip
 
 
-def dead_of(message: Any, child_in_base: Transform | None) -> Dead:
+def dead_reckoning_of(message: Any, child_in_base: Transform | None) -> DeadReckoning:
     """A nav_msgs/Odometry; ``child_in_base`` where its child frame is not the base itself. Raises ValueError.
 
     The velocity is the child frame's, which is the base's but for where the child frame is turned or off the centre.
@@ -69,7 +69,7 @@ def dead_of(message: Any, child_in_base: Transform | None) -> Dead:
     if not (np.abs(pose[:2]) <= MAX_COORDINATE_M).all():
         x, y = pose[:2]
         raise ValueError(f"the odometry is at ({x:g}, {y:g}) m, more than {MAX_COORDINATE_M:g} m from its origin")
-    return Dead(stamp_of(message.header), pose, twist, _covariance(message.pose.covariance))
+    return DeadReckoning(stamp_of(message.header), pose, twist, _covariance(message.pose.covariance))
 
 
 def _covariance(six: Any) -> Array:
@@ -78,7 +78,7 @@ def _covariance(six: Any) -> Array:
     return found if np.isfinite(found).all() else np.zeros((3, 3))
 
 
-def odom_of(dead: Dead) -> Odom:
+def odom_of(dead: DeadReckoning) -> Odom:
     """Our message."""
     vx, vy, wz = (float(v) for v in dead.twist)
     return Odom(
@@ -88,9 +88,9 @@ def odom_of(dead: Dead) -> Odom:
 
 def pose_of(message: Any, frame: str) -> Pose:
     """The pose of a PoseStamped or PoseWithCovarianceStamped in ``frame``; raises ValueError for another frame."""
-    named = message.header.frame_id.strip("/")
-    if named not in ("", frame):
-        raise ValueError(f"it is in the frame {named!r}, not {frame!r}: in rviz set the fixed frame to {frame}")
+    frame_id = message.header.frame_id.strip("/")
+    if frame_id not in ("", frame):
+        raise ValueError(f"it is in the frame {frame_id!r}, not {frame!r}: in rviz set the fixed frame to {frame}")
     pose = getattr(message.pose, "pose", message.pose)
     try:
         return Pose.of(read_pose(pose.position, pose.orientation).planar())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from services.bridge_ros2.keys import Endpoint, Names, read_token
 from services.bridge_ros2.ros_types import NO_HASH, TWIST, TWIST_STAMPED, type_hash
 
-SHOWN = 4  # names in one line
+MAX_NAMES_SHOWN = 4  # names in one line
 
 
 class Graph:
@@ -27,14 +27,14 @@ class Graph:
         """All of our flavour and domain, ordered by name."""
         return [each for each in self._all() if self._names.ours(each)]
 
-    def elsewhere(self) -> list[Endpoint]:
+    def other_endpoints(self) -> list[Endpoint]:
         """All others."""
         return [each for each in self._all() if not self._names.ours(each)]
 
     def _all(self) -> list[Endpoint]:
         return sorted(self._tokens.copy().values(), key=lambda each: (each.topic, each.kind, each.node))
 
-    def misfit(self, topic: str) -> str:
+    def distro_mismatch(self, topic: str) -> str:
         """Which ``--distro`` fits, where ours does not by the hashes of types; those who publish ``topic`` decide."""
         if self._names.flavor == "ros2dds":
             return ""
@@ -48,13 +48,13 @@ class Graph:
             return f"the types of {who} have no hashes, as Humble's: --distro humble, or it will not hear us"
         return f"the types of {who} have hashes, as from Iron on: --distro jazzy, or it will not hear us"
 
-    def why_silent(self, topic: str, kind: str, option: str, *, nobody: str) -> str:
-        """Why nothing may come on ``topic``; ``option`` names another one, ``nobody`` is said where none is seen."""
+    def why_silent(self, topic: str, kind: str, option: str, *, no_endpoints: str) -> str:
+        """Why nothing may come on ``topic``; ``option`` names another one, ``no_endpoints`` is said where none is seen."""
         there = self.endpoints()
         publishers = [each for each in there if each.publishes]
         known = any(each.kind == kind for each in publishers)
-        if not there or (not known and any(each.publishes and each.kind == kind for each in self.elsewhere())):
-            return nobody
+        if not there or (not known and any(each.publishes and each.kind == kind for each in self.other_endpoints())):
+            return no_endpoints
         here = [each for each in publishers if each.topic == topic]
         of_kind = [each for each in here if each.kind == kind]
         foreign = [each for each in of_kind if each.hash not in ("", NO_HASH, type_hash(kind))]
@@ -68,8 +68,10 @@ class Graph:
         if here:
             return f"it is of type {here[0].kind}, not {kind}"
         if others := sorted({each.topic for each in publishers if each.kind == kind}):
-            return f"nobody publishes it; {kind} is on {named(others)}: {option}"
-        return f"nobody publishes it, nor any other {kind}; there are {named(sorted({e.topic for e in publishers}))}"
+            return f"nobody publishes it; {kind} is on {join_names(others)}: {option}"
+        return (
+            f"nobody publishes it, nor any other {kind}; there are {join_names(sorted({e.topic for e in publishers}))}"
+        )
 
     def topics_of(self, kind: str) -> list[str]:
         """On which a type is published."""
@@ -80,7 +82,7 @@ class Graph:
         there = [each for each in self.endpoints() if each.publishes and each.topic == topic]
         return _nodes(there) if there else ""
 
-    def twist_wanted(self, topic: str) -> str:
+    def expected_twist_type(self, topic: str) -> str:
         """The type that subscriptions on the command topic have; empty where there is none, or both are there."""
         kinds = {e.kind for e in self.endpoints() if not e.publishes and e.topic == topic}
         found = kinds & {TWIST, TWIST_STAMPED}
@@ -88,10 +90,10 @@ class Graph:
 
 
 def _nodes(endpoints: list[Endpoint]) -> str:
-    return named(sorted({each.node for each in endpoints} - {""})) or "somebody"
+    return join_names(sorted({each.node for each in endpoints} - {""})) or "somebody"
 
 
-def named(names: list[str]) -> str:
+def join_names(names: list[str]) -> str:
     """The first of them, and how many more, for one line."""
-    more = len(names) - SHOWN
-    return ", ".join(names[:SHOWN]) + (f" and {more} more" if more > 0 else "")
+    more = len(names) - MAX_NAMES_SHOWN
+    return ", ".join(names[:MAX_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")

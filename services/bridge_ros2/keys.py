@@ -83,7 +83,7 @@ class Names:
         stem = topic.strip("/")
         return stem if self.flavor == "ros2dds" else f"{self.domain}/{stem}/{dds_name(kind)}/*"
 
-    def refuse_foreign(self, key: str, kind: str) -> None:
+    def check_type_hash(self, key: str, kind: str) -> None:
         """Raises ValueError where what came on ``key`` says that it is of another definition than known here."""
         told = key.rsplit("/", 1)[-1]
         if self.flavor == "rmw_zenoh" and told not in (type_hash(kind), NO_HASH):
@@ -99,7 +99,7 @@ class Names:
         return f"@/*/@ros2_pub_cache/{stem}", f"@ros2_pub_cache/*/{stem}"
 
 
-def mangled(name: str) -> str:
+def mangle(name: str) -> str:
     """As one chunk of a key."""
     return name.replace("/", "%")
 
@@ -119,15 +119,15 @@ class Node:
 
     def endpoint_token(self, kind: Kind, number: int, topic: str, message: str, qos: Qos) -> str:
         """The token of its publisher or subscription with that ``number``, unique among them."""
-        rest = (mangled(topic), dds_name(message), self.names.hash_of(message), qos.text())
+        rest = (mangle(topic), dds_name(message), self.names.hash_of(message), qos.text())
         return "/".join([self._token(kind, number), *rest])
 
     def _token(self, kind: Kind, number: int) -> str:
-        enclave, namespace = "%", mangled(clean_namespace(self.namespace))
+        enclave, namespace = "%", mangle(clean_namespace(self.namespace))
         return f"@ros2_lv/{self.names.domain}/{self.zid}/0/{number}/{kind}/{enclave}/{namespace}/{self.name}"
 
 
-def gid_of(token: str) -> bytes:
+def publisher_gid(token: str) -> bytes:
     """16 bytes by which ROS knows the publisher with that token: its XXH3 of 128 bits, the lower half first."""
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
 

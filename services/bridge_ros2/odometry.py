@@ -8,25 +8,27 @@ import numpy as np
 
 from common.geometry import se2
 from common.messages.ros_messages import Mount, Transform, mount_of
-from services.bridge_ros2.frames import Dead, NewestFrames, Odometer
+from services.bridge_ros2.frames import DeadReckoning, LatestTransforms, OdometryBuffer
 
 
 class NoMountError(ValueError):
     """Where the scanner sits is not in tf, or not yet."""
 
 
-class Motion:
+class MountAndOdometry:
     """Of one robot."""
 
     def __init__(self, base: str, odom: str, mount: Mount | None = None) -> None:
         """``base`` and ``odom``: names of the frames; ``mount``: of the scanner, else tf says it."""
         self.base, self.odom = base.strip("/"), odom.strip("/")
-        self.frames = NewestFrames()
+        self.frames = LatestTransforms()
         self._told = mount
         self._found = mount  # the last one used
-        self._by_topic, self._by_tf = Odometer(), Odometer()
-        self._last: Dead | None = None  # by tf
-        self.unplaced = ""  # odometry's child frame where tf does not connect it with the base, whose it is taken for
+        self._by_topic, self._by_tf = OdometryBuffer(), OdometryBuffer()
+        self._last: DeadReckoning | None = None  # by tf
+        self.unconnected_frame = (
+            ""  # odometry's child frame where tf does not connect it with the base, whose it is taken for
+        )
 
     def mount(self) -> Mount | None:
         """The scanner's, once it is known."""
@@ -48,19 +50,19 @@ class Motion:
         return self._found
 
     def child_in_base(self, child: str) -> Transform | None:
-        """Of an odometry's child frame; None where it is the base, or tf does not know better: then `unplaced`."""
+        """Of an odometry's child frame; None where it is the base, or tf does not know better: then `unconnected_frame`."""
         child = child.strip("/")
         found = None if child in ("", self.base) else self.frames.find(child, self.base)
-        self.unplaced = "" if found is not None or child == self.base else child
+        self.unconnected_frame = "" if found is not None or child == self.base else child
         return found
 
-    def hear_odometry(self, dead: Dead) -> None:
+    def add_odometry(self, dead: DeadReckoning) -> None:
         """By topic."""
-        self._by_topic.hear(dead)
+        self._by_topic.add(dead)
 
-    def hear_tf(self, message: Any) -> None:
+    def add_tf(self, message: Any) -> None:
         """Fixed joints, and the base's odometry if it is there."""
-        for parent, child, stamp_ns, transform in self.frames.hear(message):
+        for parent, child, stamp_ns, transform in self.frames.add(message):
             if parent != self.odom:
                 continue
             base = self.frames.find(self.base, child)
@@ -72,13 +74,13 @@ class Motion:
         pose, twist, last = base_in_odom.planar(), np.zeros(3), self._last
         if last is not None and 0 < (passed := (stamp_ns - last.stamp_ns) * 1e-9) < 1:
             twist = se2.between(last.pose, pose) / passed
-        self._last = Dead(stamp_ns, pose, twist, np.zeros((3, 3)))
-        self._by_tf.hear(self._last)
+        self._last = DeadReckoning(stamp_ns, pose, twist, np.zeros((3, 3)))
+        self._by_tf.add(self._last)
 
-    def at(self, stamp_ns: int) -> Dead | None:
+    def at(self, stamp_ns: int) -> DeadReckoning | None:
         """Dead reckoning for the estimator: by topic, else by tf."""
         return self._by_topic.at(stamp_ns) or self._by_tf.at(stamp_ns)
 
-    def by_tf(self, stamp_ns: int) -> Dead | None:
+    def at_by_tf(self, stamp_ns: int) -> DeadReckoning | None:
         """What the transform from map to odom has to fit: tf's own odometry, else the topic's."""
         return self._by_tf.at(stamp_ns) or self._by_topic.at(stamp_ns)

@@ -18,14 +18,14 @@ import zenoh.ext
 from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.messages.topics import Topic
-from services.bridge_ros2.keys import TOKENS, Names, Node, Qos, attachment, gid_of, read_attachment
+from services.bridge_ros2.keys import TOKENS, Names, Node, Qos, attachment, publisher_gid, read_attachment
 from services.bridge_ros2.ros_types import encode
 
 if TYPE_CHECKING:
     from services.bridge_ros2.graph import Graph
 
-HEARTBEAT = 0.5  # s, of kept topics; rmw_zenoh's
-LEASE = 3000  # ms until one who is silent counts as gone
+HEARTBEAT_PERIOD_S = 0.5  # s, of kept topics; rmw_zenoh's
+LEASE_MS = 3000  # ms until one who is silent counts as gone
 
 
 def open_ros_session(endpoint: str, config: Path | None = None) -> zenoh.Session | None:
@@ -56,7 +56,7 @@ def _settings(endpoint: str) -> dict[str, Any]:
         "connect/exit_on_failure": True,
         "scouting/multicast/enabled": False,
         "transport/shared_memory/enabled": False,
-        "transport/link/tx/lease": LEASE,
+        "transport/link/tx/lease": LEASE_MS,
     }
 
 
@@ -145,7 +145,9 @@ class RosSession:
             more = {
                 "cache": zenoh.ext.CacheConfig(qos.depth),
                 "publisher_detection": True,
-                "sample_miss_detection": zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT),
+                "sample_miss_detection": zenoh.ext.MissDetectionConfig(
+                    heartbeat=None, sporadic_heartbeat=HEARTBEAT_PERIOD_S
+                ),
             }
         made = zenoh.ext.declare_advanced_publisher(
             self._session, self._names.publish(topic, kind), congestion_control=zenoh.CongestionControl.DROP, **more
@@ -155,7 +157,7 @@ class RosSession:
         if self._node is not None:
             token = self._node.endpoint_token("MP", next(self._numbers), topic, kind, qos)
             self._token(token)
-            gid = gid_of(token)
+            gid = publisher_gid(token)
         return RosPublisher(kind, made, gid, itertools.count(1))
 
     def linked(self) -> bool:

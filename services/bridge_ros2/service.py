@@ -15,13 +15,13 @@ from common.messages.requests import LocaliseRequest, Reply
 from common.messages.ros_messages import stamp_of
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, LOCALISE, ODOM, SCAN, STATUS, Query, Topic
 from common.runtime.service import Service
-from services.bridge_ros2 import to_ros as outward
-from services.bridge_ros2.command_gate import Wheels
-from services.bridge_ros2.diagnostics import SILENT, complaint
-from services.bridge_ros2.from_ros import dead_of, odom_of, pose_of, scan_of
+from services.bridge_ros2 import to_ros
+from services.bridge_ros2.command_gate import CommandGate
+from services.bridge_ros2.diagnostics import SCAN_TIMEOUT_S, diagnose
+from services.bridge_ros2.from_ros import dead_reckoning_of, odom_of, pose_of, scan_of
 from services.bridge_ros2.graph import Graph
 from services.bridge_ros2.keys import KEPT, LATEST, SENSOR, TF, TF_STATIC, Qos
-from services.bridge_ros2.odometry import Motion, NoMountError
+from services.bridge_ros2.odometry import MountAndOdometry, NoMountError
 from services.bridge_ros2.ros_session import RosPublisher, RosSession, open_ros_session
 from services.bridge_ros2.ros_types import (
     LASER_SCAN,
@@ -38,8 +38,8 @@ from services.bridge_ros2.ros_types import (
 )  # fmt: skip
 from services.bridge_ros2.settings import BridgeRos2Settings
 
-MAP_AGAIN = 10.0  # s between two messages of the map, for who has missed it; SLAM's nodes say theirs as often
-AGAIN = 1.0  # s between two looks at how things stand, and between two tries to reach the router
+MAP_PERIOD_S = 10.0  # s between two messages of the map, for who has missed it; SLAM's nodes say theirs as often
+CHECK_PERIOD_S = 1.0  # s between two looks at how things stand, and between two tries to reach the router
 YAW_TOLERANCE = 0.25  # rad, of rviz's goals, as nav2 has it
 
 
@@ -56,8 +56,8 @@ class BridgeRos2Service(Service):
         super().__init__(settings)
         self.options = settings
         self.graph = Graph(settings.names())
-        self.motion = Motion(settings.base_frame, settings.odom_frame, settings.the_mount())
-        self.wheels = Wheels(settings.build_robot(), obstacle_stop=settings.obstacle_stop)
+        self.motion = MountAndOdometry(settings.base_frame, settings.odom_frame, settings.the_mount())
+        self.gate = CommandGate(settings.build_robot(), obstacle_stop=settings.obstacle_stop)
         self.blind = settings.build_self_filter()
         self.note = f"waits for the zenoh router at {settings.ros_connect}"
         self._ros: RosSession | None = None
@@ -78,13 +78,13 @@ class BridgeRos2Service(Service):
         """Declared before anybody asks: the first message on a key just declared may be lost."""
         self.options.check()
         if self.options.publish_map:
-            self._map = outward.map_message(rasterise(load_world(self.options.world)), self.options.map_frame)
+            self._map = to_ros.map_message(rasterise(load_world(self.options.world)), self.options.map_frame)
         for topic in (ODOM, SCAN):
             self.loop.bus.publisher(topic, self.name)
 
     def close(self) -> None:
         """A robot under way is stopped."""
-        self._drive(self.wheels.silence(time.monotonic()))
+        self._drive(self.gate.stop_for_silence(time.monotonic()))
         if self._ros is not None:
             self._ros.close()
 
@@ -100,11 +100,11 @@ class BridgeRos2Service(Service):
         ros = self._ros = RosSession(session, options.names(), options.namespace, options.node, self.graph)
         self._began = time.monotonic()
         heard: list[tuple[str, str, Qos, Callable[[Any], None]]] = [
-            (options.tf_topic + "_static", TF_MESSAGE, TF_STATIC, self._hear_tf),
-            (options.tf_topic, TF_MESSAGE, TF, self._hear_tf),
-            (options.odom_topic, ODOMETRY, Qos(), self._hear_odometry),
-            (options.scan_topic, LASER_SCAN, SENSOR, self._hear_scan),
-            (options.initial_pose_topic, POSE_WITH_COVARIANCE, Qos(), self._hear_initial_pose),
+            (options.tf_topic + "_static", TF_MESSAGE, TF_STATIC, self._on_tf),
+            (options.tf_topic, TF_MESSAGE, TF, self._on_tf),
+            (options.odom_topic, ODOMETRY, Qos(), self._on_odometry),
+            (options.scan_topic, LASER_SCAN, SENSOR, self._on_scan),
+            (options.initial_pose_topic, POSE_WITH_COVARIANCE, Qos(), self._on_initial_pose),
         ]
         said = [
             (options.pose_topic, POSE_WITH_COVARIANCE, KEPT),
@@ -114,7 +114,7 @@ class BridgeRos2Service(Service):
         if self._map is not None:
             said.append((options.map_topic, OCCUPANCY_GRID, KEPT))
         if options.commands:
-            heard.append((options.goal_topic, POSE_STAMPED, Qos(), self._hear_goal))
+            heard.append((options.goal_topic, POSE_STAMPED, Qos(), self._on_goal))
             said.append((options.cmd_topic, TWIST_STAMPED if options.stamped else TWIST, LATEST))
         self._out = {name: ros.publisher(options.topic(name), kind, qos) for name, kind, qos in said if name}
         for name, kind, qos, hear in heard:
@@ -128,27 +128,27 @@ class BridgeRos2Service(Service):
     def due(self) -> float | None:
         """Until the next look, or until a robot whose commands have ended is stopped."""
         now = time.monotonic()
-        stop = self.wheels.due(now) if self.wheels.moving else self.wheels.reminds_in(now)
+        stop = self.gate.due(now) if self.gate.moving else self.gate.repeat_due(now)
         look = self._look_at - now
         return look if stop is None else min(look, stop)
 
     def on_timer(self) -> None:
         """Stop the robot; look how things stand."""
         now = time.monotonic()
-        if self.wheels.moving and self.wheels.due(now) <= 0:
+        if self.gate.moving and self.gate.due(now) <= 0:
             self.counters["stops_for_silence"] += 1
-            self.log.warning("stop: commands have ended", silent_s=round(self.wheels.patience, 2))
-            self._drive(self.wheels.silence(now))
-        self._drive(self.wheels.remind(now))
+            self.log.warning("stop: commands have ended", silent_s=round(self.gate.timeout, 2))
+            self._drive(self.gate.stop_for_silence(now))
+        self._drive(self.gate.repeat_stop(now))
         if now >= self._look_at:
-            self._look_at = now + AGAIN
+            self._look_at = now + CHECK_PERIOD_S
             self._look(now)
 
     def _look(self, now: float) -> None:
         """Say in health, and once in the log, what is missing."""
         if self._ros is None:
             self._connect()
-            self._look_at = time.monotonic() + AGAIN
+            self._look_at = time.monotonic() + CHECK_PERIOD_S
         before = self.note
         if self._ros is not None:
             self._say_map(now)
@@ -156,7 +156,7 @@ class BridgeRos2Service(Service):
             if self.motion.mount() is None:
                 self._ros.fetch(_row(self.options.tf_topic + "_static"), static, self.loop.inbox)
             since = self._scan_at if self._scan_at is not None else self._began
-            self.note = complaint(
+            self.note = diagnose(
                 self.options, self.graph, self._problem,
                 linked=self._ros.linked(), quiet=now - since, heard=self._scan_at is not None,
                 reckoned=self._reckoned,
@@ -169,8 +169,8 @@ class BridgeRos2Service(Service):
 
     def _say_unplaced(self, now: float) -> None:
         """Once: odometry is about a frame that tf does not know, though it had the time to come."""
-        child, base = self.motion.unplaced, self.motion.base
-        if child and not self._unplaced_said and now - self._began > SILENT:
+        child, base = self.motion.unconnected_frame, self.motion.base
+        if child and not self._unplaced_said and now - self._began > SCAN_TIMEOUT_S:
             self._unplaced_said = True
             self.log.warning(
                 "odometry is about a frame that tf does not connect with the base: taken for the base's",
@@ -185,7 +185,7 @@ class BridgeRos2Service(Service):
             return
         kind, hear = self._rows[sample.topic.name]
         try:
-            self.options.names().refuse_foreign(sample.key, kind)
+            self.options.names().check_type_hash(sample.key, kind)
             hear(decode(kind, sample.payload))
         except NoMountError as error:  # tf may still be on its way: after a while it is said
             self._problem = str(error)
@@ -194,16 +194,16 @@ class BridgeRos2Service(Service):
             self._problem = str(error) if sample.topic == _row(self.options.scan_topic, newest=True) else self._problem
             self.loop.reject(sample.key, str(error))
 
-    def _hear_tf(self, message: Any) -> None:
-        self.motion.hear_tf(message)
+    def _on_tf(self, message: Any) -> None:
+        self.motion.add_tf(message)
 
-    def _hear_odometry(self, message: Any) -> None:
+    def _on_odometry(self, message: Any) -> None:
         child = self.motion.child_in_base(message.child_frame_id)
-        dead = dead_of(message, child)
-        self.motion.hear_odometry(dead)
-        self.wheels.hear_velocity(dead.twist, time.monotonic())
+        dead = dead_reckoning_of(message, child)
+        self.motion.add_odometry(dead)
+        self.gate.add_velocity(dead.twist, time.monotonic())
 
-    def _hear_scan(self, message: Any) -> None:
+    def _on_scan(self, message: Any) -> None:
         """The scan, after the odometry of its moment."""
         now = time.monotonic()
         stamp_ns = stamp_of(message.header)
@@ -219,16 +219,16 @@ class BridgeRos2Service(Service):
             self.publish(ODOM, odom_of(dead))
         else:
             self.counters["scans_without_odometry"] += 1
-        self.wheels.hear_scan(self.blind.mask_for_planning(scan), now)
+        self.gate.add_scan(self.blind.mask_for_planning(scan), now)
         self.publish(SCAN, self.blind.mask_for_bus(scan))
         self._scan_at, self._problem = now, ""
 
-    def _hear_initial_pose(self, message: Any) -> None:
+    def _on_initial_pose(self, message: Any) -> None:
         pose = pose_of(message, self.options.map_frame)
         self.log.info("told where the robot is", x=pose.x, y=pose.y, yaw=pose.yaw)
         self.request(LOCALISE, LocaliseRequest(pose=pose))
 
-    def _hear_goal(self, message: Any) -> None:
+    def _on_goal(self, message: Any) -> None:
         pose = pose_of(message, self.options.map_frame)
         self.log.info("goal", x=pose.x, y=pose.y, yaw=pose.yaw)
         stamp_ns = self._clock[0] if self._clock else 0
@@ -244,21 +244,21 @@ class BridgeRos2Service(Service):
         if isinstance(message, Belief):
             self._say(message)
         elif isinstance(message, CmdVel) and self.options.commands:
-            refused = self.wheels.refused
-            self._drive(self.wheels.command(message, time.monotonic()))
-            if self.wheels.refused > refused:
+            refused = self.gate.refused
+            self._drive(self.gate.command(message, time.monotonic()))
+            if self.gate.refused > refused:
                 self.counters["stale_commands"] += 1
 
     def _say(self, belief: Belief) -> None:
         """Pose, transform and hypotheses."""
         options = self.options
         if (cloud := self._out.get(options.hypotheses_topic)) is not None:
-            cloud.put(outward.hypotheses_message(belief, options.map_frame))
-        if not outward.said(belief):
+            cloud.put(to_ros.hypotheses_message(belief, options.map_frame))
+        if not to_ros.is_publishable(belief):
             self.counters["beliefs_not_said"] += 1
             return
         if (pose := self._out.get(options.pose_topic)) is not None:
-            message = outward.pose_message(belief, options.map_frame)
+            message = to_ros.pose_message(belief, options.map_frame)
             if message is not None:
                 pose.put(message)
         if (tf := self._out.get(options.tf_topic)) is not None:
@@ -267,19 +267,19 @@ class BridgeRos2Service(Service):
     def _say_transform(self, belief: Belief, tf: RosPublisher) -> None:
         options, odometry, child = self.options, None, self.options.base_frame
         if options.tf == "map-odom":
-            dead = self.motion.by_tf(belief.stamp_ns)
+            dead = self.motion.at_by_tf(belief.stamp_ns)
             if dead is None:
                 self.counters["transforms_without_odometry"] += 1
                 return
             odometry, child = dead.pose, options.odom_frame
         ahead = belief.stamp_ns + round(options.transform_tolerance * 1e9)
-        pose = outward.correction(belief.pose, odometry)
-        tf.put(outward.transform_message(pose, ahead, options.map_frame, child))
+        pose = to_ros.correction(belief.pose, odometry)
+        tf.put(to_ros.transform_message(pose, ahead, options.map_frame, child))
 
     def _say_map(self, now: float) -> None:
         """Kept for those who come later, as map_server's; and again, for those whom that does not reach."""
         if self._map is not None and now >= self._map_at:
-            self._map_at = now + MAP_AGAIN
+            self._map_at = now + MAP_PERIOD_S
             self._out[self.options.map_topic].put(self._map)
 
     def _drive(self, twist: Array | None) -> None:
@@ -291,10 +291,12 @@ class BridgeRos2Service(Service):
         if self.options.stamped:
             there, here = self._clock or (time.time_ns(), time.monotonic())
             stamp = there + round((time.monotonic() - here) * 1e9)
-        kind, message = outward.twist_message(twist, stamp, self.options.base_frame)
+        kind, message = to_ros.twist_message(twist, stamp, self.options.base_frame)
         publisher.put(message, kind)
 
 
 def _row(name: str, *, newest: bool = False) -> Topic:
     """A topic of ROS as the inbox has it."""
-    return Topic(f"ros {name}", Stamped, "ros", 0, "newest" if newest else "all", recorded=False, multiple_publishers=True)
+    return Topic(
+        f"ros {name}", Stamped, "ros", 0, "newest" if newest else "all", recorded=False, multiple_publishers=True
+    )

@@ -22,7 +22,7 @@ from services.bridge_ros2.ros_types import (
 )
 
 
-def said(belief: Belief) -> bool:
+def is_publishable(belief: Belief) -> bool:
     """Whether ROS is told where the robot is: only while it is tracked, not of a belief lost or in two minds."""
     return belief.state == "tracking"
 

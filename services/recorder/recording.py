@@ -19,8 +19,8 @@ from common.messages.topics import Topic
 from common.versions import versions
 from services.recorder.files.message_counts import Count, Ledger, as_metadata
 from services.recorder.files.parts import Limits, PartsWriter
-from services.recorder.files.writer import UNFINISHED, NameTakenError, RecordingWriter, is_being_written
-from services.recorder.session_description import Answer, MetadataRecord, records_of
+from services.recorder.files.writer import UNFINISHED_SUFFIX, NameTakenError, RecordingWriter, is_being_written
+from services.recorder.session_description import DescriptionReply, MetadataRecord, records_of
 from services.recorder.settings import RecorderSettings
 
 
@@ -50,9 +50,9 @@ class OpenRecording:
         self.writer.write(sample.topic, sample.key, sample.payload, published, self._logged_ns)
         self.ledger.see(sample.key, sample.payload)
 
-    def describe(self, service: str, answer: Answer) -> None:
+    def describe(self, service: str, answer: DescriptionReply) -> None:
         """What a service said of itself."""
-        write_answer(self.writer, service, answer)
+        write_description(self.writer, service, answer)
 
     def state(self) -> RecordReply:
         """How it stands."""
@@ -113,9 +113,9 @@ def parts_of(options: RecorderSettings, *, numbered: bool = False) -> Callable[[
     return open_part
 
 
-def tell_of_unfinished(folder: Path, log: Logger) -> None:
+def warn_about_unfinished(folder: Path, log: Logger) -> None:
     """Files of recorders that were killed, and what to do with them."""
-    for path in sorted(folder.glob(f"*.mcap{UNFINISHED}")) if folder.is_dir() else ():
+    for path in sorted(folder.glob(f"*.mcap{UNFINISHED_SUFFIX}")) if folder.is_dir() else ():
         if not is_being_written(path):
             log.warning("unfinished recording", file=str(path), advice=f"presage recover {path}")
 
@@ -127,7 +127,7 @@ def file_path(options: RecorderSettings) -> Path:
     return options.directory / (name if name.endswith(".mcap") else name + ".mcap")
 
 
-def write_answer(writer: RecordingWriter | PartsWriter, service: str, answer: Answer) -> None:
+def write_description(writer: RecordingWriter | PartsWriter, service: str, answer: DescriptionReply) -> None:
     """What a service said of itself, as `records_of` has it."""
     for record in records_of(service, answer):
         if isinstance(record, MetadataRecord):

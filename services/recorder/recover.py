@@ -22,9 +22,9 @@ from common.errors import UserError
 from services.recorder.files.chunks import MAGIC, PREFIX, mcap_writer, records_of
 from services.recorder.files.index import summary_of
 from services.recorder.files.message_counts import Ledger, as_metadata
-from services.recorder.files.writer import PROFILE, UNFINISHED, claim, is_being_written
+from services.recorder.files.writer import PROFILE, UNFINISHED_SUFFIX, claim, is_being_written
 
-TORN = ".torn"  # behind the name of what was recovered from
+TORN_SUFFIX = ".torn"  # behind the name of what was recovered from
 # All records that may stand before a file's end; each is read whole, so that a damaged length or kind is noticed.
 PARSERS: dict[int, Callable[[ReadDataStream], object]] = {
     Opcode.HEADER: Header.read, Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read, Opcode.CHUNK: Chunk.read,
@@ -104,15 +104,15 @@ def recover(
     except OSError as error:
         what = error.filename or source
         raise UserError(f"{what}: cannot be read or written ({error.strerror}); name another file with --out") from None
-    if source.name.endswith(UNFINISHED):
-        source.rename(source.with_name(source.name.removesuffix(UNFINISHED) + TORN))
+    if source.name.endswith(UNFINISHED_SUFFIX):
+        source.rename(source.with_name(source.name.removesuffix(UNFINISHED_SUFFIX) + TORN_SUFFIX))
     return found
 
 
 def target_of(source: Path) -> Path:
     """Where it goes when nobody says."""
-    if source.name.endswith(UNFINISHED):
-        return source.with_name(source.name.removesuffix(UNFINISHED))
+    if source.name.endswith(UNFINISHED_SUFFIX):
+        return source.with_name(source.name.removesuffix(UNFINISHED_SUFFIX))
     return source.with_name(source.name.split(".mcap")[0] + "-recovered.mcap")
 
 

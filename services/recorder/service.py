@@ -11,14 +11,14 @@ from common.errors import UserError
 from common.messages.requests import RecordReply, RecordRequest, Reply, Request, WorldReply
 from common.messages.topics import RECORDING, TOPICS, WORLD, Query, Topic
 from common.runtime.service import Service
-from services.recorder.files.message_counts import MOST
+from services.recorder.files.message_counts import MAX_COUNT
 from services.recorder.files.parts import PartsWriter
 from services.recorder.files.writer import RecordingWriter
-from services.recorder.recording import OpenRecording, tell_of_unfinished, write_answer
-from services.recorder.session_description import Answer, Describer
+from services.recorder.recording import OpenRecording, warn_about_unfinished, write_description
+from services.recorder.session_description import DescriptionCollector, DescriptionReply
 from services.recorder.settings import RecorderSettings
 
-LINK_WITHIN = 3.0  # s; a recorder may come before the others, but should not wait for nobody in silence
+LINK_WARNING_DELAY_S = 3.0  # s; a recorder may come before the others, but should not wait for nobody in silence
 
 
 class RecorderService(Service):
@@ -37,8 +37,10 @@ class RecorderService(Service):
         self.options = settings
         self.inputs = chosen_topics(settings.topics)  # type: ignore[misc]
         self.recording: OpenRecording | None = None
-        self.describer: Describer | None = None
-        self._said: dict[tuple[str, type[Answer]], Answer] = {}  # by services of themselves, the last of each kind
+        self.describer: DescriptionCollector | None = None
+        self._said: dict[
+            tuple[str, type[DescriptionReply]], DescriptionReply
+        ] = {}  # by services of themselves, the last of each kind
         self._ended = RecordReply()  # how the last recording stood at its end
         self._written: Counter[str] = Counter()  # by key, into recordings that are complete
         self._missing: Counter[str] = Counter()
@@ -50,13 +52,13 @@ class RecorderService(Service):
         """Begin to record, unless told to wait; ask who is there what it is."""
         options = self.options
         self.loop.inbox.capacity = options.capacity
-        tell_of_unfinished(options.directory, self.log)
+        warn_about_unfinished(options.directory, self.log)
         if not options.idle:
             self._begin(numbered=False)
         self._say_whether_it_records()
         self._flush_at = time.monotonic() + options.flush
-        self._warn_at = time.monotonic() + LINK_WITHIN if options.link().connect else None
-        self.describer = Describer(self.loop.bus, self.name, self.log, weights=options.weights)
+        self._warn_at = time.monotonic() + LINK_WARNING_DELAY_S if options.link().connect else None
+        self.describer = DescriptionCollector(self.loop.bus, self.name, self.log, weights=options.weights)
 
     def on_sample(self, sample: Sample) -> None:
         """Into the file, where there is one."""
@@ -98,7 +100,7 @@ class RecorderService(Service):
             for (service, _), answer in self._said.items():
                 if service in self.describer.present:
                     self.recording.describe(service, answer)
-            self.describer.ask_again()
+            self.describer.query_all()
 
     def _end(self) -> None:
         """Complete the file. What fails is over all the same."""
@@ -132,7 +134,7 @@ class RecorderService(Service):
         if self.recording is not None:
             ledger = self.recording.ledger
             written, missing = written + ledger.written.get(key, 0), missing + ledger.lost(key).missing
-        return {"written": written, "missing": min(missing, MOST)}
+        return {"written": written, "missing": min(missing, MAX_COUNT)}
 
     def due(self) -> float | None:
         """Until the next flush."""
@@ -204,4 +206,4 @@ def chosen_topics(names: str) -> tuple[Topic, ...]:
 
 def write_world(writer: RecordingWriter | PartsWriter, reply: WorldReply) -> None:
     """The world as an attachment that `load_world` reads; scanner and robot as JSON."""
-    write_answer(writer, WORLD.server, reply)
+    write_description(writer, WORLD.server, reply)

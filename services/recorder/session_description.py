@@ -16,15 +16,15 @@ from common.log import Logger
 from common.messages.requests import ConfigReply, ModelReply, ModelRequest, Request, WorldReply
 from common.messages.topics import CONFIG, MODEL, WORLD, Query
 
-TIMEOUT = 2.0  # s, for one answer
-RETRY = 5.0  # s, until one that did not answer is asked again
-ATTEMPTS = 5
-NOT_YET = 0.5  # s, until an estimator that has seen no scan is asked again for its model
-AGAIN = 5.0  # s, until the model is looked at again: another scanner may call for other weights
-EVERYBODY = "*"
-MAX_WEIGHTS = 16 << 20  # bytes; larger weights are named by their digest alone
+ANSWER_TIMEOUT_S = 2.0  # s, for one answer
+RETRY_DELAY_S = 5.0  # s, until one that did not answer is asked again
+MAX_ATTEMPTS = 5
+MODEL_RETRY_DELAY_S = 0.5  # s, until an estimator that has seen no scan is asked again for its model
+MODEL_RECHECK_PERIOD_S = 5.0  # s, until the model is looked at again: another scanner may call for other weights
+ALL_SERVICES = "*"
+MAX_WEIGHTS_BYTES = 16 << 20  # bytes; larger weights are named by their digest alone
 
-Answer = ConfigReply | WorldReply | ModelReply
+DescriptionReply = ConfigReply | WorldReply | ModelReply
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class AttachmentRecord:
     media_type: str
 
 
-def records_of(service: str, answer: Answer) -> Iterator[MetadataRecord | AttachmentRecord]:
+def records_of(service: str, answer: DescriptionReply) -> Iterator[MetadataRecord | AttachmentRecord]:
     """What an answer is stored as; what metadata speaks of comes before it. Pure."""
     if isinstance(answer, WorldReply):
         yield from _records_of_world(answer)
@@ -80,23 +80,23 @@ def _records_of_model(reply: ModelReply) -> Iterator[MetadataRecord | Attachment
     yield MetadataRecord("model", {**model, "weights": stored})
 
 
-class Describer:
+class DescriptionCollector:
     """Answers wait in a queue, so that recording goes on while a service is slow or silent."""
 
     def __init__(self, bus: Bus, me: str, log: Logger, *, weights: bool = True) -> None:
-        """Begin to watch; ``me`` is not asked. ``weights``: ask for the model's, up to `MAX_WEIGHTS`."""
+        """Begin to watch; ``me`` is not asked. ``weights``: ask for the model's, up to `MAX_WEIGHTS_BYTES`."""
         self._bus, self._me, self._log, self._weights = bus, me, log, weights
         self._seen: queue.SimpleQueue[tuple[str, bool] | None] = queue.SimpleQueue()  # from zenoh's thread
-        self._answers: queue.SimpleQueue[tuple[str, Answer]] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[tuple[str, DescriptionReply]] = queue.SimpleQueue()
         self._waiting: dict[tuple[str, str], tuple[float, int]] = {}  # service, query: when to ask, attempts before
-        self._last: dict[tuple[str, str], Answer] = {}  # what was said once is not stored again
+        self._last: dict[tuple[str, str], DescriptionReply] = {}  # what was said once is not stored again
         self.present: frozenset[str] = frozenset()  # services that are there
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="describer", daemon=True)
         self._thread.start()
         bus.watch_alive(lambda service, there: self._seen.put((service, there)))
 
-    def answers(self) -> Iterator[tuple[str, Answer]]:
+    def answers(self) -> Iterator[tuple[str, DescriptionReply]]:
         """Service and answer, of those that came since the last call."""
         while True:
             try:
@@ -104,9 +104,9 @@ class Describer:
             except queue.Empty:
                 return
 
-    def ask_again(self) -> None:
+    def query_all(self) -> None:
         """Ask everybody once more; an answer that is new is among `answers`."""
-        self._seen.put((EVERYBODY, True))
+        self._seen.put((ALL_SERVICES, True))
 
     def stop(self) -> None:
         """Ask nobody any more; an answer under way may still come."""
@@ -115,29 +115,29 @@ class Describer:
 
     def join(self) -> None:
         """After `stop`: wait for the thread, which ends within the time-out of an answer."""
-        self._thread.join(TIMEOUT + 1.0)
+        self._thread.join(ANSWER_TIMEOUT_S + 1.0)
 
     def _run(self) -> None:
         while not self._stopping.is_set():
-            self._hear()
+            self._wait_for_event()
             for (service, query), (due, attempts) in list(self._waiting.items()):
                 if due > time.monotonic() or self._stopping.is_set():
                     continue
                 del self._waiting[service, query]
-                self._put_question(service, QUESTIONS[query], attempts)
+                self._query_and_reschedule(service, QUERIES[query], attempts)
 
-    def _put_question(self, service: str, query: Query, attempts: int) -> None:
+    def _query_and_reschedule(self, service: str, query: Query, attempts: int) -> None:
         """Ask, and say when to ask again, if at all."""
         try:
-            again, attempts = self._ask(service, query), 0
+            again, attempts = self._query(service, query), 0
         except UserError as error:
-            again, attempts = RETRY if attempts + 1 < ATTEMPTS else None, attempts + 1
+            again, attempts = RETRY_DELAY_S if attempts + 1 < MAX_ATTEMPTS else None, attempts + 1
             if not self._stopping.is_set():
                 self._log.warning("a service did not describe itself", service=service, why=str(error))
         if again is not None:
             self._waiting[service, query.name] = (time.monotonic() + again, attempts)
 
-    def _hear(self) -> None:
+    def _wait_for_event(self) -> None:
         """Wait for a service to come or go, or for the next to be asked."""
         due = min((due for due, _ in self._waiting.values()), default=None)
         try:
@@ -147,52 +147,52 @@ class Describer:
         if seen is None or seen[0] == self._me:
             return
         service, there = seen
-        if service == EVERYBODY:
+        if service == ALL_SERVICES:
             for each in self.present:
-                self._expect(each)
+                self._schedule_queries(each)
         elif there:
             self.present |= {service}
-            self._expect(service)
+            self._schedule_queries(service)
         else:
             self.present -= {service}
-            for query in QUESTIONS:
+            for query in QUERIES:
                 self._waiting.pop((service, query), None)
 
-    def _expect(self, service: str) -> None:
+    def _schedule_queries(self, service: str) -> None:
         """It is to be asked now, whatever it can be asked."""
-        for query in QUESTIONS.values():
+        for query in QUERIES.values():
             if query.per_service or query.server == service:
                 self._waiting[service, query.name] = (time.monotonic(), 0)
 
-    def _ask(self, service: str, query: Query) -> float | None:
+    def _query(self, service: str, query: Query) -> float | None:
         """Put a new answer into the queue; seconds until the question is worth asking again, or None."""
         if query is CONFIG:
-            self._keep(service, query, self._bus.ask(CONFIG, Request(), ConfigReply, TIMEOUT, service))
+            self._queue_if_new(service, query, self._bus.ask(CONFIG, Request(), ConfigReply, ANSWER_TIMEOUT_S, service))
         elif query is WORLD:
-            self._keep(service, query, self._bus.ask(WORLD, Request(), WorldReply, TIMEOUT))
+            self._queue_if_new(service, query, self._bus.ask(WORLD, Request(), WorldReply, ANSWER_TIMEOUT_S))
         else:
-            return self._ask_for_model(service)
+            return self._query_model(service)
         return None
 
-    def _ask_for_model(self, service: str) -> float:
-        reply = self._bus.ask(MODEL, ModelRequest(), ModelReply, TIMEOUT)
+    def _query_model(self, service: str) -> float:
+        reply = self._bus.ask(MODEL, ModelRequest(), ModelReply, ANSWER_TIMEOUT_S)
         if not reply.ok:
-            return NOT_YET
+            return MODEL_RETRY_DELAY_S
         if reply != self._last.get((service, MODEL.name)):
             whole = reply
-            if self._weights and 0 < reply.size <= MAX_WEIGHTS:
-                whole = self._bus.ask(MODEL, ModelRequest(weights=True), ModelReply, TIMEOUT)
+            if self._weights and 0 < reply.size <= MAX_WEIGHTS_BYTES:
+                whole = self._bus.ask(MODEL, ModelRequest(weights=True), ModelReply, ANSWER_TIMEOUT_S)
                 if not whole.ok:
                     self._log.warning("the weights are not stored", why=whole.reason)
                     whole = reply
             self._last[service, MODEL.name] = reply
             self._answers.put((service, whole))
-        return AGAIN
+        return MODEL_RECHECK_PERIOD_S
 
-    def _keep(self, service: str, query: Query, answer: ConfigReply | WorldReply) -> None:
+    def _queue_if_new(self, service: str, query: Query, answer: ConfigReply | WorldReply) -> None:
         if answer != self._last.get((service, query.name)):
             self._last[service, query.name] = answer
             self._answers.put((service, answer))
 
 
-QUESTIONS = {query.name: query for query in (CONFIG, WORLD, MODEL)}
+QUERIES = {query.name: query for query in (CONFIG, WORLD, MODEL)}

@@ -1,6 +1,6 @@
 """Goals, teleports, obstacles and driving over the bus.
 
-Every action ends in an `Answer`; what cannot be done is said by raising UserError with the reason.
+Every action ends in an `ActionResult`; what cannot be done is said by raising UserError with the reason.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ from common.messages.topics import (
     Query,
     Topic,
 )
-from services.viewer import visitor_requests as a
+from services.viewer import visitor_requests as requests
 from services.viewer.state.health_rows import how_to_start
 from services.viewer.state.roster import Roster
 
-WITHIN = 3.0  # s, for an answer
-HEADING = 0.15  # rad, of a goal that was given one
-LISTENER_WITHIN = 2.0  # s, for a subscriber to be known: a put before that is lost
-CLOCK = {"pause": PAUSE, "resume": RESUME, "step": STEP}
-DONE = {"pause": "paused", "resume": "running", "step": "one scan further"}
+ANSWER_TIMEOUT_S = 3.0  # s, for an answer
+YAW_TOLERANCE_RAD = 0.15  # rad, of a goal that was given one
+SUBSCRIBER_TIMEOUT_S = 2.0  # s, for a subscriber to be known: a put before that is lost
+CLOCK_QUERIES = {"pause": PAUSE, "resume": RESUME, "step": STEP}
+CLOCK_RESULTS = {"pause": "paused", "resume": "running", "step": "one scan further"}
 R = TypeVar("R", bound=Reply)
 
 
 @dataclass(frozen=True)
-class Answer:
+class ActionResult:
     """What a visitor is told."""
 
     ok: bool
@@ -63,7 +63,7 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Sight:
+class RobotLookup:
     """What the viewer knows of a robot that an action needs."""
 
     status: Callable[[str], Status | None]  # the controller's last word about a robot
@@ -73,80 +73,80 @@ class Sight:
 class Control:
     """Actions on robots."""
 
-    def __init__(self, bus: Bus, roster: Roster, sight: Sight, connect: str = "") -> None:
+    def __init__(self, bus: Bus, roster: Roster, sight: RobotLookup, connect: str = "") -> None:
         """``connect``: endpoints to name where a service is missing, if they are not the default."""
         self._bus, self._roster, self._sight, self._connect = bus, roster, sight, connect
         self._numbers: defaultdict[str, Iterator[int]] = defaultdict(itertools.count)  # of drives, by robot
-        self._do: dict[type[a.Action], Callable[[str, Any], Answer]] = {
-            a.GoTo: self._goal,
-            a.Cancel: self._cancel,
-            a.Carry: self._teleport,
-            a.Localise: self._localise,
-            a.Furnish: self._obstacle,
-            a.Clock: self._clock,
-            a.Reset: self._reset,
-            a.Pace: self._speed,
-            a.Steer: self._drive,
-            a.Record: self._record,
+        self._do: dict[type[requests.Action], Callable[[str, Any], ActionResult]] = {
+            requests.GoTo: self._goal,
+            requests.Cancel: self._cancel,
+            requests.Teleport: self._teleport,
+            requests.Localise: self._localise,
+            requests.EditObstacle: self._obstacle,
+            requests.ControlClock: self._clock,
+            requests.Reset: self._reset,
+            requests.SetSpeed: self._speed,
+            requests.DriveByHand: self._drive,
+            requests.Record: self._record,
         }
 
-    def do(self, robot: str, action: a.Action) -> Answer:
+    def do(self, robot: str, action: requests.Action) -> ActionResult:
         """Done, or why not; never raises."""
         if "replay" in self._roster.services(robot):
-            return Answer(ok=False, reason="this is a recording: choose the live robot to act on it")
+            return ActionResult(ok=False, reason="this is a recording: choose the live robot to act on it")
         try:
             return self._do[type(action)](robot, action)
         except UserError as error:
-            return Answer(ok=False, reason=str(error))
+            return ActionResult(ok=False, reason=str(error))
 
     def ask(self, robot: str, query: Query, request: Request, reply: type[R]) -> R:
         """A service's answer; raises UserError where it is not there, does not answer, or says no."""
-        self._need(robot, query.server)
-        answer = self._bus.ask(query, request, reply, WITHIN, robot=robot)
+        self._check_running(robot, query.server)
+        answer = self._bus.ask(query, request, reply, ANSWER_TIMEOUT_S, robot=robot)
         if not answer.ok:
             raise UserError(answer.reason or f"the {query.server} refused")
         return answer
 
-    def tolerant_ask(self, robot: str, query: Query, request: Request, reply: type[R]) -> R:
+    def query(self, robot: str, query: Query, request: Request, reply: type[R]) -> R:
         """Whatever anybody answers, a refusal included."""
-        return self._bus.ask(query, request, reply, WITHIN, robot=robot)
+        return self._bus.ask(query, request, reply, ANSWER_TIMEOUT_S, robot=robot)
 
-    def _need(self, robot: str, service: str) -> None:
+    def _check_running(self, robot: str, service: str) -> None:
         if service not in self._roster.services(robot):
             start = how_to_start(service, robot, self._connect)
             raise UserError(f"the {service} is not running; start it with: {start}")
 
-    def _heard(self, robot: str, topic: Topic, service: str) -> None:
+    def _check_subscriber(self, robot: str, topic: Topic, service: str) -> None:
         """Make sure that a put will be heard."""
-        self._need(robot, service)
-        if not self._bus.wait_matching(topic, LISTENER_WITHIN, key=topic.key(robot)):
+        self._check_running(robot, service)
+        if not self._bus.wait_matching(topic, SUBSCRIBER_TIMEOUT_S, key=topic.key(robot)):
             raise UserError(f"the {service} does not listen to {topic.name}: is it of this version?")
 
-    def _goal(self, robot: str, action: a.GoTo) -> Answer:
-        self._heard(robot, GOAL, "controller")
+    def _goal(self, robot: str, action: requests.GoTo) -> ActionResult:
+        self._check_subscriber(robot, GOAL, "controller")
         # The time numbers it: the status says which goal it is about, whoever gave the others.
         goal = Goal(
             stamp_ns=self._sight.stamp_ns(robot),
             seq=time.time_ns(),
             pose=Pose(x=action.x, y=action.y, yaw=action.yaw or 0.0),
             tolerance=action.tolerance or 0.2,
-            yaw_tolerance=None if action.yaw is None else HEADING,
+            yaw_tolerance=None if action.yaw is None else YAW_TOLERANCE_RAD,
         )
         self._bus.put(GOAL, goal.encode(), key=GOAL.key(robot))
         status = self._status(robot, lambda status: status.goal_seq == goal.seq)
         if status is None:
-            raise UserError(f"the controller did not take the goal within {WITHIN:g} s")
+            raise UserError(f"the controller did not take the goal within {ANSWER_TIMEOUT_S:g} s")
         if status.state == "blocked":
             raise UserError(status.reason)
-        return Answer(ok=True, reason=f"going to ({action.x:.2f}, {action.y:.2f})")
+        return ActionResult(ok=True, reason=f"going to ({action.x:.2f}, {action.y:.2f})")
 
-    def _cancel(self, robot: str, _action: a.Cancel) -> Answer:
-        self._heard(robot, GOAL, "controller")
+    def _cancel(self, robot: str, _action: requests.Cancel) -> ActionResult:
+        self._check_subscriber(robot, GOAL, "controller")
         goal = Goal(stamp_ns=self._sight.stamp_ns(robot), seq=time.time_ns(), pose=Pose(x=0.0, y=0.0), cancel=True)
         self._bus.put(GOAL, goal.encode(), key=GOAL.key(robot))
         if self._status(robot, lambda status: status.goal is None) is None:
-            raise UserError(f"the controller did not cancel the goal within {WITHIN:g} s")
-        return Answer(ok=True, reason="goal cancelled")
+            raise UserError(f"the controller did not cancel the goal within {ANSWER_TIMEOUT_S:g} s")
+        return ActionResult(ok=True, reason="goal cancelled")
 
     def _status(self, robot: str, wanted: Callable[[Status], bool]) -> Status | None:
         """The first status seen that is as ``wanted``; None if there is none in time."""
@@ -158,58 +158,60 @@ class Control:
                 found.append(status)
             return bool(found)
 
-        return found[0] if wait_until(there, WITHIN) else None
+        return found[0] if wait_until(there, ANSWER_TIMEOUT_S) else None
 
-    def _teleport(self, robot: str, action: a.Carry) -> Answer:
+    def _teleport(self, robot: str, action: requests.Teleport) -> ActionResult:
         pose = Pose(x=action.x, y=action.y, yaw=action.yaw)
         self.ask(robot, TELEPORT, PoseRequest(pose=pose), Reply)
-        return Answer(ok=True, reason=f"carried to ({action.x:.2f}, {action.y:.2f}); the estimator is not informed")
+        return ActionResult(
+            ok=True, reason=f"carried to ({action.x:.2f}, {action.y:.2f}); the estimator is not informed"
+        )
 
-    def _localise(self, robot: str, action: a.Localise) -> Answer:
+    def _localise(self, robot: str, action: requests.Localise) -> ActionResult:
         if (action.x is None) != (action.y is None):
             raise UserError("a place is x and y, in m")
         pose = None
         if action.x is not None and action.y is not None:
             pose = Pose(x=action.x, y=action.y, yaw=action.yaw or 0.0)
         self.ask(robot, LOCALISE, LocaliseRequest(pose=pose), Reply)
-        return Answer(ok=True, reason="searching near there" if pose is not None else "searching the whole map")
+        return ActionResult(ok=True, reason="searching near there" if pose is not None else "searching the whole map")
 
-    def _obstacle(self, robot: str, action: a.Furnish) -> Answer:
+    def _obstacle(self, robot: str, action: requests.EditObstacle) -> ActionResult:
         request = ObstacleRequest(action=action.action, name=action.name, obstacle=action.obstacle)
         self.ask(robot, OBSTACLE, request, Reply)
         done = {"add": "added", "move": "moved", "remove": "removed"}[action.action]
-        return Answer(ok=True, reason=f"{action.name}: {done}")
+        return ActionResult(ok=True, reason=f"{action.name}: {done}")
 
-    def _clock(self, robot: str, action: a.Clock) -> Answer:
-        self.ask(robot, CLOCK[action.do], Request(), Reply)
-        return Answer(ok=True, reason=DONE[action.do])
+    def _clock(self, robot: str, action: requests.ControlClock) -> ActionResult:
+        self.ask(robot, CLOCK_QUERIES[action.do], Request(), Reply)
+        return ActionResult(ok=True, reason=CLOCK_RESULTS[action.do])
 
-    def _reset(self, robot: str, action: a.Reset) -> Answer:
+    def _reset(self, robot: str, action: requests.Reset) -> ActionResult:
         self.ask(robot, RESET, ResetRequest(seed=action.seed), Reply)
         seed = "" if action.seed is None else f" with seed {action.seed}"
-        return Answer(ok=True, reason=f"simulation restarted{seed}")
+        return ActionResult(ok=True, reason=f"simulation restarted{seed}")
 
-    def _speed(self, robot: str, action: a.Pace) -> Answer:
+    def _speed(self, robot: str, action: requests.SetSpeed) -> ActionResult:
         if not 0.1 <= action.factor <= 20:
             raise UserError(f"{action.factor:g} times real time cannot be: between 0.1 and 20")
         self.ask(robot, SPEED, SpeedRequest(factor=action.factor), Reply)
-        return Answer(ok=True, reason=f"{action.factor:g} times real time")
+        return ActionResult(ok=True, reason=f"{action.factor:g} times real time")
 
-    def _drive(self, robot: str, action: a.Steer) -> Answer:
+    def _drive(self, robot: str, action: requests.DriveByHand) -> ActionResult:
         key = DRIVE.key(robot)
         if robot not in self._numbers:
-            self._heard(robot, DRIVE, "controller")
+            self._check_subscriber(robot, DRIVE, "controller")
         else:
-            self._need(robot, "controller")
+            self._check_running(robot, "controller")
         twist = Twist(vx=action.vx, vy=action.vy, wz=action.wz)
         drive = Drive(stamp_ns=self._sight.stamp_ns(robot), seq=next(self._numbers[robot]), twist=twist)
         self._bus.put(DRIVE, drive.encode(), key=key)
-        return Answer(ok=True)
+        return ActionResult(ok=True)
 
-    def _record(self, robot: str, action: a.Record) -> Answer:
+    def _record(self, robot: str, action: requests.Record) -> ActionResult:
         reply = self.ask(robot, RECORDING, RecordRequest(action=action.action), RecordReply)
         more = {
             "recording": reply.recording, "file": reply.file, "messages": reply.messages, "seconds": reply.seconds,
         }  # fmt: skip
         how = f"recording into {reply.file}" if reply.recording else f"recorded {reply.file}" if reply.file else "idle"
-        return Answer(ok=True, reason=how, more=more)
+        return ActionResult(ok=True, reason=how, more=more)

@@ -16,8 +16,8 @@ from common.bus.bus import wait_until
 from common.errors import UserError
 from common.processes import end_with_this_process
 
-START_WITHIN = 30.0  # s; a large file without an index is read through
-END_WITHIN = 5.0  # s
+START_TIMEOUT_S = 30.0  # s; a large file without an index is read through
+STOP_TIMEOUT_S = 5.0  # s
 
 
 @dataclass(frozen=True)
@@ -64,14 +64,14 @@ class Playback:
             raise UserError(f"no recording {name!r} in {self.folder}")
         with self._lock:
             self._end()
-            wait_until(lambda: not alive() or self._leaving, END_WITHIN)
+            wait_until(lambda: not alive() or self._leaving, STOP_TIMEOUT_S)
             if self._leaving:
                 raise UserError("the viewer ends")
             child = self._child = self._start(name)
             over = lambda: alive() or self._leaving or child.process.poll() is not None  # noqa: E731
-            if wait_until(over, START_WITHIN) and alive():
+            if wait_until(over, START_TIMEOUT_S) and alive():
                 return
-            why = self._end() or f"it did not start within {START_WITHIN:g} s"
+            why = self._end() or f"it did not start within {START_TIMEOUT_S:g} s"
         raise UserError(f"{name} cannot be played: {why}")
 
     def close(self) -> None:
@@ -114,7 +114,7 @@ class Playback:
         if child.process.poll() is None:
             child.process.terminate()
             try:
-                child.process.wait(END_WITHIN)
+                child.process.wait(STOP_TIMEOUT_S)
             except subprocess.TimeoutExpired:
                 child.process.kill()
                 child.process.wait()

@@ -29,18 +29,18 @@ from services.viewer.desk import Desk
 from services.viewer.settings import FIRST_PORT, ViewerSettings
 from services.viewer.visitor_session import Session
 
-PAGE = Path(__file__).resolve().parent / "static"
+PAGE_FOLDER = Path(__file__).resolve().parent / "static"
 MAX_VISITORS = 100
-MAX_MESSAGE = 1 << 16  # bytes; what is longer ends the connection, what is shorter gets an answer
-SEND_BUFFER = 1 << 15  # bytes the kernel keeps for a visitor: what waits there is old when it is seen
-GONE = 30_000  # ms without a sign of what was sent, then the connection is dead
-PORTS = 20  # tried, from the first
-POLICY = (
+MAX_MESSAGE_BYTES = 1 << 16  # bytes; what is longer ends the connection, what is shorter gets an answer
+SEND_BUFFER_BYTES = 1 << 15  # bytes the kernel keeps for a visitor: what waits there is old when it is seen
+TCP_TIMEOUT_MS = 30_000  # ms without a sign of what was sent, then the connection is dead
+PORTS_TO_TRY = 20  # tried, from the first
+CONTENT_SECURITY_POLICY = (
     "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
 )
-HEADERS = {
-    "content-security-policy": POLICY,
+SECURITY_HEADERS = {
+    "content-security-policy": CONTENT_SECURITY_POLICY,
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
     "cross-origin-opener-policy": "same-origin",
@@ -50,7 +50,7 @@ HEADERS = {
 
 
 @dataclass(frozen=True)
-class Guard:
+class AccessMiddleware:
     """Lets in who may: by token, host and origin; adds the headers that keep the page to itself."""
 
     app: ASGIApp
@@ -72,7 +72,7 @@ class Guard:
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
-                headers.update(HEADERS)
+                headers.update(SECURITY_HEADERS)
                 if self.token and refusal is None:
                     headers.append("set-cookie", f"{COOKIE}={self.token}; HttpOnly; SameSite=Lax; Path=/")
             await send(message)
@@ -93,7 +93,7 @@ class Guard:
         return None
 
 
-class Frugal(WebSocketsSansIOProtocol):
+class UnbufferedWebSocketProtocol(WebSocketsSansIOProtocol):
     """A frame that the kernel has not taken holds the next one back, so that the newest goes next."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -116,13 +116,13 @@ def create_app(desk: Desk, token: str, started: Callable[[asyncio.AbstractEventL
             await work
 
     async def connect(websocket: WebSocket) -> None:
-        if len(desk.office.hub) >= MAX_VISITORS:
+        if len(desk.context.hub) >= MAX_VISITORS:
             await websocket.send_denial_response(PlainTextResponse("too many visitors\n", 503))
             return
         await Session(websocket, desk).run()
 
-    routes = [WebSocketRoute("/ws", connect), Mount("/", StaticFiles(directory=PAGE, html=True))]
-    return Starlette(routes=routes, middleware=[Middleware(Guard, token=token)], lifespan=lifespan)
+    routes = [WebSocketRoute("/ws", connect), Mount("/", StaticFiles(directory=PAGE_FOLDER, html=True))]
+    return Starlette(routes=routes, middleware=[Middleware(AccessMiddleware, token=token)], lifespan=lifespan)
 
 
 class WebServer:
@@ -132,7 +132,7 @@ class WebServer:
         """Not yet running."""
         config = uvicorn.Config(
             app, log_config=None, log_level="warning", access_log=False, proxy_headers=False, server_header=False,
-            ws=Frugal, ws_max_size=MAX_MESSAGE, ws_per_message_deflate=False, ws_ping_interval=10, ws_ping_timeout=20,
+            ws=UnbufferedWebSocketProtocol, ws_max_size=MAX_MESSAGE_BYTES, ws_per_message_deflate=False, ws_ping_interval=10, ws_ping_timeout=20,
             limit_concurrency=4 * MAX_VISITORS, timeout_graceful_shutdown=1, lifespan="on",
         )  # fmt: skip
         self._server = uvicorn.Server(config)
@@ -159,7 +159,7 @@ class WebServer:
 
 def listen(settings: ViewerSettings) -> socket.socket:
     """Listens at the port asked for, or the first free one from `FIRST_PORT`; raises UserError where it cannot."""
-    wanted = [settings.port] if settings.port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS), 0]
+    wanted = [settings.port] if settings.port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS_TO_TRY), 0]
     for port in wanted:
         try:
             return _bind(settings.host, port)
@@ -180,9 +180,9 @@ def _bind(host: str, port: int) -> socket.socket:
     listener = socket.socket(family, kind, protocol)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)  # connections inherit it
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)  # connections inherit it
         if hasattr(socket, "TCP_USER_TIMEOUT"):
-            listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, GONE)
+            listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, TCP_TIMEOUT_MS)
         listener.bind(address)
         listener.listen()  # bound twice, by two viewers at once, one fails here
     except OSError:

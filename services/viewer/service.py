@@ -22,27 +22,27 @@ from common.messages.topics import SCAN, TOPICS, Topic
 from common.messages.wire import DecodeError
 from common.runtime.service import Service
 from common.versions import versions
-from services.viewer.control import Control, Sight
-from services.viewer.desk import Desk, Office
+from services.viewer.control import Control, RobotLookup
+from services.viewer.desk import Desk, DeskContext
 from services.viewer.playback import Playback
 from services.viewer.server import WebServer, create_app, link, listen
 from services.viewer.settings import ViewerSettings
-from services.viewer.state.health_rows import Pulses, how_to_start, missing
-from services.viewer.state.robot_view import ALWAYS, SHOWN, RobotView
+from services.viewer.state.health_rows import HealthHistory, how_to_start, missing
+from services.viewer.state.robot_view import ALWAYS_READ_TOPICS, SHOWN_TOPICS, RobotView
 from services.viewer.state.roster import Roster
 from services.viewer.visitors import Hub, Visitor
 
-TICK = 1.0  # s
-SCANNING = 2.0  # s since the last scan
-LINGER = 600.0  # s without a visitor, then another robot is followed no more
+TICK_PERIOD_S = 1.0  # s
+SCAN_TIMEOUT_S = 2.0  # s since the last scan
+UNWATCHED_TIMEOUT_S = 600.0  # s without a visitor, then another robot is followed no more
 
 
 @dataclass
-class Followed:
+class FollowedRobot:
     """One robot."""
 
     view: RobotView
-    pulses: Pulses = field(default_factory=Pulses)
+    health: HealthHistory = field(default_factory=HealthHistory)
     unread: dict[Topic, Sample] = field(default_factory=dict)  # the newest of each, until somebody watches
     scan_at: float = -1e9  # s, a clock that only goes forward
     watched_at: float = field(default_factory=time.monotonic)
@@ -63,7 +63,7 @@ class ViewerService(Service):
         self.roster = Roster(settings.robot)
         self.playback = Playback(settings.recordings, settings.robot, settings.connect)
         self.pool = ThreadPoolExecutor(16, "action")
-        self.robots: dict[str, Followed] = {}
+        self.robots: dict[str, FollowedRobot] = {}
         self._renew: set[str] = set()  # robots under whose name another recording runs
         self._changed: deque[str] = deque()  # robots whose services came or went
         self._connect = "" if settings.connect == DEFAULT_ENDPOINT else settings.connect  # to be named in advice
@@ -76,15 +76,15 @@ class ViewerService(Service):
         listener = listen(options)
         self._follow(options.robot)
         self.loop.bus.watch_robots(self._came_or_went)
-        sight = Sight(self._status, self._stamp_ns)
+        sight = RobotLookup(self._status, self._stamp_ns)
         control = Control(self.loop.bus, self.roster, sight, self._connect)
         version = versions().get("presage", versions()["commit"])
         self.desk = Desk(
-            Office(
+            DeskContext(
                 self.hub, control, self.playback, self.roster, self.pool, options.control, version, self._renew.add
             )
         )  # fmt: skip
-        self._web = WebServer(create_app(self.desk, options.token, self.hub.run_in), listener)
+        self._web = WebServer(create_app(self.desk, options.token, self.hub.set_loop), listener)
         self._web.start()
         where = f"page: {link(options, listener)}"
         if options.log_json:
@@ -107,16 +107,16 @@ class ViewerService(Service):
         """Read it, or keep the newest for the first who watches."""
         robot = sample.key.split("/")[1]
         followed = self.robots.get(robot)
-        if followed is None or sample.topic not in SHOWN:
+        if followed is None or sample.topic not in SHOWN_TOPICS:
             return
         if sample.topic is SCAN:
             followed.scan_at = time.monotonic()
-        if robot in self.hub.watched or sample.topic in ALWAYS:
+        if robot in self.hub.watched or sample.topic in ALWAYS_READ_TOPICS:
             self._read(robot, followed, sample)
         else:
             followed.unread[sample.topic] = sample
 
-    def _read(self, robot: str, followed: Followed, sample: Sample) -> None:
+    def _read(self, robot: str, followed: FollowedRobot, sample: Sample) -> None:
         try:
             message = sample.topic.message.decode(sample.payload)
         except DecodeError as error:
@@ -124,15 +124,15 @@ class ViewerService(Service):
             return
         now = time.monotonic()
         if isinstance(message, Health):
-            followed.pulses.hear(message, now)
+            followed.health.add(message, now)
             return
         view = followed.view
-        self._show(robot, view, view.hear(sample.topic, message, now, sample.published_ns))
-        if view.began_anew:
-            view.began_anew = False
+        self._show(robot, view, view.add(sample.topic, message, now, sample.published_ns))
+        if view.time_restarted:
+            view.time_restarted = False
             self._tell(robot, "history", _history(view))
-        if view.new_row:
-            view.new_row = False
+        if view.log_changed:
+            view.log_changed = False
             self._tell(robot, "journal", _journal(view))
 
     def _show(self, robot: str, view: RobotView, frame: bytes | None) -> None:
@@ -140,11 +140,11 @@ class ViewerService(Service):
             self._tell(robot, "field", field)
         if frame is not None and robot in self.hub.watched:
             self.counters["frames"] += 1
-            self.hub.call(partial(self.hub.show, robot, frame))
+            self.hub.call_soon(partial(self.hub.queue_frame, robot, frame))
 
     def _tell(self, robot: str, kind: str, text: str | bytes) -> None:
         if robot in self.hub.watched:
-            self.hub.call(partial(self.hub.tell, robot, kind, text))
+            self.hub.call_soon(partial(self.hub.queue_text, robot, kind, text))
 
     def _came_or_went(self, robot: str, service: str, there: bool) -> None:  # noqa: FBT001 - zenoh's thread
         self.roster.change(robot, service, there)
@@ -168,13 +168,13 @@ class ViewerService(Service):
             if (followed := self.robots.get(robot := self._renew.pop())) is not None:
                 followed.view, followed.unread = RobotView(robot, live=False), {}
         if changed := {self._changed.popleft() for _ in range(len(self._changed))}:
-            self.hub.call(partial(self.desk.robots_changed, frozenset(changed)))
+            self.hub.call_soon(partial(self.desk.robots_changed, frozenset(changed)))
         while self.hub.newcomers:
             self._welcome(*self.hub.newcomers.popleft())
         for robot, followed in self.robots.items():
             self._show(robot, followed.view, followed.view.overdue(now))
         if now >= self._tick_at:
-            self._tick_at = now + TICK
+            self._tick_at = now + TICK_PERIOD_S
             self._tick()
 
     def _welcome(self, visitor: Visitor, robot: str) -> None:
@@ -194,11 +194,11 @@ class ViewerService(Service):
                 return
             for kind, what in known.items():
                 if what is not None:
-                    visitor.say(what, kind)
+                    visitor.queue_text(what, kind)
             if view.frame is not None:
-                visitor.show(view.frame)
+                visitor.queue_frame(view.frame)
 
-        self.hub.call(tell)
+        self.hub.call_soon(tell)
 
     def _tick(self) -> None:
         watched, now = self.hub.watched, time.monotonic()
@@ -206,7 +206,7 @@ class ViewerService(Service):
             self.robots[robot].watched_at = now
         for robot, followed in list(self.robots.items()):
             idle = now - followed.watched_at
-            if idle > LINGER or (idle > 0 and not self.roster.services(robot)):
+            if idle > UNWATCHED_TIMEOUT_S or (idle > 0 and not self.roster.services(robot)):
                 self._leave(robot)
         for robot, followed in self.robots.items():
             followed.view.live = "replay" not in self.roster.services(robot)
@@ -218,19 +218,19 @@ class ViewerService(Service):
             self.note = "the web server ended"
             self.log.error(self.note)
 
-    def _services(self, robot: str, followed: Followed) -> str:
+    def _services(self, robot: str, followed: FollowedRobot) -> str:
         now, alive, linked = time.monotonic(), self.roster.services(robot), self.loop.bus.linked()
-        lacking = missing(alive, linked=linked, scans=now - followed.scan_at < SCANNING)
+        lacking = missing(alive, linked=linked, scans=now - followed.scan_at < SCAN_TIMEOUT_S)
         rows = [{"name": name, "start": how_to_start(name, robot, self._connect)} for name in lacking]
         return json.dumps({
-            "type": "services", "services": followed.pulses.rows(alive, now), "missing": rows, "linked": linked,
+            "type": "services", "services": followed.health.rows(alive, now), "missing": rows, "linked": linked,
         })  # fmt: skip
 
-    def _follow(self, robot: str) -> Followed:
+    def _follow(self, robot: str) -> FollowedRobot:
         """Subscribe, once."""
         if robot not in self.robots:
             live = "replay" not in self.roster.services(robot)
-            followed = self.robots[robot] = Followed(RobotView(robot, live=live))
+            followed = self.robots[robot] = FollowedRobot(RobotView(robot, live=live))
             for topic in TOPICS:
                 # A step of a replay comes at once: the newest alone would be half of the next moment.
                 end = self.loop.bus.subscribe(topic, self.loop.inbox, keep_all=not live, robot=robot)

@@ -11,13 +11,13 @@ from common.errors import first_fault
 from common.geometry.world import Obstacle
 from common.limits import Angle, Coordinate
 
-MAX_TEXT = 4096  # characters; an obstacle of a hundred corners fits
+MAX_TEXT_CHARS = 4096  # characters; an obstacle of a hundred corners fits
 
 Speed = Annotated[float, Field(allow_inf_nan=False, ge=-100, le=100)]
 RobotName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 
 
-class Refused(ValueError):  # noqa: N818 - an answer, not a fault of ours
+class InvalidRequestError(ValueError):
     """A message that asks nothing that can be done; with the ``id`` it had, if any."""
 
     def __init__(self, reason: str, number: int | None = None) -> None:
@@ -55,7 +55,7 @@ class Cancel(Action):
     do: Literal["cancel"]
 
 
-class Carry(Action):
+class Teleport(Action):
     """Teleport the robot."""
 
     do: Literal["teleport"]
@@ -73,7 +73,7 @@ class Localise(Action):
     yaw: Angle | None = None
 
 
-class Furnish(Action):
+class EditObstacle(Action):
     """Change the furniture."""
 
     do: Literal["obstacle"]
@@ -82,7 +82,7 @@ class Furnish(Action):
     obstacle: Obstacle | None = None
 
 
-class Clock(Action):
+class ControlClock(Action):
     """Of the simulation."""
 
     do: Literal["pause", "resume", "step"]
@@ -95,14 +95,14 @@ class Reset(Action):
     seed: Annotated[int, Field(ge=0, lt=2**63)] | None = None
 
 
-class Pace(Action):
+class SetSpeed(Action):
     """Times real time."""
 
     do: Literal["speed"]
     factor: Annotated[float, Field(allow_inf_nan=False, gt=0, le=1000)]
 
 
-class Steer(Action):
+class DriveByHand(Action):
     """Drive by hand, for half a second."""
 
     do: Literal["drive"]
@@ -118,7 +118,7 @@ class Record(Action):
     action: Literal["start", "stop", "status"]
 
 
-class Recordings(Action):
+class ListRecordings(Action):
     """Which there are."""
 
     do: Literal["recordings"]
@@ -137,8 +137,8 @@ class Close(Action):
     do: Literal["close"]
 
 
-class Play(Action):
-    """Steer the open recording."""
+class ControlPlayer(Action):
+    """Control the open recording."""
 
     do: Literal["player"]
     action: Literal["pause", "resume", "step", "seek", "rate", "status"]
@@ -146,7 +146,7 @@ class Play(Action):
 
 
 KINDS = (
-    Watch, GoTo, Cancel, Carry, Localise, Furnish, Clock, Reset, Pace, Steer, Record, Recordings, Open, Close, Play,
+    Watch, GoTo, Cancel, Teleport, Localise, EditObstacle, ControlClock, Reset, SetSpeed, DriveByHand, Record, ListRecordings, Open, Close, ControlPlayer,
 )  # fmt: skip
 _BY_NAME: dict[str, TypeAdapter[Any]] = {
     name: TypeAdapter(kind) for kind in KINDS for name in kind.model_fields["do"].annotation.__args__  # type: ignore[union-attr]
@@ -154,26 +154,26 @@ _BY_NAME: dict[str, TypeAdapter[Any]] = {
 
 
 def parse(text: str) -> tuple[int | None, Action]:
-    """The message's id and what it asks; raises Refused, and nothing else, whatever the text is."""
-    if len(text) > MAX_TEXT:
-        raise Refused(f"a message of {len(text)} characters is too long: {MAX_TEXT} are read")
+    """The message's id and what it asks; raises InvalidRequestError, and nothing else, whatever the text is."""
+    if len(text) > MAX_TEXT_CHARS:
+        raise InvalidRequestError(f"a message of {len(text)} characters is too long: {MAX_TEXT_CHARS} are read")
     try:
         data = json.loads(text)
     except (ValueError, RecursionError):  # a number of 5000 digits, 4000 brackets
-        raise Refused("this is no JSON") from None
+        raise InvalidRequestError("this is no JSON") from None
     if not isinstance(data, dict):
-        raise Refused('a JSON object is expected, such as {"id": 1, "do": "cancel"}')
+        raise InvalidRequestError('a JSON object is expected, such as {"id": 1, "do": "cancel"}')
     number = data.get("id")
     if isinstance(number, bool) or not isinstance(number, int) or abs(number) > 2**53:
         number = None
     name = data.get("do")
     adapter = _BY_NAME.get(name) if isinstance(name, str) else None
     if adapter is None:
-        raise Refused(f"nothing is done by that name; there are: {', '.join(_BY_NAME)}", number)
+        raise InvalidRequestError(f"nothing is done by that name; there are: {', '.join(_BY_NAME)}", number)
     try:
         action: Action = adapter.validate_python(data)
     except ValidationError as error:
-        raise Refused(first_fault(error)[:500], number) from None
+        raise InvalidRequestError(first_fault(error)[:500], number) from None
     except Exception as error:  # noqa: BLE001 - whatever a hostile number does inside shapely
-        raise Refused(f"this makes no sense ({type(error).__name__})", number) from None
+        raise InvalidRequestError(f"this makes no sense ({type(error).__name__})", number) from None
     return number, action

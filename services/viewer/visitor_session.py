@@ -11,15 +11,15 @@ from typing import TypeVar
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.utils import ClientDisconnected
 
-from services.viewer import visitor_requests as a
-from services.viewer.control import Answer
+from services.viewer import visitor_requests as requests
+from services.viewer.control import ActionResult
 from services.viewer.desk import Desk
 from services.viewer.visitors import TooSlowError, Visitor
 
 T = TypeVar("T")
 MAX_QUEUED = 32  # actions of one visitor that wait for their turn
-RATE, BURST = 60.0, 120.0  # messages a second of one visitor; more are read later
-TOO_SLOW = 1008  # close code: policy violation
+MESSAGES_PER_S, MAX_BURST = 60.0, 120.0  # messages a second of one visitor; more are read later
+CLOSE_CODE_TOO_SLOW = 1008  # close code: policy violation
 
 
 class Session:
@@ -28,21 +28,21 @@ class Session:
     def __init__(self, websocket: WebSocket, desk: Desk) -> None:
         """Not yet accepted."""
         self._websocket, self._desk = websocket, desk
-        self._counters = desk.office.hub.counters
+        self._counters = desk.context.hub.counters
         self._visitor = Visitor(_sender(websocket.send_text), _sender(websocket.send_bytes))
-        self._queue: asyncio.Queue[tuple[int | None, a.Action]] = asyncio.Queue(MAX_QUEUED)
-        self._allowed, self._allowed_at = BURST, asyncio.get_running_loop().time()
+        self._queue: asyncio.Queue[tuple[int | None, requests.Action]] = asyncio.Queue(MAX_QUEUED)
+        self._allowed, self._allowed_at = MAX_BURST, asyncio.get_running_loop().time()
 
     async def run(self) -> None:
         """Until either side ends it."""
         await self._websocket.accept()
-        hub = self._desk.office.hub
+        hub = self._desk.context.hub
         tasks = [asyncio.create_task(work()) for work in (self._visitor.run, self._read, self._work)]
-        self._desk.greet(self._visitor, self._desk.office.roster.robot)
+        self._desk.show_robot(self._visitor, self._desk.context.roster.robot)
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            hub.leave(self._visitor)
+            hub.remove(self._visitor)
             for task in tasks:
                 task.cancel()
             ends = await asyncio.gather(*tasks, return_exceptions=True)
@@ -50,7 +50,7 @@ class Session:
             if isinstance(end, TooSlowError):
                 self._counters["sent_away"] += 1
                 with suppress(asyncio.TimeoutError, WebSocketDisconnect, ClientDisconnected, RuntimeError):
-                    await asyncio.wait_for(self._websocket.close(TOO_SLOW, "too slow"), 1.0)
+                    await asyncio.wait_for(self._websocket.close(CLOSE_CODE_TOO_SLOW, "too slow"), 1.0)
             elif isinstance(end, Exception) and not isinstance(end, WebSocketDisconnect | ClientDisconnected):
                 raise end
 
@@ -64,41 +64,41 @@ class Session:
             await self._keep_pace()
             text = message.get("text")
             try:
-                number, action = a.parse(text) if text is not None else _refuse_bytes()
-            except a.Refused as refused:
+                number, action = requests.parse(text) if text is not None else _refuse_bytes()
+            except requests.InvalidRequestError as refused:
                 self._counters["malformed"] += 1
-                self._answer(refused.number, Answer(ok=False, reason=str(refused)))
+                self._answer(refused.number, ActionResult(ok=False, reason=str(refused)))
                 continue
             await self._take(number, action)
 
-    async def _take(self, number: int | None, action: a.Action) -> None:
-        if isinstance(action, a.Steer):  # it does not wait behind a slow answer
+    async def _take(self, number: int | None, action: requests.Action) -> None:
+        if isinstance(action, requests.DriveByHand):  # it does not wait behind a slow answer
             self._answer(number, await self._desk.act(self._visitor, action))
             return
         try:
             self._queue.put_nowait((number, action))
         except asyncio.QueueFull:
             self._counters["turned_away"] += 1
-            self._answer(number, Answer(ok=False, reason="too much waits already; once more, slower"))
+            self._answer(number, ActionResult(ok=False, reason="too much waits already; once more, slower"))
 
     async def _work(self) -> None:
         while True:
             number, action = await self._queue.get()
             self._answer(number, await self._desk.act(self._visitor, action))
 
-    def _answer(self, number: int | None, answer: Answer) -> None:
+    def _answer(self, number: int | None, answer: ActionResult) -> None:
         self._counters["answers"] += 1
         self._counters["refused"] += not answer.ok
         said = {"type": "answer", "id": number, "ok": answer.ok, "reason": answer.reason, **answer.more}
-        self._visitor.say(json.dumps(said))
+        self._visitor.queue_text(json.dumps(said))
 
     async def _keep_pace(self) -> None:
         """Wait where messages come faster than anybody clicks; TCP passes it on."""
         now = asyncio.get_running_loop().time()
-        self._allowed = min(BURST, self._allowed + (now - self._allowed_at) * RATE) - 1.0
+        self._allowed = min(MAX_BURST, self._allowed + (now - self._allowed_at) * MESSAGES_PER_S) - 1.0
         self._allowed_at = now
         if self._allowed < 0:
-            await asyncio.sleep(-self._allowed / RATE)
+            await asyncio.sleep(-self._allowed / MESSAGES_PER_S)
 
 
 def _sender(send: Callable[[T], Awaitable[None]]) -> Callable[[T], Awaitable[None]]:
@@ -113,5 +113,5 @@ def _sender(send: Callable[[T], Awaitable[None]]) -> Callable[[T], Awaitable[Non
     return checked
 
 
-def _refuse_bytes() -> tuple[int | None, a.Action]:
-    raise a.Refused("text is expected, not bytes")
+def _refuse_bytes() -> tuple[int | None, requests.Action]:
+    raise requests.InvalidRequestError("text is expected, not bytes")

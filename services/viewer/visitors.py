@@ -1,6 +1,6 @@
 """Connected browsers and their send queues.
 
-All of it runs in the web server's loop; other threads come in through `Hub.call`. Nobody waits for anybody: a frame is
+All of it runs in the web server's loop; other threads come in through `Hub.call_soon`. Nobody waits for anybody: a frame is
 offered to all, and whoever has not taken the last one misses it.
 """
 
@@ -11,7 +11,7 @@ import itertools
 from collections import Counter, OrderedDict, deque
 from collections.abc import Awaitable, Callable
 
-MAX_WAITING = 200  # texts for one visitor; who lets more wait is sent away
+MAX_QUEUED_TEXTS = 200  # texts for one visitor; who lets more wait is sent away
 
 
 class TooSlowError(Exception):
@@ -32,21 +32,21 @@ class Visitor:
         self._something = asyncio.Event()
         self._overrun = False
 
-    def say(self, text: str | bytes, kind: str = "") -> None:
+    def queue_text(self, text: str | bytes, kind: str = "") -> None:
         """Something to be sent; what still waits of the same ``kind`` is replaced, in its place."""
-        if len(self._texts) >= MAX_WAITING:
+        if len(self._texts) >= MAX_QUEUED_TEXTS:
             self._overrun = True
         else:
             self._texts[kind or next(self._serial)] = text
         self._something.set()
 
-    def show(self, frame: bytes) -> None:
+    def queue_frame(self, frame: bytes) -> None:
         """The newest frame; one that still waits is gone."""
         self.skipped += self._frame is not None
         self._frame = frame
         self._something.set()
 
-    def forget(self) -> None:
+    def drop_robot_data(self) -> None:
         """Frames and news of another robot."""
         self._frame = None
         for kind in [kind for kind in self._texts if isinstance(kind, str)]:
@@ -81,11 +81,11 @@ class Hub:
         self._changed = changed
         self._loop: asyncio.AbstractEventLoop | None = None
 
-    def run_in(self, loop: asyncio.AbstractEventLoop) -> None:
+    def set_loop(self, loop: asyncio.AbstractEventLoop) -> None:
         """The loop of the web server."""
         self._loop = loop
 
-    def call(self, what: Callable[[], None]) -> None:
+    def call_soon(self, what: Callable[[], None]) -> None:
         """From another thread: do it in the loop, soon. Nothing happens before it runs and after it ended."""
         if self._loop is None:
             return
@@ -97,39 +97,39 @@ class Hub:
     def __len__(self) -> int:
         return len(self._visitors)
 
-    def of(self, robot: str) -> list[Visitor]:
+    def watching(self, robot: str) -> list[Visitor]:
         """Who watches it."""
         return [visitor for visitor in self._visitors if visitor.robot == robot]
 
-    def everybody(self) -> list[Visitor]:
+    def all_visitors(self) -> list[Visitor]:
         """All visitors."""
         return list(self._visitors)
 
     def watch(self, visitor: Visitor, robot: str) -> None:
         """From now on that robot."""
         self._visitors.add(visitor)
-        visitor.forget()
+        visitor.drop_robot_data()
         visitor.robot = robot
         self.newcomers.append((visitor, robot))
         self._count()
 
-    def leave(self, visitor: Visitor) -> None:
+    def remove(self, visitor: Visitor) -> None:
         """It is gone."""
         self._visitors.discard(visitor)
         self.counters["frames_sent"] += visitor.sent
         self.counters["frames_skipped"] += visitor.skipped
         self._count()
 
-    def show(self, robot: str, frame: bytes) -> None:
+    def queue_frame(self, robot: str, frame: bytes) -> None:
         """To all who watch the robot."""
         for visitor in self._visitors:
             if visitor.robot == robot:
-                visitor.show(frame)
+                visitor.queue_frame(frame)
 
-    def tell(self, robot: str, kind: str, text: str | bytes) -> None:
+    def queue_text(self, robot: str, kind: str, text: str | bytes) -> None:
         """To all who watch the robot."""
-        for visitor in self.of(robot):
-            visitor.say(text, kind)
+        for visitor in self.watching(robot):
+            visitor.queue_text(text, kind)
 
     def _count(self) -> None:
         self.watched = frozenset(visitor.robot for visitor in self._visitors)

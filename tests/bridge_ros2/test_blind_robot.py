@@ -32,8 +32,8 @@ def test_the_bridge(monkeypatch, told, near):
     service = BridgeRos2Service(BridgeRos2Settings(mount="0,0,0", **told))
     said, shown = [], []
     monkeypatch.setattr(service, "publish", lambda topic, message: said.append((topic, message)))
-    monkeypatch.setattr(service.wheels, "hear_scan", lambda scan, now: shown.append(scan))
-    service._hear_scan(decode(LASER_SCAN, sweep()))
+    monkeypatch.setattr(service.gate, "add_scan", lambda scan, now: shown.append(scan))
+    service._on_scan(decode(LASER_SCAN, sweep()))
     ((topic, scan),) = said
     assert topic is SCAN
     assert not np.isnan(Scan.decode(scan.encode()).ranges).any()

@@ -7,7 +7,7 @@ import pytest
 
 from common.messages.definitions import CmdVel, Scan, Twist
 from common.robot.base import Robot
-from services.bridge_ros2.command_gate import STANDING, Wheels
+from services.bridge_ros2.command_gate import STOP_REPEAT_S, CommandGate
 
 MS = 10**6
 
@@ -24,105 +24,105 @@ def command(stamp_ms, vx=0.5, wz=0.0):
 
 
 def driving(at=0.0, stamp_ms=1000, **more):
-    wheels = Wheels(Robot(), **more)
-    wheels.hear_scan(scan(stamp_ms), at)
-    return wheels
+    gate = CommandGate(Robot(), **more)
+    gate.add_scan(scan(stamp_ms), at)
+    return gate
 
 
 def test_a_fresh_command_passes_and_an_old_one_does_not():
-    wheels = driving()
-    np.testing.assert_array_equal(wheels.command(command(1000), 0.01), [0.5, 0, 0])
-    wheels.hear_scan(scan(1066), 0.066)
-    assert wheels.command(command(400), 0.07) is None  # before the last one's, and too old
-    assert wheels.command(command(2000), 0.07) is None  # of a scan that never was
-    assert wheels.refused == 2
-    assert wheels.command(command(1066), 0.07) is not None
-    wheels.hear_scan(scan(1700), 0.7)
-    assert wheels.command(command(1100), 0.71) is None  # answers a scan 0.6 s old
-    wheels = driving()
-    assert wheels.command(command(1000), 0.6) is None  # the newest scan is 0.6 s old itself
-    assert Wheels(Robot()).command(command(0), 0.0) is None  # no scan at all
+    gate = driving()
+    np.testing.assert_array_equal(gate.command(command(1000), 0.01), [0.5, 0, 0])
+    gate.add_scan(scan(1066), 0.066)
+    assert gate.command(command(400), 0.07) is None  # before the last one's, and too old
+    assert gate.command(command(2000), 0.07) is None  # of a scan that never was
+    assert gate.refused == 2
+    assert gate.command(command(1066), 0.07) is not None
+    gate.add_scan(scan(1700), 0.7)
+    assert gate.command(command(1100), 0.71) is None  # answers a scan 0.6 s old
+    gate = driving()
+    assert gate.command(command(1000), 0.6) is None  # the newest scan is 0.6 s old itself
+    assert CommandGate(Robot()).command(command(0), 0.0) is None  # no scan at all
 
 
 def test_a_stop_is_said_when_commands_end():
-    wheels = driving()
-    assert not wheels.moving
-    wheels.command(command(1000), 0.0)
-    assert wheels.moving
-    assert wheels.due(0.1) == pytest.approx(0.1)
-    np.testing.assert_array_equal(wheels.silence(0.2), np.zeros(3))
-    assert wheels.silence(0.2) is None
+    gate = driving()
+    assert not gate.moving
+    gate.command(command(1000), 0.0)
+    assert gate.moving
+    assert gate.due(0.1) == pytest.approx(0.1)
+    np.testing.assert_array_equal(gate.stop_for_silence(0.2), np.zeros(3))
+    assert gate.stop_for_silence(0.2) is None
 
 
 def test_a_stop_for_silence_is_said_again_until_a_command_comes():
-    wheels = driving()
-    wheels.command(command(1000), 0.0)
-    wheels.silence(0.2)
-    said = [now for now in np.arange(0.2, 1.2, 0.05).tolist() if wheels.remind(now) is not None]
-    assert 4 <= len(said) <= STANDING / 0.1
-    assert max(said) <= 0.2 + STANDING + 1e-9
-    assert wheels.reminds_in(1.2) is None
-    wheels.hear_scan(scan(1300), 1.3)
-    wheels.command(command(1300), 1.3)
-    wheels.silence(1.5)
-    wheels.hear_scan(scan(1600), 1.6)
-    assert wheels.command(command(1600), 1.6) is not None
-    assert wheels.remind(1.7) is None
+    gate = driving()
+    gate.command(command(1000), 0.0)
+    gate.stop_for_silence(0.2)
+    said = [now for now in np.arange(0.2, 1.2, 0.05).tolist() if gate.repeat_stop(now) is not None]
+    assert 4 <= len(said) <= STOP_REPEAT_S / 0.1
+    assert max(said) <= 0.2 + STOP_REPEAT_S + 1e-9
+    assert gate.repeat_due(1.2) is None
+    gate.add_scan(scan(1300), 1.3)
+    gate.command(command(1300), 1.3)
+    gate.stop_for_silence(1.5)
+    gate.add_scan(scan(1600), 1.6)
+    assert gate.command(command(1600), 1.6) is not None
+    assert gate.repeat_stop(1.7) is None
 
 
 def test_one_gap_between_scans_gives_nobody_longer():
-    wheels = driving()
+    gate = driving()
     for stamp in (1100, 1200, 1300, 2200, 2300):  # 10 Hz, 0.9 s missing
-        wheels.hear_scan(scan(stamp), stamp * 1e-3 - 1)
-        assert wheels.patience == pytest.approx(0.2)
+        gate.add_scan(scan(stamp), stamp * 1e-3 - 1)
+        assert gate.timeout == pytest.approx(0.2)
 
 
 def test_a_command_said_again_keeps_nothing_going():
-    wheels = driving()
-    wheels.command(command(1000), 0.0)
-    np.testing.assert_array_equal(wheels.command(command(1000), 0.15), [0.5, 0, 0])
-    assert wheels.due(0.15) == pytest.approx(0.05)
-    np.testing.assert_array_equal(wheels.command(command(1000), 0.25), np.zeros(3))
-    assert wheels.command(command(1000), 0.3) is None
+    gate = driving()
+    gate.command(command(1000), 0.0)
+    np.testing.assert_array_equal(gate.command(command(1000), 0.15), [0.5, 0, 0])
+    assert gate.due(0.15) == pytest.approx(0.05)
+    np.testing.assert_array_equal(gate.command(command(1000), 0.25), np.zeros(3))
+    assert gate.command(command(1000), 0.3) is None
 
 
 def test_a_slow_scanner_has_longer():
-    wheels = driving()
-    wheels.hear_scan(scan(1200), 0.2)  # 5 Hz
-    assert wheels.patience == pytest.approx(0.3)
+    gate = driving()
+    gate.add_scan(scan(1200), 0.2)  # 5 Hz
+    assert gate.timeout == pytest.approx(0.3)
 
 
 def test_a_robot_that_stands_is_told_for_a_while_and_then_left_to_others():
-    wheels = driving()
-    assert wheels.command(command(1000, vx=0.0), 0.0) is None  # it has not been driven
-    wheels.hear_scan(scan(1066), 0.066)
-    wheels.command(command(1066), 0.07)
+    gate = driving()
+    assert gate.command(command(1000, vx=0.0), 0.0) is None  # it has not been driven
+    gate.add_scan(scan(1066), 0.066)
+    gate.command(command(1066), 0.07)
     told = []
     for k in range(2, 12):
         stamp, now = 1000 + 66 * k, 0.066 * k
-        wheels.hear_scan(scan(stamp), now)
-        told.append((now, wheels.command(command(stamp, vx=0.0), now) is not None))
-    assert [said for now, said in told] == [now - 0.07 <= STANDING for now, _ in told]
+        gate.add_scan(scan(stamp), now)
+        told.append((now, gate.command(command(stamp, vx=0.0), now) is not None))
+    assert [said for now, said in told] == [now - 0.07 <= STOP_REPEAT_S for now, _ in told]
     assert told[0][1]
     assert not told[-1][1]
-    assert not wheels.moving
+    assert not gate.moving
 
 
 def test_no_faster_than_the_robot_and_not_into_what_the_scan_shows():
-    wheels = Wheels(Robot(drive="differential", max_speed=0.3))
-    wheels.hear_scan(scan(1000), 0.0)
-    np.testing.assert_allclose(wheels.command(command(1000, vx=5.0, wz=9.0), 0.0), [0.3, 0, 2.0])
-    near = Wheels(Robot())
-    near.hear_scan(scan(1000, ahead=0.33), 0.0)
+    gate = CommandGate(Robot(drive="differential", max_speed=0.3))
+    gate.add_scan(scan(1000), 0.0)
+    np.testing.assert_allclose(gate.command(command(1000, vx=5.0, wz=9.0), 0.0), [0.3, 0, 2.0])
+    near = CommandGate(Robot())
+    near.add_scan(scan(1000, ahead=0.33), 0.0)
     assert near.command(command(1000, vx=1.0), 0.0) is None  # nothing is said to a robot that stands
     assert near.stopped
-    blind = Wheels(Robot(), obstacle_stop=False)
-    blind.hear_scan(scan(1000, ahead=0.33), 0.0)
+    blind = CommandGate(Robot(), obstacle_stop=False)
+    blind.add_scan(scan(1000, ahead=0.33), 0.0)
     assert blind.command(command(1000, vx=1.0), 0.0)[0] == 1.0
 
 
 def test_time_that_begins_anew():
-    wheels = driving(stamp_ms=9000)
-    wheels.command(command(9000), 0.0)
-    wheels.hear_scan(scan(100), 0.1)
-    assert wheels.command(command(100), 0.1) is not None
+    gate = driving(stamp_ms=9000)
+    gate.command(command(9000), 0.0)
+    gate.add_scan(scan(100), 0.1)
+    assert gate.command(command(100), 0.1) is not None

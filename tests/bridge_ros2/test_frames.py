@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from common.geometry import se2
-from services.bridge_ros2.frames import Dead, Odometer
-from services.bridge_ros2.odometry import Motion
+from services.bridge_ros2.frames import DeadReckoning, OdometryBuffer
+from services.bridge_ros2.odometry import MountAndOdometry
 from services.bridge_ros2.ros_types import TF_MESSAGE, decode
 from tests.bridge_ros2 import independent as other
 
@@ -39,8 +39,8 @@ def tf(*each):
 
 @pytest.mark.parametrize(("roll", "upside_down"), [(0.0, False), (np.pi, True)])
 def test_the_mounting_is_found_over_several_joints(roll, upside_down):
-    motion = Motion("base_link", "odom")
-    motion.hear_tf(tf(
+    motion = MountAndOdometry("base_link", "odom")
+    motion.add_tf(tf(
         ("base_footprint", "base_link", (0, 0, 0.1), turned(), 0),
         ("base_link", "tower", (0.1, 0, 0.5), turned(yaw=np.pi / 2), 0),
         ("/tower", "/laser", (0.2, 0, 0), turned(roll=roll), 0),
@@ -52,15 +52,15 @@ def test_the_mounting_is_found_over_several_joints(roll, upside_down):
 
 
 def test_of_an_inclined_scanner_nothing_is_made():
-    motion = Motion("base_link", "odom")
-    motion.hear_tf(tf(("base_link", "laser", (0, 0, 0), turned(pitch=np.deg2rad(20)), 0)))
+    motion = MountAndOdometry("base_link", "odom")
+    motion.add_tf(tf(("base_link", "laser", (0, 0, 0), turned(pitch=np.deg2rad(20)), 0)))
     with pytest.raises(ValueError, match="inclined by 20"):
         motion.mount_for("laser")
 
 
 def test_where_tf_does_not_say_it_is_said_what_there_is():
-    motion = Motion("base_link", "odom")
-    motion.hear_tf(tf(("base_footprint", "rplidar_link", (0, 0, 0), turned(), 0)))
+    motion = MountAndOdometry("base_link", "odom")
+    motion.add_tf(tf(("base_footprint", "rplidar_link", (0, 0, 0), turned(), 0)))
     with pytest.raises(
         ValueError, match=r"does not connect laser with base_link.*base_footprint, rplidar_link.*--mount"
     ):
@@ -68,19 +68,19 @@ def test_where_tf_does_not_say_it_is_said_what_there_is():
 
 
 def test_odometry_of_a_frame_that_tf_does_not_know_is_noticed():
-    motion = Motion("base_link", "odom")
+    motion = MountAndOdometry("base_link", "odom")
     assert motion.child_in_base("base_link") is None
-    assert motion.unplaced == ""
+    assert motion.unconnected_frame == ""
     assert motion.child_in_base("/wheels") is None
-    assert motion.unplaced == "wheels"
-    motion.hear_tf(tf(("wheels", "base_link", (0.5, 0, 0), turned(), 0)))
+    assert motion.unconnected_frame == "wheels"
+    motion.add_tf(tf(("wheels", "base_link", (0.5, 0, 0), turned(), 0)))
     np.testing.assert_allclose(motion.child_in_base("wheels").planar(), [-0.5, 0, 0])
-    assert motion.unplaced == ""
+    assert motion.unconnected_frame == ""
 
 
 def test_nonsense_in_tf_is_left_out():
-    motion = Motion("base_link", "odom")
-    motion.hear_tf(tf(
+    motion = MountAndOdometry("base_link", "odom")
+    motion.add_tf(tf(
         ("base_link", "a", (np.nan, 0, 0), turned(), 0), ("base_link", "b", (0, 0, 0), other.quaternion(w=0.0), 0),
         ("x", "y", (0, 0, 0), turned(), 0), ("y", "x", (0, 0, 0), turned(), 0),  # a ring
     ))  # fmt: skip
@@ -90,39 +90,39 @@ def test_nonsense_in_tf_is_left_out():
 
 
 def dead(stamp, pose, twist=(0.0, 0.0, 0.0)):
-    return Dead(stamp, np.array(pose, float), np.array(twist, float), np.zeros((3, 3)))
+    return DeadReckoning(stamp, np.array(pose, float), np.array(twist, float), np.zeros((3, 3)))
 
 
 def test_odometry_between_two_and_a_little_beyond():
-    odometer = Odometer()
+    odometer = OdometryBuffer()
     assert odometer.at(0) is None
-    odometer.hear(dead(0, [0, 0, 0]))
-    odometer.hear(dead(SECOND // 2, [1, 0, np.pi / 2], [1.0, 0.0, 0.5]))
+    odometer.add(dead(0, [0, 0, 0]))
+    odometer.add(dead(SECOND // 2, [1, 0, np.pi / 2], [1.0, 0.0, 0.5]))
     middle = odometer.at(SECOND // 4)
     np.testing.assert_allclose(middle.pose, [0.5, 0, np.pi / 4])
     beyond = odometer.at(SECOND // 2 + SECOND // 10)
     np.testing.assert_allclose(beyond.pose, [1, 0.1, np.pi / 2 + 0.05])  # forward is along y by now
     assert odometer.at(SECOND) is None  # too far beyond
     assert odometer.at(-1) is None
-    odometer.hear(dead(SECOND // 4, [9, 9, 9]))  # late: left out
+    odometer.add(dead(SECOND // 4, [9, 9, 9]))  # late: left out
     np.testing.assert_allclose(odometer.at(SECOND // 4).pose, middle.pose)
-    odometer.hear(dead(60 * SECOND, [2, 0, 0]))
+    odometer.add(dead(60 * SECOND, [2, 0, 0]))
     assert odometer.at(0) is None  # long ago
-    odometer.hear(dead(0, [3, 0, 0]))  # a simulation anew
+    odometer.add(dead(0, [3, 0, 0]))  # a simulation anew
     np.testing.assert_allclose(odometer.at(0).pose, [3, 0, 0])
 
 
 @pytest.mark.parametrize("ran", [1.5, 5.0, 9.9, 3600.0])
 def test_odometry_goes_on_after_the_clock_is_set_back(ran):
     """However long the simulation ran before it began anew: a few seconds just as an hour."""
-    odometer, motion = Odometer(), Motion("base_link", "odom")
+    odometer, motion = OdometryBuffer(), MountAndOdometry("base_link", "odom")
     for k in range(int(min(ran, 12) * 20)):
         stamp = round((ran - min(ran, 12)) * SECOND) + k * SECOND // 20
-        odometer.hear(dead(stamp, [k, 0, 0]))
-        motion.hear_tf(tf(("odom", "base_link", (k, 0, 0), turned(), stamp)))
+        odometer.add(dead(stamp, [k, 0, 0]))
+        motion.add_tf(tf(("odom", "base_link", (k, 0, 0), turned(), stamp)))
     for k in range(5):
-        odometer.hear(dead(k * SECOND // 20, [0.1 * k, 0, 0], [2.0, 0, 0]))
-        motion.hear_tf(tf(("odom", "base_link", (0.1 * k, 0, 0), turned(), k * SECOND // 20)))
+        odometer.add(dead(k * SECOND // 20, [0.1 * k, 0, 0], [2.0, 0, 0]))
+        motion.add_tf(tf(("odom", "base_link", (0.1 * k, 0, 0), turned(), k * SECOND // 20)))
     for found in (odometer.at(SECOND // 8), motion.at(SECOND // 8)):
         np.testing.assert_allclose(found.pose, [0.25, 0, 0], atol=1e-9)
     assert abs(odometer.at(SECOND // 5).pose[0] - 0.4) < 1e-9  # nothing of before is in it
@@ -130,13 +130,13 @@ def test_odometry_goes_on_after_the_clock_is_set_back(ran):
 
 def test_odometry_by_tf_with_its_velocity():
     """The base is 0.5 m ahead of the frame that odometry is about."""
-    motion = Motion("base_link", "odom")
-    motion.hear_tf(tf(("wheels", "base_link", (0.5, 0, 0), turned(), 0)))
+    motion = MountAndOdometry("base_link", "odom")
+    motion.add_tf(tf(("wheels", "base_link", (0.5, 0, 0), turned(), 0)))
     for k in range(3):
-        motion.hear_tf(tf(("odom", "wheels", (0.1 * k, 0, 0), turned(yaw=0.2 * k), k * SECOND // 10)))
+        motion.add_tf(tf(("odom", "wheels", (0.1 * k, 0, 0), turned(yaw=0.2 * k), k * SECOND // 10)))
     found = motion.at(2 * SECOND // 10)
     np.testing.assert_allclose(found.pose, se2.compose([0.2, 0, 0.4], [0.5, 0, 0]))
     assert found.twist[2] == pytest.approx(2.0)
-    motion.hear_odometry(dead(2 * SECOND // 10, [7, 7, 0]))
+    motion.add_odometry(dead(2 * SECOND // 10, [7, 7, 0]))
     assert motion.at(2 * SECOND // 10).pose[0] == 7  # the topic goes before it for the estimator
-    assert motion.by_tf(2 * SECOND // 10).pose[0] == found.pose[0]  # but what is said in tf has to fit tf
+    assert motion.at_by_tf(2 * SECOND // 10).pose[0] == found.pose[0]  # but what is said in tf has to fit tf

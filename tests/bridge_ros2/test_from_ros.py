@@ -8,7 +8,7 @@ import pytest
 from common.limits import MAX_DISTANCE_M
 from common.messages.ros_messages import IDENTITY, Mount, Transform
 from common.runtime import safety
-from services.bridge_ros2.from_ros import dead_of, odom_of, pose_of, scan_of
+from services.bridge_ros2.from_ros import dead_reckoning_of, odom_of, pose_of, scan_of
 from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, POSE_STAMPED, decode
 from tests.bridge_ros2 import independent as other
 
@@ -101,24 +101,24 @@ def odometry(x=1.0, y=2.0, yaw=0.0, twist=(0.3, 0.0, 0.5), covariance=None):
 
 def test_odometry_with_the_plane_of_its_covariance():
     six = np.arange(36.0)
-    odom = odom_of(dead_of(odometry(yaw=0.4, covariance=six.tolist()), None))
+    odom = odom_of(dead_reckoning_of(odometry(yaw=0.4, covariance=six.tolist()), None))
     np.testing.assert_allclose(odom.pose.array(), [1, 2, 0.4])
     assert (odom.twist.vx, odom.twist.wz, odom.stamp_ns) == (0.3, 0.5, 9)
     np.testing.assert_array_equal(odom.covariance, [[0, 1, 5], [6, 7, 11], [30, 31, 35]])
-    assert not dead_of(odometry(covariance=[np.nan] * 36), None).covariance.any()
+    assert not dead_reckoning_of(odometry(covariance=[np.nan] * 36), None).covariance.any()
     with pytest.raises(ValueError, match="not finite"):
-        dead_of(odometry(twist=(np.inf, 0, 0)), None)
+        dead_reckoning_of(odometry(twist=(np.inf, 0, 0)), None)
     with pytest.raises(ValueError, match=r"at \(500000, 2\) m, more than 10000 m from its origin"):
-        dead_of(odometry(x=5e5), None)
+        dead_reckoning_of(odometry(x=5e5), None)
 
 
 def test_odometry_of_a_frame_off_the_base():
     """The child frame is 1 m ahead of the base: it swings where the base only turns."""
     ahead = Transform(np.array([1.0, 0, 0]), np.eye(3))
-    dead = dead_of(odometry(x=0.0, y=1.0, yaw=np.pi / 2, twist=(0.0, 0.5, 0.5)), ahead)
+    dead = dead_reckoning_of(odometry(x=0.0, y=1.0, yaw=np.pi / 2, twist=(0.0, 0.5, 0.5)), ahead)
     np.testing.assert_allclose(dead.pose, [0, 0, np.pi / 2], atol=1e-12)
     np.testing.assert_allclose(dead.twist, [0, 0, 0.5], atol=1e-12)
-    np.testing.assert_allclose(dead_of(odometry(), IDENTITY).pose, [1, 2, 0])
+    np.testing.assert_allclose(dead_reckoning_of(odometry(), IDENTITY).pose, [1, 2, 0])
 
 
 def test_a_pose_is_of_the_map():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from services.bridge_ros2.diagnostics import complaint
+from services.bridge_ros2.diagnostics import diagnose
 from services.bridge_ros2.graph import Graph
 from services.bridge_ros2.keys import Names, Node, Qos
 from services.bridge_ros2.ros_types import LASER_SCAN, OCCUPANCY_GRID, ODOMETRY, TWIST, TWIST_STAMPED, type_hash
@@ -19,7 +19,7 @@ def why(*tokens):
     graph = Graph()
     for each in tokens:
         graph.change(each, there=True)
-    return graph.why_silent("/scan", LASER_SCAN, "--scan-topic", nobody="NOBODY")
+    return graph.why_silent("/scan", LASER_SCAN, "--scan-topic", no_endpoints="NOBODY")
 
 
 def test_nobody_another_topic_another_type_another_hash_or_just_silence():
@@ -48,17 +48,17 @@ def test_whoever_goes_is_forgotten():
 
 def test_the_kind_of_command_that_the_robot_listens_for():
     graph = Graph()
-    assert graph.twist_wanted("/cmd_vel") == ""
+    assert graph.expected_twist_type("/cmd_vel") == ""
     graph.change(token("MS", "/cmd_vel", TWIST_STAMPED), there=True)
-    assert graph.twist_wanted("/cmd_vel") == TWIST_STAMPED
+    assert graph.expected_twist_type("/cmd_vel") == TWIST_STAMPED
     graph.change(token("MS", "/cmd_vel", TWIST, 2), there=True)
-    assert graph.twist_wanted("/cmd_vel") == ""  # either will do
+    assert graph.expected_twist_type("/cmd_vel") == ""  # either will do
 
 
 def test_a_complaint_names_the_option_that_mends_it():
     def said(graph, problem="", *, linked=True, quiet=0.0, heard=True, reckoned=True, **options):
         settings = BridgeRos2Settings(**options)
-        return complaint(settings, graph, problem, linked=linked, quiet=quiet, heard=heard, reckoned=reckoned)
+        return diagnose(settings, graph, problem, linked=linked, quiet=quiet, heard=heard, reckoned=reckoned)
 
     graph = Graph()
     assert said(graph) == ""
@@ -92,7 +92,7 @@ def silent(*tokens, **options):
     graph = Graph(settings.names())
     for each in tokens:
         graph.change(each, there=True)
-    return complaint(settings, graph, "", linked=True, quiet=4.0, heard=False, reckoned=False)
+    return diagnose(settings, graph, "", linked=True, quiet=4.0, heard=False, reckoned=False)
 
 
 def test_the_other_flavor_and_another_domain_are_named():
@@ -118,7 +118,7 @@ def test_a_distro_that_does_not_fit_is_named_though_scans_come():
         graph = Graph(settings.names())
         for each in tokens:
             graph.change(each, there=True)
-        return complaint(settings, graph, "", linked=True, quiet=0.0, heard=True, reckoned=True)
+        return diagnose(settings, graph, "", linked=True, quiet=0.0, heard=True, reckoned=True)
 
     scans, listens = (humble.endpoint_token(*each, Qos()) for each in (
         ("MP", 1, "/scan", LASER_SCAN), ("MS", 2, "/cmd_vel", TWIST),
@@ -139,7 +139,7 @@ def test_a_second_map_is_named():
     graph.change(token("MP", "/map", OCCUPANCY_GRID), there=True)
     for publish, says in ((True, "/map: /driver publishes a map there as well: leave out --publish-map"), (False, "")):
         settings = BridgeRos2Settings(publish_map=publish)
-        said = complaint(settings, graph, "", linked=True, quiet=0.0, heard=True, reckoned=True)
+        said = diagnose(settings, graph, "", linked=True, quiet=0.0, heard=True, reckoned=True)
         assert said.startswith(says)
         assert bool(said) is publish
 
@@ -147,4 +147,4 @@ def test_a_second_map_is_named():
 def test_a_token_of_a_domain_that_is_no_number_is_nobodys():
     graph = Graph()
     graph.change(token("MP", "/scan", LASER_SCAN).replace("@ros2_lv/0/", "@ros2_lv/x/"), there=True)
-    assert len(graph.elsewhere()) + len(graph.endpoints()) == 1
+    assert len(graph.other_endpoints()) + len(graph.endpoints()) == 1

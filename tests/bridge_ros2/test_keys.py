@@ -17,7 +17,7 @@ from services.bridge_ros2.keys import (
     Qos,
     attachment,
     full_name,
-    gid_of,
+    publisher_gid,
     read_attachment,
     read_token,
 )
@@ -85,17 +85,17 @@ def test_an_attachment_is_33_bytes():
     assert data == struct.pack("<qq", 3, 1_700_000_000_123_456_789) + b"\x10" + gid
     assert len(data) == 33
     assert read_attachment(data) == (3, 1_700_000_000_123_456_789, gid)
-    named = b"\x0fsequence_number" + data[:8] + b"\x10source_timestamp" + data[8:16] + b"\x0asource_gid" + data[16:]
-    assert len(named) == 77
-    assert read_attachment(named) == read_attachment(data)  # Jazzy's first versions
+    legacy = b"\x0fsequence_number" + data[:8] + b"\x10source_timestamp" + data[8:16] + b"\x0asource_gid" + data[16:]
+    assert len(legacy) == 77
+    assert read_attachment(legacy) == read_attachment(data)  # Jazzy's first versions
     for none in (b"", data[:-1], data + b"\0", b"\0" * 33):
         assert read_attachment(none) is None
 
 
 def test_a_gid_is_the_hash_of_the_token():
     """XXH3 of 128 bits: of nothing, by its specification, 99aa06d3014798d8 6001c324468d497f, the higher half first."""
-    assert gid_of("") == bytes.fromhex("99aa06d3014798d86001c324468d497f")[::-1]
-    assert gid_of(TOKEN) != gid_of(TOKEN + "x")
+    assert publisher_gid("") == bytes.fromhex("99aa06d3014798d86001c324468d497f")[::-1]
+    assert publisher_gid(TOKEN) != publisher_gid(TOKEN + "x")
 
 
 @pytest.mark.parametrize(
@@ -113,8 +113,8 @@ def test_relative_names_are_in_the_namespace(topic, namespace, name):
 
 def test_another_definition_of_a_type_is_refused():
     names = Names()
-    names.refuse_foreign(names.publish("/scan", LASER_SCAN), LASER_SCAN)
-    names.refuse_foreign(Names(hashes=False).publish("/scan", LASER_SCAN), LASER_SCAN)
+    names.check_type_hash(names.publish("/scan", LASER_SCAN), LASER_SCAN)
+    names.check_type_hash(Names(hashes=False).publish("/scan", LASER_SCAN), LASER_SCAN)
     with pytest.raises(ValueError, match=r"RIHS01_00.*another definition"):
-        names.refuse_foreign("0/scan/sensor_msgs::msg::dds_::LaserScan_/RIHS01_00", LASER_SCAN)
-    Names("ros2dds").refuse_foreign("scan", LASER_SCAN)
+        names.check_type_hash("0/scan/sensor_msgs::msg::dds_::LaserScan_/RIHS01_00", LASER_SCAN)
+    Names("ros2dds").check_type_hash("scan", LASER_SCAN)

@@ -237,13 +237,13 @@ def test_it_says_what_it_waits_for_and_what_is_wrong(processes, router):
         bridge.wait_for("nobody publishes it; sensor_msgs/msg/LaserScan is on /scan_raw: --scan-topic")
         put, last = node.publisher("scan", LASER), [0.0]
 
-        def named():
+        def complains_about_tf():
             if time.monotonic() - last[0] > 0.2:
                 last[0] = time.monotonic()
                 put(laser(BEGIN, "lidar"))
             return "tf does not connect lidar with base_link" in bridge.output
 
-        assert wait_until(named, PATIENCE), bridge.output
+        assert wait_until(complains_about_tf, PATIENCE), bridge.output
     theirs.kill()
     bridge.wait_for("it is gone")
     assert nowhere.stop()[0] == bridge.stop()[0] == 0

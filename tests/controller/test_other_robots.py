@@ -11,7 +11,7 @@ from common.geometry.world import Obstacle, World
 from common.messages.definitions import CmdVel, Twist
 from common.robot.base import Robot
 from common.robot.self_filter import SelfFilter
-from services.bridge_ros2.command_gate import Wheels
+from services.bridge_ros2.command_gate import CommandGate
 from services.controller.policies.planner import Pilot
 from services.simulator.simulation import Setup, Simulation
 from tests.controller.policies.test_planner import SCANNER, drive
@@ -92,9 +92,9 @@ def test_the_bridges_stop_knows_it_too():
     simulation.close()
     command, blind, driven = CmdVel(stamp_ns=scan.stamp_ns, twist=Twist(vx=0.3)), SelfFilter(radius=0.2), []
     for shown in (scan, blind.mask_for_bus(scan), blind.mask_for_planning(scan)):
-        wheels = Wheels(robot)
-        wheels.hear_scan(shown, 0.0)
-        driven.append(wheels.command(command, 0.01))
+        gate = CommandGate(robot)
+        gate.add_scan(shown, 0.0)
+        driven.append(gate.command(command, 0.01))
     assert driven[0] is None or not driven[0].any()
     assert driven[1][0] > 0
     assert driven[2][0] > 0

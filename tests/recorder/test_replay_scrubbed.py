@@ -10,7 +10,7 @@ from common.bus.bus import wait_until
 from common.bus.inbox import Inbox, Sample
 from common.messages.requests import PlayerReply, PlayerRequest, Request, WorldReply
 from common.messages.topics import BELIEF, PLAYER, SCAN, WORLD
-from services.recorder.replaying.replay import Choice, replay
+from services.recorder.replaying.replay import ReplayOptions, replay
 from tests.recorder import sessions as made
 
 
@@ -25,7 +25,7 @@ def scrubbed(tmp_path, link, bus):
         return bus.ask(PLAYER, PlayerRequest(action=action, value=value), PlayerReply, timeout=20)
 
     def start(**choice):
-        chosen = Choice(robot=link.robot, only=frozenset({"scan", "belief"}), paused=True, stay=True, **choice)
+        chosen = ReplayOptions(robot=link.robot, only=frozenset({"scan", "belief"}), paused=True, stay=True, **choice)
         threads.append(threading.Thread(target=replay, args=(path, link, chosen), kwargs={"stop": stop}))
         threads[-1].start()
         return heard, ask
@@ -93,7 +93,7 @@ def test_it_does_not_where_a_simulator_does(scrubbed, bus, link):
 
 def test_a_recording_without_its_world_says_so(tmp_path, link, bus):
     path, stop = made.write(tmp_path / "bare.mcap", world=False), threading.Event()
-    choice = Choice(robot=link.robot, only=frozenset({"scan"}), paused=True)
+    choice = ReplayOptions(robot=link.robot, only=frozenset({"scan"}), paused=True)
     thread = threading.Thread(target=replay, args=(path, link, choice), kwargs={"stop": stop})
     thread.start()
     try:

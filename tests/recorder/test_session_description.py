@@ -19,7 +19,7 @@ from common.messages.requests import ConfigReply, ModelReply, WorldReply
 from common.messages.topics import CONFIG, MODEL, WORLD
 from common.robot.base import Robot
 from services.recorder import session_description as describing
-from services.recorder.session_description import AttachmentRecord, Describer, MetadataRecord, records_of
+from services.recorder.session_description import AttachmentRecord, DescriptionCollector, MetadataRecord, records_of
 from tests.recorder.sessions import SCANNER
 from tests.recorder.sessions import WORLD as HALL
 
@@ -120,7 +120,7 @@ def bus():
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch):
-    for name in ("RETRY", "NOT_YET", "AGAIN"):
+    for name in ("RETRY_DELAY_S", "MODEL_RETRY_DELAY_S", "MODEL_RECHECK_PERIOD_S"):
         monkeypatch.setattr(describing, name, 0.01)
 
 
@@ -130,7 +130,7 @@ def describe(bus):
     made = []
 
     def make(*, weights=True):
-        made.append(Describer(bus, "recorder", logger("test"), weights=weights))
+        made.append(DescriptionCollector(bus, "recorder", logger("test"), weights=weights))
         return made[-1]
 
     yield make
@@ -199,10 +199,10 @@ def test_one_that_is_silent_is_asked_again_but_not_for_ever(bus, describe):
     bus.replies.clear()
     bus.asked.clear()
     bus.changed("mute", True)
-    assert wait_until(lambda: bus.asked.count(("mute", "config")) >= describing.ATTEMPTS, 10)
+    assert wait_until(lambda: bus.asked.count(("mute", "config")) >= describing.MAX_ATTEMPTS, 10)
     bus.changed("other", True)  # after which nothing waits for its turn
-    assert wait_until(lambda: bus.asked.count(("other", "config")) >= describing.ATTEMPTS, 10)
-    assert bus.asked.count(("mute", "config")) == describing.ATTEMPTS
+    assert wait_until(lambda: bus.asked.count(("other", "config")) >= describing.MAX_ATTEMPTS, 10)
+    assert bus.asked.count(("mute", "config")) == describing.MAX_ATTEMPTS
 
 
 def a_model(weights, *, ok=lambda: True):
@@ -220,7 +220,7 @@ def test_a_model_not_known_yet_is_waited_for_and_another_one_noticed(bus, descri
     bus.replies = {("estimator", "config"): config(1), ("estimator", "model"): a_model(WEIGHTS, ok=lambda: bool(scans))}
     describer = describe()
     bus.changed("estimator", True)
-    assert wait_until(lambda: bus.asked.count(("estimator", "model")) > describing.ATTEMPTS, 10)
+    assert wait_until(lambda: bus.asked.count(("estimator", "model")) > describing.MAX_ATTEMPTS, 10)
     assert [type(a) for _, a in describer.answers()] == [ConfigReply]
     scans.append(1)
     ((_, first),) = next_answers(describer, 1)
@@ -236,7 +236,7 @@ def test_a_model_not_known_yet_is_waited_for_and_another_one_noticed(bus, descri
 
 @pytest.mark.parametrize(("weights", "limit"), [(False, 1 << 20), (True, 299)])
 def test_weights_that_are_not_wanted_or_too_large_are_not_asked_for(bus, describe, monkeypatch, weights, limit):
-    monkeypatch.setattr(describing, "MAX_WEIGHTS", limit)
+    monkeypatch.setattr(describing, "MAX_WEIGHTS_BYTES", limit)
     bus.replies = {("estimator", "config"): config(1), ("estimator", "model"): a_model(WEIGHTS)}
     describer = describe(weights=weights)
     bus.changed("estimator", True)
@@ -257,4 +257,4 @@ def test_weights_that_cannot_be_had_leave_what_can(bus, describe):
 
 
 def test_every_question_is_a_row_of_the_table():
-    assert set(describing.QUESTIONS.values()) == {CONFIG, WORLD, MODEL}
+    assert set(describing.QUERIES.values()) == {CONFIG, WORLD, MODEL}

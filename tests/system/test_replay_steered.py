@@ -25,7 +25,7 @@ from common.messages.requests import PlayerReply, PlayerRequest
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, PLAYER, SCAN
 from common.robot.scanner import SCANNERS
 from services.recorder.files.writer import RecordingWriter
-from services.recorder.replaying.replay import Choice, replay
+from services.recorder.replaying.replay import ReplayOptions, replay
 from tests.conftest import PATIENCE, ROOT
 
 SECOND = 10**9
@@ -124,7 +124,7 @@ def test_services_take_a_time_that_goes_back_for_a_session_begun_anew(process, b
     assert bus.wait_matching(GOAL, PATIENCE)
     bus.put(GOAL, Goal(stamp_ns=0, pose=Pose(x=15.5, y=1.5)).encode())
     stop, beliefs, commands, failed = threading.Event(), [], [], {}
-    choice = Choice(rate=0.5, loop=True)
+    choice = ReplayOptions(rate=0.5, loop=True)
     thread = threading.Thread(target=replay, args=(path, link, choice), kwargs={"stop": stop})
     thread.start()
 

@@ -245,7 +245,7 @@ class Session:
 
 
 def as_pose(pose: np.ndarray) -> dict:
-    """Fields of a pose."""
+    """GoalFields of a pose."""
     return {"x": float(pose[0]), "y": float(pose[1]), "yaw": float(pose[2])}
 
 

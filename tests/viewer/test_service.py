@@ -21,7 +21,7 @@ from common.messages.requests import Reply, WorldReply
 from common.messages.topics import HEALTH, PAUSE, PREFERENCE, SCAN, TOPICS, TRUTH, WORLD
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
-from services.viewer.state.robot_view import SHOWN
+from services.viewer.state.robot_view import SHOWN_TOPICS
 from tests.conftest import PATIENCE, taken
 from tests.viewer.client import Page, page_of
 from tests.viewer.messages import RANGES, at, preference
@@ -53,7 +53,7 @@ class Pretence:
 
     def __init__(self, bus):
         self.bus = bus
-        assert all(bus.wait_matching(topic, PATIENCE) for topic in SHOWN if topic is not HEALTH)
+        assert all(bus.wait_matching(topic, PATIENCE) for topic in SHOWN_TOPICS if topic is not HEALTH)
 
     def say(self, stamp_s, **how):
         for topic, message in at(stamp_s, **how).items():

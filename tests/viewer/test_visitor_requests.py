@@ -8,38 +8,40 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.viewer import visitor_requests as a
+from services.viewer import visitor_requests as requests
 
 BOX = {"box": {"center": [1, 2], "size": [1, 0.5], "yaw_deg": 30}}
 GOOD = [
-    ({"do": "watch", "robot": "robot-2"}, a.Watch(do="watch", robot="robot-2")),
-    ({"do": "goal", "x": 1, "y": 2.5}, a.GoTo(do="goal", x=1.0, y=2.5)),
-    ({"do": "goal", "x": 1, "y": 2, "yaw": -1.5, "tolerance": 0.1}, a.GoTo(do="goal", x=1, y=2, yaw=-1.5, tolerance=0.1)),  # noqa: E501
-    ({"do": "cancel"}, a.Cancel(do="cancel")),
-    ({"do": "teleport", "x": 1, "y": 2, "yaw": 3}, a.Carry(do="teleport", x=1, y=2, yaw=3)),
-    ({"do": "localise"}, a.Localise(do="localise")),
-    ({"do": "localise", "x": 1, "y": 2, "yaw": None}, a.Localise(do="localise", x=1, y=2)),
-    ({"do": "obstacle", "action": "remove", "name": "crate"}, a.Furnish(do="obstacle", action="remove", name="crate")),
-    ({"do": "pause"}, a.Clock(do="pause")),
-    ({"do": "step"}, a.Clock(do="step")),
-    ({"do": "reset", "seed": 7}, a.Reset(do="reset", seed=7)),
-    ({"do": "speed", "factor": 2}, a.Pace(do="speed", factor=2)),
-    ({"do": "drive", "vx": 0.5, "vy": 0, "wz": -1}, a.Steer(do="drive", vx=0.5, vy=0, wz=-1)),
-    ({"do": "record", "action": "start"}, a.Record(do="record", action="start")),
-    ({"do": "recordings"}, a.Recordings(do="recordings")),
-    ({"do": "open", "name": "run.mcap"}, a.Open(do="open", name="run.mcap")),
-    ({"do": "close"}, a.Close(do="close")),
-    ({"do": "player", "action": "seek", "value": 3.5}, a.Play(do="player", action="seek", value=3.5)),
+    ({"do": "watch", "robot": "robot-2"}, requests.Watch(do="watch", robot="robot-2")),
+    ({"do": "goal", "x": 1, "y": 2.5}, requests.GoTo(do="goal", x=1.0, y=2.5)),
+    ({"do": "goal", "x": 1, "y": 2, "yaw": -1.5, "tolerance": 0.1}, requests.GoTo(do="goal", x=1, y=2, yaw=-1.5, tolerance=0.1)),  # noqa: E501
+    ({"do": "cancel"}, requests.Cancel(do="cancel")),
+    ({"do": "teleport", "x": 1, "y": 2, "yaw": 3}, requests.Teleport(do="teleport", x=1, y=2, yaw=3)),
+    ({"do": "localise"}, requests.Localise(do="localise")),
+    ({"do": "localise", "x": 1, "y": 2, "yaw": None}, requests.Localise(do="localise", x=1, y=2)),
+    ({"do": "obstacle", "action": "remove", "name": "crate"}, requests.EditObstacle(do="obstacle", action="remove", name="crate")),
+    ({"do": "pause"}, requests.ControlClock(do="pause")),
+    ({"do": "step"}, requests.ControlClock(do="step")),
+    ({"do": "reset", "seed": 7}, requests.Reset(do="reset", seed=7)),
+    ({"do": "speed", "factor": 2}, requests.SetSpeed(do="speed", factor=2)),
+    ({"do": "drive", "vx": 0.5, "vy": 0, "wz": -1}, requests.DriveByHand(do="drive", vx=0.5, vy=0, wz=-1)),
+    ({"do": "record", "action": "start"}, requests.Record(do="record", action="start")),
+    ({"do": "recordings"}, requests.ListRecordings(do="recordings")),
+    ({"do": "open", "name": "run.mcap"}, requests.Open(do="open", name="run.mcap")),
+    ({"do": "close"}, requests.Close(do="close")),
+    ({"do": "player", "action": "seek", "value": 3.5}, requests.ControlPlayer(do="player", action="seek", value=3.5)),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("message", "action"), GOOD)
 def test_every_action_is_understood(message, action):
-    assert a.parse(json.dumps({"id": 5, **message, "later": "field"})) == (5, action)
+    assert requests.parse(json.dumps({"id": 5, **message, "later": "field"})) == (5, action)
 
 
 def test_an_obstacle_is_one_as_in_a_world_file():
-    _, action = a.parse(json.dumps({"id": 1, "do": "obstacle", "action": "add", "name": "crate", "obstacle": BOX}))
+    _, action = requests.parse(
+        json.dumps({"id": 1, "do": "obstacle", "action": "add", "name": "crate", "obstacle": BOX})
+    )
     assert action.obstacle.box.center == (1.0, 2.0)
 
 
@@ -75,22 +77,22 @@ def test_an_obstacle_is_one_as_in_a_world_file():
     ],
 )
 def test_what_is_none_is_refused_with_a_reason(text, says):
-    with pytest.raises(a.Refused) as refused:
-        a.parse(text)
+    with pytest.raises(requests.InvalidRequestError) as refused:
+        requests.parse(text)
     assert says in str(refused.value)
     assert str(refused.value)
 
 
 @pytest.mark.parametrize("number", [3, None])
 def test_a_refusal_bears_the_number_of_what_it_refuses(number):
-    with pytest.raises(a.Refused) as refused:
-        a.parse(json.dumps({"id": number, "do": "goal"}))
+    with pytest.raises(requests.InvalidRequestError) as refused:
+        requests.parse(json.dumps({"id": number, "do": "goal"}))
     assert refused.value.number == number
 
 
 @pytest.mark.parametrize("number", ["5", 1.5, True, [1], {"a": 1}, 2**60])
 def test_a_number_that_is_none_is_not_repeated(number):
-    assert a.parse(json.dumps({"id": number, "do": "cancel"}))[0] is None
+    assert requests.parse(json.dumps({"id": number, "do": "cancel"}))[0] is None
 
 
 VALUES = st.recursive(
@@ -114,10 +116,10 @@ SHAPES = st.fixed_dictionaries({}, optional=dict.fromkeys(("box", "circle", "pol
 )
 def test_whatever_comes_is_an_action_or_refused(text):
     try:
-        number, action = a.parse(text)
-    except a.Refused as refused:
+        number, action = requests.parse(text)
+    except requests.InvalidRequestError as refused:
         reason, number, action = str(refused), refused.number, None
     else:
         reason = ""
-    assert bool(reason) != isinstance(action, a.Action)
+    assert bool(reason) != isinstance(action, requests.Action)
     assert number is None or isinstance(number, int)

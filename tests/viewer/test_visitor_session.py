@@ -22,8 +22,8 @@ def talk(send, messages, act=None):
         return await asyncio.Event().wait()
 
     async def whole():
-        office = SimpleNamespace(hub=Hub(), roster=SimpleNamespace(robot="robot"))
-        desk = SimpleNamespace(office=office, act=act, greet=lambda visitor, _robot: visitor.say("hello"))
+        context = SimpleNamespace(hub=Hub(), roster=SimpleNamespace(robot="robot"))
+        desk = SimpleNamespace(context=context, act=act, show_robot=lambda visitor, _robot: visitor.queue_text("hello"))
         websocket = WebSocket({"type": "websocket"}, receive, send)
         await asyncio.wait_for(Session(websocket, desk).run(), 30.0)
 

@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from services.viewer.visitors import MAX_WAITING, Hub, TooSlowError, Visitor
+from services.viewer.visitors import MAX_QUEUED_TEXTS, Hub, TooSlowError, Visitor
 
 
 class Line:
@@ -56,7 +56,7 @@ def test_a_slow_visitor_gets_fewer_frames_and_slows_nobody():
         tasks += running
         frames = [bytes([i]) for i in range(30)]
         for i, frame in enumerate(frames):
-            hub.show("robot", frame)
+            hub.queue_frame("robot", frame)
             await settle()
             if i == 14:
                 slow.permits.release()
@@ -69,7 +69,7 @@ def test_a_slow_visitor_gets_fewer_frames_and_slows_nobody():
         assert slow.taken == [frames[0], frames[14], frames[29]]
         assert [visitor.sent for visitor in visitors] == [30, 3]
         assert visitors[1].skipped == 27
-        hub.leave(visitors[1])
+        hub.remove(visitors[1])
         assert hub.counters == {"frames_sent": 3, "frames_skipped": 27}
 
     run(story)
@@ -80,14 +80,14 @@ def test_answers_keep_their_order_and_news_its_newest():
         line = Line(slow=True)
         _, (visitor,), running = scene(line)
         tasks += running
-        visitor.say("first")
+        visitor.queue_text("first")
         await settle()  # being sent
-        visitor.say("services 1", "services")
-        visitor.say("second")
-        visitor.say("services 2", "services")
-        visitor.say(b"field 1", "field")
-        visitor.say(b"field 2", "field")
-        visitor.show(b"frame")
+        visitor.queue_text("services 1", "services")
+        visitor.queue_text("second")
+        visitor.queue_text("services 2", "services")
+        visitor.queue_text(b"field 1", "field")
+        visitor.queue_text(b"field 2", "field")
+        visitor.queue_frame(b"frame")
         for _ in range(9):
             line.permits.release()
         await settle()
@@ -101,8 +101,8 @@ def test_who_takes_no_answers_is_sent_away():
         line = Line(slow=True)
         _, (visitor,), running = scene(line)
         tasks += running
-        for i in range(2 * MAX_WAITING):
-            visitor.say(str(i))
+        for i in range(2 * MAX_QUEUED_TEXTS):
+            visitor.queue_text(str(i))
             await asyncio.sleep(0)
         line.permits.release()
         with pytest.raises(TooSlowError):
@@ -116,14 +116,14 @@ def test_another_robot_another_view():
         line = Line(slow=True)
         hub, (visitor,), running = scene(line)
         tasks += running
-        visitor.say("hello")
+        visitor.queue_text("hello")
         await settle()
-        hub.show("robot", b"old")
-        visitor.say("old world", "world")
-        visitor.say("answer")
+        hub.queue_frame("robot", b"old")
+        visitor.queue_text("old world", "world")
+        visitor.queue_text("answer")
         hub.watch(visitor, "ghost")
-        hub.show("robot", b"other")
-        hub.show("ghost", b"new")
+        hub.queue_frame("robot", b"other")
+        hub.queue_frame("ghost", b"new")
         for _ in range(9):
             line.permits.release()
         await settle()
@@ -136,12 +136,12 @@ def test_another_robot_another_view():
 
 def test_a_hub_without_a_loop_is_silent():
     hub, called = Hub(), []
-    hub.call(lambda: called.append(1))
+    hub.call_soon(lambda: called.append(1))
     loop = asyncio.new_event_loop()
-    hub.run_in(loop)
-    hub.call(lambda: called.append(2))
+    hub.set_loop(loop)
+    hub.call_soon(lambda: called.append(2))
     loop.call_soon(loop.stop)
     loop.run_forever()
     loop.close()
-    hub.call(lambda: called.append(3))
+    hub.call_soon(lambda: called.append(3))
     assert called == [2]

@@ -10,10 +10,10 @@ import msgpack
 
 from common.messages.topics import topic_of
 
-MOST = 1 << 62  # a count that is larger, by numbers somebody made up, stays there: a message must hold it
+MAX_COUNT = 1 << 62  # a count that is larger, by numbers somebody made up, stays there: a message must hold it
 MAX_INSTANCES = 100  # of a key; a sender that invents instances must not fill memory
 MAX_INSTANCE_LENGTH = 200
-FAR = 64  # a number so much below the last is a publisher that began anew, not a late message
+MAX_REORDER_DISTANCE = 64  # a number so much below the last is a publisher that began anew, not a late message
 
 
 @dataclass
@@ -31,9 +31,9 @@ class Sequence:
         due = number if self._next is None else self._next
         if number > due:
             self.gaps += 1
-            self.missing = min(MOST, self.missing + number - due)
+            self.missing = min(MAX_COUNT, self.missing + number - due)
         elif number < due:
-            if number and due - number <= FAR:
+            if number and due - number <= MAX_REORDER_DISTANCE:
                 self.reordered += 1
                 return
             self.restarts += 1
@@ -82,7 +82,7 @@ class Ledger:
         total = Sequence()
         for sequence in self.sequences.get(key, {}).values():
             total.gaps += sequence.gaps
-            total.missing = min(MOST, total.missing + sequence.missing)
+            total.missing = min(MAX_COUNT, total.missing + sequence.missing)
             total.restarts += sequence.restarts
             total.reordered += sequence.reordered
         return total

@@ -17,7 +17,7 @@ from services.recorder.files.chunks import mcap_writer
 
 PROFILE = "presage"
 LIBRARY = "presage recorder"
-UNFINISHED = ".active"  # behind the name of a file that is not complete
+UNFINISHED_SUFFIX = ".active"  # behind the name of a file that is not complete
 
 
 class NameTakenError(UserError):
@@ -29,7 +29,7 @@ class RecordingWriter:
 
     def __init__(self, path: Path, compression: str = "zstd", chunk_size: int = 1 << 18) -> None:
         """Open the file; raises UserError where that cannot be, `NameTakenError` where the name is another's."""
-        self.path, self.active = path, path.with_name(path.name + UNFINISHED)
+        self.path, self.active = path, path.with_name(path.name + UNFINISHED_SUFFIX)
         self.written: Counter[str] = Counter()  # by key
         self.failed = False
         self._saved = 0

@@ -12,9 +12,9 @@ from common.errors import UserError
 from common.messages.requests import PlayerReply, PlayerRequest
 from common.messages.topics import CMD_VEL, HEALTH, ROOT, TOPICS, Topic
 
-LATE = 1.0  # s behind its own time, beyond which a replay goes on from where it is and does not hurry
-MOST_STEPS = 10_000
-GAP = 0.1  # s between the end of a loop and its beginning anew
+MAX_LAG_S = 1.0  # s behind its own time, beyond which a replay goes on from where it is and does not hurry
+MAX_STEPS = 10_000
+LOOP_GAP_S = 0.1  # s between the end of a loop and its beginning anew
 
 
 class Player:
@@ -27,7 +27,7 @@ class Player:
         self.paused = False
         self._position, self._since = begin, now
         self._steps = 0  # asked for and not yet done
-        self._jump: float | None = None
+        self._seek_target: float | None = None
 
     def position(self, now: float) -> float:
         """By the clock; as fast as it goes, and paused, that of the last message."""
@@ -48,7 +48,7 @@ class Player:
     def sent(self, at: float, now: float, *, whole: bool) -> None:
         """A message at ``at`` went out; ``whole``: it completes a step."""
         ahead = self.position(now) - at
-        if self.paused or self.rate == 0 or ahead > LATE * self.rate:
+        if self.paused or self.rate == 0 or ahead > MAX_LAG_S * self.rate:
             self._anchor(at, now)
         if self._steps and whole:
             self._steps -= 1
@@ -58,7 +58,7 @@ class Player:
         if request.action in ("pause", "step"):
             self._anchor(self.position(now), now)
             self.paused = True
-            self._steps += max(1, round(min(request.value, MOST_STEPS))) if request.action == "step" else 0
+            self._steps += max(1, round(min(request.value, MAX_STEPS))) if request.action == "step" else 0
         elif request.action == "resume":
             self._anchor(self.position(now), now)
             self.paused, self._steps = False, 0
@@ -79,28 +79,28 @@ class Player:
 
     def seek(self, position: float, now: float) -> None:
         """To the place, or the nearest end; what is read must begin there: see `jump`."""
-        self._jump = min(max(position, self.begin), self.end)
-        self._anchor(self._jump, now)
+        self._seek_target = min(max(position, self.begin), self.end)
+        self._anchor(self._seek_target, now)
         self._steps = 0
 
-    def again(self, now: float) -> None:
+    def restart(self, now: float) -> None:
         """From the beginning, a moment later."""
-        self.seek(self.begin, now + (GAP if self.rate else 0.0))
+        self.seek(self.begin, now + (LOOP_GAP_S if self.rate else 0.0))
 
     def finish(self, now: float) -> None:
         """At the end, paused, whatever was asked for: nothing comes after it."""
         self._anchor(self.end, now)
         self.paused, self._steps = True, 0
 
-    def jump(self) -> float | None:
+    def take_seek_target(self) -> float | None:
         """Where to read from now on, once after each seek."""
-        jump, self._jump = self._jump, None
+        jump, self._seek_target = self._seek_target, None
         return jump
 
     @property
-    def jumped(self) -> bool:
+    def seek_pending(self) -> bool:
         """Whether `jump` has something to say."""
-        return self._jump is not None
+        return self._seek_target is not None
 
     def _anchor(self, position: float, now: float) -> None:
         self._position, self._since = position, now
@@ -117,7 +117,7 @@ def span(duration: float, start: float | None, end: float | None) -> tuple[float
     return first, last
 
 
-def selected(
+def select_topics(
     there: Mapping[str, Topic], only: Collection[str] | None, leave_out: Collection[str] | None = None
 ) -> dict[str, Topic]:
     """Keys of the topics named, or of all but health, a live service's pulse, less those to leave out.
@@ -136,7 +136,7 @@ def selected(
     return {key: topic for key, topic in there.items() if topic.name in wanted}
 
 
-def renamed(key: str, robot: str) -> str:
+def key_for_robot(key: str, robot: str) -> str:
     """The key of another robot; empty: as it is."""
     root, was, rest = key.split("/", 2)
     return f"{root}/{robot or was}/{rest}"
@@ -147,7 +147,7 @@ def robot_of(key: str) -> str:
     return key.split("/")[1]
 
 
-def conflicts(keys: Mapping[str, Topic], alive: Mapping[str, Collection[str]]) -> str:
+def find_conflicts(keys: Mapping[str, Topic], alive: Mapping[str, Collection[str]]) -> str:
     """Why these keys should not be published beside the services alive, by robot; empty where nothing speaks against.
 
     Topics published at need (a goal) belong to nobody. Velocity commands also meet those who obey them.
@@ -176,6 +176,6 @@ def conflicts(keys: Mapping[str, Topic], alive: Mapping[str, Collection[str]]) -
     )
 
 
-def robots(keys: Iterable[str]) -> list[str]:
+def robots_of_keys(keys: Iterable[str]) -> list[str]:
     """Whose keys these are, each once, in order."""
     return list(dict.fromkeys(robot_of(key) for key in keys if key.startswith(ROOT + "/")))

@@ -25,16 +25,23 @@ from common.messages.topics import CONFIG, PLAYER, SCAN, WORLD, Topic
 from common.messages.wire import DecodeError
 from common.runtime.protocol_check import build_config_reply
 from services.recorder.reader import Raw, Recording, read_recording
-from services.recorder.replaying.player import Player, conflicts, renamed, robots, selected, span
+from services.recorder.replaying.player import (
+    Player,
+    find_conflicts,
+    key_for_robot,
+    robots_of_keys,
+    select_topics,
+    span,
+)
 
 NAME = "replay"  # of the liveliness token
-LISTENERS_WITHIN = 2.0  # s; a put before a subscriber is known is lost
-SETTLE = 0.5  # s in which a session that has just opened hears who is alive
-TURN = 0.1  # s, the longest wait without a look at whether to stop
+SUBSCRIBER_TIMEOUT_S = 2.0  # s; a put before a subscriber is known is lost
+DISCOVERY_TIME_S = 0.5  # s in which a session that has just opened hears who is alive
+POLL_PERIOD_S = 0.1  # s, the longest wait without a look at whether to stop
 
 
 @dataclass(frozen=True)
-class Choice:
+class ReplayOptions:
     """What of a recording is replayed, and how."""
 
     only: frozenset[str] | None = None  # names of topics; None: all but health
@@ -49,7 +56,7 @@ class Choice:
     stay: bool = False  # paused at the end, until told otherwise
 
 
-class Remote:
+class ReplayControl:
     """For who steers from this process: a keyboard's thread, a test."""
 
     def __init__(self, player: Player, inbox: Inbox, counts: Counter[str]) -> None:
@@ -72,31 +79,31 @@ class Remote:
         self._inbox.wake()
 
 
-Steering = Callable[[Remote], AbstractContextManager[object]]
+Steering = Callable[[ReplayControl], AbstractContextManager[object]]
 
 
 class Replay:
     """One recording on one session."""
 
-    def __init__(self, recording: Recording, choice: Choice, bus: Bus) -> None:
+    def __init__(self, recording: Recording, choice: ReplayOptions, bus: Bus) -> None:
         """Raises UserError where there is nothing to replay, or somebody alive publishes the same."""
         self.recording, self.choice, self.bus = recording, choice, bus
-        self.topics = selected(recording.topics(), choice.only, choice.leave_out)
+        self.topics = select_topics(recording.topics(), choice.only, choice.leave_out)
         if not self.topics:
             raise UserError(f"{recording.path}: nothing to replay")
-        self.keys = {key: renamed(key, choice.robot) for key in self.topics}
+        self.keys = {key: key_for_robot(key, choice.robot) for key in self.topics}
         duration = (recording.end_ns - recording.start_ns) * 1e-9
         begin, end = span(duration, choice.start, choice.end)
         self.inbox = Inbox()
         self.player = Player(begin, end, choice.rate, loop=choice.loop)
         self.counts: Counter[str] = Counter()  # by key as published
-        self.remote = Remote(self.player, self.inbox, self.counts)
+        self.remote = ReplayControl(self.player, self.inbox, self.counts)
         self._stepwise = SCAN if SCAN in self.topics.values() else None
 
     def announce(self) -> None:
         """Refuse beside live publishers; then be steerable, alive, and heard."""
         alive = self._alive()
-        if not self.choice.force and (why := conflicts(self._published(), alive)):
+        if not self.choice.force and (why := find_conflicts(self._published(), alive)):
             raise UserError(why)
         for key, topic in self._published().items():  # all before the first wait: each asks who listens
             self.bus.publisher(topic, key=key)
@@ -105,7 +112,7 @@ class Replay:
         self.bus.serve(PLAYER, self.inbox)
         self.bus.serve(CONFIG, self.inbox, NAME)
         self.bus.declare_alive(NAME)
-        deadline = time.monotonic() + LISTENERS_WITHIN
+        deadline = time.monotonic() + SUBSCRIBER_TIMEOUT_S
         unheard = [
             key
             for key, topic in self._published().items()
@@ -115,11 +122,11 @@ class Replay:
             print(f"warning: nobody listens to {', '.join(unheard)}", file=sys.stderr)
 
     def run(self, on_progress: Callable[[PlayerReply], None], stop: threading.Event) -> None:
-        """Until the end, `Remote.quit` or ``stop``."""
+        """Until the end, `ReplayControl.quit` or ``stop``."""
         player = self.player
         player.seek(player.begin, time.monotonic())
         player.paused = self.choice.paused
-        while (place := player.jump()) is not None:
+        while (place := player.take_seek_target()) is not None:
             for raw in self.recording.payloads(self.topics.keys(), *self._window(place)):
                 at = (raw.logged_ns - self.recording.start_ns) * 1e-9
                 if not self._until(at, on_progress, stop):
@@ -128,9 +135,9 @@ class Replay:
                 on_progress(player.state(time.monotonic()))
             if stop.is_set() or self.remote.quitting:
                 break
-            if player.loop and not player.jumped:
-                player.again(time.monotonic())
-            elif self.choice.stay and not player.jumped:
+            if player.loop and not player.seek_pending:
+                player.restart(time.monotonic())
+            elif self.choice.stay and not player.seek_pending:
                 self._rest(on_progress, stop)
 
     def _window(self, place: float) -> tuple[int, int | None]:
@@ -142,22 +149,22 @@ class Replay:
         """Wait until a message is due, answering meanwhile; False where it will not be sent."""
         while True:
             wait = self.player.wait(at, time.monotonic())
-            entry = self.inbox.get(min(wait, TURN))
+            entry = self.inbox.get(min(wait, POLL_PERIOD_S))
             if isinstance(entry, Call):
                 self._answer(entry)
             if entry is not None or wait > 0:
                 on_progress(self.player.state(time.monotonic()))
-            if stop.is_set() or self.remote.quitting or self.player.jumped:
+            if stop.is_set() or self.remote.quitting or self.player.seek_pending:
                 return False
             if entry is None and self.player.wait(at, time.monotonic()) <= 0:
                 return True
 
     def _rest(self, on_progress: Callable[[PlayerReply], None], stop: threading.Event) -> None:
         """Paused at the end, until somebody seeks."""
-        while not (stop.is_set() or self.remote.quitting or self.player.jumped):
+        while not (stop.is_set() or self.remote.quitting or self.player.seek_pending):
             self.player.finish(time.monotonic())
             on_progress(self.player.state(time.monotonic()))
-            if isinstance(entry := self.inbox.get(TURN), Call):
+            if isinstance(entry := self.inbox.get(POLL_PERIOD_S), Call):
                 self._answer(entry)
 
     def _send(self, raw: Raw, at: float) -> None:
@@ -195,22 +202,22 @@ class Replay:
 
     def _alive(self) -> dict[str, set[str]]:
         """Services by robot; asked until nobody new is heard of, or at once where somebody speaks against it."""
-        names = robots(self._published())
+        names = robots_of_keys(self._published())
         alive: dict[str, set[str]] = {robot: set() for robot in names}
 
         def contested() -> bool:
             for robot in names:
-                alive[robot] |= self.bus.alive(timeout=SETTLE, robot=robot)
-            return bool(conflicts(self._published(), alive))
+                alive[robot] |= self.bus.alive(timeout=DISCOVERY_TIME_S, robot=robot)
+            return bool(find_conflicts(self._published(), alive))
 
-        wait_until(contested, SETTLE)
+        wait_until(contested, DISCOVERY_TIME_S)
         return alive
 
 
 def replay(
     path: Path,
     link: Link,
-    choice: Choice | None = None,
+    choice: ReplayOptions | None = None,
     *,
     on_progress: Callable[[PlayerReply], None] = lambda _: None,
     stop: threading.Event | None = None,
@@ -222,11 +229,11 @@ def replay(
     ``opening`` makes the session, and may insist that somebody is there; ``steering`` runs beside the replay. Raises
     UserError where the file, the choice, or a live publisher of the same keys forbids it.
     """
-    choice = choice or Choice()
+    choice = choice or ReplayOptions()
     recording = read_recording(path)
     if recording.warning:
         print(f"warning: {recording.warning}", file=sys.stderr)
-    there = robots(recording.topics())
+    there = robots_of_keys(recording.topics())
     robot = choice.robot or (there[0] if there else link.robot)
     if not math.isfinite(choice.rate):
         choice = replace(choice, rate=0.0)

@@ -21,9 +21,9 @@ from common.messages.topics import SCAN, TOPICS
 from common.runtime.config import ServiceSettings, load_settings
 from common.runtime.heartbeat import Heartbeat
 from services.recorder.reader import read_recording
-from services.recorder.replaying.replay import NAME, Choice, Remote, replay
+from services.recorder.replaying.replay import NAME, ReplayControl, ReplayOptions, replay
 
-PERIOD = 1.0  # s between heartbeats
+HEARTBEAT_PERIOD_S = 1.0  # s between heartbeats
 
 
 class PlayingSettings(ServiceSettings):
@@ -58,16 +58,16 @@ class PlayingSettings(ServiceSettings):
         return path
 
 
-def choice_of(path: Path, settings: PlayingSettings) -> Choice:
+def options_for(path: Path, settings: PlayingSettings) -> ReplayOptions:
     """What the simulator sent; raises UserError where there is no scan."""
     mine = {topic.name for topic in TOPICS if topic.publisher == SCAN.publisher}
     there = {topic.name for topic in read_recording(path).topics().values()} & mine
     if SCAN.name not in there:
         raise UserError(f"{path}: no scans in this recording: choose one that has them (`presage info FILE`)")
-    return Choice(frozenset(there), rate=settings.rate, loop=True, robot=settings.robot)
+    return ReplayOptions(frozenset(there), rate=settings.rate, loop=True, robot=settings.robot)
 
 
-class Pulse:
+class ReplayHeartbeat:
     """Heartbeats while the replay goes on."""
 
     def __init__(self, settings: PlayingSettings) -> None:
@@ -75,7 +75,7 @@ class Pulse:
         self._heart = Heartbeat(settings.heartbeat, NAME, settings.robot)
         self._at = 0.0  # s, monotonic, of the next
         self._bus: Bus | None = None
-        self._remote: Remote | None = None
+        self._remote: ReplayControl | None = None
 
     @contextmanager
     def opening(self, link: Link) -> Iterator[Bus]:
@@ -84,7 +84,7 @@ class Pulse:
             yield self._bus
 
     @contextmanager
-    def steering(self, remote: Remote) -> Iterator[None]:
+    def steering(self, remote: ReplayControl) -> Iterator[None]:
         """The replay begins."""
         self._remote = remote
         yield
@@ -95,7 +95,7 @@ class Pulse:
             return
         counts = {key: {"published": count} for key, count in self._remote.counts.items()}
         self._heart.beat(counts, linked=self._bus.linked(), note="paused" if state.paused else "")
-        self._at = now + PERIOD
+        self._at = now + HEARTBEAT_PERIOD_S
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -107,7 +107,7 @@ def main(argv: list[str] | None = None) -> None:
         settings = load_settings(PlayingSettings, argv)
         set_up_logging(settings.log_level, as_json=settings.log_json)
         path = settings.file()
-        choice, pulse, log = choice_of(path, settings), Pulse(settings), logger(NAME)
+        choice, pulse, log = options_for(path, settings), ReplayHeartbeat(settings), logger(NAME)
         log.info("replaying", file=str(path), topics=",".join(sorted(choice.only or ())), robot=settings.robot)
         replay(
             path, settings.link(), choice, on_progress=pulse, stop=stop, opening=pulse.opening, steering=pulse.steering

@@ -10,11 +10,11 @@ import numpy as np
 from common.messages.definitions import Preference
 from services.viewer.state.frames import encode, pose_of
 
-CELLS = 40_000  # of the picture at most, 160 kB
-MOST = 32  # fields of a replay, which may go back to each
+MAX_CELLS = 40_000  # of the picture at most, 160 kB
+MAX_STORED_FIELDS = 32  # fields of a replay, which may go back to each
 
 
-class Fields:
+class GoalFields:
     """Those of one robot."""
 
     def __init__(self) -> None:
@@ -22,7 +22,7 @@ class Fields:
         self.shown: bytes | None = None  # what visitors have been told last
         self._by_stamp: OrderedDict[int, bytes] = OrderedDict()
 
-    def hear(self, message: Preference, robot: str, *, live: bool) -> None:
+    def add(self, message: Preference, robot: str, *, live: bool) -> None:
         """Keep one; of a live robot, not of a replay, the last alone, though its simulation began anew."""
         with suppress(ValueError):  # cells larger than all numbers: nobody can draw them
             picture = field_of(message, robot)
@@ -33,7 +33,7 @@ class Fields:
             self._by_stamp.clear()
         self._by_stamp[stamp_ns] = picture
         self._by_stamp.move_to_end(stamp_ns)
-        if len(self._by_stamp) > MOST:
+        if len(self._by_stamp) > MAX_STORED_FIELDS:
             self._by_stamp.popitem(last=False)
 
     def change(self, stamp_ns: int, *, live: bool) -> bytes | None:
@@ -49,7 +49,7 @@ class Fields:
 def field_of(message: Preference, robot: str) -> bytes:
     """A binary message of type ``field``; a large one is thinned out, each cell's value is that of its middle."""
     values = message.distance.reshape(message.height, message.width)
-    step = max(1, int(np.ceil(np.sqrt(values.size / CELLS))))
+    step = max(1, int(np.ceil(np.sqrt(values.size / MAX_CELLS))))
     first = min(step // 2, *(size - 1 for size in values.shape))
     values = values[first::step, first::step]
     shift = (first + 0.5 - step / 2) * message.resolution  # of the corner, so that kept cells keep their middles

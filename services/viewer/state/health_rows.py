@@ -9,14 +9,14 @@ from typing import Any
 from common.messages.definitions import Health, TopicHealth
 
 EXPECTED = ("simulator", "estimator", "controller")  # what a robot needs to move by itself
-FORGET = 30.0  # s after its last pulse, a service that is not alive is no longer listed
-MOST = 50  # services; somebody may invent names
+FORGET_AFTER_S = 30.0  # s after its last pulse, a service that is not alive is no longer listed
+MAX_SERVICES = 50  # services; somebody may invent names
 
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Pulse:
+class HealthPair:
     """The last two of a service, and when the last came."""
 
     now: Health
@@ -24,31 +24,31 @@ class Pulse:
     at: float  # s, a clock that only goes forward
 
 
-class Pulses:
+class HealthHistory:
     """Health messages of one robot."""
 
     def __init__(self) -> None:
         """None heard."""
-        self._pulses: dict[str, Pulse] = {}
+        self._by_service: dict[str, HealthPair] = {}
 
-    def hear(self, health: Health, at: float) -> None:
+    def add(self, health: Health, at: float) -> None:
         """Take one."""
-        before = self._pulses.get(health.service)
-        if before is None and len(self._pulses) >= MOST:
+        before = self._by_service.get(health.service)
+        if before is None and len(self._by_service) >= MAX_SERVICES:
             return
         # A service that was started anew counts from 0 again; two recorders may run, each with counts of its own.
         same = before is not None and before.now.instance == health.instance and before.now.uptime < health.uptime
-        self._pulses[health.service] = Pulse(health, before.now if before is not None and same else None, at)
+        self._by_service[health.service] = HealthPair(health, before.now if before is not None and same else None, at)
 
     def rows(self, alive: Collection[str], at: float) -> list[Row]:
         """One a service, alive or heard of lately, in order of their names."""
-        for name in [n for n, p in self._pulses.items() if n not in alive and at - p.at > FORGET]:
-            del self._pulses[name]
-        names = sorted({*sorted(alive)[:MOST], *self._pulses})
+        for name in [n for n, p in self._by_service.items() if n not in alive and at - p.at > FORGET_AFTER_S]:
+            del self._by_service[name]
+        names = sorted({*sorted(alive)[:MAX_SERVICES], *self._by_service})
         return [self._row(name, name in alive, at) for name in names]
 
     def _row(self, name: str, alive: bool, at: float) -> Row:  # noqa: FBT001
-        pulse = self._pulses.get(name)
+        pulse = self._by_service.get(name)
         if pulse is None:
             return {"name": name, "alive": alive, "age_s": None, "note": "", "rates": [], "uptime_s": None}
         health, before = pulse.now, pulse.before
@@ -65,7 +65,7 @@ class Pulses:
 
 
 def rates(row: TopicHealth, before: TopicHealth | None, seconds: float) -> Row:
-    """Of one key in one service; Hz between two pulses ``seconds`` apart, or as the service says."""
+    """Of one key in one service; Hz between two messages ``seconds`` apart, or as the service says."""
     topic = "/".join(row.key.split("/")[2:]) or row.key
     if before is not None and seconds > 0:
         published, received = (

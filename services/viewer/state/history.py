@@ -6,12 +6,12 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-SPAN = 60.0  # s of stamps
-MOST = 5000  # samples, whatever the rate
+SPAN_S = 60.0  # s of stamps
+MAX_SAMPLES = 5000  # samples, whatever the rate
 
 
 @dataclass(frozen=True)
-class Sample:
+class ChartSample:
     """One belief's worth."""
 
     t: float  # s, its stamp
@@ -27,14 +27,14 @@ class History:
 
     def __init__(self) -> None:
         """Empty."""
-        self._samples: deque[Sample] = deque(maxlen=MOST)
+        self._samples: deque[ChartSample] = deque(maxlen=MAX_SAMPLES)
 
-    def add(self, sample: Sample) -> None:
-        """The newest; those of its stamp or later are gone then, and those more than `SPAN` older."""
+    def add(self, sample: ChartSample) -> None:
+        """The newest; those of its stamp or later are gone then, and those more than `SPAN_S` older."""
         samples = self._samples
         while samples and samples[-1].t >= sample.t:
             samples.pop()
-        while samples and samples[0].t < sample.t - SPAN:
+        while samples and samples[0].t < sample.t - SPAN_S:
             samples.popleft()
         samples.append(sample)
 

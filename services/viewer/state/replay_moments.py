@@ -11,19 +11,19 @@ from collections import OrderedDict
 from common.messages.definitions import Stamped
 from common.messages.topics import PLAN, SCAN, Topic
 
-QUIET = 0.03  # s without a message: what was sent has come
-LONGEST = 0.06  # s, of one that plays on without a pause
-MOST = 64  # stamps
+QUIET_TIME_S = 0.03  # s without a message: what was sent has come
+MAX_GATHERING_S = 0.06  # s, of one that plays on without a pause
+MAX_STAMPS = 64  # stamps
 
-Moment = dict[str, Stamped]  # by topic's name
+MessagesByTopic = dict[str, Stamped]  # by topic's name
 
 
-class Moments:
+class ReplayMoments:
     """Those that may still be shown."""
 
     def __init__(self) -> None:
         """None."""
-        self._by_stamp: OrderedDict[int, Moment] = OrderedDict()
+        self._by_stamp: OrderedDict[int, MessagesByTopic] = OrderedDict()
         self._shown = (-1, 0)  # stamp, and how many messages it had
         self._first = self._last = 0.0  # s, when messages came that nobody looked at yet
         self._news = False
@@ -31,16 +31,16 @@ class Moments:
     def take(self, topic: Topic, message: Stamped, at: float) -> None:
         """Add a message."""
         self._by_stamp.setdefault(message.stamp_ns, {})[topic.name] = message
-        if len(self._by_stamp) > MOST:
+        if len(self._by_stamp) > MAX_STAMPS:
             self._by_stamp.popitem(last=False)
         self._first = self._first if self._news else at
         self._last, self._news = at, True
 
     def due(self, at: float) -> float | None:
         """Seconds until `choose` may be asked; None: nothing came."""
-        return min(self._last + QUIET, self._first + LONGEST) - at if self._news else None
+        return min(self._last + QUIET_TIME_S, self._first + MAX_GATHERING_S) - at if self._news else None
 
-    def choose(self) -> Moment | None:
+    def choose(self) -> MessagesByTopic | None:
         """The fullest of those not shown as they are, of several the newest; what is older is forgotten.
 
         A plan does not count: where the robot stands there is none.

@@ -1,7 +1,7 @@
 """One robot's latest state.
 
 A frame shows one moment: scan, truth, belief, prediction and command of the same stamp. What answers a scan comes some
-milliseconds after it and is waited for, shortly, from those who have spoken lately. Of a replay see `Moments`.
+milliseconds after it and is waited for, shortly, from those who have spoken lately. Of a replay see `ReplayMoments`.
 """
 
 from __future__ import annotations
@@ -39,25 +39,25 @@ from common.messages.topics import (
     Topic,
 )
 from services.viewer.state import frames
-from services.viewer.state.goal_field import Fields
-from services.viewer.state.history import History, Sample
-from services.viewer.state.replay_moments import Moments
-from services.viewer.state.status_log import Journal
+from services.viewer.state.goal_field import GoalFields
+from services.viewer.state.history import ChartSample, History
+from services.viewer.state.replay_moments import ReplayMoments
+from services.viewer.state.status_log import StatusLog
 
-PATIENCE = 0.05  # s of the wall's clock after a scan in which its answers are waited for
-SILENT = 2.0  # s behind the scan, by stamps and by the wall: no longer waited for, no longer shown
-ALWAYS = (BELIEF, TRUTH, STATUS, GOAL, HEALTH)  # read though nobody watches
-SHOWN = (*ALWAYS, SCAN, ODOM, PREDICTION, CMD_VEL, PLAN, PREFERENCE)
-BEGINNING = (ODOM, TRUTH, SCAN)  # what a new stamp begins with
-ANSWERS = (ODOM, TRUTH, BELIEF, PREDICTION, CMD_VEL, PLAN)
-TRUTHS = 256  # stamps; a belief may come that much later than its truth
-GOALS = 8  # the last ones given
+ANSWER_TIMEOUT_S = 0.05  # s of the wall's clock after a scan in which its answers are waited for
+SILENCE_TIMEOUT_S = 2.0  # s behind the scan, by stamps and by the wall: no longer waited for, no longer shown
+ALWAYS_READ_TOPICS = (BELIEF, TRUTH, STATUS, GOAL, HEALTH)  # read though nobody watches
+SHOWN_TOPICS = (*ALWAYS_READ_TOPICS, SCAN, ODOM, PREDICTION, CMD_VEL, PLAN, PREFERENCE)
+SENSOR_TOPICS = (ODOM, TRUTH, SCAN)  # what a new stamp begins with
+ANSWER_TOPICS = (ODOM, TRUTH, BELIEF, PREDICTION, CMD_VEL, PLAN)
+MAX_TRUTHS = 256  # stamps; a belief may come that much later than its truth
+MAX_GOALS = 8  # the last ones given
 
 M = TypeVar("M", bound=Stamped)
 
 
 @dataclass(frozen=True)
-class Heard:
+class ReceivedMessage:
     """A message and when it came."""
 
     message: Stamped
@@ -71,29 +71,29 @@ class RobotView:
     def __init__(self, robot: str, *, live: bool = True) -> None:
         """Nothing heard; ``live``: not a replay."""
         self.robot, self.live = robot, live
-        self.history, self.journal, self.fields = History(), Journal(), Fields()
-        self.began_anew = self.new_row = False  # stamps went back; the journal grew. For who tells visitors
+        self.history, self.journal, self.fields = History(), StatusLog(), GoalFields()
+        self.time_restarted = self.log_changed = False  # stamps went back; the journal grew. For who tells visitors
         self.frame: bytes | None = None  # the last one
-        self._heard: dict[str, Heard] = {}
+        self._heard: dict[str, ReceivedMessage] = {}
         self._truths: OrderedDict[int, Truth] = OrderedDict()  # by stamp
         self._goals: OrderedDict[int, Goal] = OrderedDict()  # by number
-        self._moments = Moments()  # of a replay
+        self._moments = ReplayMoments()  # of a replay
         self._waiting: tuple[int, float] | None = None  # stamp of the scan that waits for its answers, and since when
         self._latency_ms: float | None = None
 
-    def hear(self, topic: Topic, message: Stamped, at: float, published_ns: int = 0) -> bytes | None:
+    def add(self, topic: Topic, message: Stamped, at: float, published_ns: int = 0) -> bytes | None:
         """Take a message; a frame, where one is complete with it or complete no more."""
         if isinstance(message, Preference | Goal):
             self._keep_aside(message)
             return None
         last, frame = self._heard.get(topic.name), None
-        if topic in BEGINNING and last is not None and message.stamp_ns < last.message.stamp_ns:
+        if topic in SENSOR_TOPICS and last is not None and message.stamp_ns < last.message.stamp_ns:
             self._begin_anew()
-        elif topic in BEGINNING and self._waiting is not None and message.stamp_ns != self._waiting[0]:
+        elif topic in SENSOR_TOPICS and self._waiting is not None and message.stamp_ns != self._waiting[0]:
             frame = self._frame(at)
         if isinstance(message, Truth) and last is not None and isinstance(last.message, Truth):
-            self.new_row |= self.journal.add_carry(last.message, message)
-        self._heard[topic.name] = Heard(message, at, published_ns)
+            self.log_changed |= self.journal.add_carry(last.message, message)
+        self._heard[topic.name] = ReceivedMessage(message, at, published_ns)
         self._keep(message)
         if not self.live:
             self._moments.take(topic, message, at)
@@ -106,7 +106,7 @@ class RobotView:
         """Seconds until what came is to be shown, complete or not; None: nothing waits."""
         if not self.live:
             return self._moments.due(at)
-        return self._waiting[1] + PATIENCE - at if self._waiting is not None else None
+        return self._waiting[1] + ANSWER_TIMEOUT_S - at if self._waiting is not None else None
 
     def overdue(self, at: float) -> bytes | None:
         """The frame of what has waited long enough, with what there is."""
@@ -118,7 +118,7 @@ class RobotView:
         moment = self._moments.choose()
         if moment is None:
             return None
-        self._heard.update({name: Heard(message, at, 0) for name, message in moment.items()})
+        self._heard.update({name: ReceivedMessage(message, at, 0) for name, message in moment.items()})
         return self._frame(at)
 
     def fresh(self, topic: Topic, kind: type[M], at: float) -> M | None:
@@ -127,7 +127,7 @@ class RobotView:
         if heard is None or not isinstance(heard.message, kind):
             return None
         behind = (self.stamp_ns - heard.message.stamp_ns) * 1e-9
-        return None if self.live and behind > SILENT and at - heard.at > SILENT else heard.message
+        return None if self.live and behind > SILENCE_TIMEOUT_S and at - heard.at > SILENCE_TIMEOUT_S else heard.message
 
     @property
     def status(self) -> Status | None:
@@ -138,7 +138,7 @@ class RobotView:
     @property
     def stamp_ns(self) -> int:
         """Of the newest of what begins a stamp; 0 before the first."""
-        return max((h.message.stamp_ns for t in BEGINNING if (h := self._heard.get(t.name))), default=0)
+        return max((h.message.stamp_ns for t in SENSOR_TOPICS if (h := self._heard.get(t.name))), default=0)
 
     def _begin_anew(self) -> None:
         """After a reset, or a replay's jump back: what is known is about another time."""
@@ -147,32 +147,32 @@ class RobotView:
         self._truths.clear()
         self.history.clear()
         self.journal.clear()
-        self._waiting, self._latency_ms, self.began_anew, self.new_row = None, None, True, True
+        self._waiting, self._latency_ms, self.time_restarted, self.log_changed = None, None, True, True
 
     def _keep_aside(self, message: Preference | Goal) -> None:
         """What is about no scan."""
         if isinstance(message, Preference):
-            self.fields.hear(message, self.robot, live=self.live)
+            self.fields.add(message, self.robot, live=self.live)
             return
         self._goals[message.seq] = message
-        if len(self._goals) > GOALS:
+        if len(self._goals) > MAX_GOALS:
             self._goals.popitem(last=False)
 
     def _keep(self, message: Stamped) -> None:
         if isinstance(message, Truth):
             self._truths[message.stamp_ns] = message
-            if len(self._truths) > TRUTHS:
+            if len(self._truths) > MAX_TRUTHS:
                 self._truths.popitem(last=False)
             belief = self._heard.get(BELIEF.name)
             if belief is not None and belief.message.stamp_ns == message.stamp_ns:  # the network turned them round
                 self._keep(belief.message)
         elif isinstance(message, Belief):
             t, error, speed = message.stamp_ns * 1e-9, self._error(message), self._speed()
-            self.history.add(Sample(t, message.free_energy, message.accuracy, message.complexity, error, speed))
+            self.history.add(ChartSample(t, message.free_energy, message.accuracy, message.complexity, error, speed))
         elif isinstance(message, CmdVel):
             self._latency_ms = self._latency(message)
         elif isinstance(message, Status):
-            self.new_row |= self.journal.add(message)
+            self.log_changed |= self.journal.add(message)
 
     def _error(self, belief: Belief) -> float | None:
         """m, between the belief and the truth of its stamp."""
@@ -202,7 +202,7 @@ class RobotView:
         """Whether all who spoke lately have spoken about the waiting scan."""
         if self._waiting is None:
             return False
-        last = (self.fresh(topic, Stamped, at) for topic in ANSWERS)
+        last = (self.fresh(topic, Stamped, at) for topic in ANSWER_TOPICS)
         known = [message for message in last if message is not None and not _is_over(message)]
         # Where nobody has answered yet it is too early to say that nobody will.
         return bool(known) and all(message.stamp_ns >= self._waiting[0] for message in known)

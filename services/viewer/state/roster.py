@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-MOST = 200  # robots; somebody may invent names
+MAX_ROBOTS = 200  # robots; somebody may invent names
 
 
 class Roster:
@@ -18,7 +18,7 @@ class Roster:
         services = self._alive.get(robot, frozenset())
         services = services | {service} if there else services - {service}
         others = {name: alive for name, alive in self._alive.items() if name != robot}
-        self._alive = {**others, robot: services} if services and len(others) < MOST else others
+        self._alive = {**others, robot: services} if services and len(others) < MAX_ROBOTS else others
 
     def services(self, robot: str) -> frozenset[str]:
         """Those of a robot that are there."""

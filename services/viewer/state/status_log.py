@@ -9,18 +9,18 @@ from typing import Any
 
 from common.messages.definitions import Status, Truth
 
-MOST = 20  # rows
+MAX_ROWS = 20  # rows
 DISTANCE_MARGIN, ANGLE_MARGIN = 0.1, 0.3  # m and rad of a displacement that are no carry, whatever the speed
 ACCELERATION, TURN_ACCELERATION = 2.0, 12.0  # m/s² and rad/s², more than robots have
 NUMBERS = re.compile(r"[-+\d.,()]+")
 
 
-class Journal:
+class StatusLog:
     """One row for each change of state, or of reason; none for one that is over or has other numbers in it."""
 
     def __init__(self) -> None:
         """Empty."""
-        self._rows: deque[dict[str, Any]] = deque(maxlen=MOST)
+        self._rows: deque[dict[str, Any]] = deque(maxlen=MAX_ROWS)
         self._last: dict[str, Any] | None = None  # the last row of a status
 
     def add(self, status: Status) -> bool:
@@ -28,7 +28,7 @@ class Journal:
         reason = status.reason[:500]
         last = self._last
         same = last is not None and last["state"] == status.state
-        if last is not None and same and (not reason or _kind(last["reason"]) == _kind(reason)):
+        if last is not None and same and (not reason or _without_numbers(last["reason"]) == _without_numbers(reason)):
             return False
         self._last = {"t": status.stamp_ns * 1e-9, "state": status.state, "reason": reason}
         self._rows.append(self._last)
@@ -67,5 +67,5 @@ def is_carry(before: Truth, after: Truth) -> bool:
     return away > reach or turned > ANGLE_MARGIN + (turn + TURN_ACCELERATION * seconds) * seconds
 
 
-def _kind(reason: str) -> str:
+def _without_numbers(reason: str) -> str:
     return NUMBERS.sub("#", reason)

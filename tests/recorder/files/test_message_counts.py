@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from common.messages.definitions import Goal, Health, Pose, TopicHealth, Truth, Twist
 from services.recorder.files.message_counts import (
-    FAR,
     MAX_INSTANCES,
+    MAX_REORDER_DISTANCE,
     Count,
     Ledger,
     Sequence,
@@ -57,7 +57,7 @@ def test_missing_is_what_was_left_out(numbers):
     assert (restarts, reordered) == (0, 0)
 
 
-@given(st.integers(1, 10_000), st.integers(0, FAR - 1))
+@given(st.integers(1, 10_000), st.integers(0, MAX_REORDER_DISTANCE - 1))
 def test_no_number_is_both(last, back):
     gaps, missing, restarts, reordered = seen(last, max(0, last - back))
     assert (gaps, missing) == (0, 0)

@@ -11,7 +11,15 @@ from hypothesis import strategies as st
 from common.errors import UserError
 from common.messages.requests import PlayerRequest
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, SCAN, TOPICS
-from services.recorder.replaying.player import GAP, LATE, Player, conflicts, renamed, selected, span
+from services.recorder.replaying.player import (
+    LOOP_GAP_S,
+    MAX_LAG_S,
+    Player,
+    find_conflicts,
+    key_for_robot,
+    select_topics,
+    span,
+)
 
 TIMES = st.lists(st.floats(0, 100), min_size=1, max_size=30).map(sorted)
 RATES = st.floats(0.01, 100)
@@ -64,9 +72,9 @@ def test_a_seek_goes_there_or_to_the_nearest_end(rate, place, now):
     reply = ask(player, "seek", place, now)
     there = min(max(place, 10.0), 90.0)
     assert reply.position_s == pytest.approx(there)
-    assert player.jumped
-    assert player.jump() == there
-    assert not player.jumped
+    assert player.seek_pending
+    assert player.take_seek_target() == there
+    assert not player.seek_pending
     assert player.wait(there, now) == 0.0
     assert player.wait(there + rate, now) == pytest.approx(1.0)
 
@@ -102,7 +110,7 @@ def test_another_rate_holds_from_now_on(first, then, when):
 def test_who_was_held_up_goes_on_from_there_and_does_not_hurry():
     player = Player(0.0, 100.0, 2.0)
     assert play(player, [0.0, 2.0]) == [0.0, 1.0]
-    late = 1.0 + LATE * 50
+    late = 1.0 + MAX_LAG_S * 50
     assert player.wait(4.0, late) == 0.0
     player.sent(4.0, late, whole=True)
     assert player.wait(6.0, late) == pytest.approx(1.0)
@@ -110,15 +118,15 @@ def test_who_was_held_up_goes_on_from_there_and_does_not_hurry():
 
 def test_a_little_late_is_caught_up():
     player = Player(0.0, 100.0)
-    player.sent(4.0, 4.0 + LATE / 2, whole=True)
-    assert player.wait(5.0, 4.0 + LATE / 2) == pytest.approx(1.0 - LATE / 2)
+    player.sent(4.0, 4.0 + MAX_LAG_S / 2, whole=True)
+    assert player.wait(5.0, 4.0 + MAX_LAG_S / 2) == pytest.approx(1.0 - MAX_LAG_S / 2)
 
 
 def test_a_loop_begins_anew_a_moment_later():
     player = Player(3.0, 8.0, loop=True)
-    player.again(50.0)
-    assert player.jump() == 3.0
-    assert player.wait(3.0, 50.0) == pytest.approx(GAP)
+    player.restart(50.0)
+    assert player.take_seek_target() == 3.0
+    assert player.wait(3.0, 50.0) == pytest.approx(LOOP_GAP_S)
     assert player.state(50.0).position_s == 3.0
     assert player.state(50.0).loop
 
@@ -138,35 +146,35 @@ KEYS = {topic.key("r", "estimator"): topic for topic in TOPICS}
 
 def test_topics_are_selected_by_name_and_health_only_when_asked_for():
     there = {key: KEYS[key] for key in KEYS if KEYS[key] in (SCAN, ODOM, HEALTH)}
-    assert set(selected(there, None).values()) == {SCAN, ODOM}
-    assert set(selected(there, {"odom", "health"}).values()) == {ODOM, HEALTH}
-    assert set(selected(there, None, {"odom", "belief"}).values()) == {SCAN}  # belief is none to begin with
+    assert set(select_topics(there, None).values()) == {SCAN, ODOM}
+    assert set(select_topics(there, {"odom", "health"}).values()) == {ODOM, HEALTH}
+    assert set(select_topics(there, None, {"odom", "belief"}).values()) == {SCAN}  # belief is none to begin with
     with pytest.raises(UserError, match="no belief; it has health, odom, scan"):
-        selected(there, {"belief", "scan"})
+        select_topics(there, {"belief", "scan"})
     with pytest.raises(UserError, match="no topic smell: choose from belief"):
-        selected(there, None, {"smell"})
+        select_topics(there, None, {"smell"})
 
 
 def test_a_key_gets_another_robot():
-    assert renamed("presage/robot/health/estimator", "ghost") == "presage/ghost/health/estimator"
-    assert renamed("presage/robot/scan", "") == "presage/robot/scan"
+    assert key_for_robot("presage/robot/health/estimator", "ghost") == "presage/ghost/health/estimator"
+    assert key_for_robot("presage/robot/scan", "") == "presage/robot/scan"
 
 
 def test_beside_whom_keys_are_not_published():
-    assert conflicts(KEYS, {"r": set()}) == ""
-    assert conflicts(KEYS, {"other": {"estimator", "simulator"}}) == ""
-    assert conflicts(KEYS, {"r": {"recorder", "viewer"}}) == ""
-    why = conflicts({key: KEYS[key] for key in KEYS if KEYS[key] is not HEALTH}, {"r": {"estimator", "recorder"}})
+    assert find_conflicts(KEYS, {"r": set()}) == ""
+    assert find_conflicts(KEYS, {"other": {"estimator", "simulator"}}) == ""
+    assert find_conflicts(KEYS, {"r": {"recorder", "viewer"}}) == ""
+    why = find_conflicts({key: KEYS[key] for key in KEYS if KEYS[key] is not HEALTH}, {"r": {"estimator", "recorder"}})
     assert "the estimator of 'r' is alive and publishes presage/r/belief, presage/r/prediction" in why
     assert "--except belief,prediction" in why
     assert "--force" in why
-    assert "presage/r/health/estimator" in conflicts(KEYS, {"r": {"estimator"}})
-    assert conflicts({SCAN.key("r"): SCAN}, {"r": {"estimator"}}) == ""
-    assert "simulator" in conflicts({SCAN.key("r"): SCAN}, {"r": {"simulator"}})
-    assert "the replay of 'r'" in conflicts({BELIEF.key("r"): BELIEF}, {"r": {"replay"}})
+    assert "presage/r/health/estimator" in find_conflicts(KEYS, {"r": {"estimator"}})
+    assert find_conflicts({SCAN.key("r"): SCAN}, {"r": {"estimator"}}) == ""
+    assert "simulator" in find_conflicts({SCAN.key("r"): SCAN}, {"r": {"simulator"}})
+    assert "the replay of 'r'" in find_conflicts({BELIEF.key("r"): BELIEF}, {"r": {"replay"}})
 
 
 def test_commands_do_not_drive_a_live_simulator_and_goals_belong_to_nobody():
-    assert "would drive the live simulator" in conflicts({CMD_VEL.key("r"): CMD_VEL}, {"r": {"simulator"}})
-    assert conflicts({CMD_VEL.key("r"): CMD_VEL}, {"r": {"estimator"}}) == ""
-    assert conflicts({GOAL.key("r"): GOAL}, {"r": {"simulator", "controller", "viewer"}}) == ""
+    assert "would drive the live simulator" in find_conflicts({CMD_VEL.key("r"): CMD_VEL}, {"r": {"simulator"}})
+    assert find_conflicts({CMD_VEL.key("r"): CMD_VEL}, {"r": {"estimator"}}) == ""
+    assert find_conflicts({GOAL.key("r"): GOAL}, {"r": {"simulator", "controller", "viewer"}}) == ""

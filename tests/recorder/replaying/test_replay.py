@@ -20,10 +20,10 @@ from common.messages.topics import BELIEF, CONFIG, GOAL, HEALTH, ODOM, PLAYER, S
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.replaying import player as core
 from services.recorder.replaying import replay as shell
-from services.recorder.replaying.replay import Choice, replay
+from services.recorder.replaying.replay import ReplayOptions, replay
 
 SECOND = 10**9
-FAST = Choice(rate=0)
+FAST = ReplayOptions(rate=0)
 
 
 def write(path, entries):
@@ -104,7 +104,7 @@ def test_the_same_bytes_come_back_in_their_order(tmp_path, link, listening, rate
     health = (HEALTH, HEALTH.key(link.robot, "estimator"), b"pulse", 0)
     path = write(tmp_path / "run.mcap", [health, *entries])
     progress = []
-    counts = replay(path, link, Choice(rate=rate), on_progress=lambda state: progress.append(state.position_s))
+    counts = replay(path, link, ReplayOptions(rate=rate), on_progress=lambda state: progress.append(state.position_s))
     assert counts == {scan: 333, odom: 167}
     assert progress[-1] == pytest.approx(4.99)
     assert progress == sorted(progress)
@@ -115,7 +115,7 @@ def test_the_same_bytes_come_back_in_their_order(tmp_path, link, listening, rate
 
 
 def test_it_waits_for_who_comes_a_little_late(tmp_path, link, bus, monkeypatch):
-    monkeypatch.setattr(shell, "LISTENERS_WITHIN", 20.0)
+    monkeypatch.setattr(shell, "SUBSCRIBER_TIMEOUT_S", 20.0)
     inbox = Inbox()
     late = threading.Timer(1.0, lambda: bus.subscribe(SCAN, inbox, keep_all=True))
     late.start()
@@ -125,28 +125,28 @@ def test_it_waits_for_who_comes_a_little_late(tmp_path, link, bus, monkeypatch):
 
 
 def test_only_what_was_chosen_is_sent(scans, link, listening):
-    only = Choice(rate=0, only=frozenset({"odom"}), start=10.0, end=-88.9)
+    only = ReplayOptions(rate=0, only=frozenset({"odom"}), start=10.0, end=-88.9)
     assert replay(scans, link, only) == {ODOM.key(link.robot): 1}
     assert wait_until(lambda: len(listening) == 1, 10)
     assert drain(listening) == [(ODOM.key(link.robot), bytes([10]))]
 
 
 def test_what_is_left_out_is_not_sent(scans, link, listening):
-    choice = Choice(rate=0, leave_out=frozenset({"odom", "belief"}), start=98.0)
+    choice = ReplayOptions(rate=0, leave_out=frozenset({"odom", "belief"}), start=98.0)
     assert replay(scans, link, choice) == {SCAN.key(link.robot): 2}
 
 
 def test_another_robot_gets_the_bytes(scans, link, bus):
     inbox = Inbox()
     bus.subscribe(SCAN, inbox, keep_all=True, robot=f"{link.robot}-ghost")
-    assert replay(scans, link, Choice(rate=0, robot=f"{link.robot}-ghost", start=99.0, only=frozenset({"scan"})))
+    assert replay(scans, link, ReplayOptions(rate=0, robot=f"{link.robot}-ghost", start=99.0, only=frozenset({"scan"})))
     assert wait_until(lambda: len(inbox) == 1, 10)
     assert drain(inbox) == [(SCAN.key(f"{link.robot}-ghost"), bytes([99]))]
 
 
 def test_nothing_to_replay_is_said(scans, link):
     with pytest.raises(UserError, match=r"run.mcap: nothing to replay"):
-        replay(scans, link, Choice(leave_out=frozenset({"scan", "odom"})))
+        replay(scans, link, ReplayOptions(leave_out=frozenset({"scan", "odom"})))
 
 
 def test_it_ends_when_it_is_told_to(tmp_path, link, listening):
@@ -157,7 +157,7 @@ def test_it_ends_when_it_is_told_to(tmp_path, link, listening):
 
 
 def test_an_unfinished_recording_is_replayed_with_a_warning(tmp_path, link, listening, capsys, monkeypatch):
-    monkeypatch.setattr(shell, "LISTENERS_WITHIN", 5.0)
+    monkeypatch.setattr(shell, "SUBSCRIBER_TIMEOUT_S", 5.0)
     writer = RecordingWriter(tmp_path / "run.mcap")
     writer.write(SCAN, SCAN.key(link.robot), b"s", 1, 1)
     writer.flush()
@@ -167,7 +167,7 @@ def test_an_unfinished_recording_is_replayed_with_a_warning(tmp_path, link, list
 
 
 def test_a_key_nobody_listens_to_is_named_and_it_ends_all_the_same(tmp_path, link, bus, capsys, monkeypatch):
-    monkeypatch.setattr(shell, "LISTENERS_WITHIN", 2.0)
+    monkeypatch.setattr(shell, "SUBSCRIBER_TIMEOUT_S", 2.0)
     inbox = Inbox()
     bus.subscribe(ODOM, inbox, keep_all=True)
     scan, odom = SCAN.key(link.robot), ODOM.key(link.robot)
@@ -182,7 +182,7 @@ def test_it_is_steered_over_the_bus(running, listening, bus, link):
         return bus.ask(PLAYER, PlayerRequest(action=action, value=value), PlayerReply, timeout=10)
 
     scan, odom = SCAN.key(link.robot), ODOM.key(link.robot)
-    _, thread, counts = running(Choice(rate=1e-6))  # so slow that only what is asked for happens
+    _, thread, counts = running(ReplayOptions(rate=1e-6))  # so slow that only what is asked for happens
     assert wait_until(lambda: len(listening) == 1, 10)  # the first is due at once
     assert ask("pause").paused
     assert ask("status").duration_s == pytest.approx(99.5)
@@ -210,7 +210,7 @@ def test_it_is_steered_over_the_bus(running, listening, bus, link):
 
 
 def test_hostile_requests_are_refused_and_it_goes_on(running, bus):
-    running(Choice(rate=1e-6))
+    running(ReplayOptions(rate=1e-6))
     assert wait_until(lambda: "replay" in bus.alive(), 20)
 
     @settings(max_examples=200, suppress_health_check=list(HealthCheck))
@@ -231,15 +231,15 @@ def test_hostile_requests_are_refused_and_it_goes_on(running, bus):
 
 
 def test_it_says_what_it_is(running, bus, scans):
-    running(Choice(rate=1e-6))
+    running(ReplayOptions(rate=1e-6))
     assert wait_until(lambda: "replay" in bus.alive(), 10)
     reply = bus.ask(CONFIG, Request(), ConfigReply, timeout=10, service="replay")
     assert json.loads(reply.config)["file"] == str(scans)
 
 
 def test_a_loop_begins_anew(running, listening, link, monkeypatch):
-    monkeypatch.setattr(core, "GAP", 0.01)
-    remote, thread, counts = running(Choice(rate=0, start=98.0, loop=True, only=frozenset({"scan"})))
+    monkeypatch.setattr(core, "LOOP_GAP_S", 0.01)
+    remote, thread, counts = running(ReplayOptions(rate=0, start=98.0, loop=True, only=frozenset({"scan"})))
     assert wait_until(lambda: len(listening) >= 20, 10)
     remote.quit()
     thread.join(10)
@@ -278,7 +278,7 @@ def test_it_does_not_publish_beside_a_live_publisher_unless_told(tmp_path, link,
 
 
 def test_a_second_replay_of_the_same_keys_is_refused(running, link, scans, bus):
-    running(Choice(rate=1e-6))
+    running(ReplayOptions(rate=1e-6))
     assert wait_until(lambda: "replay" in bus.alive(), 20)
     with pytest.raises(UserError, match="the replay of"):
         replay(scans, link, FAST)

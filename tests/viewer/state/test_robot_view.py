@@ -12,9 +12,9 @@ import pytest
 from common.messages.definitions import Goal, Plan, Pose, Twist
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, PLAN, PREDICTION, PREFERENCE, SCAN, STATUS, TRUTH
 from services.viewer.state.frames import encode
-from services.viewer.state.history import History, Sample
-from services.viewer.state.replay_moments import QUIET
-from services.viewer.state.robot_view import PATIENCE, RobotView
+from services.viewer.state.history import ChartSample, History
+from services.viewer.state.replay_moments import QUIET_TIME_S
+from services.viewer.state.robot_view import ANSWER_TIMEOUT_S, RobotView
 from tests.viewer.client import read_frame
 from tests.viewer.messages import MOTION, PATH, PEOPLE, RANGES, UNMAPPED, at, preference
 
@@ -25,7 +25,7 @@ REST = (BELIEF, PREDICTION, STATUS, CMD_VEL, PLAN)  # what answers a scan
 def feed(view, stamp, now=None, *leave_out, **how):
     """All messages of a stamp; the frames that came of them."""
     now = stamp if now is None else now
-    sent = [view.hear(t, m, now, round(now * 1e9)) for t, m in at(stamp, **how).items() if t not in leave_out]
+    sent = [view.add(t, m, now, round(now * 1e9)) for t, m in at(stamp, **how).items() if t not in leave_out]
     return [read_frame(frame) for frame in sent if frame is not None]
 
 
@@ -85,15 +85,15 @@ def test_it_waits_for_those_who_spoke_lately_and_no_longer_than_its_patience():
     feed(view, 1.0)
     late = {BELIEF, PREDICTION, STATUS, CMD_VEL, PLAN}
     assert feed(view, 1.1, 1.1, *late) == []
-    assert view.due(1.1) == pytest.approx(PATIENCE)
-    assert view.overdue(1.1 + PATIENCE / 2) is None
-    frame = read_frame(view.overdue(1.1 + PATIENCE))
+    assert view.due(1.1) == pytest.approx(ANSWER_TIMEOUT_S)
+    assert view.overdue(1.1 + ANSWER_TIMEOUT_S / 2) is None
+    frame = read_frame(view.overdue(1.1 + ANSWER_TIMEOUT_S))
     assert frame.header["stamp_ns"] == 1_100_000_000
     assert frame.header["belief"]["stamp_ns"] == 1_000_000_000  # the last there is, and it says so
     assert frame.header["error"] == pytest.approx(0.5)  # against the truth of its own stamp
     assert view.due(2.0) is None
     # The belief that comes after all makes no second frame of that scan.
-    assert view.hear(BELIEF, at(1.1)[BELIEF], 1.2) is None
+    assert view.add(BELIEF, at(1.1)[BELIEF], 1.2) is None
 
 
 def test_the_next_scan_ends_the_wait_and_the_old_one_is_shown_as_it_was():
@@ -109,7 +109,7 @@ def test_who_fell_silent_is_not_shown_and_not_waited_for():
     view = RobotView("robot")
     for i in range(60):
         feed(view, i * 0.1, i * 0.1, *({BELIEF, PREDICTION} if i else set()))
-        view.overdue(i * 0.1 + PATIENCE)
+        view.overdue(i * 0.1 + ANSWER_TIMEOUT_S)
     (frame,) = feed(view, 6.0, 6.0, BELIEF, PREDICTION)
     assert frame.header["belief"] is None
     assert frame.header["error"] is None
@@ -122,13 +122,13 @@ def test_while_time_stands_still_nobody_falls_silent():
     feed(view, 1.0)
     assert feed(view, 1.1, 100.0, *REST) == []  # one step after a long pause: it waits
     rest = {topic: message for topic, message in at(1.1).items() if topic in REST}
-    frames = [view.hear(topic, message, 100.01) for topic, message in rest.items()]
+    frames = [view.add(topic, message, 100.01) for topic, message in rest.items()]
     assert read_frame(frames[-1]).header["belief"]["stamp_ns"] == 1_100_000_000
 
 
 def shown(view, now):
     """The frame of a replay once it is quiet."""
-    frame = view.overdue(now + QUIET)
+    frame = view.overdue(now + QUIET_TIME_S)
     return frame if frame is None else read_frame(frame)
 
 
@@ -140,7 +140,7 @@ def test_a_replay_shows_the_whole_moment_whatever_the_order(seed):
         sent += [(t, m) for t, m in at(float(step)).items() if t not in REST]
         keys = {topic: [m for t, m in sent if t is topic] for topic, _ in sent}
         order = random.sample([topic for topic, _ in sent], len(sent))  # each key keeps its own order
-        assert [view.hear(topic, keys[topic].pop(0), float(step)) for topic in order] == [None] * len(sent)
+        assert [view.add(topic, keys[topic].pop(0), float(step)) for topic in order] == [None] * len(sent)
         assert shown(view, step - 0.01) is None  # more may come
         frame = shown(view, float(step))
         assert frame.header["t"] == (1.0 if step == 1 else step - 1.0)
@@ -164,7 +164,7 @@ def test_a_replay_that_jumps_shows_where_it_is():
     feed(view, 2.0, 7.0)  # back, to the last of its file, say: no other scan follows
     frame = shown(view, 7.0)
     assert frame.header["stamp_ns"] == frame.header["belief"]["stamp_ns"] == 2_000_000_000
-    assert view.began_anew
+    assert view.time_restarted
 
 
 def test_a_replay_that_never_pauses_is_shown_all_the_same():
@@ -184,15 +184,15 @@ def test_a_replay_of_scans_alone_is_shown():
     view = RobotView("ghost", live=False)
     seen = []
     for i in range(4):
-        view.hear(SCAN, at(float(i))[SCAN], float(i))
+        view.add(SCAN, at(float(i))[SCAN], float(i))
         seen.append(shown(view, float(i)).header["t"])
     assert seen == [0.0, 1.0, 2.0, 3.0]
 
 
 def test_a_scanner_alone_is_shown():
     view = RobotView("bare")
-    view.hear(SCAN, at(1.0)[SCAN], 1.0)
-    frame = read_frame(view.overdue(1.0 + PATIENCE))
+    view.add(SCAN, at(1.0)[SCAN], 1.0)
+    frame = read_frame(view.overdue(1.0 + ANSWER_TIMEOUT_S))
     assert frame.header["truth"] is frame.header["belief"] is frame.header["status"] is frame.header["cmd"] is None
     assert len(frame.arrays["ranges"]) == 5
 
@@ -201,7 +201,7 @@ def test_latency_is_from_the_scan_to_its_own_command():
     view = RobotView("robot")
     feed(view, 1.0)
     for topic, message in at(1.1).items():
-        frame = view.hear(topic, message, 1.1, 1_100_000_000 + (7_500_000 if topic is CMD_VEL else 0))
+        frame = view.add(topic, message, 1.1, 1_100_000_000 + (7_500_000 if topic is CMD_VEL else 0))
     assert read_frame(frame).header["latency_ms"] == pytest.approx(7.5)
 
 
@@ -210,9 +210,9 @@ def test_time_that_goes_back_begins_anew():
     for i in range(5):
         feed(view, 10.0 + i)
     assert view.history.columns()["t"] == [10.0, 11.0, 12.0, 13.0, 14.0]
-    assert not view.began_anew
+    assert not view.time_restarted
     (frame, *_) = [*feed(view, 2.0), *feed(view, 3.0)]
-    assert view.began_anew
+    assert view.time_restarted
     assert frame.header["stamp_ns"] <= 3_000_000_000
     assert view.history.columns()["t"] == [2.0, 3.0]
 
@@ -220,12 +220,12 @@ def test_time_that_goes_back_begins_anew():
 def test_history_is_the_last_minute():
     history = History()
     for i in range(100):
-        history.add(Sample(float(i), i, i, 0.0, None, 0.1))
+        history.add(ChartSample(float(i), i, i, 0.0, None, 0.1))
     columns = history.columns()
     assert columns["t"] == [float(i) for i in range(39, 100)]
     assert {len(column) for column in columns.values()} == {61}
     assert columns["error"] == [None] * 61
-    history.add(Sample(99.0, -1, -1, 0.0, 0.5, 0.1))  # sent again: it takes the place of the first
+    history.add(ChartSample(99.0, -1, -1, 0.0, 0.5, 0.1))  # sent again: it takes the place of the first
     assert history.columns()["free_energy"][-2:] == [98, -1]
 
 
@@ -241,7 +241,7 @@ def test_history_remembers_what_beliefs_said():
 def test_a_truth_that_comes_after_its_belief_still_gives_the_error():
     view, messages = RobotView("robot"), at(1.0)
     for topic in (SCAN, BELIEF, TRUTH):
-        view.hear(topic, messages[topic], 1.0)
+        view.add(topic, messages[topic], 1.0)
     assert view.history.columns()["error"] == [pytest.approx(0.5)]
 
 
@@ -249,7 +249,7 @@ def test_an_empty_plan_is_the_last_one_and_nobody_waits_for_another():
     view = RobotView("robot")
     feed(view, 1.0)
     assert feed(view, 1.1, 1.1, PLAN) == []  # there was one
-    view.hear(PLAN, Plan(stamp_ns=1_100_000_000), 1.11)
+    view.add(PLAN, Plan(stamp_ns=1_100_000_000), 1.11)
     (frame,) = feed(view, 1.2, 1.2, PLAN)
     assert len(frame.arrays["path"]) == len(frame.arrays["obstacles"]) == 0
     assert view.due(1.2) is None
@@ -260,8 +260,8 @@ def test_what_a_goal_asks_for_is_shown_with_it():
     said = at(1.0)[STATUS].model_copy(update={"goal_seq": 7})
 
     def shown_goal(number, **asks):
-        view.hear(GOAL, Goal(stamp_ns=0, seq=number, pose=goal, **asks), 1.0)
-        view.hear(STATUS, said, 1.0)
+        view.add(GOAL, Goal(stamp_ns=0, seq=number, pose=goal, **asks), 1.0)
+        view.add(STATUS, said, 1.0)
         (frame,) = feed(view, view.stamp_ns * 1e-9 + 0.1, 1.0, STATUS)
         return frame.header["status"]["goal"]
 
@@ -280,7 +280,7 @@ def test_a_field_is_told_once_and_outlives_a_reset():
     view = RobotView("robot")
     feed(view, 5.0)
     assert told_field(view) is None
-    view.hear(PREFERENCE, preference(5.0), 5.0)
+    view.add(PREFERENCE, preference(5.0), 5.0)
     field = told_field(view)
     assert field.header == {
         "type": "field", "robot": "robot", "t": 5.0, "goal": {"x": 9.0, "y": 2.0, "yaw": 0.0},
@@ -290,16 +290,16 @@ def test_a_field_is_told_once_and_outlives_a_reset():
     feed(view, 6.0)
     assert told_field(view) is None
     feed(view, 1.0)  # the simulation began anew; its goal is the same
-    assert view.began_anew
+    assert view.time_restarted
     assert view.fields.shown == field.data
-    view.hear(PREFERENCE, preference(1.0, x=3.0), 7.0)
+    view.add(PREFERENCE, preference(1.0, x=3.0), 7.0)
     assert told_field(view).header["goal"]["x"] == 3.0
 
 
 def test_a_replay_shows_the_field_of_its_time():
     view = RobotView("ghost", live=False)
     for stamp, x in ((1.0, 1.0), (5.0, 5.0)):
-        view.hear(PREFERENCE, preference(stamp, x), stamp)
+        view.add(PREFERENCE, preference(stamp, x), stamp)
         feed(view, stamp)
         assert told_field(view).header["goal"]["x"] == x
     feed(view, 3.0)  # back
@@ -312,7 +312,7 @@ def test_a_replay_shows_the_field_of_its_time():
 
 def test_a_large_field_is_thinned_out_and_its_cells_stay_where_they_were():
     view, side = RobotView("robot"), 401
-    view.hear(PREFERENCE, preference(1.0, width=side, height=side), 1.0)
+    view.add(PREFERENCE, preference(1.0, width=side, height=side), 1.0)
     field = told_field(view)
     header, values = field.header, field.arrays["distance"]
     assert header["width"] == header["height"] == 134
@@ -329,8 +329,8 @@ def test_the_journal_has_a_row_for_each_change_of_mind():
     view = RobotView("robot")
 
     def say(stamp, state, reason=""):
-        view.hear(STATUS, at(stamp)[STATUS].model_copy(update={"state": state, "reason": reason}), stamp)
-        grew, view.new_row = view.new_row, False
+        view.add(STATUS, at(stamp)[STATUS].model_copy(update={"state": state, "reason": reason}), stamp)
+        grew, view.log_changed = view.log_changed, False
         return grew
 
     assert say(1.0, "navigating")
@@ -368,8 +368,8 @@ def test_a_robot_carried_off_is_an_event(x, yaw, seconds, carried):
     feed(view, 1.0)
     later = at(1.0 + seconds)
     truth = later[TRUTH].model_copy(update={"pose": Pose(x=x, y=2.0, yaw=yaw)})
-    view.hear(TRUTH, truth, 1.0 + seconds)
-    view.hear(STATUS, later[STATUS], 1.0 + seconds)
+    view.add(TRUTH, truth, 1.0 + seconds)
+    view.add(STATUS, later[STATUS], 1.0 + seconds)
     rows = view.journal.rows()
     assert [row["state"] for row in rows] == ["navigating", *["carried"] * carried]
     if x == 9.0:
@@ -389,11 +389,11 @@ def test_numbers_that_no_robot_has_are_shown_as_none():
         }
     )
     for topic, message in messages.items():
-        view.hear(topic, message, 1.1)
+        view.add(topic, message, 1.1)
     header = read_frame(view.frame).header
     assert (header["error"], header["speed"], header["belief"]["x"]) == (None, None, 1e308)
     huge = preference(1.0, width=401, height=401).model_copy(update={"resolution": 1e308})
-    view.hear(PREFERENCE, huge, 1.0)
+    view.add(PREFERENCE, huge, 1.0)
     assert told_field(view) is None
 
 
