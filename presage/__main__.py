@@ -1,4 +1,4 @@
-"""`presage`, and `python -m presage`. To import the commands takes a moment, and Ctrl-C may come meanwhile."""
+"""The command `presage`, also started as `python -m presage`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import sys
 
 
 def main() -> None:
-    """Entry point."""
+    """Entry point of the command `presage`."""
     try:
+        # Importing the commands takes a moment, during which Ctrl-C should end the program without a traceback.
         from presage.cli.main import main as run  # noqa: PLC0415
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)

@@ -36,7 +36,7 @@ from lab.real_logs.drive import (
 from lab.real_logs.drive import Job as Stretch
 from lab.real_logs.figure import draw
 from lab.real_logs.filter_tuning import Settings, Tuned, starting_point, tune
-from presage.learning.train_drive import Job as Training
+from presage.learning.train_drive import TrainDriveOptions as Training
 from presage.learning.train_drive import card_of
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.calibration import Drive

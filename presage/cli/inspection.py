@@ -18,17 +18,20 @@ def info(
     file: Annotated[Path, typer.Argument(help="A recording, finished or not (.mcap, .mcap.active).")],
     check: Annotated[
         bool | None,
-        typer.Option("--check/--no-check", help="Read every payload: gaps, bytes, checksums. None: up to 64 MiB."),
+        typer.Option(
+            "--check/--no-check",
+            help="Read every message to check gaps, sizes and checksums. Defaults to --check for files up to 64 MiB.",
+        ),
     ] = None,
     json_file: Json = None,
 ) -> None:
-    """What is in a recording: time, topics, rates, gaps, drops, sizes, metadata, and whether it is whole.
+    """Show the contents of a recording: time, topics, rates, gaps, drops, sizes, metadata, and whether it is complete.
 
-    Gaps and missing messages are counted by the publishers' own sequence numbers. Ends with status 1 where the file
-    is not whole.
+    Gaps and missing messages are counted from the publishers' sequence numbers. Exits with status 1 if the file is
+    not complete.
 
     Examples: `presage info run.mcap`; `presage info long.mcap --check --json facts.json`;
-    `presage info run.mcap.active` (unfinished: what can be read of it).
+    `presage info run.mcap.active` (an unfinished recording: shows the part that can be read).
     """
     from presage.recordings.printing import info as show  # noqa: PLC0415
 
@@ -38,16 +41,23 @@ def info(
 @app.command()
 def echo(
     source: Annotated[str, typer.Argument(help="A topic on the bus, or a recording.", metavar="TOPIC|FILE")],
-    topic: Annotated[str | None, typer.Argument(help="Of a recording: this topic or key alone; none: all.")] = None,
-    count: Annotated[int, typer.Option("-n", "--count", min=0, help="End after so many; 0: all, or Ctrl-C.")] = 0,
-    start: Annotated[float, typer.Option(min=0.0, help="Of a recording: from so many s after its beginning.")] = 0.0,
-    full: Annotated[bool, typer.Option("--full", help="Long arrays whole.")] = False,
+    topic: Annotated[
+        str | None, typer.Argument(help="Topic or key of the recording to print. Defaults to all topics.")
+    ] = None,
+    count: Annotated[
+        int,
+        typer.Option("-n", "--count", min=0, help="Stop after this many messages. 0 prints until the end or Ctrl-C."),
+    ] = 0,
+    start: Annotated[
+        float, typer.Option(min=0.0, help="Skip this many seconds at the beginning of the recording.")
+    ] = 0.0,
+    full: Annotated[bool, typer.Option("--full", help="Print long arrays completely.")] = False,
     robot: RobotName = "robot",
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
-    """Print messages, one JSON line each: of a topic as they come, or out of a recording, with key and time.
+    """Print messages as JSON lines, either live from a topic, or from a recording with their keys and times.
 
-    The name of a topic means the bus; all else is a file (./belief is a file, belief a topic).
+    The name of a topic reads from the bus; anything else is a file name (./belief is a file, belief is a topic).
 
     Examples: `presage echo belief -n 1`; `presage echo scan --full -n 1 | jq .ranges`;
     `presage echo run.mcap`; `presage echo run.mcap belief -n 3 --start 10`;
@@ -61,11 +71,13 @@ def echo(
 
 @app.command()
 def plot(
-    file: Path,
-    out: Annotated[Path | None, typer.Option(help="PNG; none: beside the recording.")] = None,
+    file: Annotated[Path, typer.Argument(help="A recording, finished or not.")],
+    out: Annotated[
+        Path | None, typer.Option(help="PNG file to write. Defaults to the recording's name with .png.")
+    ] = None,
     json_file: Json = None,
 ) -> None:
-    """Draw a recording and print its summary; of an unfinished one as far as it goes.
+    """Draw a recording and print its summary; an unfinished recording is drawn as far as it can be read.
 
     Examples: `presage plot recordings/run.mcap --out run.png`; `presage plot run.mcap.active --json run.json`.
     """
@@ -78,27 +90,32 @@ def plot(
 @app.command()
 def export(
     file: Annotated[Path, typer.Argument(help="A recording, finished or not.")],
-    to: Annotated[str, typer.Option("--format", help="csv, tum or foxglove.")],
-    out: Annotated[Path | None, typer.Option(help="Folder (csv, tum) or file; none: beside the recording.")] = None,
-    arrays: Annotated[bool, typer.Option("--arrays", help="csv: arrays (ranges) too, in their own files.")] = False,
-    localised_only: Annotated[
-        bool, typer.Option("--localised-only", help="tum: beliefs in state tracking alone.")
+    to: Annotated[str, typer.Option("--format", help="Output format: csv, tum or foxglove.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Output folder (csv, tum) or file (foxglove). Defaults to a name beside the recording."),
+    ] = None,
+    arrays: Annotated[
+        bool, typer.Option("--arrays", help="Also write arrays such as ranges, each to its own file (csv only).")
     ] = False,
-    robot: Annotated[str, typer.Option(help="Which robot; none: the recording's own.")] = "",
-    force: Annotated[bool, typer.Option("--force", help="Write over what is there.")] = False,
+    localised_only: Annotated[
+        bool, typer.Option("--localised-only", help="Write only the beliefs in state tracking (tum only).")
+    ] = False,
+    robot: Annotated[str, typer.Option(help="Robot to export. Defaults to the robot of the recording.")] = "",
+    force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
     json_file: Json = None,
 ) -> None:
-    """Give a recording to other programs.
+    """Export a recording to formats of other programs.
 
-    csv: a file a topic, a row a message, and a README of columns and units.
-    tum: belief.tum, truth.tum, odom.tum, trajectories as evo reads them; stamps are the messages' own.
-    foxglove: an MCAP file of Foxglove's schemas, which Foxglove and Lichtblick show as it is; docs/foxglove-layout.json
-    is a layout for it. Its times are the recording's wall clock.
+    - csv: one file for each topic, one row for each message, and a README of columns and units.
+    - tum: the trajectories belief.tum, truth.tum and odom.tum for evo, with the stamps of the messages.
+    - foxglove: an MCAP file that Foxglove and Lichtblick show directly, with wall clock times;
+      docs/foxglove-layout.json is a layout for it.
 
     Examples: `presage export run.mcap --format csv --out tables --arrays`;
     `presage export run.mcap --format tum --out run-tum`, then `evo_ape tum run-tum/truth.tum run-tum/belief.tum`;
     `presage export run.mcap --format foxglove --out view.mcap`.
     """
-    from presage.recordings.export import Export, run_export  # noqa: PLC0415
+    from presage.recordings.export import ExportOptions, run_export  # noqa: PLC0415
 
-    run_export(Export(file, to, out, robot, arrays, localised_only, force), json_file, console)
+    run_export(ExportOptions(file, to, out, robot, arrays, localised_only, force), json_file, console)

@@ -57,6 +57,11 @@ from presage.terminal.output import make_folder
 if TYPE_CHECKING:
     from services.estimator.precise.learning.field_learning import Recipe
 
+PACE_HELP = (
+    "Pace of the simulation: realtime, fast (as fast as possible), or lockstep (each scan waits for the command"
+    " that answers it)."
+)
+
 app = typer.Typer(
     help="A robot that localises itself and navigates by predicting what its laser will see.",
     no_args_is_help=True,
@@ -71,11 +76,13 @@ def up(
     world: WorldName = "corridor",
     beams: Beams = None,
     drive: DriveName = "holonomic",
-    pace: Annotated[str, typer.Option(help="realtime, fast or lockstep.")] = "realtime",
+    pace: Annotated[str, typer.Option(help=PACE_HELP)] = "realtime",
     seed: Seed = 0,
     record: Annotated[Path | None, typer.Option(help="Record into this folder.")] = None,
     robot: RobotName = "robot",
-    simulator: Annotated[bool, typer.Option(help="--no-simulator: a bridge or a robot brings the scans.")] = True,
+    simulator: Annotated[
+        bool, typer.Option(help="Start the simulator. Without it, a real robot or a bridge must publish the scans.")
+    ] = True,
     port: Port = 7447,
     estimator: EstimatorName = "precise",
     model: ModelName = "learned",
@@ -86,7 +93,13 @@ def up(
     people_speed: PeopleSpeed = 1.0,
     start: StartPose = "",
     robots: Annotated[
-        int, typer.Option(min=1, max=20, help="Several: ROBOT-1, ROBOT-2 ..., each simulated by itself, one estimator.")
+        int,
+        typer.Option(
+            min=1,
+            max=20,
+            help="Number of robots, named ROBOT-1, ROBOT-2 and so on. Each has its own simulation; they share one"
+            " estimator.",
+        ),
     ] = 1,
     scanner: ScannerName = "tim571",
     mount: MountText = "",
@@ -97,10 +110,12 @@ def up(
     acceleration: Acceleration = None,
     turn_acceleration: TurnAcceleration = None,
 ) -> None:
-    """Start router, simulator, estimator, controller and the live page here, until Ctrl-C.
+    """Start router, simulator, estimator, controller and live page on this machine, and run them until Ctrl-C.
 
-    The page's link is printed; PRESAGE_VIEWER_PORT and PRESAGE_VIEWER_TOKEN choose its port and who may see it.
-    Examples: `presage up`, then elsewhere `presage goal 15 1.5 --wait`; `presage up --estimator particle-filter`;
+    The address of the page is printed. PRESAGE_VIEWER_PORT sets its port and PRESAGE_VIEWER_TOKEN its access token.
+
+    Examples: `presage up`, then in another terminal `presage goal 15 1.5 --wait`;
+    `presage up --estimator particle-filter`;
     `presage up --record recordings --seed 7`; `presage up --world my.yaml --port 7500`; `presage up --no-viewer`;
     `presage up --world office --people 10 --start 9,3.5,90`; `presage up --robots 3`, then
     `presage goal 15 1.5 --robot robot-2`; `presage up --scanner my-laser.yaml`;
@@ -132,48 +147,72 @@ def up(
 @app.command()
 def demo(
     world: WorldName = "corridor",
-    goal: Annotated[tuple[float, float] | None, typer.Option(help="x y in m.")] = None,
-    out: Annotated[Path, typer.Option(help="Folder for recording and figure.")] = Path("recordings"),
-    beams: Annotated[int, typer.Option(help="Beams of the scanner.")] = 622,
+    goal: Annotated[
+        tuple[float, float] | None, typer.Option(help="Goal as X Y in m. Defaults to a free place far from the start.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the recording and the figure.")] = Path("recordings"),
+    beams: Annotated[int, typer.Option(help="Beams per scan.")] = 622,
     seed: Seed = 0,
-    pace: Annotated[str, typer.Option(help="realtime, fast or lockstep.")] = "realtime",
+    pace: Annotated[str, typer.Option(help=PACE_HELP)] = "realtime",
     port: Port = 0,
     json_file: Json = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Without the services' own lines, and the page.")] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="Do not print the services' log lines, and do not serve the live page.")
+    ] = False,
     estimator: EstimatorName = "precise",
     model: ModelName = "learned",
     viewer: Viewer = True,
     open_page: OpenPage = False,
     people: People = 0,
 ) -> None:
-    """The whole loop, live on a page: localise from nothing, drive to a goal, record, draw, summarise.
+    """Run the whole loop once: localise without a start pose, drive to a goal, record, draw and summarise.
+
+    The live page shows it while it runs. Exits with status 1 if the goal is not reached.
 
     Examples: `presage demo`; `presage demo --goal 12 2 --seed 3 --json run.json`; `presage demo --pace lockstep`;
     `presage demo --people 3`.
     """
-    from presage.session.demo import Demo, demo_command  # noqa: PLC0415
+    from presage.session.demo import DemoOptions, demo_command  # noqa: PLC0415
 
-    how = ("--estimator", estimator, "--model", model)
-    asked = Demo(world, goal, out, beams, seed, pace, port or None, how, viewer, open_page, people)
-    raise typer.Exit(demo_command(asked, json_file, quiet=quiet))
+    estimator_arguments = ("--estimator", estimator, "--model", model)
+    options = DemoOptions(
+        world, goal, out, beams, seed, pace, port or None, estimator_arguments, viewer, open_page, people
+    )
+    raise typer.Exit(demo_command(options, json_file, quiet=quiet))
 
 
 @app.command()
 def train(
     world: Annotated[
-        str, typer.Option(help="A shipped world or a world file; none: corridor, with --from the drive alone.")
+        str,
+        typer.Option(
+            help="World name or world file. Defaults to corridor; with --from, to no world (only the drive is used)."
+        ),
     ] = "",
-    preset: Annotated[str, typer.Option(help="precise or paper.")] = "precise",
+    preset: Annotated[str, typer.Option(help="Estimator preset to train: precise or paper.")] = "precise",
     scanner: ScannerName = "tim571",
-    out: Annotated[Path | None, typer.Option(help="Folder for weights and card; none: where services look.")] = None,
-    beams: Beams = None,
-    samples: Annotated[int | None, typer.Option(min=10, help="none: 5000, paper 13000.")] = None,
-    resolution: Annotated[
-        float | None, typer.Option(min=0.005, max=1.0, help="precise: m between nodes; none: 0.04, with --from 0.05.")
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder for the weights and the model card. Defaults to the folder the services read."),
     ] = None,
-    epochs: Annotated[int, typer.Option(min=1, help="paper.")] = 60,
-    batch: Annotated[int, typer.Option(min=1, help="paper.")] = 500,
-    learning_rate: Annotated[float, typer.Option(min=1e-6, help="paper.")] = 3e-3,
+    beams: Beams = None,
+    samples: Annotated[
+        int | None,
+        typer.Option(
+            min=10, help="Number of simulated scans. Defaults to 5000 (precise), 13000 (paper) or 2000 (with --from)."
+        ),
+    ] = None,
+    resolution: Annotated[
+        float | None,
+        typer.Option(
+            min=0.005,
+            max=1.0,
+            help="Grid spacing of the distance field (precise only), m. Defaults to 0.04, with --from to 0.05.",
+        ),
+    ] = None,
+    epochs: Annotated[int, typer.Option(min=1, help="Training epochs (paper only).")] = 60,
+    batch: Annotated[int, typer.Option(min=1, help="Batch size (paper only).")] = 500,
+    learning_rate: Annotated[float, typer.Option(min=1e-6, help="Learning rate (paper only).")] = 3e-3,
     seed: Seed = 0,
     robot: RobotName = "robot",
     connect: Connect = DEFAULT_ENDPOINT,
@@ -181,22 +220,31 @@ def train(
     upside_down: UpsideDown = False,
     drive: Annotated[
         Path | None,
-        typer.Option("--from", help="precise: a log or recording with reference poses; its scans teach and calibrate."),
+        typer.Option(
+            "--from", help="Log or recording with reference poses whose scans train and calibrate (precise only)."
+        ),
     ] = None,
     share: Annotated[
-        float, typer.Option(min=0.01, max=1.0, help="Of --from, from its beginning: 0.5 leaves half to test with.")
+        float,
+        typer.Option(
+            min=0.01,
+            max=1.0,
+            help="Share of the drive of --from to train on, from its beginning; 0.5 leaves half for tests.",
+        ),
     ] = 1.0,
 ) -> None:
-    """Learn to predict a scanner in a world, or from a drive.
+    """Train the generative model of a world, or of a recorded drive.
 
-    Samples come from the scanner on the bus where it is in this world, else from a simulator of its own. An interrupted
-    run of preset paper is taken up again by the same command.
+    The training scans come from the scanner on the bus if it is in this world, otherwise from a simulator that the
+    command starts. To resume an interrupted run of preset paper, give the same command again.
+
     Examples: `presage train --world my.yaml`; `presage train --world corridor --preset paper --beams 622 --out mine`;
     `presage train --world my.yaml --scanner my-laser.yaml --mount 0.1,0,0`.
 
-    With --from no simulator is needed: the drive's own scans at their reference poses teach the model, every fifth of
-    them says how far it is to be trusted, and the card beside the weights reports it. With --world as well, scans
-    simulated in that map fill in where the drive has not been.
+    With --from no simulator is needed: the model learns from the scans of the drive at their reference poses. Every
+    fifth scan is held out to measure the prediction error, which the model card beside the weights reports. With
+    --world as well, scans simulated in that map cover the places that the drive did not visit.
+
     Examples: `presage train --from drive.npz --out mine`;
     `presage train --from drive.npz --mount 0,0,0 --world map.yaml --share 0.5 --out mine` (poses of the laser itself);
     then `presage localize drive.npz --mount 0,0,0 --world map.yaml --models mine`.
@@ -213,15 +261,23 @@ def train(
         return
     world, resolution = world or "corridor", resolution or 0.04
     link, folder = link_of(connect, robot), out or FOLDER
-    asked = scanner_arguments(scanner, beams, mount, upside_down=upside_down)
+    simulator_arguments = scanner_arguments(scanner, beams, mount, upside_down=upside_down)
     chosen = chosen_scanner(scanner, beams, mount=mount, upside_down=upside_down or None)
     make_folder(folder, "--out")
     if preset == "precise":
         recipe = Recipe(resolution=resolution, seed=seed)
-        precise.train_precise(precise.Job(world, chosen, asked, folder, samples or 5000, recipe), link, console)
+        precise.train_precise(
+            precise.TrainPreciseOptions(world, chosen, simulator_arguments, folder, samples or 5000, recipe),
+            link,
+            console,
+        )
     elif preset == "paper":
         descent = PaperRecipe(epochs=epochs, batch=batch, learning_rate=learning_rate, seed=seed)
-        paper.train(paper.Job(world, preset, chosen, asked, folder, samples or 13_000, descent), link, console)
+        paper.train(
+            paper.TrainPaperOptions(world, preset, chosen, simulator_arguments, folder, samples or 13_000, descent),
+            link,
+            console,
+        )
     else:
         raise UserError(f"no preset {preset!r}: choose precise or paper")
 
@@ -230,15 +286,19 @@ def _train_from_drive(
     drive: Path, world: str, preset: str, out: Path, samples: int, recipe: Recipe, share: float, mount: str,
     upside_down: bool,
 ) -> None:  # fmt: skip
-    from presage.learning.train_drive import Job, train_from_drive  # noqa: PLC0415
+    from presage.learning.train_drive import TrainDriveOptions, train_from_drive  # noqa: PLC0415
     from presage.logs.options import reading_of  # noqa: PLC0415
 
     if preset != "precise":
-        raise UserError(f"--from teaches preset precise, not {preset}: the paper's decoder needs scans at one heading")
+        raise UserError(
+            f"--from trains preset precise, not {preset}: the paper's decoder needs scans taken at one heading"
+        )
     make_folder(out, "--out")
-    hangs = upside_down or None
-    reading = reading_of(mount, "", "", "", "", "", "sensor", reference=None, range_max=None, upside_down=hangs)
-    train_from_drive(Job(drive, world, out, samples, recipe, share, reading), console)
+    # Without the option, None: the orientation is taken from the log.
+    reading = reading_of(
+        mount, "", "", "", "", "", "sensor", reference=None, range_max=None, upside_down=upside_down or None
+    )
+    train_from_drive(TrainDriveOptions(drive, world, out, samples, recipe, share, reading), console)
 
 
 app.add_typer(cli_recording.app)
@@ -254,7 +314,7 @@ cli_secure.with_security(app, cli_recording.app, cli_replay.app, cli_inspect.app
 
 
 def main() -> None:
-    """Entry point: one line for what a user can mend, status 2; 130 after Ctrl-C."""
+    """Runs the command line; errors that a user can correct become one line and status 2, Ctrl-C status 130."""
     os.environ.setdefault("PYTHONWARNINGS", "default")
     try:
         with interruptible():
@@ -269,9 +329,9 @@ def main() -> None:
 
 
 def _in_one_line(error: UserError | ValidationError | OSError) -> str:
-    """What is wrong, where, and what to do."""
+    """The error as a message that says what is wrong, where, and what to do."""
     if isinstance(error, ValidationError):
-        return f"{first_fault(error)} ({error.title}): see --help for what is meant"
+        return f"{first_fault(error)} ({error.title}): see --help for the allowed values"
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}; choose another place"
     return " ".join(str(error).split()) or type(error).__name__

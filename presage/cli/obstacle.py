@@ -15,19 +15,21 @@ if TYPE_CHECKING:
     from common.geometry.world import Obstacle
 
 app = typer.Typer(
-    help="Put boxes and pillars in a running simulator's way; the map does not know them.", no_args_is_help=True
+    help="Add, move and remove obstacles in a running simulator. They are not in the robot's map.",
+    no_args_is_help=True,
 )
 
-NUMBERS = {"ignore_unknown_options": True}  # a coordinate may be negative
-Name = Annotated[str, typer.Argument(help="Its name, one you choose.")]
-X = Annotated[float, typer.Argument(help="m, map: its centre")]
-Y = Annotated[float, typer.Argument(help="m, map")]
-Size = Annotated[tuple[float, float], typer.Option(help="Of a box, m.")]
-Yaw = Annotated[float, typer.Option(help="Of a box, deg.")]
-Radius = Annotated[float, typer.Option(help="A disc of this radius, m; 0: a box.")]
+# Lets click pass a negative coordinate such as -1 as an argument instead of rejecting it as an unknown option.
+ALLOW_NEGATIVE_NUMBERS = {"ignore_unknown_options": True}
+Name = Annotated[str, typer.Argument(help="Name of the obstacle.")]
+X = Annotated[float, typer.Argument(help="x of the obstacle's centre in the map, m.")]
+Y = Annotated[float, typer.Argument(help="y of the obstacle's centre in the map, m.")]
+Size = Annotated[tuple[float, float], typer.Option(help="Length and width of the box, m.")]
+Yaw = Annotated[float, typer.Option(help="Orientation of the box, deg.")]
+Radius = Annotated[float, typer.Option(help="Radius of a round obstacle, m. 0 makes a box.")]
 
 
-@app.command(context_settings=NUMBERS)
+@app.command(context_settings=ALLOW_NEGATIVE_NUMBERS)
 def add(
     name: Name,
     x: X,
@@ -38,7 +40,7 @@ def add(
     robot: RobotName = "robot",
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
-    """Put one there.
+    """Add an obstacle.
 
     Examples: `presage obstacle add crate 6 1.5`; `presage obstacle add door 4 2 --size 0.9 0.05 --yaw 90`;
     `presage obstacle add pillar 6 1 --radius 0.2`.
@@ -46,7 +48,7 @@ def add(
     _change("add", name, _shape(x, y, size, yaw, radius), connect, robot)
 
 
-@app.command(context_settings=NUMBERS)
+@app.command(context_settings=ALLOW_NEGATIVE_NUMBERS)
 def move(
     name: Name,
     x: X,
@@ -57,7 +59,7 @@ def move(
     robot: RobotName = "robot",
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
-    """Put one that is there elsewhere; its shape is given anew.
+    """Move an obstacle and replace its shape; options that are left out have their defaults, as for `add`.
 
     Example: `presage obstacle move crate 6 2`.
     """
@@ -66,7 +68,7 @@ def move(
 
 @app.command()
 def remove(name: Name, robot: RobotName = "robot", connect: Connect = DEFAULT_ENDPOINT) -> None:
-    """Take one away, furniture of the world file too.
+    """Remove an obstacle; furniture of the world file can be removed too.
 
     Example: `presage obstacle remove crate`.
     """
@@ -97,5 +99,5 @@ def _change(action: str, name: str, obstacle: Obstacle | None, connect: str, rob
         reply = bus.ask(OBSTACLE, request, Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
-    done = {"add": "there", "move": "moved", "remove": "gone"}[action]
-    console.print(f"{name}: {done}; nobody told the estimator or the controller")
+    done = {"add": "added", "move": "moved", "remove": "removed"}[action]
+    console.print(f"{name}: {done}; the map of the estimator and the controller is unchanged")

@@ -8,22 +8,26 @@ from typing import Annotated
 import typer
 
 from common.bus.bus import DEFAULT_ENDPOINT
-from presage.terminal.options import Connect, RobotName, asked, console
+from presage.terminal.options import Connect, RobotName, console, invocation
 
 app = typer.Typer()
 
 
 @app.command()
 def record(
-    out: Annotated[Path, typer.Option(help="Folder.")] = Path("recordings"),
-    topics: Annotated[str, typer.Option(help="Comma-separated topic names; empty: all.")] = "",
-    split_minutes: Annotated[float, typer.Option(min=0.0, help="Of one part, each whole by itself; 0: one file.")] = 0,
-    split_size: Annotated[float, typer.Option(min=0.0, help="MB of one part; 0: one file.")] = 0,
-    weights: Annotated[bool, typer.Option(help="Store the estimator's weights, up to 16 MiB.")] = True,
+    out: Annotated[Path, typer.Option(help="Folder for the recording.")] = Path("recordings"),
+    topics: Annotated[str, typer.Option(help="Topics to record, separated by commas. Defaults to all topics.")] = "",
+    split_minutes: Annotated[
+        float, typer.Option(min=0.0, help="Start a new complete file after this many minutes. 0 writes one file.")
+    ] = 0,
+    split_size: Annotated[
+        float, typer.Option(min=0.0, help="Start a new complete file after this many MB. 0 writes one file.")
+    ] = 0,
+    weights: Annotated[bool, typer.Option(help="Store the estimator's weights in the recording, up to 16 MiB.")] = True,
     robot: RobotName = "robot",
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
-    """Record a running session to an MCAP file, until Ctrl-C.
+    """Record a running session into an MCAP file until Ctrl-C.
 
     Examples: `presage record`; `presage record --out logs --topics scan,odom`;
     `presage record --split-minutes 10`.
@@ -33,24 +37,30 @@ def record(
     from services.recorder.settings import RecorderSettings  # noqa: PLC0415
 
     def make(settings: RecorderSettings) -> RecorderService:
-        return RecorderService(settings, remote=False)  # the page's button is for the session's own recorder
+        # The live page controls the session's own recorder, not this one.
+        return RecorderService(settings, remote=False)
 
     args = ["--directory", str(out), "--robot", robot, "--connect", connect]
     args += ["--split-minutes", str(split_minutes), "--split-size", str(split_size)]
     args += ["--weights" if weights else "--no-weights", *(["--topics", topics] if topics else [])]
-    if (here := asked.get()).security is not None:
-        args += ["--security", str(here.security), "--role", here.role]
+    if (current := invocation.get()).security is not None:
+        args += ["--security", str(current.security), "--role", current.role]
     serve(RecorderSettings, make, args)
 
 
 @app.command()
 def recover(
-    file: Annotated[Path, typer.Argument(help="NAME.mcap.active of a recorder that was killed, or a damaged file.")],
-    out: Annotated[Path | None, typer.Option(help="The whole file; none: NAME.mcap, or NAME-recovered.mcap.")] = None,
+    file: Annotated[
+        Path, typer.Argument(help="NAME.mcap.active, left by a recorder that was killed, or a damaged recording.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="File to write. Defaults to NAME.mcap or NAME-recovered.mcap.")
+    ] = None,
 ) -> None:
-    """Make a whole recording of what is readable, and say what is missing.
+    """Make a complete recording from the readable parts of an unfinished or damaged one, and report what is missing.
 
-    Every complete chunk is taken, also behind a damaged one. An unfinished source is kept as NAME.mcap.torn.
+    Every intact chunk is copied, also those after a damaged one. An unfinished source is kept as NAME.mcap.torn.
+
     Examples: `presage recover recordings/run.mcap.active`; `presage recover damaged.mcap --out whole.mcap`.
     """
     from rich.progress import Progress  # noqa: PLC0415

@@ -16,38 +16,57 @@ app = typer.Typer()
 
 @app.command()
 def replay(
-    file: Path,
-    only: Annotated[str, typer.Option(help="Comma-separated topic names; empty: all but health.")] = "",
-    leave_out: Annotated[str, typer.Option("--except", help="Comma-separated topic names to leave out.")] = "",
+    file: Annotated[Path, typer.Argument(help="Recording to replay.")],
+    only: Annotated[
+        str, typer.Option(help="Topics to replay, separated by commas. Defaults to all except health.")
+    ] = "",
+    leave_out: Annotated[str, typer.Option("--except", help="Topics to leave out, separated by commas.")] = "",
     rate: Annotated[
-        float | None, typer.Option(min=0.0, help="1 is the original timing, 2 twice as fast, 0 as fast as it goes.")
+        float | None,
+        typer.Option(
+            min=0.0, help="Replay speed: 1 keeps the original timing, 2 is twice as fast, 0 as fast as possible."
+        ),
     ] = None,
-    start: Annotated[float | None, typer.Option(min=0.0, help="s from the recording's beginning.")] = None,
-    end: Annotated[float | None, typer.Option(help="s from its beginning; negative: from its end.")] = None,
-    loop: Annotated[bool, typer.Option("--loop", help="Begin anew at the end, until Ctrl-C.")] = False,
-    robot: Annotated[str, typer.Option(help="Another robot's name in the keys; empty: the recorded one.")] = "",
-    force: Annotated[bool, typer.Option("--force", help="Beside a live publisher of the same keys too.")] = False,
-    paused: Annotated[bool, typer.Option("--paused", help="Begin paused.")] = False,
-    stay: Annotated[bool, typer.Option("--stay", help="Stay at the end, paused, until Ctrl-C.")] = False,
+    start: Annotated[
+        float | None, typer.Option(min=0.0, help="Start this many seconds after the beginning of the recording.")
+    ] = None,
+    end: Annotated[
+        float | None,
+        typer.Option(help="Stop this many seconds after the beginning; a negative value counts from the end."),
+    ] = None,
+    loop: Annotated[bool, typer.Option("--loop", help="Start again at the end, until Ctrl-C.")] = False,
+    robot: Annotated[
+        str, typer.Option(help="Publish under this robot name. Defaults to the robot of the recording.")
+    ] = "",
+    force: Annotated[
+        bool, typer.Option("--force", help="Replay even if a live service publishes on the same keys.")
+    ] = False,
+    paused: Annotated[bool, typer.Option("--paused", help="Start paused.")] = False,
+    stay: Annotated[bool, typer.Option("--stay", help="Pause at the end until Ctrl-C instead of exiting.")] = False,
     with_services: Annotated[
-        str, typer.Option("--with", help="estimator[,controller]: start them here, as recorded, and compare.")
+        str,
+        typer.Option(
+            "--with",
+            help="Services to run on the recorded inputs and compare with the recording: estimator[,controller].",
+        ),
     ] = "",
     every_scan: Annotated[
-        bool, typer.Option("--every-scan", help="--with: also scans that the live estimator did not answer.")
+        bool,
+        typer.Option("--every-scan", help="With --with: also send the scans for which the recording has no belief."),
     ] = False,
     json_file: Json = None,
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
-    """Put a recording's bytes back on their keys, with their own stamps; or replay it to services started for it.
+    """Publish a recording's messages again, with their original stamps; or compare services on recorded inputs.
 
-    While it runs, in a terminal: space pauses, `.` steps one scan, left and right (h, l) go 5 s, up and down change the
-    rate, q quits. The queryable presage/ROBOT/player does the same over the bus.
+    Keys in a terminal: space pauses, `.` steps one scan, left and right (or h and l) jump 5 s, up and down change the
+    speed, q quits. The queryable presage/ROBOT/player offers the same over the bus.
 
-    `--with estimator` needs nothing but the file: a router and the services named run here as they were configured,
-    over the recorded world and model, hear what they heard, and what they say is compared with the recording. Each scan
-    waits for the belief of the last (unless `--rate` is given). Where the session ran in lockstep both must be equal
-    bit for bit; else, once tracking, within 0.01 m and 0.01 rad: a recording does not hold requests (`presage
-    localise`), restarts, or what was seen before the recorder came. The status is 1 where they are not.
+    `--with estimator` needs only the file. It starts a router and the named services with the recorded configuration,
+    world and model, sends them their recorded inputs, and compares their outputs with the recording. Each scan waits
+    for the belief of the scan before (unless `--rate` is given). If the session ran in lockstep, the outputs must be
+    identical; otherwise they must agree within 0.01 m and 0.01 rad while tracking, because a recording does not contain
+    requests (`presage localise`), restarts, or what happened before it began. Exits with status 1 if they differ.
 
     Examples: `presage replay run.mcap --only scan,odom` (with `python -m services.estimator` beside it);
     `presage replay run.mcap --rate 4 --start 10 --end -5 --loop`; `presage replay run.mcap --except belief,prediction`;
@@ -62,47 +81,64 @@ def replay(
         run_replay(file, link_of(connect, "robot", "replay"), choice, console)
         return
     if only or leave_out or robot or force or loop or paused or stay or start is not None or end is not None:
-        raise UserError("--with replays the whole of what those services heard: it takes no other choice than --rate")
-    from presage.replay.service_replay import Again, again_command  # noqa: PLC0415
+        raise UserError(
+            "--with replays all recorded inputs of the services: of the options that choose what to replay, only --rate"
+            " can be combined with it"
+        )
+    from presage.replay.service_replay import ServiceReplayOptions, service_replay_command  # noqa: PLC0415
 
-    how = Again(file, with_services, rate, every_scan=every_scan)
-    raise typer.Exit(again_command(how, json_file, console))
+    options = ServiceReplayOptions(file, with_services, rate, every_scan=every_scan)
+    raise typer.Exit(service_replay_command(options, json_file, console))
 
 
 @app.command()
 def rerun(
-    file: Path,
+    file: Annotated[Path, typer.Argument(help="Recording with the scans.")],
     estimator: Annotated[
-        str | None, typer.Option(help="precise, paper, particle-filter or amcl-defaults; none: the recorded one.")
+        str | None, typer.Option(help="Estimator preset: precise, paper, particle-filter or amcl-defaults.")
     ] = None,
     model: Annotated[
-        str | None, typer.Option(help="Of precise: learned, exact, or a file of weights; none: the recorded one.")
+        str | None, typer.Option(help="Generative model of preset precise: learned, exact, or a file of weights.")
     ] = None,
-    models: Annotated[Path | None, typer.Option(help="Folder of weights; none: the recorded or shipped ones.")] = None,
+    models: Annotated[
+        Path | None, typer.Option(help="Folder of weights. Defaults to the recorded, else the shipped weights.")
+    ] = None,
     prior: Annotated[
-        str | None, typer.Option(help="Of motion: motion, odometry, command; none: the recorded one.")
+        str | None, typer.Option(help="What predicts the motion between scans: motion, odometry or command.")
     ] = None,
-    initial_pose: Annotated[str | None, typer.Option(help="x,y[,yaw_deg]; '' is nothing known; none: as then.")] = None,
-    sigma: Annotated[float | None, typer.Option(help="The scanner's noise, m; none: the recorded one.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of what is drawn; none: the recorded one.")] = None,
-    world: Annotated[str | None, typer.Option(help="A shipped world or a file; none: the recorded one.")] = None,
-    out: Annotated[Path | None, typer.Option(help="NEW.mcap; none: FILE-ESTIMATOR.mcap beside the recording.")] = None,
+    initial_pose: Annotated[
+        str | None, typer.Option(help="Initial pose x,y[,yaw_deg], in m and deg; '' for no initial pose.")
+    ] = None,
+    sigma: Annotated[float | None, typer.Option(help="Range noise of the scanner, m.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Random seed.")] = None,
+    world: Annotated[str | None, typer.Option(help="World name, world file, or ROS map.yaml.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Recording to write. Defaults to FILE-ESTIMATOR.mcap beside the recording.")
+    ] = None,
     json_file: Json = None,
 ) -> None:
-    """Run an estimator over a recording offline, as fast as it goes; old and new beliefs in one new recording.
+    """Run an estimator over a recording offline, as fast as possible, and compare it with the recorded estimator.
 
-    The new recording has every byte of the old one, and the new beliefs and predictions under presage/ROBOT-rerun/.
-    Printed and drawn (NEW.png, .pdf, data in .csv): errors against the recorded truth, NEES, share tracking, times, the
-    difference between the two. What is not said on the command line is as it was recorded.
+    Options that are not given default to the recorded configuration. The new recording contains all messages of the
+    old one, and the new beliefs and predictions under presage/ROBOT-rerun/. Prints and draws (NEW.png, .pdf, data in
+    .csv) the errors against the recorded truth, NEES, share of scans in state tracking, computing times, and the
+    difference between the two estimators.
 
     Examples: `presage rerun run.mcap --estimator particle-filter --json pf.json`;
     `presage rerun run.mcap --model exact --out exact.mcap`; `presage rerun run.mcap --prior odometry`;
     `presage rerun run.mcap --estimator precise --initial-pose ''` (from nothing known).
     """
-    from presage.replay.rerun import Rerun, rerun_command  # noqa: PLC0415
+    from presage.replay.rerun import RerunOptions, rerun_command  # noqa: PLC0415
 
-    said = {
-        "estimator": estimator, "model": model, "models": str(models) if models else None, "prior": prior,
-        "initial_pose": initial_pose, "sigma": sigma, "seed": seed, "world": world,
-    }  # fmt: skip
-    rerun_command(Rerun(file, {k: v for k, v in said.items() if v is not None}, out), json_file, console)
+    options = {
+        "estimator": estimator,
+        "model": model,
+        "models": str(models) if models else None,
+        "prior": prior,
+        "initial_pose": initial_pose,
+        "sigma": sigma,
+        "seed": seed,
+        "world": world,
+    }
+    given = {name: value for name, value in options.items() if value is not None}
+    rerun_command(RerunOptions(file, given, out), json_file, console)

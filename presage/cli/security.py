@@ -15,17 +15,19 @@ import typer
 from presage.terminal import options
 from presage.terminal.options import console
 
-app = typer.Typer(help="Certificates, passwords and access by role (docs/security.md).", no_args_is_help=True)
+app = typer.Typer(
+    help="Manage the certificates, passwords and access rights of secure mode (docs/security.md).", no_args_is_help=True
+)
 
-Folder = Annotated[Path, typer.Argument(help="The folder of credentials.")]
-Days = Annotated[int, typer.Option(min=1, max=36_500, help="Until the certificates expire.")]
-Robots = Annotated[str, typer.Option(help="Comma-separated names of robots; none: all.")]
-Hosts = Annotated[str, typer.Option(help="Comma-separated names or addresses in the router's certificate.")]
-SOON = dt.timedelta(days=30)
+Folder = Annotated[Path, typer.Argument(help="Folder of credentials.")]
+Days = Annotated[int, typer.Option(min=1, max=36_500, help="Days until the certificates expire.")]
+Robots = Annotated[str, typer.Option(help="Names of robots, separated by commas. Defaults to all robots.")]
+Hosts = Annotated[str, typer.Option(help="Host names or addresses in the router's certificate, separated by commas.")]
+EXPIRY_WARNING = dt.timedelta(days=30)
 
 
 def with_security(*apps: typer.Typer) -> None:
-    """Give `--security` and `--role` to every command that says where to connect, or starts a session of its own."""
+    """Adds `--security` and `--role` to every command with a `--connect` or `--port` option."""
     for each in apps:
         for command in each.registered_commands:
             if command.callback is not None and {"connect", "port"} & signature(command.callback).parameters.keys():
@@ -33,15 +35,15 @@ def with_security(*apps: typer.Typer) -> None:
 
 
 def secured(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The command with two more options, which `presage.terminal.options.credentials_for` reads while it runs."""
+    """Adds `--security` and `--role` to a command; `credentials_for` reads their values while the command runs."""
 
     @wraps(command)
     def run(*args: Any, security: Path | None = None, role: str = "", **kwargs: Any) -> Any:
-        token = options.asked.set(options.Asked(command.__name__, security, role))
+        token = options.invocation.set(options.Invocation(command.__name__, security, role))
         try:
             return command(*args, **kwargs)
         finally:
-            options.asked.reset(token)
+            options.invocation.reset(token)
 
     added = (("security", options.Security, None), ("role", options.RoleName, ""))
     return options.with_options(run, command, added)
@@ -53,35 +55,39 @@ def init(
     hosts: Hosts = "",
     robots: Robots = "",
     days: Days = 365,
-    force: Annotated[bool, typer.Option("--force", help="In place of the authority that is there.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace the existing authority; its certificates become invalid.")
+    ] = False,
 ) -> None:
-    """Make an authority, and certificate, key, password and list of rights for every role.
+    """Create a certificate authority, and a certificate, key and password for every role.
 
-    With `--robots` each robot's own services get credentials for that robot alone.
+    With `--robots`, the services of each robot get credentials that are valid for that robot only.
+
     Examples: `presage secure init keys`; `presage secure init keys --robots one,two --days 90`.
     """
     from presage.session import credentials as secure  # noqa: PLC0415
 
     members = secure.init(folder, _names(hosts), _names(robots), days, force=force)
     console.print(
-        f"{len(members)} members in {folder}, until {_until(folder, members[0].name):%Y-%m-%d}. Keep "
-        f"{folder / secure.AUTHORITY_FOLDER} to yourself; give each host the folders of what runs there, and start all "
-        f"with --security. `presage secure show {folder}` says who may do what.",
-        soft_wrap=True, highlight=False,
-    )  # fmt: skip
+        f"{len(members)} members in {folder}, valid until {_expiry_date(folder, members[0].name):%Y-%m-%d}. Keep "
+        f"{folder / secure.AUTHORITY_FOLDER} secret. Copy to each host only the folders of the programs that run "
+        f"there, and start everything with --security. `presage secure show {folder}` lists the rights of each role.",
+        soft_wrap=True,
+        highlight=False,
+    )
 
 
 @app.command()
 def add(
     folder: Folder,
-    role: Annotated[str, typer.Argument(help="What it may do.")],
-    name: Annotated[str, typer.Argument(help="What it is called.")],
+    role: Annotated[str, typer.Argument(help="Role of the member; it determines the rights.")],
+    name: Annotated[str, typer.Argument(help="Name of the member.")],
     robots: Robots = "",
     hosts: Hosts = "",
     days: Days = 365,
-    force: Annotated[bool, typer.Option("--force", help="New credentials for one that is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Renew the credentials of an existing member.")] = False,
 ) -> None:
-    """One more member, or with --force new credentials for one.
+    """Add a member, or with --force renew the credentials of one.
 
     Examples: `presage secure add keys operator anna`; `presage secure add keys estimator region --robots one,two`;
     `presage secure add keys controller controller --force` (a new certificate before the old one expires).
@@ -91,15 +97,16 @@ def add(
 
     member = secure.add(folder, role, name, _names(robots), days, hosts=_names(hosts), force=force)
     console.print(
-        f"{folder / member.name}: {member.role} until {_until(folder, member.name):%Y-%m-%d}. Give the routers "
-        f"{folder / ROUTER} as it is now, and start them again.",
-        soft_wrap=True, highlight=False,
-    )  # fmt: skip
+        f"{folder / member.name}: {member.role}, valid until {_expiry_date(folder, member.name):%Y-%m-%d}. Copy "
+        f"{folder / ROUTER} to the routers and restart them.",
+        soft_wrap=True,
+        highlight=False,
+    )
 
 
 @app.command()
-def remove(folder: Folder, name: Annotated[str, typer.Argument(help="Who is no longer let in.")]) -> None:
-    """Strike a member from the routers' list: a lost laptop, somebody who left.
+def remove(folder: Folder, name: Annotated[str, typer.Argument(help="Name of the member.")]) -> None:
+    """Revoke the access of a member, for example of a lost laptop.
 
     Example: `presage secure remove keys anna`.
     """
@@ -108,18 +115,22 @@ def remove(folder: Folder, name: Annotated[str, typer.Argument(help="Who is no l
 
     secure.remove(folder, name)
     console.print(
-        f"{name} is struck off. Give the routers {folder / ROUTER} as it is now, and start them again: "
-        "until then it is let in.",
-        soft_wrap=True, highlight=False,
-    )  # fmt: skip
+        f"{name} is removed. Copy {folder / ROUTER} to the routers and restart them; until then {name} has access.",
+        soft_wrap=True,
+        highlight=False,
+    )
 
 
 @app.command()
 def show(
     folder: Folder,
-    zenoh: Annotated[str, typer.Option(help="Print this member's zenoh configuration, for programs of your own.")] = "",
+    zenoh: Annotated[
+        str, typer.Option(help="Print the zenoh configuration of this member, for use in other programs.")
+    ] = "",
 ) -> None:
-    """Who may do what, and until when; status 1 where a certificate ends within 30 days.
+    """Show all members, their rights and when their certificates expire.
+
+    Exits with status 1 if a certificate expires within 30 days.
 
     Examples: `presage secure show keys`; `presage secure show keys --zenoh observer`.
     """
@@ -127,29 +138,33 @@ def show(
     from presage.session.access_tables import members_table, rights_table  # noqa: PLC0415
 
     if zenoh:
-        mine = credentials(folder, (zenoh,))
-        mode = "router" if mine.member.role == ROUTER else "client"
-        typer.echo(json.dumps(_nested({"mode": mode, **mine.zenoh()}), indent=2))
+        of_member = credentials(folder, (zenoh,))
+        mode = "router" if of_member.member.role == ROUTER else "client"
+        typer.echo(json.dumps(_nested({"mode": mode, **of_member.zenoh()}), indent=2))
         return
     members, now = read_members(credentials(folder, (ROUTER,)).folder), dt.datetime.now(dt.timezone.utc)
-    ends = {member.name: _until(folder, member.name) for member in members if (folder / member.name).is_dir()}
+    ends = {member.name: _expiry_date(folder, member.name) for member in members if (folder / member.name).is_dir()}
     console.print(members_table(members, ends, now))
     console.print(rights_table())
-    late = [name for name, end in ends.items() if end - now < SOON]
-    if late:
-        console.print(f"[bold red]soon to expire:[/] {', '.join(late)}; `presage secure add DIR ROLE NAME --force`")
-    raise typer.Exit(1 if late else 0)
+    expiring = [name for name, end in ends.items() if end - now < EXPIRY_WARNING]
+    if expiring:
+        console.print(
+            f"[bold red]soon to expire: {', '.join(expiring)}[/]; "
+            "renew them with `presage secure add DIR ROLE NAME --force`",
+            soft_wrap=True,
+        )
+    raise typer.Exit(1 if expiring else 0)
 
 
 def _nested(settings: dict[str, Any]) -> dict[str, Any]:
-    """``a/b: c`` as ``a: {b: c}``."""
+    """Settings with keys such as ``a/b`` as nested dictionaries: ``{"a/b": c}`` becomes ``{"a": {"b": c}}``."""
     tree: dict[str, Any] = {}
     for path, value in settings.items():
-        *rooms, last = path.split("/")
-        place = tree
-        for room in rooms:
-            place = place.setdefault(room, {})
-        place[last] = value
+        *parents, key = path.split("/")
+        node = tree
+        for parent in parents:
+            node = node.setdefault(parent, {})
+        node[key] = value
     return tree
 
 
@@ -157,7 +172,7 @@ def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def _until(folder: Path, name: str) -> dt.datetime:
+def _expiry_date(folder: Path, name: str) -> dt.datetime:
     from common.bus.security import CERTIFICATE  # noqa: PLC0415
     from presage.session.credentials import expiry  # noqa: PLC0415
 

@@ -21,22 +21,25 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
-# A coordinate may be negative; a misspelt option still is no number.
-NUMBERS = {"ignore_unknown_options": True}
+# Lets click pass a negative coordinate such as -1 as an argument instead of rejecting it as an unknown option. A
+# misspelt option is still rejected, because it is not a number.
+ALLOW_NEGATIVE_NUMBERS = {"ignore_unknown_options": True}
 
 
-@app.command(context_settings=NUMBERS)
+@app.command(context_settings=ALLOW_NEGATIVE_NUMBERS)
 def goal(
-    x: Annotated[float | None, typer.Argument(help="m, map")] = None,
-    y: Annotated[float | None, typer.Argument(help="m, map")] = None,
-    yaw: Annotated[float | None, typer.Option(help="Heading there, deg; none: any.")] = None,
-    tolerance: Annotated[float, typer.Option(min=0.01, help="Reached within this, m.")] = 0.2,
-    wait: Annotated[bool, typer.Option("--wait", help="Until it is reached, refused, or blocked for 30 s.")] = False,
-    cancel: Annotated[bool, typer.Option("--cancel", help="Forget the goal and stand.")] = False,
+    x: Annotated[float | None, typer.Argument(help="x of the goal in the map, m.")] = None,
+    y: Annotated[float | None, typer.Argument(help="y of the goal in the map, m.")] = None,
+    yaw: Annotated[float | None, typer.Option(help="Heading at the goal, deg. Defaults to any heading.")] = None,
+    tolerance: Annotated[float, typer.Option(min=0.01, help="Distance at which the goal counts as reached, m.")] = 0.2,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="Wait until the goal is reached, refused, or blocked for 30 s.")
+    ] = False,
+    cancel: Annotated[bool, typer.Option("--cancel", help="Cancel the current goal and stop the robot.")] = False,
     robot: RobotName = "robot",
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
-    """Send the robot somewhere.
+    """Send the robot to a goal, or cancel its goal.
 
     Examples: `presage goal 15 1.5 --wait`; `presage goal 15 1.5 --yaw 90`; `presage goal --cancel`.
     """
@@ -47,65 +50,72 @@ def goal(
         raise UserError("a goal is two numbers, X Y in m (or --cancel)")
     if not np.isfinite(tolerance):
         raise UserError(f"--tolerance {tolerance}: a finite number is needed, in m")
-    # The time numbers it: the controller's status says which goal it is about, whoever gave the others.
-    wish = Goal(
-        stamp_ns=0, seq=time.time_ns(), pose=_pose(x or 0.0, y or 0.0, yaw or 0.0), tolerance=tolerance,
-        yaw_tolerance=None if yaw is None else 0.1, cancel=cancel,
-    )  # fmt: skip
-    raise typer.Exit(give_goal(link_of(connect, robot), wish, console, wait=wait))
+    # The time as sequence number distinguishes this goal from those of other clients in the controller's status.
+    request = Goal(
+        stamp_ns=0,
+        seq=time.time_ns(),
+        pose=_pose(x or 0.0, y or 0.0, yaw or 0.0),
+        tolerance=tolerance,
+        yaw_tolerance=None if yaw is None else 0.1,
+        cancel=cancel,
+    )
+    raise typer.Exit(give_goal(link_of(connect, robot), request, console, wait=wait))
 
 
-@app.command(context_settings=NUMBERS)
+@app.command(context_settings=ALLOW_NEGATIVE_NUMBERS)
 def teleport(
-    x: Annotated[float, typer.Argument(help="m, map")],
-    y: Annotated[float, typer.Argument(help="m, map")],
-    yaw: Annotated[float, typer.Argument(help="deg, counter-clockwise from x")] = 90.0,
+    x: Annotated[float, typer.Argument(help="x in the map, m.")],
+    y: Annotated[float, typer.Argument(help="y in the map, m.")],
+    yaw: Annotated[float, typer.Argument(help="Heading, deg, counter-clockwise from the x axis.")] = 90.0,
     robot: RobotName = "robot",
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
-    """Carry the simulated robot off, unseen by its odometry.
+    """Move the simulated robot to another place, without any trace in its odometry.
 
-    Example: `presage teleport 9 1.5`. The paper's preset knows one heading alone: 90 deg in corridor.
+    Example: `presage teleport 9 1.5`. Preset paper can only localise at the heading it was trained for, 90 deg in
+    corridor.
     """
-    from presage.live.commands import teleport as carry  # noqa: PLC0415
+    from presage.live.commands import teleport as run  # noqa: PLC0415
 
-    carry(link_of(connect, robot), _pose(x, y, yaw), console)
+    run(link_of(connect, robot), _pose(x, y, yaw), console)
 
 
-@app.command(context_settings=NUMBERS)
+@app.command(context_settings=ALLOW_NEGATIVE_NUMBERS)
 def localise(
-    x: Annotated[float | None, typer.Argument(help="m, map; none: from the map's centre")] = None,
-    y: Annotated[float | None, typer.Argument(help="m, map")] = None,
+    x: Annotated[
+        float | None, typer.Argument(help="x in the map, m. Defaults to the estimator's initial pose.")
+    ] = None,
+    y: Annotated[float | None, typer.Argument(help="y in the map, m.")] = None,
     robot: RobotName = "robot",
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
-    """Let the estimator begin anew, from a position or from nothing.
+    """Reset the estimator and localise again, near a given position or globally.
 
     Examples: `presage localise`; `presage localise 3 1.5`.
     """
-    from presage.live.commands import localise as restart  # noqa: PLC0415
+    from presage.live.commands import localise as run  # noqa: PLC0415
 
     if (x is None) != (y is None):
         raise UserError("a position is two numbers, X Y in m")
     pose = _pose(x, y) if x is not None and y is not None else None
-    restart(link_of(connect, robot), pose, console)
+    run(link_of(connect, robot), pose, console)
 
 
 def _pose(x: float, y: float, yaw: float = 0.0) -> Pose:
-    """From m and deg; raises UserError where a number is none."""
+    """A pose from m and deg; raises UserError if a value is not finite or too far from the origin."""
     from common.messages.definitions import Pose  # noqa: PLC0415
 
     if not np.isfinite([x, y, yaw]).all():
         given = f"{x:g} {y:g}" + (f" {yaw:g}" if yaw else "")
         raise UserError(f"{given}: a place is finite numbers, X Y in m (and for teleport YAW in deg)")
     if max(abs(x), abs(y)) > MAX_COORDINATE_M:
-        raise UserError(f"{x:g} {y:g}: X and Y are within {MAX_COORDINATE_M:g} m of the origin")
+        raise UserError(f"{x:g} {y:g}: X and Y must be within {MAX_COORDINATE_M:g} m of the origin")
     return Pose(x=x, y=y, yaw=float(se2.wrap(np.deg2rad(yaw))))
 
 
 @app.command()
 def topics(robot: RobotName = "robot") -> None:
-    """The table of topics and queryables.
+    """Print the table of topics and queryables.
 
     Example: `presage topics`.
     """
@@ -116,12 +126,12 @@ def topics(robot: RobotName = "robot") -> None:
 
 @app.command()
 def hz(
-    topic: Annotated[str | None, typer.Argument(help="A topic; none: all.")] = None,
-    seconds: Annotated[float, typer.Option(min=0.1)] = 3.0,
+    topic: Annotated[str | None, typer.Argument(help="Topic to measure. Defaults to all topics.")] = None,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Duration of the measurement, s.")] = 3.0,
     robot: RobotName = "robot",
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
-    """Measure rates on the bus.
+    """Measure the message rates on the bus.
 
     Examples: `presage hz`; `presage hz scan --seconds 10`.
     """
@@ -133,12 +143,14 @@ def hz(
 @app.command()
 def top(
     robot: Annotated[
-        list[str], typer.Option(envvar="PRESAGE_ROBOT", help="Which robot; may be given more than once.")
+        list[str], typer.Option(envvar="PRESAGE_ROBOT", help="Robot name; may be given several times.")
     ] = ["robot"],  # noqa: B006 - typer copies it
-    once: Annotated[bool, typer.Option("--once", help="One table; status 1 where something is missing.")] = False,
+    once: Annotated[
+        bool, typer.Option("--once", help="Print one table and exit, with status 1 if a service is missing.")
+    ] = False,
     connect: Connect = DEFAULT_ENDPOINT,
 ) -> None:
-    """The health of every service, live until Ctrl-C: rates, latency, drops, who is missing and how to start it.
+    """Show the health of every service until Ctrl-C: rates, latency, drops, missing services and how to start them.
 
     Examples: `presage top`; `presage top --once`; `presage top --robot one --robot two`.
     """
@@ -149,14 +161,19 @@ def top(
 
 @app.command()
 def doctor(
-    seconds: Annotated[float, typer.Option(min=0.5, help="How long to listen; frozen services show from 2.5 s.")] = 3.0,
+    seconds: Annotated[
+        float,
+        typer.Option(min=0.5, help="How long to observe the bus, s. Detecting a frozen service takes at least 2.5 s."),
+    ] = 3.0,
     robot: RobotName = "robot",
     connect: Connect = DEFAULT_ENDPOINT,
     world: WorldName = "corridor",
-    recordings: Annotated[Path, typer.Option(help="Folder that recordings go to.")] = Path("recordings"),
+    recordings: Annotated[Path, typer.Option(help="Folder for recordings; it must be writable.")] = Path("recordings"),
     json_file: Json = None,
 ) -> None:
-    """Find what is wrong with the installation, this machine, or the running session; status 1 where something is.
+    """Check the installation, this machine and the running session for problems.
+
+    Exits with status 1 if there is a problem.
 
     Examples: `presage doctor`; `presage doctor --seconds 10 --json findings.json`; `presage doctor --world my.yaml`;
     `presage doctor --connect tcp/192.168.0.10:7447 --robot two`.

@@ -32,7 +32,7 @@ MARGIN = 0.5  # m around what was seen
 
 
 @dataclass(frozen=True)
-class Job:
+class MapOptions:
     """What to map."""
 
     log: Path
@@ -42,7 +42,7 @@ class Job:
     reading: Reading | None = None
 
 
-def map_command(job: Job, console: Console, progress: Console) -> Path:
+def map_command(job: MapOptions, console: Console, progress: Console) -> Path:
     """Write map.yaml and its image; raises UserError in one line."""
     if job.half not in ("", "first", "second"):
         raise UserError(f"no half {job.half!r}: choose first or second, or leave out --half")

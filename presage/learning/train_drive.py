@@ -33,7 +33,7 @@ MARGIN = 1.0  # m around what the drive has seen: the world of a drive without a
 
 
 @dataclass(frozen=True)
-class Job:
+class TrainDriveOptions:
     """What to learn from."""
 
     log: Path
@@ -45,7 +45,7 @@ class Job:
     reading: Reading | None = None  # what the log does not say itself
 
 
-def train_from_drive(job: Job, console: Console) -> Path:
+def train_from_drive(job: TrainDriveOptions, console: Console) -> Path:
     """The weights' path; raises UserError in one line."""
     scans = read_scans(job.log, reading=job.reading)
     scans.say_notes(console)
@@ -137,7 +137,7 @@ def scanner_of(drive: Drive, sigma: float, name: str) -> Scanner:
     )  # fmt: skip
 
 
-def card_of(job: Job, world: World, drive: Drive, learned: Learned, seconds: float) -> weights.FieldCard:
+def card_of(job: TrainDriveOptions, world: World, drive: Drive, learned: Learned, seconds: float) -> weights.FieldCard:
     """Where the model comes from, and what its calibration found."""
     found, errors = learned.calibration, learned.errors
     source = f"{len(drive.ranges)} posed scans of {job.log.name}"

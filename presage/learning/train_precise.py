@@ -38,7 +38,7 @@ TEST_SAMPLES = 500
 
 
 @dataclass(frozen=True)
-class Job:
+class TrainPreciseOptions:
     """What to learn."""
 
     world: str
@@ -49,7 +49,7 @@ class Job:
     recipe: Recipe = Recipe()  # noqa: RUF009 - frozen
 
 
-def train_precise(job: Job, link: Link, console: Console) -> Path:
+def train_precise(job: TrainPreciseOptions, link: Link, console: Console) -> Path:
     """The weights' path; raises UserError in one line."""
     world, scanner = load_world(job.world), job.scanner
     path = weights.path_of(job.out, world.name)
@@ -83,7 +83,7 @@ def _poses(world: World, count: int, rng: np.random.Generator) -> se2.Array:
 
 
 def _learn(
-    job: Job, scanner: Scanner, poses: dict[str, se2.Array], scans: dict[str, se2.Array], bar: Progress
+    job: TrainPreciseOptions, scanner: Scanner, poses: dict[str, se2.Array], scans: dict[str, se2.Array], bar: Progress
 ) -> tuple[FieldModel, Quality]:
     mount, angles = np.array(scanner.mount), scanner.angles()
     task: TaskID = bar.add_task("learning", total=1.0)
@@ -114,7 +114,7 @@ def _learn(
 
 
 def _card(
-    job: Job, world: World, scanner: Scanner, model: FieldModel, quality: Quality, seconds: float
+    job: TrainPreciseOptions, world: World, scanner: Scanner, model: FieldModel, quality: Quality, seconds: float
 ) -> weights.FieldCard:
     return weights.FieldCard(
         world=world, scanner=scanner, samples=job.samples, seed=job.recipe.seed, resolution=job.recipe.resolution,

@@ -36,7 +36,7 @@ BLOCK = 500  # poses a request
 
 
 @dataclass(frozen=True)
-class Job:
+class TrainPaperOptions:
     """What to train."""
 
     world: str
@@ -50,7 +50,7 @@ class Job:
     shape_channels: int = 8
 
 
-def train(job: Job, link: Link, console: Console) -> Path:
+def train(job: TrainPaperOptions, link: Link, console: Console) -> Path:
     """The weights' path; raises UserError in one line."""
     world, scanner = load_world(job.world), job.scanner
     path = weights.path_of(job.out, world.name, job.preset, scanner.beams)
@@ -143,7 +143,7 @@ def collect(
 
 
 def _fit(
-    job: Job, world: World, scanner: Scanner, data: dict[str, Data], checkpoint: Checkpoint, bar: Progress
+    job: TrainPaperOptions, world: World, scanner: Scanner, data: dict[str, Data], checkpoint: Checkpoint, bar: Progress
 ) -> tuple[Trainer, float]:
     norm = Normalisation.of(world.bounds, float(data["train"].ranges.max()))
     shape = Shape(scanner.beams, job.shape_hidden, job.shape_channels)
@@ -173,7 +173,7 @@ def _warn_if_nothing_learned(data: dict[str, Data], trainer: Trainer, console: C
 
 
 def _write(
-    job: Job,
+    job: TrainPaperOptions,
     world: World,
     scanner: Scanner,
     heading: float,

@@ -40,7 +40,7 @@ STANDSTILL = 3.0  # s; over a longer gap nothing is said of the velocity
 
 
 @dataclass(frozen=True)
-class Import:
+class ImportOptions:
     """What is asked for."""
 
     file: Path
@@ -53,7 +53,7 @@ class Import:
     sigma: float | None = None  # m, the scanner's noise; None: the recording does not state it
 
 
-def import_command(job: Import, json_file: Path | None, console: Console, err_console: Console) -> None:
+def import_command(job: ImportOptions, json_file: Path | None, console: Console, err_console: Console) -> None:
     """Everything, with progress on ``err_console``; raises UserError in one line, and leaves no file then."""
     check_file(json_file, "--json")
     if kind_of(job.file) == "recording":
@@ -72,7 +72,7 @@ def import_command(job: Import, json_file: Path | None, console: Console, err_co
     write_json(json_file, {**facts, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:]})
 
 
-def open_for(job: Import) -> Log:
+def open_for(job: ImportOptions) -> Log:
     """The log, its poses those of the frame that was asked for; raises UserError."""
     if not job.laser:
         return open_log(job.file, job.reading)
@@ -102,7 +102,7 @@ class Written:
     last_ns: int = 0
     ledger: Ledger = field(default_factory=Ledger)
 
-    def facts(self, job: Import, log: Log) -> dict[str, Any]:
+    def facts(self, job: ImportOptions, log: Log) -> dict[str, Any]:
         """Plain numbers, for --json and the recording's metadata."""
         return {
             "file": str(job.file), "out": str(job.out), "format": log.format, "scans": self.scans,
@@ -114,7 +114,7 @@ class Written:
         }  # fmt: skip
 
 
-def write_recording(job: Import, log: Log, world: World | None, sweeps: Iterator[LoggedScan] | Any) -> Written:
+def write_recording(job: ImportOptions, log: Log, world: World | None, sweeps: Iterator[LoggedScan] | Any) -> Written:
     """Scan after scan; an unfinished recording is not kept."""
     start, step = evenly(log)
     begun = list(itertools.islice(stamped := _stamped(log, sweeps, job.rate), HEAD))
@@ -224,7 +224,7 @@ class _Sender:
         self._written.ledger.see(key, payload)
 
 
-def _lines(job: Import, log: Log, facts: dict[str, Any]) -> list[str]:
+def _lines(job: ImportOptions, log: Log, facts: dict[str, Any]) -> list[str]:
     """What a user wants to know of it."""
     first, last = np.rad2deg(log.angles[[0, -1]])
     x, y, yaw = np.round([*log.mount[:2], np.rad2deg(log.mount[2])], 4) + 0.0  # no 1e-17, no -0

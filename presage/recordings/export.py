@@ -18,7 +18,7 @@ BESIDE = {"csv": "-csv", "tum": "-tum", "foxglove": "-foxglove.mcap"}
 
 
 @dataclass(frozen=True)
-class Export:
+class ExportOptions:
     """What is asked for."""
 
     file: Path
@@ -30,7 +30,7 @@ class Export:
     force: bool = False
 
 
-def run_export(job: Export, json_file: Path | None, console: Console) -> None:
+def run_export(job: ExportOptions, json_file: Path | None, console: Console) -> None:
     """Write it, and print what was written; raises UserError where that cannot be."""
     if job.format not in BESIDE:
         raise UserError(f"no format {job.format!r}: choose {', '.join(BESIDE)}")
@@ -52,7 +52,7 @@ def run_export(job: Export, json_file: Path | None, console: Console) -> None:
     write_json(json_file, {**numbers, "complete": recording.complete, "undecodable": lost})
 
 
-def _write(job: Export, recording: Recording, out: Path, console: Console) -> dict[str, int]:
+def _write(job: ExportOptions, recording: Recording, out: Path, console: Console) -> dict[str, int]:
     """With the writer of the format, imported when it is needed."""
     if job.format == "csv":
         from presage.recordings.csv_tables import export_csv  # noqa: PLC0415

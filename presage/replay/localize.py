@@ -41,7 +41,7 @@ UPPER = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
 
 
 @dataclass(frozen=True)
-class Job:
+class LocalizeOptions:
     """What to localise, how, and where the result goes."""
 
     file: Path
@@ -60,7 +60,7 @@ class Job:
     def of(
         cls, file: Path, choice: Choice, mode: str, frame: str, reading: Reading, *, fresh: bool, odometry: bool,
         out: Path | None, start: float | None = None, end: float | None = None, every: int = 1,
-    ) -> Job:  # fmt: skip
+    ) -> LocalizeOptions:  # fmt: skip
         """From the command line's words; raises UserError on one that is not known."""
         if mode not in ("global", "track"):
             raise UserError(f"no mode {mode!r}: choose global or track")
@@ -95,7 +95,7 @@ def choice_of(
     return Choice(world, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
 
 
-def localize(job: Job, console: Console) -> list[dict[str, Any]]:
+def localize(job: LocalizeOptions, console: Console) -> list[dict[str, Any]]:
     """A row for each scan, written as it is computed; raises UserError in one line.
 
     Ctrl-C prints what was done, then raises KeyboardInterrupt.
@@ -141,7 +141,7 @@ def localize(job: Job, console: Console) -> list[dict[str, Any]]:
     return rows
 
 
-def chosen(job: Job, scans: Scans) -> Scans:
+def chosen(job: LocalizeOptions, scans: Scans) -> Scans:
     """The scans of --start, --end and --every; UserError where there are none."""
     if job.start is None and job.end is None and job.every == 1:
         return scans
@@ -155,7 +155,7 @@ def chosen(job: Job, scans: Scans) -> Scans:
     return scans.part(np.flatnonzero(between)[:: job.every])
 
 
-def _numbers(job: Job, count: int, console: Console) -> Generator[int]:
+def _numbers(job: LocalizeOptions, count: int, console: Console) -> Generator[int]:
     """0 to count - 1 with progress shown, but on a terminal where the rows themselves appear."""
     if job.out is None and sys.stdout.isatty() and console.is_terminal:
         yield from range(count)
@@ -163,7 +163,7 @@ def _numbers(job: Job, count: int, console: Console) -> Generator[int]:
     yield from progress(range(count), "localising", count, console)
 
 
-def _start(job: Job, scans: Scans) -> Array | None:
+def _start(job: LocalizeOptions, scans: Scans) -> Array | None:
     """Mode track: the pose given on the command line, in the file, or the truth of a recording."""
     if job.mode == "global":
         return None
@@ -193,7 +193,7 @@ def _row(scans: Scans, k: int, posterior: Posterior, update_ms: float, *, laser:
 
 
 @contextmanager
-def _output(job: Job, count: int) -> Iterator[Callable[[dict[str, Any]], None]]:
+def _output(job: LocalizeOptions, count: int) -> Iterator[Callable[[dict[str, Any]], None]]:
     """The function that writes a row: CSV at once; JSON at the end, also of an interrupted run."""
     if job.out is not None and job.out.suffix == ".json":
         rows: list[dict[str, Any]] = []
@@ -218,7 +218,7 @@ def _output(job: Job, count: int) -> Iterator[Callable[[dict[str, Any]], None]]:
             stream.close()
 
 
-def _write_json(job: Job, out: Path, rows: list[dict[str, Any]], *, complete: bool) -> None:
+def _write_json(job: LocalizeOptions, out: Path, rows: list[dict[str, Any]], *, complete: bool) -> None:
     meta = {
         "file": str(job.file), "world": job.choice.asked, "estimator": job.choice.estimator,
         "model": job.choice.model, "frame": job.frame, "mode": job.mode, "fresh": job.fresh,

@@ -42,7 +42,7 @@ OWN = "-rerun"  # behind the robot's name
 
 
 @dataclass(frozen=True)
-class Rerun:
+class RerunOptions:
     """What is asked for."""
 
     file: Path
@@ -76,7 +76,7 @@ class Offline(EstimatorService):
         self.said.append((topic, message.model_copy(update={"seq": number})))
 
 
-def rerun_command(job: Rerun, json_file: Path | None, console: Console) -> None:
+def rerun_command(job: RerunOptions, json_file: Path | None, console: Console) -> None:
     """Everything; raises UserError in one line."""
     check_file(json_file, "--json")
     set_up_logging("warning")
@@ -227,4 +227,4 @@ class _Copier:
         self.writer.write(topic, topic.key(self.alias), message.encode(), at, at)
 
 
-__all__ = ["Comparison", "Offline", "Rerun", "rerun_command"]
+__all__ = ["Comparison", "Offline", "RerunOptions", "rerun_command"]

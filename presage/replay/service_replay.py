@@ -42,7 +42,7 @@ from services.recorder.reader import Recording, read_recording
 
 
 @dataclass(frozen=True)
-class Again:
+class ServiceReplayOptions:
     """What is asked for."""
 
     file: Path
@@ -58,10 +58,10 @@ class Again:
         return names
 
 
-def again_command(how: Again, json_file: Path | None, console: Console) -> int:
+def service_replay_command(how: ServiceReplayOptions, json_file: Path | None, console: Console) -> int:
     """Run, say how it compares; 0 where it is as it must be."""
     check_file(json_file, "--json")
-    outcome = run_again(how, console)
+    outcome = run_service_replay(how, console)
     for line in words(outcome):
         console.print(line, highlight=False, soft_wrap=True)
     about = {"file": str(how.file), "services": how.names(), "rate": how.rate, "every_scan": how.every_scan}
@@ -69,7 +69,7 @@ def again_command(how: Again, json_file: Path | None, console: Console) -> int:
     return 0 if outcome.good else 1
 
 
-def run_again(how: Again, console: Console) -> Outcome:
+def run_service_replay(how: ServiceReplayOptions, console: Console) -> Outcome:
     """Raises UserError where the file does not hold what is needed, or a service ends."""
     names, recording = how.names(), read_recording(how.file)
     if recording.warning:
@@ -136,7 +136,7 @@ def configure(recording: Recording, names: tuple[str, ...], folder: Path, notes:
     return path
 
 
-def why_not_exact(recording: Recording, how: Again) -> str:
+def why_not_exact(recording: Recording, how: ServiceReplayOptions) -> str:
     """Why equality to the last bit cannot be required; empty where it can."""
     if how.rate is not None or how.every_scan:
         return f"{'--every-scan' if how.rate is None else '--rate'} was given"

@@ -38,7 +38,7 @@ GIVE_UP = 120.0  # s for localising, and again for the way
 
 
 @dataclass(frozen=True)
-class Demo:
+class DemoOptions:
     """What the demo is asked for."""
 
     world: str = "corridor"
@@ -54,7 +54,7 @@ class Demo:
     people: int = 0  # who walk about
 
 
-def run_demo(demo: Demo, stack: Stack, console: Console) -> tuple[Path, bool]:
+def run_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple[Path, bool]:
     """The recording, and whether the goal was reached; raises UserError where it cannot be or nothing is believed."""
     goal = _goal(demo, load_world(demo.world))
     make_folder(demo.out, "--out")
@@ -90,7 +90,7 @@ def run_demo(demo: Demo, stack: Stack, console: Console) -> tuple[Path, bool]:
     return recording, reached
 
 
-def _goal(demo: Demo, world: World) -> tuple[float, float]:
+def _goal(demo: DemoOptions, world: World) -> tuple[float, float]:
     """The goal asked for, or a free place at the far end of the paper's corridor, at least 12 m away."""
     robot, start = Robot(), world.start_pose(Robot().radius)
     if demo.goal is not None and not np.isfinite(demo.goal).all():
@@ -189,7 +189,7 @@ def show(summary: SessionSummary, recording: Path, figure: Path, console: Consol
     console.print(table)
 
 
-def demo_command(demo: Demo, json_file: Path | None, *, quiet: bool) -> int:
+def demo_command(demo: DemoOptions, json_file: Path | None, *, quiet: bool) -> int:
     """Everything; the exit status."""
     console = Console(width=None if sys.stdout.isatty() else 150)
     check_file(json_file, "--json")

@@ -11,21 +11,21 @@ from common.errors import UserError
 
 
 def check_file(file: Path | None, option: str) -> None:
-    """Raises UserError where ``file`` cannot be written; leaves no trace."""
+    """Raises UserError if ``file`` cannot be written; the check changes nothing on disk."""
     if file is None or (file.exists() and not file.is_file() and not file.is_dir()):
-        return  # a pipe is not opened twice
-    there = file.exists()
+        return  # do not open a pipe or device for a check: closing it would end its reader
+    existed = file.exists()
     try:
         with file.open("ab"):
             pass
     except OSError as error:
         raise UserError(f"{file}: cannot be written to ({error.strerror}); choose another file with {option}") from None
-    if not there:
+    if not existed:
         file.unlink()
 
 
 def make_folder(folder: Path, option: str) -> None:
-    """Raises UserError where there can be no ``folder`` or nothing can be written into it."""
+    """Creates ``folder`` with its parents; raises UserError if it cannot be created or written into."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -37,6 +37,6 @@ def make_folder(folder: Path, option: str) -> None:
 
 
 def write_json(file: Path | None, data: dict[str, Any]) -> None:
-    """Numbers as indented JSON, where a file was asked for."""
+    """Writes ``data`` as indented JSON; does nothing if ``file`` is None."""
     if file is not None:
         file.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")

@@ -15,7 +15,7 @@ Item = TypeVar("Item")
 
 
 def working(what: str, console: Console) -> AbstractContextManager[object]:
-    """Shows what is done while the block runs: a spinner on a terminal, elsewhere a line."""
+    """Shows ``what`` while the block runs: with a spinner on a terminal, as one line elsewhere."""
     if console.is_terminal:
         return console.status(what)
     console.print(what, highlight=False, soft_wrap=True)
@@ -25,18 +25,21 @@ def working(what: str, console: Console) -> AbstractContextManager[object]:
 def progress(
     items: Iterable[Item], what: str, total: int, console: Console, *, interval_s: float = LINE_INTERVAL_S
 ) -> Generator[Item]:
-    """Yields the items. Close it (`contextlib.closing`) where the loop can end early, or the bar stays drawn."""
+    """Yields the items and shows the progress; on other outputs than a terminal, one line every ``interval_s``.
+
+    Wrap it in `contextlib.closing` if the loop can end early; otherwise the bar stays on the screen.
+    """
     if console.is_terminal:
         columns = Progress.get_default_columns()
-        # Standard output may be a file of results; rich would redirect it to the console.
+        # rich would redirect standard output to the console, but it may be a file of results.
         with Progress(*columns, console=console, transient=True, redirect_stdout=False) as bar:
             yield from bar.track(items, total, description=what)
         return
-    began = last = time.monotonic()
+    start_s = last_line_s = time.monotonic()
     for done, item in enumerate(items):
-        now = time.monotonic()
-        if done and now - last >= interval_s:
-            left = (now - began) / done * max(0, total - done)
+        now_s = time.monotonic()
+        if done and now_s - last_line_s >= interval_s:
+            left = (now_s - start_s) / done * max(0, total - done)
             console.print(f"{what}: {done} of {total} scans, about {left:.0f} s left", highlight=False, soft_wrap=True)
-            last = now
+            last_line_s = now_s
         yield item

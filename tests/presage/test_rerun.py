@@ -23,7 +23,7 @@ from presage.replay.comparison import Outcome, Pairs
 from presage.replay.goal_times import Goals
 from presage.replay.recorded_session import estimator_settings, recorded_settings, robot_of
 from presage.replay.report import Series, Track
-from presage.replay.rerun import Rerun, another_name, rerun_command
+from presage.replay.rerun import RerunOptions, another_name, rerun_command
 from presage.replay.service_replay import words
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.reader import read_recording
@@ -49,7 +49,7 @@ def session(tmp_path_factory):
 def run(session):
     """The session with the exact model over it: file, printed text, numbers."""
     out, numbers, said = session.with_name("new.mcap"), session.with_name("new.json"), io.StringIO()
-    rerun_command(Rerun(session, EXACT, out), numbers, Console(file=said, width=150))
+    rerun_command(RerunOptions(session, EXACT, out), numbers, Console(file=said, width=150))
     return out, said.getvalue(), json.loads(numbers.read_text())
 
 
@@ -121,22 +121,22 @@ def test_nothing_is_left_of_what_was_interrupted(session, monkeypatch):
     monkeypatch.setattr(shell.Offline, "on_message", interrupted)
     out = session.with_name("never.mcap")
     with pytest.raises(KeyboardInterrupt):
-        rerun_command(Rerun(session, EXACT, out), None, Console(file=io.StringIO()))
+        rerun_command(RerunOptions(session, EXACT, out), None, Console(file=io.StringIO()))
     assert not list(session.parent.glob("never*"))
 
 
 def test_what_cannot_be_is_said(session, tmp_path, run):
     console = Console(file=io.StringIO())
     with pytest.raises(UserError, match=r"new\.mcap: is there already; choose another name with --out"):
-        rerun_command(Rerun(session, EXACT, run[0]), None, console)
+        rerun_command(RerunOptions(session, EXACT, run[0]), None, console)
     with pytest.raises(UserError, match="a recording is named"):
-        rerun_command(Rerun(session, EXACT, tmp_path / "new.bag"), None, console)
+        rerun_command(RerunOptions(session, EXACT, tmp_path / "new.bag"), None, console)
     blind = made.write(tmp_path / "blind.mcap", SCAN)
     with pytest.raises(UserError, match=r"blind\.mcap: no scan in it"):
-        rerun_command(Rerun(blind, EXACT), None, console)
+        rerun_command(RerunOptions(blind, EXACT), None, console)
     lost = made.write(tmp_path / "lost.mcap", world=False)
     with pytest.raises(UserError, match="no world was recorded: name it with --world"):
-        rerun_command(Rerun(lost, EXACT), None, console)
+        rerun_command(RerunOptions(lost, EXACT), None, console)
 
 
 # What the recording holds of its services.

@@ -33,7 +33,7 @@ WRONG = [
     (("goal", "nan", "1"), "nan 1: a place is finite numbers"),
     (("goal", "1", "1", "--tolerance", "inf"), "--tolerance inf"),
     (("goal", "1", "2", "--wiat"), "--wiat"),
-    (("goal", "1e300", "1"), "1e+300 1: X and Y are within 10000 m of the origin"),
+    (("goal", "1e300", "1"), "1e+300 1: X and Y must be within 10000 m of the origin"),
     (("teleport", "inf", "1"), "inf 1 90: a place is finite numbers"),
     (("teleport", "-1", "-1.5", "-90", *NOWHERE), "start a session"),
     (("obstacle", "add", "crate", "-1", "2", "--radius", "-1"), "the obstacle: circle.radius"),

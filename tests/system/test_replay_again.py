@@ -8,7 +8,7 @@ from rich.console import Console
 
 from common.messages.definitions import Belief, Pose
 from common.messages.topics import BELIEF, topic_of
-from presage.logs.importing import Import, import_command
+from presage.logs.importing import ImportOptions, import_command
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.reader import read_recording
 from tests.presage.logs.drives import SCANS as SCANS_OF_LOG
@@ -86,7 +86,7 @@ def test_what_a_file_does_not_hold_is_named(process, tmp_path):
     started = {
         "the estimator's configuration was not recorded": ("replay", str(file), "--with", "estimator"),
         "give estimator, or estimator,controller": ("replay", str(file), "--with", "simulator"),
-        "it takes no other choice than --rate": ("replay", str(file), "--with", "estimator", "--loop"),
+        "only --rate can be combined with it": ("replay", str(file), "--with", "estimator", "--loop"),
         "go with --with": ("replay", str(file), "--every-scan"),
         "--robot 'a/b'": ("replay", str(file), "--robot", "a/b"),
     }
@@ -102,7 +102,7 @@ def test_an_imported_log_is_answered_scan_by_scan(process, tmp_path):
     log = write_bag(tmp_path, Bag(localised=True))
     for name, world in (("there", "corridor"), ("nowhere", "")):
         import_command(
-            Import(log, tmp_path / f"{name}.mcap", world=world), None, Console(quiet=True), Console(quiet=True)
+            ImportOptions(log, tmp_path / f"{name}.mcap", world=world), None, Console(quiet=True), Console(quiet=True)
         )
     status, said, numbers = command(
         process, tmp_path / "a.json", "replay", tmp_path / "there.mcap", "--with", "estimator"

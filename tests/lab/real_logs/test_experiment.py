@@ -18,7 +18,7 @@ from lab.real_logs import filter_tuning as real_tuning
 from lab.real_logs.drive import KIDNAPPED, LASER, LIMIT, Job, drive_at, entered, second_first, unaware
 from lab.real_logs.drive import trial as one_trial
 from lab.real_logs.filter_tuning import starting_point
-from presage.learning.train_drive import Job as Training
+from presage.learning.train_drive import TrainDriveOptions as Training
 from presage.learning.train_drive import split, train_from_drive
 from presage.logs.log import Reading
 from services.estimator.particle_filter import Settings as ParticleSettings

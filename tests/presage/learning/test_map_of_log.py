@@ -11,7 +11,7 @@ from rich.console import Console
 from common.errors import UserError
 from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from common.geometry.world import load_world
-from presage.learning.map_of_log import Job, cells_of, map_command
+from presage.learning.map_of_log import MapOptions, cells_of, map_command
 from presage.logs.log import Reading
 from services.estimator.precise.learning.calibration import Drive
 from services.estimator.shared.generative_models import RayCaster
@@ -30,7 +30,7 @@ def log(tmp_path_factory):
 
 
 def made(log, tmp_path, half=""):
-    return load_world(str(map_command(Job(log, tmp_path / "made.yaml", half, reading=HERE), QUIET, QUIET)))
+    return load_world(str(map_command(MapOptions(log, tmp_path / "made.yaml", half, reading=HERE), QUIET, QUIET)))
 
 
 @pytest.mark.parametrize(("half", "world"), [("first", real_drive.BEFORE), ("second", real_drive.AFTER)])
@@ -71,16 +71,16 @@ def test_who_walks_through_is_not_in_the_map():
 
 def test_what_cannot_be_is_said(log, tmp_path):
     with pytest.raises(UserError, match="no half 'third'"):
-        map_command(Job(log, tmp_path / "a.yaml", "third", reading=HERE), QUIET, QUIET)
+        map_command(MapOptions(log, tmp_path / "a.yaml", "third", reading=HERE), QUIET, QUIET)
     with pytest.raises(UserError, match=r"give NAME\.yaml"):
-        map_command(Job(log, tmp_path / "a.png", reading=HERE), QUIET, QUIET)
+        map_command(MapOptions(log, tmp_path / "a.png", reading=HERE), QUIET, QUIET)
     (tmp_path / "a.pgm").write_bytes(b"mine")
     with pytest.raises(UserError, match=r"a\.pgm is there already"):
-        map_command(Job(log, tmp_path / "a.yaml", reading=HERE), QUIET, QUIET)
+        map_command(MapOptions(log, tmp_path / "a.yaml", reading=HERE), QUIET, QUIET)
     bare = tmp_path / "bare.npz"
     real_drive.save(bare, real_drive.drive(20), reference=False)
     with pytest.raises(UserError, match="no reference poses"):
-        map_command(Job(bare, tmp_path / "b.yaml", reading=HERE), QUIET, QUIET)
+        map_command(MapOptions(bare, tmp_path / "b.yaml", reading=HERE), QUIET, QUIET)
     with pytest.raises(UserError, match="larger --cell"):
         cells_of(real_drive.drive(20), 0.0005)
     assert not list(tmp_path.glob("*.yaml"))
@@ -89,13 +89,13 @@ def test_what_cannot_be_is_said(log, tmp_path):
 def test_a_recording_says_itself_where_its_laser_sits(tmp_path):
     recorded.write(tmp_path / "run.mcap")
     with pytest.raises(UserError, match="says itself what its scanner is"):
-        map_command(Job(tmp_path / "run.mcap", tmp_path / "r.yaml", reading=HERE), QUIET, QUIET)
+        map_command(MapOptions(tmp_path / "run.mcap", tmp_path / "r.yaml", reading=HERE), QUIET, QUIET)
 
 
 def test_a_map_needs_no_stamps(log, tmp_path):
     with np.load(log) as arrays:
         np.savez(tmp_path / "bare.npz", **{name: values for name, values in arrays.items() if name != "stamps"})
-    bare = map_command(Job(tmp_path / "bare.npz", tmp_path / "bare.yaml", reading=HERE), QUIET, QUIET)
+    bare = map_command(MapOptions(tmp_path / "bare.npz", tmp_path / "bare.yaml", reading=HERE), QUIET, QUIET)
     assert load_world(str(bare)).grid.values.tolist() == made(log, tmp_path).grid.values.tolist()
 
 
@@ -103,4 +103,4 @@ def test_a_log_without_returns_is_refused(tmp_path):
     path, drive = tmp_path / "empty.npz", real_drive.drive(20)
     real_drive.save(path, replace(drive, ranges=np.full_like(drive.ranges, np.inf)))
     with pytest.raises(UserError, match="no beam of the scans"):
-        map_command(Job(path, tmp_path / "e.yaml", reading=HERE), QUIET, QUIET)
+        map_command(MapOptions(path, tmp_path / "e.yaml", reading=HERE), QUIET, QUIET)

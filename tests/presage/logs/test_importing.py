@@ -12,13 +12,13 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import load_world
 from common.messages.topics import ODOM, SCAN, TRUTH
-from presage.logs.importing import Import, import_command
+from presage.logs.importing import ImportOptions, import_command
 from presage.logs.log import Reading
 from presage.logs.options import reading_of
 from presage.logs.scan_files import read_scans
 from presage.recordings.info import survey
 from presage.recordings.session_figure import draw_session
-from presage.replay.localize import Job, choice_of, localize
+from presage.replay.localize import LocalizeOptions, choice_of, localize
 from services.recorder.reader import read_recording
 from tests.presage.logs.drives import (
     ANGLES,
@@ -48,7 +48,7 @@ def npz(folder, **changes):
 
 
 def imported(file, out="out.mcap", **more):
-    job = Import(file, file.parent / out, **more)
+    job = ImportOptions(file, file.parent / out, **more)
     import_command(job, file.parent / "facts.json", CONSOLE, CONSOLE)
     return job.out, json.loads((file.parent / "facts.json").read_text())
 
@@ -113,7 +113,7 @@ def test_localises_from_its_reference_on(tmp_path):
     out, _ = imported(make(tmp_path, "ros1"), world="corridor")
     for file, world in ((out, ""), (tmp_path / "drive.bag", "corridor")):
         choice = choice_of(file, world, "precise", "exact", None, 0.02, 0, "")
-        job = Job.of(file, choice, "track", "base_link", Reading(), fresh=False, odometry=True, out=tmp_path / "p.json")
+        job = LocalizeOptions.of(file, choice, "track", "base_link", Reading(), fresh=False, odometry=True, out=tmp_path / "p.json")
         rows = localize(job, CONSOLE)
         found = np.array([[row["x"], row["y"]] for row in rows])
         assert np.hypot(*(found - truth(STAMPS)[:, :2]).T).max() < 0.02
@@ -214,6 +214,6 @@ def test_an_rplidar_that_looks_all_round(tmp_path):
     assert any("brought to the angles of the first" in note for note in facts["notes"])
     assert read_recording(out).scanner().beams == 360
     choice = choice_of(out, "", "precise", "exact", None, 0.02, 0, "")
-    job = Job.of(out, choice, "track", "base_link", Reading(), fresh=False, odometry=True, out=tmp_path / "p.json")
+    job = LocalizeOptions.of(out, choice, "track", "base_link", Reading(), fresh=False, odometry=True, out=tmp_path / "p.json")
     found = np.array([[row["x"], row["y"]] for row in localize(job, CONSOLE)])
     assert np.hypot(*(found - truth(STAMPS)[:, :2]).T).max() < 0.02

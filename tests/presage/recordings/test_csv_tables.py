@@ -16,7 +16,7 @@ from common.errors import UserError
 from common.messages.definitions import Pose, Truth, Twist
 from common.messages.topics import BELIEF, HEALTH, ODOM, SCAN, TOPICS, TRUTH
 from presage.recordings.csv_tables import columns_of, export_csv
-from presage.recordings.export import Export, run_export
+from presage.recordings.export import ExportOptions, run_export
 from presage.recordings.tum import export_tum
 from services.recorder.reader import read_recording
 from tests.lab.navigation import drives as driven
@@ -99,7 +99,7 @@ def test_columns_have_names_of_their_own_and_most_a_meaning(topic):
 
 def test_what_cannot_be_decoded_is_left_out_and_said(tmp_path, capsys):
     recording = driven.write(tmp_path / "run.mcap", also=[(TRUTH, TRUTH.key("rob"), b"\xc1", driven.BEGAN_NS)])
-    run_export(Export(recording, "csv", tmp_path / "csv"), tmp_path / "out.json", QUIET)
+    run_export(ExportOptions(recording, "csv", tmp_path / "csv"), tmp_path / "out.json", QUIET)
     assert len(rows_of(tmp_path / "csv" / "truth.csv")) == driven.STEPS
     assert "1 messages could not be decoded" in capsys.readouterr().err
     numbers = json.loads((tmp_path / "out.json").read_text())
@@ -171,20 +171,20 @@ def test_a_folder_with_something_in_it_is_not_written_into(tmp_path):
     recording = driven.write(tmp_path / "run.mcap")
     (tmp_path / "csv").mkdir()
     (tmp_path / "csv" / "mine.txt").touch()
-    for job in (Export(recording, "csv", tmp_path / "csv"), Export(recording, "tum", tmp_path / "csv")):
+    for job in (ExportOptions(recording, "csv", tmp_path / "csv"), ExportOptions(recording, "tum", tmp_path / "csv")):
         with pytest.raises(UserError, match=r"mine.txt: is there already; .* --force"):
             run_export(job, None, QUIET)
     assert [path.name for path in (tmp_path / "csv").iterdir()] == ["mine.txt"]
-    run_export(Export(recording, "tum", tmp_path / "csv", force=True), None, QUIET)
+    run_export(ExportOptions(recording, "tum", tmp_path / "csv", force=True), None, QUIET)
     assert (tmp_path / "csv" / "belief.tum").exists()
 
 
 def test_a_format_that_is_none(tmp_path):
     with pytest.raises(UserError, match="no format 'xml': choose csv, tum, foxglove"):
-        run_export(Export(tmp_path / "run.mcap", "xml"), None, QUIET)
+        run_export(ExportOptions(tmp_path / "run.mcap", "xml"), None, QUIET)
 
 
 def test_beside_the_recording_where_no_place_is_named(tmp_path):
     active = driven.write(tmp_path / "run.mcap", BELIEF, ODOM, HEALTH, finish=False)
-    run_export(Export(active, "tum"), None, QUIET)
+    run_export(ExportOptions(active, "tum"), None, QUIET)
     assert [path.name for path in (tmp_path / "run-tum").iterdir()] == ["truth.tum"]

@@ -20,7 +20,7 @@ from common.geometry import se2
 from common.messages import topics as table
 from common.messages.definitions import Goal, Pose, Stamped, Truth, Twist
 from common.messages.topics import BELIEF, GOAL, ODOM, TOPICS, TRUTH, Topic
-from presage.recordings.export import Export, run_export
+from presage.recordings.export import ExportOptions, run_export
 from presage.recordings.foxglove import export_foxglove
 from presage.recordings.foxglove_session import Clock, driver_of
 from presage.recordings.foxglove_shapes import NINETY_FIVE, ellipse, grid, world_entities
@@ -104,7 +104,7 @@ def test_a_recording_of_every_topic_is_exported_whole(tmp_path):
     recording = read_recording(path)
     assert set(recording.topics().values()) == set(TOPICS)
     for form in ("foxglove", "csv", "tum"):
-        run_export(Export(path, form, tmp_path / form), None, console := Console(record=True, file=io.StringIO()))
+        run_export(ExportOptions(path, form, tmp_path / form), None, console := Console(record=True, file=io.StringIO()))
         assert "left out" not in console.export_text()
 
 

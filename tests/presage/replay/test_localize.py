@@ -18,11 +18,11 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import load_world
 from common.robot.scanner import SCANNERS
-from presage.logs.importing import Import, import_command
+from presage.logs.importing import ImportOptions, import_command
 from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
-from presage.replay.localize import COLUMNS, Job, choice_of, chosen, localize
-from presage.replay.rerun import Rerun, rerun_command
+from presage.replay.localize import COLUMNS, LocalizeOptions, choice_of, chosen, localize
+from presage.replay.rerun import RerunOptions, rerun_command
 from services.estimator.precise.learning.weights import FOLDER
 from tests.conftest import PATIENCE
 from tests.recorder.sessions import write
@@ -53,7 +53,7 @@ def job(file, mode="global", frame="base_link", estimator="precise", model="lear
     models = more.pop("models", None)
     choice = choice_of(file, world, estimator, model, models, 0.02, 0, more.pop("initial_pose", ""))
     given = {"fresh": False, "odometry": True, "out": out, **more}
-    return Job.of(file, choice, mode, frame, given.pop("reading", Reading()), **given)
+    return LocalizeOptions.of(file, choice, mode, frame, given.pop("reading", Reading()), **given)
 
 
 def errors(rows, path=PATH):
@@ -101,12 +101,12 @@ def test_a_mount_that_is_only_assumed_must_be_that_of_the_weights(tmp_path):
     stated = Reading(mount=np.zeros(3))
     assert errors(localize(job(file, models=folder, reading=stated), CONSOLE)).max() < 0.02
     out = tmp_path / "imported.mcap"
-    import_command(Import(file, out, world="corridor"), None, CONSOLE)
+    import_command(ImportOptions(file, out, world="corridor"), None, CONSOLE)
     again = {"models": str(folder), "model": "learned"}
     with pytest.raises(UserError, match="import its log again with --mount"):
         localize(job(out, models=folder), CONSOLE)
     with pytest.raises(UserError, match="import its log again with --mount"):
-        rerun_command(Rerun(out, again), None, CONSOLE)
+        rerun_command(RerunOptions(out, again), None, CONSOLE)
     elsewhere = Reading(mount=np.array([0.2, 0, 0]))  # a field serves a laser mounted anywhere
     assert errors(localize(job(npz(tmp_path), models=folder, reading=elsewhere), CONSOLE)).max() < 0.02
 
