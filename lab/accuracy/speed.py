@@ -34,7 +34,7 @@ def bench_speed(world: str, beams: str, seed: int, json_file: Path | None, conso
         with pool(1) as executor:
             rows.append(executor.submit(measure, *job).result())
     table = Table(title=f"{world}, one core", title_justify="left")
-    for column in ["estimator", "beams", "tracking ms", "p95", "global search ms", "p95", "start s", "memory MB"]:
+    for column in ["estimator", "beams", "tracking ms", "p95", "from nothing ms", "p95", "ready s", "memory MB"]:
         table.add_column(column, justify="left" if column == "estimator" else "right")
     for row in rows:
         table.add_row(

@@ -19,51 +19,52 @@ from common.errors import UserError
 from common.geometry.world import load_world
 from common.versions import commit, versions
 from lab.benchmarks.fleet_load import Load, Window
-from lab.benchmarks.fleet_table import WAYS, show
+from lab.benchmarks.fleet_table import DEPLOYMENTS, show
 from presage.session.stack import Stack
 from presage.terminal.output import check_file, write_json
 
-PATIENCE = 120.0  # s
-SETTLING = 4.0  # s of slow scans in which robots find their places, and again where some have not
-SLOWLY = 3.0  # Hz, those scans
-ROUNDS = 5  # of settling
+STARTUP_TIMEOUT_S = 120.0
+# Before a measurement, scans at a low rate let the estimators localise; repeated until all robots track.
+SETTLING_TIME_S = 4.0
+SETTLING_RATE_HZ = 3.0
+MAX_SETTLING_ROUNDS = 5
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is measured."""
+    """Parameters of the benchmark."""
 
     world: str
     beams: int
     rate: float  # Hz
-    seconds: float  # of one number of robots
-    most: int  # robots
-    share: float  # of the scans that must be answered within a period
+    seconds: float  # duration of the measurement for each number of robots
+    max_robots: int
+    share: float  # share of the scans that must be answered within a period
     seed: int
 
 
 @dataclass
-class Found:
-    """One way of serving, for one estimator."""
+class DeploymentResult:
+    """Measurements of one estimator in one deployment: one process for all robots, or one process per robot."""
 
     estimator: str
     way: str
     rate: float  # Hz
     windows: list[dict[str, Any]] = field(default_factory=list)
-    served: int = 0  # robots
-    searching: dict[str, Any] | None = None  # half as many robots, one of which begins from nothing each second
-    bytes: dict[str, int] = field(default_factory=dict)  # of each message, by topic
-    memory_mb: dict[int, float] = field(default_factory=dict)  # unique to the estimators, by robots that were served
+    served: int = 0  # largest number of robots that was served
+    searching: dict[str, Any] | None = None  # with half as many robots, one of which starts a global search each second
+    bytes: dict[str, int] = field(default_factory=dict)  # message size by topic
+    memory_mb: dict[int, float] = field(default_factory=dict)  # unique set size of the estimators by number of robots
 
     def row(self) -> dict[str, Any]:
-        """For table and file."""
+        """The result as a row of the table and of the JSON file."""
         best = next((w for w in reversed(self.windows) if w["robots"] == self.served and w["served"]), None)
-        # Whoever else is on the machine takes time away, but adds little to what is used: the least is the truest.
+        # Other processes can only increase the processor time (cache misses), so the smallest value is the best one.
         busiest = max(window["robots"] for window in self.windows)
         cpu_ms = min(window["cpu_ms_per_scan"] for window in self.windows if window["robots"] == busiest)
         fewest, most = min(self.memory_mb), max(self.memory_mb)
         per_robot = self.memory_mb[most] / most
-        if self.way == WAYS[0]:
+        if self.way == DEPLOYMENTS[0]:
             per_robot = (self.memory_mb[most] - self.memory_mb[fewest]) / max(1, most - fewest)
         return {
             "estimator": self.estimator, "way": self.way, "robots_served": self.served,
@@ -74,71 +75,74 @@ class Found:
         }  # fmt: skip
 
 
-class Side:
-    """The estimators of one way, pinned to one core."""
+class EstimatorDeployment:
+    """The running estimators of one deployment, pinned to one core."""
 
-    def __init__(self, stack: Stack, load: Load, plan: Plan, found: Found, core: int) -> None:
-        """Nothing runs yet; in one process all robots are named from the start."""
-        self.stack, self.load, self.plan, self.found, self.core = stack, load, plan, found, core
-        self.ready = 0  # robots that have found their places
+    def __init__(self, stack: Stack, load: Load, plan: Plan, result: DeploymentResult, core: int) -> None:
+        """Start no process yet."""
+        self.stack, self.load, self.plan, self.result, self.core = stack, load, plan, result, core
+        self.ready = 0  # number of robots that are localised
 
     def prepare(self, count: int) -> None:
-        """As many robots as that are served, and know where they are (preset paper: or not)."""
+        """Start estimators for the first ``count`` robots and let them localise (preset paper may fail to)."""
         if count <= self.ready:
             return
-        arguments = ["--world", self.plan.world, "--estimator", self.found.estimator]
-        if self.found.way == WAYS[0]:
+        arguments = ["--world", self.plan.world, "--estimator", self.result.estimator]
+        if self.result.way == DEPLOYMENTS[0]:
             if not self.ready:
                 names = ",".join(robot.name for robot in self.load.robots)
                 self.stack.start("estimator", *arguments, "--robots", names)
         else:
             for robot in self.load.robots[self.ready : count]:
-                self.stack.start_as(robot.name, "estimator", robot.name, *arguments)
-        if not self.load.wait_matching(count, PATIENCE):
+                self.stack.start_instance(robot.name, "estimator", robot.name, *arguments)
+        if not self.load.wait_matching(count, STARTUP_TIMEOUT_S):
             self.stack.check()
-            raise UserError(f"not all estimators were ready within {PATIENCE:g} s")
+            raise UserError(f"not all of {count} estimators subscribed to scans within {STARTUP_TIMEOUT_S:g} s")
         for process in self.processes():
-            _keep_on(process, {self.core})
-        for _ in range(ROUNDS):
-            if self.load.play(count, SETTLING, SLOWLY).tracking == count or self.found.estimator == "paper":
+            _pin_threads(process, {self.core})
+        for _ in range(MAX_SETTLING_ROUNDS):
+            if (
+                self.load.play(count, SETTLING_TIME_S, SETTLING_RATE_HZ).tracking == count
+                or self.result.estimator == "paper"
+            ):
                 break
         self.ready = count
-        self.found.memory_mb[count] = sum(each.memory_full_info().uss for each in self.processes()) / 1e6
+        self.result.memory_mb[count] = sum(each.memory_full_info().uss for each in self.processes()) / 1e6
 
     def processes(self) -> list[psutil.Process]:
-        """The estimators."""
+        """The estimator processes."""
         return [psutil.Process(p.child.pid) for name, p in self.stack.processes.items() if name != "router"]
 
     def served(self, count: int) -> bool:
-        """Whether so many robots are answered in time; asked twice before a no, for a machine has hiccups."""
+        """Whether ``count`` robots are answered in time. Measures a second time if the first fails."""
         self.prepare(count)
         for _ in range(2):
-            before, others = self._cpu(), self._busy()
+            before, others = self._estimators_cpu_s(), self._core_busy_s()
             window = self.load.play(count, self.plan.seconds)
             self.stack.check()
-            used = self._cpu() - before
+            used = self._estimators_cpu_s() - before
             row = _row(window, used, self.plan)
-            row["others_share"] = max(0.0, self._busy() - others - used) / self.plan.seconds
-            self.found.windows.append(row)
+            row["others_share"] = max(0.0, self._core_busy_s() - others - used) / self.plan.seconds
+            self.result.windows.append(row)
             if row["served"]:
                 return True
         return False
 
     def search(self) -> None:
-        """What a robot that searches does to the others; preset paper does not search."""
-        count = max(2, self.found.served // 2)
-        if self.found.estimator != "paper" and count <= self.plan.most:
+        """Measure how one robot's global searches delay the others. Skips preset paper, which has no global search."""
+        count = max(2, self.result.served // 2)
+        if self.result.estimator != "paper" and count <= self.plan.max_robots:
             self.prepare(count)
-            before = self._cpu()
+            before = self._estimators_cpu_s()
             window = self.load.play(count, self.plan.seconds, searching=True)
-            self.found.searching = _row(window, self._cpu() - before, self.plan)
+            self.result.searching = _row(window, self._estimators_cpu_s() - before, self.plan)
 
-    def _busy(self) -> float:
-        """S that the core has worked, for whomever."""
+    def _core_busy_s(self) -> float:
+        """Busy time of the core in s, for all processes of the machine."""
         times = psutil.cpu_times(percpu=True)[self.core]
         return float(sum(times) - times.idle - getattr(times, "iowait", 0.0))
 
-    def _cpu(self) -> float:
+    def _estimators_cpu_s(self) -> float:
         return sum(t.user + t.system for t in (process.cpu_times() for process in self.processes()))
 
 
@@ -151,8 +155,8 @@ def _row(window: Window, cpu_s: float, plan: Plan) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def most_served(served: Callable[[int], bool], most: int) -> int:
-    """The largest count in 1 ... ``most`` for which ``served`` says yes: doubled until it says no, then halved."""
+def max_robots_served(served: Callable[[int], bool], most: int) -> int:
+    """The largest count in 1 ... ``most`` for which ``served`` is true, by doubling and then bisection; 0 if none."""
     good, bad = 0, most + 1
     count = min(8, most)
     while bad - good > 1:
@@ -165,56 +169,58 @@ def most_served(served: Callable[[int], bool], most: int) -> int:
     return good
 
 
-def measure(estimator: str, way: str, plan: Plan, console: Console) -> Found:
-    """One way, on a router of its own."""
-    found, cores = Found(estimator, way, plan.rate), sorted(os.sched_getaffinity(0))
+def measure(estimator: str, way: str, plan: Plan, console: Console) -> DeploymentResult:
+    """Measure one estimator in one deployment, with its own router."""
+    result, cores = DeploymentResult(estimator, way, plan.rate), sorted(os.sched_getaffinity(0))
     with Stack("bench", quiet=True) as stack:
         stack.start_router()
         with open_bus(stack.link()) as bus:
-            load = Load(bus, load_world(plan.world), plan.beams, plan.rate, plan.most, plan.seed)
-            side = Side(stack, load, plan, found, cores[-1])
-            side.prepare(1)
-            if way == WAYS[0]:
-                side.prepare(plan.most)  # what each costs in memory; who is not played costs no time
-            found.bytes = load.sizes()
-            with _elsewhere(cores), console.status(f"{estimator}, {way}") as status:
+            load = Load(bus, load_world(plan.world), plan.beams, plan.rate, plan.max_robots, plan.seed)
+            deployment = EstimatorDeployment(stack, load, plan, result, cores[-1])
+            deployment.prepare(1)
+            if way == DEPLOYMENTS[0]:
+                deployment.prepare(
+                    plan.max_robots
+                )  # for the memory of all robots; a robot without scans takes no processor time
+            result.bytes = load.message_sizes()
+            with _harness_on_other_cores(cores), console.status(f"{estimator}, {way}") as status:
 
                 def served(count: int) -> bool:
                     status.update(f"{estimator}, {way}: {count} robots")
-                    answer = side.served(count)
-                    last = found.windows[-1]
+                    answer = deployment.served(count)
+                    last = result.windows[-1]
                     console.print(
                         f"{estimator}, {way}: {count} robots, {100 * last['in_time_share']:.2f} % in time",
                         highlight=False,
                     )
                     return answer
 
-                found.served = most_served(served, plan.most)
-                side.search()
-    return found
+                result.served = max_robots_served(served, plan.max_robots)
+                deployment.search()
+    return result
 
 
 @contextmanager
-def _elsewhere(cores: list[int]) -> Iterator[None]:
-    """Keep our own threads on the other cores, where there are others."""
-    _keep_on(psutil.Process(), set(cores[:-1] or cores))
+def _harness_on_other_cores(cores: list[int]) -> Iterator[None]:
+    """Keep the threads of this process off the last core, if there are several cores."""
+    _pin_threads(psutil.Process(), set(cores[:-1] or cores))
     try:
         yield
     finally:
-        _keep_on(psutil.Process(), set(cores))
+        _pin_threads(psutil.Process(), set(cores))
 
 
-def _keep_on(process: psutil.Process, cores: set[int]) -> None:
-    """Every thread that is there; those to come inherit it."""
+def _pin_threads(process: psutil.Process, cores: set[int]) -> None:
+    """Pin every thread of the process to the cores; threads that are created later inherit the setting."""
     for thread in process.threads():
-        with suppress(ProcessLookupError):  # it has just ended
+        with suppress(ProcessLookupError):  # the thread has just ended
             os.sched_setaffinity(thread.id, cores)
 
 
 def bench_fleet(estimators: str, plan: Plan, json_file: Path | None, console: Console) -> int:
-    """Print, and write as JSON where asked."""
+    """Run the benchmark, print the table and write it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
-    rows = [measure(name, way, plan, console).row() for name in estimators.split(",") for way in WAYS]
+    rows = [measure(name, way, plan, console).row() for name in estimators.split(",") for way in DEPLOYMENTS]
     ratios = show(rows, plan, console)
     load_average = os.getloadavg()[0]
     console.print(f"load of the machine at the end: {load_average:.1f} on {os.cpu_count()} cores", highlight=False)

@@ -18,71 +18,71 @@ from common.messages.topics import BELIEF, HEALTH, LOCALISE, PREDICTION, SCAN
 from common.messages.wire import DecodeError
 from common.robot.scanner import SCANNERS, Scanner
 
-HEADING = np.pi / 2  # rad, all the time: the one that preset paper knows
-SPEED, RADIUS = 0.3, 0.25  # m/s, m of the circles that the robots drive
+HEADING = np.pi / 2  # rad, constant: preset paper is trained for this heading only
+SPEED, RADIUS = 0.3, 0.25  # m/s, m; of the circles that the robots drive
 CLEARANCE = 0.5  # m between a circle's centre and the walls
-AFTER = 1.0  # s in which answers may still come
+ANSWER_TIMEOUT_S = 1.0  # wait for answers after the last scan
 
 
 @dataclass
-class Robot:
-    """One that drives in circles; its time is its own, and stands still while nothing is played."""
+class CirclingRobot:
+    """A robot that drives in circles. Its time advances only while its scans are sent."""
 
     name: str
     centre: Array  # (2,) m
-    phase: float  # of the period between two scans, when its scans are sent
-    scans: int = 0  # so far
+    phase: float  # when its scans are sent, as a share of the scan period
+    scans: int = 0  # sent so far
 
     def pose(self, k: int, rate: float) -> Array:
-        """(3,) at its k-th scan."""
+        """Pose (3,) at its k-th scan."""
         turn = SPEED / RADIUS * k / rate
         return np.array([*(self.centre + RADIUS * np.array([np.cos(turn), np.sin(turn)])), HEADING])
 
 
 @dataclass(frozen=True)
 class Window:
-    """What came of the scans of some seconds."""
+    """Answers to the scans of one measurement."""
 
     robots: int
     sent: int
     answered: int
     in_time: int
     latency_ms: Array  # (answered,)
-    tracking: int  # robots whose last belief says so
+    tracking: int  # robots whose last belief has state `tracking`
 
     @property
     def in_time_share(self) -> float:
-        """Of the scans that were sent."""
+        """Share of the scans that were answered within a scan period."""
         return self.in_time / max(1, self.sent)
 
     def percentile(self, q: float) -> float | None:
-        """Latency in ms; None: nothing was answered."""
+        """Percentile of the latency in ms. Returns None if nothing was answered."""
         return float(np.percentile(self.latency_ms, q)) if len(self.latency_ms) else None
 
 
 class Load:
-    """Robots whose scans are cast before they are played, so that playing them costs little."""
+    """Simulated robots. Their scans are computed before they are sent, so that sending takes little processor time."""
 
     def __init__(self, bus: Bus, world: World, beams: int, rate: float, count: int, seed: int) -> None:
-        """``count`` robots somewhere in the world; ``rate`` Hz each."""
+        """Place ``count`` robots at random in the world; each sends scans at ``rate`` Hz."""
         self.world, self.rate = world, rate
         self.scanner: Scanner = SCANNERS["tim571"].with_beams(beams)
         self._rng = np.random.default_rng(seed)
         centres = world.sample_free(count, self._rng, CLEARANCE)
-        self.robots = [Robot(f"bench-{k}", centre, k / count) for k, centre in enumerate(centres)]
+        self.robots = [CirclingRobot(f"bench-{k}", centre, k / count) for k, centre in enumerate(centres)]
         self._buses = {robot.name: bus.for_robot(robot.name) for robot in self.robots}
         self._inbox = Inbox(capacity=1_000_000)
         bus.subscribe(BELIEF, self._inbox, keep_all=True, robot="*")
 
     def wait_matching(self, count: int, timeout: float) -> bool:
-        """Whether the first robots' scans are subscribed to."""
+        """Whether each of the first ``count`` robots' scans gets a subscriber within ``timeout`` s."""
         deadline = time.monotonic() + timeout
         return all(
             self._buses[robot.name].wait_matching(SCAN, deadline - time.monotonic()) for robot in self.robots[:count]
         )
 
-    def sizes(self) -> dict[str, int]:
-        """Bytes of each message that goes between one robot and its estimator, at most, without zenoh's own."""
+    def message_sizes(self) -> dict[str, int]:
+        """Largest payload in bytes of each topic between one robot and its estimator, without zenoh's headers."""
         robot, inbox = self.robots[0], Inbox()
         ends = [
             self._buses[robot.name].subscribe(topic, inbox, keep_all=True) for topic in (BELIEF, PREDICTION, HEALTH)
@@ -96,9 +96,10 @@ class Load:
         return found
 
     def play(self, count: int, seconds: float, rate: float | None = None, *, searching: bool = False) -> Window:
-        """Send the first robots' scans at their times, ``rate`` Hz or the usual, each robot at its own phase.
+        """Send scans of the first ``count`` robots for ``seconds`` s, and return how they were answered.
 
-        ``searching``: the first one is asked to begin from nothing each second, and the others are what is reported.
+        ``rate`` in Hz defaults to the load's rate. With ``searching``, the first robot requests a global localisation
+        once a second and is left out of the result.
         """
         rate = rate or self.rate
         schedule = sorted(
@@ -107,13 +108,13 @@ class Load:
         )  # fmt: skip
         payloads = [self._payload(robot, k) for _, robot, k in schedule]
         while self._inbox.get(0) is not None:
-            pass  # late answers to an earlier window
+            pass  # discard late answers to the previous measurement
         sent: dict[tuple[str, int], int] = {}
-        lost = self.robots[0] if searching else None
+        searching_robot = self.robots[0] if searching else None
         began = time.monotonic()
         for (due, robot, k), payload in zip(schedule, payloads, strict=True):
             time.sleep(max(0.0, began + due - time.monotonic()))
-            if robot is not lost:
+            if robot is not searching_robot:
                 sent[BELIEF.key(robot.name), self._stamp(k)] = time.time_ns()
             elif k % round(rate) == 0:
                 self._buses[robot.name].request(LOCALISE, LocaliseRequest(), k, Inbox())
@@ -124,7 +125,7 @@ class Load:
     def _stamp(self, k: int) -> int:
         return int((k + 1) / self.rate * 1e9)
 
-    def _payload(self, robot: Robot, k: int) -> bytes:
+    def _payload(self, robot: CirclingRobot, k: int) -> bytes:
         scanner, laser = self.scanner, se2.compose(robot.pose(k, self.rate), self.scanner.mount)
         clean = self.world.ray_distances(laser[None], scanner.angles())[0]
         return Scan(
@@ -135,8 +136,12 @@ class Load:
         ).encode()  # fmt: skip
 
     def _window(self, count: int, sent: dict[tuple[str, int], int]) -> Window:
-        """Wait for the last answers, then match them."""
-        deadline, latency, states = time.monotonic() + AFTER, dict[tuple[str, int], float](), dict[str, str]()
+        """Match the received answers to the scans in ``sent``, waiting up to `ANSWER_TIMEOUT_S` for the last ones."""
+        deadline, latency, states = (
+            time.monotonic() + ANSWER_TIMEOUT_S,
+            dict[tuple[str, int], float](),
+            dict[str, str](),
+        )
         while len(latency) < len(sent) and (left := deadline - time.monotonic()) > 0:
             sample = self._inbox.get(left)
             if not isinstance(sample, Sample):

@@ -30,13 +30,13 @@ from presage.session.stack import Stack
 from presage.terminal.options import credentials_for
 from presage.terminal.output import check_file, write_json
 
-# The echo process speaks on keys of a robot of its own: payload out on `odom`, back on `truth`, any bytes.
+# The echo process uses the keys of a separate robot: it receives any bytes on `odom` and returns them on `truth`.
 ECHO_ROBOT, ECHO = "echo", "simulator"
-WARM_UP = 30  # scans not counted
+WARM_UP_SCANS = 30  # at the start, left out of the statistics
 
 
 def echo_main() -> None:
-    """Child process: every payload that comes goes back, in zenoh's own callback thread's order."""
+    """Entry point of the echo process: returns every payload it receives, in order."""
     inbox = Inbox()
     folder, connect = os.environ.get("PRESAGE_SECURITY"), (os.environ["PRESAGE_CONNECT"],)
     security = credentials(Path(folder), ("simulator",), ECHO_ROBOT) if folder else None
@@ -51,40 +51,50 @@ def echo_main() -> None:
 
 
 def latency(scans: int, rate: float, beams: int, console: Console) -> dict[str, Any]:
-    """Milliseconds: scan to command (through estimator and controller), and the same payload there and back."""
+    """Latencies in ms: from scan to velocity command through estimator and controller, and zenoh's own round trip.
+
+    The round trip sends the same payload to an echo process and back.
+    """
     world, scanner = load_world("corridor"), SCANNERS["tim571"].with_beams(beams)
     start = world.start_pose(Robot().radius)
     clean = world.ray_distances(se2.compose(start[None], scanner.mount), scanner.angles())[0]
     rng = np.random.default_rng(0)
-    # We are the scanner, and the echo speaks on a scanner's keys.
+    # This process publishes scans, and the echo process uses a scanner's keys: both need the simulator's role.
     with Stack("bench", quiet=True, security=credentials_for("bench", "simulator")) as stack:
         stack.start_router()
         stack.start("controller")
         stack.start("estimator", "--initial-pose", f"{start[0]},{start[1]}")
-        with open_bus(stack.link()) as bus, open_bus(replace(stack.link(), robot=ECHO_ROBOT)) as raw:
+        with open_bus(stack.link()) as bus, open_bus(replace(stack.link(), robot=ECHO_ROBOT)) as echo_bus:
             stack.wait_alive(bus)
-            stack.start_code("echo", "from lab.benchmarks.latency import echo_main; echo_main()")
-            _wait_echo(raw, stack)
-            return _measure(bus, raw, scanner, clean, rng, scans, rate, console)
+            stack.start_python("echo", "from lab.benchmarks.latency import echo_main; echo_main()")
+            _wait_echo(echo_bus, stack)
+            return _measure(bus, echo_bus, scanner, clean, rng, scans, rate, console)
 
 
-def _wait_echo(raw: Bus, stack: Stack) -> None:
+def _wait_echo(echo_bus: Bus, stack: Stack) -> None:
     deadline = time.monotonic() + 30
-    while ECHO not in raw.alive(timeout=0.5):
+    while ECHO not in echo_bus.alive(timeout=0.5):
         stack.check()
         if time.monotonic() > deadline:
             raise UserError("the echo process did not start within 30 s")
 
 
 def _measure(
-    bus: Bus, raw: Bus, scanner: Any, clean: Any, rng: np.random.Generator, scans: int, rate: float, console: Console
+    bus: Bus,
+    echo_bus: Bus,
+    scanner: Any,
+    clean: Any,
+    rng: np.random.Generator,
+    scans: int,
+    rate: float,
+    console: Console,
 ) -> dict[str, Any]:
     commands, returns = Inbox(), Inbox()
     bus.subscribe(CMD_VEL, commands, keep_all=True)
-    raw.subscribe(TRUTH, returns, keep_all=True)
+    echo_bus.subscribe(TRUTH, returns, keep_all=True)
     loop_ms, raw_ms, lost = [], [], 0
     mount = Pose.of(scanner.mount)
-    for number in track(range(WARM_UP + scans), "scan to command", console=console, transient=True):
+    for number in track(range(WARM_UP_SCANS + scans), "scan to command", console=console, transient=True):
         stamp = int(number / rate * 1e9)
         noisy = clean + scanner.sigma * rng.standard_normal(len(clean))
         payload = Scan(
@@ -93,15 +103,15 @@ def _measure(
         ).encode()  # fmt: skip
         began = time.perf_counter()
         bus.put(SCAN, payload)
-        there = _await(commands, lambda p, s=stamp: CmdVel.decode(p).stamp_ns == s)
+        answered = _wait_for(commands, lambda p, s=stamp: CmdVel.decode(p).stamp_ns == s)
         middle = time.perf_counter()
-        raw.put(ODOM, payload)
-        back = _await(returns, lambda p, sent=payload: p == sent)
+        echo_bus.put(ODOM, payload)
+        echoed = _wait_for(returns, lambda p, sent=payload: p == sent)
         end = time.perf_counter()
-        if number >= WARM_UP:
-            lost += (not there) + (not back)
-            loop_ms += [(middle - began) * 1e3] if there else []
-            raw_ms += [(end - middle) * 1e3] if back else []
+        if number >= WARM_UP_SCANS:
+            lost += (not answered) + (not echoed)
+            loop_ms += [(middle - began) * 1e3] if answered else []
+            raw_ms += [(end - middle) * 1e3] if echoed else []
         time.sleep(max(0.0, 1 / rate - (time.perf_counter() - began)))
     return {
         "scan_to_command_median_ms": float(np.median(loop_ms)),
@@ -114,7 +124,7 @@ def _measure(
     }  # fmt: skip
 
 
-def _await(inbox: Inbox, wanted: Any) -> bool:
+def _wait_for(inbox: Inbox, wanted: Any) -> bool:
     deadline = time.monotonic() + 2.0
     while (left := deadline - time.monotonic()) > 0:
         sample = inbox.get(left)
@@ -124,7 +134,10 @@ def _await(inbox: Inbox, wanted: Any) -> bool:
 
 
 def bench_latency(scans: int, rate: float, beams: int, json_file: Path | None, console: Console) -> int:
-    """Print, and write as JSON where asked."""
+    """Run the benchmark, print the table and write it to ``json_file`` if given.
+
+    Returns exit status 1 if a payload was not answered.
+    """
     check_file(json_file, "--json")
     result = latency(scans, rate, beams, console)
     table = Table(

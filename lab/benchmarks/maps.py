@@ -33,7 +33,7 @@ SCANS = 100
 def bench_map(
     world: str, size: int, beams: int, out: Path | None, seed: int, json_file: Path | None, console: Console
 ) -> int:
-    """Measure, print, and write where asked."""
+    """Run the benchmark, print the table and write it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
     if out is not None:
         make_folder(out, "--out")
@@ -51,7 +51,7 @@ def bench_map(
 
 
 def measure(path: str, beams: int, seed: int) -> list[tuple[str, float, str]]:
-    """What, how much, and its unit, of the world in that file; processor time, whatever else runs."""
+    """Rows (name, value, unit) for the world in the file ``path``. Times are processor times, not wall times."""
     rows: list[tuple[str, float, str]] = []
 
     def timed(name: str, work: Callable[[], Any], times: int = 1) -> Any:

@@ -29,13 +29,13 @@ from presage.session.stack import Stack
 from presage.terminal.output import check_file, write_json
 
 SERVICES = ("simulator", "estimator", "controller")
-WARM_UP = 3.0  # s not counted, before the first round
-MESSAGES = 20_000  # observed one after another
+WARM_UP_S = 3.0  # before the first round
+MESSAGES = 20_000  # for the cost of one message's histograms
 
 
 @dataclass
 class Cost:
-    """Of all rounds of one kind."""
+    """Totals over all rounds with, or all rounds without, scrapes."""
 
     seconds: float = 0.0
     cpu_s: Counter[str] = field(default_factory=Counter)  # by service
@@ -43,13 +43,13 @@ class Cost:
     scrape_bytes: int = 0
 
     def share(self, service: str) -> float:
-        """Of one core."""
+        """Share of one core that the service used."""
         return self.cpu_s[service] / self.seconds
 
 
 def measure(seconds: float, rounds: int, console: Console) -> tuple[Cost, Cost]:
-    """Without scrapes and with one a second from each service."""
-    without, having = Cost(), Cost()
+    """Costs unscraped, and with one scrape per second of each service; rounds alternate between the two."""
+    unscraped, scraped = Cost(), Cost()
     ports = {name: free_port() for name in SERVICES}
     with Stack("bench", quiet=True) as stack:
         stack.start_router()
@@ -57,37 +57,37 @@ def measure(seconds: float, rounds: int, console: Console) -> tuple[Cost, Cost]:
             stack.start(name, "--metrics", str(ports[name]))
         with open_bus(stack.link()) as bus:
             stack.wait_alive(bus)
-            time.sleep(WARM_UP)
+            time.sleep(WARM_UP_S)
             for number in track(range(2 * rounds), "without, with", console=console, transient=True):
-                cost = having if number % 2 else without
+                cost = scraped if number % 2 else unscraped
                 _round(stack, seconds, cost, ports if number % 2 else {})
-    return without, having
+    return unscraped, scraped
 
 
 def _round(stack: Stack, seconds: float, cost: Cost, ports: dict[str, int]) -> None:
-    before, began = _cpu(stack), time.monotonic()
+    before, began = _cpu_seconds(stack), time.monotonic()
     for second in range(int(seconds)):
         for port in ports.values():
-            at = time.perf_counter()
+            requested = time.perf_counter()
             try:
                 with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as answer:
                     cost.scrape_bytes = max(cost.scrape_bytes, len(answer.read()))
             except OSError as error:
-                raise UserError(f"no answer to a scrape: {error}") from None
-            cost.scrape_ms.append((time.perf_counter() - at) * 1e3)
+                raise UserError(f"port {port} did not answer a request for metrics: {error}") from None
+            cost.scrape_ms.append((time.perf_counter() - requested) * 1e3)
         stack.check()
         time.sleep(max(0.0, began + second + 1 - time.monotonic()))
     cost.seconds += time.monotonic() - began
-    cost.cpu_s.update({name: used - before[name] for name, used in _cpu(stack).items()})
+    cost.cpu_s.update({name: used - before[name] for name, used in _cpu_seconds(stack).items()})
 
 
-def _cpu(stack: Stack) -> dict[str, float]:
+def _cpu_seconds(stack: Stack) -> dict[str, float]:
     times = {name: psutil.Process(stack.processes[name].child.pid).cpu_times() for name in SERVICES}
     return {name: used.user + used.system for name, used in times.items()}
 
 
 def observation_us() -> float:
-    """Processor time that one message's histograms take."""
+    """Processor time in µs to record one message in the histograms."""
     metrics = ServiceMetrics("bench", "bench", Inbox(), dict)
     sample = Sample(SCAN, SCAN.key("bench"), b"", time.time_ns(), time.time_ns())
     began = time.process_time()
@@ -98,21 +98,21 @@ def observation_us() -> float:
 
 
 def bench_metrics(seconds: float, rounds: int, json_file: Path | None, console: Console) -> int:
-    """Print, and write as JSON where asked."""
+    """Run the benchmark, print the table and write it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
-    without, having = measure(seconds, rounds, console)
+    unscraped, scraped = measure(seconds, rounds, console)
     table = Table(title=f"{rounds} x {seconds:g} s each, one scrape a second", title_justify="left")
     for column in ("share of one core", "not scraped", "scraped"):
         table.add_column(column, justify="left" if column == "share of one core" else "right")
     for name in SERVICES:
-        table.add_row(name, *(f"{100 * cost.share(name):.1f} %" for cost in (without, having)))
+        table.add_row(name, *(f"{100 * cost.share(name):.1f} %" for cost in (unscraped, scraped)))
     console.print(table)
     result: dict[str, Any] = {
-        **{f"{name}_cpu_share_without": without.share(name) for name in SERVICES},
-        **{f"{name}_cpu_share_with": having.share(name) for name in SERVICES},
-        "scrape_median_ms": float(np.median(having.scrape_ms)),
-        "scrape_p99_ms": float(np.percentile(having.scrape_ms, 99)),
-        "scrape_bytes": having.scrape_bytes, "observation_us": observation_us(),
+        **{f"{name}_cpu_share_without": unscraped.share(name) for name in SERVICES},
+        **{f"{name}_cpu_share_with": scraped.share(name) for name in SERVICES},
+        "scrape_median_ms": float(np.median(scraped.scrape_ms)),
+        "scrape_p99_ms": float(np.percentile(scraped.scrape_ms, 99)),
+        "scrape_bytes": scraped.scrape_bytes, "observation_us": observation_us(),
         "seconds": seconds, "rounds": rounds, "commit": commit(), "versions": versions(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores", "arguments": sys.argv[1:],
     }  # fmt: skip

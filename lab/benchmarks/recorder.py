@@ -30,29 +30,29 @@ from presage.terminal.output import check_file, make_folder, write_json
 from services.recorder.files.message_counts import from_metadata
 from services.recorder.reader import read_recording
 
-NORMAL = 100.0  # messages/s of a running session: seven topics at 15 Hz, and health
-SENT = tuple(topic for topic in TOPICS if topic.recorded and not topic.per_service)
+NORMAL_RATE = 100.0  # messages/s of a normal session: seven topics at 15 Hz, and health
+LOAD_TOPICS = tuple(topic for topic in TOPICS if topic.recorded and not topic.per_service)
 LIMITS = {"core_share": 1.0, "memory_mb": 512.0}
-BURST = 0.005  # s
+SEND_INTERVAL_S = 0.005  # messages due within this time are sent together
 ROBOT = "bench"
 
 
 @dataclass(frozen=True)
 class Load:
-    """What is sent."""
+    """Messages sent to the recorder."""
 
-    rate: float = 20 * NORMAL  # messages/s, over all topics
+    rate: float = 20 * NORMAL_RATE  # messages/s, over all topics
     seconds: float = 60.0
-    beams: int = 811  # of each message, a scan of noise: 3.4 kB that hardly compress
+    beams: int = 811  # per message; each is a scan of random ranges, 3.4 kB that hardly compress
 
     @property
     def count(self) -> int:
-        """Messages in all."""
+        """Total number of messages."""
         return int(self.rate * self.seconds)
 
 
 def publish_main() -> None:
-    """Child process: sends the load, and leaves how many and their checksums by key."""
+    """Entry point of the publisher process: sends the load, then writes message counts and checksums by key."""
     job = json.loads(os.environ["BENCH_RECORDER"])
     load, rng = Load(**job["load"]), np.random.default_rng(0)
     ranges = rng.uniform(0.1, 25.0, (64, load.beams)).astype(np.float32)
@@ -61,25 +61,27 @@ def publish_main() -> None:
     from common.bus.bus import Link  # noqa: PLC0415
 
     with open_bus(Link(robot=ROBOT, connect=(os.environ["PRESAGE_CONNECT"],))) as bus:
-        for topic in SENT:
+        for topic in LOAD_TOPICS:
             if not bus.wait_matching(topic, 20):
-                raise SystemExit(f"nobody listens to {topic.name}")
+                raise SystemExit(f"no subscriber to {topic.name} within 20 s")
         sums, late = _send(bus, load, bodies)
-        sent = {topic.key(ROBOT): {"count": load.count // len(SENT), "crc": sums[topic]} for topic in SENT}
+        sent = {
+            topic.key(ROBOT): {"count": load.count // len(LOAD_TOPICS), "crc": sums[topic]} for topic in LOAD_TOPICS
+        }
         Path(job["result"]).write_text(json.dumps({"sent": sent, "late_s": late}), encoding="utf-8")
-        while True:  # the session stays open until all has been received; the parent ends us
+        while True:  # keep the session open until the recorder has received everything; the parent ends this process
             time.sleep(60)
 
 
 def _send(bus: Bus, load: Load, bodies: list[dict[str, Any]]) -> tuple[dict[Topic, int], float]:
-    """Checksum of each topic's bytes in their order, and how far behind the schedule the last message was, s."""
-    sums, began = dict.fromkeys(SENT, 0), time.monotonic()
-    for number in range(load.count // len(SENT) * len(SENT)):
+    """Send the load. Returns each topic's checksum over its payloads in order, and the last message's delay in s."""
+    sums, began = dict.fromkeys(LOAD_TOPICS, 0), time.monotonic()
+    for number in range(load.count // len(LOAD_TOPICS) * len(LOAD_TOPICS)):
         due = began + number / load.rate
-        if due - time.monotonic() > BURST:
-            time.sleep(BURST)
-        topic, body = SENT[number % len(SENT)], bodies[number % len(bodies)]
-        body["seq"], body["stamp_ns"] = number // len(SENT), int(number / load.rate * 1e9)
+        if due - time.monotonic() > SEND_INTERVAL_S:
+            time.sleep(SEND_INTERVAL_S)
+        topic, body = LOAD_TOPICS[number % len(LOAD_TOPICS)], bodies[number % len(bodies)]
+        body["seq"], body["stamp_ns"] = number // len(LOAD_TOPICS), int(number / load.rate * 1e9)
         payload = bytes(msgpack.packb(body))
         bus.put(topic, payload)
         sums[topic] = zlib.crc32(payload, sums[topic])
@@ -87,7 +89,7 @@ def _send(bus: Bus, load: Load, bodies: list[dict[str, Any]]) -> tuple[dict[Topi
 
 
 def measure(load: Load, folder: Path, console: Console) -> dict[str, Any]:
-    """Everything that is reported; the recording is left in ``folder``."""
+    """Run the benchmark and return its results. The recording stays in ``folder``."""
     result = folder / "sent.json"
     job = json.dumps({"load": asdict(load), "result": str(result)})
     with Stack(ROBOT, quiet=True, environment={**os.environ, "BENCH_RECORDER": job}) as stack:
@@ -97,7 +99,7 @@ def measure(load: Load, folder: Path, console: Console) -> dict[str, Any]:
             stack.wait_alive(bus)
             watch = Watch(bus, HEALTH)
             recorder = psutil.Process(stack.processes["recorder"].child.pid)
-            stack.start_code("publisher", "from lab.benchmarks.recorder import publish_main; publish_main()")
+            stack.start_python("publisher", "from lab.benchmarks.recorder import publish_main; publish_main()")
             used = _observe(stack, watch, recorder, load, result, console)
             if (status := stack.stop("recorder")) != 0:
                 raise UserError(f"the recorder ended with status {status}")
@@ -107,14 +109,14 @@ def measure(load: Load, folder: Path, console: Console) -> dict[str, Any]:
 def _observe(
     stack: Stack, watch: Watch, recorder: psutil.Process, load: Load, result: Path, console: Console
 ) -> dict[str, Any]:
-    """Processor time and memory of the recorder until it says that it has received everything."""
+    """Processor share and memory of the recorder until its health message reports that it received everything."""
     columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
     memory, before, began = 0, recorder.cpu_times(), time.monotonic()
     first_mb = recorder.memory_info().rss / 1e6
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("recording", total=load.count)
         received = 0
-        while received < load.count // len(SENT) * len(SENT):
+        while received < load.count // len(LOAD_TOPICS) * len(LOAD_TOPICS):
             stack.check()
             if time.monotonic() - began > 60 + 4 * load.seconds:
                 raise UserError(f"only {received} of {load.count} messages arrived: is this machine busy?")
@@ -133,7 +135,7 @@ def _observe(
 
 
 def _compare(sent: dict[str, Any], file: Path) -> dict[str, Any]:
-    """What is in the file against what was sent, by count, by number and by the bytes' checksum."""
+    """Compare the recording with what was sent: counts, and checksums over the payloads."""
     recording = read_recording(file)
     sums, numbers, intact = dict.fromkeys(sent["sent"], 0), dict.fromkeys(sent["sent"], 0), True
     for raw in recording.payloads(sent["sent"].keys()):
@@ -157,30 +159,35 @@ def _compare(sent: dict[str, Any], file: Path) -> dict[str, Any]:
 
 
 def bench_recorder(load: Load, out: Path | None, json_file: Path | None, console: Console) -> int:
-    """Print, and write as JSON where asked; status 1 where anything is lost or a limit is passed."""
+    """Run the benchmark, print the table and write it to ``json_file`` if given.
+
+    Returns exit status 1 if a message was lost or altered, or if a limit was exceeded.
+    """
     check_file(json_file, "--json")
-    if load.count < len(SENT):
-        raise UserError(f"--seconds {load.seconds:g} at --rate {load.rate:g} are too few messages: ask for more")
+    if load.count < len(LOAD_TOPICS):
+        raise UserError(
+            f"--seconds {load.seconds:g} at --rate {load.rate:g} give less than one message per topic: increase either"
+        )
     if out is not None:
         make_folder(out, "--out")
     with tempfile.TemporaryDirectory() as folder:
-        found = measure(load, out or Path(folder), console)
+        result = measure(load, out or Path(folder), console)
     table = Table(
-        title=f"{load.rate:g} messages/s of {load.beams} beams, {load.rate / NORMAL:g} times the normal load",
+        title=f"{load.rate:g} messages/s of {load.beams} beams, {load.rate / NORMAL_RATE:g} times the normal load",
         title_justify="left",
     )
     for column in ("", "measured", "limit"):
         table.add_column(column, justify="right" if column else "left")
     for name in ("sent", "received", "written", "in_file"):
-        table.add_row(name.replace("_", " "), str(found[name]), str(found["sent"]))
+        table.add_row(name.replace("_", " "), str(result[name]), str(result["sent"]))
     for name in ("dropped", "missing"):
-        table.add_row(name, str(found[name]), "0")
-    table.add_row("bytes and order as sent", "yes" if found["bytes_as_sent"] else "NO", "yes")
-    table.add_row("share of one core", f"{found['core_share']:.2f}", f"{LIMITS['core_share']:g}")
-    table.add_row("memory at most (MB)", f"{found['memory_mb']:.0f}", f"{LIMITS['memory_mb']:g}")
-    table.add_row("file (MB)", f"{found['file_mb']:.1f}", "")
+        table.add_row(name, str(result[name]), "0")
+    table.add_row("bytes and order as sent", "yes" if result["bytes_as_sent"] else "NO", "yes")
+    table.add_row("share of one core", f"{result['core_share']:.2f}", f"{LIMITS['core_share']:g}")
+    table.add_row("memory at most (MB)", f"{result['memory_mb']:.0f}", f"{LIMITS['memory_mb']:g}")
+    table.add_row("file (MB)", f"{result['file_mb']:.1f}", "")
     console.print(table)
-    about = {"limits": LIMITS, "load": asdict(load), "commit": commit(), "versions": versions(), "seed": 0}
-    write_json(json_file, found | about | {"arguments": sys.argv[1:]})
-    whole = found["bytes_as_sent"] and found["written"] == found["received"] == found["sent"] == found["in_file"]
-    return 0 if whole and not found["dropped"] and all(found[k] <= v for k, v in LIMITS.items()) else 1
+    context = {"limits": LIMITS, "load": asdict(load), "commit": commit(), "versions": versions(), "seed": 0}
+    write_json(json_file, result | context | {"arguments": sys.argv[1:]})
+    whole = result["bytes_as_sent"] and result["written"] == result["received"] == result["sent"] == result["in_file"]
+    return 0 if whole and not result["dropped"] and all(result[k] <= v for k, v in LIMITS.items()) else 1

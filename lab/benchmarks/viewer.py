@@ -30,20 +30,20 @@ from presage.session.ports import free_port
 from presage.session.stack import Stack
 from presage.terminal.output import check_file, write_json
 
-WARM_UP = 3.0  # s not counted, of every round
-PATIENCE = 60.0  # s
+WARM_UP_S = 3.0  # at the start of every round, left out of the statistics
+TIMEOUT_S = 60.0
 ROBOT = "bench"
 
 
 class Visitor:
-    """A page that takes every frame, and does nothing with it."""
+    """A client that receives every frame, as a browser would, and only counts them."""
 
     def __init__(self, port: int) -> None:
-        """Connect and watch; raises UserError where the page's socket does not answer."""
+        """Connect and watch the robot. Raises UserError if the viewer's web socket does not answer."""
         self.frames = self.bytes = 0
         try:
             origin, where = Origin(f"http://127.0.0.1:{port}"), f"ws://127.0.0.1:{port}/ws"
-            self._socket: ClientConnection = connect(where, origin=origin, open_timeout=PATIENCE)
+            self._socket: ClientConnection = connect(where, origin=origin, open_timeout=TIMEOUT_S)
         except (OSError, TimeoutError) as error:
             raise UserError(f"the viewer's socket at port {port} does not answer: {error}") from None
         self._socket.send(json.dumps({"id": 1, "do": "watch", "robot": ROBOT}))
@@ -60,14 +60,14 @@ class Visitor:
             return
 
     def close(self) -> None:
-        """Leave."""
+        """Close the web socket."""
         self._socket.close()
         self._thread.join(5)
 
 
 @dataclass
 class Cost:
-    """Of all rounds of one kind."""
+    """Totals over all rounds with, or all rounds without, the viewer."""
 
     latency_ms: list[float] = field(default_factory=list)
     unanswered: int = 0
@@ -79,8 +79,8 @@ class Cost:
 
 
 def measure(seconds: float, rounds: int, beams: int, console: Console) -> dict[str, Any]:
-    """Rounds of ``seconds`` s without the viewer and with it, in turn, in one session; what is reported."""
-    without, having = Cost(), Cost()
+    """Run rounds of ``seconds`` s without and with the viewer, alternating, in one session. Returns the results."""
+    without, viewed = Cost(), Cost()
     with Stack(ROBOT, quiet=True) as stack:
         stack.start_router()
         stack.start("controller")
@@ -90,23 +90,23 @@ def measure(seconds: float, rounds: int, beams: int, console: Console) -> dict[s
             stack.wait_alive(bus)
             _first_command(bus, stack)
             for number in track(range(2 * rounds), "without, with", console=console, transient=True):
-                (_with_viewer if number % 2 else _without)(bus, stack, seconds, having if number % 2 else without)
-    return _report(without, having, seconds, rounds, beams)
+                (_with_viewer if number % 2 else _without)(bus, stack, seconds, viewed if number % 2 else without)
+    return _report(without, viewed, seconds, rounds, beams)
 
 
 def _first_command(bus: Bus, stack: Stack) -> None:
     inbox = Inbox()
     bus.subscribe(CMD_VEL, inbox)
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + TIMEOUT_S
     while inbox.get(0.5) is None:
         stack.check()
         if time.monotonic() > deadline:
-            raise UserError(f"no command came within {PATIENCE:g} s")
+            raise UserError(f"the controller sent no velocity command within {TIMEOUT_S:g} s")
 
 
 def _without(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None:
-    time.sleep(WARM_UP)
-    _listen(bus, stack, seconds, cost)
+    time.sleep(WARM_UP_S)
+    _measure_latency(bus, stack, seconds, cost)
 
 
 def _with_viewer(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None:
@@ -115,12 +115,12 @@ def _with_viewer(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None:
     stack.wait_alive(bus)
     visitor = Visitor(port)
     try:
-        if not wait_until(lambda: visitor.frames > 0, PATIENCE):
-            raise UserError(f"the viewer sent no frame within {PATIENCE:g} s")
-        time.sleep(WARM_UP)
+        if not wait_until(lambda: visitor.frames > 0, TIMEOUT_S):
+            raise UserError(f"the viewer sent no frame within {TIMEOUT_S:g} s")
+        time.sleep(WARM_UP_S)
         process = psutil.Process(stack.processes["viewer"].child.pid)
         before, frames, size = process.cpu_times(), visitor.frames, visitor.bytes
-        _listen(bus, stack, seconds, cost)
+        _measure_latency(bus, stack, seconds, cost)
         after = process.cpu_times()
         cost.cpu_s += after.user + after.system - before.user - before.system
         cost.memory_mb = max(cost.memory_mb, process.memory_info().rss / 1e6)
@@ -130,8 +130,8 @@ def _with_viewer(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None:
     stack.stop("viewer")
 
 
-def _listen(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None:
-    """Between a scan's publication and its command's, by the publishers' clock, which is this machine's."""
+def _measure_latency(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None:
+    """Record the time from each scan's publication to its command's. All publishers use this machine's clock."""
     inbox, scans = Inbox(), dict[int, int]()
     ends = [bus.subscribe(topic, inbox, keep_all=True) for topic in (SCAN, CMD_VEL)]
     began = time.monotonic()
@@ -146,14 +146,14 @@ def _listen(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None:
         elif stamp in scans:
             cost.latency_ms.append((sample.published_ns - scans.pop(stamp)) * 1e-6)
     cost.seconds += time.monotonic() - began
-    cost.unanswered += max(0, len(scans) - 1)  # the last one's command was still to come
+    cost.unanswered += max(0, len(scans) - 1)  # the last scan's command may still be under way
     for end in ends:
         end()
 
 
-def _report(without: Cost, having: Cost, seconds: float, rounds: int, beams: int) -> dict[str, Any]:
+def _report(without: Cost, viewed: Cost, seconds: float, rounds: int, beams: int) -> dict[str, Any]:
     numbers: dict[str, Any] = {}
-    for name, cost in (("without", without), ("with", having)):
+    for name, cost in (("without", without), ("with", viewed)):
         if not cost.latency_ms:
             raise UserError(f"no scan was answered {name} the viewer")
         numbers[f"scan_to_command_median_{name}_ms"] = float(np.median(cost.latency_ms))
@@ -161,15 +161,15 @@ def _report(without: Cost, having: Cost, seconds: float, rounds: int, beams: int
         numbers[f"unanswered_{name}"] = cost.unanswered
     return {
         **numbers,
-        "viewer_cpu_share": having.cpu_s / having.seconds, "viewer_memory_mb": having.memory_mb,
-        "frames_hz": having.frames / having.seconds, "frame_bytes": having.bytes / max(1, having.frames),
+        "viewer_cpu_share": viewed.cpu_s / viewed.seconds, "viewer_memory_mb": viewed.memory_mb,
+        "frames_hz": viewed.frames / viewed.seconds, "frame_bytes": viewed.bytes / max(1, viewed.frames),
         "seconds": seconds, "rounds": rounds, "beams": beams, "commit": commit(), "versions": versions(),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores", "arguments": sys.argv[1:],
     }  # fmt: skip
 
 
 def bench_viewer(seconds: float, rounds: int, beams: int, json_file: Path | None, console: Console) -> int:
-    """Print, and write as JSON where asked."""
+    """Run the benchmark, print the table and write it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
     result = measure(seconds, rounds, beams, console)
     table = Table(title=f"{beams} beams, {rounds} x {seconds:g} s each, one visitor", title_justify="left")

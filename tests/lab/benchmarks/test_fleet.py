@@ -12,7 +12,7 @@ from common.bus.inbox import Inbox, Sample
 from common.geometry.world import load_world
 from common.messages.definitions import Belief, Pose
 from common.messages.topics import BELIEF, SCAN
-from lab.benchmarks.fleet import most_served
+from lab.benchmarks.fleet import max_robots_served
 from lab.benchmarks.fleet_load import CLEARANCE, RADIUS, Load
 
 
@@ -24,7 +24,7 @@ def test_the_most_that_is_served_is_found_in_few_tries(limit):
         tried.append(count)
         return count <= limit
 
-    assert most_served(served, 32) == limit
+    assert max_robots_served(served, 32) == limit
     assert len(tried) == len(set(tried)) <= 7
     assert all(1 <= count <= 32 for count in tried)
 
