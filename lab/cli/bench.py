@@ -11,18 +11,18 @@ from common.robot.scanner import SCANNERS
 from presage.cli.security import secured
 from presage.terminal.options import Json, WorldName, console
 
-app = typer.Typer(help="Measure, with a peer or a limit in the same run.", no_args_is_help=True)
+app = typer.Typer(help="Benchmarks. Each compares with a baseline or a limit in the same run.", no_args_is_help=True)
 
 
 @app.command("latency")
 @secured
 def bench_latency(
-    scans: Annotated[int, typer.Option(min=10)] = 300,
-    rate: Annotated[float, typer.Option(min=1, max=1000, help="Scans a second.")] = 15.0,
-    beams: Annotated[int, typer.Option(help="Beams of a scan.")] = 622,
+    scans: Annotated[int, typer.Option(min=10, help="Number of scans to measure.")] = 300,
+    rate: Annotated[float, typer.Option(min=1, max=1000, help="Scans per second.")] = 15.0,
+    beams: Annotated[int, typer.Option(help="Beams per scan.")] = 622,
     json_file: Json = None,
 ) -> None:
-    """From scan to command through the real services, beside zenoh's own round trip of the same bytes.
+    """Latency from scan to velocity command through the real services, compared with a plain zenoh round trip.
 
     Examples: `presage bench latency --json latency.json`; `presage bench latency --security keys` (TLS, roles).
     """
@@ -33,12 +33,12 @@ def bench_latency(
 
 @app.command("viewer")
 def bench_viewer(
-    seconds: Annotated[float, typer.Option(min=1.0, help="Of one round.")] = 20.0,
-    rounds: Annotated[int, typer.Option(min=1, help="Without and with, so often.")] = 3,
-    beams: Annotated[int, typer.Option(help="Beams of a scan.")] = 622,
+    seconds: Annotated[float, typer.Option(min=1.0, help="Duration of one round, s.")] = 20.0,
+    rounds: Annotated[int, typer.Option(min=1, help="Number of rounds without and with the page.")] = 3,
+    beams: Annotated[int, typer.Option(help="Beams per scan.")] = 622,
     json_file: Json = None,
 ) -> None:
-    """The live page's processor time with one visitor, and the loop's latency with and without it.
+    """Processor time of the live page with one browser, and the control loop's latency with and without the page.
 
     Example: `presage bench viewer --json viewer.json`.
     """
@@ -49,14 +49,14 @@ def bench_viewer(
 
 @app.command("map")
 def bench_map(
-    world: Annotated[str, typer.Option(help="A map.yaml of yours, or any world; none: one that is made.")] = "",
-    size: Annotated[int, typer.Option(min=200, max=4000, help="Cells along each side of the one that is made.")] = 1000,
-    beams: Annotated[int, typer.Option(min=2, help="Beams of a scan.")] = 622,
-    out: Annotated[Path | None, typer.Option(help="Keep the map that is made in this folder.")] = None,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    world: Annotated[str, typer.Option(help="A ROS map.yaml or any world. Default: a generated map.")] = "",
+    size: Annotated[int, typer.Option(min=200, max=4000, help="Cells per side of the generated map.")] = 1000,
+    beams: Annotated[int, typer.Option(min=2, help="Beams per scan.")] = 622,
+    out: Annotated[Path | None, typer.Option(help="Folder in which to keep the generated map.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 0,
     json_file: Json = None,
 ) -> None:
-    """What a ROS map of many cells takes: to load, to send, to scan in, to plan on.
+    """Costs of a large ROS map: loading it, sending it, casting rays in it and planning on it.
 
     Examples: `presage bench map`; `presage bench map --world my/map.yaml`; `presage bench map --size 2000 --out made`.
     """
@@ -67,11 +67,11 @@ def bench_map(
 
 @app.command("metrics")
 def bench_metrics(
-    seconds: Annotated[float, typer.Option(min=1.0, help="Of one round.")] = 20.0,
-    rounds: Annotated[int, typer.Option(min=1, help="Without and with scrapes, so often.")] = 3,
+    seconds: Annotated[float, typer.Option(min=1.0, help="Duration of one round, s.")] = 20.0,
+    rounds: Annotated[int, typer.Option(min=1, help="Number of rounds without and with scrapes.")] = 3,
     json_file: Json = None,
 ) -> None:
-    """What Prometheus costs each service: scraped once a second or not at all, in turn, in one session.
+    """Processor time that Prometheus metrics cost each service: rounds with one scrape per second, and without.
 
     Examples: `presage bench metrics`; `presage bench metrics --seconds 5 --rounds 1 --json metrics.json`.
     """
@@ -83,13 +83,13 @@ def bench_metrics(
 @app.command("localisation")
 def bench_localisation(
     world: WorldName = "corridor",
-    beams: Annotated[int, typer.Option(help="Beams of a scan.")] = 622,
-    trials: Annotated[int, typer.Option(min=1)] = 100,
-    scans: Annotated[int, typer.Option(min=1, help="Fresh scans of each trial.")] = 25,
-    seed: Annotated[int, typer.Option(min=0)] = 1,
+    beams: Annotated[int, typer.Option(help="Beams per scan.")] = 622,
+    trials: Annotated[int, typer.Option(min=1, help="Number of random places.")] = 100,
+    scans: Annotated[int, typer.Option(min=1, help="Scans per trial.")] = 25,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
     json_file: Json = None,
 ) -> None:
-    """How often preset paper finds a standing robot from the map's centre.
+    """How often preset paper, starting at the map's centre, localises a standing robot.
 
     Example: `presage bench localisation --trials 20`.
     """
@@ -100,30 +100,37 @@ def bench_localisation(
 
 @app.command("accuracy")
 def bench_accuracy(
-    worlds: Annotated[str, typer.Option(help="Comma-separated.")] = "office",
+    worlds: Annotated[str, typer.Option(help="Comma-separated worlds.")] = "office",
     beams: Annotated[
-        str, typer.Option(help="Comma-separated; none: the scanner's own, of tim571 the paper's 622.")
+        str,
+        typer.Option(
+            help="Comma-separated numbers of beams. Default: the scanner's own; for tim571 622, as in the paper."
+        ),
     ] = "",
     estimators: Annotated[
-        str, typer.Option(help="Of precise, precise-exact, particle-filter, amcl-defaults.")
+        str, typer.Option(help="Comma-separated: precise, precise-exact, particle-filter, amcl-defaults.")
     ] = "precise,precise-exact,particle-filter",
     tasks: Annotated[
-        str, typer.Option(help="Of standing, blocked, kidnapped, tracking, odometry, twins; empty: all.")
+        str,
+        typer.Option(help="Comma-separated: standing, blocked, kidnapped, tracking, odometry, twins. Default: all."),
     ] = "",
-    trials: Annotated[int, typer.Option(min=2, help="Places of each task.")] = 100,
+    trials: Annotated[int, typer.Option(min=2, help="Number of places per task.")] = 100,
     minutes: Annotated[
-        float, typer.Option(min=0.05, help="Of each path that is tracked, at the scanner's rate.")
+        float, typer.Option(min=0.05, help="Duration of each tracked path, at the scanner's rate.")
     ] = 2.0,
-    seed: Annotated[int, typer.Option(min=0, max=2**31)] = 1,
-    workers: Annotated[int, typer.Option(min=1, help="Processes side by side.")] = 2,
+    seed: Annotated[int, typer.Option(min=0, max=2**31, help="Random seed.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Number of processes that run in parallel.")] = 2,
     json_file: Json = None,
-    figure: Annotated[Path | None, typer.Option(help="PNG, SVG or PDF.")] = None,
-    markdown: Annotated[bool, typer.Option("--markdown", help="A short table as in README.")] = False,
+    figure: Annotated[Path | None, typer.Option(help="File for a figure: PNG, SVG or PDF.")] = None,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print a short Markdown table, as in README.")] = False,
     scanner: Annotated[
-        str, typer.Option(help=f"Of {', '.join(SCANNERS)}, or files (docs/scanners.md); comma-separated.")
+        str, typer.Option(help=f"Comma-separated: {', '.join(SCANNERS)}, or scanner files (docs/scanners.md).")
     ] = "tim571",
 ) -> None:
-    """Estimators and the Cramér-Rao bound side by side: from nothing, tracking, kidnapped, blocked, two rooms alike.
+    """Accuracy of the estimators compared with the Cramér-Rao bound.
+
+    The tasks: global localisation of a standing robot, also with blocked beams; kidnapping; tracking with and without
+    odometry; and two identical rooms.
 
     Examples: `presage bench accuracy --trials 20 --minutes 0.5`;
     `presage bench accuracy --tasks standing --trials 1000 --estimators precise`;
@@ -142,11 +149,11 @@ def bench_accuracy(
 @app.command("speed")
 def bench_speed(
     world: WorldName = "office",
-    beams: Annotated[str, typer.Option(help="Comma-separated.")] = "622,811",
-    seed: Annotated[int, typer.Option(min=0, max=2**31)] = 1,
+    beams: Annotated[str, typer.Option(help="Comma-separated numbers of beams.")] = "622,811",
+    seed: Annotated[int, typer.Option(min=0, max=2**31, help="Random seed.")] = 1,
     json_file: Json = None,
 ) -> None:
-    """Milliseconds an update and memory of every estimator, one core, one process each.
+    """Update time and memory of every estimator on one core, each in its own process.
 
     Example: `presage bench speed --beams 622 --json speed.json`.
     """
@@ -158,12 +165,12 @@ def bench_speed(
 @app.command("decoders")
 def bench_decoders(
     world: WorldName = "office",
-    samples: Annotated[int, typer.Option(min=100, help="Scans to learn from.")] = 5000,
-    steps: Annotated[int, typer.Option(min=1, help="Of each network's training, 256 scans each.")] = 3000,
-    seed: Annotated[int, typer.Option(min=0, max=2**31)] = 0,
+    samples: Annotated[int, typer.Option(min=100, help="Number of training scans.")] = 5000,
+    steps: Annotated[int, typer.Option(min=1, help="Training steps of each network, 256 scans each.")] = 3000,
+    seed: Annotated[int, typer.Option(min=0, max=2**31, help="Random seed.")] = 0,
     json_file: Json = None,
 ) -> None:
-    """Generative models that were tried, learned from the same scans: error, size, training time.
+    """Error, size and training time of alternative generative models, all trained on the same scans.
 
     Example: `presage bench decoders --steps 300 --json decoders.json`.
     """
@@ -174,13 +181,17 @@ def bench_decoders(
 
 @app.command("recorder")
 def bench_recorder(
-    rate: Annotated[float, typer.Option(min=1, max=100_000, help="Messages a second; a session has about 100.")] = 2000,
-    seconds: Annotated[float, typer.Option(min=0.1, help="How long.")] = 60.0,
-    beams: Annotated[int, typer.Option(min=1, max=100_000, help="Of each message; 811 are 3.4 kB.")] = 811,
-    out: Annotated[Path | None, typer.Option(help="Folder that keeps the recording; none: it is removed.")] = None,
+    rate: Annotated[
+        float, typer.Option(min=1, max=100_000, help="Messages per second; a normal session has about 100.")
+    ] = 2000,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Duration, s.")] = 60.0,
+    beams: Annotated[int, typer.Option(min=1, max=100_000, help="Beams per message; 811 are 3.4 kB.")] = 811,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder in which to keep the recording. Default: it is deleted.")
+    ] = None,
     json_file: Json = None,
 ) -> None:
-    """Twenty times the normal load into a real recorder: nothing lost, every byte as sent, memory and processor.
+    """A real recorder under twenty times the normal load: lost or altered messages, memory and processor time.
 
     Examples: `presage bench recorder`; `presage bench recorder --seconds 10 --rate 5000 --json recorder.json`.
     """
@@ -192,17 +203,23 @@ def bench_recorder(
 
 @app.command("chaos")
 def bench_chaos(
-    faults: Annotated[list[str] | None, typer.Argument(help="Names of faults, such as 'killed*'; none: all.")] = None,
-    repeats: Annotated[int, typer.Option(min=1, help="Of each fault.")] = 1,
-    one_host: Annotated[bool, typer.Option("--one-host", help="No network namespaces: fewer faults.")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="With the lines of all processes.")] = False,
-    markdown: Annotated[bool, typer.Option("--markdown", help="The table as docs/faults.md has it.")] = False,
+    faults: Annotated[
+        list[str] | None, typer.Argument(help="Names of faults; 'killed*' selects several. Default: all.")
+    ] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="How often to inject each fault.")] = 1,
+    one_host: Annotated[
+        bool, typer.Option("--one-host", help="Use no network namespaces; skips faults that need several hosts.")
+    ] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show the output of all processes.")] = False,
+    markdown: Annotated[
+        bool, typer.Option("--markdown", help="Print the table as Markdown, as in docs/faults.md.")
+    ] = False,
     json_file: Json = None,
 ) -> None:
-    """What happens when a part dies, freezes, is cut off, is doubled, or when somebody sends noise.
+    """Injects faults into a running system: processes that die, freeze or start twice, bad networks, random payloads.
 
-    A real system drives to and fro; each fault comes at full speed. Robot, estimator and the rest are on three hosts
-    of their own where this machine allows network namespaces (Linux; as root, or with user namespaces).
+    A real system drives back and forth, and each fault happens at full speed. Where this machine allows network
+    namespaces (Linux; as root, or with user namespaces), the robot, the estimator and the rest run on three hosts.
 
     Examples: `presage bench chaos`, `presage bench chaos 'killed*' --repeats 3 --json chaos.json`.
     """
@@ -215,23 +232,30 @@ def bench_chaos(
 
 @app.command("fleet")
 def bench_fleet(
-    estimators: Annotated[str, typer.Option(help="Of precise, paper; comma-separated.")] = "precise,paper",
+    estimators: Annotated[str, typer.Option(help="Comma-separated: precise, paper.")] = "precise,paper",
     world: WorldName = "corridor",
-    beams: Annotated[int, typer.Option(min=1, help="Of a scan.")] = 622,
-    rate: Annotated[float, typer.Option(min=1, max=100, help="Scans a second of each robot.")] = 15.0,
-    seconds: Annotated[float, typer.Option(min=1, help="That each number of robots is tried.")] = 6.0,
-    most: Annotated[int, typer.Option(min=1, max=200, help="Robots that are tried at most.")] = 32,
+    beams: Annotated[int, typer.Option(min=1, help="Beams per scan.")] = 622,
+    rate: Annotated[float, typer.Option(min=1, max=100, help="Scans per second of each robot.")] = 15.0,
+    seconds: Annotated[
+        float, typer.Option(min=1, help="Duration of the measurement for each number of robots, s.")
+    ] = 6.0,
+    most: Annotated[int, typer.Option(min=1, max=200, help="Largest number of robots to try.")] = 32,
     share: Annotated[
-        float, typer.Option(min=0.5, max=1.0, help="Of the scans, to be answered within a period: counts as served.")
+        float,
+        typer.Option(
+            min=0.5, max=1.0, help="Share of the scans that must be answered within a scan period to count as served."
+        ),
     ] = 0.999,
-    quick: Annotated[bool, typer.Option("--quick", help="Precise alone, 3 s each, 8 robots at most.")] = False,
-    seed: Annotated[int, typer.Option(min=0, max=2**31)] = 1,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Only estimator precise, 3 s per measurement, at most 8 robots.")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, max=2**31, help="Random seed.")] = 1,
     json_file: Json = None,
 ) -> None:
-    """How many robots one core serves with every scan answered in time: one estimator process, and one process each.
+    """How many robots one core can serve in time: with one estimator process for all, or one process per robot.
 
-    The estimators share one core; scans are cast beforehand and played from the other cores. Both ways run in turn on
-    the same machine: compare them with one another, for the numbers themselves are this machine's.
+    The estimators share one core. Scans are computed beforehand and sent from the other cores. Compare the two
+    deployments with one another: the absolute numbers depend on the machine.
 
     Examples: `presage bench fleet`; `presage bench fleet --quick`;
     `presage bench fleet --estimators precise --most 64 --json fleet.json`.
@@ -247,11 +271,11 @@ def bench_fleet(
 
 @app.command("hosts")
 def bench_hosts(
-    seconds: Annotated[float, typer.Option(min=5.0, help="That are measured.")] = 30.0,
-    beams: Annotated[int, typer.Option(min=2, help="Beams of a scan.")] = 622,
+    seconds: Annotated[float, typer.Option(min=5.0, help="Duration of the measurement, s.")] = 30.0,
+    beams: Annotated[int, typer.Option(min=2, help="Beams per scan.")] = 622,
     json_file: Json = None,
 ) -> None:
-    """What the links between robot, estimator and the rest carry, and how late things come, on three hosts.
+    """Network traffic and delays with the robot, the estimator and the rest on three hosts.
 
     The hosts are network namespaces on this machine (Linux; as root, or with user namespaces).
 

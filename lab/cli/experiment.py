@@ -29,18 +29,18 @@ from presage.terminal.options import console
 from presage.terminal.output import make_folder
 
 app = typer.Typer(
-    help="The experiments of Burghardt & Lanillos 2021, for presets paper and precise and the particle filter; and "
-    "navigation round walls and people.",
+    help="The experiments of Burghardt & Lanillos 2021 with presets paper and precise and the particle filter, "
+    "navigation around walls and people, and localisation on real logs.",
     no_args_is_help=True,
 )
 
-FEWEST = 50  # samples that anything can be learned from
+MIN_TRAINING_SAMPLES = 50
 
 
 @app.command("e1")
 def e1(
     trials: Trials = 100,
-    iterations: Annotated[int, typer.Option(min=1, help="Scans of each trial.")] = 50,
+    iterations: Annotated[int, typer.Option(min=1, help="Scans per trial.")] = 50,
     estimators: Estimators = "",
     alpha: Alpha = None,
     steps: Steps = None,
@@ -50,7 +50,7 @@ def e1(
     out: Out = OUT,
     workers: Workers = CORES,
 ) -> None:
-    """E1: where is a standing robot? Error against iterations.
+    """E1: global localisation of a standing robot; error over iterations.
 
     Examples: `presage experiment e1 --trials 5`; `presage experiment e1 --alpha 5e-4 --out slow`;
     `presage experiment e1 --estimators "paper,precise" --iterations 200`.
@@ -66,7 +66,7 @@ def e1(
 @app.command("e2")
 def e2(
     trials: Trials = 12,
-    step: Annotated[float, typer.Option(min=1e-3, max=1.0, help="m, of each teleport.")] = 0.05,
+    step: Annotated[float, typer.Option(min=1e-3, max=1.0, help="Length of each teleport, m.")] = 0.05,
     estimators: Estimators = "",
     alpha: Alpha = None,
     steps: Steps = None,
@@ -76,7 +76,7 @@ def e2(
     out: Out = OUT,
     workers: Workers = CORES,
 ) -> None:
-    """E2: crossing the map by small teleports at one heading. Error over time, with and without odometry.
+    """E2: crossing the map by small teleports at constant heading; error over time, with and without odometry.
 
     Examples: `presage experiment e2 --trials 2`; `presage experiment e2 --step 0.02 --out slower`.
     """
@@ -91,9 +91,11 @@ def e2(
 @app.command("e3")
 def e3(
     trials: Trials = 50,
-    apart: Annotated[float, typer.Option(min=1.0, max=1000.0, help="m, between start and goal at least.")] = 12.0,
+    apart: Annotated[
+        float, typer.Option(min=1.0, max=1000.0, help="Minimum distance between start and goal, m.")
+    ] = 12.0,
     free: Annotated[
-        bool, typer.Option("--free/--any", help="Free straight line from start to goal, or any pair of places.")
+        bool, typer.Option("--free/--any", help="Require a free straight line from start to goal, or allow any pair.")
     ] = True,
     estimators: Estimators = "",
     alpha: Alpha = None,
@@ -120,12 +122,12 @@ def e3(
 @app.command("alpha")
 def alpha_sweep(
     trials: Trials = 25,
-    alphas: Annotated[str, typer.Option(help="Comma-separated, m²; empty: 2e-4 to 2e-2.")] = "",
+    alphas: Annotated[str, typer.Option(help="Comma-separated step sizes, m². Default: 2e-4 to 2e-2.")] = "",
     seed: ExperimentSeed = 1,
     out: Out = OUT,
     workers: Workers = CORES,
 ) -> None:
-    """The paper's step size α, swept on E1.
+    """E1 with a range of values for the paper's step size α.
 
     Examples: `presage experiment alpha --trials 10`; `presage experiment alpha --alphas 5e-4,1e-3,2e-3`.
     """
@@ -133,17 +135,17 @@ def alpha_sweep(
     from lab.paper import e1_localisation as localisation  # noqa: PLC0415
 
     try:
-        wanted = tuple(float(part) for part in alphas.split(",")) if alphas else step_size.ALPHAS
+        values = tuple(float(part) for part in alphas.split(",")) if alphas else step_size.ALPHAS
     except ValueError:
         raise UserError(f"--alphas {alphas!r}: give numbers, such as 2e-4,4e-4") from None
-    if not all(1e-8 <= value <= 1 for value in wanted):
+    if not all(1e-8 <= value <= 1 for value in values):
         raise UserError(f"--alphas {alphas!r}: each must lie between 1e-8 and 1 m²")
-    show(step_size, lambda: step_size.run(localisation.Job(0, seed, 50), trials, out, workers, console, wanted), out)
+    show(step_size, lambda: step_size.run(localisation.Job(0, seed, 50), trials, out, workers, console, values), out)
 
 
 @app.command("steps")
 def step_sizes(trials: Trials = 10, seed: ExperimentSeed = 1, out: Out = OUT, workers: Workers = CORES) -> None:
-    """The step sizes β and γ on E3 in one process, and the paper's own loop of teleports: where 12.5 iterations lie.
+    """E3 with a range of step sizes β and γ, also with the paper's teleports: which give the paper's 12.5 iterations.
 
     Example: `presage experiment steps --trials 2`.
     """
@@ -154,35 +156,37 @@ def step_sizes(trials: Trials = 10, seed: ExperimentSeed = 1, out: Out = OUT, wo
 
 @app.command("samples")
 def samples_needed(
-    sizes: Annotated[str, typer.Option(help="Comma-separated; empty: 500 to 13000.")] = "",
-    places: Annotated[int, typer.Option(min=1, help="To find, after learning.")] = 50,
+    sizes: Annotated[
+        str, typer.Option(help="Comma-separated numbers of training samples. Default: 100 to 13000.")
+    ] = "",
+    places: Annotated[int, typer.Option(min=1, help="Places to localise at after training.")] = 50,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
     workers: Workers = CORES,
 ) -> None:
-    """Fewer samples: error of what is predicted, and of the places found with it.
+    """Prediction error and localisation error as functions of the number of training samples.
 
-    Examples: `presage experiment samples --sizes 500,2000 --places 10`.
+    Example: `presage experiment samples --sizes 500,2000 --places 10`.
     """
     from lab.paper import samples  # noqa: PLC0415
 
     try:
-        wanted = tuple(int(part) for part in sizes.split(",")) if sizes else samples.SIZES
+        values = tuple(int(part) for part in sizes.split(",")) if sizes else samples.SIZES
     except ValueError:
         raise UserError(f"--sizes {sizes!r}: give whole numbers, such as 500,2000") from None
-    if min(wanted) < FEWEST:
-        raise UserError(f"--sizes {sizes!r}: each must be at least {FEWEST} samples")
-    show(samples, lambda: samples.run(samples.Job(seed, places=places), out, workers, console, wanted), out)
+    if min(values) < MIN_TRAINING_SAMPLES:
+        raise UserError(f"--sizes {sizes!r}: each must be at least {MIN_TRAINING_SAMPLES} samples")
+    show(samples, lambda: samples.run(samples.Job(seed, places=places), out, workers, console, values), out)
 
 
 @app.command("aliasing")
 def similar_objects(
-    places: Annotated[int, typer.Option(min=1, help="In each world.")] = 30,
+    places: Annotated[int, typer.Option(min=1, help="Number of places in each world.")] = 30,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
     workers: Workers = CORES,
 ) -> None:
-    """Similar objects, and two rooms alike: who is found, who is sure and wrong, who keeps both.
+    """Worlds with similar objects or two identical rooms: places found, wrong claims, and ambiguity kept.
 
     Example: `presage experiment aliasing --places 5`.
     """
@@ -193,11 +197,11 @@ def similar_objects(
 
 @app.command("prediction")
 def predicted(
-    scans: Annotated[int, typer.Option(min=2, help="Whose beams are counted.")] = 500,
+    scans: Annotated[int, typer.Option(min=2, help="Number of test scans.")] = 500,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
 ) -> None:
-    """Predicted against measured scan on a test sample, with the stated precision (the paper's figure 2c).
+    """Predicted and measured scans compared, with the models' stated precision (the paper's figure 2c).
 
     Example: `presage experiment prediction --seed 7 --out other`.
     """
@@ -209,24 +213,27 @@ def predicted(
 @app.command("real")
 def real_drive(
     log: Annotated[Path, typer.Option(help="Recording or log with reference poses (docs/logs.md).")],
-    world: Annotated[str, typer.Option("--map", help="ROS map or world file of the half that is learned.")],
-    name: Annotated[str, typer.Option(help="The results are called real-NAME; none: the log's.")] = "",
+    world: Annotated[str, typer.Option("--map", help="ROS map or world file of the training half.")],
+    name: Annotated[str, typer.Option(help="Results are named real-NAME. Default: the log's name.")] = "",
     mount: Annotated[
-        str, typer.Option(help="Of the laser in base_link, x,y[,yaw_deg] (m, deg); none: as the log says.")
+        str, typer.Option(help="Pose of the laser in base_link, x,y[,yaw_deg] (m, deg). Default: as in the log.")
     ] = "",
-    every: Annotated[int, typer.Option(min=1, help="Scans between the starts of c and d.")] = 50,
-    quick: Annotated[bool, typer.Option("--quick", help="A look: few scans, the particle filter not tuned.")] = False,
+    every: Annotated[int, typer.Option(min=1, help="Number of scans between the starts of tasks c and d.")] = 50,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="First impression: few scans, and the particle filter is not tuned.")
+    ] = False,
     exchange: Annotated[
-        bool, typer.Option("--exchange", help="Learn from the second half, localise the first.")
+        bool, typer.Option("--exchange", help="Train on the second half and localise on the first.")
     ] = False,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
     workers: Workers = CORES,
 ) -> None:
-    """A real drive: model and tuning from its first half, its second half localised; precise and the particle filter.
+    """A real log: trains and tunes on its first half, and localises on its second half.
 
-    a: tracking with odometry; b: without; c: from nothing, every 50th scan as a start; d: carried off. Errors are
-    against the log's reference poses. Ctrl-C keeps what is done; the same command goes on there.
+    Compares preset precise with the particle filter in four tasks. a: tracking with odometry; b: tracking without;
+    c: global localisation, starting at every 50th scan; d: kidnapping. Errors are relative to the log's reference
+    poses. After Ctrl-C the same command continues.
     Examples: `presage map drive.npz --mount 0,0,0 --half first -o first_half.yaml`, then
     `presage experiment real --log drive.npz --mount 0,0,0 --map first_half.yaml --quick`;
     `presage experiment real --log fr079.mcap --map fr079.yaml --name fr079 --every 50 --out mine`.
@@ -235,20 +242,22 @@ def real_drive(
     from lab.real_logs import experiment as real  # noqa: PLC0415
 
     if not re.fullmatch(r"[\w.-]*", name):
-        raise UserError(f"--name {name!r}: letters, digits, '.', '_' and '-' make a file's name")
-    sits: Any = tuple(pose_of_text(mount, "--mount").tolist()) if mount else None
-    job = real.Job(log, world, sits, every, quick, seed, name, exchange)
+        raise UserError(f"--name {name!r}: use only letters, digits, '.', '_' and '-', as it becomes a file name")
+    laser_pose: Any = tuple(pose_of_text(mount, "--mount").tolist()) if mount else None
+    job = real.Job(log, world, laser_pose, every, quick, seed, name, exchange)
     show(real, lambda: real.run(job, out, workers, console), out)
 
 
 @app.command("all")
 def all_experiments(
-    trials: Annotated[int, typer.Option(min=0, help="At most so many of each, for a look; 0: each its own.")] = 0,
+    trials: Annotated[
+        int, typer.Option(min=0, help="Maximum number of trials of each experiment; 0 for each one's own number.")
+    ] = 0,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
     workers: Workers = CORES,
 ) -> None:
-    """Every experiment, one after another; after Ctrl-C the same command goes on where it was.
+    """Every experiment of the paper, one after another. After Ctrl-C the same command continues.
 
     Examples: `presage experiment all`; `presage experiment all --trials 3 --out look`.
     """
@@ -261,9 +270,9 @@ def all_experiments(
 @app.command("tables")
 def tables(
     out: Annotated[Path, typer.Option(help="Folder with the results.")] = OUT,
-    page: Annotated[Path | None, typer.Option(help="Markdown file whose marked tables are filled anew.")] = None,
+    page: Annotated[Path | None, typer.Option(help="Markdown file in which to replace the marked tables.")] = None,
 ) -> None:
-    """The tables of results that are there, as Markdown; or a page filled with them.
+    """Prints the tables of existing results as Markdown, or inserts them into a page.
 
     Examples: `presage experiment tables`;
     `presage experiment tables --page docs/experiments.md --out docs/experiments`.
@@ -273,11 +282,13 @@ def tables(
     if page is not None:
         page.write_text(filled(page.read_text(encoding="utf-8"), out), encoding="utf-8")
         return
-    found = [name for name in MODULES if (out / f"{name}.json").exists()]
-    found += sorted(path.stem for kind in ("navigation", "real") for path in out.glob(f"{kind}-*.json"))
-    if not found:
-        raise UserError(f"{out}: no results there; make them with: presage experiment all")
-    for name in found:
+    names = [name for name in MODULES if (out / f"{name}.json").exists()]
+    names += sorted(path.stem for kind in ("navigation", "real") for path in out.glob(f"{kind}-*.json"))
+    if not names:
+        raise UserError(
+            f"no results in {out}: create them with `presage experiment all`, or give their folder with --out"
+        )
+    for name in names:
         print(f"\n{name}\n\n{table_of(name, out)}")
 
 

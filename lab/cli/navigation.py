@@ -14,26 +14,30 @@ def navigate(
     trials: Trials = 100,
     worlds: Annotated[str, typer.Option(help="Comma-separated names or files.")] = "maze,office",
     drives: Annotated[str, typer.Option(help="Comma-separated: holonomic, differential.")] = "holonomic,differential",
-    start: Annotated[str, typer.Option(help="known, or unknown: the estimator is not told it.")] = "known",
-    people: Annotated[int, typer.Option(min=0, max=100, help="How many walk about, unknown to the map.")] = 0,
-    people_speed: Annotated[float, typer.Option(min=0.0, max=3.0, help="Of their walk, m/s.")] = 1.0,
+    start: Annotated[
+        str, typer.Option(help="known or unknown: whether the estimator is given the start pose.")
+    ] = "known",
+    people: Annotated[int, typer.Option(min=0, max=100, help="Number of walking people; the map lacks them.")] = 0,
+    people_speed: Annotated[float, typer.Option(min=0.0, max=3.0, help="Walking speed of the people, m/s.")] = 1.0,
     estimator: Annotated[str, typer.Option(help="precise or particle-filter.")] = "precise",
     epistemic: Annotated[
-        bool, typer.Option(help="Drive so as to find out where it is, while it does not know.")
+        bool, typer.Option(help="While the pose is ambiguous, drive to where scans resolve the ambiguity.")
     ] = True,
     prior: Annotated[
-        str, typer.Option(help="Of the estimator, of motion between scans: motion or odometry.")
+        str, typer.Option(help="The estimator's motion prior between scans: motion (a motion model) or odometry.")
     ] = "motion",
     beams: Beams = 622,
-    limit: Annotated[float, typer.Option(min=1.0, max=3600.0, help="s of simulated time for each trial.")] = 120.0,
+    limit: Annotated[float, typer.Option(min=1.0, max=3600.0, help="Simulated time limit of a trial, s.")] = 120.0,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
     workers: Workers = CORES + 1,
 ) -> None:
-    """From anywhere to anywhere, round walls and people: reached, contacts, path and time over the least possible.
+    """Navigation between random places, around walls and people.
 
-    Results are named after what is not as by default: navigation.json, navigation-unknown.json,
-    navigation-office-people10.json. The same trial number is the same start and goal whatever the other options.
+    Measures goals reached, contacts, and path length and time relative to the minimum.
+
+    Results are named after the options that differ from the defaults: navigation.json, navigation-unknown.json,
+    navigation-office-people10.json. A trial number always has the same start and goal, whatever the other options.
 
     Examples: `presage experiment navigation --trials 2`;
     `presage experiment navigation --worlds office --people 10`;
@@ -46,6 +50,8 @@ def navigate(
         0, seed, start=start, people=people, people_speed=people_speed, estimator=estimator, prior=prior,
         epistemic=epistemic, beams=beams, limit=limit,
     )  # fmt: skip
-    where, how = (tuple(part.strip() for part in text.split(",") if part.strip()) for text in (worlds, drives))
-    driving.check(job, where, how)
-    show(driving, lambda: driving.run(job, trials, out, workers, console, worlds=where, drives=how), out)
+    world_names, drive_names = (
+        tuple(part.strip() for part in text.split(",") if part.strip()) for text in (worlds, drives)
+    )
+    driving.check(job, world_names, drive_names)
+    show(driving, lambda: driving.run(job, trials, out, workers, console, worlds=world_names, drives=drive_names), out)

@@ -17,14 +17,27 @@ if TYPE_CHECKING:
 
     from lab.experiments.results import Result
 
-Trials = Annotated[int, typer.Option(min=1, help="How many; few are enough for a look.")]
-ExperimentSeed = Annotated[int, typer.Option("--seed", min=0, max=2**31, help="Of places, noise, particles.")]
+Trials = Annotated[int, typer.Option(min=1, help="Number of trials; a few are enough for a first impression.")]
+ExperimentSeed = Annotated[
+    int, typer.Option("--seed", min=0, max=2**31, help="Random seed of places, noise and particles.")
+]
 Out = Annotated[Path, typer.Option(help="Folder for NAME.json, .csv, .pdf, .png.")]
-Workers = Annotated[int, typer.Option(min=1, help="Processes side by side; none: one a core.")]
-Estimators = Annotated[str, typer.Option(help="Comma-separated, as the table names them, without their own commas.")]
-Alpha = Annotated[float | None, typer.Option(min=1e-8, max=1.0, help="Paper: step size, m²; none: the best found.")]
-Steps = Annotated[int | None, typer.Option(min=1, help="Paper: gradient steps a scan; none: 1, as the paper.")]
-World = Annotated[str, typer.Option(help="World that the paper's decoder and a field were trained for.")]
+Workers = Annotated[int, typer.Option(min=1, help="Number of processes that run in parallel.")]
+Estimators = Annotated[
+    str,
+    typer.Option(
+        help="Comma-separated names as in the table, but without the commas inside a name "
+        "('particle-filter odometry'). Default: all."
+    ),
+]
+Alpha = Annotated[
+    float | None,
+    typer.Option(min=1e-8, max=1.0, help="Step size of estimator paper in m². Default: the best value of the sweep."),
+]
+Steps = Annotated[
+    int | None, typer.Option(min=1, help="Gradient steps per scan of estimator paper. Default: 1, as in the paper.")
+]
+World = Annotated[str, typer.Option(help="World; models for presets paper and precise must be trained for it.")]
 Beams = Annotated[int, typer.Option(min=2, help="Beams of the scanner.")]
 
 OUT = Path("experiments")
@@ -32,7 +45,7 @@ CORES = os.cpu_count() or 1
 
 
 def show(experiment: ModuleType, run: Callable[[], Result], out: Path) -> None:
-    """Run it; its table, its notes, and where everything lies."""
+    """Run the experiment, then print its table, its notes and the files it wrote."""
     make_folder(out, "--out")
     result = run()
     print(f"\n{experiment.table(result.summary)}\n")
