@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def make(settings: RecorderSettings) -> Service:
-    """Imports mcap here, so that --help answers at once."""
+    """Returns the service. Imports mcap only here, so that --help answers at once."""
     from services.recorder.service import RecorderService  # noqa: PLC0415
 
     return RecorderService(settings)

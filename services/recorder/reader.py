@@ -29,7 +29,7 @@ from services.recorder.files.writer import PROFILE
 
 @dataclass(frozen=True)
 class Raw:
-    """One payload of a file, with its times in ns of the wall clock."""
+    """One recorded payload with its wall-clock times, in ns."""
 
     key: str
     payload: bytes
@@ -39,49 +39,51 @@ class Raw:
 
 @dataclass
 class Recording:
-    """A recording on disk; payloads are read when asked for. `problem` says what cut it short, if anything.
+    """A recording on disk. Payloads are read on demand.
 
-    Damage inside a finished file is found where it is read: ask for `problem` after the messages.
+    `problem` describes why the file is incomplete, or is empty. Damage inside a finished file is only found when that
+    part is read, so check `problem` after reading the messages.
     """
 
     path: Path
-    metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # of each name the last
-    attachments: dict[str, bytes] = field(default_factory=dict)  # of each name the last
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)  # by name; the last record of each name
+    attachments: dict[str, bytes] = field(default_factory=dict)  # by name; the last one of each name
     problem: str = ""
-    undecodable: Counter[str] = field(default_factory=Counter)  # by key, of the last pass of `messages`
+    undecodable: Counter[str] = field(default_factory=Counter)  # by key, in the last call of `messages`
     profile: str = ""
-    start_ns: int = 0  # reception of the first message, wall clock
-    end_ns: int = 0  # and of the last
-    _counts: Counter[str] = field(default_factory=Counter)  # by key
-    _finished: bool = False  # there is an index
+    start_ns: int = 0  # wall time at which the first message was received
+    end_ns: int = 0  # wall time at which the last message was received
+    _counts: Counter[str] = field(default_factory=Counter)  # messages by key
+    _finished: bool = False  # the file has a valid index
 
     @property
     def complete(self) -> bool:
-        """Whether the file was finished and, as far as it was read, is whole."""
+        """Whether the file was finished and no damage has been found in the parts read so far."""
         return not self.problem
 
     @property
     def warning(self) -> str:
-        """One line for the user where the file is not complete; else empty."""
+        """One line for the user if the file is incomplete, else an empty string."""
         if self.complete:
             return ""
         why = (
-            "the recorder still writes, or was killed"
+            "the recorder is still writing it, or was killed"
             if self.path.suffix == ".active"
             else "it is cut short or damaged"
         )
-        readable = "what comes" if self._finished else f"the {sum(self._counts.values())} messages"
+        readable = "the messages" if self._finished else f"the {sum(self._counts.values())} messages"
         return (
             f"{self.path}: incomplete ({self.problem}): {why}; {readable} before that can be used, and "
-            "`presage recover` makes a whole file of what is readable"
+            "`presage recover` writes a complete file from the readable part"
         )
 
     def payloads(
         self, keys: Collection[str] | None = None, start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Raw]:
-        """Those of some keys (None: all), from ``start_ns`` to before ``end_ns`` of the wall clock, as received.
+        """Yields the payloads in the order in which they were received.
 
-        A chunk at a time is in memory. Ends at the first damage, and `problem` then says what it is.
+        ``keys`` defaults to all keys. ``start_ns`` (included) and ``end_ns`` (excluded) are wall times of reception.
+        One chunk at a time is held in memory. Stops at the first damaged place, which `problem` then describes.
         """
         try:
             with self.path.open("rb") as stream:
@@ -94,16 +96,19 @@ class Recording:
 
     @property
     def indexed(self) -> bool:
-        """Whether it was finished: damage is then found only where it is read."""
+        """Whether the file has an index. If so, damage is only found when the damaged part is read."""
         return self._finished
 
     @property
     def raw(self) -> list[Raw]:
-        """All of it at once, for short recordings."""
+        """All payloads as a list, for short recordings."""
         return list(self.payloads())
 
     def messages(self, *topics: Topic) -> Iterator[tuple[Topic, Stamped, Raw]]:
-        """Decoded messages of the topics (none: all) beside their bytes; the undecodable are counted and left out."""
+        """Yields topic, decoded message and payload. Defaults to all topics.
+
+        Payloads that cannot be decoded are skipped and counted in `undecodable`.
+        """
         self.undecodable.clear()
         rows = {key: topic for key in self._counts if (topic := topic_of(key)) and (not topics or topic in topics)}
         for raw in self.payloads(rows.keys()):
@@ -113,15 +118,15 @@ class Recording:
                 self.undecodable[raw.key] += 1
 
     def counts(self) -> Counter[str]:
-        """Messages by key."""
+        """Number of messages by key."""
         return Counter(self._counts)
 
     def topics(self) -> dict[str, Topic]:
-        """The rows of the table that are in it, by key."""
+        """Topics of the recording, by key. Keys that are not in the table of topics are left out."""
         return {key: topic for key in sorted(self._counts) if (topic := topic_of(key)) is not None}
 
     def world(self) -> World | None:
-        """The world the session ran in, where it was recorded."""
+        """The world of the session. Returns None if it was not recorded or is invalid."""
         text = self.attachments.get("world.yaml")
         try:
             return World.model_validate(parse_yaml(text)) if text is not None else None
@@ -129,23 +134,23 @@ class Recording:
             return None
 
     def robot(self) -> Robot:
-        """The base that was driven; the default one where it was not recorded."""
+        """The mobile base of the session, or the default one if it was not recorded."""
         try:
             return Robot.model_validate_json(self.metadata.get("world", {}).get("robot", "{}"))
         except ValidationError:
             return Robot()
 
     def scanner(self) -> Scanner | None:
-        """The scanner that was read, where it was recorded."""
+        """The scanner of the session. Returns None if it was not recorded."""
         try:
             return Scanner.model_validate_json(self.metadata.get("world", {}).get("scanner", ""))
         except ValidationError:
             return None
 
     def verify(self) -> None:
-        """Compare the checksum of all that is before the summary; `problem` is set where it is wrong.
+        """Checks the checksum of the data section and sets `problem` if it is wrong.
 
-        Reads the whole file. Recorders of before this checksum wrote none, and then only records are looked at.
+        Reads the whole file. Files from older recorders have no such checksum; then only the records are parsed.
         """
         if not self.problem:
             with self.path.open("rb") as stream:
@@ -160,7 +165,7 @@ class Recording:
                 yield from in_order(stream, summary, keys, start_ns, end_ns)
         except OSError:
             raise
-        except Exception as error:  # noqa: BLE001 - a damaged chunk raises kinds of each decompressor
+        except Exception as error:  # noqa: BLE001 - each decompressor raises its own error types
             self.problem = f"damaged: {error}"
 
     def _torn(
@@ -171,22 +176,25 @@ class Recording:
             if isinstance(record, Channel):
                 channels[record.id] = record
             elif isinstance(record, McapMessage):
-                channel, at = channels.get(record.channel_id), record.log_time
+                channel, log_time = channels.get(record.channel_id), record.log_time
                 if channel is None or (keys is not None and channel.topic not in keys):
                     continue
-                if (start_ns is None or at >= start_ns) and (end_ns is None or at < end_ns):
+                if (start_ns is None or log_time >= start_ns) and (end_ns is None or log_time < end_ns):
                     yield channel, record
 
 
 def read_recording(path: Path) -> Recording:
-    """Open a file; raises UserError where it is missing or no recording. A torn file gives its complete chunks."""
+    """Opens a recording. Of an unfinished file the complete chunks are readable.
+
+    Raises UserError if the file is missing or is not a recording.
+    """
     recording = Recording(path)
     try:
         with path.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 raise UserError(
                     f"{path}: not an MCAP file, or its first bytes are damaged; `presage record` makes recordings, "
-                    "`presage import` of logs, and `presage recover` a whole one of a damaged one"
+                    "`presage import` converts logs, and `presage recover` repairs a damaged recording"
                 )
             if not _read_summary(recording, stream):
                 _read_through(recording, stream)
@@ -194,14 +202,14 @@ def read_recording(path: Path) -> Recording:
         raise _unreadable(path, error) from None
     if recording.profile not in {"", PROFILE} and not recording.topics():
         raise UserError(
-            f"{path}: an MCAP file, but no recording of presage (its profile is {recording.profile!r}); of a ROS 2 "
-            "bag `presage import` makes one"
+            f"{path}: an MCAP file, but not a recording of presage (its profile is {recording.profile!r}); "
+            "`presage import` converts a ROS 2 bag"
         )
     return recording
 
 
 def _read_summary(recording: Recording, stream: BinaryIO) -> bool:
-    """From the index of a finished file; False where there is none that can be trusted."""
+    """Fills ``recording`` from the file's index. Returns False if there is no valid index."""
     try:
         summary = summary_of(stream)
         if summary is None or summary.statistics is None:
@@ -216,14 +224,14 @@ def _read_summary(recording: Recording, stream: BinaryIO) -> bool:
         for attachment in reader.iter_attachments():
             recording.attachments[attachment.name] = attachment.data
         for number, count in summary.statistics.channel_message_counts.items():
-            recording._counts[summary.channels[number].topic] += count  # noqa: SLF001 - the recording's own half
+            recording._counts[summary.channels[number].topic] += count  # noqa: SLF001 - same module
         recording.start_ns, recording.end_ns = (
             summary.statistics.message_start_time,
             summary.statistics.message_end_time,
         )
     except OSError:
         raise
-    except Exception as error:  # noqa: BLE001 - whatever a torn or damaged end makes of it
+    except Exception as error:  # noqa: BLE001 - a damaged index can raise any error
         recording.metadata, recording.attachments, recording._counts = {}, {}, Counter()  # noqa: SLF001
         recording.problem = str(error) if isinstance(error, ValueError) else "its index is damaged"
         return False
@@ -232,7 +240,7 @@ def _read_summary(recording: Recording, stream: BinaryIO) -> bool:
 
 
 def _read_through(recording: Recording, stream: BinaryIO) -> None:
-    """From the beginning, as far as it goes."""
+    """Fills ``recording`` by reading the file from the beginning to the first damaged place."""
     keys: dict[int, str] = {}
     for record in _records(recording, stream):
         if isinstance(record, Header):
@@ -251,9 +259,10 @@ def _read_through(recording: Recording, stream: BinaryIO) -> None:
 
 
 def _records(recording: Recording, stream: BinaryIO, *, chunks: bool = True) -> Iterator[object]:
-    """Until the end or the first damage, which is noted; a record longer than the file is damage.
+    """Yields records until the end or the first damaged place, which is stored in `Recording.problem`.
 
-    With ``chunks`` what is in chunks comes in their place.
+    A record that claims to be longer than the file counts as damaged. With ``chunks``, yields the records inside each
+    chunk instead of the chunk itself.
     """
     stream.seek(0)
     size = recording.path.stat().st_size
@@ -265,7 +274,7 @@ def _records(recording: Recording, stream: BinaryIO, *, chunks: bool = True) -> 
                 yield record
     except OSError:
         raise
-    except Exception as error:  # noqa: BLE001 - a torn or damaged chunk raises kinds of each decompressor
+    except Exception as error:  # noqa: BLE001 - each decompressor raises its own error types
         recording.problem = "its end is missing" if "End" in type(error).__name__ else f"damaged: {error}"
 
 

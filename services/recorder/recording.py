@@ -25,15 +25,18 @@ from services.recorder.settings import RecorderSettings
 
 
 class OpenRecording:
-    """What is being written. Every step raises UserError where it fails."""
+    """A recording that is being written. Every method raises UserError if writing fails."""
 
     def __init__(
         self, options: RecorderSettings, topics: Iterable[Topic], inbox: Inbox, *, numbered: bool = False
     ) -> None:
-        """Open the file: what is known first, so that even a torn one explains itself; ``numbered`` as `parts_of`."""
+        """Opens the file. ``numbered`` is passed to `parts_of`.
+
+        The metadata known so far is written first, so that it is readable even in a file that is never finished.
+        """
         self.ledger = Ledger()
         self._inbox, self._before, self._began = inbox, inbox.tally(), time.monotonic()
-        self._logged_ns = 0  # of the last message
+        self._logged_ns = 0  # log time of the last message
         limits = Limits(int(options.split_size * 1e6), options.split_minutes * 60)
         writer = self.writer = PartsWriter(parts_of(options, numbered=numbered), limits, self._counters)
         writer.metadata("presage", {"robot": options.robot, "command": " ".join(sys.argv), **versions()})
@@ -44,32 +47,33 @@ class OpenRecording:
         writer.flush()
 
     def write(self, sample: Sample) -> None:
-        """Bytes as they came, whether or not they make sense."""
-        self._logged_ns = max(self._logged_ns, sample.received_ns)  # in order, though a clock be set back
+        """Writes the payload as received, whether or not it can be decoded."""
+        # Log times must not decrease, even if the wall clock is set back.
+        self._logged_ns = max(self._logged_ns, sample.received_ns)
         published = sample.published_ns or sample.received_ns
         self.writer.write(sample.topic, sample.key, sample.payload, published, self._logged_ns)
         self.ledger.see(sample.key, sample.payload)
 
     def describe(self, service: str, answer: DescriptionReply) -> None:
-        """What a service said of itself."""
+        """Writes a service's reply about its configuration, world or model."""
         write_description(self.writer, service, answer)
 
     def state(self) -> RecordReply:
-        """How it stands."""
+        """File, number of messages and duration so far."""
         written, seconds = sum(self.ledger.written.values()), time.monotonic() - self._began
         return RecordReply(recording=True, file=str(self.writer.part.path), messages=written, seconds=seconds)
 
     def missing(self) -> int:
-        """Messages that were sent and never came, by their numbers."""
+        """Messages that were published and never received, by their sequence numbers."""
         return sum(self.ledger.lost(key).missing for key in self.ledger.sequences)
 
     def lost(self) -> int:
-        """Messages that were received, had room in the queue and are not in the file, at most; where writing failed."""
+        """Upper bound of the messages that were queued but are not in the file, after writing failed."""
         arrived, dropped, oversized = (sum(counts.values()) for counts in self._since(self._inbox.arrivals()))
         return arrived - dropped - oversized - self.writer.saved
 
     def dropped(self) -> int:
-        """Messages for which the queue had no room."""
+        """Messages that were dropped because the queue was full."""
         return sum(count.dropped for count in self._counts().values())
 
     def _counts(self) -> dict[str, Count]:
@@ -77,7 +81,7 @@ class OpenRecording:
         return self.ledger.counts(received, dropped, oversized)
 
     def _since(self, now: tuple[Counter[str], ...]) -> list[dict[str, int]]:
-        """Counts of messages since the beginning; the inbox counts requests too, under the query's name."""
+        """Counts by key since the recording began, without requests, which the inbox counts by query name."""
         since = [after - before for after, before in zip(now, self._before, strict=True)]
         return [{key: n for key, n in counts.items() if "/" in key or key == OTHERS} for counts in since]
 
@@ -86,14 +90,15 @@ class OpenRecording:
 
 
 def open_writer(options: RecorderSettings) -> RecordingWriter:
-    """Under the name asked for; a name of our own making gets a number where another recorder was first."""
+    """Opens one file, named as in `parts_of`."""
     return parts_of(options)(1)
 
 
 def parts_of(options: RecorderSettings, *, numbered: bool = False) -> Callable[[int], RecordingWriter]:
-    """Opens part number k: NAME.mcap, or NAME-001.mcap, NAME-002.mcap … where there may be several.
+    """Returns a function that opens part k: NAME.mcap, or NAME-001.mcap, NAME-002.mcap, ... if the recording is split.
 
-    Where the name is taken another with a number is, if it is of our own making or ``numbered``; else that is an error.
+    If the name is taken, a generated name, or any name with ``numbered``, gets a number appended. A name chosen by the
+    user raises NameTakenError.
     """
     first, several = file_path(options), bool(options.split_size or options.split_minutes)
     chosen: list[Path] = []  # the name that was free for the first part
@@ -103,8 +108,8 @@ def parts_of(options: RecorderSettings, *, numbered: bool = False) -> Callable[[
             path = first if number == 1 else first.with_stem(f"{first.stem}-{number}")
             path = chosen[0] if chosen else path
             file = path.with_stem(f"{path.stem}-{part:03d}") if several else path
-            another = (numbered or not options.file) and not chosen
-            with suppress(NameTakenError) if another else nullcontext():
+            try_next_number = (numbered or not options.file) and not chosen
+            with suppress(NameTakenError) if try_next_number else nullcontext():
                 writer = RecordingWriter(file, options.compression, options.chunk_size)
                 chosen.append(path)
                 return writer
@@ -114,21 +119,21 @@ def parts_of(options: RecorderSettings, *, numbered: bool = False) -> Callable[[
 
 
 def warn_about_unfinished(folder: Path, log: Logger) -> None:
-    """Files of recorders that were killed, and what to do with them."""
+    """Logs a warning for each file that a killed recorder left unfinished."""
     for path in sorted(folder.glob(f"*.mcap{UNFINISHED_SUFFIX}")) if folder.is_dir() else ():
         if not is_being_written(path):
             log.warning("unfinished recording", file=str(path), advice=f"presage recover {path}")
 
 
 def file_path(options: RecorderSettings) -> Path:
-    """Where to record: the name asked for, or one of robot and time."""
+    """Path of the recording. The file name defaults to one made of the robot's name and the time."""
     stamp = datetime.now(timezone.utc).strftime("%Y%m%d-%H%M%S")
     name = options.file or f"presage-{options.robot}-{stamp}.mcap"
     return options.directory / (name if name.endswith(".mcap") else name + ".mcap")
 
 
 def write_description(writer: RecordingWriter | PartsWriter, service: str, answer: DescriptionReply) -> None:
-    """What a service said of itself, as `records_of` has it."""
+    """Writes a service's reply as the metadata and attachments of `records_of`."""
     for record in records_of(service, answer):
         if isinstance(record, MetadataRecord):
             writer.metadata(record.name, record.values)

@@ -24,8 +24,9 @@ from services.recorder.files.index import summary_of
 from services.recorder.files.message_counts import Ledger, as_metadata
 from services.recorder.files.writer import PROFILE, UNFINISHED_SUFFIX, claim, is_being_written
 
-TORN_SUFFIX = ".torn"  # behind the name of what was recovered from
-# All records that may stand before a file's end; each is read whole, so that a damaged length or kind is noticed.
+TORN_SUFFIX = ".torn"  # appended to the name of an unfinished source file after recovery
+# Parsers of all records that may precede a file's end. Each record is parsed completely, to detect a damaged length or
+# opcode.
 PARSERS: dict[int, Callable[[ReadDataStream], object]] = {
     Opcode.HEADER: Header.read, Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read, Opcode.CHUNK: Chunk.read,
     Opcode.MESSAGE_INDEX: kinds.MessageIndex.read, Opcode.CHUNK_INDEX: kinds.ChunkIndex.read,
@@ -34,13 +35,13 @@ PARSERS: dict[int, Callable[[ReadDataStream], object]] = {
     Opcode.METADATA_INDEX: kinds.MetadataIndex.read, Opcode.SUMMARY_OFFSET: kinds.SummaryOffset.read,
     Opcode.DATA_END: DataEnd.read,
 }  # fmt: skip
-# Where reading goes on behind damage: the prefix of a chunk, an attachment or metadata shorter than 2^40 bytes.
+# Where reading may resume after damage: the prefix of a chunk, an attachment or metadata shorter than 2^40 bytes.
 LANDMARK = re.compile(rb"[\x06\x09\x0c](?=.{5}\x00\x00\x00)", re.DOTALL)
 
 
 @dataclass(frozen=True)
 class Damage:
-    """Bytes that could not be used."""
+    """A range of bytes that could not be read."""
 
     offset: int
     length: int
@@ -48,7 +49,7 @@ class Damage:
 
 @dataclass
 class Recovered:
-    """What came of it."""
+    """Result of a recovery."""
 
     source: Path
     path: Path
@@ -57,70 +58,71 @@ class Recovered:
     messages: Counter[str] = field(default_factory=Counter)  # by key
     start_ns: int | None = None
     end_ns: int | None = None
-    skipped: int = 0  # messages of whole chunks, whose channel is not declared in anything that is whole
+    skipped: int = 0  # messages in intact chunks whose channel declaration is lost
     damages: list[Damage] = field(default_factory=list)
-    altered: bool = False  # there is no damage to a chunk or a length, and yet the file's checksum is wrong
-    whole: bool = False  # the source had its end: nothing was missing but what is damaged
+    altered: bool = False  # no chunk or length is damaged, but the file's checksum is wrong
+    whole: bool = False  # the source file was finished: only the damaged parts are missing
     ledger: Ledger = field(default_factory=Ledger)
 
     def lines(self) -> list[str]:
-        """For the user."""
+        """Report for the user."""
         seconds = ((self.end_ns or 0) - (self.start_ns or 0)) * 1e-9
-        told = [f"{self.path}: {self.messages.total()} messages of {seconds:.1f} s, from {self.chunks} chunks"]
+        lines = [f"{self.path}: {self.messages.total()} messages over {seconds:.1f} s, from {self.chunks} chunks"]
         for damage in self.damages:
-            at = "at its end" if damage.offset + damage.length == self.size else f"from byte {damage.offset}"
-            told.append(f"missing: {damage.length} bytes {at} are no complete chunk")
+            where = "at its end" if damage.offset + damage.length == self.size else f"from byte {damage.offset}"
+            lines.append(f"missing: {damage.length} bytes {where} are not a complete chunk")
         if self.skipped:
-            told.append(f"missing: {self.skipped} messages of channels that are declared only in what is damaged")
+            lines.append(f"missing: {self.skipped} messages whose channels are declared only in the damaged part")
         if self.altered:
-            told.append("altered: metadata or indexes, outside of the chunks; the file's checksum does not say where")
+            lines.append("altered: metadata or indexes, outside of the chunks; the file's checksum does not show where")
         if not self.whole:
-            told.append("missing: its end; what came after the last flush was never in the file")
-        told += [
-            f"missing: {numbers.missing} messages of {key} by their numbers, in {numbers.gaps} gaps"
+            lines.append("missing: the end of the file; messages after the last flush were never written")
+        lines += [
+            f"missing: {numbers.missing} messages of {key} by their sequence numbers, in {numbers.gaps} gaps"
             for key in self.messages
             if (numbers := self.ledger.lost(key)).missing
         ]
-        return told
+        return lines
 
 
 def recover(
     source: Path, path: Path | None = None, *, on_progress: Callable[[float], None] = lambda _: None
 ) -> Recovered:
-    """Write the readable part of ``source`` to ``path`` (none: the finished name); an unfinished file is kept as .torn.
+    """Writes the readable part of ``source`` to ``path``, which defaults to `target_of`.
 
-    Raises UserError where the source is still written, where no message can be recovered, or the target is there.
+    An unfinished source (.mcap.active) is renamed to .mcap.torn. Raises UserError if the source is still being written,
+    if no message can be recovered, or if the target exists.
     """
     path = path or target_of(source)
     try:
         with source.open("rb") as stream:
             if is_being_written(source):
-                raise UserError(f"{source}: is being written by a recorder that lives; end that first")
+                raise UserError(f"{source}: is being written by a running recorder; stop it first")
             if source.stat().st_size == 0:
                 raise UserError(f"{source}: is empty, there is nothing to recover: it can be removed")
             declared = _declared(stream)
             with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 found = _copy(data, Recovered(source, path, len(data)), declared, on_progress)
     except OSError as error:
-        what = error.filename or source
-        raise UserError(f"{what}: cannot be read or written ({error.strerror}); name another file with --out") from None
+        file = error.filename or source
+        raise UserError(f"{file}: cannot be read or written ({error.strerror}); name another file with --out") from None
     if source.name.endswith(UNFINISHED_SUFFIX):
         source.rename(source.with_name(source.name.removesuffix(UNFINISHED_SUFFIX) + TORN_SUFFIX))
     return found
 
 
 def target_of(source: Path) -> Path:
-    """Where it goes when nobody says."""
+    """Default path of the recovered file."""
     if source.name.endswith(UNFINISHED_SUFFIX):
         return source.with_name(source.name.removesuffix(UNFINISHED_SUFFIX))
     return source.with_name(source.name.split(".mcap")[0] + "-recovered.mcap")
 
 
 def _declared(stream: BinaryIO) -> list[Schema | Channel]:
-    """Schemas and channels of a finished file's summary; none where there is no whole summary."""
+    """Schemas and channels in the file's summary. Returns an empty list if there is no valid summary."""
     try:
         summary = summary_of(stream)
-    except Exception:  # noqa: BLE001 - damage raises what it will
+    except Exception:  # noqa: BLE001 - a damaged summary can raise any error
         return []
     return [] if summary is None else [*summary.schemas.values(), *summary.channels.values()]
 
@@ -129,7 +131,7 @@ def _copy(
     data: mmap.mmap, found: Recovered, declared: list[Schema | Channel], on_progress: Callable[[float], None]
 ) -> Recovered:
     active = found.path.with_name(found.path.name + ".recovering")
-    if not is_being_written(active):  # of a recovery that was cut short
+    if not is_being_written(active):  # left by an interrupted recovery
         active.unlink(missing_ok=True)
     stream = claim(found.path, active, remedy="--out")
     try:
@@ -143,16 +145,16 @@ def _copy(
         active.rename(found.path)
     finally:
         active.unlink(missing_ok=True)
-        with suppress(OSError):  # what is buffered may not fit on the disk either
+        with suppress(OSError):  # the disk may be full, so flushing the buffer may fail too
             stream.close()
     return found
 
 
 class _Copier:
-    """Records of one file into another."""
+    """Copies records of one file to another."""
 
     def __init__(self, stream: BinaryIO, found: Recovered, declared: list[Schema | Channel]) -> None:
-        """Onto ``stream``; ``declared`` is what the summary says of channels, which need not be in a whole chunk."""
+        """Writes to ``stream``. ``declared`` are the summary's declarations, in case their chunks are damaged."""
         self._writer, _ = mcap_writer(stream, "zstd", 1 << 18)
         self._found, self._declared = found, declared
         self._schemas: dict[int, int] = {0: 0}
@@ -161,7 +163,7 @@ class _Copier:
         self._started = False
 
     def take(self, record: object) -> None:
-        """Any; what the writer makes by itself is left out."""
+        """Copies one record. Skips indexes and statistics, which the writer generates itself."""
         if not self._started:
             header = record if isinstance(record, Header) else Header(PROFILE, "presage recover")
             self._writer.start(header.profile, header.library)
@@ -177,7 +179,7 @@ class _Copier:
             self._channels[record.id] = self._writer.register_channel(
                 record.topic, record.message_encoding, self._schemas[record.schema_id], record.metadata
             )
-        elif isinstance(record, Metadata) and record.name != "counters":  # those were of the whole
+        elif isinstance(record, Metadata) and record.name != "counters":  # they counted the complete file
             self._writer.add_metadata(record.name, record.metadata)
         elif isinstance(record, Attachment):
             self._writer.add_attachment(
@@ -197,7 +199,7 @@ class _Copier:
         found.end_ns = record.log_time
 
     def finish(self) -> None:
-        """With a record of what was done."""
+        """Writes the counters and a record of the recovery, and completes the file."""
         found = self._found
         if not found.messages:
             raise UserError(f"{found.source}: no message in it can be recovered: {_reason(found)}")
@@ -210,11 +212,11 @@ class _Copier:
 
 
 def _reason(found: Recovered) -> str:
-    """Why nothing came of it."""
+    """Explains why no message was recovered."""
     if found.skipped:
-        return f"{found.skipped} are in whole chunks, and what declared their channels is damaged"
+        return f"{found.skipped} are in whole chunks, but the declarations of their channels are damaged"
     if not found.damages:
-        return "its recorder ended before there was one"
+        return "its recorder ended before it received one"
     lost = sum(damage.length for damage in found.damages)
     if lost >= found.size - len(MAGIC):
         return "not an MCAP file, or all of it is damaged"
@@ -222,7 +224,7 @@ def _reason(found: Recovered) -> str:
 
 
 def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[list[object], int]]:
-    """Complete records and where each ends; over what is damaged to the next that is whole."""
+    """Yields the content of each intact record and its end offset. Skips damaged bytes up to the next intact record."""
     at, size = len(MAGIC), len(data)
     while at < size:
         records = _parse(data, at)
@@ -237,14 +239,15 @@ def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[list[object], int
             found.altered = not found.damages and not _is_checksum(data, at, records[0])
             return
         at += PREFIX.size + length
-        if opcode == Opcode.MESSAGE and found.chunks:  # a damaged index: in a file of chunks messages stand in those
+        # In a chunked file, a message outside of the chunks is a misread index record.
+        if opcode == Opcode.MESSAGE and found.chunks:
             continue
         found.chunks += opcode == Opcode.CHUNK
         yield records, at
 
 
 def _parse(data: mmap.mmap, at: int) -> list[object] | None:
-    """What is in the record at ``at``; None where it is damaged or cut short."""
+    """Content of the record at offset ``at``. Returns None if it is damaged or cut short."""
     if at + PREFIX.size > len(data):
         return None
     opcode, length = PREFIX.unpack_from(data, at)
@@ -253,7 +256,7 @@ def _parse(data: mmap.mmap, at: int) -> list[object] | None:
         return None
     try:
         return _records(data, opcode, begin, length)
-    except Exception:  # noqa: BLE001 - damage raises kinds of each decompressor
+    except Exception:  # noqa: BLE001 - each decompressor raises its own error types
         return None
 
 
@@ -270,12 +273,12 @@ def _records(data: mmap.mmap, opcode: int, begin: int, length: int) -> list[obje
 
 
 def _crc(data: mmap.mmap, end: int) -> int:
-    """The last four bytes of a record."""
+    """The checksum in the last four bytes before offset ``end``."""
     return int.from_bytes(data[end - 4 : end], "little")
 
 
 def _is_checksum(data: mmap.mmap, end: int, record: object) -> bool:
-    """Whether the checksum of all that is before ``end`` is right, where there is one."""
+    """Whether the checksum of the bytes before ``end`` matches, or the file has none."""
     if not isinstance(record, DataEnd) or not record.data_section_crc:
         return True
     with memoryview(data) as view, view[:end] as before:
@@ -283,7 +286,7 @@ def _is_checksum(data: mmap.mmap, end: int, record: object) -> bool:
 
 
 def _next_whole(data: mmap.mmap, damaged: int) -> int:
-    """Where reading goes on behind the damaged record: at the one behind it, or at the next landmark."""
+    """Offset at which reading resumes after a damaged record: the following record, or else the next landmark."""
     if damaged + PREFIX.size <= len(data):
         after = damaged + PREFIX.size + int(PREFIX.unpack_from(data, damaged)[1])
         if _parse(data, after) is not None:

@@ -18,11 +18,11 @@ from services.recorder.recording import OpenRecording, warn_about_unfinished, wr
 from services.recorder.session_description import DescriptionCollector, DescriptionReply
 from services.recorder.settings import RecorderSettings
 
-LINK_WARNING_DELAY_S = 3.0  # s; a recorder may come before the others, but should not wait for nobody in silence
+LINK_WARNING_DELAY_S = 3.0  # the recorder may start before the router, but then warns that it is waiting
 
 
 class RecorderService(Service):
-    """Recording as a process."""
+    """Records all topics, from the start or on request."""
 
     name: ClassVar[str] = "recorder"
     inputs: ClassVar[tuple[Topic, ...]] = tuple(topic for topic in TOPICS if topic.recorded)
@@ -30,7 +30,7 @@ class RecorderService(Service):
     keep_all: ClassVar[bool] = True
 
     def __init__(self, settings: RecorderSettings, *, remote: bool = True) -> None:
-        """The file is opened in `open`, or on request; without ``remote`` no request begins or ends a recording."""
+        """Opens no file yet: `open` or a request does. Without ``remote`` the query `recording` is not served."""
         super().__init__(settings)
         if not remote:
             self.queries = ()  # type: ignore[misc]
@@ -38,33 +38,32 @@ class RecorderService(Service):
         self.inputs = chosen_topics(settings.topics)  # type: ignore[misc]
         self.recording: OpenRecording | None = None
         self.describer: DescriptionCollector | None = None
-        self._said: dict[
-            tuple[str, type[DescriptionReply]], DescriptionReply
-        ] = {}  # by services of themselves, the last of each kind
-        self._ended = RecordReply()  # how the last recording stood at its end
-        self._written: Counter[str] = Counter()  # by key, into recordings that are complete
-        self._missing: Counter[str] = Counter()
+        # By service and type: the last description of each.
+        self._descriptions: dict[tuple[str, type[DescriptionReply]], DescriptionReply] = {}
+        self._ended = RecordReply()  # final state of the last recording
+        self._written: Counter[str] = Counter()  # by key, in completed recordings
+        self._missing: Counter[str] = Counter()  # by key, in completed recordings
         self._flush_at = 0.0
-        self._warn_at: float | None = None  # of nobody there; None: no more
-        self._alone = ""  # what to say of that
+        self._warn_at: float | None = None  # when to warn that the router is not reached; None once it was reached
+        self._no_link_note = ""  # the warning, while the router is not reached
 
     def open(self) -> None:
-        """Begin to record, unless told to wait; ask who is there what it is."""
+        """Begins to record, unless idle, and starts to collect the services' descriptions."""
         options = self.options
         self.loop.inbox.capacity = options.capacity
         warn_about_unfinished(options.directory, self.log)
         if not options.idle:
             self._begin(numbered=False)
-        self._say_whether_it_records()
+        self._update_note()
         self._flush_at = time.monotonic() + options.flush
         self._warn_at = time.monotonic() + LINK_WARNING_DELAY_S if options.link().connect else None
         self.describer = DescriptionCollector(self.loop.bus, self.name, self.log, weights=options.weights)
 
     def on_sample(self, sample: Sample) -> None:
-        """Into the file, where there is one."""
+        """Writes the sample if a recording is open."""
         if self.recording is None:
             return
-        if self.loop.inbox.counted_as(sample.key) != sample.key:  # somebody invents keys
+        if self.loop.inbox.counted_as(sample.key) != sample.key:  # more keys than a recording may have
             self.loop.inbox.dropped[OTHERS] += 1
             self.counters["turned_away"] += 1
             return
@@ -73,7 +72,7 @@ class RecorderService(Service):
         self.counters["written_bytes"] += len(sample.payload)
 
     def on_request(self, query: Query, request: Request) -> Reply:
-        """Begin, end, or say how it stands."""
+        """Starts or stops a recording, and returns its state."""
         if not isinstance(request, RecordRequest):
             return super().on_request(query, request)
         state = self._state()
@@ -92,23 +91,23 @@ class RecorderService(Service):
         return self._ended if self.recording is None else self.recording.state()
 
     def _begin(self, *, numbered: bool) -> None:
-        """A new file, with what is known of those who are there; they are asked again, for a world changes."""
+        """Opens a new file, writes the known descriptions, and queries them again in case the world has changed."""
         self.recording = OpenRecording(self.options, self.inputs, self.loop.inbox, numbered=numbered)
-        self._say_whether_it_records()
+        self._update_note()
         self.log.info("recording", file=self.recording.state().file)
         if self.describer is not None:
-            for (service, _), answer in self._said.items():
+            for (service, _), answer in self._descriptions.items():
                 if service in self.describer.present:
                     self.recording.describe(service, answer)
             self.describer.query_all()
 
     def _end(self) -> None:
-        """Complete the file. What fails is over all the same."""
+        """Completes the file. The recording counts as ended even if this fails."""
         recording, self.recording = self.recording, None
-        assert recording is not None  # noqa: S101 - callers have looked
+        assert recording is not None  # noqa: S101 - checked by the callers
         state, dropped, missing = recording.state(), recording.dropped(), recording.missing()
         self._ended = state.model_copy(update={"recording": False})
-        self._say_whether_it_records()
+        self._update_note()
         for key, written in recording.ledger.written.items():
             self._written[key] += written
             self._missing[key] += recording.ledger.lost(key).missing
@@ -119,9 +118,13 @@ class RecorderService(Service):
             if writer.failed:
                 self._ended = self._ended.model_copy(update={"messages": writer.saved})
                 self.log.error(
-                    "recording is incomplete", file=str(writer.part.active), messages=writer.saved,
-                    lost=recording.lost(), dropped=dropped, missing=missing,
-                )  # fmt: skip
+                    "recording is incomplete",
+                    file=str(writer.part.active),
+                    messages=writer.saved,
+                    lost=recording.lost(),
+                    dropped=dropped,
+                    missing=missing,
+                )
         self._ended = self._ended.model_copy(update={"file": str(path)})
         if not writer.failed:
             parts = {"parts": len(files)} if len(files) > 1 else {}
@@ -129,7 +132,7 @@ class RecorderService(Service):
             self.log.info("recorded", file=str(path), **counts, **parts)
 
     def extra_counts(self, key: str) -> dict[str, int]:
-        """For health: what was written of a key, and what never came."""
+        """Written and missing messages of a key, for the health message."""
         written, missing = self._written[key], self._missing[key]
         if self.recording is not None:
             ledger = self.recording.ledger
@@ -137,26 +140,26 @@ class RecorderService(Service):
         return {"written": written, "missing": min(missing, MAX_COUNT)}
 
     def due(self) -> float | None:
-        """Until the next flush."""
+        """Seconds until the next flush."""
         return self._flush_at - time.monotonic()
 
     def on_timer(self) -> None:
-        """Now and then: what services said of themselves, then to disk."""
+        """Writes new descriptions, checks the link and flushes the file."""
         self._flush_at = time.monotonic() + self.options.flush
         self._write_answers()
-        self._look_for_others()
+        self._check_link()
         if self.recording is not None:
             self.recording.writer.flush()
 
     def close(self) -> None:
-        """What still waits, then the end of the file."""
+        """Writes the messages that are still queued and completes the file."""
         inbox, describer = self.loop.inbox, self.describer
         if describer is None:
             return
         describer.stop()
         try:
             if self.recording is not None and not self.recording.writer.failed:
-                for _ in range(inbox.capacity):  # bounded: others may go on publishing
+                for _ in range(inbox.capacity):  # bounded, because others may continue to publish
                     if (entry := inbox.get(0)) is None:
                         break
                     if isinstance(entry, Sample):
@@ -167,36 +170,36 @@ class RecorderService(Service):
                 self._end()
             describer.join()
 
-    def _look_for_others(self) -> None:
-        """Say once that nobody is there, and when somebody comes after that."""
+    def _check_link(self) -> None:
+        """Warns once if the router is not reached, and logs when it is reached after that."""
         if self._warn_at is None or time.monotonic() < self._warn_at:
             return
         linked = self.loop.bus.linked()
-        if not linked and not self._alone:
-            self._alone = f"nothing answers at {', '.join(self.options.link().connect)}"
-            advice = "start a session with `presage up`, or say where it is with --connect"
-            self.log.warning(self._alone, advice=advice)
+        if not linked and not self._no_link_note:
+            self._no_link_note = f"nothing answers at {', '.join(self.options.link().connect)}"
+            advice = "start a session with `presage up`, or name its endpoint with --connect"
+            self.log.warning(self._no_link_note, advice=advice)
         elif linked:
-            if self._alone:
-                self.log.info("there it is")
-            self._warn_at, self._alone = None, ""
-        self._say_whether_it_records()
+            if self._no_link_note:
+                self.log.info("connected to the router")
+            self._warn_at, self._no_link_note = None, ""
+        self._update_note()
 
-    def _say_whether_it_records(self) -> None:
-        """The note in health."""
-        self.note = self._alone or ("" if self.recording is not None else "records nothing until told")
+    def _update_note(self) -> None:
+        """Sets the note in the health message."""
+        self.note = self._no_link_note or ("" if self.recording is not None else "records nothing until told")
 
     def _write_answers(self) -> None:
         if self.describer is None:
             return
         for service, answer in self.describer.answers():
-            self._said[service, type(answer)] = answer
+            self._descriptions[service, type(answer)] = answer
             if self.recording is not None:
                 self.recording.describe(service, answer)
 
 
 def chosen_topics(names: str) -> tuple[Topic, ...]:
-    """The rows of those comma-separated names, or all that are marked; raises UserError for an unknown one."""
+    """Topics of the comma-separated names. Defaults to all recorded topics; raises UserError for an unknown name."""
     recorded = {topic.name: topic for topic in TOPICS if topic.recorded}
     wanted = [part.strip() for part in names.split(",") if part.strip()]
     if unknown := [name for name in wanted if name not in recorded]:
@@ -205,5 +208,5 @@ def chosen_topics(names: str) -> tuple[Topic, ...]:
 
 
 def write_world(writer: RecordingWriter | PartsWriter, reply: WorldReply) -> None:
-    """The world as an attachment that `load_world` reads; scanner and robot as JSON."""
+    """Writes the world as an attachment that `load_world` reads, and scanner and robot as JSON metadata."""
     write_description(writer, WORLD.server, reply)

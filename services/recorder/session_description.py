@@ -16,20 +16,20 @@ from common.log import Logger
 from common.messages.requests import ConfigReply, ModelReply, ModelRequest, Request, WorldReply
 from common.messages.topics import CONFIG, MODEL, WORLD, Query
 
-ANSWER_TIMEOUT_S = 2.0  # s, for one answer
-RETRY_DELAY_S = 5.0  # s, until one that did not answer is asked again
+ANSWER_TIMEOUT_S = 2.0  # for one reply
+RETRY_DELAY_S = 5.0  # after a service did not reply
 MAX_ATTEMPTS = 5
-MODEL_RETRY_DELAY_S = 0.5  # s, until an estimator that has seen no scan is asked again for its model
-MODEL_RECHECK_PERIOD_S = 5.0  # s, until the model is looked at again: another scanner may call for other weights
+MODEL_RETRY_DELAY_S = 0.5  # while an estimator has no model yet because it has received no scan
+MODEL_RECHECK_PERIOD_S = 5.0  # the model can change: another scanner may need other weights
 ALL_SERVICES = "*"
-MAX_WEIGHTS_BYTES = 16 << 20  # bytes; larger weights are named by their digest alone
+MAX_WEIGHTS_BYTES = 16 << 20  # of larger weights only the digest is stored
 
 DescriptionReply = ConfigReply | WorldReply | ModelReply
 
 
 @dataclass(frozen=True)
 class MetadataRecord:
-    """A named map of text for the file."""
+    """A named map of text to be stored in the recording."""
 
     name: str
     values: dict[str, str]
@@ -37,7 +37,7 @@ class MetadataRecord:
 
 @dataclass(frozen=True)
 class AttachmentRecord:
-    """A file inside the file."""
+    """A file to be attached to the recording."""
 
     name: str
     data: bytes
@@ -45,7 +45,7 @@ class AttachmentRecord:
 
 
 def records_of(service: str, answer: DescriptionReply) -> Iterator[MetadataRecord | AttachmentRecord]:
-    """What an answer is stored as; what metadata speaks of comes before it. Pure."""
+    """Yields the records that store a reply. Attachments come before the metadata that refers to them."""
     if isinstance(answer, WorldReply):
         yield from _records_of_world(answer)
     elif isinstance(answer, ModelReply):
@@ -55,7 +55,7 @@ def records_of(service: str, answer: DescriptionReply) -> Iterator[MetadataRecor
 
 
 def _records_of_world(reply: WorldReply) -> Iterator[MetadataRecord | AttachmentRecord]:
-    """The world as a file that `load_world` reads; scanner and robot as JSON."""
+    """The world as a file that `load_world` reads, and scanner and robot as JSON."""
     if reply.world is not None:
         yield AttachmentRecord("world.yaml", save_world(reply.world).encode(), "application/yaml")
     described = {"scanner": reply.scanner, "robot": reply.robot}
@@ -63,8 +63,8 @@ def _records_of_world(reply: WorldReply) -> Iterator[MetadataRecord | Attachment
 
 
 def _records_of_model(reply: ModelReply) -> Iterator[MetadataRecord | AttachmentRecord]:
-    """A folder ``model/`` that serves as `--models`, and the estimator's map in it."""
-    # The name comes from the bus and will be a file's: nothing that could lead out of a folder.
+    """A folder ``model/`` that can be passed to `--models`, with the estimator's map in it."""
+    # The name comes from the bus and becomes a file name, so it must not contain a path.
     named = re.fullmatch(r"[\w.-]+\.safetensors", reply.file) is not None
     stored = "none: nothing was learned" if not reply.file else "not stored"
     if reply.world is not None:
@@ -81,23 +81,29 @@ def _records_of_model(reply: ModelReply) -> Iterator[MetadataRecord | Attachment
 
 
 class DescriptionCollector:
-    """Answers wait in a queue, so that recording goes on while a service is slow or silent."""
+    """Queries services for their descriptions in a thread, so that a slow service does not hold up the recording."""
 
     def __init__(self, bus: Bus, me: str, log: Logger, *, weights: bool = True) -> None:
-        """Begin to watch; ``me`` is not asked. ``weights``: ask for the model's, up to `MAX_WEIGHTS_BYTES`."""
+        """Starts the thread. The service ``me`` is not queried.
+
+        With ``weights``, also fetches the model's weights, up to `MAX_WEIGHTS_BYTES`.
+        """
         self._bus, self._me, self._log, self._weights = bus, me, log, weights
-        self._seen: queue.SimpleQueue[tuple[str, bool] | None] = queue.SimpleQueue()  # from zenoh's thread
+        # Services that came (True) or went (False), from zenoh's thread; None wakes the thread.
+        self._events: queue.SimpleQueue[tuple[str, bool] | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[tuple[str, DescriptionReply]] = queue.SimpleQueue()
-        self._waiting: dict[tuple[str, str], tuple[float, int]] = {}  # service, query: when to ask, attempts before
-        self._last: dict[tuple[str, str], DescriptionReply] = {}  # what was said once is not stored again
-        self.present: frozenset[str] = frozenset()  # services that are there
+        self._scheduled: dict[
+            tuple[str, str], tuple[float, int]
+        ] = {}  # by service and query: due time, attempts so far
+        self._last: dict[tuple[str, str], DescriptionReply] = {}  # an unchanged reply is not stored again
+        self.present: frozenset[str] = frozenset()  # services that are alive
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="describer", daemon=True)
         self._thread.start()
-        bus.watch_alive(lambda service, there: self._seen.put((service, there)))
+        bus.watch_alive(lambda service, there: self._events.put((service, there)))
 
     def answers(self) -> Iterator[tuple[str, DescriptionReply]]:
-        """Service and answer, of those that came since the last call."""
+        """Yields service and reply for each reply since the last call."""
         while True:
             try:
                 yield self._answers.get_nowait()
@@ -105,67 +111,67 @@ class DescriptionCollector:
                 return
 
     def query_all(self) -> None:
-        """Ask everybody once more; an answer that is new is among `answers`."""
-        self._seen.put((ALL_SERVICES, True))
+        """Queries all services again. Changed replies appear in `answers`."""
+        self._events.put((ALL_SERVICES, True))
 
     def stop(self) -> None:
-        """Ask nobody any more; an answer under way may still come."""
+        """Stops querying. A reply that is already on its way may still arrive."""
         self._stopping.set()
-        self._seen.put(None)
+        self._events.put(None)
 
     def join(self) -> None:
-        """After `stop`: wait for the thread, which ends within the time-out of an answer."""
+        """Waits for the thread after `stop`. It ends within the timeout of one query."""
         self._thread.join(ANSWER_TIMEOUT_S + 1.0)
 
     def _run(self) -> None:
         while not self._stopping.is_set():
             self._wait_for_event()
-            for (service, query), (due, attempts) in list(self._waiting.items()):
+            for (service, query), (due, attempts) in list(self._scheduled.items()):
                 if due > time.monotonic() or self._stopping.is_set():
                     continue
-                del self._waiting[service, query]
+                del self._scheduled[service, query]
                 self._query_and_reschedule(service, QUERIES[query], attempts)
 
     def _query_and_reschedule(self, service: str, query: Query, attempts: int) -> None:
-        """Ask, and say when to ask again, if at all."""
+        """Sends the query once and schedules the next attempt, if any."""
         try:
-            again, attempts = self._query(service, query), 0
+            delay, attempts = self._query(service, query), 0
         except UserError as error:
-            again, attempts = RETRY_DELAY_S if attempts + 1 < MAX_ATTEMPTS else None, attempts + 1
+            delay, attempts = RETRY_DELAY_S if attempts + 1 < MAX_ATTEMPTS else None, attempts + 1
             if not self._stopping.is_set():
                 self._log.warning("a service did not describe itself", service=service, why=str(error))
-        if again is not None:
-            self._waiting[service, query.name] = (time.monotonic() + again, attempts)
+        if delay is not None:
+            self._scheduled[service, query.name] = (time.monotonic() + delay, attempts)
 
     def _wait_for_event(self) -> None:
-        """Wait for a service to come or go, or for the next to be asked."""
-        due = min((due for due, _ in self._waiting.values()), default=None)
+        """Waits until a service comes or goes, or the next query is due."""
+        due = min((due for due, _ in self._scheduled.values()), default=None)
         try:
-            seen = self._seen.get(timeout=None if due is None else max(0.0, due - time.monotonic()))
+            event = self._events.get(timeout=None if due is None else max(0.0, due - time.monotonic()))
         except queue.Empty:
             return
-        if seen is None or seen[0] == self._me:
+        if event is None or event[0] == self._me:
             return
-        service, there = seen
+        service, alive = event
         if service == ALL_SERVICES:
             for each in self.present:
                 self._schedule_queries(each)
-        elif there:
+        elif alive:
             self.present |= {service}
             self._schedule_queries(service)
         else:
             self.present -= {service}
             for query in QUERIES:
-                self._waiting.pop((service, query), None)
+                self._scheduled.pop((service, query), None)
 
     def _schedule_queries(self, service: str) -> None:
-        """It is to be asked now, whatever it can be asked."""
+        """Schedules all queries that the service answers, for now."""
         for query in QUERIES.values():
             if query.per_service or query.server == service:
-                self._waiting[service, query.name] = (time.monotonic(), 0)
+                self._scheduled[service, query.name] = (time.monotonic(), 0)
 
     def _query(self, service: str, query: Query) -> float | None:
-        """Put a new answer into the queue; seconds until the question is worth asking again, or None."""
+        """Queries the service and queues a changed reply. Returns the delay until the next query in s, or None."""
         if query is CONFIG:
             self._queue_if_new(service, query, self._bus.ask(CONFIG, Request(), ConfigReply, ANSWER_TIMEOUT_S, service))
         elif query is WORLD:
@@ -179,14 +185,14 @@ class DescriptionCollector:
         if not reply.ok:
             return MODEL_RETRY_DELAY_S
         if reply != self._last.get((service, MODEL.name)):
-            whole = reply
+            with_weights = reply
             if self._weights and 0 < reply.size <= MAX_WEIGHTS_BYTES:
-                whole = self._bus.ask(MODEL, ModelRequest(weights=True), ModelReply, ANSWER_TIMEOUT_S)
-                if not whole.ok:
-                    self._log.warning("the weights are not stored", why=whole.reason)
-                    whole = reply
+                with_weights = self._bus.ask(MODEL, ModelRequest(weights=True), ModelReply, ANSWER_TIMEOUT_S)
+                if not with_weights.ok:
+                    self._log.warning("the weights are not stored", why=with_weights.reason)
+                    with_weights = reply
             self._last[service, MODEL.name] = reply
-            self._answers.put((service, whole))
+            self._answers.put((service, with_weights))
         return MODEL_RECHECK_PERIOD_S
 
     def _queue_if_new(self, service: str, query: Query, answer: ConfigReply | WorldReply) -> None:

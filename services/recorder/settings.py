@@ -11,32 +11,40 @@ from common.runtime.config import ServiceSettings
 
 
 class RecorderSettings(ServiceSettings):
-    """Recorder: every message of the session, bytes as sent, into an MCAP file.
+    """Recorder: writes every message of the session unchanged to an MCAP file.
 
     The file is NAME.mcap.active until it is complete; `presage recover` completes one whose recorder was killed.
 
     Examples:
-      python -m services.recorder                                    into recordings/
+      python -m services.recorder                                    records to recordings/
       python -m services.recorder --directory logs --file run.mcap
       python -m services.recorder --topics scan,odom --compression none
-      python -m services.recorder --idle                             records when the page, or a program, says so
-      python -m services.recorder --split-minutes 10                 run-001.mcap, run-002.mcap, each whole by itself
+      python -m services.recorder --idle                             waits for a request from the page or a program
+      python -m services.recorder --split-minutes 10                 NAME-001.mcap, NAME-002.mcap, each complete
 
     """
 
     service: ClassVar[str] = "recorder"
 
-    directory: Annotated[Path, Field(description="folder, made where it is missing")] = Path("recordings")
-    file: Annotated[str, Field(pattern=r"^[^/]*$", description="name; none: presage-ROBOT-TIME.mcap, UTC")] = ""
-    idle: Annotated[bool, Field(description="record nothing until told to: query `recording`")] = False
-    topics: Annotated[str, Field(description="comma-separated topic names; empty: all that the table marks")] = ""
+    directory: Annotated[Path, Field(description="folder for recordings, created if missing")] = Path("recordings")
+    file: Annotated[
+        str, Field(pattern=r"^[^/]*$", description="file name; defaults to presage-ROBOT-TIME.mcap, time in UTC")
+    ] = ""
+    idle: Annotated[bool, Field(description="record nothing until a request (query `recording`) starts it")] = False
+    topics: Annotated[str, Field(description="comma-separated topic names; defaults to all recorded topics")] = ""
     compression: Annotated[Literal["zstd", "lz4", "none"], Field(description="zstd, lz4 or none")] = "zstd"
-    # Half of the largest chunk that is read (chunks.py): a message and declarations may come on top.
-    chunk_size: Annotated[int, Field(ge=1024, le=1 << 23, description="bytes; a crash loses at most one chunk")] = (
-        1 << 18
-    )
-    flush: Annotated[float, Field(ge=0.05, le=60, description="s; a kill loses at most what came since")] = 0.5
-    capacity: Annotated[int, Field(ge=1, le=10_000_000, description="messages that may wait to be written")] = 20_000
-    split_size: Annotated[float, Field(ge=0, description="MB of one part; 0: one file")] = 0.0
-    split_minutes: Annotated[float, Field(ge=0, description="of one part; 0: one file")] = 0.0
+    # At most half of MAX_CHUNK_BYTES (chunks.py), because one message and declarations may exceed the chunk size.
+    chunk_size: Annotated[
+        int, Field(ge=1024, le=1 << 23, description="chunk size in bytes; a crash loses at most one chunk")
+    ] = 1 << 18
+    flush: Annotated[
+        float, Field(ge=0.05, le=60, description="flush period in s; a kill loses at most the messages since then")
+    ] = 0.5
+    capacity: Annotated[
+        int, Field(ge=1, le=10_000_000, description="maximum number of messages that wait to be written")
+    ] = 20_000
+    split_size: Annotated[float, Field(ge=0, description="maximum size of one part in MB; 0 writes one file")] = 0.0
+    split_minutes: Annotated[
+        float, Field(ge=0, description="maximum duration of one part in minutes; 0 writes one file")
+    ] = 0.0
     weights: Annotated[bool, Field(description="store the estimator's weights, up to 16 MiB")] = True

@@ -54,7 +54,7 @@ def test_an_unfinished_recording_becomes_a_whole_one(tmp_path):
     assert recording.metadata["recovered"]["bytes_not_used"] == "0"
     assert recording.attachments == {"world.yaml": b"name: x"}
     assert found.messages == {KEY: CHUNKS * EACH}
-    assert found.lines()[1:] == ["missing: its end; what came after the last flush was never in the file"]
+    assert found.lines()[1:] == ["missing: the end of the file; messages after the last flush were never written"]
     for reader in (NonSeekingReader, make_reader):
         with found.path.open("rb") as stream:
             messages = list(reader(stream, validate_crcs=True).iter_messages())
@@ -108,7 +108,7 @@ def test_what_is_missing_is_said_by_the_publishers_numbers(tmp_path):
     whole[ends[2] + 60] ^= 1
     (tmp_path / "bad.mcap").write_bytes(whole)
     lines = recover(tmp_path / "bad.mcap").lines()
-    assert f"missing: {EACH} messages of {KEY} by their numbers, in 1 gaps" in lines
+    assert f"missing: {EACH} messages of {KEY} by their sequence numbers, in 1 gaps" in lines
     assert any("bytes from byte" in line for line in lines)
 
 

@@ -170,7 +170,7 @@ def test_it_does_not_wait_in_silence_for_nobody(processes, tmp_path, free_port):
     running.wait_for(f"nothing answers at {endpoint}")
     running.wait_for("start a session with `presage up`")
     processes.start("common.router", "--listen", endpoint)
-    running.wait_for("there it is")
+    running.wait_for("connected to the router")
     assert running.output.count("nothing answers") == 1
     assert running.stop()[0] == 0
 
@@ -227,7 +227,7 @@ def test_a_file_removed_underneath_is_noticed(recorder, bus, tmp_path):
     running = recorder()
     only_file(tmp_path / "logs", ".mcap.active").unlink()
     assert running.wait() == 2
-    assert "was removed or moved away while it was written" in running.output
+    assert "was removed or moved while it was being written" in running.output
     assert "Traceback" not in running.output
 
 

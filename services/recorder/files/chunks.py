@@ -17,71 +17,71 @@ from mcap.records import Channel, Chunk, Message, Schema
 from mcap.writer import CompressionType, Writer
 
 COMPRESSION = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
-# A file of 200 kB can state and hold chunks of gigabytes; the recorder writes at most half of this.
+# A file of 200 kB can unpack to chunks of gigabytes. The recorder writes at most half of this.
 MAX_CHUNK_BYTES = 1 << 24
-MAGIC = b"\x89MCAP0\r\n"  # what every file begins and ends with
-PREFIX = Struct("<BQ")  # of every record: opcode, length of what follows (MCAP specification, "Records")
-BUILDER = "_Writer__chunk_builder"  # mcap has no setting that repeats declarations
+MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of every file
+PREFIX = Struct("<BQ")  # first bytes of every record: opcode and length (MCAP specification, "Records")
+BUILDER = "_Writer__chunk_builder"  # private: mcap has no option to repeat declarations in each chunk
 MESSAGE = Struct("<HIQQ")  # channel, sequence, log time, publish time
 
 
 class SelfContainedChunk(ChunkBuilder):
-    """A chunk with the schemas and channels of all its messages: where another chunk is damaged, it stays readable."""
+    """A chunk that repeats the schemas and channels of its messages, so it stays readable if others are damaged."""
 
     def __init__(self) -> None:
         super().__init__()
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
-        self._here: set[tuple[type, int]] = set()  # schemas and channels that are in this chunk
+        self._declared: set[tuple[type, int]] = set()  # schemas and channels that are in this chunk
 
     def add_schema(self, schema: Schema) -> None:
-        """Put it into this chunk, and later into each that needs it."""
+        """Adds the schema to this chunk, and to each later chunk that needs it."""
         self._schemas[schema.id] = schema
         self._declare_schema(schema)
 
     def add_channel(self, channel: Channel) -> None:
-        """Put it into this chunk, and later into each that has messages of it."""
+        """Adds the channel to this chunk, and to each later chunk that has messages of it."""
         self._channels[channel.id] = channel
         self._declare_channel(channel)
 
     def add_message(self, message: Message) -> None:
-        """Add a message behind the declaration of its channel."""
+        """Adds a message, after the declaration of its channel."""
         self._declare_channel(self._channels[message.channel_id])
         super().add_message(message)
 
     def reset(self) -> None:
-        """Begin the next chunk."""
+        """Begins the next chunk."""
         super().reset()  # type: ignore[no-untyped-call]
-        self._here.clear()
+        self._declared.clear()
 
     def _declare_schema(self, schema: Schema) -> None:
-        if (Schema, schema.id) not in self._here:
-            self._here.add((Schema, schema.id))
+        if (Schema, schema.id) not in self._declared:
+            self._declared.add((Schema, schema.id))
             super().add_schema(schema)
 
     def _declare_channel(self, channel: Channel) -> None:
-        if (Channel, channel.id) in self._here:
+        if (Channel, channel.id) in self._declared:
             return
-        self._here.add((Channel, channel.id))
+        self._declared.add((Channel, channel.id))
         if channel.schema_id:
             self._declare_schema(self._schemas[channel.schema_id])
         super().add_channel(channel)
 
 
 def mcap_writer(stream: BinaryIO, compression: str, chunk_size: int) -> tuple[Writer, SelfContainedChunk]:
-    """A writer with checksums of every part of the file, and the chunk it fills."""
+    """Returns a writer that checksums every part of the file, and the chunk that it fills."""
     writer = Writer(stream, chunk_size=chunk_size, compression=COMPRESSION[compression], enable_data_crcs=True)
     if not isinstance(getattr(writer, BUILDER, None), ChunkBuilder):
-        raise TypeError("this version of the package mcap builds its chunks elsewhere: install mcap 1.6")
+        raise TypeError("this version of the package mcap is not supported: install mcap 1.6")
     chunk = SelfContainedChunk()
     setattr(writer, BUILDER, chunk)
     return writer, chunk
 
 
 def records_of(chunk: Chunk) -> Iterator[Schema | Channel | Message]:
-    """What is in a chunk; raises ValueError or the decompressor's own error where it is damaged or too large.
+    """Yields the records of a chunk, after checking its checksum.
 
-    The checksum is compared before the first record comes.
+    Raises ValueError, or the decompressor's own error, if the chunk is damaged or too large.
     """
     data = uncompressed(chunk)
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
@@ -107,12 +107,12 @@ def records_of(chunk: Chunk) -> Iterator[Schema | Channel | Message]:
 
 
 def uncompressed(chunk: Chunk) -> bytes:
-    """The records of a chunk as bytes; raises as `records_of`, and never makes more than `MAX_CHUNK_BYTES`."""
+    """The uncompressed records of a chunk, at most `MAX_CHUNK_BYTES`. Raises the errors of `records_of`."""
     size = chunk.uncompressed_size
     if size > MAX_CHUNK_BYTES:
         raise ValueError(f"a chunk of {size} bytes, where at most {MAX_CHUNK_BYTES} are read")
     if chunk.compression == "zstd":
-        if zstandard.frame_content_size(chunk.data) not in {-1, size}:  # -1: the frame does not state it
+        if zstandard.frame_content_size(chunk.data) not in {-1, size}:  # -1: the frame does not state its size
             raise ValueError("a chunk's size is not what it states")
         data = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size)
     elif chunk.compression == "lz4":
@@ -120,7 +120,7 @@ def uncompressed(chunk: Chunk) -> bytes:
     elif not chunk.compression:
         data = chunk.data
     else:
-        raise ValueError(f"a chunk is compressed with {chunk.compression[:20]!r}, which is not known here")
+        raise ValueError(f"a chunk has the unknown compression {chunk.compression[:20]!r}")
     if len(data) != size:
         raise ValueError("a chunk's size is not what it states")
     return bytes(data)

@@ -17,14 +17,14 @@ from mcap.summary import Summary
 
 from services.recorder.files.chunks import MAGIC, PREFIX, records_of
 
-FOOTER = Struct("<BQQQI")  # opcode, length, where the summary begins, where its offsets do, its checksum
-CRC_BYTES = 4  # the footer's last field, which the summary's checksum leaves out
-OVERHEAD = 512  # bytes of memory that a message takes beside its payload, about
-MAX_WAITING_BYTES = 1 << 28  # of messages that wait for their place in time, where chunks overlap
+FOOTER = Struct("<BQQQI")  # opcode, length, offset of the summary, offset of the summary offsets, summary checksum
+CRC_BYTES = 4  # size of the checksum, which itself is not part of the checksummed data
+MESSAGE_OVERHEAD_BYTES = 512  # approximate memory of a message besides its payload
+MAX_WAITING_BYTES = 1 << 28  # messages held in memory to sort them by time, if chunks overlap
 
 
 def summary_of(stream: BinaryIO) -> Summary | None:
-    """The summary at a file's end; None where the file states that it has none, ValueError where it is damaged."""
+    """The summary at the end of a file. Returns None if the file has none; raises ValueError if it is damaged."""
     size = stream.seek(0, os.SEEK_END)
     at = size - len(MAGIC) - FOOTER.size
     stream.seek(max(0, at))
@@ -47,9 +47,10 @@ def summary_of(stream: BinaryIO) -> Summary | None:
 def in_order(
     stream: BinaryIO, summary: Summary, keys: Collection[str] | None, start_ns: int | None, end_ns: int | None
 ) -> Iterator[tuple[Channel, Message]]:
-    """Messages of some keys and times, by their log times; raises where a chunk is damaged."""
+    """Yields the selected messages in the order of their log times. Raises if a chunk is damaged."""
     ids = {number for number, channel in summary.channels.items() if keys is None or channel.topic in keys}
-    # By time, then by place in the file: a chunk stands before its messages. Of a chunk the index, of a message itself.
+    # Holds chunk indexes and messages, ordered by time and then by position in the file; a chunk (number -1) comes
+    # before its own messages.
     queue: list[tuple[int, int, int, Any]] = [
         (index.message_start_time, index.chunk_start_offset, -1, index)
         for index in summary.chunk_indexes
@@ -60,7 +61,7 @@ def in_order(
     while queue:
         _, offset, _, entry = heapq.heappop(queue)
         if not isinstance(entry, ChunkIndex):
-            waiting -= len(entry.data) + OVERHEAD
+            waiting -= len(entry.data) + MESSAGE_OVERHEAD_BYTES
             yield summary.channels[entry.channel_id], entry
             continue
         if (start_ns is not None and entry.message_end_time < start_ns) or (
@@ -71,9 +72,9 @@ def in_order(
         for number, record in enumerate(records_of(Chunk.read(ReadDataStream(stream)))):
             if not isinstance(record, Message) or record.channel_id not in ids:
                 continue
-            at = record.log_time
-            if (start_ns is None or at >= start_ns) and (end_ns is None or at < end_ns):
-                heapq.heappush(queue, (at, offset, number, record))
-                waiting += len(record.data) + OVERHEAD
+            log_time = record.log_time
+            if (start_ns is None or log_time >= start_ns) and (end_ns is None or log_time < end_ns):
+                heapq.heappush(queue, (log_time, offset, number, record))
+                waiting += len(record.data) + MESSAGE_OVERHEAD_BYTES
         if waiting > MAX_WAITING_BYTES:
-            raise ValueError("too many chunks are of the same time")
+            raise ValueError("too many chunks overlap in time")

@@ -10,30 +10,30 @@ import msgpack
 
 from common.messages.topics import topic_of
 
-MAX_COUNT = 1 << 62  # a count that is larger, by numbers somebody made up, stays there: a message must hold it
-MAX_INSTANCES = 100  # of a key; a sender that invents instances must not fill memory
+MAX_COUNT = 1 << 62  # counts saturate here, so that forged sequence numbers cannot overflow a message field
+MAX_INSTANCES = 100  # per key, so that a sender with ever new instance names cannot fill the memory
 MAX_INSTANCE_LENGTH = 200
-MAX_REORDER_DISTANCE = 64  # a number so much below the last is a publisher that began anew, not a late message
+MAX_REORDER_DISTANCE = 64  # a larger step back means that the publisher restarted, not that a message was late
 
 
 @dataclass
 class Sequence:
-    """A publisher's numbers on one key, as they came: 0, 1, 2 and so on."""
+    """Counts gaps and restarts in the sequence numbers (0, 1, 2, ...) of one publisher on one key."""
 
-    gaps: int = 0  # places where at least one number was left out
-    missing: int = 0  # numbers left out
-    restarts: int = 0  # times the publisher began anew
-    reordered: int = 0  # numbers that came late or twice, or of a second publisher
-    _next: int | None = None  # a recorder that came later has missed nothing it was there for
+    gaps: int = 0  # places where at least one number is missing
+    missing: int = 0  # missing numbers
+    restarts: int = 0  # times the publisher restarted
+    reordered: int = 0  # numbers that came late or twice, or from a second publisher
+    _next: int | None = None  # None before the first number: earlier messages do not count as missing
 
     def see(self, number: int) -> None:
-        """The next one."""
-        due = number if self._next is None else self._next
-        if number > due:
+        """Counts the next received number."""
+        expected = number if self._next is None else self._next
+        if number > expected:
             self.gaps += 1
-            self.missing = min(MAX_COUNT, self.missing + number - due)
-        elif number < due:
-            if number and due - number <= MAX_REORDER_DISTANCE:
+            self.missing = min(MAX_COUNT, self.missing + number - expected)
+        elif number < expected:
+            if number and expected - number <= MAX_REORDER_DISTANCE:
                 self.reordered += 1
                 return
             self.restarts += 1
@@ -42,30 +42,30 @@ class Sequence:
 
 @dataclass
 class Count:
-    """Of one key."""
+    """Messages of one key, as stored in a recording's metadata `counters`."""
 
-    received: int = 0  # by the process, whatever became of it
-    written: int = 0  # handed to the file
-    dropped: int = 0  # the queue was full
+    received: int = 0  # by the recorder process
+    written: int = 0  # to the file
+    dropped: int = 0  # because the queue was full
     oversized: int = 0  # longer than the bus allows
-    unreadable: int = 0  # written, though no MessagePack map with a sequence number
+    unreadable: int = 0  # written, but without a readable sequence number
     gaps: int = 0
-    missing: int = 0  # sent by the publisher and never received
+    missing: int = 0  # published but never received
     restarts: int = 0
     reordered: int = 0
 
 
 @dataclass
 class Ledger:
-    """Counts of all keys."""
+    """Counts the messages of all keys."""
 
     written: dict[str, int] = field(default_factory=dict)
     unreadable: dict[str, int] = field(default_factory=dict)
-    # By key and instance: two processes of one service publish under one key, each with numbers of its own.
+    # By key and instance: several processes of one service publish under one key, each with its own numbers.
     sequences: dict[str, dict[str, Sequence]] = field(default_factory=dict)
 
     def see(self, key: str, payload: bytes) -> None:
-        """A payload that was written."""
+        """Counts a payload that was written."""
         self.written[key] = self.written.get(key, 0) + 1
         numbered = sequence_of(payload)
         if numbered is None:
@@ -78,7 +78,7 @@ class Ledger:
             instances.setdefault(instance, Sequence()).see(number)
 
     def lost(self, key: str) -> Sequence:
-        """What a key's numbers say, of all instances together."""
+        """Gaps and missing messages of a key, summed over all instances."""
         total = Sequence()
         for sequence in self.sequences.get(key, {}).values():
             total.gaps += sequence.gaps
@@ -90,25 +90,32 @@ class Ledger:
     def counts(
         self, received: Mapping[str, int], dropped: Mapping[str, int], oversized: Mapping[str, int]
     ) -> dict[str, Count]:
-        """By key, with what the queue before the file has counted."""
+        """Counts by key, combined with the given counts of the receiving queue."""
         keys = sorted(set(received) | set(self.written))
         found = {}
         for key in keys:
             numbers = self.lost(key)
             found[key] = Count(
-                received.get(key, 0), self.written.get(key, 0), dropped.get(key, 0), oversized.get(key, 0),
-                self.unreadable.get(key, 0), numbers.gaps, numbers.missing, numbers.restarts, numbers.reordered,
-            )  # fmt: skip
+                received=received.get(key, 0),
+                written=self.written.get(key, 0),
+                dropped=dropped.get(key, 0),
+                oversized=oversized.get(key, 0),
+                unreadable=self.unreadable.get(key, 0),
+                gaps=numbers.gaps,
+                missing=numbers.missing,
+                restarts=numbers.restarts,
+                reordered=numbers.reordered,
+            )
         return found
 
 
 def as_metadata(counts: Mapping[str, Count]) -> dict[str, str]:
-    """The record `counters` at a file's end: JSON by key."""
+    """The metadata record `counters` at the end of a file: counts as JSON, by key."""
     return {key: json.dumps(asdict(count)) for key, count in counts.items()}
 
 
 def from_metadata(record: Mapping[str, str]) -> dict[str, Count]:
-    """Of a recording's metadata `counters`; what is no count is left out."""
+    """Counts by key from a recording's metadata `counters`. Leaves out invalid entries."""
     found = {}
     for key, text in record.items():
         try:
@@ -119,17 +126,17 @@ def from_metadata(record: Mapping[str, str]) -> dict[str, Count]:
 
 
 def is_numbered(key: str) -> bool:
-    """Whether one service publishes the key and counts its messages; a goal comes from whoever wishes."""
+    """Whether messages of this key are numbered by one publisher. Topics such as `goal` have several publishers."""
     topic = topic_of(key)
     return topic is not None and topic.rate > 0
 
 
 def sequence_of(payload: bytes) -> tuple[int, str] | None:
-    """The message's `seq` and `instance`; None where the payload is no MessagePack map that could have a `seq`."""
+    """The message's `seq` and `instance`. Returns None if the payload is not a MessagePack map with a valid `seq`."""
     try:
         message = msgpack.unpackb(payload)
         number, instance = message.get("seq", 0), message.get("instance", "")
-    except Exception:  # noqa: BLE001 - msgpack raises many kinds, and the payload may be anything
+    except Exception:  # noqa: BLE001 - msgpack raises many error types on arbitrary bytes
         return None
     if not isinstance(number, int) or not 0 <= number < 1 << 63:
         return None

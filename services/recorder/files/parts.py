@@ -9,58 +9,61 @@ from pathlib import Path
 from common.messages.topics import Topic
 from services.recorder.files.writer import RecordingWriter
 
-Ending = Callable[[], Mapping[str, Mapping[str, str]]]
+Ending = Callable[[], Mapping[str, Mapping[str, str]]]  # returns metadata records by name
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Of one part; 0 is none."""
+    """Limits of one part. 0 means no limit."""
 
     size: int = 0  # bytes
-    seconds: float = 0.0  # between the reception of its first message and its last
+    seconds: float = 0.0  # between the reception of the first and the last message
 
 
 class PartsWriter:
-    """Writes one file after another; what was said of the session is said again in each. Raises as RecordingWriter."""
+    """Writes one file after another and repeats metadata and attachments in each.
+
+    Has the interface of RecordingWriter and raises the same errors.
+    """
 
     def __init__(self, open_part: Callable[[int], RecordingWriter], limits: Limits, ending: Ending = dict) -> None:
-        """Open the first part, number 1; ``ending`` gives the metadata records that stand at each part's end."""
+        """Opens part 1. ``ending`` returns the metadata records that are written at the end of each part."""
         self._open, self._limits, self._ending = open_part, limits, ending
-        self._metadata: dict[str, dict[str, str]] = {}  # of each name the last
+        self._metadata: dict[str, dict[str, str]] = {}  # by name; the last record of each name
         self._attachments: dict[str, tuple[bytes, str, int]] = {}
         self._channels: dict[str, Topic] = {}  # by key
-        self._began_ns: int | None = None  # reception of the part's first message
-        self._saved_before = 0  # messages in parts that are complete
+        self._began_ns: int | None = None  # when the part's first message was received
+        self._saved_before = 0  # messages in completed parts
         self.finished: list[Path] = []
         self.part = open_part(1)
 
     @property
     def failed(self) -> bool:
-        """Whether the part that is open cannot be written any more."""
+        """Whether writing the current part has failed."""
         return self.part.failed
 
     @property
     def saved(self) -> int:
-        """Messages in all parts that are there whatever happens now."""
+        """Number of messages in all parts that are safely in the file."""
         return self._saved_before + self.part.saved
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
-        """A named map of text, in this part and in those to come."""
+        """Writes a named map of text to this part and to all later ones."""
         self._metadata[name] = values
         self.part.metadata(name, values)
 
     def attachment(self, name: str, data: bytes, media_type: str, time_ns: int) -> None:
-        """A file inside the file, in this part and in those to come."""
+        """Attaches a file to this part and to all later ones."""
         self._attachments[name] = data, media_type, time_ns
         self.part.attachment(name, data, media_type, time_ns)
 
     def declare(self, topic: Topic, key: str) -> None:
-        """The channel of a key, in this part and in those to come."""
+        """Declares the channel of a key in this part and in all later ones."""
         self._channels[key] = topic
         self.part.declare(topic, key)
 
     def write(self, topic: Topic, key: str, payload: bytes, published_ns: int, received_ns: int) -> None:
-        """One payload, exactly as it came; times in ns of the wall clock."""
+        """Writes one payload unchanged. Times are wall times in ns."""
         if self._is_over(received_ns):
             self._next()
         if self._began_ns is None:
@@ -69,11 +72,11 @@ class PartsWriter:
         self.part.write(topic, key, payload, published_ns, received_ns)
 
     def flush(self) -> None:
-        """What came before survives this process."""
+        """Hands all messages so far to the operating system, so that they survive the end of this process."""
         self.part.flush()
 
     def finish(self) -> list[Path]:
-        """Complete the last part; all of them."""
+        """Completes the last part and returns the paths of all parts."""
         if not self.part.failed:
             self._write_ending()
         self.finished.append(self.part.finish())
@@ -82,13 +85,13 @@ class PartsWriter:
     def _is_over(self, now_ns: int) -> bool:
         limits, began = self._limits, self._began_ns
         if began is None:
-            return False  # a part has one message at least
+            return False  # each part has at least one message
         large = limits.size and self.part.size >= limits.size
         return bool(large or (limits.seconds and now_ns - began >= limits.seconds * 1e9))
 
     def _next(self) -> None:
         number = len(self.finished) + 2
-        following = self._open(number)  # first: where that fails, this part still can be completed
+        following = self._open(number)  # opened first: if that fails, the current part can still be completed
         self._write_ending()
         before = self.part.finish()
         self.finished.append(before)

@@ -17,18 +17,18 @@ from services.recorder.files.chunks import mcap_writer
 
 PROFILE = "presage"
 LIBRARY = "presage recorder"
-UNFINISHED_SUFFIX = ".active"  # behind the name of a file that is not complete
+UNFINISHED_SUFFIX = ".active"  # appended to the name until the file is complete
 
 
 class NameTakenError(UserError):
-    """A recording of that name is there, or being written."""
+    """A recording of that name exists or is being written."""
 
 
 class RecordingWriter:
-    """Writes NAME.mcap.active, which becomes NAME.mcap at `finish`; every step raises UserError where it fails."""
+    """Writes NAME.mcap.active, which `finish` renames to NAME.mcap. Every method raises UserError if writing fails."""
 
     def __init__(self, path: Path, compression: str = "zstd", chunk_size: int = 1 << 18) -> None:
-        """Open the file; raises UserError where that cannot be, `NameTakenError` where the name is another's."""
+        """Opens the file. Raises UserError if that fails, and NameTakenError if the name is taken."""
         self.path, self.active = path, path.with_name(path.name + UNFINISHED_SUFFIX)
         self.written: Counter[str] = Counter()  # by key
         self.failed = False
@@ -45,24 +45,24 @@ class RecordingWriter:
 
     @property
     def size(self) -> int:
-        """Bytes that lie in the file so far; what is not flushed is not counted."""
+        """Bytes in the file so far, without those that are not yet flushed."""
         return self._stream.tell()
 
     @property
     def saved(self) -> int:
-        """Messages, at least, that are in complete chunks which the system has: they survive a failure to write on."""
+        """Number of messages in complete chunks that were handed to the operating system; they survive later errors."""
         return self._saved
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
-        """A named map of text."""
+        """Writes a named map of text."""
         self._guarded(lambda: self._writer.add_metadata(name, values))
 
     def attachment(self, name: str, data: bytes, media_type: str, time_ns: int) -> None:
-        """A file inside the file."""
+        """Attaches a file."""
         self._guarded(lambda: self._writer.add_attachment(time_ns, time_ns, name, media_type, data))
 
     def declare(self, topic: Topic, key: str) -> int:
-        """The channel of a key, with the JSON schema derived from its message; registered once."""
+        """Registers the channel of a key once, with the JSON schema of its message. Returns the channel id."""
         if key not in self._channels:
             name = topic.message.__name__
             if name not in self._schemas:
@@ -73,7 +73,7 @@ class RecordingWriter:
         return self._channels[key]
 
     def write(self, topic: Topic, key: str, payload: bytes, published_ns: int, received_ns: int) -> None:
-        """One payload, exactly as it came; times in ns of the wall clock."""
+        """Writes one payload unchanged. Times are wall times in ns."""
 
         def add() -> None:
             self._writer.add_message(
@@ -86,29 +86,29 @@ class RecordingWriter:
 
         self.written[key] += 1
         self._guarded(add)
-        if not self._chunk.num_messages:  # that was the last message of a chunk
+        if not self._chunk.num_messages:  # the chunk was completed by this message
             self._guarded(self._stream.flush)
             self._saved = self.written.total()
 
     def flush(self) -> None:
-        """Complete the chunk and hand it to the system: what came before survives this process."""
+        """Completes the chunk and hands it to the operating system, so that it survives the end of this process."""
         self._guarded(self._writer.flush)
         self._saved = self.written.total()
         if not is_there(self.active, self._stream):
             self.failed = True
             raise UserError(
-                f"{self.active}: was removed or moved away while it was written: what it held is gone with it; "
-                "start recording anew"
+                f"{self.active}: was removed or moved while it was being written, and its messages are lost; "
+                "start a new recording"
             )
 
     def finish(self) -> Path:
-        """Complete the file and give it its name; after a failure only close it, unfinished."""
+        """Completes and renames the file, and returns its path. After a failure, only closes the unfinished file."""
 
         def end() -> None:
             self._writer.finish()  # type: ignore[no-untyped-call]
             self._stream.flush()
             os.fsync(self._stream.fileno())
-            self.active.rename(self.path)  # while it is locked: nobody else has taken it
+            self.active.rename(self.path)  # before closing, which releases the lock
             self._stream.close()
 
         if self.failed:
@@ -126,19 +126,19 @@ class RecordingWriter:
             self.failed = True
             why = error.strerror or str(error)
             raise UserError(
-                f"{self.active}: recording failed ({why}); what was flushed before is in the file, and "
-                f"`presage recover {self.active}` makes a whole one of it: make room, or choose another folder"
+                f"{self.active}: recording failed ({why}); the messages flushed before are in the file, and "
+                f"`presage recover {self.active}` completes it: free some space, or choose another folder"
             ) from None
 
     def _abandon(self) -> None:
         try:
             self._stream.close()
         except OSError:
-            self._stream.raw.close()  # what is still in the buffer cannot be written
+            self._stream.raw.close()  # the rest of the buffer cannot be written
 
 
 def is_there(path: Path, stream: BufferedWriter) -> bool:
-    """Whether the file that is open still has that name."""
+    """Whether ``path`` still names the open file ``stream``."""
     try:
         named, opened = path.stat(), os.fstat(stream.fileno())
     except OSError:
@@ -147,19 +147,23 @@ def is_there(path: Path, stream: BufferedWriter) -> bool:
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether a live process holds this unfinished file; the lock ends with the process, however it ends."""
+    """Whether a running process is writing this file. The lock is released whenever that process ends."""
     try:
         with path.open("rb") as stream:
             fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
-    except OSError:  # gone, or a file system without locks
+    except OSError:  # the file is gone, or the file system has no locks
         return False
     return False
 
 
 def claim(path: Path, active: Path, remedy: str = "--file") -> BufferedWriter:
-    """The unfinished file, open; whoever makes it owns the name, so two recorders never write one recording."""
+    """Creates and locks the unfinished file ``active``, and returns it open for writing.
+
+    Creation is exclusive, so two recorders never write to one recording. Raises NameTakenError if ``active`` or
+    ``path`` exists; the message names the option ``remedy``.
+    """
     taken = f"is there already; choose another name with {remedy}, or another folder"
     try:
         stream = active.open("xb")

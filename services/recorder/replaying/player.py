@@ -1,6 +1,7 @@
 """Position, rate and pause of a replay.
 
-Positions are seconds from the recording's beginning; the wall's clock comes in as ``now``, s, and is never read here.
+Positions are seconds since the beginning of the recording. The current time is passed in as ``now`` in s; this module
+reads no clock.
 """
 
 from __future__ import annotations
@@ -12,31 +13,31 @@ from common.errors import UserError
 from common.messages.requests import PlayerReply, PlayerRequest
 from common.messages.topics import CMD_VEL, HEALTH, ROOT, TOPICS, Topic
 
-MAX_LAG_S = 1.0  # s behind its own time, beyond which a replay goes on from where it is and does not hurry
+MAX_LAG_S = 1.0  # a replay that lags further behind continues from its position instead of catching up
 MAX_STEPS = 10_000
-LOOP_GAP_S = 0.1  # s between the end of a loop and its beginning anew
+LOOP_GAP_S = 0.1  # pause between the end of a loop and its next pass
 
 
 class Player:
-    """Where a replay of ``begin`` to ``end`` stands; ``rate`` times the original timing, 0 as fast as it goes."""
+    """Position of a replay between ``begin`` and ``end``. ``rate`` multiplies the speed; 0: as fast as possible."""
 
     def __init__(self, begin: float, end: float, rate: float = 1.0, *, loop: bool = False, now: float = 0.0) -> None:
-        """Running, at ``begin``."""
+        """Starts at ``begin``, not paused."""
         self.begin, self.end, self.loop = begin, end, loop
         self.rate = 0.0 if rate <= 0 or math.isinf(rate) else rate
         self.paused = False
         self._position, self._since = begin, now
-        self._steps = 0  # asked for and not yet done
+        self._steps = 0  # requested but not yet executed
         self._seek_target: float | None = None
 
     def position(self, now: float) -> float:
-        """By the clock; as fast as it goes, and paused, that of the last message."""
+        """Position in s. While paused or with rate 0, the position of the last message."""
         if self.paused or self.rate == 0:
             return self._position
         return min(self.end, self._position + max(0.0, now - self._since) * self.rate)
 
     def wait(self, at: float, now: float) -> float:
-        """Seconds until a message at ``at`` is due: 0 is now, infinity while paused."""
+        """Seconds until a message at position ``at`` is due. 0 if it is due now, infinity while paused."""
         if self._steps:
             return 0.0
         if self.paused:
@@ -46,7 +47,7 @@ class Player:
         return max(0.0, (at - self._position) / self.rate - (now - self._since))
 
     def sent(self, at: float, now: float, *, whole: bool) -> None:
-        """A message at ``at`` went out; ``whole``: it completes a step."""
+        """Records that the message at position ``at`` was published. ``whole``: it completes a step."""
         ahead = self.position(now) - at
         if self.paused or self.rate == 0 or ahead > MAX_LAG_S * self.rate:
             self._anchor(at, now)
@@ -54,7 +55,7 @@ class Player:
             self._steps -= 1
 
     def handle(self, request: PlayerRequest, now: float) -> PlayerReply:
-        """Do what is asked; the state then, or why not."""
+        """Executes a request. Returns the new state, or a refusal with its reason."""
         if request.action in ("pause", "step"):
             self._anchor(self.position(now), now)
             self.paused = True
@@ -72,34 +73,34 @@ class Player:
         return self.state(now)
 
     def state(self, now: float) -> PlayerReply:
-        """For who asks; ``duration_s`` is where the replay ends."""
+        """State as a reply. ``duration_s`` is the position at which the replay ends."""
         return PlayerReply(
             paused=self.paused, position_s=self.position(now), duration_s=self.end, rate=self.rate, loop=self.loop
         )
 
     def seek(self, position: float, now: float) -> None:
-        """To the place, or the nearest end; what is read must begin there: see `jump`."""
+        """Moves to a position, clamped to begin and end. The reader gets it from `take_seek_target`."""
         self._seek_target = min(max(position, self.begin), self.end)
         self._anchor(self._seek_target, now)
         self._steps = 0
 
     def restart(self, now: float) -> None:
-        """From the beginning, a moment later."""
+        """Seeks to the beginning, after a short gap."""
         self.seek(self.begin, now + (LOOP_GAP_S if self.rate else 0.0))
 
     def finish(self, now: float) -> None:
-        """At the end, paused, whatever was asked for: nothing comes after it."""
+        """Pauses at the end and drops requested steps, because no message follows."""
         self._anchor(self.end, now)
         self.paused, self._steps = True, 0
 
     def take_seek_target(self) -> float | None:
-        """Where to read from now on, once after each seek."""
-        jump, self._seek_target = self._seek_target, None
-        return jump
+        """Returns the position to read from, once after each seek, else None."""
+        target, self._seek_target = self._seek_target, None
+        return target
 
     @property
     def seek_pending(self) -> bool:
-        """Whether `jump` has something to say."""
+        """Whether `take_seek_target` would return a position."""
         return self._seek_target is not None
 
     def _anchor(self, position: float, now: float) -> None:
@@ -107,7 +108,7 @@ class Player:
 
 
 def span(duration: float, start: float | None, end: float | None) -> tuple[float, float]:
-    """Begin and end in s; a negative ``end`` counts from the recording's end. UserError where nothing lies between."""
+    """Begin and end in s. A negative ``end`` counts from the recording's end; raises UserError if nothing is left."""
     first = start or 0.0
     last = duration if end is None else duration + end if end < 0 else min(end, duration)
     if not 0 <= first <= duration:
@@ -120,9 +121,11 @@ def span(duration: float, start: float | None, end: float | None) -> tuple[float
 def select_topics(
     there: Mapping[str, Topic], only: Collection[str] | None, leave_out: Collection[str] | None = None
 ) -> dict[str, Topic]:
-    """Keys of the topics named, or of all but health, a live service's pulse, less those to leave out.
+    """Keys to replay, with their topics.
 
-    Raises UserError for a name that the recording (``only``) or the table (``leave_out``) does not have.
+    ``only`` defaults to all topics except health, which only live services should publish. ``leave_out`` is removed
+    from it. Raises UserError for a name in ``only`` that the recording does not have, or in ``leave_out`` that the
+    table of topics does not have.
     """
     names = {topic.name for topic in there.values()}
     if only is not None and (unknown := set(only) - names):
@@ -137,20 +140,21 @@ def select_topics(
 
 
 def key_for_robot(key: str, robot: str) -> str:
-    """The key of another robot; empty: as it is."""
-    root, was, rest = key.split("/", 2)
-    return f"{root}/{robot or was}/{rest}"
+    """The same key for another robot. Unchanged if ``robot`` is empty."""
+    root, recorded_robot, rest = key.split("/", 2)
+    return f"{root}/{robot or recorded_robot}/{rest}"
 
 
 def robot_of(key: str) -> str:
-    """Whose key it is."""
+    """Name of the robot in a key."""
     return key.split("/")[1]
 
 
 def find_conflicts(keys: Mapping[str, Topic], alive: Mapping[str, Collection[str]]) -> str:
-    """Why these keys should not be published beside the services alive, by robot; empty where nothing speaks against.
+    """Explains which live services (``alive``, by robot) publish the same keys. Returns an empty string if none do.
 
-    Topics published at need (a goal) belong to nobody. Velocity commands also meet those who obey them.
+    Topics without a rate, such as `goal`, may have several publishers and never conflict. Velocity commands also
+    conflict with a live simulator, because it would execute them.
     """
     found: dict[tuple[str, str], list[str]] = {}
     driven: list[str] = []
@@ -171,11 +175,11 @@ def find_conflicts(keys: Mapping[str, Topic], alive: Mapping[str, Collection[str
         return ""
     names = sorted({keys[key].name for held in found.values() for key in held} | {CMD_VEL.name for _ in driven})
     return (
-        f"not beside a live publisher: {'; '.join(reasons)}; leave them out with --except {','.join(names)}, use other "
-        "keys with --robot NAME, or insist with --force"
+        f"conflict with a live publisher: {'; '.join(reasons)}; leave them out with --except {','.join(names)}, use "
+        "other keys with --robot NAME, or publish anyway with --force"
     )
 
 
 def robots_of_keys(keys: Iterable[str]) -> list[str]:
-    """Whose keys these are, each once, in order."""
+    """Names of the robots in these keys, each once, in order."""
     return list(dict.fromkeys(robot_of(key) for key in keys if key.startswith(ROOT + "/")))

@@ -1,7 +1,7 @@
 """Publishes a recording's messages at their times.
 
-The clock of a replay is the recording's: payloads, and so their stamps and sequence numbers, are as recorded. After a
-seek backwards or a loop those who hear it see stamps that go back, as after a reset of the simulator.
+Payloads are published unchanged, so stamps and sequence numbers are those of the recording. After a seek backwards, or
+when a loop restarts, subscribers see stamps that go back, as after a reset of the simulator.
 """
 
 from __future__ import annotations
@@ -34,47 +34,47 @@ from services.recorder.replaying.player import (
     span,
 )
 
-NAME = "replay"  # of the liveliness token
-SUBSCRIBER_TIMEOUT_S = 2.0  # s; a put before a subscriber is known is lost
-DISCOVERY_TIME_S = 0.5  # s in which a session that has just opened hears who is alive
-POLL_PERIOD_S = 0.1  # s, the longest wait without a look at whether to stop
+NAME = "replay"  # service name of the liveliness token
+SUBSCRIBER_TIMEOUT_S = 2.0  # wait for subscribers, because messages before that are lost
+DISCOVERY_TIME_S = 0.5  # in which a new session learns which services are alive
+POLL_PERIOD_S = 0.1  # longest wait before checking whether to stop
 
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """What of a recording is replayed, and how."""
+    """Which part of a recording is replayed, and how."""
 
-    only: frozenset[str] | None = None  # names of topics; None: all but health
+    only: frozenset[str] | None = None  # topic names; defaults to all except health
     leave_out: frozenset[str] = frozenset()
-    rate: float = 1.0  # times the original timing; 0: as fast as it goes
-    start: float | None = None  # s from the recording's beginning
-    end: float | None = None  # and of its end; negative: from the end
+    rate: float = 1.0  # factor on the original speed; 0 means as fast as possible
+    start: float | None = None  # s since the recording's beginning
+    end: float | None = None  # s since the recording's beginning; negative: before its end
     loop: bool = False
-    robot: str = ""  # instead of the recorded one
-    force: bool = False  # beside a live publisher too
-    paused: bool = False  # until told otherwise
-    stay: bool = False  # paused at the end, until told otherwise
+    robot: str = ""  # replaces the recorded robot's name
+    force: bool = False  # publish even beside a live publisher of the same keys
+    paused: bool = False  # start paused
+    stay: bool = False  # pause at the end instead of ending
 
 
 class ReplayControl:
-    """For who steers from this process: a keyboard's thread, a test."""
+    """Controls a replay from another thread of this process, such as the keyboard's."""
 
     def __init__(self, player: Player, inbox: Inbox, counts: Counter[str]) -> None:
-        """Requests wait in the inbox as those of the bus do; ``counts`` is what was sent so far, by key."""
+        """Puts requests into ``inbox``, like those from the bus. ``counts``: messages published so far, by key."""
         self._player, self._inbox = player, inbox
         self.counts = counts
         self.quitting = False
 
     def send(self, request: PlayerRequest) -> None:
-        """Done in order, soon."""
+        """Queues a request. Requests are executed in order."""
         self._inbox.put(Call(PLAYER, request.encode(), lambda _: None, lambda _: None))
 
     def state(self) -> PlayerReply:
-        """As it stands now."""
+        """Current state of the replay."""
         return self._player.state(time.monotonic())
 
     def quit(self) -> None:
-        """End the replay."""
+        """Ends the replay."""
         self.quitting = True
         self._inbox.wake()
 
@@ -83,10 +83,10 @@ Steering = Callable[[ReplayControl], AbstractContextManager[object]]
 
 
 class Replay:
-    """One recording on one session."""
+    """Publishes one recording on one bus session."""
 
     def __init__(self, recording: Recording, choice: ReplayOptions, bus: Bus) -> None:
-        """Raises UserError where there is nothing to replay, or somebody alive publishes the same."""
+        """Selects the topics. Raises UserError if there is nothing to replay."""
         self.recording, self.choice, self.bus = recording, choice, bus
         self.topics = select_topics(recording.topics(), choice.only, choice.leave_out)
         if not self.topics:
@@ -96,40 +96,43 @@ class Replay:
         begin, end = span(duration, choice.start, choice.end)
         self.inbox = Inbox()
         self.player = Player(begin, end, choice.rate, loop=choice.loop)
-        self.counts: Counter[str] = Counter()  # by key as published
+        self.counts: Counter[str] = Counter()  # messages by published key
         self.remote = ReplayControl(self.player, self.inbox, self.counts)
         self._stepwise = SCAN if SCAN in self.topics.values() else None
 
     def announce(self) -> None:
-        """Refuse beside live publishers; then be steerable, alive, and heard."""
+        """Declares publishers, queries and liveliness, and waits for subscribers.
+
+        Raises UserError if a live service publishes the same keys, unless forced.
+        """
         alive = self._alive()
         if not self.choice.force and (why := find_conflicts(self._published(), alive)):
             raise UserError(why)
-        for key, topic in self._published().items():  # all before the first wait: each asks who listens
+        for key, topic in self._published().items():  # all before the first wait, so that discovery runs in parallel
             self.bus.publisher(topic, key=key)
-        if WORLD.server not in alive.get(self.bus.robot, set()):  # a simulator knows better
+        if WORLD.server not in alive.get(self.bus.robot, set()):  # a live simulator answers this query itself
             self.bus.serve(WORLD, self.inbox)
         self.bus.serve(PLAYER, self.inbox)
         self.bus.serve(CONFIG, self.inbox, NAME)
         self.bus.declare_alive(NAME)
         deadline = time.monotonic() + SUBSCRIBER_TIMEOUT_S
-        unheard = [
+        without_subscriber = [
             key
             for key, topic in self._published().items()
             if not self.bus.wait_matching(topic, max(0.0, deadline - time.monotonic()), key=key)
         ]
-        if unheard:
-            print(f"warning: nobody listens to {', '.join(unheard)}", file=sys.stderr)
+        if without_subscriber:
+            print(f"warning: no subscriber for {', '.join(without_subscriber)}", file=sys.stderr)
 
     def run(self, on_progress: Callable[[PlayerReply], None], stop: threading.Event) -> None:
-        """Until the end, `ReplayControl.quit` or ``stop``."""
+        """Publishes messages until the end, `ReplayControl.quit` or ``stop``."""
         player = self.player
         player.seek(player.begin, time.monotonic())
         player.paused = self.choice.paused
-        while (place := player.take_seek_target()) is not None:
-            for raw in self.recording.payloads(self.topics.keys(), *self._window(place)):
+        while (position := player.take_seek_target()) is not None:
+            for raw in self.recording.payloads(self.topics.keys(), *self._window(position)):
                 at = (raw.logged_ns - self.recording.start_ns) * 1e-9
-                if not self._until(at, on_progress, stop):
+                if not self._wait_until_due(at, on_progress, stop):
                     break
                 self._send(raw, at)
                 on_progress(player.state(time.monotonic()))
@@ -138,15 +141,18 @@ class Replay:
             if player.loop and not player.seek_pending:
                 player.restart(time.monotonic())
             elif self.choice.stay and not player.seek_pending:
-                self._rest(on_progress, stop)
+                self._wait_at_end(on_progress, stop)
 
-    def _window(self, place: float) -> tuple[int, int | None]:
-        """Of the recording's own times, ns; the end is not part of it, the recording's last message is."""
-        start, last = self.recording.start_ns, self.choice.end is not None
-        return start + round(place * 1e9), start + round(self.player.end * 1e9) if last else None
+    def _window(self, position: float) -> tuple[int, int | None]:
+        """Wall times in ns between which messages are read.
 
-    def _until(self, at: float, on_progress: Callable[[PlayerReply], None], stop: threading.Event) -> bool:
-        """Wait until a message is due, answering meanwhile; False where it will not be sent."""
+        The end is exclusive. It is None if the user gave none, so that the last message is included.
+        """
+        start, has_end = self.recording.start_ns, self.choice.end is not None
+        return start + round(position * 1e9), start + round(self.player.end * 1e9) if has_end else None
+
+    def _wait_until_due(self, at: float, on_progress: Callable[[PlayerReply], None], stop: threading.Event) -> bool:
+        """Waits until a message is due and answers requests meanwhile. Returns False if it must not be published."""
         while True:
             wait = self.player.wait(at, time.monotonic())
             entry = self.inbox.get(min(wait, POLL_PERIOD_S))
@@ -159,8 +165,8 @@ class Replay:
             if entry is None and self.player.wait(at, time.monotonic()) <= 0:
                 return True
 
-    def _rest(self, on_progress: Callable[[PlayerReply], None], stop: threading.Event) -> None:
-        """Paused at the end, until somebody seeks."""
+    def _wait_at_end(self, on_progress: Callable[[PlayerReply], None], stop: threading.Event) -> None:
+        """Stays paused at the end until a seek is requested."""
         while not (stop.is_set() or self.remote.quitting or self.player.seek_pending):
             self.player.finish(time.monotonic())
             on_progress(self.player.state(time.monotonic()))
@@ -190,27 +196,27 @@ class Replay:
         call.reply(self.player.handle(request, time.monotonic()).encode())
 
     def _world(self) -> WorldReply:
-        """As the recording has it."""
+        """The recorded world, or a refusal if there is none."""
         recording, world = self.recording, self.recording.world()
         if world is None:
             return WorldReply(ok=False, reason=f"{recording.path.name} does not hold its world")
         return WorldReply(world=world, scanner=recording.scanner(), robot=recording.robot())
 
     def _published(self) -> dict[str, Topic]:
-        """By the key it is published on."""
+        """Topics by the key on which they are published."""
         return {self.keys[key]: topic for key, topic in self.topics.items()}
 
     def _alive(self) -> dict[str, set[str]]:
-        """Services by robot; asked until nobody new is heard of, or at once where somebody speaks against it."""
+        """Live services by robot. Waits for the discovery time, or until a conflict is found."""
         names = robots_of_keys(self._published())
         alive: dict[str, set[str]] = {robot: set() for robot in names}
 
-        def contested() -> bool:
+        def has_conflicts() -> bool:
             for robot in names:
                 alive[robot] |= self.bus.alive(timeout=DISCOVERY_TIME_S, robot=robot)
             return bool(find_conflicts(self._published(), alive))
 
-        wait_until(contested, DISCOVERY_TIME_S)
+        wait_until(has_conflicts, DISCOVERY_TIME_S)
         return alive
 
 
@@ -224,17 +230,18 @@ def replay(
     opening: Callable[[Link], AbstractContextManager[Bus]] = open_bus,
     steering: Steering = lambda _: nullcontext(),
 ) -> Counter[str]:
-    """Publish the recording; counts by key. Waits shortly for somebody to listen, and warns of keys nobody wants.
+    """Publishes the recording and returns the number of messages by key.
 
-    ``opening`` makes the session, and may insist that somebody is there; ``steering`` runs beside the replay. Raises
-    UserError where the file, the choice, or a live publisher of the same keys forbids it.
+    Waits briefly for subscribers and warns about keys without one. ``opening`` opens the bus session and may check
+    that the router is reached; ``steering`` is entered for the duration of the replay. Raises UserError if the file
+    cannot be read, the options are invalid, or a live service publishes the same keys.
     """
     choice = choice or ReplayOptions()
     recording = read_recording(path)
     if recording.warning:
         print(f"warning: {recording.warning}", file=sys.stderr)
-    there = robots_of_keys(recording.topics())
-    robot = choice.robot or (there[0] if there else link.robot)
+    recorded_robots = robots_of_keys(recording.topics())
+    robot = choice.robot or (recorded_robots[0] if recorded_robots else link.robot)
     if not math.isfinite(choice.rate):
         choice = replace(choice, rate=0.0)
     with opening(replace(link, robot=robot)) as bus:
@@ -242,11 +249,11 @@ def replay(
         running.announce()
         with steering(running.remote):
             running.run(on_progress, stop or threading.Event())
-    if recording.problem and recording.indexed:  # found where it was read
+    if recording.problem and recording.indexed:  # damage inside a finished file is only found while reading
         print(f"warning: {recording.warning}", file=sys.stderr)
     return running.counts
 
 
 def names_of(text: str) -> frozenset[str]:
-    """Comma-separated names."""
+    """Set of the comma-separated names in ``text``."""
     return frozenset(part.strip() for part in text.split(",") if part.strip())

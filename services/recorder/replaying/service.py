@@ -23,17 +23,17 @@ from common.runtime.heartbeat import Heartbeat
 from services.recorder.reader import read_recording
 from services.recorder.replaying.replay import NAME, ReplayControl, ReplayOptions, replay
 
-HEARTBEAT_PERIOD_S = 1.0  # s between heartbeats
+HEARTBEAT_PERIOD_S = 1.0
 
 
 class PlayingSettings(ServiceSettings):
-    """A recording in the scanner's place: what the simulator published (scan, odom, truth), in a loop.
+    """Replays a recording in place of the simulator: its scan, odom and truth, in a loop.
 
-    A robot's recording goes out under the name that --robot says. Refused while a simulator of that name is alive.
-    `presage replay` has more to choose from, and steers this one too, over query `player`.
+    Publishes under the robot name given by --robot. Refuses to start while a simulator of that robot is alive.
+    `presage replay` has more options. This replay can be controlled with the query `player`.
 
     Examples:
-      python -m services.recorder.replaying.service --replay drive.mcap                   of the folder recordings
+      python -m services.recorder.replaying.service --replay drive.mcap                   reads recordings/drive.mcap
       python -m services.recorder.replaying.service --directory logs --replay drive.mcap --robot truck
       PRESAGE_SCANNER=replay PRESAGE_REPLAY=drive.mcap docker compose up
 
@@ -42,12 +42,12 @@ class PlayingSettings(ServiceSettings):
     service: ClassVar[str] = NAME
     program: ClassVar[str] = "python -m services.recorder.replaying.service"
 
-    replay: Annotated[str, Field(description="the recording, a file of the folder")] = ""
+    replay: Annotated[str, Field(description="file name of the recording, in --directory")] = ""
     directory: Annotated[Path, Field(description="folder of recordings")] = Path("recordings")
-    rate: Annotated[float, Field(gt=0, le=1000, description="times its own timing")] = 1.0
+    rate: Annotated[float, Field(gt=0, le=1000, description="factor on the original speed")] = 1.0
 
     def file(self) -> Path:
-        """The recording; raises UserError where there is none of that name."""
+        """Path of the recording. Raises UserError if it does not exist."""
         path = self.directory / self.replay
         if not self.replay or not path.is_file():
             there = sorted(found.name for found in self.directory.glob("*.mcap"))
@@ -59,47 +59,46 @@ class PlayingSettings(ServiceSettings):
 
 
 def options_for(path: Path, settings: PlayingSettings) -> ReplayOptions:
-    """What the simulator sent; raises UserError where there is no scan."""
-    mine = {topic.name for topic in TOPICS if topic.publisher == SCAN.publisher}
-    there = {topic.name for topic in read_recording(path).topics().values()} & mine
-    if SCAN.name not in there:
+    """Options that replay the simulator's topics in a loop. Raises UserError if the recording has no scans."""
+    of_simulator = {topic.name for topic in TOPICS if topic.publisher == SCAN.publisher}
+    recorded = {topic.name for topic in read_recording(path).topics().values()} & of_simulator
+    if SCAN.name not in recorded:
         raise UserError(f"{path}: no scans in this recording: choose one that has them (`presage info FILE`)")
-    return ReplayOptions(frozenset(there), rate=settings.rate, loop=True, robot=settings.robot)
+    return ReplayOptions(frozenset(recorded), rate=settings.rate, loop=True, robot=settings.robot)
 
 
 class ReplayHeartbeat:
-    """Heartbeats while the replay goes on."""
+    """Writes heartbeats during the replay. An instance is the replay's progress callback."""
 
     def __init__(self, settings: PlayingSettings) -> None:
-        """Nothing has been sent."""
         self._heart = Heartbeat(settings.heartbeat, NAME, settings.robot)
-        self._at = 0.0  # s, monotonic, of the next
+        self._next_at = 0.0  # monotonic time of the next heartbeat, s
         self._bus: Bus | None = None
         self._remote: ReplayControl | None = None
 
     @contextmanager
     def opening(self, link: Link) -> Iterator[Bus]:
-        """The replay's session."""
+        """Opens the replay's bus session and keeps it to report the link."""
         with open_bus(link) as self._bus:
             yield self._bus
 
     @contextmanager
     def steering(self, remote: ReplayControl) -> Iterator[None]:
-        """The replay begins."""
+        """Keeps the control of the replay to report its counts."""
         self._remote = remote
         yield
 
     def __call__(self, state: PlayerReply) -> None:
-        """It stands there now."""
-        if self._bus is None or self._remote is None or (now := time.monotonic()) < self._at:
+        """Writes a heartbeat if one is due."""
+        if self._bus is None or self._remote is None or (now := time.monotonic()) < self._next_at:
             return
         counts = {key: {"published": count} for key, count in self._remote.counts.items()}
         self._heart.beat(counts, linked=self._bus.linked(), note="paused" if state.paused else "")
-        self._at = now + HEARTBEAT_PERIOD_S
+        self._next_at = now + HEARTBEAT_PERIOD_S
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Replay until SIGTERM or Ctrl-C; status 0 then, 2 and one line where the user can mend something."""
+    """Replays until SIGTERM or Ctrl-C and exits with status 0. Exits with 2 and a message after a UserError."""
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())

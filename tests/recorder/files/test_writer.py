@@ -222,7 +222,7 @@ def foreign(path):
         (lambda path: path.mkdir(), "cannot be read"),
         (lambda path: path.write_bytes(b""), "not an MCAP file"),
         (lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n" * 100), "not an MCAP file"),
-        (foreign, "no recording of presage .*'ros2'"),
+        (foreign, "not a recording of presage .*'ros2'"),
     ],
     ids=["missing", "folder", "empty", "picture", "ros2"],
 )

@@ -173,7 +173,7 @@ def test_a_key_nobody_listens_to_is_named_and_it_ends_all_the_same(tmp_path, lin
     scan, odom = SCAN.key(link.robot), ODOM.key(link.robot)
     path = write(tmp_path / "run.mcap", [(SCAN, scan, b"s", 1), (ODOM, odom, b"o", 2)])
     assert replay(path, link) == {scan: 1, odom: 1}
-    assert f"warning: nobody listens to {scan}\n" in capsys.readouterr().err
+    assert f"warning: no subscriber for {scan}\n" in capsys.readouterr().err
     assert wait_until(lambda: len(inbox) == 1, 10)
 
 
