@@ -109,7 +109,7 @@ def _helper(what: str, *args: str) -> tuple[Callable[[System], None], Callable[[
     """A troublemaker of lab.fault_injection.misbehaving_peers, at the router's host."""
 
     def begin(system: System) -> None:
-        system.start_code(what, f"from lab.fault_injection.misbehaving_peers import main; main({[what, *args]!r})")
+        system.start_python(what, f"from lab.fault_injection.misbehaving_peers import main; main({[what, *args]!r})")
 
     def end(system: System) -> None:
         process = system.processes[what]

@@ -34,7 +34,7 @@ WHERE = {"simulator": "robot", "controller": "robot", "observer": "robot", "esti
 class System(Stack):
     """All services, three hosts where there is a network, else this one; a context manager."""
 
-    orphans_get = signal.SIGKILL  # one that is frozen would not end by SIGTERM
+    orphan_signal = signal.SIGKILL  # one that is frozen would not end by SIGTERM
 
     def __init__(
         self,
@@ -67,7 +67,7 @@ class System(Stack):
         """The router's, as all hosts see it."""
         return f"tcp/{'127.0.0.1' if self.network is None else self.network.here}:{self.port}"
 
-    def router_listens(self) -> str:
+    def router_endpoints(self) -> str:
         """For the other hosts, too."""
         return self.endpoint if self.network is None else f"tcp/127.0.0.1:{self.port},{self.endpoint}"
 
@@ -76,7 +76,7 @@ class System(Stack):
         entering = [] if self.network is None or name not in WHERE else self.network.hosts[WHERE[name]].entering
         return [*entering, sys.executable, *args]
 
-    def variables(self, name: str) -> Mapping[str, str]:
+    def child_environment(self, name: str) -> Mapping[str, str]:
         """Services listen where the other hosts reach them."""
         more = {"PRESAGE_INSECURE": "1", **self.extra.get(name, {})}
         if self.network is None or name == "router":
@@ -86,7 +86,7 @@ class System(Stack):
 
     def __enter__(self) -> Self:
         self.start_router()
-        self.start_code("observer", "from lab.fault_injection.observer import main; main()")
+        self.start_python("observer", "from lab.fault_injection.observer import main; main()")
         self._bus = open_bus(self.link())
         self.bus: Bus = self._bus.__enter__()
         for service in self.arguments:
@@ -171,7 +171,7 @@ class System(Stack):
     def _latest(self, what: str) -> Row | None:
         return next((row for row in reversed(self.timeline.rows) if row["what"] == what), None)
 
-    def heard(self, name: str, line: str) -> None:
+    def on_output(self, name: str, line: str) -> None:
         """Lines of the observer are what it saw; other lines may tell of a fault."""
         row: Row = {"t": time.monotonic(), "what": "line", "name": name, "line": line}
         if name == "observer":

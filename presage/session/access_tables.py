@@ -12,7 +12,7 @@ from common.messages.topics import QUERIES, TOPICS
 
 
 def members_table(members: Sequence[Member], ends: Mapping[str, dt.datetime], now: dt.datetime) -> Table:
-    """One row a member; ``ends`` by name, where the certificate is at hand."""
+    """A table with one row for each member; ``ends`` holds the known expiry dates of certificates, by name."""
     table = Table(title="members", title_justify="left")
     for column in ("name", "role", "robots", "certificate ends", "days left"):
         table.add_column(column)
@@ -24,7 +24,10 @@ def members_table(members: Sequence[Member], ends: Mapping[str, dt.datetime], no
 
 
 def rights_table() -> Table:
-    """One row a role: what it puts, asks and answers; all but the router may listen to everything."""
+    """A table with one row for each role: topics it may publish, queries it may send and answer.
+
+    Every role may subscribe to everything.
+    """
     table = Table(title="roles (each may also listen)", title_justify="left", show_lines=True)
     for column in ("role", "puts", "asks", "answers", "for"):
         table.add_column(column)

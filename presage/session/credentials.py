@@ -1,8 +1,8 @@
 """Certificates and passwords for secure mode.
 
-DIR/authority/      ca.key, ca.crt: makes members; belongs on no robot
-DIR/NAME/           certificate, key and password of one member, with its role
-DIR/router/         the same, and the list of those it lets in with their passwords
+DIR/authority/      ca.key and ca.crt, which sign the members' certificates; must not be copied to a robot
+DIR/NAME/           certificate, key, password and role of one member
+DIR/router/         the same for the router, and the list of the members with access and their passwords
 """
 
 from __future__ import annotations
@@ -41,16 +41,17 @@ from common.bus.security import (
 from common.errors import UserError
 
 AUTHORITY_FOLDER, AUTHORITY_KEY = "authority", "ca.key"
-# Stand in for a robot, one with all its rights: made where asked for.
-ON_REQUEST = frozenset({"replay", "remote", "bridge_ros2"})
-PER_ROBOT = ("simulator", "estimator", "controller")
-HOSTS = ("localhost", "127.0.0.1", "router")  # a router's, for programs that look at names; ours look at roles
+# Roles that act in place of a robot and therefore have many rights: made only with `add`.
+ROLES_ON_REQUEST = frozenset({"replay", "remote", "bridge_ros2"})
+ROLES_PER_ROBOT = ("simulator", "estimator", "controller")
+# Host names in the router's certificate. Presage verifies roles instead of names; other programs may verify names.
+DEFAULT_ROUTER_HOSTS = ("localhost", "127.0.0.1", "router")
 Key = ec.EllipticCurvePrivateKey
 
 
 @dataclass(frozen=True)
 class Authority:
-    """Who signs."""
+    """The certificate authority that signs the members' certificates."""
 
     key: Key
     certificate: x509.Certificate
@@ -59,26 +60,26 @@ class Authority:
 def init(
     folder: Path, hosts: Sequence[str] = (), robots: Sequence[str] = (), days: int = 365, *, force: bool = False
 ) -> list[Member]:
-    """A new authority and a member of every role; with ``robots`` one of each robot's own services for each.
+    """Creates an authority and a member for every role; returns the members.
 
-    Raises UserError where the folder holds something already, unless ``force``: then nothing old is let in any more.
+    With ``robots``, the services of each robot become members of their own. Raises UserError if the folder is not
+    empty. With ``force``, an existing authority is replaced, and its certificates become invalid.
     """
     for robot in robots:
         check_robot(robot)
     if folder.exists() and any(folder.iterdir()):
         if not (folder / AUTHORITY_FOLDER).is_dir():
-            raise UserError(f"{folder}: not empty, and nothing that `presage secure` made: choose another folder")
+            raise UserError(f"{folder}: not empty, and not made by `presage secure`: choose another folder")
         if not force:
             raise UserError(
-                f"{folder}: has an authority already; --force makes a new one, which lets in nobody of the old, "
-                "`presage secure add` one more member"
+                f"{folder}: has an authority already; use `presage secure add` to add a member, or --force to make a "
+                "new authority, which invalidates all existing certificates"
             )
         for old in (path.parent for path in folder.glob(f"*/{AUTHORITY}")):
             shutil.rmtree(old)
-    members = [
-        Member(name=role, role=role) for role in ROLES if role not in ON_REQUEST | set(PER_ROBOT if robots else ())
-    ]
-    members += [Member(name=f"{role}-{r}", role=role, robots=(r,)) for r in robots for role in PER_ROBOT]
+    omitted = ROLES_ON_REQUEST | set(ROLES_PER_ROBOT if robots else ())
+    members = [Member(name=role, role=role) for role in ROLES if role not in omitted]
+    members += [Member(name=f"{role}-{r}", role=role, robots=(r,)) for r in robots for role in ROLES_PER_ROBOT]
     authority = _new_authority(folder, days)
     for member in members:
         _write_member(folder, authority, member, days, hosts)
@@ -87,21 +88,35 @@ def init(
 
 
 def add(
-    folder: Path, role: str, name: str, robots: Sequence[str] = (), days: int = 365, *, hosts: Sequence[str] = (),
+    folder: Path,
+    role: str,
+    name: str,
+    robots: Sequence[str] = (),
+    days: int = 365,
+    *,
+    hosts: Sequence[str] = (),
     force: bool = False,
-) -> Member:  # fmt: skip
-    """One more member; with ``force`` new credentials for one there is. Raises UserError where that cannot be."""
+) -> Member:
+    """Adds a member and returns it; with ``force``, renews the credentials of an existing member.
+
+    Raises UserError if the role is unknown, a name is not allowed, or the member exists and ``force`` is not given.
+    """
     if role not in ROLES:
         raise UserError(f"no role {role!r}: choose one of {', '.join(ROLES)}")
     if re.fullmatch(NAME, name) is None or name == AUTHORITY_FOLDER:
-        raise UserError(f"name {name!r}: lower-case letters, digits, - and _, and not {AUTHORITY_FOLDER!r}")
+        raise UserError(
+            f"name {name!r}: only lower-case letters, digits, - and _ are allowed, and not {AUTHORITY_FOLDER!r}"
+        )
     if (role == ROUTER) != (name == ROUTER):
-        raise UserError(f"routers share one name: copy {folder / ROUTER} to where the other runs")
+        raise UserError(
+            f"the role {ROUTER!r} has one member, of the same name: for another router, copy {folder / ROUTER} to its "
+            "host"
+        )
     for robot in robots:
         check_robot(robot)
     authority, members = _authority(folder), list(read_members(folder / ROUTER))
     if not force and any(each.name == name for each in members):
-        raise UserError(f"{folder / name}: is there already; --force gives it new credentials")
+        raise UserError(f"{folder / name}: exists already; --force renews its credentials")
     member = Member(name=name, role=role, robots=tuple(robots) or EVERY_ROBOT)
     _write_member(folder, authority, member, days, hosts)
     _write_list(folder, [*(each for each in members if each.name != name), member])
@@ -109,25 +124,30 @@ def add(
 
 
 def remove(folder: Path, name: str) -> None:
-    """Strike a member from the router's list; raises UserError where it is not on it."""
+    """Removes a member from the router's list, and its folder; raises UserError if there is no such member."""
     members = read_members(folder / ROUTER) if _authority(folder) else ()
     if name == ROUTER:
-        raise UserError(f"without {ROUTER!r} nobody is let in; `presage secure init --force` begins anew")
+        raise UserError(
+            f"{ROUTER!r} cannot be removed: without a router there is no access at all; `presage secure init --force` "
+            "replaces all credentials"
+        )
     if all(each.name != name for each in members):
-        raise UserError(f"no member {name!r}: there are {', '.join(each.name for each in members)}")
+        raise UserError(f"no member {name!r}: choose one of {', '.join(each.name for each in members)}")
     _write_list(folder, [each for each in members if each.name != name])
     shutil.rmtree(folder / name, ignore_errors=True)
 
 
 def expiry(path: Path) -> dt.datetime:
-    """When a certificate ends, UTC; raises UserError where it is none."""
+    """Expiry date of a certificate, UTC; raises UserError if the file is not a certificate."""
     return _certificate(path).not_valid_after_utc
 
 
 def check_robot(name: str) -> None:
-    """Raises UserError where it is no single chunk of a key."""
+    """Raises UserError if the name of a robot cannot be used in names of members and in keys."""
     if re.fullmatch(r"[a-z0-9][a-z0-9_-]{0,40}", name) is None:
-        raise UserError(f"robot {name!r}: lower-case letters, digits, - and _ (it becomes part of names and keys)")
+        raise UserError(
+            f"robot {name!r}: only lower-case letters, digits, - and _ are allowed (it becomes part of names and keys)"
+        )
 
 
 def _new_authority(folder: Path, days: int) -> Authority:
@@ -135,7 +155,7 @@ def _new_authority(folder: Path, days: int) -> Authority:
     certificate = (
         _builder(subject, subject, key, max(3650, 2 * days))
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(_SIGNS, critical=True)
+        .add_extension(_SIGNING_ONLY, critical=True)
         .sign(key, hashes.SHA256())
     )
     _make_folder(folder / AUTHORITY_FOLDER)
@@ -144,10 +164,17 @@ def _new_authority(folder: Path, days: int) -> Authority:
     return Authority(key, certificate)
 
 
-_SIGNS = x509.KeyUsage(
-    digital_signature=False, content_commitment=False, key_encipherment=False, data_encipherment=False,
-    key_agreement=False, key_cert_sign=True, crl_sign=True, encipher_only=False, decipher_only=False,
-)  # fmt: skip
+_SIGNING_ONLY = x509.KeyUsage(
+    digital_signature=False,
+    content_commitment=False,
+    key_encipherment=False,
+    data_encipherment=False,
+    key_agreement=False,
+    key_cert_sign=True,
+    crl_sign=True,
+    encipher_only=False,
+    decipher_only=False,
+)
 
 
 def _authority(folder: Path) -> Authority:
@@ -155,11 +182,11 @@ def _authority(folder: Path) -> Authority:
     try:
         key = serialization.load_pem_private_key(path.read_bytes(), None)
     except FileNotFoundError:
-        raise UserError(f"{path}: not there; `presage secure init {folder}` makes an authority") from None
+        raise UserError(f"{path}: does not exist; `presage secure init {folder}` makes an authority") from None
     except ValueError:
-        raise UserError(f"{path}: no private key in PEM") from None
+        raise UserError(f"{path}: not a private key in PEM format") from None
     if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise UserError(f"{path}: not a key that `presage secure init` made")
+        raise UserError(f"{path}: not a key made by `presage secure init`")
     return Authority(key, _certificate(folder / AUTHORITY_FOLDER / AUTHORITY))
 
 
@@ -167,12 +194,14 @@ def _certificate(path: Path) -> x509.Certificate:
     try:
         return x509.load_pem_x509_certificate(path.read_bytes())
     except ValueError:
-        raise UserError(f"{path}: no certificate in PEM") from None
+        raise UserError(f"{path}: not a certificate in PEM format") from None
 
 
 def _write_member(folder: Path, authority: Authority, member: Member, days: int, hosts: Sequence[str]) -> None:
     key = ec.generate_private_key(ec.SECP256R1())
-    names = [_host(host) for host in (hosts or HOSTS)] if member.role == ROUTER else [x509.DNSName(member.name)]
+    names: list[x509.GeneralName] = [x509.DNSName(member.name)]
+    if member.role == ROUTER:
+        names = [_host(host) for host in (hosts or DEFAULT_ROUTER_HOSTS)]
     certificate = (
         _builder(_subject(member.name), authority.certificate.subject, key, days)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
@@ -192,9 +221,11 @@ def _write_member(folder: Path, authority: Authority, member: Member, days: int,
 
 
 def _write_list(folder: Path, members: Sequence[Member]) -> None:
-    """The router's: whom it lets in, and their passwords."""
-    words = {member.name: (folder / member.name / PASSWORD).read_text(encoding="utf-8").strip() for member in members}
-    lines = "".join(f"{name}:{word}\n" for name, word in words.items())
+    """Writes the router's list of members and their passwords."""
+    passwords = {
+        member.name: (folder / member.name / PASSWORD).read_text(encoding="utf-8").strip() for member in members
+    }
+    lines = "".join(f"{name}:{password}\n" for name, password in passwords.items())
     _write(folder / ROUTER / PASSWORDS, lines.encode())
     _write(folder / ROUTER / MEMBERS, Members(members=tuple(members)).model_dump_json(indent=1).encode(), 0o644)
 
@@ -207,7 +238,7 @@ def _builder(subject: x509.Name, issuer: x509.Name, key: Key, days: int) -> x509
         .issuer_name(issuer)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - dt.timedelta(hours=1))  # clocks of hosts differ
+        .not_valid_before(now - dt.timedelta(hours=1))  # tolerates differences between the clocks of hosts
         .not_valid_after(now + dt.timedelta(days=days))
     )
 
@@ -234,7 +265,7 @@ def _make_folder(path: Path) -> None:
 
 
 def _write(path: Path, data: bytes, mode: int = 0o600) -> None:
-    """With its mode from the first byte on, in place of what was there."""
+    """Replaces the file; the new one has its mode from the first byte on, so that a secret is never readable."""
     new = path.with_name(path.name + ".new")
     new.unlink(missing_ok=True)
     with os.fdopen(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:

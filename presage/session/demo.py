@@ -23,23 +23,23 @@ from common.versions import commit
 from presage.live.bus_watch import Watch
 from presage.recordings.session_figure import draw_session
 from presage.recordings.session_summary import SessionSummary, summarise
-from presage.session.page import say_page, start_page
+from presage.session.page import show_page_link, start_page
 from presage.session.preflight import check_services
 from presage.session.stack import Stack, controller_arguments
 from presage.terminal.options import credentials_for
 from presage.terminal.output import check_file, make_folder, write_json
 
-# By the messages' stamps, whatever the pace:
-LOCALISE_WITHIN = 30.0  # s from the first belief; the paper's descent takes 3.3 s
-ARRIVE_WITHIN = 90.0  # s from the goal; 12.5 m take about 15
-# By the wall's clock:
-FIRST_WITHIN = 30.0  # s until there is a belief at all
-GIVE_UP = 120.0  # s for localising, and again for the way
+# Measured with the stamps of the messages, so that they do not depend on the pace of the simulation:
+LOCALISATION_TIMEOUT_S = 30.0  # from the first belief; preset paper takes 3.3 s
+ARRIVAL_TIMEOUT_S = 90.0  # from the goal; 12.5 m take about 15 s
+# Measured with the wall clock:
+FIRST_BELIEF_TIMEOUT_S = 30.0
+WALL_TIMEOUT_S = 120.0  # for localising, and again for the drive
 
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """What the demo is asked for."""
+    """Options of `presage demo`."""
 
     world: str = "corridor"
     goal: tuple[float, float] | None = None
@@ -47,60 +47,66 @@ class DemoOptions:
     beams: int = 622
     seed: int = 0
     pace: str = "realtime"
-    port: int | None = None  # None: any free one
-    estimator: tuple[str, ...] = ()  # arguments
+    port: int | None = None  # of the router; defaults to a free port
+    estimator: tuple[str, ...] = ()  # command-line arguments of the estimator
     viewer: bool = True
-    open_page: bool = False  # where there is a display
-    people: int = 0  # who walk about
+    open_page: bool = False
+    people: int = 0  # number of simulated people
 
 
 def run_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple[Path, bool]:
-    """The recording, and whether the goal was reached; raises UserError where it cannot be or nothing is believed."""
-    goal = _goal(demo, load_world(demo.world))
+    """Runs the demo with the services of ``stack``; returns the recording, and whether the goal was reached.
+
+    Raises UserError if an option is wrong, a service fails, or no belief comes.
+    """
+    goal = _choose_goal(demo, load_world(demo.world))
     make_folder(demo.out, "--out")
-    # A name of its own: others may record into the same folder in the same second.
-    began = datetime.now(timezone.utc).strftime("%Y%m%d-%H%M%S")
-    perceiving = ["--world", demo.world, *demo.estimator]
-    driving = controller_arguments(demo.world, demo.estimator, lockstep=demo.pace == "lockstep")
-    simulator = ["--world", demo.world, "--beams", str(demo.beams), "--seed", str(demo.seed), "--pace", demo.pace]
-    simulator += ["--people", str(demo.people)]
-    check_services(demo.world, perceiving, driving, simulator)
-    recording = demo.out / f"presage-{stack.robot}-{began}-{secrets.token_hex(3)}.mcap"
+    start_time = datetime.now(timezone.utc).strftime("%Y%m%d-%H%M%S")
+    estimator_args = ["--world", demo.world, *demo.estimator]
+    controller_args = controller_arguments(demo.world, demo.estimator, lockstep=demo.pace == "lockstep")
+    simulator_args = ["--world", demo.world, "--beams", str(demo.beams), "--seed", str(demo.seed)]
+    simulator_args += ["--pace", demo.pace, "--people", str(demo.people)]
+    check_services(demo.world, estimator_args, controller_args, simulator_args)
+    # The random part keeps names unique if several demos record into the same folder in the same second.
+    recording = demo.out / f"presage-{stack.robot}-{start_time}-{secrets.token_hex(3)}.mcap"
     stack.start_router()
     with open_bus(stack.link()) as bus:
         watch = Watch(bus, TRUTH, BELIEF, STATUS, HEALTH)
         page = demo.viewer and start_page(stack, demo.out, console)
         stack.start("recorder", "--directory", str(demo.out), "--file", recording.name)
-        stack.start("controller", *driving)
-        stack.start("estimator", *perceiving)
-        if demo.pace != "realtime":  # time must not have run off before the others see it
-            simulator += ["--wait-for", "estimator,controller,recorder"]
-        stack.start("simulator", *simulator)
+        stack.start("controller", *controller_args)
+        stack.start("estimator", *estimator_args)
+        if demo.pace != "realtime":  # simulated time must not pass before the other services run
+            simulator_args += ["--wait-for", "estimator,controller,recorder"]
+        stack.start("simulator", *simulator_args)
         with console.status("starting simulator, estimator, controller, recorder"):
             stack.wait_alive(bus)
         if page:
-            say_page(stack, console, open_it=demo.open_page)
+            show_page_link(stack, console, open_it=demo.open_page)
         reached = _localise(watch, stack, console) and _navigate(bus, watch, stack, goal, console)
         stack.check()
         for name in ("controller", "estimator", "simulator"):
             stack.stop(name)
         status = stack.stop("recorder")
     if status != 0 or not recording.exists():
-        raise UserError(f"the recorder ended with status {status}; what it has written is {recording}.active")
+        raise UserError(
+            f"the recorder ended with status {status}; the unfinished recording is {recording}.active "
+            "(`presage recover` completes it)"
+        )
     return recording, reached
 
 
-def _goal(demo: DemoOptions, world: World) -> tuple[float, float]:
-    """The goal asked for, or a free place at the far end of the paper's corridor, at least 12 m away."""
+def _choose_goal(demo: DemoOptions, world: World) -> tuple[float, float]:
+    """The goal of the options; defaults to the far end of the corridor, or a free place far from the start."""
     robot, start = Robot(), world.start_pose(Robot().radius)
     if demo.goal is not None and not np.isfinite(demo.goal).all():
         raise UserError(f"goal {demo.goal}: two finite numbers are needed, in m, as in --goal 12 2")
     if demo.goal is None:
         _, y0, _, y1 = world.bounds
         free = world.sample_free(2000, np.random.default_rng(demo.seed), robot.radius + 0.3)
-        straight = free[np.abs(free[:, 1] - start[1]) < 0.1 * (y1 - y0)]  # the preset goes in a straight line
-        far = straight[np.argmax(np.abs(straight[:, 0] - start[0]))] if len(straight) else free[0]
-        return (15.5, float(start[1])) if world.name == "corridor" else (float(far[0]), float(far[1]))
+        aligned = free[np.abs(free[:, 1] - start[1]) < 0.1 * (y1 - y0)]  # preset paper drives in a straight line
+        farthest = aligned[np.argmax(np.abs(aligned[:, 0] - start[0]))] if len(aligned) else free[0]
+        return (15.5, float(start[1])) if world.name == "corridor" else (float(farthest[0]), float(farthest[1]))
     if (clearance := float(world.clearance(demo.goal)[0])) < robot.radius:
         raise UserError(
             f"goal {demo.goal}: {clearance:.2f} m from a wall of {world.name!r}, the robot's radius is {robot.radius} m"
@@ -109,78 +115,88 @@ def _goal(demo: DemoOptions, world: World) -> tuple[float, float]:
 
 
 def _localise(watch: Watch, stack: Stack, console: Console) -> bool:
-    """Stand until the belief has settled, one scan after another; raises UserError where there is none at all."""
-    began, first, belief, pulse = time.monotonic(), None, None, None
-    with console.status("localising, by the laser alone") as status:
-        while (waited := time.monotonic() - began) < GIVE_UP:
+    """Waits until the belief is in state tracking; returns False on timeout, raises UserError if no belief comes."""
+    start_s = time.monotonic()
+    first_stamp: int | None = None
+    belief: Belief | None = None
+    health: Health | None = None
+    with console.status("localising with the laser only") as line:
+        while (waited := time.monotonic() - start_s) < WALL_TIMEOUT_S:
             stack.check()
             message = watch.next(0.5)
             if isinstance(message, Health) and message.service == "estimator":
-                pulse = message
-            if first is None:
-                _check_estimator(pulse, waited)
+                health = message
+            if first_stamp is None:
+                _check_estimator(health, waited)
             if isinstance(message, Belief):
-                belief, first = message, message.stamp_ns if first is None else first
+                belief, first_stamp = message, message.stamp_ns if first_stamp is None else first_stamp
                 truth = watch.latest.get("truth")
-                off = f"{_apart(belief, truth):.3f} m from the truth" if isinstance(truth, Truth) else "truth unknown"
-                status.update(f"localising: scan {belief.seq}, F = {belief.free_energy:.0f} nats, {off}")
+                error = (
+                    f"{_position_error(belief, truth):.3f} m from the truth"
+                    if isinstance(truth, Truth)
+                    else "truth unknown"
+                )
+                line.update(f"localising: scan {belief.seq}, F = {belief.free_energy:.0f} nats, {error}")
                 if belief.state == "tracking":
-                    console.print(f"localised after {belief.seq + 1} scans, {off}")
+                    console.print(f"localised after {belief.seq + 1} scans, {error}")
                     return True
-                if belief.stamp_ns - first > LOCALISE_WITHIN * 1e9:
+                if belief.stamp_ns - first_stamp > LOCALISATION_TIMEOUT_S * 1e9:
                     break
     console.print(
-        f"[bold]not localised within {LOCALISE_WITHIN:g} s[/]: the belief is {belief.state if belief else 'unknown'}. "
-        "How often that happens: presage bench localisation"
+        f"[bold]not localised within {LOCALISATION_TIMEOUT_S:g} s[/]: the belief is "
+        f"{belief.state if belief else 'unknown'}. `presage bench localisation` measures how often this happens"
     )
     return False
 
 
-def _apart(belief: Belief, truth: Truth) -> float:
+def _position_error(belief: Belief, truth: Truth) -> float:
     return float(np.hypot(*(belief.pose.array() - truth.pose.array())[:2]))
 
 
-def _check_estimator(pulse: Health | None, waited: float) -> None:
-    """Raises UserError with the estimator's own reason where it can use no scan, or says nothing for long."""
-    note = (pulse.note if pulse is not None else "") or "nothing"
-    if pulse is not None and pulse.counters.get("unfit_scans"):
-        raise UserError(f"no belief comes: the estimator says: {note}")
-    if waited > FIRST_WITHIN:
-        raise UserError(f"no belief came within {FIRST_WITHIN:g} s; the estimator says: {note}. See its lines above")
+def _check_estimator(health: Health | None, waited: float) -> None:
+    """Raises UserError with the note of the estimator's health if it cannot use the scans, or after a timeout."""
+    note = (health.note if health is not None else "") or "nothing"
+    if health is not None and health.counters.get("unfit_scans"):
+        raise UserError(f"the estimator publishes no belief; its health reports: {note}")
+    if waited > FIRST_BELIEF_TIMEOUT_S:
+        raise UserError(
+            f"no belief came within {FIRST_BELIEF_TIMEOUT_S:g} s; the estimator's health reports: {note}. See its log "
+            "lines above"
+        )
 
 
 def _navigate(bus: Bus, watch: Watch, stack: Stack, place: tuple[float, float], console: Console) -> bool:
-    """Give the goal and watch until it is reached."""
+    """Sends the goal and waits for the outcome; returns whether the goal was reached."""
     if not bus.wait_matching(GOAL, 5.0):
-        raise UserError("nobody listens for goals: is the controller running?")
-    stamp, began = watch.latest["belief"].stamp_ns, time.monotonic()
-    goal = Goal(stamp_ns=stamp, seq=1, pose=Pose(x=place[0], y=place[1]))  # the first: a status without one says 0
+        raise UserError("no controller receives goals: is it running?")
+    stamp, start_s = watch.latest["belief"].stamp_ns, time.monotonic()
+    goal = Goal(stamp_ns=stamp, seq=1, pose=Pose(x=place[0], y=place[1]))  # seq 0 in a status means no goal
     bus.put(GOAL, goal.encode())
-    with console.status("navigating") as status:
+    with console.status("navigating") as line:
         while True:
             stack.check()
-            said = watch.until(Status, lambda s: s.goal_seq == goal.seq, 5.0)
-            if said is None:
-                console.print("[bold]the controller has said nothing about the goal for 5 s[/]")
+            status = watch.until(Status, lambda s: s.goal_seq == goal.seq, 5.0)
+            if status is None:
+                console.print("[bold]the controller has published no status of the goal for 5 s[/]")
                 return False
-            if said.distance is not None:
-                where = f"({place[0]:g}, {place[1]:g})"
-                status.update(f"navigating to {where}: {said.distance:.2f} m to go {said.reason}")
-            if said.state == "reached":
+            if status.distance is not None:
+                target = f"({place[0]:g}, {place[1]:g})"
+                line.update(f"navigating to {target}: {status.distance:.2f} m to go {status.reason}")
+            if status.state == "reached":
                 break
-            passed = (said.stamp_ns - stamp) * 1e-9
-            if said.refused or (said.state == "lost" and passed > 5 and "standing" not in said.reason):
-                console.print(f"[bold]{said.state}: {said.reason}[/]")
+            passed = (status.stamp_ns - stamp) * 1e-9
+            if status.refused or (status.state == "lost" and passed > 5 and "standing" not in status.reason):
+                console.print(f"[bold]{status.state}: {status.reason}[/]")
                 return False
-            if passed > ARRIVE_WITHIN or time.monotonic() - began > GIVE_UP:
-                console.print(f"[bold]not there after {passed:.0f} s[/]: {said.state} {said.reason}")
+            if passed > ARRIVAL_TIMEOUT_S or time.monotonic() - start_s > WALL_TIMEOUT_S:
+                console.print(f"[bold]not at the goal after {passed:.0f} s[/]: {status.state} {status.reason}")
                 return False
-    # The last scans of the standing robot belong to the picture.
+    # Wait until the robot stands, so that the recording and the figure contain the end of the drive.
     return watch.until(Truth, lambda truth: bool(np.hypot(truth.twist.vx, truth.twist.vy) < 0.01), 5.0) is not None
 
 
 def show(summary: SessionSummary, recording: Path, figure: Path, console: Console) -> None:
-    """The numbers, one a line."""
+    """Prints the summary and the names of the files."""
     table = Table(show_header=False, box=None, padding=(0, 2))
     for name, value in summary.lines():
         table.add_row(name, value)
@@ -190,10 +206,10 @@ def show(summary: SessionSummary, recording: Path, figure: Path, console: Consol
 
 
 def demo_command(demo: DemoOptions, json_file: Path | None, *, quiet: bool) -> int:
-    """Everything; the exit status."""
+    """Runs the demo, prints its summary and draws its figure; returns status 1 if the goal was not reached."""
     console = Console(width=None if sys.stdout.isatty() else 150)
     check_file(json_file, "--json")
-    if quiet:  # nobody looks
+    if quiet:
         demo = replace(demo, viewer=False)
     with Stack("robot", demo.port, quiet=quiet, security=credentials_for("robot")) as stack:
         recording, reached = run_demo(demo, stack, console)
@@ -208,7 +224,7 @@ def demo_command(demo: DemoOptions, json_file: Path | None, *, quiet: bool) -> i
 
 
 def plot_command(recording: Path, figure: Path, json_file: Path | None, console: Console) -> None:
-    """Summary and figure of any recording."""
+    """Prints the summary of a recording and draws its figure."""
     check_file(figure, "--out")
     check_file(json_file, "--json")
     summary = summarise(recording)

@@ -15,17 +15,17 @@ from presage.session.stack import Stack
 
 
 def start_page(stack: Stack, recordings: Path, console: Console) -> bool:
-    """Start the viewer, over a folder of recordings; False, and a word why, where its packages are not installed."""
+    """Starts the viewer for a folder of recordings; prints a note and returns False if its packages are missing."""
     if any(find_spec(name) is None for name in ("starlette", "uvicorn", "websockets")):
-        console.print("no live page: its packages are not installed (pip install 'presage\\[viewer]')")
+        console.print("no live page: its packages are not installed; run pip install 'presage\\[viewer]'")
         return False
     stack.start("viewer", "--recordings", str(recordings))
     return True
 
 
-def say_page(stack: Stack, console: Console, *, open_it: bool) -> None:
-    """Print the link, and open it for whoever sits at a display."""
-    link = stack.said("viewer", "page: ")
+def show_page_link(stack: Stack, console: Console, *, open_it: bool) -> None:
+    """Prints the address of the live page; with ``open_it``, also opens it in a browser if there is a display."""
+    link = stack.wait_for_line("viewer", "page: ")
     console.print(f"[bold]page:[/] {link}", soft_wrap=True)
     if open_it and has_display():
         with suppress(webbrowser.Error, OSError):
@@ -33,5 +33,5 @@ def say_page(stack: Stack, console: Console, *, open_it: bool) -> None:
 
 
 def has_display() -> bool:
-    """Whether a browser would have a window to open in; elsewhere it might take over the terminal."""
+    """Whether a graphical browser can open; without a display, a text browser might take over the terminal."""
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -19,18 +19,18 @@ from services.simulator.settings import SimulatorSettings
 def check_services(
     world: str, estimator: Sequence[str], controller: Sequence[str], simulator: Sequence[str] | None = None
 ) -> None:
-    """Raises UserError for what the services would say of these arguments and of our environment; None: it is not run.
+    """Raises the UserError that a service would raise for its arguments and this process's environment.
 
-    Models are looked for and read; nothing is compiled, and nobody is asked.
+    ``simulator`` is None if no simulator is started. Models are read, but nothing is compiled and no bus is used.
     """
-    known = load_world(world)
-    perceiving = load_settings(EstimatorSettings, list(estimator))
+    loaded_world = load_world(world)
+    estimator_settings = load_settings(EstimatorSettings, list(estimator))
     load_settings(ControllerSettings, list(controller)).check()
     if simulator is not None:
         settings = load_settings(SimulatorSettings, list(simulator))
         settings.the_scanner()
         radius, start = settings.build_robot().radius, settings.start_pose()
-        pose = known.start_pose(radius) if start is None else np.array(start)
-        if (why := known.why_no_room(pose, radius)) is not None:
+        pose = loaded_world.start_pose(radius) if start is None else np.array(start)
+        if (why := loaded_world.why_no_room(pose, radius)) is not None:
             raise UserError(f"start {why} (--start, --radius)")
-    check(choice_of(perceiving), known)
+    check(choice_of(estimator_settings), loaded_world)

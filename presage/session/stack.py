@@ -24,34 +24,37 @@ from common.processes import end_with_this_process
 from presage.session.ports import accepts, check_port, free_port
 
 COLOURS = {"router": 37, "simulator": 36, "estimator": 35, "controller": 33, "recorder": 32, "viewer": 34}
-ACCESS = {"PRESAGE_SECURITY", "PRESAGE_ROLE"}  # meant for us, not for our children
-GRACE = 5.0  # s between asking a process to end and ending it
-# Who is asked first: the robot stops before its eyes close, and the recorder sees all of it.
-ENDING = ("controller", "estimator", "simulator", "viewer", "recorder", "router")
+SECURITY_VARIABLES = {"PRESAGE_SECURITY", "PRESAGE_ROLE"}  # choose this process's credentials, not the children's
+TERMINATION_TIMEOUT_S = 5.0  # between SIGTERM and SIGKILL
+# The controller stops the robot first; the recorder ends late, to record how the others stop.
+SHUTDOWN_ORDER = ("controller", "estimator", "simulator", "viewer", "recorder", "router")
 
 
 @dataclass
 class Process:
-    """One child and the thread that passes its lines on."""
+    """A child process and the thread that reads its output."""
 
     name: str
     child: subprocess.Popen[str]
     reader: threading.Thread
-    lines: list[str] = field(default_factory=list)  # the last few, to explain an end
-    args: list[str] = field(default_factory=list)  # of Python
-    service: str = ""  # the token that says it is there; empty: its name
-    robot: str = ""  # whose; empty: the stack's
+    lines: list[str] = field(default_factory=list)  # the last few lines of output, for error messages
+    args: list[str] = field(default_factory=list)  # arguments of the Python interpreter
+    service: str = ""  # service name in its liveliness token; defaults to `name`
+    robot: str = ""  # robot it belongs to; defaults to the robot of the stack
 
-    def again(self, stack: Stack) -> str:
-        """The command that starts another like it, for a shell."""
-        said = f"PRESAGE_CONNECT={stack.endpoint} PRESAGE_ROBOT={stack.robot} "
-        return ("" if self.name == "router" else said) + shlex.join(["python", *self.args])
+    def restart_command(self, stack: Stack) -> str:
+        """Shell command that starts the same service again."""
+        variables = f"PRESAGE_CONNECT={stack.endpoint} PRESAGE_ROBOT={stack.robot} "
+        return ("" if self.name == "router" else variables) + shlex.join(["python", *self.args])
 
 
 def controller_arguments(
     world: str, estimator: Sequence[str], limits: Sequence[str] = ("--drive", "holonomic"), *, lockstep: bool = False
 ) -> list[str]:
-    """Of the controller beside an estimator with these arguments: the paper's two belong together, at one heading."""
+    """Command-line arguments of the controller that goes with an estimator with the arguments ``estimator``.
+
+    The paper's estimator localises at one heading only and needs the paper's controller.
+    """
     arguments = ["--world", world, *limits]
     if "paper" in estimator:
         arguments += ["--preset", "paper"]
@@ -59,17 +62,24 @@ def controller_arguments(
 
 
 class Stack:
-    """Child processes of one session; a context manager that leaves none behind."""
+    """The services of one session as child processes; a context manager that ends them all on exit."""
 
-    orphans_get = signal.SIGTERM  # what ends the children where we end without a word
+    orphan_signal = signal.SIGTERM  # sent to the children if this process dies
 
     def __init__(
-        self, robot: str, port: int | None = None, *, quiet: bool = False,
-        environment: Mapping[str, str] | None = None, security: Credentials | None = None,
-    ) -> None:  # fmt: skip
-        """``port`` on loopback for the router, or a free one; ``environment`` of the children, or ours.
+        self,
+        robot: str,
+        port: int | None = None,
+        *,
+        quiet: bool = False,
+        environment: Mapping[str, str] | None = None,
+        security: Credentials | None = None,
+    ) -> None:
+        """Starts nothing yet.
 
-        With ``security``, ours, the children take theirs from the same folder; else they run without.
+        ``port`` is the router's port on loopback; it defaults to a free port. ``environment`` is the children's
+        environment; it defaults to that of this process. ``security`` are the credentials of this process; the children
+        then use those of their roles from the same folder.
         """
         self.security = security
         self.port = port if port is not None else free_port()
@@ -79,59 +89,64 @@ class Stack:
 
     @property
     def endpoint(self) -> str:
-        """Where the router listens."""
+        """Endpoint to which the children connect."""
         return f"tcp/127.0.0.1:{self.port}"
 
-    def command(self, name: str, args: list[str]) -> list[str]:  # noqa: ARG002 - for who runs some of them elsewhere
-        """What is executed for a child with these arguments of Python."""
+    def command(self, name: str, args: list[str]) -> list[str]:  # noqa: ARG002 - subclasses may run it on another host
+        """Command line of the child ``name``; ``args`` are the arguments of the Python interpreter."""
         return [sys.executable, *args]
 
-    def variables(self, name: str) -> Mapping[str, str]:  # noqa: ARG002
-        """More of a child's environment."""
+    def child_environment(self, name: str) -> Mapping[str, str]:  # noqa: ARG002 - for subclasses
+        """Additional environment variables of the child ``name``."""
         return {}
 
-    def router_listens(self) -> str:
-        """Endpoints of the router, comma-separated; loopback is among them."""
+    def router_endpoints(self) -> str:
+        """Comma-separated endpoints on which the router listens, among them loopback."""
         return self.endpoint
 
-    def heard(self, name: str, line: str) -> None:
-        """A child said something; called from its reader's thread."""
+    def on_output(self, name: str, line: str) -> None:
+        """Hook for subclasses: called for each line that the child ``name`` prints, in its reader thread."""
 
     def link(self) -> Link:
-        """For a session of our own beside the children."""
+        """Link for a bus session of this process."""
         return Link(robot=self.robot, connect=(self.endpoint,), security=self.security)
 
     def start_router(self) -> None:
-        """The router first; raises UserError where the port is taken."""
+        """Starts the router and waits until it listens; raises UserError if the port is taken."""
         check_port(self.port)
-        self._spawn("router", ["-m", "common.router", "--listen", self.router_listens()])
+        self._spawn("router", ["-m", "common.router", "--listen", self.router_endpoints()])
         deadline = time.monotonic() + 20
         while not accepts(self.port):
             self.check()
             if time.monotonic() > deadline:
-                raise UserError(f"the router did not listen on {self.endpoint} within 20 s")
+                raise UserError(f"the router did not start to listen on {self.endpoint} within 20 s")
             time.sleep(0.02)
 
     def start(self, service: str, *args: str) -> None:
-        """A service, connected to this session's router."""
+        """Starts a service, connected to this session's router."""
         self._spawn(service, ["-m", f"services.{service}", *args])
 
-    def start_as(self, name: str, service: str, robot: str, *args: str) -> None:
-        """One of several of a kind, under a name of its own, for a robot of its own."""
+    def start_instance(self, name: str, service: str, robot: str, *args: str) -> None:
+        """Starts one of several instances of a service, as child ``name``, for the robot ``robot``."""
         self._spawn(name, ["-m", f"services.{service}", "--robot", robot, *args])
         self.processes[name].service, self.processes[name].robot = service, robot
 
-    def start_code(self, name: str, code: str) -> None:
-        """A child of our own making that is no service, connected to this session's router."""
+    def start_python(self, name: str, code: str) -> None:
+        """Starts a child that runs the given Python code, with the environment of a service."""
         self._spawn(name, ["-c", code])
 
     def wait_alive(self, bus: Bus, timeout: float = 60.0) -> None:
-        """Until every started service has its liveliness token; raises UserError naming who is missing or ended."""
+        """Waits until every started service has its liveliness token.
+
+        Raises UserError with the names of the missing services, or if a service has ended.
+        """
         deadline = time.monotonic() + timeout
         while missing := self._missing(bus):
             self.check()
             if time.monotonic() > deadline:
-                raise UserError(f"not alive within {timeout:g} s: {', '.join(sorted(missing))}; their lines are above")
+                raise UserError(
+                    f"not alive within {timeout:g} s: {', '.join(sorted(missing))}; see their log lines above"
+                )
             time.sleep(0.05)
 
     def _missing(self, bus: Bus) -> set[str]:
@@ -143,38 +158,41 @@ class Stack:
             if name != "router" and (process.service or name) not in alive[process.robot or self.robot]
         }
 
-    def said(self, name: str, beginning: str, timeout: float = 30.0) -> str:
-        """What a child's line says after ``beginning``; raises UserError where it ends, or does not say it in time."""
+    def wait_for_line(self, name: str, beginning: str, timeout: float = 30.0) -> str:
+        """Waits for an output line of the child ``name`` that starts with ``beginning``; returns the rest of the line.
+
+        Raises UserError if the line does not come within ``timeout`` s, or if a child ends.
+        """
         deadline = time.monotonic() + timeout
         while True:
             for line in self.processes[name].lines:
-                if (text := _text_of(line)).startswith(beginning):
+                if (text := _log_text(line)).startswith(beginning):
                     return text.removeprefix(beginning)
             self.check()
             if time.monotonic() > deadline:
-                raise UserError(f"{name} did not say {beginning!r} within {timeout:g} s; its lines are above")
+                raise UserError(f"{name} did not print {beginning!r} within {timeout:g} s; see its log lines above")
             time.sleep(0.02)
 
     def ended(self) -> list[str]:
-        """Names of children that are gone."""
+        """Names of the children that have ended."""
         return [name for name, process in self.processes.items() if process.child.poll() is not None]
 
     def check(self) -> None:
-        """Raises UserError with the last line of a child that ended though nobody asked it to."""
+        """Raises UserError with the last output line of a child that has ended by itself."""
         for name in self.ended():
             process = self.processes[name]
             process.reader.join(timeout=1)
-            last = process.lines[-1] if process.lines else "without a word"
+            last = process.lines[-1] if process.lines else "it printed nothing"
             raise UserError(f"{name} ended with status {process.child.returncode}: {last}")
 
     def _spawn(self, name: str, args: list[str]) -> None:
         environment = {
-            **{name: value for name, value in self.environment.items() if name not in ACCESS},
+            **{name: value for name, value in self.environment.items() if name not in SECURITY_VARIABLES},
             **({} if self.security is None else {"PRESAGE_SECURITY": str(self.security.folder.parent)}),
             "PRESAGE_CONNECT": self.endpoint,
             "PRESAGE_ROBOT": self.robot,
             "PYTHONUNBUFFERED": "1",
-            **self.variables(name),
+            **self.child_environment(name),
         }
         child = subprocess.Popen(  # noqa: S603 - our own modules
             self.command(name, args),
@@ -184,23 +202,24 @@ class Stack:
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
-            start_new_session=True,  # Ctrl-C is ours to pass on, in order
-            preexec_fn=end_with_this_process(self.orphans_get),  # noqa: PLW1509 - one call, before any thread of the child
+            start_new_session=True,  # so that Ctrl-C does not reach the children: they are ended in order
+            preexec_fn=end_with_this_process(self.orphan_signal),  # noqa: PLW1509 - no threads in the child yet
         )
-        process = Process(name, child, threading.Thread(target=lambda: self._pass_on(process), daemon=True))
+        process = Process(name, child, threading.Thread(target=lambda: self._forward_output(process), daemon=True))
         process.args = args
         process.reader.start()
         self.processes[name] = process
 
-    def _pass_on(self, process: Process) -> None:
-        assert process.child.stdout is not None  # noqa: S101 - asked for above
+    def _forward_output(self, process: Process) -> None:
+        """Prints the child's output to standard error, each line with the child's name in front."""
+        assert process.child.stdout is not None  # noqa: S101 - it is a pipe, see _spawn
         colour = f"\033[{COLOURS.get(process.name, 0)}m" if sys.stderr.isatty() else ""
         for line in process.child.stdout:
             process.lines = [*process.lines[-20:], line.rstrip()]
-            self.heard(process.name, line.rstrip())
+            self.on_output(process.name, line.rstrip())
             if self.quiet or process.name == "observer":
                 continue
-            if line.startswith("{"):  # a log line as JSON says itself whose it is
+            if line.startswith("{"):  # a JSON log line contains the name of its service
                 print(line.rstrip(), file=sys.stderr)
             else:
                 print(
@@ -208,13 +227,13 @@ class Stack:
                 )
 
     def stop(self, name: str) -> int:
-        """End one child cleanly; its status."""
+        """Ends one child as `close` does; returns its exit status."""
         process = self.processes.pop(name)
         return _end(process)
 
     def close(self) -> None:
-        """End all, in order; those that do not listen are killed."""
-        for name in sorted(self.processes, key=lambda n: ENDING.index(n) if n in ENDING else -1):
+        """Ends all children in `SHUTDOWN_ORDER`, others first; a child that ignores SIGTERM is killed."""
+        for name in sorted(self.processes, key=lambda n: SHUTDOWN_ORDER.index(n) if n in SHUTDOWN_ORDER else -1):
             self.stop(name)
 
     def __enter__(self) -> Self:
@@ -227,22 +246,22 @@ class Stack:
             self.close()
 
 
-def _text_of(line: str) -> str:
-    """What a line says, also one of a log in JSON."""
+def _log_text(line: str) -> str:
+    """The message of a log line; also of a JSON log line."""
     with suppress(ValueError, AttributeError):
         return str(json.loads(line).get("event", line))
     return line
 
 
 def _end(process: Process) -> int:
-    """Its status; one that ended already is tidied up."""
+    """Ends the child unless it has ended, and releases its resources; returns its exit status."""
     child = process.child
     if child.poll() is None:
         child.terminate()
         try:
-            child.wait(GRACE)
+            child.wait(TERMINATION_TIMEOUT_S)
         except subprocess.TimeoutExpired:
-            print(f"{process.name} did not end within {GRACE:g} s and is killed", file=sys.stderr)
+            print(f"{process.name} did not end within {TERMINATION_TIMEOUT_S:g} s and is killed", file=sys.stderr)
             child.kill()
             child.wait()
     process.reader.join(timeout=1)
@@ -253,29 +272,32 @@ def _end(process: Process) -> int:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """SIGTERM and SIGHUP, where nohup does not ignore them, end the block as Ctrl-C does: what it started is ended."""
+    """Makes SIGTERM and SIGHUP raise KeyboardInterrupt in the block, so that it cleans up as after Ctrl-C.
+
+    A signal that is ignored, as SIGHUP is under nohup, stays ignored.
+    """
 
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    heard = [s for s in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(s) != signal.SIG_IGN]
-    before = {s: signal.signal(s, interrupt) for s in heard}
+    handled = [s for s in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(s) != signal.SIG_IGN]
+    previous = {s: signal.signal(s, interrupt) for s in handled}
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)
 
 
 @contextmanager
 def ignoring_interrupts() -> Iterator[None]:
-    """A second Ctrl-C does not cut the cleaning short."""
+    """Ignores SIGINT, SIGTERM and SIGHUP in the block, so that a second Ctrl-C does not interrupt the cleanup."""
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before: dict[int, Callable[[int, FrameType | None], object] | int | None] = {
+    previous: dict[int, Callable[[int, FrameType | None], object] | int | None] = {
         s: signal.signal(s, signal.SIG_IGN) for s in numbers
     }
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in previous.items():
             signal.signal(number, handler)

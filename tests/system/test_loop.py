@@ -142,7 +142,7 @@ def test_demo_without_a_belief_says_why(process, tmp_path):
     )
     assert demo.wait(60) == 2, demo.output
     (line,) = demo.output.splitlines()
-    assert line.startswith("presage: no belief comes: the estimator says: the scan does not fit the weights")
+    assert line.startswith("presage: the estimator publishes no belief; its health reports: the scan does not fit the")
     assert "presage train" in line
     assert "--beams 100" in line
 

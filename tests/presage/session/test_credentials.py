@@ -64,7 +64,7 @@ def test_nothing_is_overwritten_unless_told(tmp_path):
     assert not (tmp_path / "anna").exists()
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis").touch()
-    with pytest.raises(UserError, match="nothing that `presage secure` made"):
+    with pytest.raises(UserError, match="not made by `presage secure`"):
         secure.init(tmp_path / "home", force=True)
 
 
@@ -77,7 +77,7 @@ def test_added_and_struck_off(tmp_path):
     secure.remove(tmp_path, "anna")
     assert "anna" not in {member.name for member in read_members(tmp_path / "router")}
     assert "anna" not in (tmp_path / "router" / "passwords").read_text()
-    with pytest.raises(UserError, match="no member 'anna': there are router, "):
+    with pytest.raises(UserError, match="no member 'anna': choose one of router, "):
         secure.remove(tmp_path, "anna")
 
 
@@ -85,8 +85,8 @@ def test_added_and_struck_off(tmp_path):
     ("role", "name", "why"),
     [
         ("king", "arthur", "no role 'king'"), ("operator", "Anna", "lower-case"), ("operator", "a.b", "lower-case"),
-        ("operator", "authority", "authority"), ("operator", "../x", "lower-case"), ("router", "two", "share one name"),
-        ("operator", "router", "share one name"),
+        ("operator", "authority", "authority"), ("operator", "../x", "lower-case"), ("router", "two", "one member"),
+        ("operator", "router", "one member"),
     ],
 )  # fmt: skip
 def test_names_that_cannot_be(tmp_path, role, name, why):
