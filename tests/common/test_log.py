@@ -14,7 +14,7 @@ from common.bus.bus import wait_until
 from common.log_capture import Line, parse_line
 from common.messages.definitions import Goal, Pose
 from common.messages.topics import GOAL
-from presage.session.stack import _text_of
+from presage.session.stack import _log_text
 from tests.conftest import PATIENCE, ROOT
 
 HEAD = ["time", "level", "service", "robot", "event"]
@@ -94,6 +94,6 @@ def test_zenoh_s_own_lines_are_taken_apart():
 
 
 def test_who_started_it_still_reads_what_a_line_says():
-    assert _text_of('{"event": "page: http://x/"}') == "page: http://x/"
-    assert _text_of("page: http://x/") == "page: http://x/"
-    assert _text_of("[1]") == "[1]"
+    assert _log_text('{"event": "page: http://x/"}') == "page: http://x/"
+    assert _log_text("page: http://x/") == "page: http://x/"
+    assert _log_text("[1]") == "[1]"
