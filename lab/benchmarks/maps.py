@@ -21,7 +21,7 @@ from lab.accuracy.runner import provenance
 from presage.learning.grid_map import rooms, write_map
 from presage.terminal.output import check_file, make_folder, write_json
 from services.controller.policies.free_space import FreeSpace
-from services.controller.policies.geodesic_field import Roads
+from services.controller.policies.geodesic_field import FreeSpaceGraph
 from services.estimator.particle_filter.likelihood_field import DistanceField
 from services.estimator.shared.generative_models import RayCaster
 from services.simulator.people import People
@@ -77,7 +77,7 @@ def measure(path: str, beams: int, seed: int) -> list[tuple[str, float, str]]:
     RayCaster(world).expect(lasers[:1], angles)
     timed("exact rays, compiled", lambda: RayCaster(world).expect(lasers, angles), SCANS)
     free = timed("controller: free space", lambda: FreeSpace.of(world))
-    timed("controller: roads", lambda: Roads(free, Robot().radius))
+    timed("controller: graph of free space", lambda: FreeSpaceGraph(free, Robot().radius))
     timed("particle filter: likelihood field", lambda: DistanceField(world))
     start = world.start_pose(Robot().radius)[:2]
     timed("simulator: room for 10 people", lambda: People(world, 10, 1.0, rng, start, Robot().radius))

@@ -10,34 +10,42 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.messages.definitions import Drive
 
-HOLDS = 500_000_000  # ns a drive message counts, and a hand that asks to stand keeps the goal waiting
+MANUAL_TIMEOUT_NS = 500_000_000  # age at which a drive message expires, and time for which zero velocity is held
 
 
-class Hand:
-    """The last velocity asked for by hand."""
+class ManualDrive:
+    """The latest velocity commanded by hand, until it expires.
+
+    All times are stamps of scans and beliefs, so that the timeout pauses when a simulation pauses.
+    """
 
     def __init__(self) -> None:
-        """Nobody drives."""
         self._twist = np.zeros(3)
-        self._heard: int | None = None  # ns, when the last message came
-        self._standing: int | None = None  # ns, since when it asks to stand
+        self._last_message_ns: int | None = None
+        self._zero_since_ns: int | None = None  # first of the latest run of messages that command zero velocity
 
-    def hear(self, drive: Drive, now_ns: int) -> None:
-        """Somebody drives; ``now_ns`` is the stamp of what was measured last."""
+    def update(self, drive: Drive, now_ns: int) -> None:
+        """Take a drive message that arrived at ``now_ns``, the stamp of the latest scan or command."""
         self._twist = drive.twist.array()
         if self._twist.any():
-            self._standing = None
-        elif self._standing is None or self._silent(now_ns):
-            self._standing = now_ns
-        self._heard = now_ns
+            self._zero_since_ns = None
+        elif self._zero_since_ns is None or self._expired(now_ns):
+            self._zero_since_ns = now_ns
+        self._last_message_ns = now_ns
 
     def twist(self, now_ns: int) -> Array | None:
-        """(3,) m/s, m/s, rad/s in base_link, as asked for; None where nobody drives, or no more."""
-        if self._silent(now_ns) or (self._standing is not None and now_ns - self._standing > HOLDS):
+        """Velocity (3,) in m/s, m/s and rad/s in base_link, before any limit.
+
+        Returns None if the robot is not driven by hand: no message came within the timeout, or only zero velocity has
+        been commanded for longer than that, so that an idle joystick does not hold up the goal.
+        """
+        if self._expired(now_ns):
+            return None
+        if self._zero_since_ns is not None and now_ns - self._zero_since_ns > MANUAL_TIMEOUT_NS:
             return None
         return self._twist
 
-    def _silent(self, now_ns: int) -> bool:
-        if self._heard is not None and now_ns < self._heard:  # the simulation began anew: that was another run
-            self._heard = None
-        return self._heard is None or now_ns - self._heard > HOLDS
+    def _expired(self, now_ns: int) -> bool:
+        if self._last_message_ns is not None and now_ns < self._last_message_ns:
+            self._last_message_ns = None  # time went back: the simulation was reset, and the message is from before
+        return self._last_message_ns is None or now_ns - self._last_message_ns > MANUAL_TIMEOUT_NS

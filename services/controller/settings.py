@@ -11,43 +11,54 @@ from common.runtime.robot_settings import SeenRobotSettings
 
 
 class ControllerSettings(SeenRobotSettings):
-    """Action controller: from each belief, and the goal preferred, a velocity command.
+    """Controller: turns each belief, and the current goal, into a velocity command.
 
     Examples:
       python -m services.controller
-      python -m services.controller --max-speed 0.5      more careful
+      python -m services.controller --max-speed 0.5      drives more slowly
       python -m services.controller --drive differential --radius 0.105 --max-speed 0.22    a TurtleBot 3
-      python -m services.controller --preset paper       straight to the goal, as the paper has it
-      python -m services.controller --preset paper --world ''    with no map at all
-      presage goal 15 1.5                                gives it something to do
+      python -m services.controller --preset paper       straight to the goal, as in the paper
+      python -m services.controller --preset paper --world ''    without a map
+      presage goal 15 1.5                                sends a goal to the controller
 
     """
 
     service: ClassVar[str] = "controller"
 
     world: Annotated[
-        str, Field(description="the map: shipped world, world file or ROS map.yaml; empty, of preset paper alone: none")
+        str,
+        Field(description="the map: a shipped world, a world file or a ROS map.yaml; may be empty with preset paper"),
     ] = "corridor"
     preset: Annotated[
         Literal["geodesic", "paper"],
-        Field(description="geodesic: round walls and what the scan shows; paper: equation 4, straight to the goal"),
+        Field(description="geodesic: around walls and obstacles in the scan; paper: straight to the goal (equation 4)"),
     ] = "geodesic"
     heading: Annotated[
-        Literal["travel", "keep"], Field(description="a holonomic robot turns into its way, or keeps its heading")
+        Literal["travel", "keep"],
+        Field(description="a holonomic robot turns into its direction of travel, or keeps its heading"),
     ] = "travel"
     epistemic: Annotated[
-        bool, Field(description="with a goal and several possible places, drive to where they can be told apart")
+        bool, Field(description="with a goal and several possible places, drive where they can be told apart")
     ] = True
-    resume: Annotated[bool, Field(description="started again, go on to the goal it was on the way to")] = True
-    gamma: Annotated[float, Field(gt=0, lt=1, description="paper: action step size a scan (eq. 4)")] = 0.3
-    reach: Annotated[float, Field(gt=0, le=100, description="paper: m by which the goal attracts at most")] = 2.0
-    belief_timeout: Annotated[float, Field(gt=0, le=60, description="s without a belief until the robot stands")] = 0.5
+    resume: Annotated[
+        bool, Field(description="after a restart, continue to the goal of the previous controller instance")
+    ] = True
+    gamma: Annotated[float, Field(gt=0, lt=1, description="preset paper: action step size per scan (equation 4)")] = 0.3
+    reach: Annotated[
+        float, Field(gt=0, le=100, description="preset paper: upper limit of the goal's attraction, m")
+    ] = 2.0
+    belief_timeout: Annotated[
+        float, Field(gt=0, le=60, description="the robot stops after this time without a belief, s")
+    ] = 0.5
 
     def check(self) -> None:
-        """Raises UserError where settings do not go together."""
+        """Raise UserError if settings contradict each other."""
         self.build_robot()
         self.build_self_filter()
         if self.preset == "geodesic" and not self.world:
-            raise UserError("preset geodesic needs a map: give --world, or --preset paper")
+            raise UserError("preset geodesic needs a map: give --world, or use --preset paper")
         if self.preset == "paper" and self.drive != "holonomic":
-            raise UserError("preset paper moves without turning: give --drive holonomic, or --preset geodesic")
+            raise UserError(
+                "preset paper moves without turning, which only a holonomic robot can: give --drive holonomic, or use "
+                "--preset geodesic"
+            )

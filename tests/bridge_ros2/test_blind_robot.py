@@ -45,8 +45,8 @@ def test_the_bridge(monkeypatch, told, near):
 def test_the_controller(monkeypatch, told, near):
     service = ControllerService(ControllerSettings(**told))
     shown = []
-    monkeypatch.setattr(service.navigator, "hear_scan", shown.append)
-    monkeypatch.setattr(service.navigator, "steer", lambda stamp_ns: None)  # nobody drives by hand
+    monkeypatch.setattr(service.navigator, "on_scan", shown.append)
+    monkeypatch.setattr(service.navigator, "step_without_belief", lambda stamp_ns: None)  # no manual driving
     scan = Scan(stamp_ns=0, angle_min=-1.0, angle_increment=0.5, range_min=0.1, range_max=10.0, ranges=[1, 2, -np.inf])
     service.on_message(SCAN, scan)
     assert (~np.isnan(shown[0].ranges)).sum() == near

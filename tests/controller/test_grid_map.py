@@ -9,8 +9,8 @@ from common.geometry.occupancy_grid import FREE, UNKNOWN, OccupancyGrid
 from common.geometry.world import World
 from common.robot.base import Robot
 from services.controller.policies.free_space import FreeSpace
-from services.controller.policies.planner import Pilot
-from services.controller.policies.straight_line import Straight
+from services.controller.policies.planner import GeodesicPolicy
+from services.controller.policies.straight_line import StraightLinePolicy
 from tests.common.geometry.maps import rooms
 
 WORLD = World(name="rooms", grid=OccupancyGrid.of(rooms(400), 0.05, (-10.0, -10.0, 0.0)))
@@ -27,11 +27,11 @@ def test_free_space_is_that_of_the_cells(origin):
 
 
 def test_a_way_from_room_to_room_keeps_clear_of_every_cell():
-    pilot = Pilot(Robot(), WORLD)
+    policy = GeodesicPolicy(Robot(), WORLD)
     start, goal = np.array([-6.5, -6.5]), np.array([5.0, 5.0])
-    start, goal = (pilot.free.grid.centres([pilot.roads.nearest_free(place)])[0] for place in (start, goal))
-    assert pilot.refusal(goal) is None
-    field = pilot.roads.from_(goal)
+    start, goal = (policy.free.grid.centres([policy.graph.nearest_free(place)])[0] for place in (start, goal))
+    assert policy.refusal(goal) is None
+    field = policy.graph.cost_field(goal)
     way = field.path(start)
     assert len(way) > 20
     between = np.linspace(way[:-1], way[1:], 5).reshape(-1, 2)
@@ -41,14 +41,14 @@ def test_a_way_from_room_to_room_keeps_clear_of_every_cell():
 def test_goals_in_unknown_cells_and_walls_are_refused():
     row, column = np.argwhere(WORLD.grid.values == UNKNOWN)[0]
     nowhere = WORLD.grid.shapes.points_in_cells(np.array([[column, row]]), 0.5)[0]
-    pilot, straight = Pilot(Robot(), WORLD), Straight(Robot(), None, WORLD)
+    policy, straight = GeodesicPolicy(Robot(), WORLD), StraightLinePolicy(Robot(), None, WORLD)
     for goal in (nowhere, np.array([50.0, 50.0])):
-        assert "is inside something, or off the map; the nearest place that can be reached is" in pilot.refusal(goal)
+        assert "is inside something, or off the map; the nearest place that can be reached is" in policy.refusal(goal)
         assert "is inside something" in straight.refusal(goal)
 
 
 def test_a_map_of_one_cell_has_no_goals_and_stops_nothing():
     world = World(name="dot", grid=OccupancyGrid.of(np.array([[FREE]], np.uint8), 0.05, (0.0, 0.0, 0.0)))
-    pilot = Pilot(Robot(), world)
-    assert "goal refused" in pilot.refusal(np.array([0.02, 0.02]))
-    assert pilot.roads.from_(np.array([0.02, 0.02])) is None
+    policy = GeodesicPolicy(Robot(), world)
+    assert "goal refused" in policy.refusal(np.array([0.02, 0.02]))
+    assert policy.graph.cost_field(np.array([0.02, 0.02])) is None

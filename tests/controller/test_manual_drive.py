@@ -13,7 +13,7 @@ from common.geometry import se2
 from common.geometry.world import World
 from common.messages.definitions import Drive, Twist
 from common.robot.base import Robot
-from services.controller.manual_drive import HOLDS, Hand
+from services.controller.manual_drive import MANUAL_TIMEOUT_NS, ManualDrive
 from services.controller.navigator import Navigator
 from tests.controller.test_navigator import PERIOD_NS, ROOM, belief, goal, scan
 
@@ -27,9 +27,9 @@ def session(navigator, pose, asked, *, world=ROOM, first=0, state="tracking"):
     pose, log = np.array(pose, float), []
     for number, drive in enumerate(asked, start=first):
         stamp = number * PERIOD_NS
-        navigator.hear_scan(scan(stamp, pose, world))
+        navigator.on_scan(scan(stamp, pose, world))
         if drive is not None:
-            navigator.hear_drive(drive)
+            navigator.on_drive(drive)
         command, status = navigator.step(belief(stamp, pose, state))
         log.append((command, status, pose))
         pose = se2.compose(pose, command.twist.array() * PERIOD_NS * 1e-9)
@@ -42,7 +42,7 @@ def states(log) -> list[str]:
 
 def test_it_goes_before_the_goal_which_waits_until_half_a_second_of_silence():
     navigator = Navigator(world=ROOM)
-    navigator.hear_goal(goal(8.5, 2))
+    navigator.on_goal(goal(8.5, 2))
     log = session(navigator, [3.0, 2, 0], [None] * 3 + [by_hand(vx=-0.4)] * 20 + [None] * 20)
     assert states(log)[:3] == ["navigating"] * 3
     assert states(log)[3:30] == ["manual"] * 27  # 7 periods are 0.467 s
@@ -56,7 +56,7 @@ def test_it_goes_before_the_goal_which_waits_until_half_a_second_of_silence():
 
 def test_one_that_asks_to_stand_gives_way_to_the_goal_however_often_it_says_so():
     navigator = Navigator(world=ROOM)
-    navigator.hear_goal(goal(8.5, 2))
+    navigator.on_goal(goal(8.5, 2))
     log = session(navigator, [3.0, 2, 0], [by_hand(vy=0.5)] * 5 + [by_hand()] * 30)
     assert states(log)[:13] == ["manual"] * 13
     assert states(log)[13:] == ["navigating"] * 22
@@ -73,7 +73,7 @@ def test_without_a_goal_it_is_idle_again():
 
 def test_a_goal_that_was_reached_is_done_with():
     navigator = Navigator(world=ROOM)
-    navigator.hear_goal(goal(3.0, 2))
+    navigator.on_goal(goal(3.0, 2))
     log = session(navigator, [3.0, 2, 0], [None] * 2 + [by_hand(vx=1.0)] * 30 + [None] * 20)
     assert states(log)[1] == "reached"
     assert states(log)[-1] == "idle"
@@ -83,7 +83,7 @@ def test_a_goal_that_was_reached_is_done_with():
 
 def test_a_goal_that_was_refused_stays_so():
     navigator = Navigator(world=ROOM)
-    navigator.hear_goal(goal(20, 20))
+    navigator.on_goal(goal(20, 20))
     log = session(navigator, [3.0, 2, 0], [None, by_hand(vx=1.0), *[None] * 10])
     assert (states(log)[1], states(log)[-1]) == ("manual", "blocked")
     assert "goal refused" in log[-1][1].reason
@@ -92,7 +92,7 @@ def test_a_goal_that_was_refused_stays_so():
 def test_a_goal_given_meanwhile_is_taken_and_waits():
     navigator = Navigator(world=ROOM)
     session(navigator, [3.0, 2, 0], [by_hand(vx=0.2)] * 3)
-    navigator.hear_goal(goal(8.5, 2, seq=7))
+    navigator.on_goal(goal(8.5, 2, seq=7))
     log = session(navigator, [3.0, 2, 0], [by_hand(vx=0.2)] * 3 + [None] * 9, first=3)
     assert (states(log)[0], log[0][1].goal_seq) == ("manual", 7)
     assert states(log)[-1] == "navigating"
@@ -100,7 +100,7 @@ def test_a_goal_given_meanwhile_is_taken_and_waits():
 
 def test_a_belief_that_does_not_know_where_it_is_does_not_matter():
     navigator = Navigator(world=ROOM)
-    navigator.hear_goal(goal(8.5, 2))
+    navigator.on_goal(goal(8.5, 2))
     log = session(navigator, [3.0, 2, 0], [None, *[by_hand(vx=0.5)] * 10, *[None] * 8], state="lost")
     assert (states(log)[0], states(log)[-1]) == ("lost", "lost")
     assert set(states(log)[1:11]) == {"manual"}
@@ -136,10 +136,10 @@ def test_nobody_drives_into_what_the_scan_shows(heading):
 def test_it_needs_no_belief_and_brakes_when_it_falls_silent():
     navigator, log = Navigator(world=ROOM), []
     for number in range(60):
-        navigator.hear_scan(scan(number * PERIOD_NS, [3.0, 2, 0]))
+        navigator.on_scan(scan(number * PERIOD_NS, [3.0, 2, 0]))
         if 5 <= number < 30:
-            navigator.hear_drive(by_hand(vx=0.8))
-        log.append(navigator.steer(number * PERIOD_NS))
+            navigator.on_drive(by_hand(vx=0.8))
+        log.append(navigator.step_without_belief(number * PERIOD_NS))
     assert log[:5] == [None] * 5
     commands = [answer[0].twist.vx for answer in log[5:] if answer is not None]
     assert max(commands) == pytest.approx(0.8)
@@ -152,8 +152,8 @@ def test_it_needs_no_belief_and_brakes_when_it_falls_silent():
 
 
 def test_time_that_began_anew_knows_no_hand_of_before():
-    hand, late = Hand(), 100 * 10**9
-    hand.hear(by_hand(vx=1.0), late)
+    hand, late = ManualDrive(), 100 * 10**9
+    hand.update(by_hand(vx=1.0), late)
     assert hand.twist(late) is not None
     assert hand.twist(0) is None
     assert hand.twist(late) is None
@@ -162,10 +162,10 @@ def test_time_that_began_anew_knows_no_hand_of_before():
 @given(st.lists(st.tuples(st.integers(0, 400), st.booleans()), min_size=1, max_size=30), st.integers(0, 1500))
 def test_who_drives_is_said_by_the_last_half_second(said, after):
     """Steps in ms with what was asked for then (drive or stand), and a look some ms after."""
-    hand, now, at = Hand(), 0, []
+    hand, now, at = ManualDrive(), 0, []
     for step, drives in said:
         now += step * 10**6
-        hand.hear(by_hand(vx=1.0) if drives else by_hand(), now)
+        hand.update(by_hand(vx=1.0) if drives else by_hand(), now)
         at.append((now, drives))
     look = now + after * 10**6
     last, drives = at[-1]
@@ -174,15 +174,15 @@ def test_who_drives_is_said_by_the_last_half_second(said, after):
         if drove:
             break
         stands_since = when  # steps are shorter than half a second: no silence in between
-    expected = look - last <= HOLDS and (drives or look - stands_since <= HOLDS)
+    expected = look - last <= MANUAL_TIMEOUT_NS and (drives or look - stands_since <= MANUAL_TIMEOUT_NS)
     assert (hand.twist(look) is not None) == expected
 
 
 def test_a_simulation_that_was_paused_goes_on_at_its_speed():
     navigator = Navigator(world=ROOM)
-    navigator.hear_goal(goal(8.5, 2))
+    navigator.on_goal(goal(8.5, 2))
     before = session(navigator, [2.0, 2, 0], [None] * 12)[-1]
-    stands = navigator.without_belief(11 * PERIOD_NS, "no belief")[0]
+    stands = navigator.stop_without_belief(11 * PERIOD_NS, "no belief")[0]
     assert not stands.twist.array().any()
     after = session(navigator, before[2], [None] * 2, first=12)[0]
     assert after[0].twist.vx >= before[0].twist.vx > 0.5
@@ -192,11 +192,11 @@ def test_a_simulation_that_was_paused_goes_on_at_its_speed():
 @pytest.mark.parametrize("late", [1, 9])
 def test_an_estimator_that_was_late_finds_a_robot_that_stands(late):
     navigator = Navigator(world=ROOM)
-    navigator.hear_goal(goal(8.5, 2))
+    navigator.on_goal(goal(8.5, 2))
     before = session(navigator, [2.0, 2, 0], [None] * 12)[-1]
     for number in range(12, 12 + late):
-        navigator.hear_scan(scan(number * PERIOD_NS, before[2]))  # scans come, no belief about them
-    navigator.without_belief(11 * PERIOD_NS, "no belief")
+        navigator.on_scan(scan(number * PERIOD_NS, before[2]))  # scans come, no belief about them
+    navigator.stop_without_belief(11 * PERIOD_NS, "no belief")
     command, _ = navigator.step(belief((11 + late) * PERIOD_NS, before[2]))
     assert 0 < command.twist.vx <= Robot().acceleration * late * PERIOD_NS * 1e-9 + 1e-9
     assert command.twist.vx < before[0].twist.vx

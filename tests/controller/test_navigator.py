@@ -38,7 +38,7 @@ def drive(navigator, pose, seconds, world=ROOM):
     pose, log = np.array(pose, float), []
     for number in range(int(seconds * 15)):
         stamp = number * PERIOD_NS
-        navigator.hear_scan(scan(stamp, pose, world))
+        navigator.on_scan(scan(stamp, pose, world))
         command, status = navigator.step(belief(stamp, pose))
         log.append((command, status, pose))
         pose = se2.compose(pose, command.twist.array() * PERIOD_NS * 1e-9)
@@ -52,7 +52,7 @@ def goal(x, y, **rest) -> Goal:
 @pytest.mark.parametrize("yaw", [0.0, np.pi / 2, -2.0])
 def test_reaches_a_goal_at_any_heading_and_stands_there(yaw):
     navigator = Navigator(world=ROOM)
-    navigator.hear_goal(goal(8.5, 1.5))
+    navigator.on_goal(goal(8.5, 1.5))
     log = drive(navigator, [1.5, 2.5, yaw], 25)
     assert log[-1][1].state == "reached"
     assert np.hypot(*(log[-1][2][:2] - [8.5, 1.5])) <= 0.2
@@ -64,7 +64,7 @@ def test_reaches_a_goal_at_any_heading_and_stands_there(yaw):
 def test_limits_have_the_last_word():
     robot = Robot(max_speed=0.6, acceleration=0.5)
     navigator = Navigator(robot, world=ROOM)
-    navigator.hear_goal(goal(8.5, 1.5))
+    navigator.on_goal(goal(8.5, 1.5))
     twists = np.array([c.twist.array() for c, _, _ in drive(navigator, [1.5, 2.5, 0.3], 15)])
     speeds = np.linalg.norm(twists[:, :2], axis=1)
     assert speeds.max() <= 0.6 + 1e-9
@@ -81,16 +81,16 @@ def test_commands_answer_the_belief_stamp():
 def test_idle_without_goal_and_after_cancel():
     navigator = Navigator(world=ROOM)
     assert all(s.state == "idle" and not c.twist.array().any() for c, s, _ in drive(navigator, [1.5, 2, 0], 1))
-    navigator.hear_goal(goal(8.5, 2))
+    navigator.on_goal(goal(8.5, 2))
     assert drive(navigator, [1.5, 2, 0], 1)[-1][1].state == "navigating"
-    navigator.hear_goal(goal(8.5, 2, cancel=True))
+    navigator.on_goal(goal(8.5, 2, cancel=True))
     assert navigator.step(belief(10**10, [1.5, 2, 0]))[1].state == "idle"
 
 
 @pytest.mark.parametrize(("x", "y", "why"), [(20, 20, "inside something"), (0.1, 2.0, "m from a wall")])
 def test_a_goal_in_a_wall_is_refused(x, y, why):
     navigator = Navigator(world=ROOM)
-    navigator.hear_goal(goal(x, y))
+    navigator.on_goal(goal(x, y))
     log = drive(navigator, [1.5, 2, 0], 1)
     assert all(s.state == "blocked" and why in s.reason for _, s, _ in log)
     assert not any(c.twist.array().any() for c, _, _ in log)
@@ -99,7 +99,7 @@ def test_a_goal_in_a_wall_is_refused(x, y, why):
 @pytest.mark.parametrize("state", ["localising", "lost", "ambiguous"])
 def test_stands_until_it_knows_where_it_is(state):
     navigator = Navigator(world=ROOM)
-    navigator.hear_goal(goal(8.5, 2))
+    navigator.on_goal(goal(8.5, 2))
     command, status = navigator.step(belief(0, [1.5, 2, 0], state))
     assert not command.twist.array().any()
     assert state in status.reason
@@ -113,7 +113,7 @@ def test_stands_until_it_knows_where_it_is(state):
 def test_an_obstacle_the_scan_shows_blocks_without_contact():
     crossed = World(name="crossed", boundary=ROOM.boundary, obstacles=[{"box": {"center": (5, 2), "size": (0.2, 3.9)}}])
     navigator = Navigator(world=ROOM)  # its map does not know the box
-    navigator.hear_goal(goal(8.5, 2))
+    navigator.on_goal(goal(8.5, 2))
     log = drive(navigator, [1.5, 2, 0], 15, crossed)
     assert log[-1][1].state == "blocked"
     assert "in the way" in log[-1][1].reason
@@ -122,9 +122,9 @@ def test_an_obstacle_the_scan_shows_blocks_without_contact():
 
 def test_without_a_belief_it_stands_and_keeps_the_goal():
     navigator = Navigator(world=ROOM)
-    navigator.hear_goal(goal(8.5, 2))
+    navigator.on_goal(goal(8.5, 2))
     drive(navigator, [1.5, 2, 0], 1)
-    command, status = navigator.without_belief(5, "no belief")
+    command, status = navigator.stop_without_belief(5, "no belief")
     assert (command.stamp_ns, status.reason, status.state) == (5, "no belief", "lost")
     assert not command.twist.array().any()
     for number in range(20, 25):
@@ -135,10 +135,10 @@ def test_without_a_belief_it_stands_and_keeps_the_goal():
 
 def test_without_a_belief_a_refused_goal_keeps_its_reason():
     navigator = Navigator(world=ROOM)
-    navigator.hear_goal(goal(8.5, -3))
+    navigator.on_goal(goal(8.5, -3))
     refusal = navigator.status(5, None)
     assert (refusal.state, refusal.refused) == ("blocked", True)
-    assert navigator.without_belief(5, "no belief")[1] == refusal
+    assert navigator.stop_without_belief(5, "no belief")[1] == refusal
 
 
 def test_the_controller_needs_no_torch():

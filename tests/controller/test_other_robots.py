@@ -12,7 +12,7 @@ from common.messages.definitions import CmdVel, Twist
 from common.robot.base import Robot
 from common.robot.self_filter import SelfFilter
 from services.bridge_ros2.command_gate import CommandGate
-from services.controller.policies.planner import Pilot
+from services.controller.policies.planner import GeodesicPolicy
 from services.simulator.simulation import Setup, Simulation
 from tests.controller.policies.test_planner import SCANNER, drive
 
@@ -46,10 +46,10 @@ def test_each_goes_through_its_own_door_within_its_own_limits(robot, gap):
 def test_a_door_too_narrow_for_one_is_not_for_another():
     world, goal = two_rooms(0.45), np.array([5.0, 1.5])
     for robot, fits in ((BURGER, True), (Robot(), False)):
-        pilot = Pilot(robot, world)
-        roads = pilot.roads
-        here, there = (roads.nearest_free(np.array(at)) for at in ((1.0, 1.5), goal))
-        assert (roads.component[here] == roads.component[there]) is np.bool_(fits)
+        policy = GeodesicPolicy(robot, world)
+        graph = policy.graph
+        here, there = (graph.nearest_free(np.array(at)) for at in ((1.0, 1.5), goal))
+        assert (graph.component[here] == graph.component[there]) is np.bool_(fits)
 
 
 POSTS = ((25, 0.12), (-110, 0.15), (110, 0.02))  # deg, m: of the robot itself; the last nearer than the scanner can say

@@ -12,12 +12,12 @@ from common.robot.base import Robot
 from common.robot.scan_geometry import ALL_ROUND, Sector, Sweep
 from common.robot.scanner import SCANNERS
 from services.controller.navigator import Navigator
-from services.controller.policies.active_localisation import Seeker
+from services.controller.policies.active_localisation import ActiveLocaliser
 from services.controller.policies.free_space import FreeSpace
-from services.controller.policies.motion_model import facing
+from services.controller.policies.motion_model import turn_to_attractor
 from services.controller.policies.obstacles import TemporaryObstacles
-from services.controller.policies.planner import BLIND, Pilot
-from services.controller.policies.policy import ASIDE, Around, choose
+from services.controller.policies.planner import BLIND_AHEAD, GeodesicPolicy
+from services.controller.policies.policy import VIEW_MARGIN_RAD, Surroundings, choose
 from services.simulator.simulation import Setup, Simulation
 from tests.controller.policies.test_planner import belief_at
 
@@ -43,7 +43,7 @@ def scan_of(scanner, world, pose, stamp_ns=0):
 
 
 def around(view, **more):
-    return Around(
+    return Surroundings(
         lambda p: np.full(p.shape[:-1], np.inf), np.zeros((0, 2)), np.zeros(0, bool), 0.0, 0.33, view=view, **more
     )
 
@@ -76,9 +76,9 @@ def test_no_action_leads_to_where_the_scanner_does_not_look(centre, half_deg):
         action = choose(np.zeros(3), attractor, around(view), Robot()).action
         if np.hypot(*action[:2]) > 0.02:
             off = abs(float(se2.wrap(np.arctan2(action[1], action[0]) - centre)))
-            assert off <= max(view.half - ASIDE, view.half / 3) + 1e-6
+            assert off <= max(view.half - VIEW_MARGIN_RAD, view.half / 3) + 1e-6
         else:
-            turned = facing(action, attractor, Robot(), turns=True, front=around(view).front)
+            turned = turn_to_attractor(action, attractor, Robot(), may_turn=True, forward=around(view).forward)
             assert abs(turned[2]) > 0.1  # it turns until it sees
 
 
@@ -87,21 +87,21 @@ def test_what_went_away_is_forgotten_whichever_way_the_beams_run(name):
     scanner, pose = TURNED[name], np.array([2.0, 1.5, 0.4])
     changed = World(name="hall", boundary=HALL.boundary, obstacles=[BOX])
     layer = TemporaryObstacles(FreeSpace.of(HALL))
-    layer.see(scan_of(scanner, changed, pose), pose)
+    layer.update(scan_of(scanner, changed, pose), pose)
     assert len(layer.points()) >= 4
     assert np.abs(layer.points() - [3.75, 1.5]).max() < 0.4
-    layer.see(scan_of(scanner, HALL, pose, 10**9), pose)
+    layer.update(scan_of(scanner, HALL, pose, 10**9), pose)
     assert len(layer.points()) == 0
 
 
 @pytest.mark.parametrize("name", TURNED)
 def test_lost_it_goes_where_there_is_room_whichever_way_the_beams_run(name):
-    pilot, pose = Pilot(Robot(), HALL), np.array([1.0, 3.0, 0.0])
+    policy, pose = GeodesicPolicy(Robot(), HALL), np.array([1.0, 3.0, 0.0])
     scan = scan_of(TURNED[name], HALL, pose, 2 * 10**9)
-    pilot.see(scan, belief_at(pose, scan.stamp_ns, "lost"))
-    seeker: Seeker = pilot.seeker
+    policy.observe(scan, belief_at(pose, scan.stamp_ns, "lost"))
+    localiser: ActiveLocaliser = policy.localiser
     for stamp in (0, 2 * 10**9):
-        decision = seeker.act(belief_at(pose, stamp, "lost"), scan, np.zeros((0, 2)), np.zeros(3), pilot._view)
+        decision = localiser.decide(belief_at(pose, stamp, "lost"), scan, np.zeros((0, 2)), np.zeros(3), policy._view)
     assert decision.state == "exploring"
     assert decision.action[0] > 0.1  # the hall lies ahead
     assert abs(decision.action[1]) < decision.action[0]
@@ -115,10 +115,10 @@ def test_beams_that_measured_nothing_are_neither_room_nor_wall():
     for silent in (slice(0, 0), slice(0, None, 2), slice(None)):
         ranges = np.array(whole.ranges)
         ranges[silent] = 0.0
-        scan, pilot = whole.model_copy(update={"ranges": ranges, "stamp_ns": 2 * 10**9}), Pilot(Robot(), HALL)
-        pilot.see(scan, belief_at(pose, scan.stamp_ns, "lost"))
+        scan, policy = whole.model_copy(update={"ranges": ranges, "stamp_ns": 2 * 10**9}), GeodesicPolicy(Robot(), HALL)
+        policy.observe(scan, belief_at(pose, scan.stamp_ns, "lost"))
         for stamp in (0, 2 * 10**9):
-            decision = pilot.seeker.act(belief_at(pose, stamp, "lost"), scan, none, np.zeros(3), pilot._view)
+            decision = policy.localiser.decide(belief_at(pose, stamp, "lost"), scan, none, np.zeros(3), policy._view)
         assert decision.state == "exploring"
         found.append(decision.action)
     np.testing.assert_allclose(found[1], found[0], atol=0.05)
@@ -131,14 +131,14 @@ def test_with_half_a_view_it_turns_before_it_drives_and_touches_nothing(scanner)
     world = World(name="hall", boundary=HALL.boundary, obstacles=[BOX])
     start, goal = (6.0, 1.5, scanner.mount[2]), (2.0, 1.5)
     simulation = Simulation(Setup(world, scanner, Robot(), start, 0, obstacle_stop=False))
-    navigator = Navigator(Robot(), world=HALL, preset=Pilot(Robot(), HALL))
-    navigator.hear_goal(Goal(stamp_ns=0, pose=Pose(x=goal[0], y=goal[1])))
+    navigator = Navigator(Robot(), world=HALL, preset=GeodesicPolicy(Robot(), HALL))
+    navigator.on_goal(Goal(stamp_ns=0, pose=Pose(x=goal[0], y=goal[1])))
     try:
         while simulation.steps < 400:
             _, truth, scan = simulation.observe()
             assert not truth.contact
             pose = truth.pose.array()
-            navigator.hear_scan(scan)
+            navigator.on_scan(scan)
             command, status = navigator.step(belief_at(pose, scan.stamp_ns))
             speed = np.hypot(command.twist.vx, command.twist.vy)
             if simulation.steps < 5:  # it has not turned yet
@@ -154,9 +154,9 @@ def test_with_half_a_view_it_turns_before_it_drives_and_touches_nothing(scanner)
 
 def test_a_base_that_only_goes_forward_says_that_it_is_blind():
     robot, pose = Robot(drive="differential"), np.array([4.0, 3.0, 0.0])
-    pilot = Pilot(robot, HALL)
-    pilot.aim(np.array([6.0, 3.0]))
-    pilot.see(scan_of(BACKWARDS, HALL, pose), belief_at(pose, 0))
-    decision = pilot.decide(belief_at(pose, 0), np.zeros(3))
-    assert decision.reason == BLIND
+    policy = GeodesicPolicy(robot, HALL)
+    policy.set_goal(np.array([6.0, 3.0]))
+    policy.observe(scan_of(BACKWARDS, HALL, pose), belief_at(pose, 0))
+    decision = policy.decide(belief_at(pose, 0), np.zeros(3))
+    assert decision.reason == BLIND_AHEAD
     assert not decision.action[:2].any()

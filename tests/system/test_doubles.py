@@ -57,14 +57,14 @@ def test_the_second_controller_stands_by_and_takes_the_goal_over(process, bus, h
     first.send(signal.SIGSTOP)
     next_of(truths, Truth, lambda t: speed(t) < 1e-3)
     second.wait_for("taking over", PATIENCE)
-    second.wait_for("going on to the goal of the controller before this one", PATIENCE)
+    second.wait_for("resuming the goal of the previous controller instance", PATIENCE)
     next_of(states, Status, lambda s: s.goal_seq == 7 and s.state == "navigating")
     next_of(truths, Truth, lambda t: speed(t) > 0.3)
 
     # Back again, the older one leads; never are both heard.
     first.send(signal.SIGCONT)
     assert second.wait(PATIENCE) == 2
-    assert "was started before this one and leads: this one ends" in second.output
+    assert "was started before this one and is active, so this one ends" in second.output
     assert wait_until(lambda: list(bus.alive_instances().get("controller", [])) != [], PATIENCE)
     next_of(states, Status, lambda s: s.state == "reached", 120)
     assert first.running

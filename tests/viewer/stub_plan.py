@@ -7,7 +7,7 @@ import numpy as np
 from common.geometry.world import World
 from common.messages.definitions import Pose, Preference
 from services.controller.policies.free_space import FreeSpace
-from services.controller.policies.geodesic_field import Field, Roads
+from services.controller.policies.geodesic_field import CostField, FreeSpaceGraph
 from services.viewer.state.goal_field import field_of
 
 RADIUS = 0.27  # m
@@ -19,19 +19,19 @@ class Planner:
 
     def __init__(self, world: World) -> None:
         """No goal yet."""
-        self.roads = Roads(FreeSpace.of(world), RADIUS)
+        self.graph = FreeSpaceGraph(FreeSpace.of(world), RADIUS)
         self.goal: np.ndarray | None = None
-        self.field: Field | None = None
+        self.field: CostField | None = None
         self.news: bytes | None = None  # the field, until somebody has sent it
 
     def aim(self, goal: np.ndarray | None, t: float) -> None:
         """Another goal (2,) m, or none; at a time, s."""
         if goal is None or (self.goal is not None and np.allclose(goal, self.goal)):
             return
-        self.goal, self.field = goal, self.roads.from_(goal)
+        self.goal, self.field = goal, self.graph.cost_field(goal)
         if self.field is None:
             return
-        grid = self.roads.grid
+        grid = self.graph.grid
         message = Preference(
             stamp_ns=int(t * 1e9), goal=Pose(x=goal[0], y=goal[1]), origin=Pose(x=grid.origin[0], y=grid.origin[1]),
             resolution=grid.resolution, width=grid.shape[1], height=grid.shape[0],

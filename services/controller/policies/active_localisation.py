@@ -1,7 +1,8 @@
 """Moves to find out where the robot is.
 
-While several places are possible, destinations are scored by what a scan there is expected to tell between them
-(`epistemic`). While none is known at all, the robot goes where there is most room: what it has not seen yet tells most.
+While several places are possible, destinations are rated by how well a scan taken there is expected to tell the places
+apart (`epistemic`). While no place is known at all, the robot drives where there is most room, because scans from there
+show the most that is new.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ from common.geometry import se2
 from common.robot.ranges import surfaces
 from common.robot.scan_geometry import Sweep
 from services.controller.policies.decision import Decision
-from services.controller.policies.epistemic import Explorer, Options
-from services.controller.policies.motion_model import facing
-from services.controller.policies.policy import Around, choose
+from services.controller.policies.epistemic import CandidateMotions, DestinationSelector
+from services.controller.policies.motion_model import turn_to_attractor
+from services.controller.policies.policy import Surroundings, choose
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -24,142 +25,155 @@ if TYPE_CHECKING:
     from common.messages.requests import PredictReply
     from common.robot.base import Robot
     from common.robot.scan_geometry import Sector
-    from services.controller.policies.geodesic_field import Field, Roads
+    from services.controller.policies.geodesic_field import CostField, FreeSpaceGraph
 
-LIKELY = 0.02  # weight of the hypotheses that count
-MOST = 6  # hypotheses
-SPACING = 1.0  # m between destinations
-NEAREST, FARTHEST = 0.8, 12.0  # m to drive to one
-DESTINATIONS = 60
-AGAIN = 1_000_000_000  # ns between two choices
-SPEED = 0.5  # m/s at most, for what is behind and beside is not known
-FIRST_LOOK = 1_000_000_000  # ns that the estimator is given before anybody moves
-ROOM_ENOUGH = 5.0  # m; more room than this is no better
-WINDOW = 0.35  # rad to either side of a direction that must be free
-ROOM = 0.7  # m; with less in every direction it turns on the spot
+MIN_WEIGHT = 0.02  # hypotheses with less weight are ignored
+MAX_HYPOTHESES = 6
+DESTINATION_SPACING_M = 1.0
+MIN_PATH_M, MAX_PATH_M = 0.8, 12.0  # length of the path to a destination
+MAX_DESTINATIONS = 60
+CHOICE_PERIOD_NS = 1_000_000_000  # least time between two choices of a destination
+MAX_SPEED = 0.5  # m/s, because it is not known what is behind and beside the robot
+INITIAL_WAIT_NS = 1_000_000_000  # time for the estimator to localise before the robot moves
+MAX_USEFUL_ROOM_M = 5.0  # more room than this makes a direction no better
+WINDOW_RAD = 0.35  # to either side of a direction; the least range within counts as its room
+MIN_ROOM_M = 0.7  # with less in every direction, the robot turns on the spot
 
 
-class Seeker:
-    """Where to go to know where one is."""
+class ActiveLocaliser:
+    """Chooses velocities while the pose is ambiguous or unknown."""
 
-    def __init__(self, robot: Robot, roads: Roads, keep: float, *, turns: bool = True) -> None:
-        """``keep`` m from the robot's centre to whatever the scan shows; ``turns``: not bound to its heading."""
-        self.turns = turns
-        self.robot = robot.model_copy(update={"max_speed": min(robot.max_speed, SPEED)})
-        self.roads, self.keep = roads, keep
-        self.explorer = Explorer()
-        self._asked: tuple[int, Options] | None = None  # ns, and what predictions are awaited for
-        self._field: tuple[Array, Field | None] | None = None  # of a destination (2,) m
-        self._since: int | None = None  # ns, nothing is known since
+    def __init__(
+        self, robot: Robot, graph: FreeSpaceGraph, min_point_distance: float, *, may_turn: bool = True
+    ) -> None:
+        """``min_point_distance`` m from the robot's centre to anything in the scan; ``may_turn``: heading is free."""
+        self.may_turn = may_turn
+        self.robot = robot.model_copy(update={"max_speed": min(robot.max_speed, MAX_SPEED)})
+        self.graph, self.min_point_distance = graph, min_point_distance
+        self.selector = DestinationSelector()
+        self._requested: tuple[int, CandidateMotions] | None = None  # stamp in ns and motions of the last request
+        self._field: tuple[Array, CostField | None] | None = None  # a destination (2,) m and its field
+        self._unknown_since_ns: int | None = None  # since when no place is known
 
-    def forget(self) -> None:
-        """It is known, or nobody asks any more."""
-        self.explorer.forget()
-        self._asked, self._field, self._since = None, None, None
+    def reset(self) -> None:
+        """Forget everything. Call it when the pose is known, or the goal has changed."""
+        self.selector.reset()
+        self._requested, self._field, self._unknown_since_ns = None, None, None
 
-    def question(self, belief: Belief) -> Options | None:
-        """The destinations whose predicted scans are needed now; None: none."""
-        hypotheses = [h for h in belief.hypotheses if h.weight >= LIKELY][:MOST]
+    def prediction_request(self, belief: Belief) -> CandidateMotions | None:
+        """Candidate motions for whose end poses scans must be predicted; pass the answer to `use_predictions`.
+
+        Returns None if no predictions are needed now.
+        """
+        hypotheses = [h for h in belief.hypotheses if h.weight >= MIN_WEIGHT][:MAX_HYPOTHESES]
         if belief.state != "ambiguous" or len(hypotheses) < 2:
             return None
         stamp = belief.stamp_ns
-        if self._asked is not None and 0 <= stamp - self._asked[0] < AGAIN:
+        if self._requested is not None and 0 <= stamp - self._requested[0] < CHOICE_PERIOD_NS:
             return None
         poses, weights = np.array([h.pose.array() for h in hypotheses]), np.array([h.weight for h in hypotheses])
         displacements, lengths = self._destinations(poses[0])
-        if (kept := self.explorer.displacement(poses[0])) is not None:
+        if (kept := self.selector.displacement(poses[0])) is not None:
             displacements = np.concatenate([kept[None], displacements])
             lengths = np.concatenate([[np.hypot(*kept[:2])], lengths])
         if not len(lengths):
             return None
-        self._asked = (stamp, Options(poses, weights, displacements, lengths))
-        return self._asked[1]
+        self._requested = (stamp, CandidateMotions(poses, weights, displacements, lengths))
+        return self._requested[1]
 
-    def answer(self, reply: PredictReply, range_max: float) -> None:
-        """The predictions of the last question; a refusal leaves things as they were."""
-        if self._asked is None or not reply.ok:
+    def use_predictions(self, reply: PredictReply, range_max: float) -> None:
+        """Choose a destination with the predictions for the last request. Does nothing if the request was refused."""
+        if self._requested is None or not reply.ok:
             return
-        stamp, options = self._asked
-        shape = (len(options.hypotheses), len(options.displacements), -1)
+        stamp, motions = self._requested
+        shape = (len(motions.hypotheses), len(motions.displacements), -1)
         ranges = reply.ranges.astype(np.float64).reshape(shape)
         sigma = reply.sigma.astype(np.float64).reshape(shape) if len(reply.sigma) else np.full_like(ranges, 0.05)
-        self.explorer.choose(stamp, options, ranges, sigma, range_max)
+        self.selector.choose(stamp, motions, ranges, sigma, range_max)
 
-    def act(self, belief: Belief, scan: Scan, points: Array, velocity: Array, view: Sector) -> Decision:
-        """The action now; ``points`` (K, 2) m in base_link stand about, it sees ``view``."""
-        around = Around(_unknown, points, np.zeros(len(points), bool), 0.0, self.keep, view=view, turns=self.turns)
-        likely = [h for h in belief.hypotheses if h.weight >= LIKELY][:MOST]
+    def decide(self, belief: Belief, scan: Scan, points: Array, velocity: Array, view: Sector) -> Decision:
+        """Choose a velocity; ``points`` (K, 2) m in base_link are obstacles, ``view`` is what the scanner sees."""
+        static = np.zeros(len(points), bool)
+        around = Surroundings(
+            _no_walls, points, static, 0.0, self.min_point_distance, view=view, may_turn=self.may_turn
+        )
+        likely = [h for h in belief.hypotheses if h.weight >= MIN_WEIGHT][:MAX_HYPOTHESES]
         if belief.state == "ambiguous" and likely:
-            self._since = None
+            self._unknown_since_ns = None
             poses, weights = np.array([h.pose.array() for h in likely]), np.array([h.weight for h in likely])
-            target = self.explorer.follow(belief.stamp_ns, poses, weights)
-            if target is not None:
-                return self._go(poses[0], target, around, velocity, len(likely))
+            destination = self.selector.follow(belief.stamp_ns, poses, weights)
+            if destination is not None:
+                return self._drive_to(poses[0], destination, around, velocity, len(likely))
             return Decision(reason=f"{len(likely)} places are possible: looking for where to tell them apart")
-        if self._since is None or belief.stamp_ns < self._since:
-            self._since = belief.stamp_ns
-        if belief.stamp_ns - self._since < FIRST_LOOK:
+        if self._unknown_since_ns is None or belief.stamp_ns < self._unknown_since_ns:
+            self._unknown_since_ns = belief.stamp_ns
+        if belief.stamp_ns - self._unknown_since_ns < INITIAL_WAIT_NS:
             return Decision(reason=f"the belief is {belief.state}: looking", state="lost")
         return self._wander(belief, scan, around, velocity)
 
     def _destinations(self, pose: Array) -> tuple[Array, Array]:
-        """(M, 3) displacements in base_link and (M,) m to drive, for one hypothesis (3,)."""
-        field = self.roads.from_(pose[:2], self.keep + SPACING)
+        """Displacements (M, 3) in base_link and path lengths (M,) m of the destinations around a hypothesis (3,)."""
+        field = self.graph.cost_field(pose[:2], self.min_point_distance + DESTINATION_SPACING_M)
         if field is None:
             return np.zeros((0, 3)), np.zeros(0)
-        step = max(1, round(SPACING / self.roads.grid.resolution))
+        step = max(1, round(DESTINATION_SPACING_M / self.graph.grid.resolution))
         rows, columns = np.meshgrid(*(np.arange(step // 2, n, step) for n in field.cost.shape), indexing="ij")
         cells = (rows * field.cost.shape[1] + columns).ravel()
         cost = field.cost.ravel()[cells]
-        cells, cost = (each[(cost > NEAREST) & (cost < FARTHEST)] for each in (cells, cost))
-        nearest = np.argsort(cost, kind="stable")[:: max(1, -(-len(cost) // DESTINATIONS))]
-        cells, cost = cells[nearest], cost[nearest]
-        there, before = self.roads.grid.centres(cells), self.roads.grid.centres(field.before[cells])
-        heading = np.arctan2(*(there - before).T[::-1])  # as it will arrive
-        return se2.between(pose, np.column_stack([there, heading])), cost
+        cells, cost = (each[(cost > MIN_PATH_M) & (cost < MAX_PATH_M)] for each in (cells, cost))
+        # Thin out to MAX_DESTINATIONS, evenly over the costs.
+        selected = np.argsort(cost, kind="stable")[:: max(1, -(-len(cost) // MAX_DESTINATIONS))]
+        cells, cost = cells[selected], cost[selected]
+        # The field leads to the hypothesis, so a cell's next one is the one before it on the way there.
+        places, previous = self.graph.grid.centres(cells), self.graph.grid.centres(field.next_cell[cells])
+        heading = np.arctan2(*(places - previous).T[::-1])  # on arrival
+        return se2.between(pose, np.column_stack([places, heading])), cost
 
-    def _go(self, pose: Array, target: Array, around: Around, velocity: Array, places: int) -> Decision:
-        if self._field is None or np.hypot(*(self._field[0] - target[:2])) > self.roads.grid.resolution:
-            self._field = (np.array(target[:2]), self.roads.from_(target[:2], self.keep + SPACING))
+    def _drive_to(self, pose: Array, destination: Array, around: Surroundings, velocity: Array, count: int) -> Decision:
+        """Drives from the first of ``count`` hypotheses towards a destination (3,)."""
+        target = destination[:2]
+        if self._field is None or np.hypot(*(self._field[0] - target)) > self.graph.grid.resolution:
+            field = self.graph.cost_field(target, self.min_point_distance + DESTINATION_SPACING_M)
+            self._field = (np.array(target), field)
         field = self._field[1]
-        way = field.path(pose[:2]) if field is not None else np.zeros((0, 2))
-        reason = f"{places} places are possible: going to ({target[0]:.1f}, {target[1]:.1f}) to tell them apart"
-        if field is None or not len(way):
-            self.explorer.forget()
+        path = field.path(pose[:2]) if field is not None else np.zeros((0, 2))
+        reason = f"{count} places are possible: going to ({target[0]:.1f}, {target[1]:.1f}) to tell them apart"
+        if field is None or not len(path):
+            self.selector.reset()
             return Decision(reason="no way to where places could be told apart", state="blocked")
-        point = field.attractor(pose[:2], way)
+        point = field.attractor(pose[:2], path)
         attractor = se2.rotate(-pose[2], point - pose[:2])
-        return self._towards(attractor, around, velocity, reason, way)
+        return self._approach(attractor, around, velocity, reason, path)
 
-    def _wander(self, belief: Belief, scan: Scan, around: Around, velocity: Array) -> Decision:
-        """Towards the most room, rather ahead than aside."""
+    def _wander(self, belief: Belief, scan: Scan, around: Surroundings, velocity: Array) -> Decision:
+        """Drives in the direction with the most room, preferring directions ahead."""
         ranges = np.where(np.isneginf(scan.ranges), 0.0, scan.ranges.astype(np.float64))
-        ranges = np.minimum(ranges, ROOM_ENOUGH)
-        # Not measured, or cut out: their neighbours speak for them.
+        ranges = np.minimum(ranges, MAX_USEFUL_ROOM_M)
+        # Beams that were not measured, or were cut out, must not limit the room: their neighbours decide.
         ranges[~surfaces(scan.ranges) & ~np.isinf(scan.ranges)] = np.inf
         angles = scan.angles() + scan.mount.yaw
         sweep = Sweep.of(scan)
-        half = max(1, round(WINDOW / max(sweep.spacing, WINDOW / 1000)))
-        # Beyond the outermost beams nothing is known to be free; all round there is no outermost.
+        half = max(1, round(WINDOW_RAD / max(sweep.spacing, WINDOW_RAD / 1000)))  # beams
+        # Outside the field of view nothing counts as free.
         padded = np.pad(ranges, half, mode="wrap") if sweep.all_round else np.pad(ranges, half)
-        free = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1).min(axis=1)
-        free[np.isinf(free)] = 0.0  # where none has measured anything
-        best = int(np.argmax(free + 0.5 * np.cos(angles - around.front)))
+        room = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1).min(axis=1)
+        room[np.isinf(room)] = 0.0  # no beam in the window measured anything
+        best = int(np.argmax(room + 0.5 * np.cos(angles - around.forward)))
         reason = f"the belief is {belief.state}: going where there is room, to see more"
-        if free[best] < ROOM:
+        if room[best] < MIN_ROOM_M:
             return Decision(np.array([0.0, 0.0, 0.5]), reason.replace("going", "turning to"), "exploring")
-        away = min(float(free[best]) - self.keep, 2.0)
-        attractor = away * np.array([np.cos(angles[best]), np.sin(angles[best])])
-        return self._towards(attractor, around, velocity, reason, np.zeros((0, 2)))
+        distance = min(float(room[best]) - self.min_point_distance, 2.0)
+        attractor = distance * np.array([np.cos(angles[best]), np.sin(angles[best])])
+        return self._approach(attractor, around, velocity, reason, np.zeros((0, 2)))
 
-    def _towards(self, attractor: Array, around: Around, velocity: Array, reason: str, way: Array) -> Decision:
+    def _approach(self, attractor: Array, around: Surroundings, velocity: Array, reason: str, path: Array) -> Decision:
         choice = choose(velocity, attractor, around, self.robot)
-        action = facing(choice.action, attractor, self.robot, turns=self.turns, front=around.front)
-        if not action.any() and self.turns:  # nothing ahead is free: look elsewhere
+        action = turn_to_attractor(choice.action, attractor, self.robot, may_turn=self.may_turn, forward=around.forward)
+        if not action.any() and self.may_turn:  # no free motion: turn to look elsewhere
             action[2] = 0.5 if attractor[1] >= 0 else -0.5
-        return Decision(action, reason, "exploring", way)
+        return Decision(action, reason, "exploring", path)
 
 
-def _unknown(places: Array) -> Array:
-    """No map: (..., 2) m to (...,)."""
-    return np.full(places.shape[:-1], np.inf)
+def _no_walls(positions: Array) -> Array:
+    """Wall distances (...,) of positions (..., 2) without a map: infinite."""
+    return np.full(positions.shape[:-1], np.inf)

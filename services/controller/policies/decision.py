@@ -15,43 +15,46 @@ if TYPE_CHECKING:
 State = Literal["navigating", "blocked", "lost", "exploring"]
 
 
-def _none() -> Array:
+def _no_points() -> Array:
     return np.zeros((0, 2))
 
 
 @dataclass
 class Decision:
-    """What to do now, before any limit, and why."""
+    """The velocity chosen for one belief, before any limit, and why."""
 
     action: Array = field(default_factory=lambda: np.zeros(3))  # (3,) m/s, m/s, rad/s in base_link
-    reason: str = ""  # empty: nothing is in the way
+    reason: str = ""  # shown in Status; empty if nothing hinders the robot
     state: State = "navigating"
-    path: Array = field(default_factory=_none)  # (K, 2) m in map
-    motion: Array = field(default_factory=_none)  # (T, 2) m in map
-    recovering: bool = False  # it moves to get free, not on
-    refused: bool = False  # the goal cannot be, as is known by now
+    path: Array = field(default_factory=_no_points)  # (K, 2) m in map, to the goal or destination
+    motion: Array = field(default_factory=_no_points)  # (T, 2) m in map, predicted for the action until standstill
+    recovering: bool = False  # a recovery motion, which does not lead to the goal
+    refused: bool = False  # the goal turned out to be unreachable; `reason` says why
 
 
-class Preset(Protocol):
-    """How a goal becomes actions."""
+class Policy(Protocol):
+    """Turns a goal and beliefs into velocities. The setting `preset` selects one."""
 
     def refusal(self, goal: Array) -> str | None:
-        """Why a goal (2,) m in map cannot be; None: it can, as far as is known. What shows later, `decide` says."""
+        """Why a goal (2,) m in map cannot be reached. None if nothing known so far speaks against it.
 
-    def aim(self, goal: Array | None) -> None:
-        """Prefer a place (2,) m in map; None: none. What was under way is forgotten."""
+        What becomes known only on the way is reported by `decide`, as `Decision.refused`.
+        """
+
+    def set_goal(self, goal: Array | None) -> None:
+        """Start towards a goal (2,) m in map, or none. Forgets everything about the previous goal."""
 
     def interrupt(self) -> None:
-        """The robot stands, or somebody else drives it: nothing is under way."""
+        """Discard the current manoeuvre: the robot stopped, or is driven by hand."""
 
-    def go_on(self) -> None:
-        """As before the last interruption: no time has passed."""
+    def resume(self) -> None:
+        """Undo the last `interrupt`: the simulation was only paused, no simulated time has passed."""
 
-    def see(self, scan: Scan, belief: Belief) -> None:
-        """The scan that a belief is about."""
+    def observe(self, scan: Scan, belief: Belief) -> None:
+        """Take a scan and the belief computed from it."""
 
     def decide(self, belief: Belief, velocity: Array) -> Decision:
-        """On the way to the goal, with a belief that knows where it is; ``velocity`` (3,) is the last command."""
+        """Choose a velocity towards the goal when the pose is known; ``velocity`` (3,) is the latest command."""
 
-    def seek(self, belief: Belief, velocity: Array) -> Decision:
-        """With a belief that does not."""
+    def decide_unlocalised(self, belief: Belief, velocity: Array) -> Decision:
+        """Choose a velocity when the belief is lost, localising or ambiguous."""

@@ -17,87 +17,89 @@ if TYPE_CHECKING:
     from common.messages.definitions import Scan
     from services.controller.policies.free_space import FreeSpace
 
-UNEXPLAINED = 0.2  # m from every wall of the map: ten times the scanner's noise
-FARTHEST = 8.0  # m; beyond it an error of heading moves an end point too far
-CELL = 0.05  # m
-STANDS = 1_000_000_000  # ns; what has stood that long is furniture, until it goes
-BESIDE = 0.3  # m
-FORGET = 20_000_000_000  # ns after which furniture that is out of sight is forgotten
-FORGET_YOUNG = 2_000_000_000  # ns for what was not seen to stand
-BEYOND = 0.15  # m behind a cell that a beam must reach to show it free
+MIN_WALL_DISTANCE_M = 0.2  # farther from every wall, a return is an obstacle; ten times the scanner's noise
+MAX_RANGE_M = 8.0  # beyond it, an error of the heading displaces a return too far
+CELL_M = 0.05
+STATIC_AFTER_NS = 1_000_000_000  # a cell hit for at least this long counts as furniture, a younger one as moving
+SAME_OBSTACLE_M = 0.3  # a new cell this close to furniture is another side of it
+FORGET_STATIC_NS = 20_000_000_000  # a cell that was hit for 3 * STATIC_AFTER_NS is kept this long out of sight
+FORGET_RECENT_NS = 2_000_000_000  # and any other cell this long
+FREE_MARGIN_M = 0.15  # a beam must end this far behind a cell to show that the cell is free
 
 
 class TemporaryObstacles:
-    """Cells in map that were hit though the map has nothing there."""
+    """Grid cells in which beams ended although the map has no wall there."""
 
     def __init__(self, free: FreeSpace) -> None:
-        """None."""
         self._free = free
         x0, y0 = free.grid.origin
         self._origin = np.array([x0, y0])
-        self._columns = int(np.ceil(free.grid.shape[1] * free.grid.resolution / CELL)) + 1
-        self._cells = np.zeros(0, np.int64)  # flat numbers, sorted
-        self._first = np.zeros(0, np.int64)  # ns
-        self._last = np.zeros(0, np.int64)  # ns
+        self._columns = int(np.ceil(free.grid.shape[1] * free.grid.resolution / CELL_M)) + 1
+        # One entry per occupied cell.
+        self._cells = np.zeros(0, np.int64)  # flat indices, sorted
+        self._first_seen = np.zeros(0, np.int64)  # ns
+        self._last_seen = np.zeros(0, np.int64)  # ns
 
-    def see(self, scan: Scan, pose: Array) -> None:
-        """A scan taken at a pose (3,) that can be trusted, base_link in map."""
+    def update(self, scan: Scan, pose: Array) -> None:
+        """Add and remove cells according to a scan taken at a reliable pose (3,) of base_link in map."""
         laser = se2.compose(pose, scan.mount.array())
         ranges = scan.ranges.astype(np.float64)
         angles = scan.angles()
-        hit = surfaces(ranges) & (ranges < FARTHEST)
+        hit = surfaces(ranges) & (ranges < MAX_RANGE_M)
         heading = laser[2] + angles[hit]
         ends = laser[:2] + ranges[hit, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-        odd = ends[self._free.grid.inside(ends) & (self._free.clear(ends) > UNEXPLAINED)]
-        self._drop(scan, laser, scan.stamp_ns)
-        self._add(np.unique(self._number(odd)), scan.stamp_ns)
+        unmapped = ends[self._free.grid.inside(ends) & (self._free.clearance_at(ends) > MIN_WALL_DISTANCE_M)]
+        self._remove_cleared(scan, laser, scan.stamp_ns)
+        self._add(np.unique(self._cell_of(unmapped)), scan.stamp_ns)
 
     def points(self) -> Array:
-        """(K, 2) m in map, one a cell."""
+        """Centres (K, 2) m in map of the occupied cells."""
         rows, columns = np.divmod(self._cells, self._columns)
-        return np.asarray(np.stack([columns + 0.5, rows + 0.5], axis=-1) * CELL + self._origin)
+        return np.asarray(np.stack([columns + 0.5, rows + 0.5], axis=-1) * CELL_M + self._origin)
 
     def moving(self, stamp_ns: int) -> npt.NDArray[np.bool_]:
-        """(K,) bool: came there so lately that it may walk on.
+        """Whether each of `points` may be a moving obstacle, (K,) bool: first hit less than a second ago.
 
-        What shows itself beside something that stands is another side of it. Who walks has no cell that stands: each of
-        theirs is left again within a second.
+        A new cell beside one that is older and still hit is taken for another side of the same furniture. A walking
+        person leaves every cell within a second, so no cell of theirs becomes old.
         """
-        young = stamp_ns - self._first < STANDS
-        old = ~young & (self._last == stamp_ns)
+        young = stamp_ns - self._first_seen < STATIC_AFTER_NS
+        old = ~young & (self._last_seen == stamp_ns)
         if young.any() and old.any():
             points = self.points()
-            apart, _ = cKDTree(points[old]).query(points[young], distance_upper_bound=BESIDE)
-            young[young] = ~np.isfinite(apart)
+            distance, _ = cKDTree(points[old]).query(points[young], distance_upper_bound=SAME_OBSTACLE_M)
+            young[young] = ~np.isfinite(distance)
         return np.asarray(young)
 
-    def _number(self, points: Array) -> npt.NDArray[np.int64]:
-        where = np.floor((points - self._origin) / CELL).astype(np.int64)
-        return np.asarray(where[:, 1] * self._columns + where[:, 0])
+    def _cell_of(self, points: Array) -> npt.NDArray[np.int64]:
+        position = np.floor((points - self._origin) / CELL_M).astype(np.int64)
+        return np.asarray(position[:, 1] * self._columns + position[:, 0])
 
     def _add(self, cells: npt.NDArray[np.int64], stamp_ns: int) -> None:
-        where = np.searchsorted(self._cells, cells)
-        known = where < len(self._cells)
-        known[known] = self._cells[where[known]] == cells[known]
-        self._last[where[known]] = stamp_ns
+        position = np.searchsorted(self._cells, cells)
+        known = position < len(self._cells)
+        known[known] = self._cells[position[known]] == cells[known]
+        self._last_seen[position[known]] = stamp_ns
         new = cells[~known]
         order = np.argsort(merged := np.concatenate([self._cells, new]), kind="stable")
         stamps = np.full(len(new), stamp_ns, np.int64)
         self._cells = merged[order]
-        self._first = np.concatenate([self._first, stamps])[order]
-        self._last = np.concatenate([self._last, stamps])[order]
+        self._first_seen = np.concatenate([self._first_seen, stamps])[order]
+        self._last_seen = np.concatenate([self._last_seen, stamps])[order]
 
-    def _drop(self, scan: Scan, laser: Array, stamp_ns: int) -> None:
-        """Cells that a beam has passed through, and those unseen for long."""
+    def _remove_cleared(self, scan: Scan, laser: Array, stamp_ns: int) -> None:
+        """Removes cells through which a beam passed, cells not seen for long, and cells from before a reset."""
         if not len(self._cells):
             return
-        away = self.points() - laser[:2]
-        distance = np.hypot(*away.T)
-        bearing = se2.wrap(np.arctan2(away[:, 1], away[:, 0]) - laser[2])
+        offset = self.points() - laser[:2]
+        distance = np.hypot(*offset.T)
+        bearing = se2.wrap(np.arctan2(offset[:, 1], offset[:, 0]) - laser[2])
         beam = Sweep.of(scan).beams_at(bearing)
         measured = scan.ranges.astype(np.float64)[beam]
-        # No return is no proof of free space: a dark or a slanting surface gives none either.
-        through = (beam >= 0) & np.isfinite(measured) & (measured > distance + BEYOND)
-        long = np.where(self._last - self._first < 3 * STANDS, FORGET_YOUNG, FORGET)
-        keep = ~through & (stamp_ns - self._last < long) & (stamp_ns >= self._last)
-        self._cells, self._first, self._last = self._cells[keep], self._first[keep], self._last[keep]
+        # A beam without return does not prove free space: dark or slanting surfaces give no return either.
+        passed = (beam >= 0) & np.isfinite(measured) & (measured > distance + FREE_MARGIN_M)
+        recent = self._last_seen - self._first_seen < 3 * STATIC_AFTER_NS
+        memory = np.where(recent, FORGET_RECENT_NS, FORGET_STATIC_NS)
+        keep = ~passed & (stamp_ns - self._last_seen < memory) & (stamp_ns >= self._last_seen)
+        self._cells = self._cells[keep]
+        self._first_seen, self._last_seen = self._first_seen[keep], self._last_seen[keep]

@@ -1,6 +1,6 @@
 """Default policy: drives to a goal around walls and obstacles.
 
-Pure: beliefs, scans and stamps in, actions and reasons out. The limits that have the last word are the navigator's.
+A pure computation: beliefs, scans and stamps in, actions and reasons out. The navigator applies the limits afterwards.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import numpy.typing as npt
 from common.geometry import se2
 from common.robot.scan_geometry import ALL_ROUND, Sweep
 from common.runtime import safety
-from services.controller.policies.active_localisation import Seeker
+from services.controller.policies.active_localisation import ActiveLocaliser
 from services.controller.policies.decision import Decision
 from services.controller.policies.free_space import FreeSpace
-from services.controller.policies.geodesic_field import SOFT, Field, Roads
-from services.controller.policies.motion_model import facing, moves
+from services.controller.policies.geodesic_field import WALL_COST_RANGE_M, CostField, FreeSpaceGraph
+from services.controller.policies.motion_model import is_moving, turn_to_attractor
 from services.controller.policies.obstacles import TemporaryObstacles
-from services.controller.policies.policy import Around, choose, least_distance
+from services.controller.policies.policy import Surroundings, choose, least_distance
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -27,48 +27,53 @@ if TYPE_CHECKING:
     from common.messages.definitions import Belief, Scan
     from common.messages.requests import PredictReply
     from common.robot.base import Robot
-    from services.controller.policies.epistemic import Options
+    from services.controller.policies.epistemic import CandidateMotions
 
-KEEP = 0.06  # m between footprint and what the map does not know: the scanner's noise, and half a cell
-REPLAN = 400_000_000  # ns between two plans for another picture of what stands in the way
-REPLAN_AFAR = 1_500_000_000  # ns where it changed elsewhere
-STUCK = 3_000_000_000  # ns without progress until it backs off
-BACK_OFF = 3_000_000_000  # ns of it
-BLIND = "the scanner does not look ahead, and this base goes nowhere else: mount it so that it does"
-RANGE = 3.0  # m about the robot within which what the map does not know matters to its next second
+OBSTACLE_GAP_M = 0.06  # between footprint and unmapped obstacles: the scanner's noise, and half a cell
+REPLAN_PERIOD_NS = 400_000_000  # least time between two plans when obstacles near the path change
+REPLAN_PERIOD_FAR_NS = 1_500_000_000  # the same when obstacles change elsewhere
+STUCK_AFTER_NS = 3_000_000_000  # time without motion after which the robot backs off
+BACK_OFF_NS = 3_000_000_000  # how long it does
+BLIND_AHEAD = "the scanner does not look ahead, and this base goes nowhere else: mount it so that it does"
+OBSTACLE_RANGE_M = 3.0  # obstacles farther from the robot do not matter to its next second
 
 
-class Pilot:
-    """Navigation in a known world; heading turned into the way unless told to keep it."""
+class GeodesicPolicy:
+    """Preset `geodesic`: drives around the walls of a map and around obstacles in the scan."""
 
     def __init__(self, robot: Robot, world: World, *, keep_heading: bool = False, epistemic: bool = True) -> None:
-        """Without a goal; ``epistemic``: while it does not know where it is, it moves so as to find out."""
+        """Build the graph of the world.
+
+        ``keep_heading``: a holonomic base does not turn into its direction of motion. ``epistemic``: with an ambiguous
+        belief, drive where the possible places can be told apart; otherwise drive on as if the best one were true.
+        """
         self.epistemic = epistemic
         self.robot, self.world, self.keep_heading = robot, world, keep_heading
         self.free = FreeSpace.of(world)
-        self.roads = Roads(self.free, robot.radius)
+        self.graph = FreeSpaceGraph(self.free, robot.radius)
         self.obstacles = TemporaryObstacles(self.free)
-        self.seeker = Seeker(robot, self.roads, robot.radius + KEEP, turns=not keep_heading)
-        self.field: Field | None = None  # of the goal, with what is known to stand in the way
-        self.closed = False  # the field is the map's alone, for what stands about leaves no way
-        self.changed = False  # the field is another one; for whoever publishes it, who sets it False
+        self.localiser = ActiveLocaliser(robot, self.graph, robot.radius + OBSTACLE_GAP_M, may_turn=not keep_heading)
+        self.field: CostField | None = None  # to the goal, around obstacles unless `closed`
+        self.closed = False  # obstacles leave no path; the field ignores them
+        self.field_changed = False  # set with each new field, and cleared by the caller that publishes it
         self._goal: Array | None = None
-        self._component: int | None = None  # of the roads, where the robot was last known to be
+        self._component: int | None = None  # of the graph, where the robot was when last tracked
         self._scan: Scan | None = None
-        # When roads were last blocked, ns, and the cells that were; whether the field does not know of it yet.
-        self._planned: tuple[int, npt.NDArray[Any]] = (-REPLAN, np.zeros(0, int))
-        self._outdated = False
-        self._vetted_from: int | None = None  # the component from which the goal was found reachable
+        # Stamp at which obstacles were last given to the graph, and their cells; whether the field is older than that.
+        self._planned: tuple[int, npt.NDArray[Any]] = (-REPLAN_PERIOD_NS, np.zeros(0, int))
+        self._field_outdated = False
+        self._vetted_component: int | None = None  # the component from which the goal was found to be reachable
         self._view = ALL_ROUND
-        self._stuck_since: int | None = None
-        self._backing_until: int | None = None
+        self._standing_since_ns: int | None = None
+        self._backing_off_until_ns: int | None = None
 
     def refusal(self, goal: Array) -> str | None:
-        """A goal (2,) inside something, or out of reach of where the robot was last; with the nearest that is not."""
-        here = self._component
-        cell = self.roads.nearest_free(goal, self.robot.radius, by_map=True)
+        """Why a goal (2,) m cannot be reached by the map, with the nearest place that can. None if it can."""
+        component = self._component
+        cell = self.graph.nearest_free(goal, self.robot.radius, map_only=True)
         clearance = float(self.world.clearance(goal)[0])
-        if clearance >= self.robot.radius and cell is not None and here in (None, self.roads.component[cell]):
+        reachable = cell is not None and component in (None, self.graph.component[cell])
+        if clearance >= self.robot.radius and reachable:
             return None
         if clearance < 0:
             why = "is inside something, or off the map"
@@ -76,176 +81,192 @@ class Pilot:
             why = f"is {clearance:.2f} m from a wall"
         else:
             why = "cannot be reached from here"
-        nearest = self.roads.nearest_free(goal, component=here, by_map=True)
-        instead = ""
+        nearest = self.graph.nearest_free(goal, component=component, map_only=True)
+        alternative = ""
         if nearest is not None:
             x, y = self.free.grid.centres([nearest])[0]
-            instead = f"; the nearest place that can be reached is ({x:.2f}, {y:.2f})"
-        return f"goal refused: ({goal[0]:.2f}, {goal[1]:.2f}) in {self.world.name} {why}{instead}"
+            alternative = f"; the nearest place that can be reached is ({x:.2f}, {y:.2f})"
+        return f"goal refused: ({goal[0]:.2f}, {goal[1]:.2f}) in {self.world.name} {why}{alternative}"
 
-    def aim(self, goal: Array | None) -> None:
-        """Prefer a place (2,) m in map; None: none."""
-        self._goal, self.field, self._vetted_from = goal, None, None
-        self.seeker.forget()
+    def set_goal(self, goal: Array | None) -> None:
+        """Set the goal (2,) m in map, or none."""
+        self._goal, self.field, self._vetted_component = goal, None, None
+        self.localiser.reset()
         self.interrupt()
 
     def interrupt(self) -> None:
-        """Nobody is stuck who does not drive."""
-        self._stuck_since = self._backing_until = None
+        """Stop watching for progress: a robot that does not drive to its goal is not stuck."""
+        self._standing_since_ns = self._backing_off_until_ns = None
 
-    def go_on(self) -> None:
-        """Nothing was given up."""
+    def resume(self) -> None:
+        """Do nothing: `interrupt` discarded nothing that has to be restored."""
 
-    def see(self, scan: Scan, belief: Belief) -> None:
-        """What the map does not know, and how far the scanner looks."""
+    def observe(self, scan: Scan, belief: Belief) -> None:
+        """Update the scanner's view, and while tracking the obstacles and the component of the graph."""
         self._view = Sweep.of(scan).sector(scan.mount.yaw)
         self._scan = scan
         if belief.state != "tracking":
-            return  # what was seen before stands where it stood
-        self.seeker.forget()
+            return  # the pose is not reliable; obstacles found so far are kept
+        self.localiser.reset()
         pose = belief.pose.array()
-        self.obstacles.see(scan, pose)
-        if (cell := self.roads.nearest_free(pose[:2], self.roads.least, by_map=True)) is not None:
-            self._component = int(self.roads.component[cell])
+        self.obstacles.update(scan, pose)
+        if (cell := self.graph.nearest_free(pose[:2], self.graph.min_clearance, map_only=True)) is not None:
+            self._component = int(self.graph.component[cell])
 
     def decide(self, belief: Belief, velocity: Array) -> Decision:
-        """The action of least expected free energy, going with ``velocity`` (3,) in base_link."""
+        """Choose the velocity of least expected free energy; ``velocity`` (3,) in base_link is the latest command."""
         pose, stamp_ns = belief.pose.array(), belief.stamp_ns
-        if self._goal is not None and self._component != self._vetted_from:
+        if self._goal is not None and self._component != self._vetted_component:
             if (refusal := self.refusal(self._goal)) is not None:
                 return Decision(reason=refusal, state="blocked", refused=True)
-            self._vetted_from = self._component
+            self._vetted_component = self._component
         points, moving = self.obstacles.points(), self.obstacles.moving(stamp_ns)
-        self._plan(pose[:2], points[~moving], stamp_ns)  # whoever walks will have gone on
-        way = self.field.path(pose[:2]) if self.field is not None else np.zeros((0, 2))
-        if not len(way):
+        self._plan(pose[:2], points[~moving], stamp_ns)  # moving obstacles will have gone on
+        path = self.field.path(pose[:2]) if self.field is not None else np.zeros((0, 2))
+        if not len(path):
             return Decision(reason="no way to the goal from here", state="blocked")
-        around = self._around(pose, points, moving)
-        if self._backing_until is not None and stamp_ns < self._backing_until:
-            return self._back_off(pose, velocity, around, way)
-        assert self.field is not None  # noqa: S101 - there is a way
-        point = self.field.attractor(pose[:2], way)
+        around = self._surroundings(pose, points, moving)
+        if self._backing_off_until_ns is not None and stamp_ns < self._backing_off_until_ns:
+            return self._back_off(pose, velocity, around, path)
+        assert self.field is not None  # noqa: S101 - there is a path
+        point = self.field.attractor(pose[:2], path)
         attractor = se2.rotate(-pose[2], point - pose[:2])
         choice = choose(velocity, attractor, around, self.robot)
-        action = facing(choice.action, attractor, self.robot, turns=around.turns, front=around.front)
-        # What was driven, not what is wished: the limits may have held it.
-        self._watch(stamp_ns, driven=moves(velocity))
-        reason = ""
-        if choice.held:
-            reason = self._what_holds(pose, around, stood=not choice.action.any())
-        if self.closed:
-            reason = self._no_way(pose, around)
-        if self.robot.drive == "differential" and not bool(around.sees(0.0)):
-            reason = BLIND
-        stands = bool(reason) and not choice.action.any()
-        return Decision(
-            action, reason, "blocked" if stands else "navigating", way, se2.transform(pose, choice.way[:, :2])
+        action = turn_to_attractor(
+            choice.action, attractor, self.robot, may_turn=around.may_turn, forward=around.forward
         )
+        # Judged by the command that was sent, not by the action: the limits may have stopped the robot.
+        self._watch_progress(stamp_ns, moving=is_moving(velocity))
+        reason = ""
+        if choice.hindered:
+            reason = self._hindrance(pose, around, standing=not choice.action.any())
+        if self.closed:
+            reason = self._no_path(pose, around)
+        if self.robot.drive == "differential" and not bool(around.sees(0.0)):
+            reason = BLIND_AHEAD
+        blocked = bool(reason) and not choice.action.any()
+        motion = se2.transform(pose, choice.motion[:, :2])
+        return Decision(action, reason, "blocked" if blocked else "navigating", path, motion)
 
-    def question(self, belief: Belief) -> Options | None:
-        """Where scans must be predicted before `seek` can choose where to go; None: nowhere, now."""
+    def prediction_request(self, belief: Belief) -> CandidateMotions | None:
+        """Motions for whose end poses scans must be predicted before `decide_unlocalised`. None if none are needed."""
         if self._goal is None or not self.epistemic:
             return None
-        return self.seeker.question(belief)
+        return self.localiser.prediction_request(belief)
 
-    def answer(self, reply: PredictReply) -> None:
-        """What is expected there."""
+    def use_predictions(self, reply: PredictReply) -> None:
+        """Take the predictions for the last `prediction_request`."""
         if self._scan is not None:
-            self.seeker.answer(reply, self._scan.range_max)
+            self.localiser.use_predictions(reply, self._scan.range_max)
 
-    def seek(self, belief: Belief, velocity: Array) -> Decision:
-        """Find out where it is; without the epistemic term the goal leads, as if the best hypothesis were true."""
+    def decide_unlocalised(self, belief: Belief, velocity: Array) -> Decision:
+        """Move so that the pose becomes known. Without `epistemic`, drive to the goal from the best hypothesis."""
         if self._scan is None:
             return Decision(reason=f"standing until localised: the belief is {belief.state}")
         if self.epistemic or belief.state != "ambiguous":
             points = safety.scan_points(self._scan)
-            points = points[np.hypot(*points.T) < RANGE]
-            return self.seeker.act(belief, self._scan, points, velocity, self._view)
+            points = points[np.hypot(*points.T) < OBSTACLE_RANGE_M]
+            return self.localiser.decide(belief, self._scan, points, velocity, self._view)
         decision = self.decide(belief, velocity)
         decision.reason = decision.reason or f"the belief is {belief.state}: going by its best guess"
         return decision
 
-    def _plan(self, here: Array, points: Array, stamp_ns: int) -> None:
-        """The field anew where the goal, or the ``points`` (K, 2) m of what stands about, changed."""
+    def _plan(self, position: Array, points: Array, stamp_ns: int) -> None:
+        """Recomputes the field if the goal or the obstacles, ``points`` (K, 2) m in map, changed.
+
+        If there is a usable field, the obstacles are given to the graph with one scan and the field follows with the
+        next, because each of the two takes milliseconds.
+        """
         if self._goal is None:
             self.field = None
             return
         cells = np.unique(self.free.grid.cell_of(points)) if len(points) else np.zeros(0, int)
-        when, before = self._planned
-        others = np.setxor1d(cells, before, assume_unique=True)
-        age = stamp_ns - when
-        due = age < 0 or age >= REPLAN_AFAR or (age >= REPLAN and self._on_the_way(here, others))
-        if self.field is None or (len(others) and due):
-            self.roads.block(points)
-            self._planned, self._outdated = (stamp_ns, cells), True
+        planned_ns, planned_cells = self._planned
+        changed = np.setxor1d(cells, planned_cells, assume_unique=True)
+        age = stamp_ns - planned_ns
+        due = (
+            age < 0  # the simulation was reset
+            or age >= REPLAN_PERIOD_FAR_NS
+            or (age >= REPLAN_PERIOD_NS and self._near_path(position, changed))
+        )
+        if self.field is None or (len(changed) and due):
+            self.graph.set_obstacles(points)
+            self._planned, self._field_outdated = (stamp_ns, cells), True
             if self.field is not None and not self.closed:
-                return  # the field itself with the next scan: each takes milliseconds
-        if self.field is not None and not self._outdated:
+                return
+        if self.field is not None and not self._field_outdated:
             return
-        self._outdated = False
-        near = self.robot.radius + 2 * self.free.grid.resolution
-        self.field, self.changed, self.closed = self.roads.from_(self._goal, near), True, False
-        if self.field is None or not self.field.reaches(here):
-            # By the map alone: up to what closes the way, and there until it opens.
-            self.roads.block(np.zeros((0, 2)))
-            self.field, self.closed = self.roads.from_(self._goal, near), bool(len(points))
+        self._field_outdated = False
+        max_goal_shift = self.robot.radius + 2 * self.free.grid.resolution
+        self.field, self.field_changed, self.closed = self.graph.cost_field(self._goal, max_goal_shift), True, False
+        if self.field is None or not self.field.reaches(position):
+            # Obstacles leave no path. Drive by the map alone, up to what closes the path, and wait there.
+            self.graph.set_obstacles(np.zeros((0, 2)))
+            self.field, self.closed = self.graph.cost_field(self._goal, max_goal_shift), bool(len(points))
 
-    def _on_the_way(self, here: Array, cells: npt.NDArray[Any]) -> bool:
-        """Whether any of these cells, which came or went, lies near the way from ``here``."""
+    def _near_path(self, position: Array, cells: npt.NDArray[Any]) -> bool:
+        """Whether any of these cells lies near the path from ``position`` (2,) m. True if there is no path yet."""
         if self.field is None or not len(cells) or self.closed:
             return True
-        way = self.field.path(here)
-        return bool(len(way)) and bool(
-            least_distance(self.free.grid.centres(cells), way).min() < self.roads.least + SOFT
+        path = self.field.path(position)
+        if not len(path):
+            return False
+        distance = least_distance(self.free.grid.centres(cells), path)
+        return bool(distance.min() < self.graph.min_clearance + WALL_COST_RANGE_M)
+
+    def _surroundings(self, pose: Array, points: Array, moving: npt.NDArray[np.bool_]) -> Surroundings:
+        near = np.hypot(*(points - pose[:2]).T) < OBSTACLE_RANGE_M
+
+        def wall_distance(positions: Array) -> Array:
+            return self.free.clearance_at(se2.transform(pose, positions))
+
+        return Surroundings(
+            wall_distance,
+            se2.rotate(-pose[2], points[near] - pose[:2]),
+            moving[near],
+            self.graph.min_clearance,
+            self.robot.radius + OBSTACLE_GAP_M,
+            view=self._view,
+            may_turn=not self.keep_heading,
         )
 
-    def _around(self, pose: Array, points: Array, moving: npt.NDArray[np.bool_]) -> Around:
-        near = np.hypot(*(points - pose[:2]).T) < RANGE
-        radius = self.robot.radius
+    def _watch_progress(self, stamp_ns: int, *, moving: bool) -> None:
+        """Starts backing off after `STUCK_AFTER_NS` without motion."""
+        if moving:
+            self._standing_since_ns = None
+        elif self._standing_since_ns is None or stamp_ns < self._standing_since_ns:
+            self._standing_since_ns = stamp_ns
+        elif stamp_ns - self._standing_since_ns > STUCK_AFTER_NS:
+            self._standing_since_ns, self._backing_off_until_ns = None, stamp_ns + BACK_OFF_NS
 
-        def known(places: Array) -> Array:
-            return self.free.clear(se2.transform(pose, places))
-
-        return Around(
-            known, se2.rotate(-pose[2], points[near] - pose[:2]), moving[near], self.roads.least, radius + KEEP,
-            view=self._view, turns=not self.keep_heading,
-        )  # fmt: skip
-
-    def _watch(self, stamp_ns: int, *, driven: bool) -> None:
-        if driven:
-            self._stuck_since = None
-        elif self._stuck_since is None or stamp_ns < self._stuck_since:
-            self._stuck_since = stamp_ns
-        elif stamp_ns - self._stuck_since > STUCK:
-            self._stuck_since, self._backing_until = None, stamp_ns + BACK_OFF
-
-    def _back_off(self, pose: Array, velocity: Array, around: Around, way: Array) -> Decision:
-        """Recovery: towards where there is more room, by the map and by what is seen."""
+    def _back_off(self, pose: Array, velocity: Array, around: Surroundings, path: Array) -> Decision:
+        """Recovery: drives towards the direction with the largest gap to walls and obstacles."""
         angle = np.arange(16) * np.pi / 8
-        places = 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        best = int(np.argmax(around.gaps(places[:, None, :], np.zeros(1))[:, 0]))
-        choice = choose(velocity, places[best], around, self.robot)
-        action = facing(choice.action, places[best], self.robot, turns=around.turns, front=around.front)
-        return Decision(
-            action, "stuck: backing off", path=way, motion=se2.transform(pose, choice.way[:, :2]), recovering=True
-        )
+        targets = 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        target = targets[int(np.argmax(around.gaps(targets[:, None, :], np.zeros(1))[:, 0]))]
+        choice = choose(velocity, target, around, self.robot)
+        action = turn_to_attractor(choice.action, target, self.robot, may_turn=around.may_turn, forward=around.forward)
+        motion = se2.transform(pose, choice.motion[:, :2])
+        return Decision(action, "stuck: backing off", path=path, motion=motion, recovering=True)
 
-    def _what_holds(self, pose: Array, around: Around, *, stood: bool) -> str:
-        does = "waiting" if stood else "slowing"
+    def _hindrance(self, pose: Array, around: Surroundings, *, standing: bool) -> str:
+        """Reason text: what hinders the robot, and where."""
+        verb = "waiting" if standing else "slowing"
         if not len(around.points):
-            return f"{does}: a wall is near"
-        nearest, where = _nearest(pose, around)
-        # What has been seen for less than a second may be a person as well as a box that was just moved.
+            return f"{verb}: a wall is near"
+        nearest, position = _nearest_point(pose, around)
+        # Anything seen for less than a second may be a person, or a box that was just moved.
         what = "something that may move" if around.moving[nearest] else "something that is not in the map"
-        return f"{does}: {what}, {np.hypot(*around.points[nearest]):.1f} m away at {where}"
+        return f"{verb}: {what}, {np.hypot(*around.points[nearest]):.1f} m away at {position}"
 
-    def _no_way(self, pose: Array, around: Around) -> str:
-        at = f" at {_nearest(pose, around)[1]}" if len(around.points) else ""
+    def _no_path(self, pose: Array, around: Surroundings) -> str:
+        """Reason text: obstacles leave no path."""
+        at = f" at {_nearest_point(pose, around)[1]}" if len(around.points) else ""
         return f"no way around something that is not in the map{at}: waiting until it clears"
 
 
-def _nearest(pose: Array, around: Around) -> tuple[int, str]:
-    """Index of the nearest of ``around.points``, of which there are some, and where it is in map."""
+def _nearest_point(pose: Array, around: Surroundings) -> tuple[int, str]:
+    """Index of the obstacle point nearest to the robot, and its position in map as text. There must be one."""
     nearest = int(np.argmin(np.hypot(*around.points.T)))
     x, y = se2.transform(pose, around.points[nearest])
     return nearest, f"({x:.1f}, {y:.1f})"

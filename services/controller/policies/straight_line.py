@@ -7,7 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from services.controller.policies.decision import Decision, State
-from services.controller.policies.paper_action import Preference, next_action, observed_position, preferred_position
+from services.controller.policies.paper_action import (
+    ActionParameters,
+    next_action,
+    observed_position,
+    preferred_position,
+)
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -16,18 +21,18 @@ if TYPE_CHECKING:
     from common.robot.base import Robot
 
 
-class Straight:
-    """The paper's controller; see `action`."""
+class StraightLinePolicy:
+    """The paper's controller: accumulates steps of equation 4 (see `paper_action`). Needs no map."""
 
-    def __init__(self, robot: Robot, preference: Preference, world: World | None) -> None:
-        """``world`` is to refuse a goal inside a wall; None: any goal is tried."""
-        self.robot, self.preference, self.world = robot, preference, world
+    def __init__(self, robot: Robot, parameters: ActionParameters, world: World | None) -> None:
+        """``world`` is used only to refuse goals inside walls; without it any goal is accepted."""
+        self.robot, self.parameters, self.world = robot, parameters, world
         self._goal: Array | None = None
-        self._action = np.zeros(2)
-        self._kept = np.zeros(2)
+        self._action = np.zeros(2)  # m/s in base_link, the sum of equation 4
+        self._action_before_interrupt = np.zeros(2)
 
     def refusal(self, goal: Array) -> str | None:
-        """Inside something, or too near to it."""
+        """Why a goal (2,) m in map cannot be reached: it is closer to a wall than the robot's radius."""
         if self.world is None:
             return None
         clearance = float(self.world.clearance(goal)[0])
@@ -37,33 +42,33 @@ class Straight:
         what = "inside something, or off the map" if clearance < 0 else f"{clearance:.2f} m from a wall"
         return f"goal refused: {where} is {what}"
 
-    def aim(self, goal: Array | None) -> None:
-        """The sum of equation 4 begins at 0."""
+    def set_goal(self, goal: Array | None) -> None:
+        """Set the goal (2,) m in map, and the sum of equation 4 to zero."""
         self._goal, self._action = goal, np.zeros(2)
 
     def interrupt(self) -> None:
-        """The sum of equation 4 begins at 0 again, unless `go_on` follows."""
-        self._kept, self._action = self._action, np.zeros(2)
+        """Set the sum of equation 4 to zero; `resume` restores it."""
+        self._action_before_interrupt, self._action = self._action, np.zeros(2)
 
-    def go_on(self) -> None:
-        """As before the last interruption."""
-        self._action = self._kept
+    def resume(self) -> None:
+        """Restore the sum of equation 4 from before the last `interrupt`."""
+        self._action = self._action_before_interrupt
 
-    def see(self, scan: Scan, belief: Belief) -> None:
-        """Nothing: the belief says all."""
+    def observe(self, scan: Scan, belief: Belief) -> None:
+        """Do nothing: this policy uses the belief alone."""
 
-    def decide(self, belief: Belief, velocity: Array) -> Decision:  # noqa: ARG002 - the sum knows
-        """One step of equation 4."""
+    def decide(self, belief: Belief, velocity: Array) -> Decision:  # noqa: ARG002 - the sum replaces the last velocity
+        """Add one step of equation 4."""
         if self._goal is None:
             return Decision()
         pose = belief.pose.array()
         observed = observed_position(pose, belief.xi.astype(np.float64), belief.curvature)
-        preferred = preferred_position(observed, self._goal, self.preference.reach)
-        self._action = next_action(self._action, observed, preferred, float(pose[2]), self.preference)
+        preferred = preferred_position(observed, self._goal, self.parameters.reach)
+        self._action = next_action(self._action, observed, preferred, float(pose[2]), self.parameters)
         return Decision(np.array([self._action[0], self._action[1], 0.0]))
 
-    def seek(self, belief: Belief, velocity: Array) -> Decision:  # noqa: ARG002
-        """Stand."""
+    def decide_unlocalised(self, belief: Belief, velocity: Array) -> Decision:  # noqa: ARG002
+        """Stand until the pose is known."""
         self._action = np.zeros(2)
         state: State = "lost" if belief.state == "lost" else "navigating"
         return Decision(reason=f"standing until localised: the belief is {belief.state}", state=state)

@@ -12,10 +12,10 @@ from common.geometry.world import load_world
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
 from services.controller.policies.epistemic import (
-    Doubt,
-    Explorer,
-    Options,
-    best,
+    CandidateMotions,
+    DestinationSelector,
+    PredictionTrust,
+    best_index,
     candidate_poses,
     entropy,
     expected_free_energy,
@@ -26,12 +26,12 @@ R = 25.0
 SECOND = 1_000_000_000
 
 
-def gain_of(ranges, sigma=0.02, weights=None, doubt=None):
+def gain_of(ranges, sigma=0.02, weights=None, trust=None):
     """For ranges (K, M, B) or, of one motion, (K, B)."""
     r = np.asarray(ranges, float)
     r = r[:, None, :] if r.ndim == 2 else r
     w = np.ones(len(r)) if weights is None else weights
-    return information_gain(w, r, np.full(r.shape, sigma), R, doubt)
+    return information_gain(w, r, np.full(r.shape, sigma), R, trust)
 
 
 @st.composite
@@ -77,7 +77,7 @@ def test_the_order_of_hypotheses_motions_and_beams_does_not_matter(given_, rando
 def test_clearly_different_scans_tell_all(beams, outliers):
     weights = np.array([0.5, 0.3, 0.2])
     ranges = np.array([[1.0], [4.0], [9.0]]) * np.ones((3, beams))
-    gain = gain_of(ranges, weights=weights, doubt=Doubt(outliers=outliers))[0]
+    gain = gain_of(ranges, weights=weights, trust=PredictionTrust(outliers=outliers))[0]
     assert gain == pytest.approx(entropy(weights), rel=2e-3)
 
 
@@ -92,7 +92,7 @@ def test_further_apart_tells_more(beams, step):
 
 
 def test_more_beams_that_differ_tell_more_and_a_few_are_no_certainty():
-    """The figures in Doubt's docstring: a few beams at edges leave the places about as alike as they were."""
+    """The figures in PredictionTrust's docstring: a few beams at edges leave the places about as alike as they were."""
     ranges = np.full((2, 61, 61), 5.0)
     for count in range(61):
         ranges[1, count, :count] = 8.0
@@ -123,12 +123,12 @@ def test_it_is_below_the_mutual_information_and_not_by_much(sigma, share):
     From about three deviations between predictions on, it is at least ``share`` of it; from eight on, 0.9.
     """
     rng = np.random.default_rng(5)
-    doubt = Doubt(outliers=0.25, blur=0.0, sectors=6)
+    trust = PredictionTrust(outliers=0.25, blur=0.0, sectors=6)
     weights, offsets = np.array([0.5, 0.3, 0.2]), rng.uniform(-1, 1, (3, 6))
     for spread in (0.0, 0.3, 1.0, 3.0, 8.0):
         ranges = 9 + 1.4 * spread * sigma * offsets
-        true = mutual_information(weights, ranges, sigma, doubt.outliers, rng)
-        (found,) = gain_of(ranges, sigma, weights, doubt)
+        true = mutual_information(weights, ranges, sigma, trust.outliers, rng)
+        (found,) = gain_of(ranges, sigma, weights, trust)
         assert found <= true + 0.005, spread  # what 100 000 draws leave
         assert found >= {3.0: share, 8.0: 0.9}.get(spread, 0) * true, spread
 
@@ -157,19 +157,19 @@ def test_the_same_motion_from_each_hypothesis():
 def test_short_ways_of_equal_use_are_preferred_and_no_way_is_none():
     lengths = np.array([4.0, 2.0, np.inf, 2.0])
     energy = expected_free_energy(np.array([0.6, 0.6, 0.69, 0.6]), lengths, 0.0)
-    assert best(np.where(np.isfinite(lengths), energy, np.inf), lengths) == 1
+    assert best_index(np.where(np.isfinite(lengths), energy, np.inf), lengths) == 1
     energy = expected_free_energy(np.array([0.6, 0.5, 0.69, 0.5]), lengths, 0.02)
     assert energy == pytest.approx([-0.52, -0.46, np.inf, -0.46])
-    assert best(energy, lengths) == 0
-    assert best(np.full(3, np.inf), np.full(3, np.inf)) is None
-    assert best(np.zeros(0), np.zeros(0)) is None
+    assert best_index(energy, lengths) == 0
+    assert best_index(np.full(3, np.inf), np.full(3, np.inf)) is None
+    assert best_index(np.zeros(0), np.zeros(0)) is None
 
 
 class TwoRooms:
     """Two rooms, 6 m apart; scans differ behind x = 3 m of either, more the further, and not before."""
 
     def __init__(self, **settings):
-        self.explorer = Explorer(**settings)
+        self.selector = DestinationSelector(**settings)
         self.displacements = np.array([[1.0, 0, 0], [2.0, 0, 0], [4.0, 0, 0], [0, 4.0, 0], [-1.0, 0, 0]])
         self.lengths = np.hypot(*self.displacements[:, :2].T)
         self.robot = 0.0  # m, x in the left room
@@ -179,7 +179,7 @@ class TwoRooms:
         hypotheses = np.array([[x, 0.0, 0.0], [x + 6.0, 0.0, 0.0]])
         moves = self.displacements if displacements is None else np.asarray(displacements, float)
         lengths = (self.lengths if displacements is None else np.hypot(*moves[:, :2].T)) if lengths is None else lengths
-        return Options(hypotheses[::-1] if swapped else hypotheses, np.array(weights), moves, lengths)
+        return CandidateMotions(hypotheses[::-1] if swapped else hypotheses, np.array(weights), moves, lengths)
 
     def choose(self, stamp, options):
         poses = options.poses().reshape(len(options.hypotheses), -1, 3)
@@ -188,7 +188,7 @@ class TwoRooms:
             if hypothesis[0] - self.robot >= 3.0:  # the room on the right
                 beams = np.clip(20 * (row[:, 0] - 8.9), 0, 61)
                 ranges[k][np.arange(61) < beams[:, None]] = 8.0
-        return self.explorer.choose(stamp, options, ranges, np.full(ranges.shape, 0.02), R)
+        return self.selector.choose(stamp, options, ranges, np.full(ranges.shape, 0.02), R)
 
 
 def test_it_goes_where_scans_differ():
@@ -202,9 +202,9 @@ def test_where_nothing_can_be_learned_or_reached_it_stays():
     rooms = TwoRooms()
     assert rooms.choose(0, rooms.options(displacements=[[1.0, 0, 0], [2.0, 0, 0]])) is None
     assert rooms.choose(0, rooms.options(lengths=np.full(5, np.inf))) is None
-    nothing = Options(rooms.options().hypotheses, np.ones(2), np.zeros((0, 3)), np.zeros(0))
-    assert Explorer().choose(0, nothing, np.zeros((2, 0, 61)), np.zeros((2, 0, 61)), R) is None
-    alone = Options(np.zeros((1, 3)), np.ones(1), rooms.displacements, rooms.lengths)
+    nothing = CandidateMotions(rooms.options().hypotheses, np.ones(2), np.zeros((0, 3)), np.zeros(0))
+    assert DestinationSelector().choose(0, nothing, np.zeros((2, 0, 61)), np.zeros((2, 0, 61)), R) is None
+    alone = CandidateMotions(np.zeros((1, 3)), np.ones(1), rooms.displacements, rooms.lengths)
     assert rooms.choose(0, alone) is None
 
 
@@ -213,9 +213,9 @@ def test_it_keeps_to_it_though_the_hypotheses_change_places():
     rooms.choose(0, rooms.options())
     for k in range(1, 30):
         options = rooms.options(0.1 * k, swapped=k % 2 == 1)
-        found = rooms.explorer.follow(k * SECOND // 15, options.hypotheses, options.weights)
+        found = rooms.selector.follow(k * SECOND // 15, options.hypotheses, options.weights)
         assert found == pytest.approx([10.0, 0, 0] if k % 2 else [4.0, 0, 0]), k
-        assert rooms.explorer.displacement(options.hypotheses[0]) == pytest.approx([4.0 - 0.1 * k, 0, 0])
+        assert rooms.selector.displacement(options.hypotheses[0]) == pytest.approx([4.0 - 0.1 * k, 0, 0])
 
 
 def test_one_reached_that_told_nothing_is_not_chosen_again_until_all_are_tried():
@@ -223,34 +223,34 @@ def test_one_reached_that_told_nothing_is_not_chosen_again_until_all_are_tried()
     near = [[4.0, 0, 0], [4.0, 3.0, 0]]
     assert rooms.choose(0, rooms.options(displacements=near)) == pytest.approx([4, 0, 0])
     for k in range(1, 41):
-        rooms.explorer.follow(k, rooms.options(0.1 * k).hypotheses, [0.5, 0.5])
-    assert rooms.explorer.choice is None
+        rooms.selector.follow(k, rooms.options(0.1 * k).hypotheses, [0.5, 0.5])
+    assert rooms.selector.chosen is None
     here = [[0.2, 0, 0], [0.0, 3.0, 0]]
     assert rooms.choose(50, rooms.options(4.0, displacements=here)) == pytest.approx([4.0, 3.0, 0])
-    rooms.explorer.choice = None
+    rooms.selector.chosen = None
     assert rooms.choose(51, rooms.options(4.0, displacements=here[:1])) == pytest.approx([4.2, 0, 0])
 
 
 def test_a_deadline_a_resolved_belief_a_jump_and_a_new_beginning_end_it():
     def begun():
-        rooms = TwoRooms(patience=10.0)
+        rooms = TwoRooms(timeout=10.0)
         rooms.choose(5 * SECOND, rooms.options())
-        return rooms.explorer, rooms.options().hypotheses
+        return rooms.selector, rooms.options().hypotheses
 
-    explorer, hypotheses = begun()
-    assert explorer.follow(15 * SECOND, hypotheses, [0.5, 0.5]) is not None
-    assert explorer.follow(15 * SECOND + 1, hypotheses, [0.5, 0.5]) is None
-    explorer, hypotheses = begun()
-    assert explorer.follow(5 * SECOND, hypotheses, [0.7, 0.3]) is not None
-    assert explorer.follow(5 * SECOND, hypotheses, [0.97, 0.03]) is None
-    explorer, hypotheses = begun()
-    assert explorer.follow(5 * SECOND, hypotheses + np.array([0.0, 2.0, 0.0]), [0.5, 0.5]) is None
-    explorer, hypotheses = begun()
-    assert explorer.follow(4 * SECOND, hypotheses, [0.5, 0.5]) is None
-    assert explorer.displacement(hypotheses[0]) is None
-    explorer, hypotheses = begun()
-    explorer.forget()
-    assert explorer.follow(5 * SECOND, hypotheses, [0.5, 0.5]) is None
+    selector, hypotheses = begun()
+    assert selector.follow(15 * SECOND, hypotheses, [0.5, 0.5]) is not None
+    assert selector.follow(15 * SECOND + 1, hypotheses, [0.5, 0.5]) is None
+    selector, hypotheses = begun()
+    assert selector.follow(5 * SECOND, hypotheses, [0.7, 0.3]) is not None
+    assert selector.follow(5 * SECOND, hypotheses, [0.97, 0.03]) is None
+    selector, hypotheses = begun()
+    assert selector.follow(5 * SECOND, hypotheses + np.array([0.0, 2.0, 0.0]), [0.5, 0.5]) is None
+    selector, hypotheses = begun()
+    assert selector.follow(4 * SECOND, hypotheses, [0.5, 0.5]) is None
+    assert selector.displacement(hypotheses[0]) is None
+    selector, hypotheses = begun()
+    selector.reset()
+    assert selector.follow(5 * SECOND, hypotheses, [0.5, 0.5]) is None
 
 
 def test_another_destination_must_be_clearly_better():
@@ -266,7 +266,7 @@ def test_one_whose_gain_fell_is_given_up():
     rooms = TwoRooms()
     assert rooms.choose(0, rooms.options()) == pytest.approx([4, 0, 0])
     assert rooms.choose(1, rooms.options(weights=(0.99, 0.01))) is None
-    assert rooms.explorer.choice is None
+    assert rooms.selector.chosen is None
 
 
 def test_the_same_questions_get_the_same_answers():
@@ -276,7 +276,7 @@ def test_the_same_questions_get_the_same_answers():
             options = rooms.options(0.08 * k, swapped=k % 3 == 0)
             if k % 10 == 0:
                 found.append(rooms.choose(k * SECOND // 15, options))
-            found.append(rooms.explorer.follow(k * SECOND // 15, options.hypotheses, options.weights))
+            found.append(rooms.selector.follow(k * SECOND // 15, options.hypotheses, options.weights))
         return [None if f is None else f.tolist() for f in found]
 
     first = run()
@@ -302,12 +302,12 @@ def test_in_one_of_two_rooms_alike_it_looks_out_of_the_door_and_not_into_a_corne
     lengths = np.where(outside, round_the_corner, np.hypot(*(places - here[:2]).T))
     moves = se2.between(here, np.column_stack([places, np.full(len(places), here[2])]))
     for first, second in ((here, here + twin), (here + twin, here)):
-        options = Options(np.array([first, second]), np.array([0.5, 0.5]), moves, lengths)
+        options = CandidateMotions(np.array([first, second]), np.array([0.5, 0.5]), moves, lengths)
         ranges = world.ray_distances(se2.compose(options.poses(), np.array(scanner.mount)), scanner.angles())
         ranges = ranges.reshape(2, len(places), 61)
         gain = information_gain(options.weights, ranges, np.full(ranges.shape, 0.02), scanner.range_max)
         assert np.median(gain[places[:, 1] < 3.5]) < 0.01
         assert gain[outside].max() > 0.6
-        chosen = Explorer().choose(0, options, ranges, np.full(ranges.shape, 0.02), scanner.range_max)
+        chosen = DestinationSelector().choose(0, options, ranges, np.full(ranges.shape, 0.02), scanner.range_max)
         assert chosen[1] > 4.5
         assert 0 < chosen[0] - (first[0] - here[0]) < 5.8

@@ -10,11 +10,17 @@ from hypothesis import strategies as st
 
 from common.geometry.world import World, load_world
 from services.controller.policies.free_space import FreeSpace, Grid
-from services.controller.policies.geodesic_field import GAP, NEAR_WALL, SOFT, Roads, slowness
+from services.controller.policies.geodesic_field import (
+    MAX_WALL_COST,
+    WALL_COST_RANGE_M,
+    WALL_GAP_M,
+    FreeSpaceGraph,
+    slowness,
+)
 
 RADIUS = 0.27
 NAMES = ("corridor", "maze", "office")
-ROADS = {name: Roads(FreeSpace.of(load_world(name)), RADIUS) for name in NAMES}
+GRAPHS = {name: FreeSpaceGraph(FreeSpace.of(load_world(name)), RADIUS) for name in NAMES}
 EMPTY = World(name="hall", boundary=[(0, 0), (10, 0), (10, 6), (0, 6)])
 
 
@@ -28,24 +34,24 @@ def test_interpolation_is_exact_for_a_plane(x, y):
     centres = grid.centres()
     values = (2 * centres[:, 0] - 3 * centres[:, 1] + 1).reshape(grid.shape)
     inner = np.clip([x, y], [0.05, 0.05], [9.95, 5.95])  # beyond the outermost centres it is constant
-    assert grid.between(values, np.array([x, y])) == pytest.approx(2 * inner[0] - 3 * inner[1] + 1)
+    assert grid.interpolate(values, np.array([x, y])) == pytest.approx(2 * inner[0] - 3 * inner[1] + 1)
     assert grid.cell_of(centres).tolist() == list(range(grid.cells))
 
 
 def test_clearance_on_the_grid_is_that_of_the_world():
     world, rng = load_world("office"), np.random.default_rng(0)
     points = world.sample_free(2000, rng, 0.1)
-    apart = np.abs(FreeSpace.of(world).clear(points) - world.clearance(points))
+    apart = np.abs(FreeSpace.of(world).clearance_at(points) - world.clearance(points))
     assert apart.max() < 0.05  # less than half a cell, at corners
     assert np.median(apart) < 1e-3
 
 
 def test_without_walls_it_is_the_distance_itself_but_for_the_grid():
-    roads = Roads(FreeSpace.of(EMPTY), RADIUS)
+    graph = FreeSpaceGraph(FreeSpace.of(EMPTY), RADIUS)
     goal = np.array([2.05, 3.05])
-    field = roads.from_(goal)
-    rows, columns = np.nonzero(roads.clearance > RADIUS + 0.4)
-    centres = roads.grid.centres(rows * roads.grid.shape[1] + columns)
+    field = graph.cost_field(goal)
+    rows, columns = np.nonzero(graph.clearance > RADIUS + 0.4)
+    centres = graph.grid.centres(rows * graph.grid.shape[1] + columns)
     exact = np.hypot(*(centres - goal).T)
     ratio = field.cost[rows, columns][exact > 0.5] / exact[exact > 0.5]
     assert ratio.min() > 1 - 1e-9
@@ -54,12 +60,12 @@ def test_without_walls_it_is_the_distance_itself_but_for_the_grid():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_ways_keep_their_distance_and_are_hardly_longer_than_the_shortest(name):
-    world, roads, rng = load_world(name), ROADS[name], np.random.default_rng(1)
-    room = shapely.buffer(world.free_space, -(RADIUS + GAP) + 0.05)  # what the grid may cut off a corner
-    places = world.sample_free(40, rng, RADIUS + GAP).reshape(-1, 2, 2)
+    world, graph, rng = load_world(name), GRAPHS[name], np.random.default_rng(1)
+    room = shapely.buffer(world.free_space, -(RADIUS + WALL_GAP_M) + 0.05)  # what the grid may cut off a corner
+    places = world.sample_free(40, rng, RADIUS + WALL_GAP_M).reshape(-1, 2, 2)
     reached = 0
     for start, goal in places:
-        field = roads.from_(goal)
+        field = graph.cost_field(goal)
         path = field.path(start)
         if not len(path):
             assert not field.reaches(start)
@@ -78,15 +84,15 @@ def test_ways_keep_their_distance_and_are_hardly_longer_than_the_shortest(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_following_the_attractor_leads_to_the_goal_along_free_lines(name):
-    world, roads, rng = load_world(name), ROADS[name], np.random.default_rng(2)
+    world, graph, rng = load_world(name), GRAPHS[name], np.random.default_rng(2)
     for start, goal in world.sample_free(20, rng, 0.4).reshape(-1, 2, 2):
-        field, here, gone = roads.from_(goal), start, 0.0
+        field, here, gone = graph.cost_field(goal), start, 0.0
         first = length(field.path(start)) if field.reaches(start) else None
         for _ in range(200):
             if first is None or np.hypot(*(here - field.goal)) < 0.01:
                 break
             point = field.attractor(here, field.path(here))
-            ok, _ = roads.clear_line(here, point[None])
+            ok, _ = graph.clear_line(here, point[None])
             assert ok[0], (start, goal, here, point)
             step = min(0.3, float(np.hypot(*(point - here))))
             gone += step
@@ -98,62 +104,62 @@ def test_following_the_attractor_leads_to_the_goal_along_free_lines(name):
 
 
 def test_an_obstacle_is_gone_round_and_forgotten_again():
-    roads = Roads(FreeSpace.of(EMPTY), RADIUS)
+    graph = FreeSpaceGraph(FreeSpace.of(EMPTY), RADIUS)
     start, goal = np.array([1.0, 3.0]), np.array([9.0, 3.0])
-    free = length(roads.from_(goal).path(start))
+    free = length(graph.cost_field(goal).path(start))
     wall = np.stack([np.full(41, 5.0), np.linspace(1.0, 5.0, 41)], axis=-1)
-    roads.block(wall)
-    round_it = roads.from_(goal).path(start)
-    assert np.hypot(*(round_it[:, None] - wall).transpose(2, 0, 1)).min() >= RADIUS + GAP - 0.06
+    graph.set_obstacles(wall)
+    round_it = graph.cost_field(goal).path(start)
+    assert np.hypot(*(round_it[:, None] - wall).transpose(2, 0, 1)).min() >= RADIUS + WALL_GAP_M - 0.06
     assert length(round_it) > free + 1.0
-    roads.block(np.stack([np.full(60, 5.0), np.linspace(0.05, 5.95, 60)], axis=-1))
-    closed = roads.from_(goal)
+    graph.set_obstacles(np.stack([np.full(60, 5.0), np.linspace(0.05, 5.95, 60)], axis=-1))
+    closed = graph.cost_field(goal)
     assert not closed.reaches(start)
     assert len(closed.path(start)) == 0
-    roads.block(np.zeros((0, 2)))
-    assert length(roads.from_(goal).path(start)) == pytest.approx(free)
+    graph.set_obstacles(np.zeros((0, 2)))
+    assert length(graph.cost_field(goal).path(start)) == pytest.approx(free)
 
 
-@pytest.mark.parametrize("world", ROADS)
+@pytest.mark.parametrize("world", GRAPHS)
 def test_whatever_stood_about_before_the_roads_are_those_of_what_stands_now(world):
-    roads, rng = Roads(ROADS[world].free, RADIUS), np.random.default_rng(2)
+    graph, rng = FreeSpaceGraph(GRAPHS[world].free, RADIUS), np.random.default_rng(2)
     x0, y0, x1, y1 = load_world(world).bounds
     for count in (40, 3, 200, 1, 0):
         points = rng.uniform((x0 - 1, y0 - 1), (x1 + 1, y1 + 1), (count, 2))  # some beyond the map
-        roads.block(points)
-        anew = Roads(roads.free, RADIUS)
-        anew.block(points)
-        apart = np.hypot(*(roads.grid.centres()[:, None] - points).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
-        exact = np.minimum(roads.free.clearance.ravel(), apart)
-        relevant = exact < roads.least + SOFT
-        assert np.allclose(roads.clearance.ravel()[relevant], exact[relevant], rtol=0, atol=1e-12)
-        assert (roads.clearance.ravel()[~relevant] >= roads.least + SOFT).all()
-        assert np.allclose(roads.slowness.ravel(), slowness(exact, roads.least), rtol=0, atol=1e-12)
-        goal = roads.nearest_free(np.array([(x0 + x1) / 2, (y0 + y1) / 2]))
-        place = roads.grid.centres([goal])[0]
-        assert np.array_equal(roads.from_(place).cost, anew.from_(place).cost)
+        graph.set_obstacles(points)
+        anew = FreeSpaceGraph(graph.free, RADIUS)
+        anew.set_obstacles(points)
+        apart = np.hypot(*(graph.grid.centres()[:, None] - points).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
+        exact = np.minimum(graph.free.clearance.ravel(), apart)
+        relevant = exact < graph.min_clearance + WALL_COST_RANGE_M
+        assert np.allclose(graph.clearance.ravel()[relevant], exact[relevant], rtol=0, atol=1e-12)
+        assert (graph.clearance.ravel()[~relevant] >= graph.min_clearance + WALL_COST_RANGE_M).all()
+        assert np.allclose(graph.slowness.ravel(), slowness(exact, graph.min_clearance), rtol=0, atol=1e-12)
+        goal = graph.nearest_free(np.array([(x0 + x1) / 2, (y0 + y1) / 2]))
+        place = graph.grid.centres([goal])[0]
+        assert np.array_equal(graph.cost_field(place).cost, anew.cost_field(place).cost)
 
 
 def test_a_metre_near_a_wall_costs_more_and_none_costs_less():
-    for roads in ROADS.values():
-        assert roads.slowness.min() >= 1
-        assert roads.slowness.max() <= 1 + NEAR_WALL
-        far = roads.clearance > RADIUS + 0.5
-        assert (roads.slowness[far] == 1).all()
+    for graph in GRAPHS.values():
+        assert graph.slowness.min() >= 1
+        assert graph.slowness.max() <= 1 + MAX_WALL_COST
+        far = graph.clearance > RADIUS + 0.5
+        assert (graph.slowness[far] == 1).all()
 
 
 def test_where_there_is_room_the_way_keeps_away_from_the_wall():
-    roads = Roads(FreeSpace.of(EMPTY), RADIUS)
-    path = roads.from_(np.array([9.0, 0.35])).path(np.array([1.0, 0.35]))
+    graph = FreeSpaceGraph(FreeSpace.of(EMPTY), RADIUS)
+    path = graph.cost_field(np.array([9.0, 0.35])).path(np.array([1.0, 0.35]))
     assert path[len(path) // 2, 1] > 0.5
     assert length(path) < 8.3
 
 
 def test_rooms_without_a_door_are_two_components():
     wall = [{"box": {"center": (5, 3), "size": (0.2, 6)}}]
-    roads = Roads(FreeSpace.of(World(name="two", boundary=EMPTY.boundary, obstacles=wall)), RADIUS)
-    left, right = (roads.nearest_free(np.array(point)) for point in ([2.0, 3.0], [8.0, 3.0]))
-    assert roads.component[left] != roads.component[right]
-    assert not roads.from_(np.array([8.0, 3.0])).reaches(np.array([2.0, 3.0]))
-    near = roads.nearest_free(np.array([8.0, 3.0]), component=int(roads.component[left]))
-    assert roads.grid.centres([near])[0][0] < 5
+    graph = FreeSpaceGraph(FreeSpace.of(World(name="two", boundary=EMPTY.boundary, obstacles=wall)), RADIUS)
+    left, right = (graph.nearest_free(np.array(point)) for point in ([2.0, 3.0], [8.0, 3.0]))
+    assert graph.component[left] != graph.component[right]
+    assert not graph.cost_field(np.array([8.0, 3.0])).reaches(np.array([2.0, 3.0]))
+    near = graph.nearest_free(np.array([8.0, 3.0]), component=int(graph.component[left]))
+    assert graph.grid.centres([near])[0][0] < 5

@@ -11,8 +11,15 @@ from common.geometry import se2
 from common.robot.base import Robot
 from common.robot.scan_geometry import Sector
 from common.runtime import safety
-from services.controller.policies.motion_model import HOLD, braking_speed, candidates, facing, rollouts, turn_rate
-from services.controller.policies.policy import Around, choose, to_go
+from services.controller.policies.motion_model import (
+    HOLD_S,
+    braking_speed,
+    candidate_actions,
+    rollouts,
+    turn_rate,
+    turn_to_attractor,
+)
+from services.controller.policies.policy import Surroundings, choose, to_go
 
 DRIVES = [Robot(), Robot(drive="differential")]
 PERIOD = 1 / 15
@@ -25,7 +32,7 @@ def nothing(places):
 
 def around(points=(), moving=(), known=nothing, **more):
     points = np.array(points, float).reshape(-1, 2)
-    return Around(known, points, np.array(moving, bool).reshape(-1), 0.3, 0.33, **more)
+    return Surroundings(known, points, np.array(moving, bool).reshape(-1), 0.3, 0.33, **more)
 
 
 @settings(max_examples=15)
@@ -35,7 +42,7 @@ def test_a_differential_rollout_is_what_the_ramp_makes_of_it(v0, w0, v, w):
     poses, times, stands = rollouts(np.array([v0, 0, w0]), np.array([[v, 0, w]]), robot)
     fine, velocity, pose, count = 1e-3, np.array([v0, 0.0, w0]), np.zeros(3), 0
     for number in range(round(times[-1] / fine)):
-        wanted = np.array([v, 0, w]) if (number + 0.5) * fine < HOLD else np.zeros(3)
+        wanted = np.array([v, 0, w]) if (number + 0.5) * fine < HOLD_S else np.zeros(3)
         velocity = safety.ramp(velocity, wanted, robot, fine)
         pose = se2.compose(pose, velocity * fine)
         if count < len(times) and abs((number + 1) * fine - times[count]) < fine / 2:
@@ -52,7 +59,7 @@ def test_the_braking_speed_ends_where_it_should(distance):
     v = braking_speed(distance, robot)
     assert v <= robot.max_speed
     if v < robot.max_speed:
-        assert v * HOLD + v**2 / (2 * robot.acceleration) == pytest.approx(distance)
+        assert v * HOLD_S + v**2 / (2 * robot.acceleration) == pytest.approx(distance)
 
 
 @given(st.floats(-np.pi, np.pi))
@@ -73,10 +80,10 @@ def test_the_choice_never_leaves_the_robot_farther_off(robot, x, y, v, w):
     current, goal = np.array([v, 0.0, w]), np.array([x, y])
     choice = choose(current, goal, around(), robot)
     poses, _, _ = rollouts(current, np.zeros((1, 3)), robot)
-    assert to_go(choice.way[-1], goal, robot) <= to_go(poses[0, -1], goal, robot) + 1e-9
+    assert to_go(choice.motion[-1], goal, robot) <= to_go(poses[0, -1], goal, robot) + 1e-9
     assert np.hypot(*choice.action[:2]) <= robot.max_speed + 1e-9
     assert abs(choice.action[2]) <= robot.max_turn + 1e-9
-    assert not choice.held
+    assert not choice.hindered
     assert robot.drive == "holonomic" or choice.action[1] == 0
 
 
@@ -102,7 +109,7 @@ def test_a_chosen_way_is_free_until_the_robot_stands(robot, points, seed):
     here = around(points, [False] * len(points))
     choice = choose(np.array([v, 0, w]), np.array([1.5, 0.7]), here, robot)
     if choice.action.any():
-        gaps = here.gaps(choice.way[None], np.zeros(len(choice.way)))
+        gaps = here.gaps(choice.motion[None], np.zeros(len(choice.motion)))
         assert gaps.min() >= -1e-3
 
 
@@ -112,8 +119,8 @@ def test_somebody_who_walks_is_given_room_to_and_furniture_is_not():
     walking = choose(current, goal, around([(1.6, 0.0)], [True]), robot)
     assert np.hypot(*still.action[:2]) > 0.6
     assert np.hypot(*walking.action[:2]) < 0.6  # straight at them it would have to stand before they come
-    assert walking.held
-    assert not still.held
+    assert walking.hindered
+    assert not still.hindered
     beside = choose(current, goal, around([(0.0, 0.5)], [False]), robot)
     assert beside.action[0] > 0.6
 
@@ -121,21 +128,21 @@ def test_somebody_who_walks_is_given_room_to_and_furniture_is_not():
 def test_a_wall_across_the_way_is_waited_at():
     wall = [(0.4, y) for y in np.linspace(-2, 2, 81)]
     choice = choose(np.zeros(3), np.array([3.0, 0.0]), around(wall, [False] * 81), Robot(drive="differential"))
-    assert choice.held
-    assert choice.way[-1, 0] < 0.4 - 0.33 + 1e-3
+    assert choice.hindered
+    assert choice.motion[-1, 0] < 0.4 - 0.33 + 1e-3
 
 
 def test_where_the_scanner_does_not_look_it_turns_first_or_goes_slowly():
     behind, view = np.array([-3.0, 0.0]), Sector(0.0, np.deg2rad(135))
     choice = choose(np.zeros(3), behind, around(view=view), Robot())
     assert abs(np.arctan2(choice.action[1], choice.action[0])) <= np.pi / 2 + 1e-9  # the body is wide
-    assert abs(facing(choice.action, behind, Robot(), turns=True)[2]) > 1.0
-    kept = choose(np.zeros(3), behind, around(view=view, turns=False), Robot())
+    assert abs(turn_to_attractor(choice.action, behind, Robot(), may_turn=True)[2]) > 1.0
+    kept = choose(np.zeros(3), behind, around(view=view, may_turn=False), Robot())
     assert 0 < np.hypot(*kept.action[:2]) <= 0.25 + 1e-9
 
 
 def test_candidates_hold_standing_and_going_on():
     for robot in DRIVES:
-        many = candidates(np.array([0.3, 0.0, 0.1]), np.array([1.0, 0.2]), robot)
+        many = candidate_actions(np.array([0.3, 0.0, 0.1]), np.array([1.0, 0.2]), robot)
         np.testing.assert_array_equal(many[:2], [[0, 0, 0], [0.3, 0, 0.1]])
         assert len(many) < 130

@@ -10,7 +10,7 @@ from common.geometry.world import World, load_world
 from common.messages.definitions import Pose, Scan
 from common.robot.scanner import SCANNERS
 from services.controller.policies.free_space import FreeSpace
-from services.controller.policies.obstacles import STANDS, TemporaryObstacles
+from services.controller.policies.obstacles import STATIC_AFTER_NS, TemporaryObstacles
 
 SCANNER = SCANNERS["tim571"].with_beams(271)
 SECOND = 1_000_000_000
@@ -40,7 +40,7 @@ def test_in_the_world_of_the_map_nothing_is_found(name):
     for x, y in world.sample_free(15, rng, 0.4):
         layer, pose = TemporaryObstacles(free), np.array([x, y, rng.uniform(-np.pi, np.pi)])
         believed = pose + rng.normal(0, [0.01, 0.01, 0.004])
-        layer.see(scan_of(world, pose, 0, rng), believed)
+        layer.update(scan_of(world, pose, 0, rng), believed)
         assert len(layer.points()) == 0
 
 
@@ -49,20 +49,20 @@ def test_a_new_box_is_found_where_it_is_and_becomes_furniture():
     changed, pose, layer = with_box(world, 3.2, 3.0), np.array([1.5, 3.0, 0.0]), TemporaryObstacles(FreeSpace.of(world))
     for number in range(20):
         stamp = number * SECOND // 15
-        layer.see(scan_of(changed, pose, stamp), pose)
+        layer.update(scan_of(changed, pose, stamp), pose)
         points = layer.points()
         assert len(points) >= 4
         assert np.abs(points - [3.0, 3.0]).max() < 0.3  # its near face
-        assert layer.moving(stamp).all() == (stamp < STANDS)
+        assert layer.moving(stamp).all() == (stamp < STATIC_AFTER_NS)
 
 
 def test_beams_that_measured_nothing_neither_find_nor_clear():
     world = load_world("maze")
     changed, pose, layer = with_box(world, 3.2, 3.0), np.array([1.5, 3.0, 0.0]), TemporaryObstacles(FreeSpace.of(world))
-    layer.see(scan_of(changed, pose, 0), pose)
+    layer.update(scan_of(changed, pose, 0), pose)
     before = layer.points()
     scan = scan_of(world, pose, SECOND // 15)
-    layer.see(scan.model_copy(update={"ranges": np.zeros_like(scan.ranges)}), pose)
+    layer.update(scan.model_copy(update={"ranges": np.zeros_like(scan.ranges)}), pose)
     np.testing.assert_array_equal(layer.points(), before)
     assert len(before)
 
@@ -70,12 +70,12 @@ def test_beams_that_measured_nothing_neither_find_nor_clear():
 def test_what_went_away_is_forgotten_once_a_beam_passes_and_not_before():
     world = load_world("maze")
     changed, pose, layer = with_box(world, 3.2, 3.0), np.array([1.5, 3.0, 0.0]), TemporaryObstacles(FreeSpace.of(world))
-    layer.see(scan_of(changed, pose, 0), pose)
+    layer.update(scan_of(changed, pose, 0), pose)
     before = layer.points()
     away = np.array([1.5, 3.0, np.pi])  # the box lies where the scanner does not look
-    layer.see(scan_of(world, away, SECOND), away)
+    layer.update(scan_of(world, away, SECOND), away)
     np.testing.assert_array_equal(layer.points(), before)
-    layer.see(scan_of(world, pose, 2 * SECOND), pose)
+    layer.update(scan_of(world, pose, 2 * SECOND), pose)
     assert len(layer.points()) == 0
 
 
@@ -84,7 +84,7 @@ def test_who_walks_stays_moving_and_leaves_no_trail():
     layer = TemporaryObstacles(FreeSpace.of(world))
     for number in range(30):
         stamp, y = number * SECOND // 15, 2.0 + number / 15
-        layer.see(scan_of(with_box(world, 3.2, y), pose, stamp), pose)
+        layer.update(scan_of(with_box(world, 3.2, y), pose, stamp), pose)
         assert np.abs(layer.points() - [3.2, y]).max() < 0.45
         assert layer.moving(stamp).any()
 
@@ -93,11 +93,11 @@ def test_out_of_sight_it_is_forgotten_after_a_while_and_when_time_goes_back():
     world = load_world("maze")
     pose, away = np.array([1.5, 3.0, 0.0]), np.array([1.5, 3.0, np.pi])
     layer = TemporaryObstacles(FreeSpace.of(world))
-    layer.see(scan_of(with_box(world, 3.2, 3.0), pose, 5 * SECOND), pose)
-    layer.see(scan_of(world, away, 30 * SECOND), away)
+    layer.update(scan_of(with_box(world, 3.2, 3.0), pose, 5 * SECOND), pose)
+    layer.update(scan_of(world, away, 30 * SECOND), away)
     assert len(layer.points()) == 0
-    layer.see(scan_of(with_box(world, 3.2, 3.0), pose, 31 * SECOND), pose)
-    layer.see(scan_of(world, away, 0), away)
+    layer.update(scan_of(with_box(world, 3.2, 3.0), pose, 31 * SECOND), pose)
+    layer.update(scan_of(world, away, 0), away)
     assert len(layer.points()) == 0
 
 
@@ -106,8 +106,8 @@ def test_furniture_out_of_sight_is_kept_for_a_while_and_not_for_ever():
     pose, away = np.array([1.5, 3.0, 0.0]), np.array([1.5, 3.0, np.pi])
     layer = TemporaryObstacles(FreeSpace.of(world))
     for half in range(9):
-        layer.see(scan_of(with_box(world, 3.2, 3.0), pose, half * SECOND // 2), pose)
-    layer.see(scan_of(world, away, 14 * SECOND), away)
+        layer.update(scan_of(with_box(world, 3.2, 3.0), pose, half * SECOND // 2), pose)
+    layer.update(scan_of(world, away, 14 * SECOND), away)
     assert len(layer.points()) >= 4
-    layer.see(scan_of(world, away, 29 * SECOND), away)
+    layer.update(scan_of(world, away, 29 * SECOND), away)
     assert len(layer.points()) == 0

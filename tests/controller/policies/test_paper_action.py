@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.controller.policies.paper_action import (
-    MAX_CORRECTION,
-    Preference,
+    MAX_CORRECTION_M,
+    ActionParameters,
     action_free_energy,
     action_gradient,
     next_action,
@@ -19,37 +19,37 @@ from services.controller.policies.paper_action import (
 
 number = st.floats(-5, 5)
 pair = st.tuples(number, number).map(np.array)
-preferences = st.builds(
-    Preference, gamma=st.floats(0.01, 0.45), horizon=st.floats(0.2, 2.0), reach=st.floats(0.1, 3.0),
+parameter_sets = st.builds(
+    ActionParameters, gamma=st.floats(0.01, 0.45), horizon=st.floats(0.2, 2.0), reach=st.floats(0.1, 3.0),
     action_precision=st.floats(0.1, 3.0),
 )  # fmt: skip
 
 
-@given(pair, pair, pair, st.floats(-np.pi, np.pi), preferences)
-def test_gradient_agrees_with_finite_differences(action, observed, preferred, yaw, preference):
-    found = action_gradient(action, observed, preferred, yaw, preference)
+@given(pair, pair, pair, st.floats(-np.pi, np.pi), parameter_sets)
+def test_gradient_agrees_with_finite_differences(action, observed, preferred, yaw, parameters):
+    found = action_gradient(action, observed, preferred, yaw, parameters)
     h = 1e-5
     for axis in range(2):
         step = h * np.eye(2)[axis]
-        f = [action_free_energy(action + s * step, observed, preferred, yaw, preference) for s in (1, -1)]
+        f = [action_free_energy(action + s * step, observed, preferred, yaw, parameters) for s in (1, -1)]
         assert found[axis] == pytest.approx((f[0] - f[1]) / (2 * h), rel=1e-5, abs=1e-5)
 
 
 @given(pair, pair, pair, st.floats(-np.pi, np.pi), st.floats(0.01, 0.45))
 def test_each_step_lowers_the_free_energy_of_action(action, observed, preferred, yaw, gamma):
-    preference = Preference(gamma=gamma)
-    after = next_action(action, observed, preferred, yaw, preference)
-    f = [action_free_energy(a, observed, preferred, yaw, preference) for a in (action, after)]
+    parameters = ActionParameters(gamma=gamma)
+    after = next_action(action, observed, preferred, yaw, parameters)
+    f = [action_free_energy(a, observed, preferred, yaw, parameters) for a in (action, after)]
     assert f[1] <= f[0]
-    if np.linalg.norm(action_gradient(action, observed, preferred, yaw, preference)) > 1e-3:
+    if np.linalg.norm(action_gradient(action, observed, preferred, yaw, parameters)) > 1e-3:
         assert f[1] < f[0]
 
 
 @given(pair, pair, st.floats(-np.pi, np.pi))
 def test_action_settles_at_the_minimum_and_points_to_what_is_preferred(observed, preferred, yaw):
-    preference, action = Preference(), np.zeros(2)
+    parameters, action = ActionParameters(), np.zeros(2)
     for _ in range(100):
-        action = next_action(action, observed, preferred, yaw, preference)
+        action = next_action(action, observed, preferred, yaw, parameters)
     in_map = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ action
     assert in_map == pytest.approx((preferred - observed) / 2, abs=1e-6)  # half: as precise a wish to stand
 
@@ -75,6 +75,6 @@ def test_without_curvature_or_information_the_belief_stands():
 def test_corrections_and_attraction_are_bounded(xi, scale):
     pose = np.zeros(3)
     found = observed_position(pose, np.array([*xi, 0]) * scale, np.diag([1.0, 1.0, 0.0]))
-    assert np.linalg.norm(found) <= MAX_CORRECTION + 1e-9
+    assert np.linalg.norm(found) <= MAX_CORRECTION_M + 1e-9
     assert np.linalg.norm(preferred_position(found, np.array([100.0, 50.0, 0]), 1.0) - found) == pytest.approx(1.0)
     assert preferred_position(found, np.array([*found, 0]), 1.0) == pytest.approx(found)

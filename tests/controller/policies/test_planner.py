@@ -10,7 +10,7 @@ from common.messages.definitions import Belief, Goal, Pose
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
 from services.controller.navigator import Navigator
-from services.controller.policies.planner import Pilot
+from services.controller.policies.planner import GeodesicPolicy
 from services.simulator.simulation import Setup, Simulation
 
 SCANNER = SCANNERS["tim571"].with_beams(271)
@@ -33,10 +33,8 @@ def drive(
     Without ``stop`` nobody holds the wheels back but the controller. ``seen``: what it is shown of a scan.
     """
     simulation = Simulation(Setup(world, scanner, robot, start, seed, obstacle_stop=stop))
-    navigator = Navigator(robot, world=known or world, preset=Pilot(robot, known or world))
-    navigator.hear_goal(
-        Goal(stamp_ns=0, pose=Pose(x=goal[0], y=goal[1], yaw=(more or {}).pop("yaw", 0)), **(more or {}))
-    )
+    navigator = Navigator(robot, world=known or world, preset=GeodesicPolicy(robot, known or world))
+    navigator.on_goal(Goal(stamp_ns=0, pose=Pose(x=goal[0], y=goal[1], yaw=(more or {}).pop("yaw", 0)), **(more or {})))
     poses, said, contacts = [], [], 0
     try:
         while simulation.steps < limit:
@@ -45,7 +43,7 @@ def drive(
             _, truth, scan = simulation.observe()
             poses.append(truth.pose.array())
             contacts += truth.contact
-            navigator.hear_scan(seen(scan) if seen else scan)
+            navigator.on_scan(seen(scan) if seen else scan)
             command, status = navigator.step(belief_at(poses[-1], scan.stamp_ns))
             said.append(status)
             if status.state == "reached" and not np.any(simulation.physics.twist().round(3)):
@@ -61,10 +59,10 @@ def drive(
 @pytest.mark.parametrize("name", ["maze", "office"])
 def test_it_goes_round_walls_without_touching_them(name, kind):
     world, robot, rng = load_world(name), Robot(drive=kind), np.random.default_rng(3)
-    pilot = Pilot(robot, world)
+    policy = GeodesicPolicy(robot, world)
     for number in range(2):
         start, goal = world.sample_free(2, rng, 0.32)
-        field = pilot.roads.from_(goal)
+        field = policy.graph.cost_field(goal)
         shortest = float(np.hypot(*np.diff(field.path(start), axis=0).T).sum())
         poses, said, contacts = drive(world, robot, (*start, rng.uniform(-np.pi, np.pi)), goal, seed=number)
         assert said[-1].state == "reached", (start, goal, said[-1])
@@ -137,19 +135,19 @@ def test_a_door_that_was_shut_is_said_and_once_it_opens_it_goes_on():
 def test_goals_that_cannot_be_are_refused_with_the_nearest_that_can():
     walls = [{"name": "wall", "box": {"center": (5, 2.5), "size": (0.2, 5)}}]
     world = World(name="two", boundary=[(0, 0), (10, 0), (10, 5), (0, 5)], obstacles=walls)
-    navigator = Navigator(world=world, preset=Pilot(Robot(), world))
-    navigator.hear_goal(Goal(stamp_ns=0, pose=Pose(x=5.0, y=2.5)))
+    navigator = Navigator(world=world, preset=GeodesicPolicy(Robot(), world))
+    navigator.on_goal(Goal(stamp_ns=0, pose=Pose(x=5.0, y=2.5)))
     assert (navigator.state, "is inside something" in navigator.reason) == ("blocked", True)
-    navigator.hear_goal(Goal(stamp_ns=0, pose=Pose(x=0.2, y=2.5)))
+    navigator.on_goal(Goal(stamp_ns=0, pose=Pose(x=0.2, y=2.5)))
     assert "is 0.20 m from a wall; the nearest place that can be reached is (0.35, 2." in navigator.reason
     # The other room: refused as soon as it is known in which one the robot is.
-    navigator.hear_goal(Goal(stamp_ns=0, pose=Pose(x=8.0, y=2.5)))
+    navigator.on_goal(Goal(stamp_ns=0, pose=Pose(x=8.0, y=2.5)))
     simulation = Simulation(Setup(world, SCANNER, Robot(), (2.0, 2.5, 0.0)))
     try:
         _, truth, scan = simulation.observe()
     finally:
         simulation.close()
-    navigator.hear_scan(scan)
+    navigator.on_scan(scan)
     command, status = navigator.step(belief_at(truth.pose.array(), 0))
     assert status.state == "blocked"
     assert "cannot be reached from here; the nearest place that can be reached is (4.5" in status.reason
@@ -193,10 +191,10 @@ def test_before_a_closed_door_it_is_blocked_and_backs_off_and_stays_blocked_mean
 
 def test_who_is_held_by_the_limits_alone_is_stuck_too():
     """A doorway that the plan takes and the limits do not: returns of the scan hold the robot, whatever it wishes."""
-    pilot = Pilot(Robot(), load_world("corridor"))
-    pilot.aim(np.array([15.0, 1.5]))
+    policy = GeodesicPolicy(Robot(), load_world("corridor"))
+    policy.set_goal(np.array([15.0, 1.5]))
     reasons = [
-        pilot.decide(belief_at(np.array([5.0, 1.5, 0.0]), k * 66_000_000), np.zeros(3)).reason for k in range(60)
+        policy.decide(belief_at(np.array([5.0, 1.5, 0.0]), k * 66_000_000), np.zeros(3)).reason for k in range(60)
     ]
     assert reasons[0] == ""
     assert reasons[-1] == "stuck: backing off"
@@ -206,13 +204,13 @@ def test_who_is_held_by_the_limits_alone_is_stuck_too():
 def test_who_does_not_know_where_it_is_goes_slowly(kind):
     world, robot = load_world("office"), Robot(drive=kind)
     simulation = Simulation(Setup(world, SCANNER, robot, (6.0, 4.0, 0.0), 0))
-    navigator = Navigator(robot, world=world, preset=Pilot(robot, world))
-    navigator.hear_goal(Goal(stamp_ns=0, pose=Pose(x=15.0, y=4.0)))
+    navigator = Navigator(robot, world=world, preset=GeodesicPolicy(robot, world))
+    navigator.on_goal(Goal(stamp_ns=0, pose=Pose(x=15.0, y=4.0)))
     speeds = []
     try:
         for _ in range(120):
             scan = simulation.observe()[2]
-            navigator.hear_scan(scan)
+            navigator.on_scan(scan)
             command, status = navigator.step(belief_at(np.array([6.0, 4.0, 0.0]), scan.stamp_ns, "localising"))
             speeds.append(float(np.hypot(command.twist.vx, command.twist.vy)))
             simulation.command(scan.stamp_ns, command.twist)
