@@ -55,11 +55,11 @@ def e1(
     Examples: `presage experiment e1 --trials 5`; `presage experiment e1 --alpha 5e-4 --out slow`;
     `presage experiment e1 --estimators "paper,precise" --iterations 200`.
     """
-    from lab.experiments.estimators import Field, chosen, descent_of  # noqa: PLC0415
+    from lab.experiments.estimators import ExperimentWorld, descent_of, parse_estimators  # noqa: PLC0415
     from lab.paper import e1_localisation as localisation  # noqa: PLC0415
 
-    job = localisation.Job(0, seed, iterations, field=Field(world, beams), descent=descent_of(alpha, steps))
-    job = replace(job, estimators=chosen(estimators)) if estimators else job
+    job = localisation.Job(0, seed, iterations, field=ExperimentWorld(world, beams), descent=descent_of(alpha, steps))
+    job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
     show(localisation, lambda: localisation.run(job, trials, out, workers, console), out)
 
 
@@ -80,11 +80,11 @@ def e2(
 
     Examples: `presage experiment e2 --trials 2`; `presage experiment e2 --step 0.02 --out slower`.
     """
-    from lab.experiments.estimators import Field, chosen, descent_of  # noqa: PLC0415
+    from lab.experiments.estimators import ExperimentWorld, descent_of, parse_estimators  # noqa: PLC0415
     from lab.paper import e2_crossing as crossing  # noqa: PLC0415
 
-    job = crossing.Job(0, seed, step, field=Field(world, beams), descent=descent_of(alpha, steps))
-    job = replace(job, estimators=chosen(estimators)) if estimators else job
+    job = crossing.Job(0, seed, step, field=ExperimentWorld(world, beams), descent=descent_of(alpha, steps))
+    job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
     show(crossing, lambda: crossing.run(job, trials, out, workers, console), out)
 
 
@@ -111,11 +111,11 @@ def e3(
     Examples: `presage experiment e3 --trials 2`; `presage experiment e3 --estimators precise --apart 5 --out near`;
     `presage experiment e3 --any --trials 20 --estimators precise --out any`.
     """
-    from lab.experiments.estimators import Field, chosen, descent_of  # noqa: PLC0415
+    from lab.experiments.estimators import ExperimentWorld, descent_of, parse_estimators  # noqa: PLC0415
     from lab.paper import e3_navigation as navigation  # noqa: PLC0415
 
-    job = navigation.Job(0, seed, apart, free=free, field=Field(world, beams), descent=descent_of(alpha, steps))
-    job = replace(job, estimators=chosen(estimators)) if estimators else job
+    job = navigation.Job(0, seed, apart, free=free, field=ExperimentWorld(world, beams), descent=descent_of(alpha, steps))
+    job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
     show(navigation, lambda: navigation.run(job, trials, out, workers, console), out)
 
 
@@ -277,10 +277,10 @@ def tables(
     Examples: `presage experiment tables`;
     `presage experiment tables --page docs/experiments.md --out docs/experiments`.
     """
-    from lab.experiments.tables_page import MODULES, filled, table_of  # noqa: PLC0415
+    from lab.experiments.tables_page import MODULES, fill_tables, table_of  # noqa: PLC0415
 
     if page is not None:
-        page.write_text(filled(page.read_text(encoding="utf-8"), out), encoding="utf-8")
+        page.write_text(fill_tables(page.read_text(encoding="utf-8"), out), encoding="utf-8")
         return
     names = [name for name in MODULES if (out / f"{name}.json").exists()]
     names += sorted(path.stem for kind in ("navigation", "real") for path in out.glob(f"{kind}-*.json"))

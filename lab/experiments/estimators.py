@@ -17,70 +17,77 @@ from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
 from services.estimator.shared.interface import Estimator
 
-STEPS = "10 steps a scan"  # of the paper's estimator as the service has it: its robot does not stand between two
+TEN_STEPS = "10 steps a scan"  # variant of the paper's estimator with the service's defaults, for a moving robot
 NAMES = (
-    "paper", f"paper, {STEPS}", "precise", "particle-filter", "particle-filter, heading known",
+    "paper", f"paper, {TEN_STEPS}", "precise", "particle-filter", "particle-filter, heading known",
     "amcl-defaults", "precise, odometry", "particle-filter, odometry", "amcl-defaults, odometry",
 )  # fmt: skip
-# One gradient step a scan, as the paper's algorithm 1. The step size lies where `presage experiment alpha` is flat.
-PAPER = Descent(iterations=1)
+# One gradient step per scan, as in the paper's algorithm 1. The default step size lies where the results of
+# `presage experiment alpha` hardly depend on it.
+PAPER_DESCENT = Descent(iterations=1)
 
 
 @dataclass(frozen=True)
-class Field:
-    """Where they meet: a world, a number of beams, the one heading the paper's decoder knows."""
+class ExperimentWorld:
+    """World and number of beams of an experiment. All estimators run in the same one."""
 
     world: str = "corridor"
     beams: int = 622
 
     def scene(self, *seed: int) -> Scene:
-        """With the shipped scanner; its noise and places are drawn from these seeds."""
+        """A scene with the default scanner; the seeds determine its noise and places."""
         return Scene.of(load_world(self.world), self.beams, seed)
 
     def front(self) -> float:
-        """M, the least y of any object of the world: below it lies the corridor's free middle. None: infinity."""
+        """Smallest y of any obstacle in m; the corridor is free below it. Infinity if there is no obstacle."""
         objects = [obstacle.shape() for obstacle in load_world(self.world).obstacles]
         return float(shapely.bounds(objects)[:, 1].min()) if objects else np.inf
 
     @property
     def heading(self) -> float:
-        """Rad."""
+        """Heading of the robot in rad; the paper's decoder is trained for this heading only."""
         return float(load_world(self.world).start_pose(0.0)[2])
 
 
 def descent_of(alpha: float | None, steps: int | None) -> Descent:
-    """The paper's parameters; where one is None, those of `PAPER`."""
-    return Descent(alpha=PAPER.alpha if alpha is None else alpha, iterations=steps or PAPER.iterations)
+    """Parameters of the paper's estimator; ``alpha`` in m². An argument that is None defaults to `PAPER_DESCENT`."""
+    return Descent(alpha=PAPER_DESCENT.alpha if alpha is None else alpha, iterations=steps or PAPER_DESCENT.iterations)
 
 
-def chosen(names: str) -> tuple[str, ...]:
-    """From a comma-separated text; "particle-filter odometry" may stand for "particle-filter, odometry"."""
+def parse_estimators(names: str) -> tuple[str, ...]:
+    """Estimator names from a comma-separated text, in which a name is written without its own comma.
+
+    "particle-filter odometry" stands for "particle-filter, odometry". Raises UserError for unknown names.
+    """
     by_name = {name.replace(",", ""): name for name in NAMES}
-    asked = [" ".join(part.split()) for part in names.split(",")]
-    if unknown := [name for name in asked if name not in by_name]:
-        raise UserError(f"no estimator {unknown[0]!r}: choose from {', '.join(by_name)}")
-    return tuple(by_name[name] for name in asked)
+    parsed = [" ".join(part.split()) for part in names.split(",")]
+    if unknown := [name for name in parsed if name not in by_name]:
+        raise UserError(f"no estimator {unknown[0]!r} in the experiments: choose from {', '.join(by_name)}")
+    return tuple(by_name[name] for name in parsed)
 
 
 def knows_heading(name: str) -> bool:
-    """Whether this one is given the robot's heading."""
+    """Whether the estimator is given the robot's heading."""
     return name.startswith("paper") or name.endswith("heading known")
 
 
 def uses_odometry(name: str) -> bool:
-    """Whether this one is told of motion."""
+    """Whether the estimator uses odometry."""
     return name.endswith("odometry")
 
 
-def enter(name: str, field: Field, scene: Scene, seed: int, descent: Descent = PAPER) -> Estimator:
-    """A new estimator that knows nothing but the world; the paper's begins at the map's centre, as there."""
+def create_estimator(
+    name: str, field: ExperimentWorld, scene: Scene, seed: int, descent: Descent = PAPER_DESCENT
+) -> Estimator:
+    """A new estimator without a start pose. The paper's starts at the map's centre, as in the paper."""
     scanner, kind = scene.scanner, name.split(",", maxsplit=1)[0]
     geometry = Geometry.of(scanner)
     if kind == "paper":
-        return _factory(field.world, "paper", Descent() if name.endswith(STEPS) else descent)(geometry)
+        return _factory(field.world, "paper", Descent() if name.endswith(TEN_STEPS) else descent)(geometry)
     if kind == "precise":
         return _factory(field.world, "precise", descent)(geometry)
-    # The default motion model, differential, cannot follow a base that moves sideways: nobody would leave it.
+    # AMCL's default motion model is differential and cannot follow a base that moves sideways, so any user would
+    # change it.
     settings = ParticleSettings(robot_model_type="omni") if kind == "amcl-defaults" else ParticleSettings.tuned()
     heading = field.heading if name.endswith("heading known") else None
     return ParticleFilter(scene.world, settings, scanner.mount, seed, heading)
@@ -91,4 +98,4 @@ def _factory(world: str, name: str, descent: Descent) -> Factory:
     try:
         return prepare(Choice(world, name, descent=descent))  # type: ignore[arg-type]
     except UserError as error:
-        raise UserError(f"{error}; or leave {name} out: --estimators names who takes part") from None
+        raise UserError(f"{error}; or leave {name} out with --estimators") from None

@@ -12,41 +12,41 @@ from common.geometry.se2 import Array
 from common.geometry.world import World
 from common.robot.base import Robot
 
-CLOSE = 0.8  # m, there: the paper's range of the target
-APART = 12.0  # m, between start and goal at least
-# m between robot and anything along the line. The obstacle stop (`safety`) looks 1 cm beside the robot and
-# keeps 5 cm before it; the rest is seven times the scanner's noise, so that on this line it never acts.
+ARRIVAL_DISTANCE = 0.8  # m; closer than this counts as arrived, as in the paper
+MIN_DISTANCE = 12.0  # m, between start and goal
+# m between the robot and any obstacle along the line. The obstacle stop (`safety`) checks 1 cm beside the robot and
+# keeps 5 cm ahead of it; the rest is seven times the scanner's noise, so that it never triggers on this line.
 CLEARANCE = 0.15
-TRIES = 20_000
+MAX_DRAWS = 20_000
 
 
 @dataclass(frozen=True)
 class Journey:
-    """From standing at ``start`` to within `CLOSE` of ``goal``, m."""
+    """A drive from standstill at ``start`` to within `ARRIVAL_DISTANCE` of ``goal``, in m."""
 
     start: tuple[float, float]
     goal: tuple[float, float]
-    too_near: int = 0  # pairs drawn before this one that were less than APART apart
-    obstructed: int = 0  # and those far enough apart whose straight line is not free
+    too_near: int = 0  # rejected pairs that were too close together
+    obstructed: int = 0  # rejected pairs that were far enough apart, but without a free straight line
 
     @property
     def straight(self) -> float:
-        """M from start to goal."""
+        """Straight distance from start to goal in m."""
         return float(np.hypot(self.goal[0] - self.start[0], self.goal[1] - self.start[1]))
 
 
 def draw_journey(
-    world: World, rng: np.random.Generator, robot: Robot, apart: float = APART, *, free: bool = True
+    world: World, rng: np.random.Generator, robot: Robot, apart: float = MIN_DISTANCE, *, free: bool = True
 ) -> Journey:
-    """Uniform over pairs of places where the robot fits, of those ``apart`` m or more with a free line between.
+    """Draws uniformly from pairs of places that are ``apart`` m or more apart with a free straight line between them.
 
-    With ``free`` False the line between need not be. Places are rounded to whole millimetres, so that they pass through
-    a command line unchanged. Raises UserError where there seems to be no such pair.
+    With ``free`` False the line may be obstructed. Coordinates are rounded to whole millimetres, so that they pass
+    through a command line unchanged. Raises UserError if no such pair is found.
     """
     room = shapely.buffer(world.free_space, -(robot.radius + CLEARANCE))
     shapely.prepare(room)
     too_near = obstructed = 0
-    for _ in range(TRIES // 256):
+    for _ in range(MAX_DRAWS // 256):
         places = np.round(world.sample_free(256, rng, robot.radius), 3)
         for start, goal in places.reshape(-1, 2, 2):
             if np.hypot(*(goal - start)) < apart:
@@ -61,14 +61,17 @@ def draw_journey(
     )
 
 
-def least_time(distance: float, robot: Robot, close: float = CLOSE) -> float:
-    """S from standstill until ``distance`` m shrank to ``close``: accelerate, cruise; nobody asks it to stop there."""
+def least_time(distance: float, robot: Robot, close: float = ARRIVAL_DISTANCE) -> float:
+    """Minimum time in s from standstill until a distance of ``distance`` m has shrunk to ``close`` m.
+
+    The robot accelerates, then drives at full speed; it need not stop at the end.
+    """
     way, v, a = max(0.0, distance - close), robot.max_speed, robot.acceleration
     return float(np.sqrt(2 * way / a)) if way < v**2 / (2 * a) else way / v + v / (2 * a)
 
 
 def path_ratio(path: Array) -> float:
-    """Length of a path (N, 2+) over the straight line between its ends; 1 where it never moved."""
+    """Length of a path (N, 2+) divided by the distance between its ends; 1 if the ends coincide."""
     steps = np.hypot(*np.diff(path[:, :2], axis=0).T)
     straight = float(np.hypot(*(path[-1] - path[0])[:2]))
     return float(steps.sum()) / straight if straight > 0 else 1.0

@@ -1,7 +1,8 @@
 """One journey through real processes in lockstep.
 
-All but the router are started anew for every journey: so the numbers depend on the errand alone, not on what ran
-before. In lockstep each scan waits for the command that answers it, so the machine's speed does not count either.
+All processes but the router are restarted for every journey, so the results depend on the run's parameters alone and
+not on earlier runs. In lockstep each scan waits for the command that answers it, so the machine's speed does not
+matter either.
 """
 
 from __future__ import annotations
@@ -19,58 +20,63 @@ from common.errors import UserError
 from common.geometry.se2 import Array
 from common.messages.definitions import Belief, Goal, Health, Pose, Preference, Stamped, Status, Truth
 from common.messages.topics import BELIEF, GOAL, HEALTH, PREFERENCE, STATUS, TRUTH
-from lab.experiments.journeys import CLOSE, Journey
+from lab.experiments.journeys import ARRIVAL_DISTANCE, Journey
 from lab.workers import THREAD_COUNT_VARIABLES
 from presage.live.bus_watch import Watch
 from presage.session.stack import Stack
 
-OURS = "experiment"  # our liveliness token: the simulator waits for it, so the goal is there before the first scan
-PATIENCE = 120.0  # s of wall time without a message
-ROUTERS = 5  # tries: between finding a free port and listening on it somebody else may take it
+# This process's liveliness token. The simulator waits for it, so that the goal is set before the first scan.
+HARNESS_NAME = "experiment"
+TIMEOUT_S = 120.0  # wall time without a message
+MAX_ROUTER_STARTS = 5  # another process may take the free port before the router listens on it
 
 
 @dataclass(frozen=True)
-class Errand:
-    """Everything a run depends on."""
+class LockstepRun:
+    """Parameters of a run; its results depend on nothing else."""
 
     journey: Journey
-    yaw: float  # rad, kept throughout
+    yaw: float  # rad, of the robot at the start
     world: str
     beams: int
     seed: int
-    estimator: tuple[str, ...]  # arguments of the estimator's command line
-    limit: int  # iterations after which it is given up
-    controller: tuple[str, ...] = ("--preset", "paper")  # arguments of the controller's command line
-    simulator: tuple[str, ...] = ()  # and of the simulator's
-    known: bool = True  # the belief begins at the true start
-    told: bool = False  # it ends when the controller says `reached`, or refuses; else when the robot truly is there
+    estimator: tuple[str, ...]  # command-line arguments of the estimator
+    limit: int  # maximum number of iterations
+    controller: tuple[str, ...] = ("--preset", "paper")  # command-line arguments of the controller
+    simulator: tuple[str, ...] = ()  # command-line arguments of the simulator
+    start_known: bool = True  # whether the estimator is given the true start
+    # Whether the run ends when the controller reports that the goal is reached or refused; otherwise it ends when the
+    # robot truly is near the goal.
+    ends_with_status: bool = False
 
 
 @dataclass
-class Track:
-    """What happened, one entry a scan; the first is before any motion."""
+class RunTrace:
+    """Recorded messages of a run, one truth and one belief per scan; the first are from before any motion."""
 
     truths: list[Truth] = field(default_factory=list)
     beliefs: list[Belief] = field(default_factory=list)
-    statuses: dict[int, Status] = field(default_factory=dict)  # the last of each stamp, ns
-    plans: list[int] = field(default_factory=list)  # ns, when the goal prior was made anew
-    health: Health | None = None  # of the controller, the last that was heard
-    failure: str = ""  # why it was cut short
+    statuses: dict[int, Status] = field(default_factory=dict)  # the last status of each stamp (ns)
+    plans: list[int] = field(
+        default_factory=list
+    )  # stamps (ns) at which the controller published a new goal preference
+    health: Health | None = None  # the controller's last health message
+    failure: str = ""  # why the run was aborted; empty if it was not
 
     def path(self) -> Array:
-        """(N, 3) true poses."""
+        """True poses (N, 3)."""
         return np.array([truth.pose.array() for truth in self.truths])
 
     def believed(self) -> Array:
-        """(N, 3) poses of the beliefs about the same scans."""
+        """Believed poses (N, 3) at the same scans."""
         return np.array([belief.pose.array() for belief in self.beliefs])
 
     def has(self, stamp_ns: int) -> bool:
-        """Whether truth and belief of that scan are there."""
-        return all(bool(of) and of[-1].stamp_ns >= stamp_ns for of in (self.truths, self.beliefs))
+        """Whether the truth and the belief of that scan have been received."""
+        return all(bool(kept) and kept[-1].stamp_ns >= stamp_ns for kept in (self.truths, self.beliefs))
 
-    def cut(self, stamp_ns: int) -> None:
-        """Forget what came after."""
+    def discard_after(self, stamp_ns: int) -> None:
+        """Removes all messages about later scans."""
         self.truths = [each for each in self.truths if each.stamp_ns <= stamp_ns]
         self.beliefs = [each for each in self.beliefs if each.stamp_ns <= stamp_ns]
         self.statuses = {stamp: each for stamp, each in self.statuses.items() if stamp <= stamp_ns}
@@ -78,64 +84,71 @@ class Track:
 
 @contextmanager
 def session() -> Iterator[Stack]:
-    """A router of our own for runs one after another; whatever happens, no process is left."""
-    # Nobody's own settings change the experiment; one thread each, for sums depend on how they are split.
+    """Context manager: a router for several runs. On exit it ends all processes."""
+    # Without the user's own settings, which would change the experiment. With one thread per process, because
+    # floating-point sums depend on how they are split among threads.
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PRESAGE_")}
     environment = clean | dict.fromkeys(THREAD_COUNT_VARIABLES, "1")
-    for left in reversed(range(ROUTERS)):
+    for tries_left in reversed(range(MAX_ROUTER_STARTS)):
         with Stack("e3", quiet=True, environment=environment) as stack:
             try:
                 stack.start_router()
             except UserError:
-                if not left:
+                if not tries_left:
                     raise
                 continue
             yield stack
             return
 
 
-def run(errand: Errand, stack: Stack) -> Track:
-    """Until the robot is at the goal, or ``limit`` scans were answered; ends what it started.
+def run(params: LockstepRun, stack: Stack) -> RunTrace:
+    """Runs the services until the robot is at the goal or ``limit`` scans were answered, then ends the services.
 
-    Raises UserError where it goes wrong; an errand that is ``told``, once under way, has a ``failure`` instead.
+    Raises UserError if a process fails. With ``ends_with_status``, a failure after the first scan is stored in the
+    trace's ``failure`` instead.
     """
-    # A name nobody else has: neither an earlier run's last messages nor another session's are heard.
+    # A unique robot name, so that messages of earlier runs or other sessions are not received.
     stack.robot = f"e3-{os.getpid()}-{time.monotonic_ns()}"
-    (x, y), yaw = errand.journey.start, float(np.rad2deg(errand.yaw))
-    pose, world, seed = f"{x!r},{y!r},{yaw!r}", ("--world", errand.world), ("--seed", str(errand.seed))
+    (x, y), yaw = params.journey.start, float(np.rad2deg(params.yaw))
+    pose, world, seed = f"{x!r},{y!r},{yaw!r}", ("--world", params.world), ("--seed", str(params.seed))
     with open_bus(stack.link()) as bus:
-        watch = Watch(bus, TRUTH, BELIEF, STATUS, *((PREFERENCE, HEALTH) if errand.told else ()))
-        known = ("--initial-pose", pose) if errand.known else ()
-        stack.start("controller", *world, *errand.controller, "--belief-timeout", "60")
-        stack.start("estimator", *world, *seed, *known, *errand.estimator)
+        watch = Watch(bus, TRUTH, BELIEF, STATUS, *((PREFERENCE, HEALTH) if params.ends_with_status else ()))
+        start_pose = ("--initial-pose", pose) if params.start_known else ()
+        stack.start("controller", *world, *params.controller, "--belief-timeout", "60")
+        stack.start("estimator", *world, *seed, *start_pose, *params.estimator)
         stack.start(
-            "simulator", *world, *seed, "--start", pose, "--beams", str(errand.beams), "--pace", "lockstep",
-            "--wait-for", f"estimator,controller,{OURS}", *errand.simulator,
+            "simulator", *world, *seed, "--start", pose, "--beams", str(params.beams), "--pace", "lockstep",
+            "--wait-for", f"estimator,controller,{HARNESS_NAME}", *params.simulator,
         )  # fmt: skip
         stack.wait_alive(bus)
-        given = _give(
-            watch, stack, Goal(stamp_ns=0, seq=1, pose=Pose(x=errand.journey.goal[0], y=errand.journey.goal[1]))
+        answer = _send_goal(
+            watch,
+            stack,
+            Goal(stamp_ns=0, seq=1, pose=Pose(x=params.journey.goal[0], y=params.journey.goal[1])),
         )
-        if given.state == "blocked" and not errand.told:
-            raise UserError(given.reason)
-        bus.declare_alive(OURS)
-        track = Track()
+        if answer.state == "blocked" and not params.ends_with_status:
+            raise UserError(answer.reason)
+        bus.declare_alive(HARNESS_NAME)
+        trace = RunTrace()
         try:
-            _follow(watch, stack, errand, track)
+            _record(watch, stack, params, trace)
         except UserError as error:
-            if not errand.told or not track.truths:
+            if not params.ends_with_status or not trace.truths:
                 raise
-            track.failure = str(error)
+            trace.failure = str(error)
     for name in ("controller", "estimator", "simulator"):
         stack.stop(name)
-    return track
+    return trace
 
 
-def _give(watch: Watch, stack: Stack, goal: Goal) -> Status:
-    """Until the controller says that it has the goal; sent again, for a message on a new key may be lost."""
+def _send_goal(watch: Watch, stack: Stack, goal: Goal) -> Status:
+    """Sends the goal repeatedly until the controller's status confirms it: the first message on a new key may be lost.
+
+    Returns that status.
+    """
     answers: list[Status] = []
 
-    def taken() -> bool:
+    def accepted() -> bool:
         stack.check()
         watch.bus.put(GOAL, goal.encode())
         status = watch.until(Status, lambda s: s.goal_seq == goal.seq, 1.0)
@@ -143,57 +156,57 @@ def _give(watch: Watch, stack: Stack, goal: Goal) -> Status:
         return bool(answers)
 
     watch.bus.wait_matching(GOAL, 10.0)
-    if not wait_until(taken, PATIENCE, 0.0):
-        raise UserError(f"the controller did not take the goal within {PATIENCE:g} s")
+    if not wait_until(accepted, TIMEOUT_S, 0.0):
+        raise UserError(f"the controller did not confirm the goal within {TIMEOUT_S:g} s")
     return answers[-1]
 
 
-def _follow(watch: Watch, stack: Stack, errand: Errand, track: Track) -> None:
-    """Truths and beliefs of every scan, once each: what is sent again carries a stamp that is known."""
-    heard, end = time.monotonic(), None  # ns, the last scan that counts
-    while end is None or not track.has(end):
-        message, known = watch.next(0.5), len(track.truths) + len(track.beliefs)
+def _record(watch: Watch, stack: Stack, params: LockstepRun, trace: RunTrace) -> None:
+    """Appends messages to the trace until the run ends. Skips repeated messages, which have a known stamp."""
+    last_progress, end = time.monotonic(), None  # end: stamp of the last scan, ns
+    while end is None or not trace.has(end):
+        message, count = watch.next(0.5), len(trace.truths) + len(trace.beliefs)
         if message is not None:
-            _take(message, track, end)
-            if end is None and _over(message, track, errand):
+            _append(message, trace, end)
+            if end is None and _is_final(message, trace, params):
                 end = message.stamp_ns
-        if len(track.truths) + len(track.beliefs) > known:
-            heard = time.monotonic()
+        if len(trace.truths) + len(trace.beliefs) > count:
+            last_progress = time.monotonic()
         elif message is None or isinstance(message, Health):
             stack.check()
-            if time.monotonic() - heard > PATIENCE:
-                raise UserError(f"no scan was answered within {PATIENCE:g} s, after {len(track.beliefs)} scans")
-    track.cut(end)
+            if time.monotonic() - last_progress > TIMEOUT_S:
+                raise UserError(f"no scan was answered within {TIMEOUT_S:g} s, after {len(trace.beliefs)} scans")
+    trace.discard_after(end)
 
 
-def _take(message: Stamped, track: Track, end: int | None) -> None:
-    """What belongs to the track, up to the end."""
+def _append(message: Stamped, trace: RunTrace, end: int | None) -> None:
+    """Stores the message in the trace, unless it is about a scan after ``end`` (ns)."""
     if isinstance(message, Truth) and end is not None and message.stamp_ns > end:
         return
-    if isinstance(message, Truth) and _is_next(track.truths, message):
-        track.truths.append(message)
-    elif isinstance(message, Belief) and _is_next(track.beliefs, message):
-        track.beliefs.append(message)
+    if isinstance(message, Truth) and _is_next(trace.truths, message):
+        trace.truths.append(message)
+    elif isinstance(message, Belief) and _is_next(trace.beliefs, message):
+        trace.beliefs.append(message)
     elif isinstance(message, Status):
-        track.statuses[message.stamp_ns] = message
+        trace.statuses[message.stamp_ns] = message
     elif isinstance(message, Preference):
-        track.plans.append(message.stamp_ns)
+        trace.plans.append(message.stamp_ns)
     elif isinstance(message, Health) and message.service == "controller":
-        track.health = message
+        trace.health = message
 
 
-def _over(message: Stamped, track: Track, errand: Errand) -> bool:
-    """Whether nothing after this message counts."""
+def _is_final(message: Stamped, trace: RunTrace, params: LockstepRun) -> bool:
+    """Whether this message is about the last scan of the run."""
     if isinstance(message, Truth):
-        away = float(np.hypot(*(message.pose.array()[:2] - np.array(errand.journey.goal))))
-        return len(track.truths) > errand.limit or (not errand.told and away <= CLOSE)
-    if isinstance(message, Status) and errand.told and message.goal_seq:
+        away = float(np.hypot(*(message.pose.array()[:2] - np.array(params.journey.goal))))
+        return len(trace.truths) > params.limit or (not params.ends_with_status and away <= ARRIVAL_DISTANCE)
+    if isinstance(message, Status) and params.ends_with_status and message.goal_seq:
         return message.state == "reached" or message.refused
     return False
 
 
 def _is_next(kept: Sequence[Stamped], message: Stamped) -> bool:
-    """Whether it is new; raises UserError where one between is missing."""
+    """Whether the message follows the last one kept; False if it repeats it. Raises UserError if one is missing."""
     if kept and message.stamp_ns <= kept[-1].stamp_ns:
         return False
     period = kept[1].stamp_ns - kept[0].stamp_ns if len(kept) > 1 else None

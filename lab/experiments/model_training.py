@@ -30,42 +30,45 @@ from services.estimator.precise.learning.field_learning import (
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.precise.likelihood import Likelihood
 
-# Of the shipped weights. 520 steps are 20 epochs of 13 000 samples in batches of 500: our reading of the paper's "20
-# batches of 500 samples", which to the letter are 20 steps.
-HIDDEN, CHANNELS, BATCH, RATE, STEPS = 128, 8, 500, 3e-3, 520
-WATCHED = 50  # clean scans on which the curve of learning is drawn, after each pass over the samples
-JUDGED = 500  # clean scans on which the decoder's own error is measured
-CALIBRATED = 10  # one scan in so many gives the field's precision, the others the field
+# Values of the shipped weights. 520 steps are 20 epochs of 13 000 samples in batches of 500: our interpretation of the
+# paper's "20 batches of 500 samples", which literally means 20 steps.
+HIDDEN_UNITS, CHANNELS, BATCH_SIZE, LEARNING_RATE, GRADIENT_STEPS = 128, 8, 500, 3e-3, 520
+CURVE_SCANS = 50  # noise-free scans for the learning curve, evaluated after each epoch
+TEST_SCANS = 500  # noise-free scans for the decoder's error
+CALIBRATION_DIVISOR = 10  # one scan in ten calibrates the field's precision; the others train the field
 
 
 @dataclass(frozen=True)
-class Decoder:
-    """The paper's generative model."""
+class TrainedDecoder:
+    """The paper's generative model, trained in memory."""
 
     model: PaperModel
     card: ModelCard
 
     def estimator(self, descent: Descent) -> PaperPerception:
-        """One that begins at the map's centre."""
+        """A new estimator that starts at the map's centre."""
         return PaperPerception(self.model, self.card, descent)
 
 
 @dataclass(frozen=True)
-class Field:
-    """The generative model of preset `precise`, and where a search may begin."""
+class TrainedField:
+    """The generative model of preset `precise` and the seeds of its global search, trained in memory."""
 
     model: FieldModel
     seeds: Seeds
-    learning_s: float  # of one core, not of the wall's clock: trials run side by side
+    learning_s: float  # processor time; wall time would depend on the trials running in parallel
 
     def estimator(self, scene: Scene) -> PreciseEstimator:
-        """One that knows nothing of where it is."""
+        """A new estimator without a start pose."""
         scanner = scene.scanner
         return PreciseEstimator(self.model, self.seeds, np.array(scanner.mount), Likelihood(scanner.sigma))
 
 
-def posed(scene: Scene, count: int, heading: float | None, *, noise: bool = True) -> Data:
-    """Scans (count, B) from where the robot fits, at one heading (rad) or any; no return is +inf, too close -inf."""
+def sample_scans(scene: Scene, count: int, heading: float | None, *, noise: bool = True) -> Data:
+    """Scans (count, B) from random places where the robot fits, at the given heading (rad) or at random headings.
+
+    Ranges are in m: +inf means no return, -inf too close.
+    """
     poses = scene.poses(count)
     if heading is not None:
         poses[:, 2] = heading
@@ -75,39 +78,41 @@ def posed(scene: Scene, count: int, heading: float | None, *, noise: bool = True
     return Data(poses, scene.scanner.limit(ranges))
 
 
-def train_paper(scene: Scene, heading: float, samples: int, steps: int, seed: int) -> Decoder:
-    """The paper's decoder from so many samples at one heading, by ``steps`` gradient steps (whole epochs, rounded up).
+def train_paper(scene: Scene, heading: float, samples: int, steps: int, seed: int) -> TrainedDecoder:
+    """Trains the paper's decoder on ``samples`` scans of one heading, with ``steps`` gradient steps.
 
-    Learning falls to rate zero within those steps, whatever the number of samples: data differs, not time.
+    The steps are rounded up to whole epochs. The learning rate decays to zero within them whatever the number of
+    samples, so that experiments compare amounts of data and not training times.
     """
-    use_one_core()  # the sums of two threads are others
-    train = _usable(posed(scene, samples, heading), scene)
-    judge = _usable(posed(scene, JUDGED, heading, noise=False), scene)
-    watch = Data(judge.poses[:WATCHED], judge.ranges[:WATCHED])
-    recipe = training.Recipe(max(1, -(-steps // -(-samples // BATCH))), BATCH, RATE, seed)
+    use_one_core()  # floating-point sums depend on the number of threads
+    train = _usable(sample_scans(scene, samples, heading), scene)
+    judge = _usable(sample_scans(scene, TEST_SCANS, heading, noise=False), scene)
+    watch = Data(judge.poses[:CURVE_SCANS], judge.ranges[:CURVE_SCANS])
+    recipe = training.Recipe(max(1, -(-steps // -(-samples // BATCH_SIZE))), BATCH_SIZE, LEARNING_RATE, seed)
     norm = Normalisation.of(scene.world.bounds, float(train.ranges.max()))
     began = time.process_time()
-    trainer = training.Trainer(Shape(scene.scanner.beams, HIDDEN, CHANNELS), norm, recipe, train, watch)
+    trainer = training.Trainer(Shape(scene.scanner.beams, HIDDEN_UNITS, CHANNELS), norm, recipe, train, watch)
     model = trainer.run()
     took = time.process_time() - began
     error = np.abs(model.ranges(judge.poses) - judge.ranges)
     card = ModelCard(
         preset="paper", world=scene.world, scanner=scene.scanner, heading=heading, samples=samples,
-        epochs=recipe.epochs, batch=BATCH, learning_rate=RATE, seed=seed, hidden=HIDDEN, channels=CHANNELS,
-        center=norm.center, half_size=norm.half_size, range_scale=norm.range_scale, test_samples=JUDGED,
+        epochs=recipe.epochs, batch=BATCH_SIZE, learning_rate=LEARNING_RATE, seed=seed,
+        hidden=HIDDEN_UNITS, channels=CHANNELS,
+        center=norm.center, half_size=norm.half_size, range_scale=norm.range_scale, test_samples=TEST_SCANS,
         test_l1_mean=float(error.mean()), test_l1_median=float(np.median(error)),
         curve_train_l1=trainer.progress.train_l1, curve_test_l1=trainer.progress.test_l1, training_s=took,
         commit=commit(), command="", versions=versions(),
     )  # fmt: skip
-    return Decoder(model, card)
+    return TrainedDecoder(model, card)
 
 
-def learn_precise(scene: Scene, samples: int, recipe: Recipe | None = None) -> Field:
-    """The distance field from so many scans at any heading, a tenth of them for its precision; all with noise."""
+def learn_precise(scene: Scene, samples: int, recipe: Recipe | None = None) -> TrainedField:
+    """Trains the distance field on ``samples`` noisy scans at random headings; a tenth of them calibrates precision."""
     scanner, recipe = scene.scanner, recipe or Recipe()
     mount, angles = np.array(scanner.mount), scanner.angles()
-    data = posed(scene, samples, None)
-    split = max(1, samples // CALIBRATED)
+    data = sample_scans(scene, samples, None)
+    split = max(1, samples // CALIBRATION_DIVISOR)
     began = time.process_time()
     field = learn_field(Beams.of(data.poses[split:], mount, angles, data.ranges[split:]), recipe)
     held, scans = data.poses[:split], data.ranges[:split]
@@ -115,16 +120,16 @@ def learn_precise(scene: Scene, samples: int, recipe: Recipe | None = None) -> F
     model = replace(model, ripple=learn_ripple(field, se2.compose(held, mount), angles))
     visited = se2.compose(data.poses, mount)[:, :2]
     places = thin_places(np.concatenate([visited, reachable(field, visited)]), SPACING)
-    return Field(model, Seeds.at(model, places), time.process_time() - began)
+    return TrainedField(model, Seeds.at(model, places), time.process_time() - began)
 
 
 def steps_of(card: ModelCard) -> int:
-    """Gradient steps that were made."""
+    """Number of gradient steps of the training."""
     return card.epochs * -(-card.samples // card.batch)
 
 
 def range_errors(model: PaperModel | FieldModel, scene: Scene, data: Data) -> Array:
-    """(N, B) m, absolute, of the ranges that a model expects at the poses; where either is no return: left out, NaN."""
+    """Absolute errors (N, B), m, of the ranges that a model predicts; NaN where a return is missing in either."""
     if isinstance(model, PaperModel):
         return np.asarray(np.abs(model.ranges(data.poses) - usable_ranges(data.ranges, scene.scanner.range_max)))
     expected = model.expect(se2.compose(data.poses, np.array(scene.scanner.mount)), scene.scanner.angles()).ranges

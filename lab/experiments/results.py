@@ -20,28 +20,28 @@ from common.versions import commit, versions
 
 @dataclass
 class Result:
-    """One experiment's outcome; plain values throughout."""
+    """Outcome of an experiment; all values can be written as JSON."""
 
     name: str  # e1
     title: str
     seed: int
     parameters: dict[str, Any]
-    summary: dict[str, dict[str, Any]]  # by estimator, or whatever was compared
+    summary: dict[str, dict[str, Any]]  # by what is compared, such as the estimator
     curves: dict[str, list[Any]] = field(default_factory=dict)  # columns of equal length
     trials: list[dict[str, Any]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def write(self, out: Path, figure: Figure | None) -> list[Path]:
-        """Into the folder ``out``; the files."""
-        about = {"command": " ".join(["presage", *sys.argv[1:]]), "commit": commit(), "versions": versions()}
+        """Writes the result into the folder ``out``. Returns the paths of the files."""
+        provenance = {"command": " ".join(["presage", *sys.argv[1:]]), "commit": commit(), "versions": versions()}
         path = out / f"{self.name}.json"
-        if figure is not None:  # first: a result without its figure would look complete
+        if figure is not None:  # before the JSON file, which marks a result as complete
             for suffix in (".pdf", ".png"):
-                # Without its date a figure's bytes depend on its data alone.
+                # Without a creation date the file depends on the data alone.
                 metadata = {"CreationDate": None} if suffix == ".pdf" else None
                 figure.savefig(out / (self.name + suffix), dpi=150, metadata=metadata)
         own = {name: value for name, value in vars(self).items() if name not in ("trials", "curves")}
-        path.write_text(json.dumps({**own, **about}, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        path.write_text(json.dumps({**own, **provenance}, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         files = [path]
         if self.trials:
             files.append(out / f"{self.name}.trials.jsonl")
@@ -58,25 +58,25 @@ class Result:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """A result's JSON; raises UserError where there is none."""
+    """Reads a result's JSON. Raises UserError if it does not exist or is malformed."""
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError:
         raise UserError(
-            f"{path}: no such result; make it with: presage experiment {path.stem.split('-')[0]} (its --help says how)"
+            f"{path}: no such result; create it with: presage experiment {path.stem.split('-')[0]} (see its --help)"
         ) from None
     except ValueError as error:
         raise UserError(f"{path}: not a result of `presage experiment` ({error})") from None
 
 
 def spread(rows: Sequence[Sequence[float]] | Array) -> tuple[list[float], list[float]]:
-    """Mean and standard deviation over trials (N, K) at each of the K moments."""
+    """Mean and standard deviation over N trials at each of K times, of values (N, K)."""
     values = np.asarray(rows, float)
     return values.mean(axis=0).tolist(), values.std(axis=0).tolist()
 
 
 def curves_of(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> dict[str, list[Any]]:
-    """Columns: mean and deviation over trials of each estimator's error_m, at each moment."""
+    """CSV columns: mean and standard deviation over trials of each estimator's error_m, at each time."""
     curves: dict[str, list[Any]] = {}
     for name in names:
         curves[f"{name} mean m"], curves[f"{name} std m"] = spread([row["error_m"][name] for row in rows])
@@ -84,18 +84,18 @@ def curves_of(rows: Sequence[dict[str, Any]], names: Sequence[str]) -> dict[str,
 
 
 def markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table."""
+    """A Markdown table."""
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """For a table; a dash for what is not known."""
+    """Formats a number for a table; a dash for None and non-finite values."""
     return "–" if value is None or not np.isfinite(value) else f"{value:.{digits}f}"
 
 
 def millimetres(metres: float | None) -> str:
-    """For a table: one thousandth as precise as it is large, 0.35, 12.3, 1757."""
+    """Formats a length as millimetres for a table, with about three digits: 0.35, 12.3, 1757."""
     if metres is None or not np.isfinite(metres):
         return "–"
     value = 1000 * metres
@@ -103,11 +103,11 @@ def millimetres(metres: float | None) -> str:
 
 
 def ratio(value: float) -> str:
-    """For a table: 1.1, 23, 5494."""
+    """Formats a ratio for a table: 1.1, 23, 5494."""
     return f"{value:.{1 if value < 10 else 0}f}"
 
 
 def mean_std(summary: Mapping[str, Any], quantity: str, digits: int = 3) -> str:
-    """As ± of what the summary holds as QUANTITY_mean_m and QUANTITY_std_m."""
+    """Formats the summary's QUANTITY_mean_m and QUANTITY_std_m as mean ± standard deviation."""
     mean, std = summary.get(f"{quantity}_mean_m"), summary.get(f"{quantity}_std_m")
     return f"{number(mean, digits)} ± {number(std, digits)}"

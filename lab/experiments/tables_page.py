@@ -10,38 +10,45 @@ from typing import Any
 
 from common.errors import UserError
 from lab.experiments import results
-from lab.experiments.estimators import STEPS
+from lab.experiments.estimators import TEN_STEPS
 from lab.experiments.results import mean_std, number
 
-# Experiments in the order of the page, and the modules that run them.
+# Modules of the experiments, in the order of docs/experiments.md. Each has a function `table`.
 MODULES = {
-    "e1": "localisation", "e2": "crossing", "e3": "navigation", "alpha": "step_size", "steps": "stepping",
-    "samples": "samples", "aliasing": "aliasing", "prediction": "prediction", "navigation": "driving",
-    "real": "real",
-}  # fmt: skip
-MARKED = re.compile(r"(<!-- table (?P<name>[\w/.-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+    "e1": "lab.paper.e1_localisation",
+    "e2": "lab.paper.e2_crossing",
+    "e3": "lab.paper.e3_navigation",
+    "alpha": "lab.paper.alpha_sweep",
+    "steps": "lab.paper.step_sizes",
+    "samples": "lab.paper.samples",
+    "aliasing": "lab.paper.aliasing",
+    "prediction": "lab.paper.prediction",
+    "navigation": "lab.navigation.experiment",
+    "real": "lab.real_logs.experiment",
+}
+TABLE_MARKS = re.compile(r"(<!-- table (?P<name>[\w/.-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 Summary = dict[str, dict[str, Any]]
 
 
 def table_of(name: str, folder: Path) -> str:
-    """The table and the notes of one result in ``folder``, or `overview` of several; e1, converged/e1."""
+    """Table and notes of a result in ``folder``, named "e1" or "converged/e1", for example; or "overview"."""
     if name == "overview":
         return overview(folder)
-    kind = name.rsplit("/", maxsplit=1)[-1].partition("-")[0]  # navigation-unknown is one of navigation's
+    kind = name.rsplit("/", maxsplit=1)[-1].partition("-")[0]  # navigation-unknown belongs to navigation
     if kind not in MODULES:
         raise UserError(f"no experiment {kind!r}: choose from {', '.join(MODULES)}")
-    table: Callable[[Summary], str] = import_module(f"presage.experiments.{MODULES[kind]}").table
+    table: Callable[[Summary], str] = import_module(MODULES[kind]).table
     result = results.read(folder / f"{name}.json")
     return "\n\n".join([table(result["summary"]), *(f"{note[0].upper()}{note[1:]}" for note in result["notes"])])
 
 
-def filled(page: str, folder: Path) -> str:
-    """The page with each table between its marks as the results have it."""
-    return MARKED.sub(lambda m: f"{m[1]}{table_of(m['name'], folder)}\n{m[3]}", page)
+def fill_tables(page: str, folder: Path) -> str:
+    """Returns the page with every marked table replaced by the current results."""
+    return TABLE_MARKS.sub(lambda m: f"{m[1]}{table_of(m['name'], folder)}\n{m[3]}", page)
 
 
 def overview(folder: Path) -> str:
-    """The paper, its rebuild, preset precise, the particle filter and the bound, side by side."""
+    """Table that compares the paper, presets paper and precise, the particle filter and the Cramér-Rao bound."""
     e1, e2, e3 = (results.read(folder / f"{name}.json") for name in ("e1", "e2", "e3"))
     names = ("paper", "precise", "particle-filter")
     heads = ("", "Burghardt & Lanillos", "preset `paper`", "preset `precise`", "particle filter, tuned", "bound")
@@ -64,8 +71,8 @@ def overview(folder: Path) -> str:
 
 
 def _navigation(summary: Summary, names: tuple[str, ...]) -> list[list[str]]:
-    # The running service makes ten gradient steps a scan.
-    own = [summary[name if name in summary else f"{name}, {STEPS}"] for name in names]
+    # As a service, preset paper takes ten gradient steps per scan.
+    own = [summary[name if name in summary else f"{name}, {TEN_STEPS}"] for name in names]
     return [
         ["E3: reached", "–", *(f"{r['reached']} of {r['trials']}" for r in own), ""],
         ["E3: trials with a contact", "–", *(str(r["trials_with_contact"]) for r in own), ""],

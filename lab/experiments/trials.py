@@ -18,16 +18,17 @@ from common.errors import UserError
 from common.versions import commit
 from lab.workers import pool
 
-Job = TypeVar("Job")  # a frozen dataclass of plain values: it is sent to a process, and it names its result
-Result = dict[str, Any]  # plain values
+Job = TypeVar("Job")  # a frozen dataclass of plain values, because it is pickled and compared with stored jobs
+Result = dict[str, Any]  # can be written as JSON
 
 
 def run_trials(
     name: str, trial: Callable[[Job], Result], jobs: Sequence[Job], out: Path, workers: int, console: Console
 ) -> list[Result]:
-    """The result of every job, in their order; ``trial`` is a function of a module, and depends on its job alone.
+    """Runs ``trial`` on every job in worker processes. Returns the results in the order of the jobs.
 
-    What is done is kept in ``out`` until all is done: the same command goes on there after Ctrl-C.
+    ``trial`` must be a module-level function whose result depends on its job alone. Finished trials are stored in
+    ``out`` until all are done, so that after Ctrl-C the same command continues.
     """
     store = Store(out / f".{name}.unfinished.jsonl", jobs)
     done = store.read()
@@ -40,49 +41,52 @@ def run_trials(
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(name, total=len(jobs), completed=len(done))
 
-        def keep(index: int, result: Result) -> None:
+        def store_result(index: int, result: Result) -> None:
             done[index] = result
             store.add(index, result)
             bar.advance(task)
 
-        left = [index for index in range(len(jobs)) if index not in done]
+        remaining = [index for index in range(len(jobs)) if index not in done]
         try:
-            if workers == 1 or len(left) <= 1:
-                for index in left:
-                    keep(index, trial(jobs[index]))
+            if workers == 1 or len(remaining) <= 1:
+                for index in remaining:
+                    store_result(index, trial(jobs[index]))
             else:
-                _side_by_side(trial, jobs, left, min(workers, len(left)), keep)
+                _run_in_parallel(trial, jobs, remaining, min(workers, len(remaining)), store_result)
         except KeyboardInterrupt:
-            console.print(f"{name}: {len(done)} of {len(jobs)} trials are kept; the same command goes on there")
+            console.print(f"{name}: {len(done)} of {len(jobs)} trials are kept; the same command continues from there")
             raise
     store.path.unlink(missing_ok=True)
     return [done[index] for index in range(len(jobs))]
 
 
-def _side_by_side(
-    trial: Callable[[Job], Result], jobs: Sequence[Job], left: list[int], workers: int,
-    keep: Callable[[int, Result], None],
+def _run_in_parallel(
+    trial: Callable[[Job], Result], jobs: Sequence[Job], remaining: list[int], workers: int,
+    store_result: Callable[[int, Result], None],
 ) -> None:  # fmt: skip
     try:
         with pool(workers) as executor:
-            futures = {executor.submit(trial, jobs[index]): index for index in left}
+            futures = {executor.submit(trial, jobs[index]): index for index in remaining}
             for future in as_completed(futures):
-                keep(futures[future], future.result())
+                store_result(futures[future], future.result())
     except BrokenProcessPool:
-        raise UserError("a worker process was ended from outside (out of memory?); the same command goes on") from None
+        raise UserError(
+            "a worker process was killed, perhaps for lack of memory; run the same command again to continue, with "
+            "fewer --workers if memory is short"
+        ) from None
 
 
 class Store:
-    """Results of an unfinished run, a line each; those of other jobs or another commit are not taken."""
+    """A file with the results of an unfinished run, one per line, valid for the same jobs and commit only."""
 
     def __init__(self, path: Path, jobs: Sequence[Any]) -> None:
-        """Nothing is read or written yet."""
+        """Remember the path and the jobs' key; the file is neither read nor written yet."""
         self.path = path
         plain = json.dumps([commit(), [asdict(job) for job in jobs]], sort_keys=True, default=str)
         self.key = hashlib.sha256(plain.encode()).hexdigest()
 
     def read(self) -> dict[int, Result]:
-        """By index; a last line cut short by a kill is left out."""
+        """Results by index. Ignores an incomplete last line; deletes a file of other jobs or another commit."""
         done: dict[int, Result] = {}
         if not self.path.exists():
             return done
@@ -100,7 +104,7 @@ class Store:
         return done
 
     def add(self, index: int, result: Result) -> None:
-        """Keep one more."""
+        """Append a result."""
         first = "" if self.path.exists() else self.key + "\n"
         with self.path.open("a", encoding="utf-8") as file:
             file.write(first + json.dumps([index, result]) + "\n")

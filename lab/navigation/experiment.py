@@ -21,20 +21,20 @@ from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
 from lab.experiments import results
 from lab.experiments.journeys import Journey
-from lab.experiments.lockstep import Errand, session
-from lab.experiments.lockstep import run as run_errand
+from lab.experiments.lockstep import LockstepRun, session
+from lab.experiments.lockstep import run as run_in_lockstep
 from lab.experiments.trials import run_trials
 from lab.navigation import figure as driving_figure
-from lab.navigation.drive import TOLERANCE, TRULY, measure
-from lab.navigation.shortest_path import APART, GAP, SPARE, draw_trip, ways_of
+from lab.navigation.drive import MAX_REACHED_DISTANCE, TOLERANCE, measure
+from lab.navigation.shortest_path import MIN_TRIP_LENGTH, START_GOAL_MARGIN, WALL_GAP, draw_trip, load_ways
 
-NUMBER = 7  # of the experiment, in its seeds
+EXPERIMENT_ID = 7  # of the experiment, in its seeds
 WORLDS, DRIVES = ("maze", "office"), ("holonomic", "differential")
-CHOICES = {
+OPTION_VALUES = {
     "drives": DRIVES, "start": ("known", "unknown"), "estimator": ("precise", "particle-filter"),
     "prior": ("motion", "odometry"),
 }  # fmt: skip
-WORST = 5  # trials named in the summary
+WORST_TRIALS = 5  # trials named in the summary
 QUANTITIES = {  # of reached trials; others by name in `worst`
     "path_over_shortest": ("median", "max"), "time_over_least": ("median", "max"), "seconds": ("median", "max"),
     "time_over_bound": ("median", "max"), "untracked_s": ("median", "max"), "claimed_error_max_m": ("max",),
@@ -66,18 +66,18 @@ class Job:
         """As the table has it."""
         return f"{Path(self.world).stem}, {self.drive}"
 
-    def errand(self, journey: Journey, yaw: float) -> Errand:
+    def lockstep_run(self, journey: Journey, yaw: float) -> LockstepRun:
         """For `lockstep.run`."""
         seeks = "--epistemic" if self.epistemic else "--no-epistemic"
         people = ("--people", str(self.people), "--people-speed", repr(self.people_speed)) if self.people else ()
-        return Errand(
+        return LockstepRun(
             journey, yaw, self.world, self.beams, (self.seed * 100_003 + self.index) % 2**31,
             ("--estimator", self.estimator, "--prior", self.prior),
             round(self.limit * SCANNERS["tim571"].rate),
             controller=("--preset", "geodesic", "--drive", self.drive, seeks),
             simulator=("--drive", self.drive, *people),
-            known=self.start == "known",
-            told=True,
+            start_known=self.start == "known",
+            ends_with_status=True,
         )  # fmt: skip
 
 
@@ -88,8 +88,8 @@ def check(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> None:
     asked = {"drives": drives, "start": (job.start,), "estimator": (job.estimator,), "prior": (job.prior,)}
     for option, values in asked.items():
         for value in values:
-            if value not in CHOICES[option]:
-                raise UserError(f"--{option} {value!r}: choose from {', '.join(CHOICES[option])}")
+            if value not in OPTION_VALUES[option]:
+                raise UserError(f"--{option} {value!r}: choose from {', '.join(OPTION_VALUES[option])}")
     for option, these in (("worlds", worlds), ("drives", drives)):
         if not these or len(set(these)) < len(these):
             raise UserError(f"--{option} {','.join(these)!r}: give each once, and one at least")
@@ -97,7 +97,7 @@ def check(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> None:
         raise UserError("--worlds: two files have one name; rename one of them")
 
 
-def name_of(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> str:
+def result_name(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> str:
     """`navigation`, and whatever is not as by default, so that no result overwrites that of another question."""
     parts = [
         *([] if tuple(worlds) == WORLDS else [Path(world).stem for world in worlds]),
@@ -116,20 +116,20 @@ def name_of(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> str:
 def trial(job: Job) -> dict[str, Any]:
     """One drive; what became of it."""
     robot = Robot.model_validate({"drive": job.drive})
-    trip = draw_trip(job.world, np.random.default_rng((job.seed, NUMBER, job.index)), robot)
+    trip = draw_trip(job.world, np.random.default_rng((job.seed, EXPERIMENT_ID, job.index)), robot)
     with session() as stack:
-        track = run_errand(job.errand(Journey(trip.start[:2], trip.goal), trip.start[2]), stack)
-    world, _ = ways_of(job.world, robot.radius)
+        trace = run_in_lockstep(job.lockstep_run(Journey(trip.start[:2], trip.goal), trip.start[2]), stack)
+    world, _ = load_ways(job.world, robot.radius)
     about = {"group": job.group, "trial": job.index, **asdict(trip)}
-    return about | measure(track, trip, world, robot)
+    return about | measure(trace, trip, world, robot)
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Numbers of one world and drive; ways and times are of trials that were reached, safety is of all."""
-    there = [row for row in rows if row["reached"]]
+    reached = [row for row in rows if row["reached"]]
     counted = {
         "trials": len(rows),
-        "reached": len(there),
+        "reached": len(reached),
         **{
             f"trials_{outcome.replace(' ', '_')}": sum(row["outcome"] == outcome for row in rows)
             for outcome in ("claimed elsewhere", "refused", "too late", "failed")
@@ -141,15 +141,15 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
     for quantity, statistics in QUANTITIES.items():
         for statistic in statistics:
-            counted[f"{statistic}_{quantity}"] = _of(there, quantity, statistic)
+            counted[f"{statistic}_{quantity}"] = _statistic(reached, quantity, statistic)
     for quantity in ("clearance_m", "clearance_to_people_m"):
-        counted[f"min_{quantity}"] = _of(rows, quantity, "min")
-    counted["median_step_mean_ms"] = _of(rows, "step_mean_ms", "median")
-    counted["max_step_max_ms"] = _of(rows, "step_max_ms", "max")
+        counted[f"min_{quantity}"] = _statistic(rows, quantity, "min")
+    counted["median_step_mean_ms"] = _statistic(rows, "step_mean_ms", "median")
+    counted["max_step_max_ms"] = _statistic(rows, "step_max_ms", "max")
     return counted | {"reasons_s": _reasons(rows), "worst": worst(rows)}
 
 
-def _of(rows: Sequence[dict[str, Any]], quantity: str, statistic: str) -> float | None:
+def _statistic(rows: Sequence[dict[str, Any]], quantity: str, statistic: str) -> float | None:
     values = [row[quantity] for row in rows if row[quantity] is not None]
     return float(STATISTICS[statistic](values)) if values else None
 
@@ -166,7 +166,7 @@ def worst(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     order = sorted(
         rows, key=lambda r: (r["reached"], -r["contacts_moving"], -r["contacts_standing"], -r["time_over_least"])
     )
-    return [{"trial": row["trial"], "outcome": row["outcome"], "why": _why(row)} for row in order[:WORST]]
+    return [{"trial": row["trial"], "outcome": row["outcome"], "why": _why(row)} for row in order[:WORST_TRIALS]]
 
 
 def _why(row: dict[str, Any]) -> str:
@@ -190,7 +190,7 @@ def run(
 ) -> results.Result:  # fmt: skip
     """All trials of all worlds and drives; writes NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
     check(job, worlds, drives)
-    name = name_of(job, worlds, drives)
+    name = result_name(job, worlds, drives)
     groups = [replace(job, world=world, drive=drive) for world in worlds for drive in drives]
     # The first of each before the second of any: a run cut short says something of all.
     jobs = [replace(group, index=index) for index in range(trials) for group in groups]
@@ -198,8 +198,8 @@ def run(
     by_group = {group.group: [row for row in rows if row["group"] == group.group] for group in groups}
     common = {key: value for key, value in asdict(job).items() if key not in ("index", "world", "drive", "seed")}
     parameters = common | {
-        "worlds": list(worlds), "drives": list(drives), "trials": trials, "tolerance_m": TOLERANCE, "truly_m": TRULY,
-        "apart_m": APART, "spare_m": SPARE, "gap_m": GAP, "robot": Robot().model_dump(exclude={"drive"}),
+        "worlds": list(worlds), "drives": list(drives), "trials": trials, "tolerance_m": TOLERANCE, "truly_m": MAX_REACHED_DISTANCE,
+        "apart_m": MIN_TRIP_LENGTH, "spare_m": START_GOAL_MARGIN, "gap_m": WALL_GAP, "robot": Robot().model_dump(exclude={"drive"}),
     }  # fmt: skip
     result = results.Result(
         name, f"Navigation: {driving_figure.describe(job)}", job.seed, parameters,

@@ -2,7 +2,7 @@
 
 Exact, and none of the controller's: a visibility graph over free space shrunk by the robot's radius and a gap, with
 Dijkstra's algorithm on it (Lozano-Perez and Wesley 1979). The shrunk space has round corners; they become polygons that
-are at most `EXACT` off.
+are at most `ARC_TOLERANCE` off.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from common.geometry.world import World, load_world
 from common.robot.base import Robot
 from lab.experiments.journeys import least_time
 
-EXACT = 1e-3  # m, polygon instead of arc
-GAP = 0.03  # m between footprint and walls that the shortest way keeps
-SPARE = 0.05  # m, and what start and goal have around the footprint
-APART = 2.0  # m by the shortest way
-TRIES = 500
+ARC_TOLERANCE = 1e-3  # m, polygon instead of arc
+WALL_GAP = 0.03  # m between footprint and walls that the shortest way keeps
+START_GOAL_MARGIN = 0.05  # m, and what start and goal have around the footprint
+MIN_TRIP_LENGTH = 2.0  # m by the shortest way
+MAX_DRAWS = 500
 # Where starts and goals are drawn, of worlds that are about one part of them: x0, y0, x1, y1 in m. In the corridor of
 # `twins` a scan tells where it is, so whoever has a goal there finds out on the way.
 ROOMS = {"twins": ((0.0, 0.0, 5.9, 4.4), (6.1, 0.0, 12.0, 4.4))}
@@ -37,7 +37,7 @@ class Ways:
 
     def __init__(self, world: World, clearance: float) -> None:
         """``clearance`` m between the robot's centre and everything."""
-        room = shapely.simplify(shapely.buffer(world.free_space, -clearance, quad_segs=64), EXACT)
+        room = shapely.simplify(shapely.buffer(world.free_space, -clearance, quad_segs=64), ARC_TOLERANCE)
         # A line along an edge, or through a corner, is inside.
         self.room = shapely.buffer(room, 1e-6, join_style="mitre")
         shapely.prepare(self.room)
@@ -103,10 +103,10 @@ def length(way: Array) -> float:
 
 
 @functools.lru_cache(maxsize=8)
-def ways_of(world: str, radius: float = Robot().radius) -> tuple[World, Ways]:
-    """A world by name and the shortest ways in it, with `GAP`; made once a process."""
+def load_ways(world: str, radius: float = Robot().radius) -> tuple[World, Ways]:
+    """A world by name and the shortest ways in it, with `WALL_GAP`; made once a process."""
     known = load_world(world)
-    return known, Ways(known, radius + GAP)
+    return known, Ways(known, radius + WALL_GAP)
 
 
 @dataclass(frozen=True)
@@ -119,15 +119,15 @@ class Trip:
     redrawn: int = 0  # pairs drawn before that were nearer, or had no way between
 
 
-def draw_trip(world: str, rng: np.random.Generator, robot: Robot, apart: float = APART) -> Trip:
-    """Places uniform over free space with `SPARE`, ``apart`` m or more by the shortest way; any heading.
+def draw_trip(world: str, rng: np.random.Generator, robot: Robot, apart: float = MIN_TRIP_LENGTH) -> Trip:
+    """Places uniform over free space with `START_GOAL_MARGIN`, ``apart`` m or more by the shortest way; any heading.
 
     Whole millimetres and ten-thousandths of a radian. Raises UserError where there seems to be no such pair.
     """
-    known, ways = ways_of(world, robot.radius)
+    known, ways = load_ways(world, robot.radius)
     rooms = ROOMS.get(world)
-    for redrawn in range(TRIES):
-        start, goal = np.round(known.sample_free(2, rng, robot.radius + SPARE), 3)
+    for redrawn in range(MAX_DRAWS):
+        start, goal = np.round(known.sample_free(2, rng, robot.radius + START_GOAL_MARGIN), 3)
         if rooms and not all(any(_inside(place, room) for room in rooms) for place in (start, goal)):
             continue
         way = ways.way(start, goal)

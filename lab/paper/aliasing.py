@@ -21,17 +21,17 @@ from common.geometry.world import World, load_world
 from lab.accuracy.scenes import ROBOT, TWIN_OFFSET, TWINS, Scene, alike, twin_of
 from lab.experiments import model_training as learning
 from lab.experiments import results
-from lab.experiments.estimators import PAPER
+from lab.experiments.estimators import PAPER_DESCENT
 from lab.experiments.trials import run_trials
-from lab.paper.e1_localisation import CLOSE, FOUND
+from lab.paper.e1_localisation import CLOSE_DISTANCE, FOUND_DISTANCE
 from presage.plotting import style as drawing
 from services.estimator.paper.perception import Descent
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
 from services.estimator.shared.interface import Estimator, Posterior
 
-NUMBER = 5  # of the experiment, in its seeds
-PLACES, LEARNING, SCANS = 0, 1, 2  # in the seeds
+EXPERIMENT_ID = 5  # of the experiment, in its seeds
+PLACES_SEED, LEARNING_SEED, SCANS_SEED = 0, 1, 2  # in the seeds
 HEADING = float(np.pi / 2)  # rad, the paper's one; nobody else is told
 ALIKE = World(
     name="alike",
@@ -57,9 +57,9 @@ class Job:
     iterations: int = 50
     beams: int = 622
     samples: int = 13_000  # of the paper's decoder
-    steps: int = learning.STEPS
+    steps: int = learning.GRADIENT_STEPS
     scans: int = 2000  # that the field is learned from
-    descent: Descent = PAPER
+    descent: Descent = PAPER_DESCENT
 
 
 def world_of(name: str) -> World:
@@ -69,10 +69,10 @@ def world_of(name: str) -> World:
 
 def scene_of(job: Job, *seed: int) -> Scene:
     """The job's world; places and scans are the same for every estimator."""
-    return Scene.of(world_of(job.world), job.beams, (job.seed, NUMBER, list(TITLES).index(job.world), *seed))
+    return Scene.of(world_of(job.world), job.beams, (job.seed, EXPERIMENT_ID, list(TITLES).index(job.world), *seed))
 
 
-def stands(scene: Scene, count: int) -> Array:
+def sample_places(scene: Scene, count: int) -> Array:
     """(count, 3) places at the one heading; among twins only such as give the very scan of their twin."""
     if scene.world.name != TWINS.name:
         poses = scene.poses(count)
@@ -92,8 +92,8 @@ def trial(job: Job) -> dict[str, Any]:
     """What the estimator learns and then believes at each place."""
     make = _maker(job)
     rows = []
-    for number, pose in enumerate(stands(scene_of(job, PLACES), job.places)):
-        scene = scene_of(job, SCANS, number)
+    for number, pose in enumerate(sample_places(scene_of(job, PLACES_SEED), job.places)):
+        scene = scene_of(job, SCANS_SEED, number)
         clean = scene.clean(pose[None])[0]
         estimator = make(number)
         posteriors = [estimator.update(scene.observe(clean, k / scene.scanner.rate)) for k in range(job.iterations)]
@@ -103,7 +103,7 @@ def trial(job: Job) -> dict[str, Any]:
 
 def _maker(job: Job) -> Callable[[int], Estimator]:
     """New estimators that know nothing but the world, learned here; by the place's number."""
-    scene = scene_of(job, LEARNING, ESTIMATORS.index(job.estimator))
+    scene = scene_of(job, LEARNING_SEED, ESTIMATORS.index(job.estimator))
     if job.estimator == "paper":
         decoder = learning.train_paper(scene, HEADING, job.samples, job.steps, job.seed)
         return lambda _: decoder.estimator(job.descent)
@@ -117,13 +117,13 @@ def _maker(job: Job) -> Callable[[int], Estimator]:
 def _row(pose: Array, posteriors: Sequence[Posterior], *, twins: bool) -> dict[str, Any]:
     """One place: errors and wrong claims after every scan, and at the end whether both of two like places are kept."""
     off = [round(float(np.hypot(*(p.pose - pose)[:2])), 6) for p in posteriors]
-    wrong = [int(p.state == "tracking" and error > FOUND) for p, error in zip(posteriors, off, strict=True)]
+    wrong = [int(p.state == "tracking" and error > FOUND_DISTANCE) for p, error in zip(posteriors, off, strict=True)]
     last = posteriors[-1]
     found = {"pose": pose.tolist(), "believed": last.pose.tolist(), "error_m": off, "wrong": wrong, "claim": last.state}
     if not twins:
         return found
     twin = twin_of(pose)
-    near = [any(np.hypot(*(h.pose - at)[:2]) < CLOSE for h in last.hypotheses) for at in (pose, twin)]
+    near = [any(np.hypot(*(h.pose - at)[:2]) < CLOSE_DISTANCE for h in last.hypotheses) for at in (pose, twin)]
     either = min(off[-1], float(np.hypot(*(last.pose - twin)[:2])))
     return {**found, "both_kept": int(last.state == "ambiguous" and all(near)), "either_error_m": round(either, 6)}
 
@@ -134,7 +134,7 @@ def summarise(row: dict[str, Any]) -> dict[str, Any]:
     errors, wrong = (np.array([place[name] for place in places]) for name in ("error_m", "wrong"))
     moments = [k for k in MOMENTS if k <= errors.shape[1]]
     found: dict[str, Any] = {"world": row["world"], "estimator": row["estimator"], "places": len(places)}
-    found |= {f"within_0.2_m_after_{k}": int((errors[:, k - 1] < CLOSE).sum()) for k in moments}
+    found |= {f"within_0.2_m_after_{k}": int((errors[:, k - 1] < CLOSE_DISTANCE).sum()) for k in moments}
     found |= {f"tracking_but_wrong_after_{k}": int(wrong[:, k - 1].sum()) for k in moments}
     found |= {
         "tracking_but_wrong_ever": int(wrong.any(axis=1).sum()),
@@ -145,7 +145,7 @@ def summarise(row: dict[str, Any]) -> dict[str, Any]:
     if "both_kept" in places[0]:
         either = np.array([place["either_error_m"] for place in places])
         found["both_kept"] = sum(place["both_kept"] for place in places)
-        found["at_either_within_0.2_m"] = int((either < CLOSE).sum())
+        found["at_either_within_0.2_m"] = int((either < CLOSE_DISTANCE).sum())
     return found
 
 
@@ -160,7 +160,7 @@ def run(job: Job, out: Path, workers: int, console: Console, worlds: Sequence[st
         errors = np.array([place["error_m"] for place in row["places"]])
         key = f"{row['world']}, {row['estimator']}"
         curves[f"{key} median m"] = np.median(errors, axis=0).tolist()
-        curves[f"{key} share within 0.2 m"] = (errors < CLOSE).mean(axis=0).tolist()
+        curves[f"{key} share within 0.2 m"] = (errors < CLOSE_DISTANCE).mean(axis=0).tolist()
     summary = {f"{row['world']}, {row['estimator']}": summarise(row) for row in rows}
     result = results.Result(
         "aliasing", "Similar objects", job.seed, asdict(job) | {"worlds": list(worlds)}, summary, curves, rows,
@@ -180,7 +180,7 @@ def draw(rows: Sequence[dict[str, Any]], summary: dict[str, dict[str, Any]]) -> 
         _map(left, world_of(name), own["paper"]["places"])
         left.set_title(TITLES[name])
         _bars(drawing.dress(right), {each: summary[f"{name}, {each}"] for each in own})
-    panels[0][1].set_title(f"belief within {CLOSE} m of the truth | claims at the end")
+    panels[0][1].set_title(f"belief within {CLOSE_DISTANCE} m of the truth | claims at the end")
     drawing.legend_below(figure, *panels[0])
     return figure
 
@@ -189,7 +189,7 @@ def _map(axes: Axes, world: World, places: Sequence[dict[str, Any]]) -> None:
     """Walls, furniture, true places, and lines to where the belief ended where that is somewhere else."""
     drawing.world_map(axes, world)
     true, believed = (np.array([place[key] for place in places])[:, :2] for key in ("pose", "believed"))
-    off = np.hypot(*(believed - true).T) > FOUND
+    off = np.hypot(*(believed - true).T) > FOUND_DISTANCE
     for a, b in zip(true[off], believed[off], strict=True):
         axes.plot(*np.array([a, b]).T, color=drawing.COLOURS["paper"], linewidth=1)
     axes.plot(*true.T, ".", color="#222222", markersize=5, label="true place")
@@ -210,7 +210,7 @@ def _bars(axes: Axes, summary: dict[str, dict[str, Any]]) -> None:
     ]
     good = len(asked)
     last = max(int(name.rsplit("_", 1)[1]) for name in one if name.startswith("within"))
-    asked.append((f"says: here, but\n> {FOUND} m off", f"tracking_but_wrong_after_{last}"))
+    asked.append((f"says: here, but\n> {FOUND_DISTANCE} m off", f"tracking_but_wrong_after_{last}"))
     if "both_kept" in one:
         asked.append(("says: one of\nthese two", "both_kept"))
     at, width = np.arange(len(asked)) + 0.35 * (np.arange(len(asked)) >= good), 0.8 / len(summary)

@@ -17,7 +17,7 @@ from presage.plotting import style as drawing
 from services.estimator.paper.perception import Descent
 
 ALPHAS = (2e-4, 5e-4, 1e-3, 2e-3, 3e-3, 4e-3, 6e-3, 1e-2, 2e-2)  # m²
-STEPS = (1, 10)  # gradient steps a scan: the paper's, and the service's default
+STEPS_PER_SCAN = (1, 10)  # gradient steps a scan: the paper's, and the service's default
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def run(
     job: localisation.Job, trials: int, out: Path, workers: int, console: Console, alphas: tuple[float, ...] = ALPHAS
 ) -> results.Result:
     """All step sizes at the places of E1; writes alpha.json, .csv, .pdf and .png into ``out``."""
-    grid = [(steps, alpha) for steps in STEPS for alpha in alphas]
+    grid = [(steps, alpha) for steps in STEPS_PER_SCAN for alpha in alphas]
     jobs = [Job(alpha, steps, replace(job, index=k)) for steps, alpha in grid for k in range(trials)]
     rows = run_trials("alpha", trial, jobs, out, workers, console)
     summary: dict[str, dict[str, Any]] = {}
@@ -49,10 +49,10 @@ def run(
         summary[f"{alpha:g} m², {steps} a scan"] = {"alpha_m2": alpha, "steps_a_scan": steps, **found}
     columns = ("alpha_m2", "steps_a_scan", "final_error_mean_m", "final_error_median_m", "found_within_0.2_m")
     curves = {name: [row[name] for row in summary.values()] for name in columns}
-    parameters = {"alphas": alphas, "steps": STEPS, "trials": trials, "e1": asdict(job)}
+    parameters = {"alphas": alphas, "steps": STEPS_PER_SCAN, "trials": trials, "e1": asdict(job)}
     result = results.Result(
         "alpha", "Step size of the paper's perception", job.seed, parameters, summary, curves,
-        notes=[f"best with {steps} a scan: {best(summary, steps):g} m² (most within 0.2 m)" for steps in STEPS],
+        notes=[f"best with {steps} a scan: {best(summary, steps):g} m² (most within 0.2 m)" for steps in STEPS_PER_SCAN],
     )  # fmt: skip
     result.write(out, draw(summary, trials))
     return result
@@ -67,7 +67,7 @@ def best(summary: dict[str, dict[str, Any]], steps: int) -> float:
 def draw(summary: dict[str, dict[str, Any]], trials: int) -> Figure:
     """Share found, and median error, against alpha."""
     figure, (share, error) = drawing.figure_of(2, height=3.6)
-    for steps, colour, mark in zip(STEPS, (drawing.COLOURS["paper"], drawing.COLOURS["precise"]), "os", strict=True):
+    for steps, colour, mark in zip(STEPS_PER_SCAN, (drawing.COLOURS["paper"], drawing.COLOURS["precise"]), "os", strict=True):
         own = [row for row in summary.values() if row["steps_a_scan"] == steps]
         alphas = [row["alpha_m2"] for row in own]
         for limit, style in (("0.5", "--"), ("0.2", "-")):

@@ -19,22 +19,22 @@ from rich.console import Console
 from common.geometry.se2 import Array
 from lab.accuracy import bound
 from lab.experiments import results
-from lab.experiments.estimators import PAPER, STEPS, Field, enter, knows_heading
+from lab.experiments.estimators import PAPER_DESCENT, TEN_STEPS, ExperimentWorld, create_estimator, knows_heading
 from lab.experiments.trials import run_trials
 from presage.plotting import style as drawing
 from services.estimator.paper.perception import Descent
 
-NUMBER = 1  # of the experiment, in its seeds
+EXPERIMENT_ID = 1  # of the experiment, in its seeds
 ESTIMATORS = (
     "paper",
-    f"paper, {STEPS}",
+    f"paper, {TEN_STEPS}",
     "precise",
     "particle-filter",
     "particle-filter, heading known",
     "amcl-defaults",
 )
-FOUND = 0.5  # m
-CLOSE = 0.2  # m
+FOUND_DISTANCE = 0.5  # m
+CLOSE_DISTANCE = 0.2  # m
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,13 @@ class Job:
     seed: int
     iterations: int
     estimators: tuple[str, ...] = ESTIMATORS
-    field: Field = Field()  # noqa: RUF009 - frozen
-    descent: Descent = PAPER
+    field: ExperimentWorld = ExperimentWorld()  # noqa: RUF009 - frozen
+    descent: Descent = PAPER_DESCENT
 
 
 def trial(job: Job) -> dict[str, Any]:
     """Errors in m after each iteration, and what was claimed at the end, by estimator; the bound beside them."""
-    scene = job.field.scene(job.seed, NUMBER, job.index)
+    scene = job.field.scene(job.seed, EXPERIMENT_ID, job.index)
     pose = scene.poses(1)[0]
     pose[2] = job.field.heading
     clean = scene.clean(pose[None])[0]
@@ -62,7 +62,7 @@ def trial(job: Job) -> dict[str, Any]:
         "error_m": {}, "claim": {},
     }  # fmt: skip
     for name in job.estimators:
-        estimator = enter(name, job.field, scene, job.seed * 100_003 + job.index, job.descent)
+        estimator = create_estimator(name, job.field, scene, job.seed * 100_003 + job.index, job.descent)
         posteriors = [estimator.update(scan) for scan in scans]
         found["error_m"][name] = [round(float(np.hypot(*(p.pose - pose)[:2])), 6) for p in posteriors]
         found["claim"][name] = posteriors[-1].state
@@ -76,7 +76,7 @@ def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
     last, claims = errors[:, -1], [each["claim"][name] == "tracking" for each in trials]
     front = np.array([each["in_front"] for each in trials], bool)
     # Iterations until it is close and stays so; those that never are have none.
-    far = errors >= CLOSE
+    far = errors >= CLOSE_DISTANCE
     until = np.array([np.inf if row[-1] else (np.flatnonzero(row)[-1] + 2 if row.any() else 1) for row in far])
     return {
         "trials": len(trials),
@@ -87,17 +87,17 @@ def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
         "final_error_rms_m": float(np.sqrt(np.mean(last**2))),
         "final_rms_over_bound": float(np.sqrt(np.mean(last**2) / np.mean(bound.position(limit) ** 2))),
         "final_median_over_bound": float(np.median(last)) / bound.median(limit),
-        "found_within_0.5_m": int((last < FOUND).sum()),
-        "found_within_0.2_m": int((last < CLOSE).sum()),
+        "found_within_0.5_m": int((last < FOUND_DISTANCE).sum()),
+        "found_within_0.2_m": int((last < CLOSE_DISTANCE).sum()),
         "first_scan_error_median_m": float(np.median(errors[:, 0])),
         "iterations_to_0.2_m_median": float(np.median(until)) if np.isfinite(np.median(until)) else None,
         "places_in_front": int(front.sum()),
-        "in_front_within_0.5_m": int((last[front] < FOUND).sum()),
+        "in_front_within_0.5_m": int((last[front] < FOUND_DISTANCE).sum()),
         "in_front_error_mean_m": float(last[front].mean()) if front.any() else None,
         "in_front_error_std_m": float(last[front].std()) if front.any() else None,
         "in_front_error_median_m": float(np.median(last[front])) if front.any() else None,
         "claimed_tracking": int(np.sum(claims)),
-        "claimed_tracking_but_wrong": int(np.sum(np.array(claims) & (last >= FOUND))),
+        "claimed_tracking_but_wrong": int(np.sum(np.array(claims) & (last >= FOUND_DISTANCE))),
     }
 
 

@@ -23,20 +23,27 @@ from common.robot.base import Robot
 from lab.accuracy import bound
 from lab.accuracy.scenes import Scene
 from lab.experiments import results
-from lab.experiments.estimators import PAPER, STEPS, Field, enter, knows_heading, uses_odometry
+from lab.experiments.estimators import (
+    PAPER_DESCENT,
+    TEN_STEPS,
+    ExperimentWorld,
+    create_estimator,
+    knows_heading,
+    uses_odometry,
+)
 from lab.experiments.trials import run_trials
 from presage.plotting import style as drawing
 from services.estimator.paper.perception import Descent
 from services.simulator.odometry import Drift, Odometer
 
-NUMBER = 2  # of the experiment, in its seeds
+EXPERIMENT_ID = 2  # of the experiment, in its seeds
 ESTIMATORS = (
-    "paper", f"paper, {STEPS}", "precise", "particle-filter", "particle-filter, heading known",
+    "paper", f"paper, {TEN_STEPS}", "precise", "particle-filter", "particle-filter, heading known",
     "amcl-defaults", "precise, odometry", "particle-filter, odometry", "amcl-defaults, odometry",
 )  # fmt: skip
-START = np.diag([0.01, 0.01, 0.01])  # covariance of what is known of the start: 10 cm, 6 degrees
-LOST = 0.5  # m
-BOUNDS = ("one scan", "one scan, heading known", "all scans, odometry")
+START_COVARIANCE = np.diag([0.01, 0.01, 0.01])  # covariance of what is known of the start: 10 cm, 6 degrees
+LOST_DISTANCE = 0.5  # m
+BOUND_NAMES = ("one scan", "one scan, heading known", "all scans, odometry")
 MARGIN = 0.1  # m, between the robot and anything
 
 
@@ -48,13 +55,13 @@ class Job:
     seed: int
     step: float = 0.05  # m, of each teleport
     estimators: tuple[str, ...] = ESTIMATORS
-    field: Field = Field()  # noqa: RUF009 - frozen
-    descent: Descent = PAPER
+    field: ExperimentWorld = ExperimentWorld()  # noqa: RUF009 - frozen
+    descent: Descent = PAPER_DESCENT
 
 
 def bound_of(name: str) -> str:
-    """Which of `BOUNDS` is this estimator's: those without odometry cannot tell how far they were carried."""
-    return BOUNDS[2] if uses_odometry(name) else BOUNDS[knows_heading(name)]
+    """Which of `BOUND_NAMES` is this estimator's: those without odometry cannot tell how far they were carried."""
+    return BOUND_NAMES[2] if uses_odometry(name) else BOUND_NAMES[knows_heading(name)]
 
 
 def path_of(scene: Scene, heading: float, step: float) -> Array:
@@ -71,27 +78,27 @@ def path_of(scene: Scene, heading: float, step: float) -> Array:
 
 def trial(job: Job) -> dict[str, Any]:
     """Errors in m at each scan, by estimator."""
-    scene = job.field.scene(job.seed, NUMBER, job.index)
+    scene = job.field.scene(job.seed, EXPERIMENT_ID, job.index)
     path = path_of(scene, job.field.heading, job.step)
-    odometer, scans = Odometer(Drift(), np.random.default_rng((job.seed, NUMBER, job.index, 1))), []
+    odometer, scans = Odometer(Drift(), np.random.default_rng((job.seed, EXPERIMENT_ID, job.index, 1))), []
     for k, clean in enumerate(scene.clean(path)):
         if k:
             odometer.move(path[k - 1], path[k])
         scans.append(scene.observe(clean, k / scene.scanner.rate, odometer.pose.copy()))
     found: dict[str, Any] = {"y": float(path[0, 1]), "error_m": {}, "lost": {}}
     one = bound.single(scene, path)
-    limits = one, bound.heading_known(one), bound.recursive(scene, path, Drift(), START)
+    limits = one, bound.heading_known(one), bound.recursive(scene, path, Drift(), START_COVARIANCE)
     found["bound_m"] = {
-        name: np.round(bound.position(each), 7).tolist() for name, each in zip(BOUNDS, limits, strict=True)
+        name: np.round(bound.position(each), 7).tolist() for name, each in zip(BOUND_NAMES, limits, strict=True)
     }
     for name in job.estimators:
-        estimator = enter(name, job.field, scene, job.seed * 100_003 + job.index, job.descent)
-        estimator.restart(path[0], START)
-        told = scans if uses_odometry(name) else [replace(scan, odom=None) for scan in scans]
-        poses = np.array([estimator.update(scan).pose for scan in told])
+        estimator = create_estimator(name, job.field, scene, job.seed * 100_003 + job.index, job.descent)
+        estimator.restart(path[0], START_COVARIANCE)
+        with_odometry = scans if uses_odometry(name) else [replace(scan, odom=None) for scan in scans]
+        poses = np.array([estimator.update(scan).pose for scan in with_odometry])
         error = np.hypot(*(poses - path)[:, :2].T)
         found["error_m"][name] = np.round(error, 6).tolist()
-        found["lost"][name] = bool((error > LOST).any())
+        found["lost"][name] = bool((error > LOST_DISTANCE).any())
     return found
 
 
@@ -116,14 +123,14 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
     """All crossings; writes e2.json, .csv, .pdf and .png into ``out``."""
     jobs = [replace(job, index=index) for index in range(trials)]
     rows = run_trials("e2", trial, jobs, out, workers, console)
-    scans = len(rows[0]["bound_m"][BOUNDS[0]])
+    scans = len(rows[0]["bound_m"][BOUND_NAMES[0]])
     scanner = job.field.scene(job.seed).scanner
     curves: dict[str, list[Any]] = {"time s": [round(k / scanner.rate, 6) for k in range(scans)]}
     curves |= results.curves_of(rows, job.estimators)
     for name in job.estimators:
         curves[f"{name} RMS m"] = _rms([row["error_m"][name] for row in rows])
     parameters = asdict(job) | {"trials": trials}
-    for name in BOUNDS:
+    for name in BOUND_NAMES:
         limits = [row["bound_m"][name] for row in rows]
         curves[f"bound, {name} RMS m"] = _rms(limits)
         parameters[f"bound, {name}, rms_m"] = float(np.sqrt(np.mean(np.square(limits))))
@@ -143,9 +150,9 @@ def _rms(rows: Sequence[Sequence[float]]) -> list[float]:
 def draw(names: Sequence[str], curves: dict[str, list[Any]]) -> Figure:
     """Error over time, root mean square over the crossings as the bounds are; without odometry, and with it."""
     figure, panels = drawing.figure_of(2)
-    told = [name for name in names if uses_odometry(name)]
-    groups = [name for name in names if name not in told], told
-    titles, limits = ("laser alone", "with odometry that drifts"), (BOUNDS[:2], BOUNDS[2:])
+    with_odometry = [name for name in names if uses_odometry(name)]
+    groups = [name for name in names if name not in with_odometry], with_odometry
+    titles, limits = ("laser alone", "with odometry that drifts"), (BOUND_NAMES[:2], BOUND_NAMES[2:])
     for axes, group, title, lines in zip(panels, groups, titles, limits, strict=True):
         for name in group:
             drawing.line(axes, curves["time s"], curves[f"{name} RMS m"], name)

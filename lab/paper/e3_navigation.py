@@ -21,17 +21,25 @@ from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from common.robot.base import Robot
 from lab.experiments import results
-from lab.experiments.estimators import PAPER, STEPS, Field, uses_odometry
-from lab.experiments.journeys import APART, CLEARANCE, CLOSE, Journey, draw_journey, least_time, path_ratio
-from lab.experiments.lockstep import Errand, Track, session
-from lab.experiments.lockstep import run as run_errand
+from lab.experiments.estimators import PAPER_DESCENT, TEN_STEPS, ExperimentWorld, uses_odometry
+from lab.experiments.journeys import (
+    ARRIVAL_DISTANCE,
+    CLEARANCE,
+    MIN_DISTANCE,
+    Journey,
+    draw_journey,
+    least_time,
+    path_ratio,
+)
+from lab.experiments.lockstep import LockstepRun, RunTrace, session
+from lab.experiments.lockstep import run as run_in_lockstep
 from lab.experiments.trials import run_trials
 from presage.plotting import style as drawing
 from presage.session.stack import Stack
 from services.estimator.paper.perception import Descent
 
-NUMBER = 3  # of the experiment, in its seeds
-ESTIMATORS = (f"paper, {STEPS}", "precise", "particle-filter")
+EXPERIMENT_ID = 3  # of the experiment, in its seeds
+ESTIMATORS = (f"paper, {TEN_STEPS}", "precise", "particle-filter")
 
 
 @dataclass(frozen=True)
@@ -40,18 +48,18 @@ class Job:
 
     index: int
     seed: int
-    apart: float = APART  # m, between start and goal at least
+    apart: float = MIN_DISTANCE  # m, between start and goal at least
     limit: int = 900  # iterations after which a trial is given up: one minute
     free: bool = True  # only pairs with a free straight line between them
     estimators: tuple[str, ...] = ESTIMATORS
-    field: Field = Field()  # noqa: RUF009 - frozen
-    descent: Descent = PAPER  # of estimator `paper` alone
+    field: ExperimentWorld = ExperimentWorld()  # noqa: RUF009 - frozen
+    descent: Descent = PAPER_DESCENT  # of estimator `paper` alone
 
 
 def arguments(name: str, descent: Descent) -> tuple[str, ...]:
     """Of the estimator's command line, by its name in the figures."""
     kind, _, how = name.partition(", ")
-    if how not in ("", "odometry", STEPS):
+    if how not in ("", "odometry", TEN_STEPS):
         raise UserError(f"estimator {name!r} is none that runs as a service: choose others for e3")
     steps = ("--alpha", repr(descent.alpha), "--iterations", str(descent.iterations)) if name == "paper" else ()
     return ("--estimator", kind, *(("--prior", "odometry") if uses_odometry(name) else ()), *steps)
@@ -61,39 +69,39 @@ def trial(job: Job) -> dict[str, Any]:
     """One journey; by estimator what became of it, m and s."""
     world = load_world(job.field.world)
     journey = draw_journey(
-        world, np.random.default_rng((job.seed, NUMBER, job.index)), Robot(), job.apart, free=job.free
+        world, np.random.default_rng((job.seed, EXPERIMENT_ID, job.index)), Robot(), job.apart, free=job.free
     )
     found: dict[str, Any] = asdict(journey) | {"straight_m": journey.straight, "estimators": {}}
     found["least_s"] = least_time(journey.straight, Robot())
     seed = (job.seed * 100_003 + job.index) % 2**31
     with session() as stack:
         for name in job.estimators:
-            errand = Errand(
+            lockstep_run = LockstepRun(
                 journey, job.field.heading, job.field.world, job.field.beams, seed, arguments(name, job.descent),
                 job.limit,
             )  # fmt: skip
-            found["estimators"][name] = _run(errand, stack)
+            found["estimators"][name] = _run(lockstep_run, stack)
     return found
 
 
-def _run(errand: Errand, stack: Stack) -> dict[str, Any]:
-    return measure(run_errand(errand, stack), errand.journey)
+def _run(lockstep_run: LockstepRun, stack: Stack) -> dict[str, Any]:
+    return measure(run_in_lockstep(lockstep_run, stack), lockstep_run.journey)
 
 
-def measure(track: Track, journey: Journey) -> dict[str, Any]:
+def measure(trace: RunTrace, journey: Journey) -> dict[str, Any]:
     """One run in numbers; what stands in lists has one entry an iteration, the first before any motion."""
-    path = track.path()
+    path = trace.path()
     away = np.hypot(*(path[:, :2] - np.array(journey.goal)).T)
-    error = np.hypot(*(track.believed() - path)[:, :2].T)
-    seconds = track.truths[-1].stamp_ns * 1e-9
+    error = np.hypot(*(trace.believed() - path)[:, :2].T)
+    seconds = trace.truths[-1].stamp_ns * 1e-9
     return {
-        "reached": bool(away[-1] <= CLOSE),
+        "reached": bool(away[-1] <= ARRIVAL_DISTANCE),
         "iterations": len(path) - 1,
         "seconds": seconds,
         "time_over_least": seconds / least_time(journey.straight, Robot()),
         "path_over_straight": path_ratio(path),
-        "contacts": sum(truth.contact for truth in track.truths),
-        "held_back": sum(truth.stopped for truth in track.truths),  # by the obstacle stop
+        "contacts": sum(truth.contact for truth in trace.truths),
+        "held_back": sum(truth.stopped for truth in trace.truths),  # by the obstacle stop
         "distance_m": np.round(away, 6).tolist(),
         "error_m": np.round(error, 6).tolist(),
         "x_m": np.round(path[:, 0], 4).tolist(),
@@ -144,7 +152,7 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
     straight = [row["straight_m"] for row in rows]
     drawn = {name: sum(row[name] for row in rows) for name in ("too_near", "obstructed")}
     parameters = asdict(job) | {
-        "trials": trials, "close_m": CLOSE, "clearance_m": CLEARANCE, "robot": Robot().model_dump(),
+        "trials": trials, "close_m": ARRIVAL_DISTANCE, "clearance_m": CLEARANCE, "robot": Robot().model_dump(),
         "straight_mean_m": float(np.mean(straight)), "straight_max_m": float(np.max(straight)),
         "pairs_redrawn_too_near": drawn["too_near"], "pairs_redrawn_obstructed": drawn["obstructed"],
     }  # fmt: skip
@@ -183,8 +191,8 @@ def draw(rows: Sequence[dict[str, Any]], job: Job) -> Figure:
             drawing.band(axes, range(values.shape[1]), values, name, colour)
             if name == "precise" and axes is left:  # wide, for another that drives as fast may lie upon it
                 axes.lines[-1].set(linewidth=3.2, zorder=1.5)
-    left.axhline(CLOSE, linestyle="--", color=drawing.BOUND, linewidth=1)
-    left.annotate(f"{CLOSE:g} m: there", (1, CLOSE), (4, 4), textcoords="offset points", fontsize=9)
+    left.axhline(ARRIVAL_DISTANCE, linestyle="--", color=drawing.BOUND, linewidth=1)
+    left.annotate(f"{ARRIVAL_DISTANCE:g} m: there", (1, ARRIVAL_DISTANCE), (4, 4), textcoords="offset points", fontsize=9)
     left.set(xlabel="iteration (one scan, 1/15 s)", ylabel="distance to the goal (m)", ylim=(0, None))
     right.set(xlabel="iteration", ylabel="position error of the belief (m)")
     drawing.log_metres(right)
@@ -200,7 +208,7 @@ def draw(rows: Sequence[dict[str, Any]], job: Job) -> Figure:
         below.plot(one["x_m"], one["y_m"], color=drawing.GOAL, linewidth=0.7, alpha=0.7)
         below.plot(*row["start"], "o", color="black", markersize=2.5)
         below.plot(*row["goal"], "x", color=drawing.PREDICTED, markersize=4)
-    below.set(title=f"true paths with {name}: from dots to crosses, until within {CLOSE:g} m")
+    below.set(title=f"true paths with {name}: from dots to crosses, until within {ARRIVAL_DISTANCE:g} m")
     drawing.legend_below(figure, left)
     return figure
 

@@ -21,7 +21,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from lab.accuracy.scenes import ROBOT, Scene
 from lab.experiments import results
-from lab.experiments.estimators import Field
+from lab.experiments.estimators import ExperimentWorld
 from lab.experiments.trials import run_trials
 from presage.plotting import style as drawing
 from services.estimator.paper import weights as paper_weights
@@ -29,15 +29,15 @@ from services.estimator.paper.decoder import use_one_core
 from services.estimator.paper.training import usable_ranges
 from services.estimator.precise.learning import weights as precise_weights
 
-NUMBER = 6  # of the experiment, in its seeds
-SAMPLE, TEST = 0, 1  # in the seeds
+EXPERIMENT_ID = 6  # of the experiment, in its seeds
+SAMPLE_SEED, TEST_SEED = 0, 1  # in the seeds
 PAPER_SIGMA = 1.0  # m, the paper's Σ_o
-FACTORS = tuple(np.round(np.arange(0.25, 4.01, 0.25), 2).tolist())  # of the stated deviation
+SIGMA_FACTORS = tuple(np.round(np.arange(0.25, 4.01, 0.25), 2).tolist())  # of the stated deviation
 GAUSSIAN = {1: 0.6827, 2: 0.9545, 3: 0.9973}  # share within so many deviations
-UNSURE = float(np.sqrt(2))  # times the scanner's noise: of such beams the model says that its own error m is the larger
-FEET = 0.3  # m that the sample's robot keeps from the line of the objects
-FAR = 0.1  # m
-NAMES = ("paper", "precise")
+IMPRECISE_FACTOR = float(np.sqrt(2))  # times the scanner's noise: of such beams the model says that its own error m is the larger
+FRONT_MARGIN = 0.3  # m that the sample's robot keeps from the line of the objects
+FAR_RESIDUAL = 0.1  # m
+ESTIMATORS = ("paper", "precise")
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,13 @@ class Job:
 
     seed: int
     scans: int = 500
-    field: Field = Field()  # noqa: RUF009 - frozen
+    field: ExperimentWorld = ExperimentWorld()  # noqa: RUF009 - frozen
 
 
 def trial(job: Job) -> dict[str, Any]:
     """The sample as measured and as each expects it; shares of beams within the stated deviation's multiples."""
     use_one_core()
-    sample, test = (job.field.scene(job.seed, NUMBER, part) for part in (SAMPLE, TEST))
+    sample, test = (job.field.scene(job.seed, EXPERIMENT_ID, part) for part in (SAMPLE_SEED, TEST_SEED))
     pose = in_front(job.field, sample)
     noisy = sample.observe(sample.clean(pose[None])[0], 0.0).ranges
     found: dict[str, Any] = {
@@ -60,7 +60,7 @@ def trial(job: Job) -> dict[str, Any]:
     }  # fmt: skip
     poses = test.poses(job.scans)
     clean = test.clean(poses)
-    for name in NAMES:
+    for name in ESTIMATORS:
         own = poses.copy()
         if name == "paper":  # knows but one heading
             own[:, 2] = job.field.heading
@@ -68,7 +68,7 @@ def trial(job: Job) -> dict[str, Any]:
         ranges = ranges + test.scanner.sigma * test.rng.standard_normal(ranges.shape)
         expected, sigma = _expected(name, job.field, test, own)
         error = np.abs(usable_ranges(test.scanner.limit(ranges), test.scanner.range_max) - expected)
-        unsure = sigma > UNSURE * test.scanner.sigma
+        unsure = sigma > IMPRECISE_FACTOR * test.scanner.sigma
         one, deviation = _expected(name, job.field, sample, pose[None])
         found["models"][name] = {
             "expected_m": one[0].tolist(), "sigma_m": deviation[0].tolist(), "beams": error.size,
@@ -83,17 +83,17 @@ def trial(job: Job) -> dict[str, Any]:
 
 def _shares(error: Array, sigma: Array) -> dict[str, float]:
     """Of absolute errors within so many deviations; of none, none."""
-    return {f"{k:g}": float((error <= k * sigma).mean()) for k in FACTORS} if error.size else {}
+    return {f"{k:g}": float((error <= k * sigma).mean()) for k in SIGMA_FACTORS} if error.size else {}
 
 
-def in_front(field: Field, scene: Scene) -> Array:
+def in_front(field: ExperimentWorld, scene: Scene) -> Array:
     """(3,) at random between the bare wall and the objects; anywhere where there are none."""
     places = scene.world.sample_free(1000, scene.rng, ROBOT.radius)
-    front = places[places[:, 1] < field.front() - FEET]
+    front = places[places[:, 1] < field.front() - FRONT_MARGIN]
     return np.array([*(front if len(front) else places)[0], field.heading])
 
 
-def _expected(name: str, field: Field, scene: Scene, poses: Array) -> tuple[Array, Array]:
+def _expected(name: str, field: ExperimentWorld, scene: Scene, poses: Array) -> tuple[Array, Array]:
     """Ranges (N, B) m and the stated deviation of what is measured, m; from the shipped weights."""
     if name == "paper":
         path = paper_weights.find(paper_weights.FOLDER, scene.world.name, "paper", scene.scanner.beams)
@@ -137,7 +137,7 @@ def draw(result: results.Result) -> Figure:
     bottoms = [drawing.dress(figure.add_subplot(grid[1, k], sharex=tops[k])) for k in range(2)]
     angle, measured = np.rad2deg(row["angle_rad"]), np.array(row["measured_m"])
     titles = {"paper": "paper: states no precision (Σ_o = 1)", "precise": "precise: states ± 2σ of every beam"}
-    for name, top, bottom in zip(NAMES, tops, bottoms, strict=True):
+    for name, top, bottom in zip(ESTIMATORS, tops, bottoms, strict=True):
         found = row["models"][name]
         expected, sigma = np.array(found["expected_m"]), np.array(found["sigma_m"])
         top.plot(angle, measured, ".", color=drawing.MEASURED, markersize=3.5, label="measured")
@@ -146,8 +146,8 @@ def draw(result: results.Result) -> Figure:
         if name == "precise":
             _band(top, angle, expected, sigma)
             _band(bottom, angle, np.zeros_like(expected), sigma)
-        share = float((np.abs(measured - expected) > FAR).mean())
-        bottom.text(0.99, 0.97, f"{share:.1%} of beams > {FAR} m off", transform=bottom.transAxes, ha="right", va="top")
+        share = float((np.abs(measured - expected) > FAR_RESIDUAL).mean())
+        bottom.text(0.99, 0.97, f"{share:.1%} of beams > {FAR_RESIDUAL} m off", transform=bottom.transAxes, ha="right", va="top")
         bottom.axhline(0, color=drawing.PREDICTED, linewidth=1)
         bottom.set_yscale("symlog", linthresh=0.1, linscale=1.5)
         limit = 4 * max(1.0, *(np.abs(measured - np.array(m["expected_m"])).max() for m in row["models"].values()))
@@ -173,7 +173,7 @@ def _band(axes: Axes, angle: Array, middle: Array, sigma: Array) -> None:
 
 def _calibration(axes: Axes, found: dict[str, Any], scans: int) -> None:
     """Share of beams within k stated deviations, against the Gaussian's."""
-    factors = np.array(FACTORS)
+    factors = np.array(SIGMA_FACTORS)
     axes.plot(factors, _gaussian(factors), "-", color=drawing.BOUND, label="Gaussian: a true statement")
     unsure = f"{found['unsure_share']:.1%} of beams: m > σ"
     for key, colour, mark, label in (

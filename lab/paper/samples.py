@@ -21,17 +21,17 @@ from lab.accuracy import bound
 from lab.accuracy.scenes import Scene
 from lab.experiments import model_training as learning
 from lab.experiments import results
-from lab.experiments.estimators import PAPER, Field
+from lab.experiments.estimators import PAPER_DESCENT, ExperimentWorld
 from lab.experiments.trials import run_trials
-from lab.paper.e1_localisation import CLOSE
+from lab.paper.e1_localisation import CLOSE_DISTANCE
 from presage.plotting import style as drawing
 from services.estimator.paper.perception import Descent
 from services.estimator.shared.interface import Estimator
 
-NUMBER = 4  # of the experiment, in its seeds
+EXPERIMENT_ID = 4  # of the experiment, in its seeds
 SIZES = (100, 500, 1000, 2000, 5000, 13_000)
 ESTIMATORS = ("paper", "precise")
-SHARED, LEARNING = 0, 1  # in the seeds: what all sizes are judged on, and what each learns from
+SHARED_SEED, LEARNING_SEED = 0, 1  # in the seeds: what all sizes are judged on, and what each learns from
 
 
 @dataclass(frozen=True)
@@ -41,18 +41,18 @@ class Job:
     seed: int
     estimator: str = "paper"
     samples: int = SIZES[-1]
-    steps: int = learning.STEPS  # of the paper's decoder
+    steps: int = learning.GRADIENT_STEPS  # of the paper's decoder
     places: int = 50
     iterations: int = 50  # scans, of the paper's descent; precise gets one
     held_out: int = 1000  # scans without noise
-    field: Field = Field()  # noqa: RUF009 - frozen
-    descent: Descent = PAPER
+    field: ExperimentWorld = ExperimentWorld()  # noqa: RUF009 - frozen
+    descent: Descent = PAPER_DESCENT
 
 
 def trial(job: Job) -> dict[str, Any]:
     """Error of the ranges expected, and of the pose found with them."""
-    learner = job.field.scene(job.seed, NUMBER, LEARNING, ESTIMATORS.index(job.estimator), job.samples)
-    judge = job.field.scene(job.seed, NUMBER, SHARED)
+    learner = job.field.scene(job.seed, EXPERIMENT_ID, LEARNING_SEED, ESTIMATORS.index(job.estimator), job.samples)
+    judge = job.field.scene(job.seed, EXPERIMENT_ID, SHARED_SEED)
     make: Callable[[], Estimator]
     if job.estimator == "paper":
         decoder = learning.train_paper(learner, job.field.heading, job.samples, job.steps, job.seed)
@@ -62,7 +62,7 @@ def trial(job: Job) -> dict[str, Any]:
         found = learning.learn_precise(learner, job.samples)
         model, steps, seconds = found.model, None, found.learning_s  # type: ignore[assignment]
         make, scans = (lambda: found.estimator(judge)), 1
-    held_out = learning.posed(judge, job.held_out, job.field.heading, noise=False)
+    held_out = learning.sample_scans(judge, job.held_out, job.field.heading, noise=False)
     ranges = learning.range_errors(model, judge, held_out)
     poses = judge.poses(job.places)
     poses[:, 2] = job.field.heading
@@ -93,7 +93,7 @@ def summarise(row: dict[str, Any]) -> dict[str, Any]:
         "position_error_mean_m": float(errors.mean()),
         "position_error_median_m": float(np.median(errors)),
         "position_error_max_m": float(errors.max()),
-        "found_within_0.2_m": int((errors < CLOSE).sum()),
+        "found_within_0.2_m": int((errors < CLOSE_DISTANCE).sum()),
     }
 
 
@@ -111,7 +111,7 @@ def run(job: Job, out: Path, workers: int, console: Console, sizes: Sequence[int
         for name, row in summary.items() if row["range_error_mean_m"] > 0.9 * row["same_scan_everywhere_m"]
     ]  # fmt: skip
     reading = (
-        f"paper: {job.steps} gradient steps (batches of {learning.BATCH}) from any number of samples; 520 are 20 "
+        f"paper: {job.steps} gradient steps (batches of {learning.BATCH_SIZE}) from any number of samples; 520 are 20 "
         'epochs of 13 000, our reading of its "20 batches of 500 samples"'
     )
     result = results.Result(
@@ -143,7 +143,7 @@ def draw(result: results.Result) -> Figure:
     limit = next(iter(result.summary.values()))["bound_median_m"]
     right.axhline(limit, color=drawing.BOUND, linestyle=":", linewidth=1.4, label="Cramér-Rao bound of 1 scan, median")
     left.set(ylabel="range error (m)", title=f"expected ranges, {result.parameters['held_out']} held-out scans")
-    right.set(ylabel="median position error (m)", title=f"position; numbers: share of places within {CLOSE} m")
+    right.set(ylabel="median position error (m)", title=f"position; numbers: share of places within {CLOSE_DISTANCE} m")
     for axes in (left, right):
         _decades(axes, curves["samples"])
         low, high = axes.get_ylim()

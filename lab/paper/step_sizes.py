@@ -25,14 +25,14 @@ from common.geometry.world import World
 from common.messages.definitions import Belief, Goal, Pose
 from common.robot.base import Robot
 from lab.experiments import results
-from lab.experiments.estimators import Field
-from lab.experiments.journeys import CLOSE, Journey, draw_journey, least_time
+from lab.experiments.estimators import ExperimentWorld
+from lab.experiments.journeys import ARRIVAL_DISTANCE, Journey, draw_journey, least_time
 from lab.experiments.trials import run_trials
 from lab.paper import e3_navigation as navigation
 from lab.paper.teleports import Steps, travel
 from presage.plotting import style as drawing
 from services.controller.navigator import Navigator
-from services.controller.policies.paper_action import Preference
+from services.controller.policies.paper_action import ActionParameters
 from services.estimator.paper import weights
 from services.estimator.paper.decoder import PaperModel, use_one_core
 from services.estimator.paper.estimator import PaperPerception
@@ -40,14 +40,14 @@ from services.estimator.paper.perception import Descent
 from services.estimator.paper.training import usable_ranges
 from services.estimator.shared.interface import Observation
 
-NUMBER = 5  # of the experiment, in its seeds; the journeys are E3's
-PAPERS = 12.5  # iterations, the paper's mean over 50 trials
+EXPERIMENT_ID = 5  # of the experiment, in its seeds; the journeys are E3's
+PAPER_ITERATIONS = 12.5  # iterations, the paper's mean over 50 trials
 ALPHA = 2e-3  # m² along x, in the network's own coordinates: the largest with which the belief does not swing
 GAMMAS = (1e-3, 2e-3, 3e-3, 5e-3, 8e-3)  # m²
 BETAS = (0.3, 1.0, 3.0)
 SUMS = (1e-4, 3e-4, 1e-3)
 VELOCITY_GAMMAS, VELOCITY_BETAS = (0.05, 0.1, 0.3, 0.8), (0.03, 0.1, 0.3)
-SHARE = 5  # of so many journeys one is driven with velocities as well: it takes a second per ten metres
+VELOCITY_DIVISOR = 5  # of so many journeys one is driven with velocities as well: it takes a second per ten metres
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Job:
     seed: int
     limit: int = 150  # iterations of displacement
     velocity_limit: int = 900  # iterations of velocity
-    field: Field = Field()  # noqa: RUF009 - frozen
+    field: ExperimentWorld = ExperimentWorld()  # noqa: RUF009 - frozen
     setting: Setting = Setting("displacement", Steps())
 
 
@@ -86,26 +86,26 @@ def settings() -> list[Setting]:
     # In metres alpha is bounded by the short axis, along which the scan changes most.
     every += [Steps(5e-4, 1.0, 1e-3, normalised=False), Steps(ALPHA, 1.0, 1e-3, "printed")]
     driven = [Steps(beta=0.0, gamma=gamma) for gamma in VELOCITY_GAMMAS]
-    driven += [Steps(beta=beta, gamma=Preference().gamma) for beta in VELOCITY_BETAS]
+    driven += [Steps(beta=beta, gamma=ActionParameters().gamma) for beta in VELOCITY_BETAS]
     return [Setting("displacement", each) for each in every] + [Setting("velocity", each) for each in driven]
 
 
 def trial(job: Job) -> dict[str, Any]:
     """Iterations, and time over the least where the robot drives."""
     world = job.field.scene(0).world
-    journey = draw_journey(world, np.random.default_rng((job.seed, navigation.NUMBER, job.index)), Robot())
+    journey = draw_journey(world, np.random.default_rng((job.seed, navigation.EXPERIMENT_ID, job.index)), Robot())
     found = {"setting": job.setting.name, "straight_m": journey.straight}
-    return found | (_displaced if job.setting.loop == "displacement" else _driven)(job, world, journey)
+    return found | (_run_displacement if job.setting.loop == "displacement" else _run_velocity)(job, world, journey)
 
 
 @functools.lru_cache(maxsize=2)
-def _model(field: Field) -> tuple[PaperModel, weights.ModelCard]:
+def _model(field: ExperimentWorld) -> tuple[PaperModel, weights.ModelCard]:
     use_one_core()
     return weights.load(weights.find(weights.FOLDER, field.world, "paper", field.beams))
 
 
-def _displaced(job: Job, world: World, journey: Journey) -> dict[str, Any]:
-    scene = job.field.scene(job.seed, NUMBER, job.index)
+def _run_displacement(job: Job, world: World, journey: Journey) -> dict[str, Any]:
+    scene = job.field.scene(job.seed, EXPERIMENT_ID, job.index)
 
     def look(pose: Array) -> Array:
         return usable_ranges(scene.observe(scene.clean(pose[None])[0], 0.0).ranges, scene.scanner.range_max)
@@ -120,7 +120,7 @@ def _displaced(job: Job, world: World, journey: Journey) -> dict[str, Any]:
     }
 
 
-def _driven(job: Job, world: World, journey: Journey) -> dict[str, Any]:
+def _run_velocity(job: Job, world: World, journey: Journey) -> dict[str, Any]:
     """As E3, but in one process and with these step sizes."""
     from services.simulator.simulation import Setup, Simulation  # noqa: PLC0415 - pybullet, for this alone
 
@@ -128,8 +128,8 @@ def _driven(job: Job, world: World, journey: Journey) -> dict[str, Any]:
     pose, goal = (*journey.start, job.field.heading), np.array([*journey.goal, job.field.heading])
     model, card = _model(job.field)
     perception = PaperPerception(model, card, Descent(beta=steps.beta), np.array(pose))
-    navigator = Navigator(Robot(), Preference(gamma=steps.gamma), world)
-    navigator.hear_goal(Goal(stamp_ns=0, pose=Pose.of(goal)))
+    navigator = Navigator(Robot(), ActionParameters(gamma=steps.gamma), world)
+    navigator.on_goal(Goal(stamp_ns=0, pose=Pose.of(goal)))
     simulation = Simulation(Setup(world, scanner, Robot(), pose, job.seed * 100_003 + job.index))
     errors, contacts = [], 0
     try:
@@ -137,7 +137,7 @@ def _driven(job: Job, world: World, journey: Journey) -> dict[str, Any]:
             _, truth, scan = simulation.observe()
             here = truth.pose.array()
             away, contacts = float(np.hypot(*(here - goal)[:2])), contacts + truth.contact
-            if away <= CLOSE or simulation.steps >= job.velocity_limit:
+            if away <= ARRIVAL_DISTANCE or simulation.steps >= job.velocity_limit:
                 break
             seen = Observation(scan.ranges.astype(float), scan.angles(), scan.range_max, goal=goal)
             found = perception.update(seen)
@@ -146,14 +146,14 @@ def _driven(job: Job, world: World, journey: Journey) -> dict[str, Any]:
                 stamp_ns=scan.stamp_ns, state=found.state, pose=Pose.of(found.pose), xi=found.xi.astype(np.float32),
                 curvature=found.curvature, free_energy=found.free_energy, accuracy=found.accuracy,
             )  # fmt: skip
-            navigator.hear_scan(scan)
+            navigator.on_scan(scan)
             simulation.command(scan.stamp_ns, navigator.step(belief)[0].twist)
             simulation.advance()
     finally:
         simulation.close()
     over = simulation.stamp_ns * 1e-9 / least_time(journey.straight, Robot())
     return {
-        "reached": away <= CLOSE, "iterations": simulation.steps, "time_over_least": over, "contacts": contacts,
+        "reached": away <= ARRIVAL_DISTANCE, "iterations": simulation.steps, "time_over_least": over, "contacts": contacts,
         "error_m": float(np.mean(errors)), "distance_m": [away],
     }  # fmt: skip
 
@@ -175,7 +175,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
     """Every setting over the first ``trials`` of E3's journeys; writes steps.json, .csv, .trials.jsonl, .pdf, .png."""
     grid = settings()
-    counts = [trials if each.loop == "displacement" else max(1, trials // SHARE) for each in grid]
+    counts = [trials if each.loop == "displacement" else max(1, trials // VELOCITY_DIVISOR) for each in grid]
     jobs = [replace(job, index=k, setting=each) for each, count in zip(grid, counts, strict=True) for k in range(count)]
     rows = run_trials("steps", trial, jobs, out, workers, console)
     summary = {each.name: summarise([row for row in rows if row["setting"] == each.name]) for each in grid}
@@ -189,12 +189,12 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
     }
     nearest = min(
         (each for each in grid if each.loop == "displacement" and summary[each.name]["reached"] == trials),
-        key=lambda each: abs(summary[each.name]["iterations_mean"] - PAPERS), default=None,
+        key=lambda each: abs(summary[each.name]["iterations_mean"] - PAPER_ITERATIONS), default=None,
     )  # fmt: skip
     note = "no setting reached every goal"
     if nearest is not None:
         mean = summary[nearest.name]["iterations_mean"]
-        note = f"nearest to the paper's {PAPERS:g} iterations, where every goal is reached: {nearest.name}: {mean:.1f}"
+        note = f"nearest to the paper's {PAPER_ITERATIONS:g} iterations, where every goal is reached: {nearest.name}: {mean:.1f}"
     result = results.Result(
         "steps", "Step sizes of action and goal", job.seed, {**asdict(job), "trials": trials, "alpha": ALPHA}, summary,
         curves, rows, [note],
@@ -212,7 +212,7 @@ def draw(grid: Sequence[Setting], summary: dict[str, dict[str, Any]]) -> Figure:
         _line(left, own, summary, "gamma", "iterations_mean", f"β = {beta:g}", colour)
     summed = [each for each in moved if each.steps.form == "sum"]
     _line(left, summed, summary, "gamma", "iterations_mean", "β = 1, action summed (eq. 4)", "#D55E00")
-    left.axhline(PAPERS, linestyle="--", color=drawing.GOAL, linewidth=1.2, label="the paper's 12.5")
+    left.axhline(PAPER_ITERATIONS, linestyle="--", color=drawing.GOAL, linewidth=1.2, label="the paper's 12.5")
     left.set(
         xlabel="γ (m²)",
         ylabel="iterations until within 0.8 m, mean",

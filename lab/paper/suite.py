@@ -51,7 +51,7 @@ def run_all(trials: int, seed: int, out: Path, workers: int, console: Console) -
         "aliasing": lambda: aliasing.run(aliasing.Job(seed, places=few(30)), out, workers, console),
         "prediction": lambda: prediction.run(prediction.Job(seed), out, 1, console),
     }
-    done = Done(out / ".all.unfinished.json", [trials, seed])
+    done = FinishedExperiments(out / ".all.unfinished.json", [trials, seed])
     began = time.monotonic()
     for number, (name, run) in enumerate(runs.items(), 1):
         if done.has(name):
@@ -65,7 +65,7 @@ def run_all(trials: int, seed: int, out: Path, workers: int, console: Console) -
     console.print(f"all of it lies in {out}/; {(time.monotonic() - began) / 60:.1f} minutes")
 
 
-class Done:
+class FinishedExperiments:
     """Names of the experiments that an interrupted run has finished; those of another command or commit count not."""
 
     def __init__(self, path: Path, parameters: list[int]) -> None:

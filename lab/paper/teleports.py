@@ -16,7 +16,7 @@ import shapely
 from common.geometry.se2 import Array
 from common.geometry.world import World
 from common.robot.base import Robot
-from lab.experiments.journeys import CLOSE, Journey
+from lab.experiments.journeys import ARRIVAL_DISTANCE, Journey
 from services.estimator.paper.decoder import PaperModel
 from services.estimator.paper.free_energy import gradient
 
@@ -51,8 +51,8 @@ class Outcome:
 
     @property
     def reached(self) -> bool:
-        """Whether it came within `CLOSE`."""
-        return bool(self.distance[-1] <= CLOSE)
+        """Whether it came within `ARRIVAL_DISTANCE`."""
+        return bool(self.distance[-1] <= ARRIVAL_DISTANCE)
 
     @property
     def iterations(self) -> int:
@@ -72,7 +72,7 @@ def travel(
     x0, y0, x1, y1 = world.bounds
     g_goal = model.predict(np.array([*goal, yaw]))[0]
     distances, errors, stopped = [float(np.hypot(*(robot - goal)))], [0.0], 0
-    while distances[-1] > CLOSE and len(distances) <= limit:
+    while distances[-1] > ARRIVAL_DISTANCE and len(distances) <= limit:
         o = look(np.array([*robot, yaw]))
         belief = belief + steps.alpha * metric * _perceive(o, belief, g_goal, model, steps, yaw)
         belief = np.clip(belief, [x0, y0], [x1, y1])

@@ -22,12 +22,12 @@ from services.estimator.particle_filter.settings import Settings as ParticleSett
 from services.estimator.precise.learning.calibration import Drive
 from services.estimator.shared.interface import Estimator, Observation
 
-LIMIT = 40  # scans that a search may take
-BEFORE = 10  # scans that a robot is tracked for before it is carried off
-NEAR = np.diag([0.01, 0.01, 0.0025])  # covariance of the start that is given, m², m², rad²
-NEAR_ENOUGH = 0.5  # m, within which a scan counts as tracked
-# A differential model cannot follow every base; AMCL has an omnidirectional one for these.
-AMCL = ParticleSettings(robot_model_type="omni")
+MAX_SEARCH_SCANS = 40  # scans that a search may take
+SCANS_BEFORE_KIDNAPPING = 10  # scans that a robot is tracked for before it is carried off
+START_COVARIANCE = np.diag([0.01, 0.01, 0.0025])  # covariance of the start that is given, m², m², rad²
+TRACKED_DISTANCE = 0.5  # m, within which a scan counts as tracked
+# A differential model cannot follow every base; AMCL_SETTINGS has an omnidirectional one for these.
+AMCL_SETTINGS = ParticleSettings(robot_model_type="omni")
 ODOMETRY, LASER, GLOBAL, KIDNAPPED = "odometry", "laser", "global", "kidnapped"
 
 
@@ -66,12 +66,12 @@ def drive_at(log: str, mount: tuple[float, float, float] | None, exchanged: bool
     from presage.logs.log import Reading  # noqa: PLC0415
 
     if exchanged:
-        return second_first(drive_at(log, mount))
+        return exchange_halves(drive_at(log, mount))
     path = Path(log)
     return drive_of(read_scans(path, reading=Reading(mount=None if mount is None else np.array(mount))), path)
 
 
-def second_first(drive: Drive) -> Drive:
+def exchange_halves(drive: Drive) -> Drive:
     """The second half, and then the first as if it had followed at the usual interval."""
     early, late = split(drive)
     follows = late.stamps[-1] + float(np.median(np.diff(drive.stamps))) - early.stamps[0]
@@ -81,21 +81,21 @@ def second_first(drive: Drive) -> Drive:
 
 def trial(job: Job) -> dict[str, Any]:
     """What was believed after every scan."""
-    drive, estimator = job.drive, entered(job)
+    drive, estimator = job.drive, create_estimator(job)
     if job.task in (ODOMETRY, LASER):
-        estimator.restart(drive.poses[job.first], NEAR)
+        estimator.restart(drive.poses[job.first], START_COVARIANCE)
         numbers = np.arange(job.first, job.first + job.count)
     elif job.task == GLOBAL:
-        numbers = np.arange(job.first, min(job.first + (job.count or LIMIT), len(drive.ranges)))
+        numbers = np.arange(job.first, min(job.first + (job.count or MAX_SEARCH_SCANS), len(drive.ranges)))
     else:
-        estimator.restart(drive.poses[job.first], NEAR)
-        after = np.arange(job.to, min(job.to + LIMIT, len(drive.ranges)))
-        numbers = np.concatenate([np.arange(job.first, job.first + BEFORE), after])
+        estimator.restart(drive.poses[job.first], START_COVARIANCE)
+        after = np.arange(job.to, min(job.to + MAX_SEARCH_SCANS, len(drive.ranges)))
+        numbers = np.concatenate([np.arange(job.first, job.first + SCANS_BEFORE_KIDNAPPING), after])
     clock = drive.stamps[numbers]
     odom = None if drive.odom is None or job.task == LASER else drive.odom[numbers]
     if job.task == KIDNAPPED:  # carried in no time, as far as the sensors tell
-        clock[BEFORE:] += drive.stamps[job.first + BEFORE] - clock[BEFORE]
-        odom = None if odom is None else unaware(odom, BEFORE)
+        clock[SCANS_BEFORE_KIDNAPPING:] += drive.stamps[job.first + SCANS_BEFORE_KIDNAPPING] - clock[SCANS_BEFORE_KIDNAPPING]
+        odom = None if odom is None else hide_kidnapping(odom, SCANS_BEFORE_KIDNAPPING)
     rows: dict[str, list[Any]] = {name: [] for name in ("stamp_s", "error_m", "yaw_error_rad", "state", "nees", "ms")}
     for i, k in enumerate(numbers):
         told = None if odom is None else odom[i]
@@ -119,20 +119,20 @@ def _nees(off: Array, covariance: Array | None) -> float | None:
     return round(min(float(off @ np.linalg.pinv(covariance, hermitian=True) @ off), 1e6), 3)
 
 
-def unaware(odom: Array, carried: int) -> Array:
+def hide_kidnapping(odom: Array, carried: int) -> Array:
     """Odometry (N, 3) of a robot that is lifted before its ``carried``-th scan: its wheels stand still meanwhile."""
     moved = odom.copy()
     moved[carried:] = se2.compose(odom[carried - 1], se2.between(odom[carried], odom[carried:]))
     return np.asarray(moved)
 
 
-def entered(job: Job) -> Estimator:
+def create_estimator(job: Job) -> Estimator:
     """A new estimator that knows the place and nothing of where it is."""
     drive = job.drive
     if job.estimator == "precise":
         factory = _precise(job.map, job.model)
         return factory(Geometry(drive.angles, drive.mount, drive.range_max))
-    settings = AMCL if job.estimator == "amcl-defaults" else particle_settings(job.particles)
+    settings = AMCL_SETTINGS if job.estimator == "amcl-defaults" else particle_settings(job.particles)
     x, y, yaw = map(float, drive.mount)
     return ParticleFilter(load_world(job.map), settings, (x, y, yaw), job.seed, sensor=_sensor(job.map, settings))
 
@@ -141,7 +141,7 @@ def particle_settings(changed: tuple[tuple[str, float], ...]) -> ParticleSetting
     """The tuned set, or AMCL's own, with what a tuning on the first half has changed."""
     kinds = {"max_beams": int, "keep_initial_pose": bool}
     values = {name: kinds[name](value) if name in kinds else value for name, value in changed}
-    base = AMCL if values.pop("amcl_defaults", 0.0) else ParticleSettings.tuned()
+    base = AMCL_SETTINGS if values.pop("amcl_defaults", 0.0) else ParticleSettings.tuned()
     return replace(base, **values)  # type: ignore[arg-type]
 
 

@@ -24,13 +24,13 @@ from common.versions import commit
 from lab.experiments import results
 from lab.experiments.trials import run_trials
 from lab.real_logs.drive import (
-    BEFORE,
     GLOBAL,
     KIDNAPPED,
     LASER,
-    LIMIT,
-    NEAR_ENOUGH,
+    MAX_SEARCH_SCANS,
     ODOMETRY,
+    SCANS_BEFORE_KIDNAPPING,
+    TRACKED_DISTANCE,
     trial,
 )
 from lab.real_logs.drive import Job as Stretch
@@ -48,10 +48,10 @@ TASKS = {
     ODOMETRY: "a: tracking with odometry", LASER: "b: tracking without", GLOBAL: "c: from nothing",
     KIDNAPPED: "d: carried off",
 }  # fmt: skip
-LEAST_FREE = 0.5  # share of the poses; a map may lack what the drive saw
-FOUND = NEAR_ENOUGH  # m and
-FOUND_YAW = float(np.deg2rad(10))  # rad from the reference: tracked; beyond, `tracking` is a wrong claim
-QUICK = 120  # scans of (a) and (b), for a look
+MIN_FREE_SHARE = 0.5  # share of the poses; a map may lack what the drive saw
+TRACKED_DISTANCE = TRACKED_DISTANCE  # m and
+TRACKED_YAW = float(np.deg2rad(10))  # rad from the reference: tracked; beyond, `tracking` is a wrong claim
+QUICK_SCANS = 120  # scans of (a) and (b), for a look
 
 
 @dataclass(frozen=True)
@@ -86,8 +86,8 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
         f"base_link{'' if job.mount else ' (--mount)'}; {'first' if job.exchange else 'second'} half localised"
     )
     _fits(world, drive.part(np.arange(half)), job.map)
-    if len(drive.ranges) < 4 * LIMIT:
-        raise UserError(f"{job.log}: {len(drive.ranges)} posed scans; at least {4 * LIMIT} are needed")
+    if len(drive.ranges) < 4 * MAX_SEARCH_SCANS:
+        raise UserError(f"{job.log}: {len(drive.ranges)} posed scans; at least {4 * MAX_SEARCH_SCANS} are needed")
     model, card, tuned = _prepared(job, plain, half, out, console)
     plain = replace(plain, first=half, model=str(model))
     jobs = [
@@ -105,7 +105,7 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
     result = results.Result(
         job.result, f"A real drive: {job.log.name}", job.seed,
         {**{k: str(v) if isinstance(v, Path) else v for k, v in asdict(job).items()}, "scans": len(drive.ranges),
-         "particle_filter": {**{name: dict(each) for name, each in _sets(tuned).items()}, "tried": tuned.tried},
+         "particle_filter": {**{name: dict(each) for name, each in _settings_by_task(tuned).items()}, "tried": tuned.tried},
          "calibration": asdict(card.calibration) if card.calibration else None},
         summary, curves_of(rows), rows, notes(job, card, tuned),
     )  # fmt: skip
@@ -116,7 +116,7 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
 def _fits(world: World, learned: Drive, name: str) -> None:
     """Raises UserError where the drive cannot have been in that map."""
     free = float((world.clearance(learned.poses[:, :2]) > 0).mean())
-    if free < LEAST_FREE:
+    if free < MIN_FREE_SHARE:
         raise UserError(
             f"only {free:.0%} of the reference poses of the half that is learned are in free space of {name}: "
             "is it a map of this place, in the frame of these poses?"
@@ -154,41 +154,41 @@ def _prepared(
             if job.quick
             else tune(replace(stretch, estimator="particle-filter"), half, start, path.parent, report)
         )
-    plain = {"key": key, **{name: dict(each) for name, each in _sets(tuned).items()}, "tried": tuned.tried}
+    plain = {"key": key, **{name: dict(each) for name, each in _settings_by_task(tuned).items()}, "tried": tuned.tried}
     kept.write_text(json.dumps(plain) + "\n", encoding="utf-8")
     return path, card, tuned
 
 
 def _settings(tuned: Tuned, task: str) -> Settings:
-    return _sets(tuned).get(task, tuned.finding)
+    return _settings_by_task(tuned).get(task, tuned.finding)
 
 
-def _sets(tuned: Tuned) -> dict[str, Settings]:
+def _settings_by_task(tuned: Tuned) -> dict[str, Settings]:
     return {ODOMETRY: tuned.odometry, LASER: tuned.laser, "finding": tuned.finding}
 
 
 def stretches(plain: Stretch, half: int, count: int, job: Job, *, odometry: bool) -> list[Stretch]:
     """The trials of one estimator; what takes longest first."""
-    length = min(QUICK, count - half) if job.quick else count - half
+    length = min(QUICK_SCANS, count - half) if job.quick else count - half
     whole = [replace(plain, task=task, count=length) for task in ((ODOMETRY, LASER) if odometry else (LASER,))]
-    starts = list(range(half, count - LIMIT, job.every * (4 if job.quick else 1)))
+    starts = list(range(half, count - MAX_SEARCH_SCANS, job.every * (4 if job.quick else 1)))
     carried = [
         replace(plain, task=KIDNAPPED, first=first, to=to)
         for first in starts
-        if (to := half + (first - half + (count - half) // 2) % (count - half - LIMIT)) > first + BEFORE
-        or to + LIMIT <= first
+        if (to := half + (first - half + (count - half) // 2) % (count - half - MAX_SEARCH_SCANS)) > first + SCANS_BEFORE_KIDNAPPING
+        or to + MAX_SEARCH_SCANS <= first
     ]
     return [*whole, *(replace(plain, task=GLOBAL, first=first) for first in starts), *carried]
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Numbers of one estimator in one task."""
-    after = [BEFORE if row["task"] == KIDNAPPED else 0 for row in rows]
+    after = [SCANS_BEFORE_KIDNAPPING if row["task"] == KIDNAPPED else 0 for row in rows]
     error, yaw, state, ms, nees = (
         np.array([value for row, skip in zip(rows, after, strict=True) for value in row[name][skip:]])
         for name in ("error_m", "yaw_error_rad", "state", "ms", "nees")
     )
-    good = (error < FOUND) & (yaw < FOUND_YAW)
+    good = (error < TRACKED_DISTANCE) & (yaw < TRACKED_YAW)
     claims = state == "tracking"
     first = [_found(row, skip) for row, skip in zip(rows, after, strict=True)]
     reached = [k for k in first if k is not None]
@@ -209,7 +209,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def _good(row: dict[str, Any], skip: int) -> np.ndarray[Any, np.dtype[np.bool_]]:
     error, yaw = np.array(row["error_m"][skip:]), np.array(row["yaw_error_rad"][skip:])
-    return np.asarray((error < FOUND) & (yaw < FOUND_YAW))
+    return np.asarray((error < TRACKED_DISTANCE) & (yaw < TRACKED_YAW))
 
 
 def _found(row: dict[str, Any], skip: int) -> int | None:
@@ -243,8 +243,8 @@ def notes(job: Job, card: weights.FieldCard, tuned: Tuned) -> list[str]:
     found, learned = card.calibration, "second" if job.exchange else "first"
     lines = [
         (
-            f"tracked: within {FOUND} m and 10 deg of the reference, whose own error is among the errors; found: says "
-            f"`tracking` there, within {LIMIT} scans; wrong claim: says `tracking` elsewhere"
+            f"tracked: within {TRACKED_DISTANCE} m and 10 deg of the reference, whose own error is among the errors; found: says "
+            f"`tracking` there, within {MAX_SEARCH_SCANS} scans; wrong claim: says `tracking` elsewhere"
         ),
         *(
             f"particle filter, tuned on the {learned} half, {what}: {_listed(each)}"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from lab.real_logs.drive import LASER, NEAR_ENOUGH, ODOMETRY
+from lab.real_logs.drive import LASER, ODOMETRY, TRACKED_DISTANCE
 from presage.learning.drive_figure import calibration_curve
 from presage.plotting import style as drawing
 from services.estimator.precise.learning.calibration import Calibration
@@ -31,7 +31,7 @@ def draw(found: Calibration | None, rows: Sequence[dict[str, Any]], titles: dict
             share = np.arange(1, len(error) + 1) / len(error)
             shares.plot(np.sort(error), share, style, color=colour, label=f"{name}, {titles[task][3:]}")
         drawing.log_metres(axes)
-        axes.axhline(NEAR_ENOUGH, color=drawing.BOUND, linestyle=":", linewidth=1)
+        axes.axhline(TRACKED_DISTANCE, color=drawing.BOUND, linestyle=":", linewidth=1)
         axes.set(xlabel="time (s)", ylabel="position error (m)", title=titles[task])
     drawing.log_metres(shares, "x")
     shares.set(xlabel="position error (m)", ylabel="share of scans with less", ylim=(0, 1), title="the half localised")

@@ -19,12 +19,22 @@ from typing import Any
 import numpy as np
 
 from common.geometry.world import load_world
-from lab.real_logs.drive import BEFORE, GLOBAL, KIDNAPPED, LASER, LIMIT, NEAR_ENOUGH, ODOMETRY, Job, trial
+from lab.real_logs.drive import (
+    GLOBAL,
+    KIDNAPPED,
+    LASER,
+    MAX_SEARCH_SCANS,
+    ODOMETRY,
+    SCANS_BEFORE_KIDNAPPING,
+    TRACKED_DISTANCE,
+    Job,
+    trial,
+)
 from presage.learning.grid_map import write_map
 from presage.learning.map_of_log import cells_of
 from services.estimator.precise.motion_model import MotionNoise
 
-TRIED: dict[str, tuple[float, ...]] = {
+TRACKING_CANDIDATES: dict[str, tuple[float, ...]] = {
     "amcl_defaults": (1.0,),
     "keep_initial_pose": (0.0,),
     "sigma_hit": (0.05, 0.2),
@@ -38,14 +48,14 @@ TRIED: dict[str, tuple[float, ...]] = {
 # amcl_defaults 1: nav2's values in place of the tuned set's where no other is listed; keep_initial_pose 0: recovery
 # after a start from a given pose; sigma_odometry 0: sigma_hit and max_beams with odometry too; alpha: all five, times
 # what the odometry says
-TRIED_TO_FIND: dict[str, tuple[float, ...]] = {
+SEARCH_CANDIDATES: dict[str, tuple[float, ...]] = {
     "recovery_alpha_fast": (0.0, 0.1),
     "sigma_search": (0.2,),
     "jitter_position": (0.005, 0.05),
 }
-STRETCHES, LENGTH = 3, 150  # of the second quarter: at most so many, of at most so many scans
-STARTS, TO_FIND = 4, 15  # places to find, and scans it may take from nothing
-CELL = 0.05  # m, of the first quarter's map where the drive's own map has no cells
+MAX_STRETCHES, MAX_STRETCH_SCANS = 3, 150  # of the second quarter: at most so many, of at most so many scans
+SEARCH_STARTS, SEARCH_SCANS = 4, 15  # places to find, and scans it may take from nothing
+CELL_SIZE = 0.05  # m, of the first quarter's map where the drive's own map has no cells
 Settings = tuple[tuple[str, float], ...]
 
 
@@ -63,7 +73,7 @@ class Tuned:
 
 def starting_point(motion: MotionNoise) -> Settings:
     """Of odometry, by the first half: variances of AMCL's omnidirectional model, per square metre and radian."""
-    along = float(np.sqrt(motion.path_by_path / 0.1))  # over steps of a decimetre, AMCL's grow with the path itself
+    along = float(np.sqrt(motion.path_by_path / 0.1))  # over steps of a decimetre, AMCL_SETTINGS's grow with the path itself
     return (
         ("alpha1", motion.path_by_turn), ("alpha2", motion.turn_by_path / 0.1), ("alpha3", along**2),
         ("alpha4", motion.turn_by_turn / 0.1), ("alpha5", along**2),
@@ -76,26 +86,26 @@ def tune(job: Job, half: int, start: Settings, folder: Path, report: Callable[[s
     The map of the first quarter is written into ``folder``.
     """
     lines: list[str] = []
-    total = 2 * sum(map(len, TRIED.values())) + sum(map(len, TRIED_TO_FIND.values())) + 3
+    total = 2 * sum(map(len, TRACKING_CANDIDATES.values())) + sum(map(len, SEARCH_CANDIDATES.values())) + 3
     quarter = half // 2
     job = replace(job, map=str(_map_of_quarter(job, quarter, folder)))
-    length = min(LENGTH, half - quarter)
-    firsts = sorted(set(_known(job, quarter, half - length, STRETCHES)))
+    length = min(MAX_STRETCH_SCANS, half - quarter)
+    firsts = sorted(set(_evenly_spaced(job, quarter, half - length, MAX_STRETCHES)))
 
-    starts = _known(job, quarter, half - LIMIT, STARTS)
+    starts = _evenly_spaced(job, quarter, half - MAX_SEARCH_SCANS, SEARCH_STARTS)
 
     def tracking(task: str, settings: Settings) -> tuple[float, float]:
-        return _kept(
+        return _tracking_score(
             [trial(replace(job, task=task, first=first, count=length, particles=settings)) for first in firsts]
         )
 
     def finding(settings: Settings) -> tuple[float, float]:
-        rows = [trial(replace(job, task=GLOBAL, first=k, count=TO_FIND, particles=settings)) for k in starts]
+        rows = [trial(replace(job, task=GLOBAL, first=k, count=SEARCH_SCANS, particles=settings)) for k in starts]
         carried = zip(starts, starts[len(starts) // 2 :] + starts[: len(starts) // 2], strict=True)
         rows += [trial(replace(job, task=KIDNAPPED, first=k, to=to, particles=settings)) for k, to in carried]
-        return _found(rows)
+        return _search_score(rows)
 
-    def climb(
+    def coordinate_search(
         title: str,
         settings: Settings,
         tried: dict[str, tuple[float, ...]],
@@ -114,23 +124,23 @@ def tune(job: Job, half: int, start: Settings, folder: Path, report: Callable[[s
                 report(f"particle filter, {title}: {name}", len(lines) / total)
         return best
 
-    odometry, laser = start, climb(LASER, start, TRIED, partial(tracking, LASER))
+    odometry, laser = start, coordinate_search(LASER, start, TRACKING_CANDIDATES, partial(tracking, LASER))
     if job.drive.odom is not None:
-        odometry = climb(ODOMETRY, start, TRIED, partial(tracking, ODOMETRY))
+        odometry = coordinate_search(ODOMETRY, start, TRACKING_CANDIDATES, partial(tracking, ODOMETRY))
     # A robot that was carried off has to give up the pose that was given; nav2's few particles would not find it.
     found = _with(_with(odometry, "keep_initial_pose", 0.0), "amcl_defaults", 0.0)
-    return Tuned(odometry, laser, climb("finding", found, TRIED_TO_FIND, finding), lines)
+    return Tuned(odometry, laser, coordinate_search("finding", found, SEARCH_CANDIDATES, finding), lines)
 
 
 def _map_of_quarter(job: Job, quarter: int, folder: Path) -> Path:
     """A ROS map of the first ``quarter`` scans, with cells like those of the job's map."""
     grid = load_world(job.map).grid
-    cell = grid.resolution if grid is not None else CELL
+    cell = grid.resolution if grid is not None else CELL_SIZE
     values, (x, y) = cells_of(job.drive.part(np.arange(quarter)), cell)
     return write_map(folder, values, name="quarter", image="quarter.pgm", resolution=cell, origin=[x, y, 0.0])
 
 
-def _known(job: Job, first: int, last: int, count: int) -> list[int]:
+def _evenly_spaced(job: Job, first: int, last: int, count: int) -> list[int]:
     """``count`` scans from ``first`` to ``last``, evenly spaced among those whose reference pose is free in the map."""
     free = np.flatnonzero(load_world(job.map).clearance(job.drive.poses[first : last + 1, :2]) > 0)
     numbers = first + (free if len(free) else np.arange(last + 1 - first))
@@ -144,19 +154,19 @@ def _with(settings: Settings, name: str, value: float) -> Settings:
     return tuple({**values, name: value, **({"z_hit": 1 - value} if name == "z_rand" else {})}.items())
 
 
-def _kept(rows: list[dict[str, Any]]) -> tuple[float, float]:
+def _tracking_score(rows: list[dict[str, Any]]) -> tuple[float, float]:
     """Share of scans tracked, and minus the median error (m) of those."""
     off = np.array([value for row in rows for value in row["error_m"]])
-    tracked = off < NEAR_ENOUGH
+    tracked = off < TRACKED_DISTANCE
     return round(float(tracked.mean()), 2), -float(np.median(off[tracked])) if tracked.any() else -np.inf
 
 
-def _found(rows: list[dict[str, Any]]) -> tuple[float, float]:
+def _search_score(rows: list[dict[str, Any]]) -> tuple[float, float]:
     """Share of starts found, and minus the mean of the scans until then."""
     scans = []
     for row in rows:
-        skip = BEFORE if row["task"] == KIDNAPPED else 0
-        right = (np.array(row["error_m"][skip:]) < NEAR_ENOUGH) & (np.array(row["state"][skip:]) == "tracking")
+        skip = SCANS_BEFORE_KIDNAPPING if row["task"] == KIDNAPPED else 0
+        right = (np.array(row["error_m"][skip:]) < TRACKED_DISTANCE) & (np.array(row["state"][skip:]) == "tracking")
         scans.append(int(np.argmax(right)) + 1 if right.any() else None)
     found = [k for k in scans if k is not None]
-    return len(found) / len(rows), -float(np.mean([LIMIT if k is None else k for k in scans]))
+    return len(found) / len(rows), -float(np.mean([MAX_SEARCH_SCANS if k is None else k for k in scans]))

@@ -22,11 +22,11 @@ from common.robot.base import Robot
 from common.runtime import safety
 from lab.experiments import tables_page as page
 from lab.experiments.journeys import Journey
-from lab.experiments.lockstep import Errand, Track, _over, _take
+from lab.experiments.lockstep import LockstepRun, RunTrace, _append, _is_final
 from lab.navigation import drive as driven
 from lab.navigation import experiment as driving
 from lab.navigation import shortest_path as shortest
-from lab.navigation.shortest_path import Trip, Ways, draw_trip, least_trip, least_turn, length, ways_of
+from lab.navigation.shortest_path import Trip, Ways, draw_trip, least_trip, least_turn, length, load_ways
 
 QUIET = Console(quiet=True)
 ROBOT, TURNING = Robot(), Robot(drive="differential")
@@ -70,12 +70,12 @@ def test_a_door_too_narrow_is_none():
 @given(st.integers(0, 10_000))
 @settings(max_examples=20, deadline=None)
 def test_a_shortest_way_keeps_its_clearance_and_there_is_no_short_cut(seed):
-    world, ways = ways_of("maze")
+    world, ways = load_ways("maze")
     rng = np.random.default_rng(seed)
-    start, middle, goal = world.sample_free(3, rng, ROBOT.radius + shortest.SPARE)
+    start, middle, goal = world.sample_free(3, rng, ROBOT.radius + shortest.START_GOAL_MARGIN)
     way = ways.way(start, goal)
     keeps = shapely.distance(shapely.LineString(way), shapely.boundary(world.free_space))
-    assert keeps >= ROBOT.radius + shortest.GAP - shortest.EXACT - 1e-5
+    assert keeps >= ROBOT.radius + shortest.WALL_GAP - shortest.ARC_TOLERANCE - 1e-5
     assert length(way) >= np.hypot(*(goal - start)) - 1e-9
     assert length(way) == pytest.approx(length(ways.way(goal, start)))
     assert length(way) <= length(ways.way(start, middle)) + length(ways.way(middle, goal)) + 1e-9
@@ -89,12 +89,12 @@ def test_a_shortest_way_keeps_its_clearance_and_there_is_no_short_cut(seed):
 def test_shortest_ways_are_no_longer_than_those_over_a_fine_grid():
     """An entirely different computation: 16 neighbours on a grid of 5 cm are never shorter."""
     from services.controller.policies.free_space import FreeSpace  # noqa: PLC0415
-    from services.controller.policies.geodesic_field import Roads  # noqa: PLC0415
+    from services.controller.policies.geodesic_field import FreeSpaceGraph  # noqa: PLC0415
 
-    world, ways = ways_of("office")
-    roads = Roads(FreeSpace.of(world), ROBOT.radius)
+    world, ways = load_ways("office")
+    graph = FreeSpaceGraph(FreeSpace.of(world), ROBOT.radius)
     for start, goal in world.sample_free(12, np.random.default_rng(3), 0.5).reshape(-1, 2, 2):
-        field = roads.from_(goal)
+        field = graph.cost_field(goal)
         exact, grid = length(ways.way(start, goal)), length(field.path(start))
         assert exact <= grid + 1e-6
         assert grid < 1.25 * exact + 0.1  # it costs what is near walls more, and so goes round them farther
@@ -102,13 +102,13 @@ def test_shortest_ways_are_no_longer_than_those_over_a_fine_grid():
 
 @pytest.mark.parametrize("world", ["maze", "office", "twins"])
 def test_a_trip_fits_is_long_enough_and_the_same_for_every_drive(world):
-    known, _ = ways_of(world)
+    known, _ = load_ways(world)
     trips = [draw_trip(world, np.random.default_rng((1, k)), ROBOT) for k in range(25)]
     for k, trip in enumerate(trips):
         assert trip == draw_trip(world, np.random.default_rng((1, k)), TURNING)
         ends = [trip.start[:2], trip.goal]
-        assert known.clearance(ends).min() >= ROBOT.radius + shortest.SPARE - 1e-3
-        assert length(np.array(trip.shortest)) >= shortest.APART - 1e-3
+        assert known.clearance(ends).min() >= ROBOT.radius + shortest.START_GOAL_MARGIN - 1e-3
+        assert length(np.array(trip.shortest)) >= shortest.MIN_TRIP_LENGTH - 1e-3
         assert trip.shortest[0] == trip.start[:2]
         assert trip.shortest[-1] == trip.goal
         assert world != "twins" or trip.start[1] < 4.4
@@ -166,7 +166,7 @@ def status(number, state, reason="", goal_seq=1, *, refused=False):
 TRIP = Trip((1.0, 1.0, 0.0), (5.0, 1.0), ((1.0, 1.0), (5.0, 1.0)))
 
 
-def a_track(last="reached", ends_at=4.9):
+def a_trace(last="reached", ends_at=4.9):
     people = np.array([[3.0, 2.0], [9.0, 5.0]], np.float32)
     truths = [
         truth(0, 1.0),
@@ -186,11 +186,11 @@ def a_track(last="reached", ends_at=4.9):
     health = Health(
         stamp_ns=9, service="controller", uptime=1.0, counters={"steps": 4, "step_us": 8000, "step_us_max": 5000}
     )
-    return Track(truths, beliefs, {each.stamp_ns: each for each in states}, [0, 0, 3], health)
+    return RunTrace(truths, beliefs, {each.stamp_ns: each for each in states}, [0, 0, 3], health)
 
 
 def test_what_is_measured():
-    found = driven.measure(a_track(), TRIP, HALL, ROBOT)
+    found = driven.measure(a_trace(), TRIP, HALL, ROBOT)
     assert found["outcome"] == "reached"
     assert found["driven_m"] == pytest.approx(3.9)
     assert found["path_over_shortest"] == pytest.approx(1.0)  # stopping short saves nothing
@@ -214,20 +214,22 @@ def test_what_is_measured():
 
 
 def test_errors_of_what_is_claimed_are_told_from_those_of_a_belief_that_is_lost():
-    track = a_track()
-    track.beliefs[3] = belief(3, 7.0, "localising")
-    found = driven.measure(track, TRIP, HALL, ROBOT)
+    trace = a_trace()
+    trace.beliefs[3] = belief(3, 7.0, "localising")
+    found = driven.measure(trace, TRIP, HALL, ROBOT)
     assert found["error_max_m"] == pytest.approx(4.0)
     assert found["claimed_error_max_m"] == pytest.approx(0.01)
     assert found["untracked_s"] == pytest.approx(0.3 / 4)  # of four scans since 0.1 s one
-    never = driven.measure(Track(track.truths, [belief(k, 9.0, "lost") for k in range(5)]), TRIP, HALL, ROBOT)
+    never = driven.measure(RunTrace(trace.truths, [belief(k, 9.0, "lost") for k in range(5)]), TRIP, HALL, ROBOT)
     assert never["tracking_s"] is never["error_max_m"] is None
 
 
 def test_reasons_differ_in_what_not_in_where():
     for place in ("", ", 0.8 m away at (1.2, -3.4)", " at (-1.0, 2.0)"):
-        assert driven.plain(f"waiting: something{place}: until it clears") == "waiting: something: until it clears"
-    assert driven.plain("2 places are possible: going to (1.0, 2.0) to tell them apart") == (
+        assert (
+            driven.strip_numbers(f"waiting: something{place}: until it clears") == "waiting: something: until it clears"
+        )
+    assert driven.strip_numbers("2 places are possible: going to (1.0, 2.0) to tell them apart") == (
         "2 places are possible: going to tell them apart"
     )
 
@@ -239,28 +241,28 @@ def test_a_path_past_a_corner_is_as_near_as_its_straight_pieces():
 
 
 def test_what_is_claimed_refused_late_or_broken_is_not_reached():
-    far = driven.measure(a_track(ends_at=4.69), TRIP, HALL, ROBOT)
+    far = driven.measure(a_trace(ends_at=4.69), TRIP, HALL, ROBOT)
     assert far["outcome"] == "claimed elsewhere"
     assert not far["reached"]
-    late = driven.measure(a_track("blocked"), TRIP, HALL, ROBOT)
+    late = driven.measure(a_trace("blocked"), TRIP, HALL, ROBOT)
     assert late["outcome"] == "too late"
     assert "0.10 m from the goal after 0.4 s; at last blocked" in late["why"]
-    track = a_track("blocked")
-    track.failure = "controller ended with status 1: x"
-    broken = driven.measure(track, TRIP, HALL, ROBOT)
-    assert (broken["outcome"], broken["why"]) == ("failed", track.failure)
-    track = a_track()
+    trace = a_trace("blocked")
+    trace.failure = "controller ended with status 1: x"
+    broken = driven.measure(trace, TRIP, HALL, ROBOT)
+    assert (broken["outcome"], broken["why"]) == ("failed", trace.failure)
+    trace = a_trace()
     why = "goal refused: (5.00, 1.00) in hall is inside something, or off the map"
-    track.statuses[400_000_000] = status(4, "blocked", why, refused=True)
-    assert driven.measure(track, TRIP, HALL, ROBOT)["outcome"] == "refused"
-    track.health = None
-    assert driven.measure(track, TRIP, HALL, ROBOT)["step_mean_ms"] is None
+    trace.statuses[400_000_000] = status(4, "blocked", why, refused=True)
+    assert driven.measure(trace, TRIP, HALL, ROBOT)["outcome"] == "refused"
+    trace.health = None
+    assert driven.measure(trace, TRIP, HALL, ROBOT)["step_mean_ms"] is None
 
 
 def test_summary_tells_reached_from_safe_and_names_the_worst():
     rows = []
-    for number, track in enumerate([a_track(), a_track(ends_at=4.0), a_track()]):
-        rows.append({"trial": number, **driven.measure(track, TRIP, HALL, ROBOT)})
+    for number, trace in enumerate([a_trace(), a_trace(ends_at=4.0), a_trace()]):
+        rows.append({"trial": number, **driven.measure(trace, TRIP, HALL, ROBOT)})
     rows[2] |= {"contacts_moving": 0, "contacts_standing": 0, "contact_at": [], "time_over_least": 3.0}
     summary = driving.summarise(rows)
     assert (summary["trials"], summary["reached"], summary["trials_claimed_elsewhere"]) == (3, 2, 1)
@@ -280,44 +282,44 @@ def test_summary_tells_reached_from_safe_and_names_the_worst():
 
 
 def test_the_drive_ends_when_the_controller_says_so_and_that_scan_is_its_last():
-    errand = Errand(Journey((1.0, 1.0), (5.0, 1.0)), 0.0, "maze", 101, 0, (), 100, told=True)
-    track, end = Track(), None
+    lockstep_run = LockstepRun(Journey((1.0, 1.0), (5.0, 1.0)), 0.0, "maze", 101, 0, (), 100, ends_with_status=True)
+    trace, end = RunTrace(), None
     # As they may come: another process's messages of the next scan before the status of this one.
     order = [truth(0, 1.0), status(0, "navigating"), belief(0, 1.0), truth(1, 5.0), belief(1, 5.0), truth(2, 5.0),
              status(1, "reached"), belief(2, 5.0), status(2, "reached")]  # fmt: skip
     for message in order:
-        _take(message, track, end)
-        if end is None and _over(message, track, errand):
+        _append(message, trace, end)
+        if end is None and _is_final(message, trace, lockstep_run):
             end = message.stamp_ns
     assert end == 100_000_000
-    track.cut(end)
-    assert len(track.truths) == len(track.beliefs) == len(track.statuses) == 2
-    assert not _over(truth(1, 5.0), Track(), errand)  # being there is not enough
-    assert _over(truth(1, 5.0), Track(), replace(errand, told=False))
-    assert _over(status(0, "blocked", "goal refused: no", refused=True), Track(), errand)
-    assert not _over(status(0, "reached", goal_seq=0), Track(), errand)
+    trace.discard_after(end)
+    assert len(trace.truths) == len(trace.beliefs) == len(trace.statuses) == 2
+    assert not _is_final(truth(1, 5.0), RunTrace(), lockstep_run)  # being there is not enough
+    assert _is_final(truth(1, 5.0), RunTrace(), replace(lockstep_run, ends_with_status=False))
+    assert _is_final(status(0, "blocked", "goal refused: no", refused=True), RunTrace(), lockstep_run)
+    assert not _is_final(status(0, "reached", goal_seq=0), RunTrace(), lockstep_run)
 
 
 def test_a_name_for_each_question():
     job = driving.Job(0, 1)
-    assert driving.name_of(job, driving.WORLDS, driving.DRIVES) == "navigation"
-    assert driving.name_of(replace(job, seed=7, limit=9.0), driving.WORLDS, driving.DRIVES) == "navigation"
+    assert driving.result_name(job, driving.WORLDS, driving.DRIVES) == "navigation"
+    assert driving.result_name(replace(job, seed=7, limit=9.0), driving.WORLDS, driving.DRIVES) == "navigation"
     odd = replace(job, start="unknown", people=10, epistemic=False, estimator="particle-filter", prior="odometry")
-    name = driving.name_of(odd, ("folder/my.yaml",), ("differential",))
+    name = driving.result_name(odd, ("folder/my.yaml",), ("differential",))
     assert name == "navigation-my-differential-unknown-people10-particle-filter-odometry-no-epistemic"
-    assert driving.name_of(replace(job, people=3, people_speed=0.5), ("office",), driving.DRIVES) == (
+    assert driving.result_name(replace(job, people=3, people_speed=0.5), ("office",), driving.DRIVES) == (
         "navigation-office-people3-0.5mps"
     )
 
 
 def test_the_services_are_told_what_was_asked_for():
     job = driving.Job(3, 2, "office", "differential", "unknown", 4, 0.5, "particle-filter", "odometry", epistemic=False)
-    errand = job.errand(Journey((1.0, 1.0), (5.0, 1.0)), 0.5)
-    assert errand.controller == ("--preset", "geodesic", "--drive", "differential", "--no-epistemic")
-    assert errand.simulator == ("--drive", "differential", "--people", "4", "--people-speed", "0.5")
-    assert errand.estimator == ("--estimator", "particle-filter", "--prior", "odometry")
-    assert not errand.known
-    assert errand.limit == 1800
+    lockstep_run = job.lockstep_run(Journey((1.0, 1.0), (5.0, 1.0)), 0.5)
+    assert lockstep_run.controller == ("--preset", "geodesic", "--drive", "differential", "--no-epistemic")
+    assert lockstep_run.simulator == ("--drive", "differential", "--people", "4", "--people-speed", "0.5")
+    assert lockstep_run.estimator == ("--estimator", "particle-filter", "--prior", "odometry")
+    assert not lockstep_run.start_known
+    assert lockstep_run.limit == 1800
 
 
 @pytest.mark.parametrize(
@@ -349,9 +351,9 @@ def test_from_anywhere_through_real_processes_the_same_again_and_all_files(tmp_p
     assert {path.name for path in tmp_path.iterdir()} == {
         f"navigation-maze-beams101{suffix}" for suffix in (".json", ".csv", ".trials.jsonl", ".pdf", ".png")
     }
-    told = json.loads((tmp_path / "navigation-maze-beams101.json").read_text())
-    assert told["parameters"]["beams"] == 101
-    assert {"seed", "commit", "command", "versions"} <= set(told)
+    written = json.loads((tmp_path / "navigation-maze-beams101.json").read_text())
+    assert written["parameters"]["beams"] == 101
+    assert {"seed", "commit", "command", "versions"} <= set(written)
     for drive in driving.DRIVES:
         summary = result.summary[f"maze, {drive}"]
         assert summary["reached"] == 1, summary["worst"]
@@ -368,7 +370,7 @@ def test_from_anywhere_through_real_processes_the_same_again_and_all_files(tmp_p
         k: tuple(map(tuple, v)) if k == "shortest" else tuple(v) if k in ("start", "goal") else v
         for k, v in differential.items() if k not in timing
     }  # fmt: skip
-    text = page.filled("<!-- table navigation-maze-beams101 -->\n<!-- end -->", tmp_path)
+    text = page.fill_tables("<!-- table navigation-maze-beams101 -->\n<!-- end -->", tmp_path)
     assert "| maze, differential | 1 of 1 | 0 | 0; 0 |" in text
 
 
@@ -396,7 +398,7 @@ def test_a_run_cut_short_goes_on_and_nobody_is_left(process, tmp_path):
 def test_the_page_has_the_numbers_of_the_results_beside_it():
     docs = Path(__file__).resolve().parents[3] / "docs"
     text = (docs / "navigation.md").read_text(encoding="utf-8")
-    assert page.filled(text, docs / "experiments") == text
+    assert page.fill_tables(text, docs / "experiments") == text
     assert "<!-- table navigation -->" in text
 
 

@@ -19,12 +19,12 @@ from common.errors import UserError
 from lab.accuracy.scenes import Scene
 from lab.experiments import results
 from lab.experiments import tables_page as page
-from lab.experiments.estimators import PAPER, Field, chosen
+from lab.experiments.estimators import PAPER_DESCENT, ExperimentWorld, parse_estimators
 from lab.experiments.trials import Store, run_trials
 from lab.paper import alpha_sweep as step_size
 from lab.paper import e1_localisation as localisation
 from lab.paper import e2_crossing as crossing
-from lab.paper.suite import Done
+from lab.paper.suite import FinishedExperiments
 
 QUIET = Console(quiet=True)
 
@@ -103,7 +103,7 @@ def test_a_trial_depends_on_its_job_alone():
 
 def test_precise_finds_in_one_scan_what_the_papers_descent_approaches():
     for index in range(3):
-        errors = localisation.trial(replace(small(index), iterations=30, descent=PAPER))["error_m"]
+        errors = localisation.trial(replace(small(index), iterations=30, descent=PAPER_DESCENT))["error_m"]
         assert errors["precise"][0] < 0.01
         assert errors["paper"][0] > 10 * errors["precise"][0]
         assert errors["paper"][-1] < errors["paper"][0]
@@ -128,7 +128,7 @@ def test_summary_counts_and_places():
 
 
 def test_the_crossing_is_free_and_straight():
-    scene = Field().scene(3, 4)
+    scene = ExperimentWorld().scene(3, 4)
     path = crossing.path_of(scene, 1.0, 0.05)
     assert (scene.world.clearance(path[:, :2]) > 0.37).all()
     assert np.allclose(np.diff(path, axis=0), [0.05, 0, 0])
@@ -136,7 +136,7 @@ def test_the_crossing_is_free_and_straight():
 
 
 def test_a_world_without_a_free_line_is_refused():
-    scene = Scene.of(Field("maze").scene(0).world, 622, 0)
+    scene = Scene.of(ExperimentWorld("maze").scene(0).world, 622, 0)
     assert shapely.area(scene.world.free_space) > 0
     with pytest.raises(UserError, match="no free straight line"):
         crossing.path_of(scene, 0.0, 0.05)
@@ -161,9 +161,9 @@ def test_best_step_size_is_that_of_most_places():
 
 
 def test_names_are_those_of_the_tables():
-    assert chosen("paper,particle-filter heading known") == ("paper", "particle-filter, heading known")
+    assert parse_estimators("paper,particle-filter heading known") == ("paper", "particle-filter, heading known")
     with pytest.raises(UserError, match="no estimator 'kalman'"):
-        chosen("paper,kalman")
+        parse_estimators("paper,kalman")
 
 
 def test_a_page_is_filled_from_results_and_missing_ones_are_named(tmp_path):
@@ -172,20 +172,20 @@ def test_a_page_is_filled_from_results_and_missing_ones_are_named(tmp_path):
         "precise")}, notes=["a remark"])  # fmt: skip
     result.write(tmp_path, None)
     text = "before\n<!-- table e2 -->\nold\n<!-- end -->\nafter\n"
-    filled = page.filled(text, tmp_path)
-    assert "0.0020 ± 0.0010" in filled
-    assert "| 2.24 | 2.2 | one scan |" in filled
-    assert "\n\nA remark\n" in filled
-    assert "old" not in filled
-    assert page.filled(filled, tmp_path) == filled
+    fill_tables = page.fill_tables(text, tmp_path)
+    assert "0.0020 ± 0.0010" in fill_tables
+    assert "| 2.24 | 2.2 | one scan |" in fill_tables
+    assert "\n\nA remark\n" in fill_tables
+    assert "old" not in fill_tables
+    assert page.fill_tables(fill_tables, tmp_path) == fill_tables
     with pytest.raises(UserError, match="presage experiment e1"):
-        page.filled(text.replace("e2", "e1"), tmp_path)
+        page.fill_tables(text.replace("e2", "e1"), tmp_path)
 
 
 def test_the_page_has_the_numbers_of_the_results_beside_it():
     docs = Path(__file__).resolve().parents[3] / "docs"
     text = (docs / "experiments.md").read_text(encoding="utf-8")
-    assert page.filled(text, docs / "experiments") == text
+    assert page.fill_tables(text, docs / "experiments") == text
     assert "<!-- table e1 -->" in text
 
 
@@ -243,19 +243,19 @@ def test_all_goes_on_only_where_the_results_still_are_what_it_wrote(tmp_path):
     path = tmp_path / ".all.unfinished.json"
     (tmp_path / "e1.json").write_text("{}")
     (tmp_path / "e2.json").write_text("{}")
-    done = Done(path, [0, 1])
+    done = FinishedExperiments(path, [0, 1])
     done.add("e1")
     done.add("e2")
     (tmp_path / "e2.json").write_text('{"other": 1}')
-    again = Done(path, [0, 1])
+    again = FinishedExperiments(path, [0, 1])
     assert again.has("e1")
     assert not again.has("e2")
     assert not again.has("e3")
     (tmp_path / "e1.json").unlink()
-    assert not Done(path, [0, 1]).has("e1")
-    assert not Done(path, [5, 1]).has("e1")
+    assert not FinishedExperiments(path, [0, 1]).has("e1")
+    assert not FinishedExperiments(path, [5, 1]).has("e1")
     path.write_text("x")
-    assert not Done(path, [0, 1]).has("e1")
+    assert not FinishedExperiments(path, [0, 1]).has("e1")
 
 
 @pytest.mark.parametrize("args", [("alpha", "--alphas", "nan"), ("samples", "--sizes", "0"), ("e1", "--trials", "0")])

@@ -13,12 +13,12 @@ from common.errors import UserError
 from common.geometry.world import load_world
 from lab.accuracy.scenes import ROBOT, TWIN_OFFSET, Scene
 from lab.experiments import model_training as learning
-from lab.experiments.estimators import Field
+from lab.experiments.estimators import ExperimentWorld
 from lab.paper import aliasing, prediction, samples
 from services.estimator.shared.interface import Hypothesis, Posterior
 
 QUIET = Console(quiet=True)
-SMALL = samples.Job(3, steps=6, places=2, iterations=3, held_out=20, field=Field("corridor", 60))
+SMALL = samples.Job(3, steps=6, places=2, iterations=3, held_out=20, field=ExperimentWorld("corridor", 60))
 FEW = aliasing.Job(3, places=2, iterations=3, beams=120, samples=60, steps=5, scans=200)
 
 
@@ -36,7 +36,7 @@ def test_samples_same_seed_same_numbers_whatever_ran_before(name):
 
 
 def test_more_samples_smaller_error_and_as_many_gradient_steps():
-    job = replace(SMALL, seed=4, steps=260, held_out=200, field=Field("corridor", 30))
+    job = replace(SMALL, seed=4, steps=260, held_out=200, field=ExperimentWorld("corridor", 30))
     few, many = (samples.trial(replace(job, samples=size)) for size in (20, 1000))
     assert few["gradient_steps"] == many["gradient_steps"] == 260
     assert many["range_error_mean_m"] < 0.8 * few["range_error_mean_m"]
@@ -62,15 +62,15 @@ def test_samples_leaves_its_files_and_a_row_for_each(tmp_path):
 def test_a_decoder_is_judged_on_scans_without_noise_that_it_has_not_seen():
     scene = Scene.of(load_world("corridor"), 40, 5)
     decoder = learning.train_paper(scene, 1.0, 200, 5, 0)
-    fresh = learning.posed(Scene.of(load_world("corridor"), 40, 6), 500, 1.0, noise=False)
+    fresh = learning.sample_scans(Scene.of(load_world("corridor"), 40, 6), 500, 1.0, noise=False)
     error = learning.range_errors(decoder.model, scene, fresh)
     assert decoder.card.test_l1_mean == pytest.approx(error.mean(), rel=0.1)
     assert decoder.card.heading == 1.0
 
 
 def test_twins_stand_where_both_rooms_give_the_same_scan_and_in_both():
-    scene = aliasing.scene_of(replace(FEW, world="twins"), aliasing.PLACES)
-    poses = aliasing.stands(scene, 40)
+    scene = aliasing.scene_of(replace(FEW, world="twins"), aliasing.PLACES_SEED)
+    poses = aliasing.sample_places(scene, 40)
     assert poses.shape == (40, 3)
     right = poses[:, 0] > TWIN_OFFSET
     assert 0 < right.sum() < 40
@@ -134,7 +134,7 @@ def test_stated_precision_is_true_and_the_sample_is_not_chosen(tmp_path):
     assert precise["unsure_within_1_sigma"] > precise["unsure_within_noise_alone_1_sigma"] + 0.1
     shares = list(row["models"]["precise"]["within"].values())
     assert shares == sorted(shares)
-    assert row["pose"][1] < 3.14 - prediction.FEET
+    assert row["pose"][1] < 3.14 - prediction.FRONT_MARGIN
     measured, expected = np.array(row["measured_m"]), np.array(row["models"]["precise"]["expected_m"])
     assert np.median(np.abs(measured - expected)) < 0.02
     assert result.summary["paper"]["stated_sigma_median_m"] == 1.0
@@ -145,4 +145,4 @@ def test_stated_precision_is_true_and_the_sample_is_not_chosen(tmp_path):
 
 def test_prediction_without_weights_says_what_makes_them(tmp_path):
     with pytest.raises(UserError, match="presage train"):
-        prediction.run(prediction.Job(1, field=Field("maze")), tmp_path, 1, QUIET)
+        prediction.run(prediction.Job(1, field=ExperimentWorld("maze")), tmp_path, 1, QUIET)

@@ -17,9 +17,9 @@ from common.geometry.world import World, load_world
 from common.messages.definitions import Belief, Pose, Truth, Twist
 from common.robot.base import Robot
 from common.runtime import safety
-from lab.experiments.estimators import Field
-from lab.experiments.journeys import CLEARANCE, CLOSE, Journey, draw_journey, least_time, path_ratio
-from lab.experiments.lockstep import Track, _is_next
+from lab.experiments.estimators import ExperimentWorld
+from lab.experiments.journeys import ARRIVAL_DISTANCE, CLEARANCE, Journey, draw_journey, least_time, path_ratio
+from lab.experiments.lockstep import RunTrace, _is_next
 from lab.paper import e3_navigation as navigation
 from lab.paper import step_sizes as stepping
 from lab.paper import teleports
@@ -59,7 +59,7 @@ def test_no_robot_within_its_limits_is_sooner_there_than_the_least_time(distance
     """Full acceleration, by the simulator's own ramp, integrated finely."""
     robot, dt = Robot(max_speed=speed, acceleration=acceleration), 5e-3
     v, way, seconds = np.zeros(3), 0.0, 0.0
-    while distance - way > CLOSE:
+    while distance - way > ARRIVAL_DISTANCE:
         before, v = v, safety.ramp(v, np.array([speed, 0, 0]), robot, dt)
         way, seconds = way + (before[0] + v[0]) / 2 * dt, seconds + dt
     assert seconds == pytest.approx(least_time(distance, robot), abs=2 * dt)
@@ -92,8 +92,8 @@ def belief(number, x):
 
 
 def test_what_is_measured():
-    track = Track([truth(0, 1.0), truth(1, 2.0, contact=True), truth(2, 14.3)], [belief(k, 2.0) for k in range(3)])
-    found = navigation.measure(track, Journey((1.0, 1.0), (15.0, 1.0)))
+    trace = RunTrace([truth(0, 1.0), truth(1, 2.0, contact=True), truth(2, 14.3)], [belief(k, 2.0) for k in range(3)])
+    found = navigation.measure(trace, Journey((1.0, 1.0), (15.0, 1.0)))
     assert found["reached"]
     assert found["iterations"] == 2
     assert found["contacts"] == 1
@@ -124,7 +124,7 @@ def test_what_no_service_offers_is_refused(tmp_path):
 
 
 def test_e3_through_the_real_processes_and_a_trial_does_not_depend_on_others(tmp_path, monkeypatch):
-    job = navigation.Job(0, 7, apart=3.0, estimators=("precise",), field=Field(beams=101))
+    job = navigation.Job(0, 7, apart=3.0, estimators=("precise",), field=ExperimentWorld(beams=101))
     result = navigation.run(job, 2, tmp_path, 1, QUIET)
     summary = result.summary["precise"]
     assert (summary["reached"], summary["trials_with_contact"]) == (2, 0)
@@ -166,7 +166,7 @@ def test_a_fifth_an_iteration_makes_the_papers_number():
     ratios = outcome.distance[1:] / outcome.distance[:-1]
     assert ratios == pytest.approx(0.8)
     assert outcome.reached
-    assert outcome.iterations == int(np.ceil(np.log(outcome.distance[0] / CLOSE) / -np.log(0.8)))
+    assert outcome.iterations == int(np.ceil(np.log(outcome.distance[0] / ARRIVAL_DISTANCE) / -np.log(0.8)))
 
 
 def test_the_summed_action_does_not_die_away_and_passes_the_goal():

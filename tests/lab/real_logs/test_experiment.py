@@ -15,7 +15,16 @@ from common.geometry.world import World, load_world, save_world
 from lab.experiments import tables_page as page
 from lab.real_logs import experiment as real
 from lab.real_logs import filter_tuning as real_tuning
-from lab.real_logs.drive import KIDNAPPED, LASER, LIMIT, Job, drive_at, entered, second_first, unaware
+from lab.real_logs.drive import (
+    KIDNAPPED,
+    LASER,
+    MAX_SEARCH_SCANS,
+    Job,
+    create_estimator,
+    drive_at,
+    exchange_halves,
+    hide_kidnapping,
+)
 from lab.real_logs.drive import trial as one_trial
 from lab.real_logs.filter_tuning import starting_point
 from presage.learning.train_drive import TrainDriveOptions as Training
@@ -73,7 +82,7 @@ def test_a_robot_that_is_carried_off_finds_itself(folder, estimator):
         ),
     )  # fmt: skip
     row = one_trial(job)
-    assert len(row["error_m"]) == 10 + min(LIMIT, 45)
+    assert len(row["error_m"]) == 10 + min(MAX_SEARCH_SCANS, 45)
     assert np.median(row["error_m"][:10]) < 0.2
     found = real.summarise([row])
     assert found["found"] == 1
@@ -100,7 +109,7 @@ def test_tuning_uses_the_second_quarter_in_a_map_of_the_first(folder, tmp_path, 
     assert any(dict(each.particles).get("keep_initial_pose") == 0.0 for each in tried if each.task == LASER)
     for each in tried:
         assert each.first >= 50
-        assert max(each.first + each.count, each.to + LIMIT * (each.task == KIDNAPPED)) <= 100
+        assert max(each.first + each.count, each.to + MAX_SEARCH_SCANS * (each.task == KIDNAPPED)) <= 100
     mapped = load_world(tried[0].map)
     poses = job.drive.poses[:50, :2]
     assert mapped.grid is not None
@@ -109,13 +118,13 @@ def test_tuning_uses_the_second_quarter_in_a_map_of_the_first(folder, tmp_path, 
 
 def test_amcl_follows_a_base_that_moves_sideways(folder):
     job = Job(str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "amcl-defaults", LASER, 100)
-    assert entered(job).settings == ParticleSettings(robot_model_type="omni")
+    assert create_estimator(job).settings == ParticleSettings(robot_model_type="omni")
 
 
 def test_odometry_does_not_tell_of_being_carried_off():
     rng = np.random.default_rng(0)
     odom = np.cumsum(rng.normal(0, 0.1, (20, 3)), axis=0)
-    told = unaware(odom, 12)
+    told = hide_kidnapping(odom, 12)
     assert told[:12] == pytest.approx(odom[:12])
     assert told[12] == pytest.approx(odom[11])
     assert se2.between(told[12], told[15]) == pytest.approx(se2.between(odom[12], odom[15]))
@@ -143,7 +152,7 @@ def test_halves_are_disjoint_and_complete(count):
 def test_halves_exchanged_are_a_drive_whose_time_goes_on(count):
     drive = real_drive.drive(count)
     first, second = split(drive)
-    turned = second_first(drive)
+    turned = exchange_halves(drive)
     late = len(second.ranges)
     assert turned.poses[:late] == pytest.approx(second.poses)
     assert turned.ranges[late:] == pytest.approx(first.ranges)
@@ -198,7 +207,7 @@ def test_wrong_claims_are_counted_while_they_last():
 
 
 def test_its_table_is_one_of_the_page(tmp_path):
-    assert page.MODULES["real"] == "real"
+    assert page.MODULES["real"] == "lab.real_logs.experiment"
     summary = {"a: tracking with odometry, precise": real.summarise([row("odometry", [0.01, 0.02], ["tracking"] * 2)])}
     table = real.table(summary)
     assert "| a: tracking with odometry, precise | 15.0 |" in table
