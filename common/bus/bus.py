@@ -1,6 +1,6 @@
 """Publish, subscribe, query and answer messages over zenoh.
 
-With session.py and presence.py the only file that imports zenoh.
+Only this module, session.py and liveliness.py import zenoh.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import zenoh
 
-from common.bus.endpoints import not_let_in, refuse_exposure
+from common.bus.endpoints import explain_rejection, refuse_exposure
 from common.bus.inbox import Answer, Call, Inbox, Sample
 from common.bus.liveliness import Liveliness, published_ns
 from common.bus.security import Credentials, may_ask, may_put
@@ -27,16 +27,16 @@ from common.messages.topics import Query, Topic, topic_of
 from common.messages.wire import ENCODING, DecodeError, Message
 
 R = TypeVar("R", bound=Reply)
-JOIN_PAUSE_S = 0.2  # between two attempts to join a router, where it refuses at once
+JOIN_PAUSE_S = 0.2  # between two attempts to join a router that refuses
 
 
 class Bus(Liveliness):
-    """One session, bound to one robot's keys."""
+    """A zenoh session with which to publish, subscribe and query on the keys of one robot."""
 
     def __init__(
         self, session: zenoh.Session, robot: str, security: Credentials | None = None, *, lossless: bool = True
     ) -> None:
-        """Use `open_bus`."""
+        """Use `open_bus` instead, which opens and closes the session."""
         super().__init__(session, robot)
         self._security = security
         self._congestion = zenoh.CongestionControl.BLOCK if lossless else zenoh.CongestionControl.DROP
@@ -44,25 +44,28 @@ class Bus(Liveliness):
         self._lock = threading.Lock()
 
     def for_robot(self, robot: str) -> Bus:
-        """Another robot's keys on the same session."""
+        """A bus for the keys of another robot on the same session."""
         lossless = self._congestion == zenoh.CongestionControl.BLOCK
         return Bus(self._session, robot, self._security, lossless=lossless)
 
     def undeclare_all(self) -> None:
-        """Undeclare all that was declared here: this robot is served no more."""
+        """Undeclare everything that was declared with this bus, to stop serving its robot."""
         declared: list[Any] = [*self._declared, *self._publishers.values()]
         self._declared.clear()
         self._publishers.clear()
-        for each in reversed(declared):  # the liveliness token, which came last, first
+        for each in reversed(declared):  # the liveliness token was declared last and goes first
             each.undeclare()
 
     def put(self, topic: Topic, payload: bytes, service: str = "*", key: str | None = None) -> None:
-        """Publish bytes on the topic's key, or on ``key`` where a replay names it."""
+        """Publish bytes on the topic's key, or on ``key`` if given (as in a replay).
+
+        Raises UserError if the role of the credentials may not publish the topic.
+        """
         publisher = self.publisher(topic, service, key)
         publisher.put(payload, source_info=zenoh.SourceInfo(publisher.id, 0))
 
     def publisher(self, topic: Topic, service: str = "*", key: str | None = None) -> zenoh.Publisher:
-        """The publisher of a key, declared once."""
+        """The publisher of a key, which is declared at its first use."""
         key = key or topic.key(self.robot, service)
         if self._security is not None:
             self._security.check(may_put, topic, key.split("/")[1])
@@ -76,14 +79,17 @@ class Bus(Liveliness):
             return self._publishers[key]
 
     def wait_matching(self, topic: Topic, timeout: float, service: str = "*", key: str | None = None) -> bool:
-        """Whether somebody subscribes to the topic within ``timeout`` s; a put before that may be lost."""
-        publisher: Any = self.publisher(topic, service, key)  # zenoh's stub has the status wrong
+        """Whether the topic has a subscriber within ``timeout`` s; what is published before may be lost."""
+        publisher: Any = self.publisher(topic, service, key)  # zenoh's stub declares the wrong type of the status
         return wait_until(lambda: bool(publisher.matching_status.matching), timeout)
 
     def subscribe(
         self, topic: Topic, inbox: Inbox, *, keep_all: bool = False, robot: str | None = None
     ) -> Callable[[], None]:
-        """Move the topic's payloads to ``inbox`` by the topic's queue policy, or all of them; a call ends it."""
+        """Put the payloads of a topic into ``inbox``, by the topic's queue policy or, with ``keep_all``, all of them.
+
+        Returns a function that ends the subscription.
+        """
         newest = topic.queue == "newest" and not keep_all
 
         def move(sample: zenoh.Sample) -> None:
@@ -102,14 +108,14 @@ class Bus(Liveliness):
         return end
 
     def serve(self, query: Query, inbox: Inbox, service: str = "*") -> None:
-        """Move requests to ``inbox``; the loop answers them."""
+        """Put requests into ``inbox``, as `Call`s that have to be answered."""
 
         def move(call: zenoh.Query) -> None:
             payload = call.payload.to_bytes() if call.payload is not None else b""
             key = query.key(self.robot, service)
 
             def reply(answer: bytes) -> None:
-                with suppress(zenoh.ZError):  # the asker may be gone
+                with suppress(zenoh.ZError):  # the requester may be gone
                     call.reply(key, answer, encoding=zenoh.Encoding(ENCODING).with_schema(query.reply.__name__))
                 call.drop()  # type: ignore[no-untyped-call]
 
@@ -123,10 +129,18 @@ class Bus(Liveliness):
         self._declared.append(self._session.declare_queryable(query.key(self.robot, service), move, complete=True))
 
     def ask(
-        self, query: Query, request: Request, reply: type[R], timeout: float = 5.0, service: str = "*",
+        self,
+        query: Query,
+        request: Request,
+        reply: type[R],
+        timeout: float = 5.0,
+        service: str = "*",
         robot: str | None = None,
-    ) -> R:  # fmt: skip
-        """The first answer; raises UserError where nobody answers, the answer is an error, or makes no sense."""
+    ) -> R:
+        """Send a request and wait for the first reply.
+
+        Raises UserError if there is no reply within ``timeout`` s, or if it is an error or cannot be decoded.
+        """
         key = query.key(robot or self.robot, service)
         if self._security is not None:
             self._security.check(may_ask, query, robot or self.robot)
@@ -140,21 +154,25 @@ class Bus(Liveliness):
                     raise UserError(f"{key}: refused: {why}")
             if answers:
                 break
-            time.sleep(0.02)  # a session that has just opened does not know yet who is there: nothing was asked
-        who = service if service != "*" else query.server
-        raise UserError(f"nobody answers {key} within {timeout:g} s: is the {who} running? `presage doctor` looks")
+            # A session that has just opened does not know the queryables yet; the request was sent to none of them.
+            time.sleep(0.02)
+        server = service if service != "*" else query.server
+        raise UserError(
+            f"no service answers {key} within {timeout:g} s: is the {server} running? `presage doctor` checks it"
+        )
 
     def request(
         self, query: Query, request: Request, number: int, inbox: Inbox, timeout: float = 5.0, service: str = "*"
-    ) -> None:  # fmt: skip
-        """Ask and return at once; exactly one `Answer` with ``number`` comes to ``inbox``, within ``timeout`` s or so.
+    ) -> None:
+        """Send a request and return at once; exactly one `Answer` with ``number`` is put into ``inbox``.
 
-        Nobody is asked twice: a session that has just opened, and does not know yet who is there, hears of nobody.
+        It arrives after about ``timeout`` s at the latest. The request is sent once: if the session has just opened and
+        does not know the queryables yet, the answer is that there is no service.
         """
-        key, owed = query.key(self.robot, service), threading.Lock()
+        key, unanswered = query.key(self.robot, service), threading.Lock()
 
         def settle(payload: bytes, refusal: str = "") -> None:
-            if owed.acquire(blocking=False):  # the first answer counts, and is never given back
+            if unanswered.acquire(blocking=False):  # never released, so only the first answer is used
                 inbox.put(Answer(query, number, payload, refusal))
 
         def move(answer: zenoh.Reply) -> None:
@@ -164,32 +182,44 @@ class Bus(Liveliness):
                 settle(b"", f"{key}: refused: {why}")
 
         def end() -> None:
-            settle(b"", f"nobody answers {key}: is the {service if service != '*' else query.server} running?")
+            settle(b"", f"no service answers {key}: is the {service if service != '*' else query.server} running?")
 
         handler = zenoh.handlers.Callback(move, end)
         self._session.get(key, handler, payload=request.encode(), encoding=ENCODING, timeout=timeout)
 
     def ask_each(
-        self, query: Query, request: Request, inbox: Inbox, timeout: float = 5.0, service: str = "*",
+        self,
+        query: Query,
+        request: Request,
+        inbox: Inbox,
+        timeout: float = 5.0,
+        service: str = "*",
         robot: str | None = None,
-    ) -> threading.Event:  # fmt: skip
-        """Ask all who serve the query, also several of one name: an `Answer` each. Set once no more will come."""
+    ) -> threading.Event:
+        """Send a request to all services that serve the query, including several instances of one service.
+
+        Each reply is put into ``inbox`` as an `Answer`. Returns an event that is set when no more replies will arrive.
+        """
         done, number = threading.Event(), itertools.count()
 
         def move(answer: zenoh.Reply) -> None:
             if answer.ok is not None:
-                inbox.put(Answer(query, next(number), answer.ok.payload.to_bytes(), who=str(answer.replier_id)))
+                inbox.put(Answer(query, next(number), answer.ok.payload.to_bytes(), session=str(answer.replier_id)))
 
         self._session.get(
-            query.key(robot or self.robot, service), zenoh.handlers.Callback(move, done.set),
-            payload=request.encode(), encoding=ENCODING, timeout=timeout,
-            target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE,
-        )  # fmt: skip
+            query.key(robot or self.robot, service),
+            zenoh.handlers.Callback(move, done.set),
+            payload=request.encode(),
+            encoding=ENCODING,
+            timeout=timeout,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
         return done
 
 
 def _source(sample: zenoh.Sample) -> str:
-    """Whoever published it: by its own word, else by the clock that stamped it."""
+    """Id of the session that published a sample: from its source info, else from the clock of its timestamp."""
     if (info := sample.source_info) is not None:
         return str(info.source_id.zid)
     return str(sample.timestamp.get_id()) if sample.timestamp is not None else ""
@@ -199,17 +229,22 @@ def _decode_reply(key: str, reply: type[R], payload: bytes) -> R:
     try:
         return reply.decode(payload)
     except DecodeError as error:
-        raise UserError(f"{key}: the answer makes no sense: {error}") from None
+        raise UserError(f"{key}: the reply cannot be decoded: {error}") from None
 
 
 @contextmanager
 def open_bus(
-    link: Link, *, patience: float | None = None, give_up: Callable[[], bool] = lambda: False,
+    link: Link,
+    *,
+    patience: float | None = None,
+    give_up: Callable[[], bool] = lambda: False,
     log_filter: str = LOG_FILTER,
-) -> Iterator[Bus]:  # fmt: skip
-    """A session for the block; raises UserError where the endpoints cannot be used, or are open to everybody.
+) -> Iterator[Bus]:
+    """Open a session for the block.
 
-    With credentials it begins once a router has let us in: waited for until ``give_up``, or for ``patience`` s.
+    With credentials, waits until a router accepts them: for ``patience`` s, then raises UserError, or without limit if
+    it is None. Exits the process when ``give_up()`` becomes true meanwhile. Raises UserError if the endpoints cannot be
+    used, or if a session without credentials would be reachable from other machines.
     """
     if link.security is None and not link.insecure:
         refuse_exposure(link.listen)
@@ -217,8 +252,8 @@ def open_bus(
     began, waiting = time.monotonic(), False
     join_timeout = JOIN_TIMEOUT_S if patience is None else min(patience, JOIN_TIMEOUT_S)
     while (session := open_session(link, join_timeout)) is None:
-        assert link.security is not None  # noqa: S101 - others do not wait
-        why = not_let_in(link.security.member.name, link.connect)
+        assert link.security is not None  # noqa: S101 - open_session returns None only with credentials
+        why = explain_rejection(link.security.member.name, link.connect)
         if give_up():
             raise SystemExit(0)
         if patience is not None and time.monotonic() - began > patience:
@@ -227,7 +262,7 @@ def open_bus(
             logging.getLogger(__name__).warning("%s; waiting", why)
         waiting = True
         time.sleep(JOIN_PAUSE_S)
-    with closing(session):  # its own __exit__ fails while another thread is inside one of its calls; close() does not
+    with closing(session):  # zenoh's own __exit__ fails while another thread is in a call of the session
         yield Bus(session, link.robot, link.security, lossless=link.lossless)
 
 

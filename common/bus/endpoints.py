@@ -7,28 +7,29 @@ from collections.abc import Sequence
 
 from common.errors import UserError
 
-NETWORKS = frozenset({"tcp", "udp", "tls", "quic", "ws", "vsock"})  # zenoh itself refuses what it does not know
+NETWORK_PROTOCOLS = frozenset({"tcp", "udp", "tls", "quic", "ws", "vsock"})  # zenoh refuses unknown protocols
 
 
 def over_tls(endpoint: str) -> str:
-    """With credentials nothing goes over the wire in the clear, however the endpoint is written."""
+    """Replace tcp by tls: a session with credentials sends nothing unencrypted."""
     return endpoint.replace("tcp/", "tls/", 1) if endpoint.startswith("tcp/") else endpoint
 
 
 def refuse_exposure(listen: Sequence[str]) -> None:
-    """Raises UserError where anybody on the network could join: for sessions without credentials."""
+    """Raise UserError if a session without credentials would listen on addresses that other machines reach."""
     if exposed := [endpoint for endpoint in listen if not on_loopback(endpoint)]:
         raise UserError(
-            f"listen {', '.join(exposed)}: whoever reaches that could drive the robot. --security DIR lets in "
-            "whom you name (`presage secure init`), --insecure (PRESAGE_INSECURE=1) says that the network is private"
+            f"listen {', '.join(exposed)}: any machine that reaches this address could drive the robot. Either give "
+            "credentials with --security DIR (`presage secure init` creates them), or declare the network private with "
+            "--insecure (PRESAGE_INSECURE=1)"
         )
 
 
 def on_loopback(endpoint: str) -> bool:
-    """Whether only this machine reaches it; a name other than localhost may be anything."""
+    """Whether only this machine can reach the endpoint; False for host names other than localhost."""
     protocol, _, rest = endpoint.partition("/")
     host = rest.rsplit(":", 1)[0].strip("[]")
-    if protocol not in NETWORKS:
+    if protocol not in NETWORK_PROTOCOLS:
         return True
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
@@ -36,9 +37,10 @@ def on_loopback(endpoint: str) -> bool:
         return False
 
 
-def not_let_in(name: str, connect: Sequence[str]) -> str:
-    """What may be wrong where no router accepts ``name``."""
+def explain_rejection(name: str, connect: Sequence[str]) -> str:
+    """Error message for the case that no router accepts the credentials ``name``."""
     return (
         f"no router at {', '.join(map(over_tls, connect)) or 'no endpoint'} lets {name!r} in: "
-        "does it run, with --security, of the same authority? its log says whom it refuses"
+        "is a router running there, with --security and credentials of the same authority? "
+        "Its log lists the connections it refuses"
     )

@@ -11,13 +11,13 @@ from common.messages.requests import Reply
 from common.messages.topics import MAX_BYTES, Query, Topic
 from common.messages.wire import DecodeError
 
-MAX_KEYS = 1000  # counted by name; a sender that invents keys must not fill memory
-OTHERS = "others"  # what the rest is counted under
+MAX_KEYS = 1000  # counted separately; a sender that invents keys must not fill memory
+OTHERS = "others"  # name under which all further keys are counted
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One payload as it came."""
+    """A received payload, not yet decoded."""
 
     topic: Topic
     key: str
@@ -29,43 +29,46 @@ class Sample:
 
 @dataclass(frozen=True)
 class Call:
-    """One request as it came; exactly one of the two answers is owed."""
+    """A received request, not yet decoded. The receiver has to call exactly one of ``reply`` and ``refuse``."""
 
     query: Query
     payload: bytes
     reply: Callable[[bytes], None]
-    refuse: Callable[[str], None]
+    refuse: Callable[[str], None]  # with the reason
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What became of a request of ours: an answer as it came, or why there is none."""
+    """The result of a request that this process sent: a reply, not yet decoded, or the reason why there is none."""
 
     query: Query
     number: int  # of the request
     payload: bytes
     refusal: str = ""  # why there is no payload
-    who: str = ""  # the session that answered, where each was asked
+    session: str = ""  # the zenoh session that replied, set by `Bus.ask_each`
 
     def reply(self) -> Reply:
-        """The answer decoded; where there is none that makes sense, one with ok false that says why."""
+        """The decoded reply; one with ok=False and the reason if there is none or it cannot be decoded."""
         if self.refusal:
             return self.query.reply(ok=False, reason=self.refusal)
         try:
             return self.query.reply.decode(self.payload)
         except DecodeError as error:
-            return self.query.reply(ok=False, reason=f"the answer makes no sense: {error}")
+            return self.query.reply(ok=False, reason=f"the reply cannot be decoded: {error}")
 
 
 class Inbox:
-    """A bounded queue in which a newest-only key takes one place, and every drop is counted."""
+    """A bounded, thread-safe queue that counts every dropped entry.
+
+    Of a topic with queue policy "newest", at most one sample of each source waits.
+    """
 
     def __init__(
         self, capacity: int = 10_000, max_bytes: int = 1 << 28, changed: threading.Condition | None = None
     ) -> None:
         """Hold at most ``capacity`` entries and ``max_bytes`` bytes of payload.
 
-        ``changed`` is notified of each entry: one for several inboxes lets one loop wait for all of them.
+        ``changed`` is notified of each new entry; several inboxes may share it, so that one loop can wait for all.
         """
         self.capacity, self.max_bytes = capacity, max_bytes
         self.received: Counter[str] = Counter()  # by key
@@ -75,13 +78,17 @@ class Inbox:
         self._bytes = 0
         self._serial = 0
         self._counted: set[str] = set()
-        lock = threading.RLock()  # reentrant: a signal handler may wake us inside wait
+        lock = threading.RLock()  # reentrant, because a signal handler may call `wake` while this thread waits
         self._changed = changed or threading.Condition(lock)
-        # Not entered through the condition: Ctrl-C in its __enter__, which is Python, would leave it locked for ever.
+        # Lock with this and not with the condition: its __enter__ is Python code, and Ctrl-C inside it would leave the
+        # lock taken for ever.
         self._lock = changed or lock
 
     def put(self, entry: Sample | Call | Answer, *, newest_only: bool = False) -> None:
-        """Add an entry; where a newest-only key still waits, the new one takes the old one's place."""
+        """Add an entry. With ``newest_only``, it replaces a waiting sample of the same key and source.
+
+        Entries that are too large or do not fit are dropped and counted; dropped requests are refused.
+        """
         size = len(entry.payload)
         full_key = entry.key if isinstance(entry, Sample) else entry.query.name
         with self._lock:
@@ -90,49 +97,48 @@ class Inbox:
             if size > (MAX_BYTES if isinstance(entry, Sample) else 64 * MAX_BYTES):
                 self.oversized[key] += 1
                 if isinstance(entry, Call):
-                    entry.refuse(f"{size} bytes are too many")
+                    entry.refuse(f"the request of {size} bytes is too large")
                 if not isinstance(entry, Answer):
                     return
-                entry, size = replace(entry, payload=b"", refusal=f"the answer's {size} bytes are too many"), 0
+                entry, size = replace(entry, payload=b"", refusal=f"the reply of {size} bytes is too large"), 0
             self._serial += 1
-            # Of each source: nobody's newest takes the place of somebody else's.
+            # One slot for each source, so that a source never replaces the sample of another.
             slot: object = (full_key, entry.source) if newest_only and isinstance(entry, Sample) else self._serial
             old = self._entries.get(slot)
+            full = len(self._entries) >= self.capacity or self._bytes + size > self.max_bytes
             if old is not None:
                 self._bytes -= len(old.payload)
                 self.dropped[key] += 1
-            elif not isinstance(entry, Answer) and (  # of those come no more than were asked for
-                len(self._entries) >= self.capacity or self._bytes + size > self.max_bytes
-            ):
+            elif full and not isinstance(entry, Answer):  # answers are never more than the requests sent
                 self.dropped[key] += 1
                 if isinstance(entry, Call):
-                    entry.refuse("too many requests wait")
+                    entry.refuse("too many requests are waiting")
                 return
             self._entries[slot] = entry
             self._bytes += size
             self._changed.notify()
 
     def counted_as(self, key: str) -> str:
-        """The name a key is counted under: its own, or `OTHERS` when there are too many."""
+        """Name under which a key is counted: the key itself, or `OTHERS` if there are too many keys."""
         if key not in self._counted and len(self._counted) >= MAX_KEYS:
             return OTHERS
         self._counted.add(key)
         return key
 
     def tally(self) -> tuple[Counter[str], Counter[str], Counter[str]]:
-        """By key and as of one moment: received and no longer waiting, dropped, oversized."""
+        """Counts by key at one moment: taken from the queue or dropped, dropped, oversized."""
         with self._lock:
             taken = self.received.copy()
             taken.subtract(self.counted_as(entry.key) for entry in self._entries.values() if isinstance(entry, Sample))
             return taken, self.dropped.copy(), self.oversized.copy()
 
     def arrivals(self) -> tuple[Counter[str], Counter[str], Counter[str]]:
-        """By key and as of one moment: received, those that wait included, dropped, oversized."""
+        """Counts by key at one moment: received (including waiting entries), dropped, oversized."""
         with self._lock:
             return self.received.copy(), self.dropped.copy(), self.oversized.copy()
 
     def get(self, timeout: float) -> Sample | Call | Answer | None:
-        """The oldest entry, waiting at most ``timeout`` s for one; None when none came."""
+        """Take the oldest entry, waiting at most ``timeout`` s for one; returns None if there is none."""
         with self._lock:
             if not self._entries and timeout > 0:
                 self._changed.wait(timeout)
@@ -143,7 +149,7 @@ class Inbox:
             return entry
 
     def wake(self) -> None:
-        """End a wait early."""
+        """Make a waiting `get` return."""
         with self._lock:
             self._changed.notify_all()
 

@@ -1,7 +1,8 @@
 """Names and ordering of several instances of one service.
 
-The instance that was started first leads; others stand by and say nothing, until it is gone. Names begin with the time
-of the start, so that names in order are instances by age (where clocks differ, at least all agree on the order).
+The instance that was started first is active (it leads); the others stand by and publish nothing until it is gone.
+Names begin with the time of the start, so sorted names are instances by age. Where the clocks of hosts differ, all
+instances still agree on the order.
 """
 
 from __future__ import annotations
@@ -14,94 +15,93 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Instance:
-    """What a name says."""
+    """The parts of an instance name."""
 
     started_ms: int  # wall time of the instance's host
     host: str
     pid: int
-    zid: str  # beginning of its zenoh session's id
+    zid: str  # beginning of the id of its zenoh session
 
     @classmethod
     def parse(cls, name: str) -> Instance | None:
-        """None: no name of ours."""
+        """Returns None if ``name`` is not an instance name."""
         match = re.fullmatch(r"([0-9a-f]{12})~(.+)~(\d+)~([0-9a-f]*)", name)
         return cls(int(match[1], 16), match[2], int(match[3]), match[4]) if match else None
 
     @property
     def name(self) -> str:
-        """One chunk of a key."""
+        """The name, valid as one chunk of a zenoh key."""
         host = re.sub(r"[^A-Za-z0-9_.-]", "-", self.host)[:64] or "host"
         return f"{self.started_ms:012x}~{host}~{self.pid}~{self.zid[:8]}"
 
 
 def describe_instance(name: str) -> str:
-    """For people."""
+    """Process and host of an instance, for log lines and error messages; other names are returned unchanged."""
     instance = Instance.parse(name)
     return name if instance is None else f"process {instance.pid} on {instance.host}"
 
 
 class Instances:
-    """Which instances of one service are there; zenoh's threads tell, a loop asks."""
+    """The other instances of one service that are alive; updated by zenoh's threads and read by the service's loop."""
 
     def __init__(self, me: str) -> None:
-        """Nobody but ``me``, who does not count."""
+        """``me`` is the name of this instance, which is not counted as another one."""
         self.me = me
-        self.look: Callable[[], None] = lambda: None  # asks who leads, without waiting
+        self.refresh: Callable[[], None] = lambda: None  # queries the active instances again, without waiting
         self._leading: set[str] = set()
         self._waiting: set[str] = set()
         self._lock = threading.Lock()
 
-    def change(self, name: str, *, leads: bool, there: bool) -> None:
-        """An instance leads or waits from now on, or does so no more."""
-        # This session itself: as it is now, or as it led this robot before, which zenoh may tell again.
+    def update(self, name: str, *, leads: bool, alive: bool) -> None:
+        """Record that an instance that leads, or waits, is now alive or no longer alive."""
+        # Ignore this session, also with an earlier start time: zenoh may repeat a token from when it led before.
         if name.partition("~")[2] == self.me.partition("~")[2]:
             return
         with self._lock:
             group = self._leading if leads else self._waiting
-            (group.add if there else group.discard)(name)
+            (group.add if alive else group.discard)(name)
 
     def leaders(self) -> list[str]:
-        """Others that lead, by age."""
+        """Other instances that lead, oldest first."""
         with self._lock:
             return sorted(self._leading)
 
     def may_lead(self) -> bool:
-        """Nobody leads, and none who waits is older."""
+        """Whether no other instance leads and none that waits is older."""
         with self._lock:
             return not self._leading and self.me <= min(self._waiting, default=self.me)
 
     def must_yield(self) -> bool:
-        """Another leads that was started before: two halves of a network have met."""
+        """Whether an older instance leads too, as after two parts of a network were joined."""
         leaders = self.leaders()
         return bool(leaders) and leaders[0] < self.me
 
 
 class SourceSelector:
-    """Of several that publish what one should, only one is heard.
+    """Selects one source for each key on which several sessions publish although only one should.
 
-    That is the service's own instance, where one says that it leads, of two the elder; where none does (a replay, a
-    robot's own driver), the first, until it has been silent for a while.
+    If instances of the publishing service lead, the oldest of them is selected. If there is none, as in a replay or
+    with a robot's own driver, the first source is selected until it has been silent for ``timeout`` s.
     """
 
-    def __init__(self, patience: float) -> None:
-        """``patience``: s of silence."""
-        self.patience = patience
-        self._heard: dict[str, tuple[str, float]] = {}  # by key: who, and when last
-        self._owners: dict[tuple[str, str], frozenset[str]] = {}  # by robot and service
+    def __init__(self, timeout: float) -> None:
+        self.timeout = timeout
+        self._selected: dict[str, tuple[str, float]] = {}  # by key: the source and the time of its last message
+        self._leaders: dict[tuple[str, str], frozenset[str]] = {}  # by robot and service
 
-    def change(self, robot: str, service: str, name: str, there: bool) -> None:  # noqa: FBT001 - zenoh's thread
-        """An instance leads from now on, or no more."""
+    def update(self, robot: str, service: str, name: str, alive: bool) -> None:  # noqa: FBT001 - called by zenoh
+        """Record that an instance that leads is now alive or no longer alive."""
         if Instance.parse(name) is not None:
-            before = self._owners.get((robot, service), frozenset())
-            self._owners[robot, service] = before | {name} if there else before - {name}
+            before = self._leaders.get((robot, service), frozenset())
+            self._leaders[robot, service] = before | {name} if alive else before - {name}
 
-    def takes(self, key: str, service: str, source: str, now: float) -> bool:
-        """Whether a message of ``source`` that came at ``now`` s counts on a key that ``service`` publishes."""
-        owners = self._owners.get((key.split("/")[1], service))
-        if owners and (eldest := Instance.parse(min(owners))) is not None:
-            return source.startswith(eldest.zid)
-        who, when = self._heard.get(key, (source, now))
-        if who != source and now - when < self.patience:
+    def accepts(self, key: str, service: str, source: str, now: float) -> bool:
+        """Whether to use a message of ``source``, received at ``now`` s on a key that ``service`` publishes."""
+        leaders = self._leaders.get((key.split("/")[1], service))
+        if leaders and (oldest := Instance.parse(min(leaders))) is not None:
+            return source.startswith(oldest.zid)
+        selected, last_time = self._selected.get(key, (source, now))
+        if selected != source and now - last_time < self.timeout:
             return False
-        self._heard[key] = (source, now)
+        self._selected[key] = (source, now)
         return True

@@ -9,46 +9,47 @@ from common.bus.instances import Instances, describe_instance
 from common.errors import UserError
 from common.log import Logger
 
-LINKED_WITHIN = 0.5  # s that a service waits for its first link before it looks who else is there
+LINK_TIMEOUT_S = 0.5  # for the first link of a service, before it looks for other instances
 
 
 class LeaderElection:
-    """Waits for the lead, and gives it up to an elder."""
+    """Lets this instance become active when no other is, and ends it if an older instance is active too."""
 
     def __init__(self, bus: Bus, service: str, log: Logger, wake: Callable[[], None]) -> None:
-        """``wake`` is called from another thread when somebody came or went."""
+        """Take part in the election for ``service``; ``wake`` is called from another thread when instances change."""
         self._bus, self._service, self._log, self._wake = bus, service, log, wake
-        self._others: Instances | None = None  # nobody has looked yet
-        self._stands_by: Callable[[], None] | None = None  # ends it
+        self._others: Instances | None = None
+        self._end_standby: Callable[[], None] | None = None  # set while this instance stands by
 
-    def takes(self) -> bool:
-        """Whether this instance leads from now on; else it stands by, and is to ask again."""
+    def try_activate(self) -> bool:
+        """Returns whether this instance is active now; if not, it stands by and the caller has to try again."""
         if self._others is None:
-            wait_until(self._bus.linked, LINKED_WITHIN)  # who is linked to nobody hears of nobody
+            wait_until(self._bus.linked, LINK_TIMEOUT_S)  # without a link, other instances cannot be found
             self._others = self._bus.instances(self._service, self._wake)
         if not self._others.may_lead():
-            if self._stands_by is None:
-                self._stands_by = self._bus.stand_by(self._service)
+            if self._end_standby is None:
+                self._end_standby = self._bus.stand_by(self._service)
                 self._log.warning(
-                    "standing by: another was there first; this one takes over when it is gone",
+                    "standing by: another instance is active; this one takes over when it is gone",
                     leads=[describe_instance(name) for name in self._others.leaders()],
                 )
             return False
-        if self._stands_by is not None:
-            self._stands_by()
-            self._stands_by = None
-            self._log.warning("taking over: the one that led is gone")
+        if self._end_standby is not None:
+            self._end_standby()
+            self._end_standby = None
+            self._log.warning("taking over: the active instance is gone")
         return True
 
-    def look(self) -> None:
-        """Ask who else leads: now and then, for a word of one who comes back may get lost."""
+    def refresh(self) -> None:
+        """Query the active instances again; call it now and then, because a notification may get lost."""
         if self._others is not None:
-            self._others.look()
+            self._others.refresh()
 
     def check(self) -> None:
-        """Raises UserError where an elder instance leads as well: two halves of a network have met."""
+        """Raise UserError if an older instance is active too, as after two parts of a network were joined."""
         if self._others is not None and self._others.must_yield():
+            older = describe_instance(self._others.leaders()[0])
             raise UserError(
-                f"another {self._service} of {self._bus.robot!r}, {describe_instance(self._others.leaders()[0])}, was started "
-                f"before this one and leads: this one ends. Started again, it stands by"
+                f"another {self._service} of {self._bus.robot!r}, {older}, was started before this one and is active, "
+                "so this one ends. If it is started again, it stands by"
             )

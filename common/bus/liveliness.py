@@ -15,55 +15,57 @@ from common.bus.session import wait_until
 from common.messages.topics import Topic, alive_key, standby_key
 from common.messages.wire import ENCODING
 
-TOLD_WITHIN = 0.3  # s for a subscriber to hear of those who were there before it
+HISTORY_TIMEOUT_S = 0.3  # for a new liveliness subscriber to receive the tokens that existed before it
 
 
 class Liveliness:
-    """One robot's services on one session."""
+    """Declares and watches the liveliness tokens of one robot's services, and serves its latched topics."""
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
-        """Nothing is declared yet."""
+        """Use ``session`` for the keys of ``robot``; nothing is declared yet."""
         self.robot = robot
         self.zid = str(session.zid())
         self.instance = Instance(time.time_ns() // 10**6, socket.gethostname(), os.getpid(), self.zid).name
         self._session = session
-        self._kept: dict[str, tuple[bytes, zenoh.Timestamp | None]] = {}  # by key, the last payload of kept topics
-        self._there: dict[str, set[str]] = {}  # tokens by the key that was asked for
-        self._declared: list[object] = []  # zenoh undeclares what nobody holds
+        self._latched: dict[str, tuple[bytes, zenoh.Timestamp | None]] = {}  # by key: the last payload
+        self._alive: dict[str, set[str]] = {}  # tokens by the key expression that is watched
+        self._declared: list[object] = []  # zenoh undeclares objects that are garbage-collected
 
-    def keep(self, topic: Topic) -> None:
-        """From now on hear a kept topic, and tell the last payload to whoever asks with `kept`."""
+    def serve_latched(self, topic: Topic) -> None:
+        """Subscribe to a latched topic, and serve its last payload to sessions that call `query_latched`."""
         key = topic.key(self.robot)
 
-        def move(sample: zenoh.Sample) -> None:
-            self._kept[key] = (sample.payload.to_bytes(), sample.timestamp)
+        def store(sample: zenoh.Sample) -> None:
+            self._latched[key] = (sample.payload.to_bytes(), sample.timestamp)
 
-        def tell(call: zenoh.Query) -> None:
-            if (last := self._kept.get(key)) is not None:
-                with suppress(zenoh.ZError):  # the asker may be gone
+        def reply(call: zenoh.Query) -> None:
+            if (last := self._latched.get(key)) is not None:
+                with suppress(zenoh.ZError):  # the requester may be gone
                     call.reply(key, last[0], encoding=ENCODING, timestamp=last[1])
             call.drop()  # type: ignore[no-untyped-call]
 
-        self._declared += [self._session.declare_subscriber(key, move), self._session.declare_queryable(key, tell)]
+        self._declared += [self._session.declare_subscriber(key, store), self._session.declare_queryable(key, reply)]
 
-    def kept(self, topic: Topic, timeout: float = 0.5) -> bytes | None:
-        """The last payload that anybody still knows of a kept topic."""
+    def query_latched(self, topic: Topic, timeout: float = 0.5) -> bytes | None:
+        """The newest payload of a latched topic that any session has stored, or None."""
         answers = self._session.get(
-            topic.key(self.robot), target=zenoh.QueryTarget.ALL, consolidation=zenoh.ConsolidationMode.NONE,
+            topic.key(self.robot),
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout,
-        )  # fmt: skip
+        )
         found = [(published_ns(a.ok), a.ok.payload.to_bytes()) for a in answers if a.ok is not None]
         return max(found, default=(0, None), key=lambda each: each[0])[1]
 
     def declare_alive(self, service: str) -> None:
-        """Say that the service is there, until the session ends. Declare it last: order is kept."""
-        self._token(alive_key(self.robot, service, self.instance))
+        """Declare the service alive until the session ends.
 
-    def _token(self, key: str) -> None:
-        self._declared.append(self._session.liveliness().declare_token(key))
+        Call it last: others receive declarations in order, so that an alive service has all its subscriptions.
+        """
+        self._declared.append(self._session.liveliness().declare_token(alive_key(self.robot, service, self.instance)))
 
     def stand_by(self, service: str) -> Callable[[], None]:
-        """Say that this instance waits until no other leads; a call ends it."""
+        """Declare that this instance waits until no other is active; returns a function that ends it."""
         token = self._session.liveliness().declare_token(standby_key(self.robot, service, self.instance))
         self._declared.append(token)
 
@@ -74,38 +76,38 @@ class Liveliness:
         return end
 
     def instances(self, service: str, changed: Callable[[], None], timeout: float = 0.5) -> Instances:
-        """Who else does what ``service`` does, kept up to date; ``changed`` is called from another thread."""
+        """The other instances of ``service``, kept up to date; ``changed`` is called from another thread."""
         found = Instances(self.instance)
 
-        def move(sample: zenoh.Sample) -> None:
+        def update(sample: zenoh.Sample) -> None:
             *_, kind, _, name = str(sample.key_expr).split("/")
-            found.change(name, leads=kind == "alive", there=sample.kind == zenoh.SampleKind.PUT)
+            found.update(name, leads=kind == "alive", alive=sample.kind == zenoh.SampleKind.PUT)
             changed()
 
-        def heard(reply: zenoh.Reply) -> None:
+        def handle_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                move(reply.ok)
+                update(reply.ok)
 
         liveliness, alive = self._session.liveliness(), alive_key(self.robot, service)
         for key in (alive, standby_key(self.robot, service)):
-            self._follow(key, move, timeout)
+            self._watch_tokens(key, update, timeout)
             for reply in liveliness.get(key, timeout=timeout):
-                heard(reply)
+                handle_reply(reply)
 
-        def look() -> None:
-            liveliness.get(alive, zenoh.handlers.Callback(heard), timeout=timeout)
+        def refresh() -> None:
+            liveliness.get(alive, zenoh.handlers.Callback(handle_reply), timeout=timeout)
 
-        found.look = look
+        found.refresh = refresh
         return found
 
     def alive(self, timeout: float = 1.0, robot: str | None = None) -> set[str]:
-        """Services of this robot, or another, that are there now."""
+        """Names of the services that are alive now, of this robot or of ``robot``."""
         return set(self.alive_instances(timeout, robot))
 
     def alive_instances(
         self, timeout: float = 1.0, robot: str | None = None, *, standby: bool = False
     ) -> dict[str, list[str]]:
-        """Instances by service, by age; those that lead, or those that stand by."""
+        """Names of the active instances, or with ``standby`` of the waiting ones, by service and oldest first."""
         found: dict[str, list[str]] = {}
         for key in self._tokens((standby_key if standby else alive_key)(robot or self.robot), timeout):
             *_, service, name = key.split("/")
@@ -113,78 +115,79 @@ class Liveliness:
         return {service: sorted(names) for service, names in found.items()}
 
     def _tokens(self, key: str, timeout: float) -> set[str]:
-        """Keys of those there now: a query alone now and then leaves out what is there (see `_follow`)."""
-        there = self._there.get(key)
-        if there is None:
-            there = self._there[key] = set()
+        """Keys of the tokens that exist now: a query alone may miss some (see `_watch_tokens`)."""
+        alive = self._alive.get(key)
+        if alive is None:
+            alive = self._alive[key] = set()
 
-            def move(sample: zenoh.Sample) -> None:
-                (there.add if sample.kind == zenoh.SampleKind.PUT else there.discard)(str(sample.key_expr))
+            def update(sample: zenoh.Sample) -> None:
+                (alive.add if sample.kind == zenoh.SampleKind.PUT else alive.discard)(str(sample.key_expr))
 
-            self._follow(key, move, timeout)
-        return self._asked(key, timeout) | there
+            self._watch_tokens(key, update, timeout)
+        return self._query_tokens(key, timeout) | alive
 
-    def _asked(self, key: str, timeout: float) -> set[str]:
-        """What one query for tokens finds."""
+    def _query_tokens(self, key: str, timeout: float) -> set[str]:
+        """Keys of the tokens that one query finds."""
         answers = self._session.liveliness().get(key, timeout=timeout)
         return {str(answer.ok.key_expr) for answer in answers if answer.ok is not None}
 
-    def _follow(self, key: str, move: Callable[[zenoh.Sample], None], timeout: float) -> None:
-        """Hear of all tokens from now on; returns once it was told of those that are there.
+    def _watch_tokens(self, key: str, changed: Callable[[zenoh.Sample], None], timeout: float) -> None:
+        """Call ``changed`` for every token of ``key``; returns after it was called for the existing ones.
 
-        Zenoh (1.10) does not say when that is. A query knows, with two faults: it leaves some out while sessions find
-        one another, and, of a router's client, all that a subscriber just declared was not told of yet. So it comes
-        first, and who is gone in between is not waited for long.
+        Zenoh (1.10) does not report when a subscriber has received all existing tokens, so they are queried first and
+        then awaited. The query has two faults: it misses some tokens while sessions are still connecting, and, for a
+        router's client, all those that a newly declared subscriber has not received yet. It therefore precedes the
+        declaration. A token that disappears in between is awaited only for a short time.
         """
-        untold = self._asked(key, timeout)
+        missing = self._query_tokens(key, timeout)
 
-        def hear(sample: zenoh.Sample) -> None:
-            move(sample)
-            untold.discard(str(sample.key_expr))
+        def receive(sample: zenoh.Sample) -> None:
+            changed(sample)
+            missing.discard(str(sample.key_expr))
 
-        self._declared.append(self._session.liveliness().declare_subscriber(key, hear, history=True))
-        wait_until(lambda: not untold, TOLD_WITHIN, period=0.001)
+        self._declared.append(self._session.liveliness().declare_subscriber(key, receive, history=True))
+        wait_until(lambda: not missing, HISTORY_TIMEOUT_S, period=0.001)
 
     def watch_alive(self, changed: Callable[[str, bool], None]) -> None:
-        """Call ``changed(service, is_there)`` for those there now and at every change, from another thread."""
-        self._watch(self.robot, lambda _, service, there: changed(service, there))
+        """Call ``changed(service, is_alive)`` for the services alive now and at every change, from another thread."""
+        self._watch_services(self.robot, lambda _, service, alive: changed(service, alive))
 
     def watch_robots(self, changed: Callable[[str, str, bool], None]) -> None:
-        """The same for every robot: ``changed(robot, service, is_there)``."""
-        self._watch("*", changed)
+        """Like `watch_alive` for all robots: calls ``changed(robot, service, is_alive)``."""
+        self._watch_services("*", changed)
 
-    def _watch(self, robots: str, changed: Callable[[str, str, bool], None]) -> None:
-        """A service is gone with its last instance; one that comes beside another is told of as well."""
+    def _watch_services(self, robots: str, changed: Callable[[str, str, bool], None]) -> None:
+        """Report every new instance of a service as alive, and the service as gone with its last instance."""
         instances: dict[tuple[str, str], set[str]] = {}
 
-        def move(robot: str, service: str, name: str, there: bool) -> None:  # noqa: FBT001
+        def update(robot: str, service: str, name: str, alive: bool) -> None:  # noqa: FBT001
             known = instances.setdefault((robot, service), set())
-            (known.add if there else known.discard)(name)
-            if there or not known:
-                changed(robot, service, there)
+            (known.add if alive else known.discard)(name)
+            if alive or not known:
+                changed(robot, service, alive)
 
-        self.watch_instances(move, robots)
+        self.watch_instances(update, robots)
 
     def watch_instances(self, changed: Callable[[str, str, str, bool], None], robots: str | None = None) -> None:
-        """Call ``changed(robot, service, instance, is_there)`` for all that lead now, and at every change."""
+        """Call ``changed(robot, service, instance, is_alive)`` for all active instances, and at every change."""
 
-        def move(sample: zenoh.Sample) -> None:
+        def update(sample: zenoh.Sample) -> None:
             _, robot, _, service, name = str(sample.key_expr).split("/")
             changed(robot, service, name, sample.kind == zenoh.SampleKind.PUT)
 
         key = alive_key(robots or self.robot)
-        self._declared.append(self._session.liveliness().declare_subscriber(key, move, history=True))
+        self._declared.append(self._session.liveliness().declare_subscriber(key, update, history=True))
 
     def linked(self) -> bool:
-        """Whether any other session is reached."""
+        """Whether this session is connected to any other."""
         return self.count_links() > 0
 
     def count_links(self) -> int:
-        """How many other sessions are reached directly."""
+        """Number of sessions to which this one is directly connected."""
         return len(list(self._session.info.routers_zid())) + len(list(self._session.info.peers_zid()))
 
 
 def published_ns(sample: zenoh.Sample) -> int:
-    """Wall time at the publisher, 0 if unknown."""
+    """Wall time in ns at which a sample was published, by the publisher's clock; 0 if unknown."""
     stamp = sample.timestamp
     return int(stamp.get_time().timestamp() * 1e9) if stamp is not None else 0

@@ -1,7 +1,7 @@
 """Roles, access rules derived from the table of topics, and credentials.
 
-In secure mode every session but the router's is a zenoh client: all goes through routers, which check certificate,
-password and, message by message, the role. docs/security.md says what that protects, and what not.
+In secure mode every session but the router's is a zenoh client: all messages go through routers, which check the
+certificate, the password and, for each message, the role. docs/security.md explains what that protects and what not.
 """
 
 from __future__ import annotations
@@ -19,41 +19,42 @@ from common.messages.topics import ALL_ROLES, QUERIES, ROOT, TOPICS, Query, Topi
 
 ROUTER = "router"
 IDENTITY, AUTHORITY, CERTIFICATE, KEY, PASSWORD = "identity.json", "ca.crt", "own.crt", "own.key", "password"
-MEMBERS, PASSWORDS = "members.json", "passwords"  # the router's alone
-NAME = r"^[a-z0-9][a-z0-9_-]{0,62}$"  # no dot: no public authority certifies it, so a certificate of theirs fits nobody
+MEMBERS, PASSWORDS = "members.json", "passwords"  # only in the router's folder
+# Names have no dot: public authorities certify only names with dots, so their certificates match no member.
+NAME = r"^[a-z0-9][a-z0-9_-]{0,62}$"
 ROLES: dict[str, str] = {
-    ROUTER: "passes on what the others may send; trusted with all of it",
-    "simulator": "the robot: scanner, odometry, wheels",
-    "bridge_ros2": "a robot in ROS 2, and who sits at its rviz: scanner, odometry, wheels, goals",
-    "estimator": "says where the robot is",
+    ROUTER: "forwards what the others may send; can read and send everything",
+    "simulator": "the simulated robot: scanner, odometry, wheels",
+    "bridge_ros2": "a robot in ROS 2 and its rviz: scanner, odometry, wheels, goals",
+    "estimator": "estimates where the robot is",
     "controller": "drives the robot",
-    "recorder": "hears everything, keeps it",
-    "viewer": "the live page, to look at",
+    "recorder": "reads and records everything",
+    "viewer": "the live page, read-only",
     "viewer-control": "the live page, whose visitors may drive",
     "operator": "people and tools that may drive, teleport, reset, record",
-    "observer": "people and tools that look on",
-    "remote": "waits for the scans of a robot elsewhere, and says whether they come",
-    "replay": "puts a recording back on its keys: in place of the whole robot",
+    "observer": "people and tools that only read",
+    "remote": "reports whether scans of a robot outside compose arrive",
+    "replay": "publishes a recording in place of the robot's services",
 }
 EVERY_ROBOT = ("*",)
 READ = ("declare_subscriber", "liveliness_query", "declare_liveliness_subscriber")
 ANSWER = ("declare_queryable", "reply")
 EVERYTHING = (*READ, *ANSWER, "put", "delete", "query", "liveliness_token")
-Rule = tuple[tuple[str, ...], list[str]]  # messages, key expressions
+Rule = tuple[tuple[str, ...], list[str]]  # kinds of zenoh messages, key expressions
 
 
 class Member(BaseModel):
-    """One name a certificate can show."""
+    """A holder of credentials, named as in the certificate."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     role: str
-    robots: tuple[str, ...] = EVERY_ROBOT  # whose keys it may use
+    robots: tuple[str, ...] = EVERY_ROBOT  # robots whose keys it may use
 
 
 class Members(BaseModel):
-    """Everybody whom a router lets in; who is not in it has no rights, whatever their certificate."""
+    """All members that a router accepts; others have no rights, even with a valid certificate."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -61,7 +62,7 @@ class Members(BaseModel):
 
 
 def service_of(role: str) -> str:
-    """The service that has the role, under whose name it speaks; empty for people, tools and the router."""
+    """Name of the service that has the role, as used in keys; empty for people, tools and the router."""
     return "" if role in {ROUTER, "operator", "observer"} else role.removesuffix("-control")
 
 
@@ -73,36 +74,36 @@ def may_put(role: str, topic: Topic) -> bool:
 
 
 def may_ask(role: str, query: Query) -> bool:
-    """Whether the role may ask the query."""
+    """Whether the role may send requests of the query."""
     return role in query.requester_roles
 
 
 def may_answer(role: str, query: Query) -> bool:
-    """Whether the role serves the query; a replay speaks for the world it was recorded in."""
+    """Whether the role may serve the query; a replay may serve the world of its recording."""
     if query.per_service:
         return bool(service_of(role))
     return role == query.server or (role == "replay" and query.name == "world")
 
 
 def rules_of(member: Member) -> list[Rule]:
-    """What a member may send: kinds of messages, on which keys. All else is refused."""
+    """Rules of what a member may send: kinds of messages and on which keys. Everything else is refused."""
     role, service = member.role, service_of(member.role)
     if role == ROUTER:
         return [(EVERYTHING, [f"{ROOT}/**"])]
 
-    def keys(rows: Sequence[Topic | Query], who: str = "*") -> list[str]:
-        return [row.key(robot, who) for robot in member.robots for row in rows]
+    def keys(rows: Sequence[Topic | Query], service_name: str = "*") -> list[str]:
+        return [row.key(robot, service_name) for robot in member.robots for row in rows]
 
-    # A kept topic is told by services that heard it to those that come later.
-    kept = [t for t in TOPICS if t.latched] if service else []
-    # A replay's health is that of the services it speaks for.
+    # Services store latched topics and serve them to services that start later.
+    latched = [t for t in TOPICS if t.latched] if service else []
+    # A replay publishes the health of all recorded services.
     own = "*" if role == "replay" else service
     rules: list[Rule] = [
         (READ[:1], [f"{ROOT}/{robot}/**" for robot in member.robots]),
         (READ[1:], [f"{ROOT}/**"]),
         (("put",), keys([t for t in TOPICS if may_put(role, t)], own)),
-        (("query",), keys([*(q for q in QUERIES if may_ask(role, q)), *kept])),
-        (ANSWER, keys([*(q for q in QUERIES if may_answer(role, q)), *kept], service)),
+        (("query",), keys([*(q for q in QUERIES if may_ask(role, q)), *latched])),
+        (ANSWER, keys([*(q for q in QUERIES if may_answer(role, q)), *latched], service)),
         (
             ("liveliness_token",),
             [f"{ROOT}/{robot}/{kind}/{service}/**" for robot in member.robots for kind in ("alive", "standby")]
@@ -114,7 +115,7 @@ def rules_of(member: Member) -> list[Rule]:
 
 
 def router_rules(members: Sequence[Member]) -> dict[str, Any]:
-    """A router's ``access_control``: by certificate and password of the same name; who is unknown gets nothing."""
+    """A router's setting ``access_control``: rights by the name that certificate and password share."""
     rules, policies = [], []
     for member in members:
         mine = [("ingress", *rule) for rule in rules_of(member)] + [("egress", EVERYTHING, [f"{ROOT}/**"])]
@@ -125,7 +126,7 @@ def router_rules(members: Sequence[Member]) -> dict[str, Any]:
         ]
         policies.append({"subjects": [member.name], "rules": ids})
     subjects = [
-        # Who dials learns the other's certificate, not its user; all routers are one.
+        # A router that connects to another learns its certificate but not its user name.
         {"id": m.name, "cert_common_names": [m.name]} | ({} if m.role == ROUTER else {"usernames": [m.name]})
         for m in members
     ]
@@ -133,32 +134,42 @@ def router_rules(members: Sequence[Member]) -> dict[str, Any]:
 
 
 def client_rules() -> dict[str, Any]:
-    """Everybody else's: to and from routers alone, so that nobody's certificate passes for a router's."""
+    """The setting ``access_control`` of all other sessions: exchange messages only with routers.
+
+    Otherwise, a member could use its certificate to act as a router.
+    """
     rule = {
-        "id": "all", "permission": "allow", "flows": ["ingress", "egress"], "messages": EVERYTHING,
+        "id": "all",
+        "permission": "allow",
+        "flows": ["ingress", "egress"],
+        "messages": EVERYTHING,
         "key_exprs": [f"{ROOT}/**"],
-    }  # fmt: skip
+    }
     subject = {"id": ROUTER, "cert_common_names": [ROUTER]}
     return _access([rule], [subject], [{"subjects": [ROUTER], "rules": ["all"]}])
 
 
 def _access(rules: list[Any], subjects: list[Any], policies: list[Any]) -> dict[str, Any]:
     return {
-        "enabled": True, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies,
-    }  # fmt: skip
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
 
 
 @dataclass(frozen=True)
 class Credentials:
-    """A member's folder, read."""
+    """Credentials of a member, read from its folder."""
 
     folder: Path
     member: Member
     password: str = field(repr=False)
-    members: tuple[Member, ...] = ()  # a router's
+    members: tuple[Member, ...] = ()  # of a router: the members it accepts
 
     def zenoh(self) -> dict[str, Any]:
-        """Settings of a zenoh session, by key; the rest of its configuration stays as it is, but for its mode."""
+        """Settings to add to the configuration of a zenoh session, by key; the mode is set by the caller."""
         own = {"certificate": str(self.folder / CERTIFICATE), "private_key": str(self.folder / KEY)}
         user = {"user": self.member.name, "password": self.password}
         router = self.member.role == ROUTER
@@ -170,7 +181,7 @@ class Credentials:
                 "root_ca_certificate": str(self.folder / AUTHORITY),
                 "enable_mtls": True,
                 **{f"{side}_{what}": path for side in ("listen", "connect") for what, path in own.items()},
-                # The rules ask for a router's certificate by name; by which address it is reached says nothing more.
+                # The access rules check a router's certificate by its name, so its address need not match.
                 "verify_name_on_connect": False,
                 "close_link_on_expiration": True,
             },
@@ -179,36 +190,40 @@ class Credentials:
         }
 
     def check(self, allowed: Callable[[str, Any], bool], row: Topic | Query, robot: str) -> None:
-        """Raises UserError where the rules refuse it anyway: the router would do so without a word."""
+        """Raise UserError if the role may not use a topic or query, which the router would drop silently."""
         member = self.member
         if member.robots != EVERY_ROBOT and robot not in member.robots:
             raise UserError(f"{member.name!r} is for {', '.join(member.robots)}, not for robot {robot!r}")
         if member.role != ROUTER and not allowed(member.role, row):
-            what, who = ("ask", row.requester_roles) if isinstance(row, Query) else ("put", row.publisher_roles or (row.publisher,))
+            if isinstance(row, Query):
+                verb, roles = "query", row.requester_roles
+            else:
+                verb, roles = "publish", row.publisher_roles or (row.publisher,)
             raise UserError(
-                f"role {member.role!r} may not {what} {row.name}: "
-                f"it takes one of {', '.join(who)} (--role, PRESAGE_ROLE; `presage secure show` lists all)"
+                f"role {member.role!r} may not {verb} {row.name}; allowed roles: {', '.join(roles)} "
+                "(--role, PRESAGE_ROLE; `presage secure show` lists all)"
             )
 
 
 def credentials(folder: Path, names: Sequence[str], robot: str = "*") -> Credentials:
-    """Those of the first name that the folder holds, a robot's own (NAME-ROBOT) before the common one.
+    """Read the credentials of the first of ``names`` that the folder contains.
 
-    Raises UserError where there is none, or a file is missing or does not make sense.
+    Credentials for one robot (NAME-ROBOT) are preferred to those for all robots. Raises UserError if there are none, or
+    if a file is missing or invalid.
     """
     wanted = [each for name in names for each in (f"{name}-{robot}", name)]
     for name in wanted:
         if (folder / name / IDENTITY).exists():
             return _read(folder / name)
     if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder (--security, PRESAGE_SECURITY); `presage secure init` makes one")
+        raise UserError(f"{folder}: no such folder (--security, PRESAGE_SECURITY); `presage secure init` creates one")
     raise UserError(
-        f"{folder}: no credentials of {' or '.join(map(repr, names))}, but of {', '.join(_held(folder)) or 'nobody'}:"
-        " --role chooses, `presage secure add` makes more"
+        f"{folder}: no credentials of {' or '.join(map(repr, names))}, "
+        f"but of {', '.join(_stored(folder)) or 'no member'}: choose some with --role, or create more with `presage secure add`"
     )
 
 
-def _held(folder: Path) -> Iterator[str]:
+def _stored(folder: Path) -> Iterator[str]:
     return (path.parent.name for path in sorted(folder.glob(f"*/{IDENTITY}")))
 
 
@@ -226,17 +241,17 @@ def _read(folder: Path) -> Credentials:
                 pass
     except OSError as error:
         raise UserError(
-            f"{error.filename}: {error.strerror} (read by user {os.geteuid()}): whose are the files?"
+            f"{error.filename}: {error.strerror} (read by user {os.geteuid()}): check the files' owner and permissions"
         ) from None
     except ValidationError as error:
         raise UserError(f"{folder / IDENTITY}: {first_fault(error)}") from None
     if member.role not in (ROUTER, *ALL_ROLES):
-        raise UserError(f"{folder / IDENTITY}: no role {member.role!r}; there are {', '.join(ROLES)}")
+        raise UserError(f"{folder / IDENTITY}: no role {member.role!r}; the roles are {', '.join(ROLES)}")
     return Credentials(folder.resolve(), member, password, members)
 
 
 def read_members(folder: Path) -> tuple[Member, ...]:
-    """A router's list; raises UserError where it makes no sense."""
+    """The members that a router accepts; raises UserError if the file is invalid."""
     path = folder / MEMBERS
     try:
         return Members.model_validate_json(path.read_text(encoding="utf-8")).members

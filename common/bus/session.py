@@ -19,8 +19,8 @@ DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 # clients that fail all the time it waits for 6 s. An attempt that ends earlier starts again at the end of the queue.
 # Zenoh cannot be interrupted while it waits, so this is also how long ending a service may take.
 JOIN_TIMEOUT_S = 8.0
-# Both call it an error when something arrives while a session opens or closes.
-# The third says at every message that a host's clock is ahead; `presage doctor` says it once.
+# The first two modules log an error for every message that arrives while a session opens or closes. The third one logs
+# at every message that a host's clock is ahead, which `presage doctor` reports once.
 LOG_FILTER = (
     "error,zenoh::api::session=off,zenoh::net::protocol::gossip=off,zenoh::net::routing::dispatcher::pubsub=off"
 )
@@ -28,16 +28,16 @@ LOG_FILTER = (
 
 @dataclass(frozen=True)
 class Link:
-    """Where a session connects and listens; endpoints as zenoh writes them, such as tcp/127.0.0.1:7447."""
+    """Parameters of a session. Endpoints are in zenoh's notation, such as tcp/127.0.0.1:7447."""
 
     robot: str = "robot"
     connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
     listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
     router: bool = False
     multicast: bool = False
-    lossless: bool = True  # who cannot keep up holds the publisher back; else it loses what is too much for it
-    security: Credentials | None = None  # then it listens nowhere, unless it is a router
-    insecure: bool = False  # may listen beyond loopback without credentials
+    lossless: bool = True  # publishers wait for slow subscribers instead of dropping messages
+    security: Credentials | None = None  # with credentials, only a router listens
+    insecure: bool = False  # may listen on other addresses than loopback without credentials
 
 
 def _config(link: Link, join_timeout: float = JOIN_TIMEOUT_S) -> zenoh.Config:
@@ -45,37 +45,41 @@ def _config(link: Link, join_timeout: float = JOIN_TIMEOUT_S) -> zenoh.Config:
     settings: dict[str, Any] = {
         "mode": "router" if link.router else "peer",
         "connect/endpoints": link.connect,
-        "connect/timeout_ms": -1,  # a router that is not there yet is waited for, in the background
+        "connect/timeout_ms": -1,  # keep trying in the background until the router is running
         "connect/exit_on_failure": False,
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
         "listen/endpoints": link.listen,
         "scouting/multicast/enabled": link.multicast,
         "transport/shared_memory/enabled": False,  # drops silently when a receiver stalls (zenoh issue 2628)
         "timestamping/enabled": True,
-        # Who is gone without a word (frozen, cut off) is known to be gone after this; zenoh's own is 10 s.
+        # Time in ms after which a silent session (frozen, disconnected) counts as gone; zenoh's default is 10 s.
         "transport/link/tx/lease": 3000,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 5000,  # us
     }
     if not all(map(on_loopback, link.listen)):
-        # Of two that hear of each other one dials: where both do, both may be refused, and neither tries again.
-        # Who listens on loopback alone is not to be reached by other hosts, and always dials.
+        # Only one of two peers that discover each other may connect: if both try, both may be refused, and neither
+        # tries again. A peer that listens only on loopback cannot be reached by other hosts and always connects.
         settings["scouting/gossip/autoconnect_strategy"] = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
     if link.security is not None:
         settings |= {**link.security.zenoh(), "mode": "router" if link.router else "client"}
         settings["connect/endpoints"] = [over_tls(each) for each in link.connect]
         settings["listen/endpoints"] = [over_tls(each) for each in link.listen] if link.router else []
-        if not link.router:  # one attempt, which the caller repeats: so that it can be given up
+        if not link.router:  # a single attempt; the caller repeats it, so that it can stop trying
             settings |= {
-                "connect/timeout_ms": 0, "connect/exit_on_failure": True,
+                "connect/timeout_ms": 0,
+                "connect/exit_on_failure": True,
                 "transport/unicast/open_timeout": int(join_timeout * 1000),
-            }  # fmt: skip
+            }
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config
 
 
 def open_session(link: Link, join_timeout: float = JOIN_TIMEOUT_S) -> zenoh.Session | None:
-    """Returns None if in secure mode no router lets us in; each endpoint has ``join_timeout`` s to do so."""
+    """Open a session; raises UserError if the endpoints cannot be used.
+
+    In secure mode, returns None if no router accepts the credentials within ``join_timeout`` s for each endpoint.
+    """
     try:
         return zenoh.open(_config(link, join_timeout))
     except zenoh.ZError as error:
@@ -84,14 +88,14 @@ def open_session(link: Link, join_timeout: float = JOIN_TIMEOUT_S) -> zenoh.Sess
             return None
         if "in use" in text:
             raise UserError(f"port in use: {' '.join(link.listen)}; choose another with --listen") from None
-        # Zenoh appends its own source line, and wraps some messages in the name of a Rust enum.
+        # Zenoh appends its source line, and wraps some messages in the name of a Rust enum.
         why = " ".join(text.split(" at /", maxsplit=1)[0].split()).removeprefix('Json5Err(Message { msg: "')
-        asked = f"connect {', '.join(link.connect) or 'none'}, listen {', '.join(link.listen) or 'none'}"
-        raise UserError(f"no session with {asked}: {why}; an endpoint is written like {DEFAULT_ENDPOINT}") from None
+        endpoints = f"connect {', '.join(link.connect) or 'none'}, listen {', '.join(link.listen) or 'none'}"
+        raise UserError(f"no session with {endpoints}: {why}; an endpoint is written like {DEFAULT_ENDPOINT}") from None
 
 
 def wait_until(condition: Callable[[], bool], timeout: float, period: float = 0.02) -> bool:
-    """Whether ``condition`` comes true within ``timeout`` s."""
+    """Wait until ``condition()`` is true; returns False if it is not within ``timeout`` s."""
     deadline = time.monotonic() + timeout
     while not condition():
         if time.monotonic() > deadline:

@@ -277,7 +277,7 @@ def load_world(name: str) -> World:
     except TooLargeError as error:
         raise UserError(f"world {path}: {error}") from None
     except NOT_YAML as error:
-        raise UserError(f"world {path}: no YAML ({' '.join(str(error).split())})") from None
+        raise UserError(f"world {path}: not valid YAML ({' '.join(str(error).split())})") from None
 
 
 def save_world(world: World) -> str:

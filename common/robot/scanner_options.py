@@ -74,7 +74,7 @@ def load_scanner(name: str) -> Scanner:
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"scanner {path}: cannot be read ({error})") from None
     except (yaml.YAMLError, ValueError) as error:
-        raise UserError(f"scanner {path}: no YAML ({' '.join(str(error).split())})") from None
+        raise UserError(f"scanner {path}: not valid YAML ({' '.join(str(error).split())})") from None
 
 
 def chosen_scanner(

@@ -1,6 +1,7 @@
 """Settings from defaults, a YAML file, the environment and the command line.
 
-One class a service; the environment's names, the command line and its help follow from the fields.
+Each service has one settings class. Environment variables, command-line options and their help are derived from its
+fields.
 """
 
 from __future__ import annotations
@@ -32,11 +33,11 @@ from common.errors import UserError
 
 _file_values: ContextVar[dict[str, Any]] = ContextVar("_file_values")
 S = TypeVar("S", bound="ServiceSettings")
-METRICS_TEXT = r"^$|^(\[[0-9A-Fa-f:.]+\]:|[^\s:\[\]]+:)?\d{1,5}$"  # PORT, HOST:PORT, [IPv6]:PORT, or nothing
+METRICS_PATTERN = r"^$|^(\[[0-9A-Fa-f:.]+\]:|[^\s:\[\]]+:)?\d{1,5}$"  # PORT, HOST:PORT, [IPv6]:PORT, or empty
 
 
 class ServiceSettings(BaseSettings):
-    """What every service can be told."""
+    """Settings that every service has."""
 
     model_config = SettingsConfigDict(
         env_prefix="PRESAGE_",
@@ -47,55 +48,71 @@ class ServiceSettings(BaseSettings):
         cli_hide_none_type=True,
     )
     service: ClassVar[str] = "service"
-    program: ClassVar[str] = ""  # in --help; empty: python -m services.NAME
-    # Fields that PRESAGE_<FIELD> and a shared line of the file do not reach: PRESAGE_<SERVICE>_<FIELD> sets them.
+    program: ClassVar[str] = ""  # shown in --help; if empty, python -m services.NAME
+    # Fields that PRESAGE_<FIELD> and the top level of the file do not set, only PRESAGE_<SERVICE>_<FIELD> and the
+    # section of the service.
     private: ClassVar[frozenset[str]] = frozenset()
 
     robot: Annotated[
-        str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$", description="name in the keys presage/ROBOT/TOPIC")
+        str,
+        Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$", description="name of the robot: the topics are presage/ROBOT/TOPIC"),
     ] = "robot"
-    connect: Annotated[str, Field(description="zenoh endpoints to connect to, comma-separated; empty: none")] = (
-        DEFAULT_ENDPOINT
-    )
-    listen: Annotated[str, Field(description="zenoh endpoints to listen on, comma-separated; loopback unless told")] = (
-        "tcp/127.0.0.1:0"
-    )
-    multicast: Annotated[bool, Field(description="also find other sessions by multicast")] = False
+    connect: Annotated[
+        str, Field(description="zenoh endpoints to connect to, comma-separated; empty for no connection")
+    ] = DEFAULT_ENDPOINT
+    listen: Annotated[
+        str, Field(description="zenoh endpoints to listen on, comma-separated; by default only on loopback")
+    ] = "tcp/127.0.0.1:0"
+    multicast: Annotated[bool, Field(description="also discover other sessions by multicast")] = False
     lossless: Annotated[
-        bool, Field(description="who cannot keep up holds this service back; for replays, not for a robot")
+        bool,
+        Field(description="wait for slow subscribers instead of dropping messages; for replays, not for a robot"),
     ] = False
     security: Annotated[
-        Path | None, Field(description="folder of credentials (presage secure init): TLS, access by role")
+        Path | None, Field(description="folder with credentials from `presage secure init`; enables TLS and roles")
     ] = None
-    role: Annotated[str, Field(description="whose credentials of that folder; none: those named like the service")] = ""
-    insecure: Annotated[bool, Field(description="without --security: listen beyond loopback all the same")] = False
+    role: Annotated[
+        str, Field(description="name of the credentials in that folder; defaults to the name of the service")
+    ] = ""
+    insecure: Annotated[
+        bool, Field(description="allow listening on other addresses than loopback without --security")
+    ] = False
     log_level: Annotated[
         str, Field(pattern="^(debug|info|warning|error)$", description="debug, info, warning, error")
     ] = "info"
-    log_json: Annotated[bool, Field(description="log lines as JSON")] = False
+    log_json: Annotated[bool, Field(description="write log lines as JSON")] = False
     metrics: Annotated[
         str,
-        Field(pattern=METRICS_TEXT, description="PORT or HOST:PORT for Prometheus, 0: any free port; empty: none"),
+        Field(
+            pattern=METRICS_PATTERN,
+            description="PORT or HOST:PORT of the Prometheus endpoint, 0 for any free port; empty for no endpoint",
+        ),
     ] = ""
     heartbeat: Annotated[
-        Path | None, Field(description="folder for a file that says each second how it stands; none: no file")
+        Path | None,
+        Field(description="folder for a status file that is written each second, for health checks; default: no file"),
     ] = None
     config: Annotated[Path | None, Field(description="YAML file of settings, with a section for each service")] = None
-    print_config: Annotated[bool, Field(description="print the effective settings as YAML and end")] = False
+    print_config: Annotated[bool, Field(description="print the effective settings as YAML and exit")] = False
 
     def link(self) -> Link:
-        """The session these settings ask for."""
+        """Parameters of the zenoh session; raises UserError if the credentials cannot be read."""
         return Link(
-            self.robot, split_endpoints(self.connect), split_endpoints(self.listen), multicast=self.multicast,
-            lossless=self.lossless, security=self.credentials(), insecure=self.insecure,
-        )  # fmt: skip
+            self.robot,
+            split_endpoints(self.connect),
+            split_endpoints(self.listen),
+            multicast=self.multicast,
+            lossless=self.lossless,
+            security=self.credentials(),
+            insecure=self.insecure,
+        )
 
     def credentials(self) -> Credentials | None:
-        """Those of the folder, if one is named; raises UserError where they are not there."""
+        """Credentials from the folder ``security``, or None if it is not set; raises UserError if they are missing."""
         return credentials(self.security, (self.role or self.service,), self.robot) if self.security else None
 
     def effective(self) -> dict[str, Any]:
-        """Every setting as it holds, plain types; not what belongs to this machine alone."""
+        """Values of all settings as plain types, without those that only matter on this machine."""
         return self.model_dump(mode="json", exclude={"config", "print_config", "heartbeat"})
 
     @classmethod
@@ -107,8 +124,8 @@ class ServiceSettings(BaseSettings):
         dotenv_settings: PydanticBaseSettingsSource,  # noqa: ARG003
         file_secret_settings: PydanticBaseSettingsSource,  # noqa: ARG003
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Command line (put first by pydantic) over arguments over environment over file."""
-        # Only here is an empty value none at all (compose files pass such); on the command line '' says something.
+        """Precedence: command line (which pydantic puts first), constructor arguments, environment, file."""
+        # Compose files pass unset variables as empty ones, so these are ignored. On the command line '' is a value.
         shared = EnvSettingsSource(settings_cls, env_ignore_empty=True)()
         own = EnvSettingsSource(settings_cls, env_prefix=f"PRESAGE_{cls.service.upper()}_", env_ignore_empty=True)()
         environment = {k: v for k, v in shared.items() if k not in cls.private}
@@ -118,45 +135,49 @@ class ServiceSettings(BaseSettings):
 
 
 def split_endpoints(text: str) -> tuple[str, ...]:
-    """Comma-separated endpoints."""
+    """Split comma-separated endpoints."""
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
-def with_values_joined(argv: list[str]) -> list[str]:
-    """``--start -3,1`` as ``--start=-3,1``: argparse takes a value that begins with a minus for an option."""
+def join_negative_values(argv: list[str]) -> list[str]:
+    """Write ``--start -3,1`` as ``--start=-3,1``, because argparse takes values that begin with a minus for options."""
     joined: list[str] = []
-    for word in argv:
-        if re.match(r"-[.\d]", word) and joined and re.fullmatch(r"--[a-z][a-z-]*", joined[-1]):
-            joined[-1] += f"={word}"
+    for argument in argv:
+        if re.match(r"-[.\d]", argument) and joined and re.fullmatch(r"--[a-z][a-z-]*", joined[-1]):
+            joined[-1] += f"={argument}"
         else:
-            joined.append(word)
+            joined.append(argument)
     return joined
 
 
 def load_settings(cls: type[S], argv: list[str] | None = None) -> S:
-    """Settings of a service from all sources; raises UserError in one line. ``--print-config`` prints and ends."""
-    argv = with_values_joined(sys.argv[1:] if argv is None else argv)
-    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    early.add_argument("--config", type=Path)
-    path = early.parse_known_args(argv)[0].config
+    """Settings of a service from all sources.
+
+    ``argv`` defaults to the arguments of the process. With ``--print-config``, prints the settings and exits. Raises
+    UserError for an invalid setting or file.
+    """
+    argv = join_negative_values(sys.argv[1:] if argv is None else argv)
+    config_parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    config_parser.add_argument("--config", type=Path)
+    path = config_parser.parse_known_args(argv)[0].config
     values = _read_file(cls, path) if path else {}
     token = _file_values.set(values)
     try:
         source: CliSettingsSource[S] = CliSettingsSource(
             cls,
             cli_prog_name=cls.program or f"python -m services.{cls.service}",
-            formatter_class=_Help,
+            formatter_class=_HelpFormatter,
         )
         settings = CliApp.run(cls, cli_args=argv, cli_settings_source=source)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         name = ".".join(map(str, first["loc"])) or "settings"
         variable = f"PRESAGE_{cls.service.upper()}_{name.upper()}" if name in cls.private else f"PRESAGE_{name.upper()}"
-        wrong = first["msg"]
+        problem = first["msg"]
         if first["type"] == "string_pattern_mismatch" and name in cls.model_fields:
-            wrong = f"{first['input']!r} is not as it should be: {cls.model_fields[name].description}"
+            problem = f"{first['input']!r} is not valid; expected: {cls.model_fields[name].description}"
         raise UserError(
-            f"{name}: {wrong} (--{name.replace('_', '-')}, {variable}{f' or {path}' if path else ''})"
+            f"{name}: {problem} (--{name.replace('_', '-')}, {variable}{f' or {path}' if path else ''})"
         ) from None
     except SettingsError as error:
         raise UserError(" ".join(str(error).split())) from None
@@ -168,26 +189,27 @@ def load_settings(cls: type[S], argv: list[str] | None = None) -> S:
     return settings
 
 
-class _Help(argparse.RawDescriptionHelpFormatter):
-    """The docstring's own lines, dedented."""
+class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Shows the docstring of the settings class with its own line breaks."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         return super()._fill_text(inspect.cleandoc(text), width, indent)
 
 
 def _read_file(cls: type[ServiceSettings], path: Path) -> dict[str, Any]:
-    """Top-level keys hold for every service that knows them, the section named after the service for it alone."""
+    """Settings of one service: top-level keys apply to all services, the section named after the service only to it."""
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror})") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # a date like 2020-13-45, 20 000 brackets
-        raise UserError(f"{path}: no YAML ({' '.join(str(error).split())})") from None
+    # A date such as 2020-13-45 raises ValueError; 20 000 nested brackets raise RecursionError.
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise UserError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
     if not isinstance(data, dict):
-        raise UserError(f"{path}: a map of settings is expected")
+        raise UserError(f"{path}: expected a mapping of settings")
     known = cls.model_fields.keys() - cls.private
     shared = {k: v for k, v in data.items() if not isinstance(v, dict) and k in known}
     section = data.get(cls.service) or {}
     if not isinstance(section, dict):
-        raise UserError(f"{path}: {cls.service}: a map of settings is expected")
+        raise UserError(f"{path}: {cls.service}: expected a mapping of settings")
     return {**shared, **section}

@@ -22,85 +22,145 @@ from common.versions import PROTOCOL, versions
 if TYPE_CHECKING:
     from common.bus.inbox import Inbox, Sample
 
-SECONDS = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.066, 0.125, 0.25, 0.5, 1.0, 2.5)  # 0.066: a scan's time
-TOPIC, PLAIN = ("robot", "service", "topic"), ("robot", "service")
+# Upper bounds of the histograms' buckets; 0.066 s is the period of a 15 Hz scanner.
+BUCKETS_S = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.066, 0.125, 0.25, 0.5, 1.0, 2.5)
+TOPIC_LABELS, SERVICE_LABELS = ("robot", "service", "topic"), ("robot", "service")
 STATES = {kind: get_args(kind.model_fields["state"].annotation) for kind in (Belief, Status)}
 
 
 @dataclass(frozen=True)
-class Row:
-    """One metric: its name without the suffixes that Prometheus's text format adds."""
+class MetricDefinition:
+    """One row of the table of metrics."""
 
-    name: str
+    name: str  # without the suffixes that Prometheus's text format adds
     kind: str  # counter, gauge, histogram, info
     labels: tuple[str, ...]
     about: str
-    of: str = "every service"
+    exported_by: str = "every service"
 
     @property
     def sample(self) -> str:
-        """The name to query."""
+        """Name to use in Prometheus queries."""
         return self.name + {"counter": "_total", "info": "_info"}.get(self.kind, "")
 
 
 RECORDER = "the recorder"
-ROWS: tuple[Row, ...] = (
-    Row("presage_messages_received", "counter", TOPIC, "Messages that came from the bus"),
-    Row("presage_messages_published", "counter", TOPIC, "Messages put on the bus"),
-    Row("presage_messages_dropped", "counter", TOPIC, "Messages not used: a newer one came, or the queue was full"),
-    Row("presage_messages_undecodable", "counter", TOPIC, "Payloads that are not the message they should be"),
-    Row("presage_message_rate_hertz", "gauge", TOPIC, "Messages a second, over the second before the last pulse"),
-    Row(
-        "presage_message_latency_seconds", "histogram", TOPIC,
+METRICS: tuple[MetricDefinition, ...] = (
+    MetricDefinition("presage_messages_received", "counter", TOPIC_LABELS, "Messages received from the bus"),
+    MetricDefinition("presage_messages_published", "counter", TOPIC_LABELS, "Messages published on the bus"),
+    MetricDefinition(
+        "presage_messages_dropped",
+        "counter",
+        TOPIC_LABELS,
+        "Messages replaced by newer ones, or refused by a full queue",
+    ),
+    MetricDefinition(
+        "presage_messages_undecodable", "counter", TOPIC_LABELS, "Payloads that are not a valid message of their topic"
+    ),
+    MetricDefinition(
+        "presage_message_rate_hertz", "gauge", TOPIC_LABELS, "Messages per second, in the second before the last health"
+    ),
+    MetricDefinition(
+        "presage_message_latency_seconds",
+        "histogram",
+        TOPIC_LABELS,
         "From a message's publication to its handling, by both hosts' clocks",
     ),
-    Row("presage_step_duration_seconds", "histogram", TOPIC, "Handling one message, answers published included"),
-    Row("presage_requests_received", "counter", (*PLAIN, "query"), "Requests that came"),
-    Row("presage_requests_dropped", "counter", (*PLAIN, "query"), "Requests refused because too many waited"),
-    Row("presage_requests_undecodable", "counter", (*PLAIN, "query"), "Requests that made no sense"),
-    Row("presage_steps_failed", "counter", PLAIN, "Steps that ended in an exception, which was logged"),
-    Row("presage_events", "counter", (*PLAIN, "event"), "The service's own counters, by name, as in its health"),
-    Row("presage_uptime_seconds", "gauge", PLAIN, "Since the service's loop was made"),
-    Row("presage_pulse_age_seconds", "gauge", PLAIN, "Since the last pulse; each second while the loop turns"),
-    Row("presage_free_energy_nats", "gauge", PLAIN, "Free energy of the last belief", "the estimator"),
-    Row("presage_estimator_state", "gauge", (*PLAIN, "state"), "1 for the last belief's state", "the estimator"),
-    Row("presage_controller_state", "gauge", (*PLAIN, "state"), "1 for the last status's state", "the controller"),
-    Row("presage_recorder_messages_written", "counter", TOPIC, "Messages written into recordings", RECORDER),
-    Row("presage_recorder_messages_missing", "counter", TOPIC, "Messages sent and never received, by number", RECORDER),
-    Row("presage_recorder_written_bytes", "counter", PLAIN, "Payload bytes written, before compression", RECORDER),
-    Row(
-        "presage_build", "info", (*PLAIN, "version", "protocol", "zenoh", "python", "commit"),
-        "Always 1; the labels say what runs", "every service, the router",
+    MetricDefinition(
+        "presage_step_duration_seconds",
+        "histogram",
+        TOPIC_LABELS,
+        "Time to handle one message, including the messages published in response",
     ),
-    Row("presage_router_uptime_seconds", "gauge", (), "Since the router listens", "the router"),
-    Row("presage_router_sessions", "gauge", (), "Sessions linked with the router", "the router"),
-)  # fmt: skip
-BY_NAME = {row.name: row for row in ROWS}
-Values = Iterable[tuple[tuple[str, ...], float]]
+    MetricDefinition("presage_requests_received", "counter", (*SERVICE_LABELS, "query"), "Requests received"),
+    MetricDefinition(
+        "presage_requests_dropped", "counter", (*SERVICE_LABELS, "query"), "Requests refused because the queue was full"
+    ),
+    MetricDefinition(
+        "presage_requests_undecodable", "counter", (*SERVICE_LABELS, "query"), "Requests that could not be decoded"
+    ),
+    MetricDefinition("presage_steps_failed", "counter", SERVICE_LABELS, "Steps that raised an exception (see the log)"),
+    MetricDefinition(
+        "presage_events", "counter", (*SERVICE_LABELS, "event"), "The service's own counters, by name, as in its health"
+    ),
+    MetricDefinition("presage_uptime_seconds", "gauge", SERVICE_LABELS, "Time since the service's loop was created"),
+    MetricDefinition(
+        "presage_pulse_age_seconds",
+        "gauge",
+        SERVICE_LABELS,
+        "Time since the last health message, which a running service sends each second",
+    ),
+    MetricDefinition(
+        "presage_free_energy_nats", "gauge", SERVICE_LABELS, "Free energy of the last belief", "the estimator"
+    ),
+    MetricDefinition(
+        "presage_estimator_state",
+        "gauge",
+        (*SERVICE_LABELS, "state"),
+        "1 for the state of the last belief, else 0",
+        "the estimator",
+    ),
+    MetricDefinition(
+        "presage_controller_state",
+        "gauge",
+        (*SERVICE_LABELS, "state"),
+        "1 for the state of the last status, else 0",
+        "the controller",
+    ),
+    MetricDefinition(
+        "presage_recorder_messages_written", "counter", TOPIC_LABELS, "Messages written to recordings", RECORDER
+    ),
+    MetricDefinition(
+        "presage_recorder_messages_missing",
+        "counter",
+        TOPIC_LABELS,
+        "Messages published and never received, by their sequence numbers",
+        RECORDER,
+    ),
+    MetricDefinition(
+        "presage_recorder_written_bytes",
+        "counter",
+        SERVICE_LABELS,
+        "Payload bytes written, before compression",
+        RECORDER,
+    ),
+    MetricDefinition(
+        "presage_build",
+        "info",
+        (*SERVICE_LABELS, "version", "protocol", "zenoh", "python", "commit"),
+        "Always 1; its labels are the versions of the running program",
+        "every service, the router",
+    ),
+    MetricDefinition("presage_router_uptime_seconds", "gauge", (), "Time since the router started", "the router"),
+    MetricDefinition("presage_router_sessions", "gauge", (), "Sessions connected to the router", "the router"),
+)
+BY_NAME = {metric.name: metric for metric in METRICS}
+Values = Iterable[tuple[tuple[str, ...], float]]  # label values and value of each sample
 
 
 def family(name: str, values: Values) -> Metric:
-    """A counter or gauge of the table with its values by label."""
-    row = BY_NAME[name]
-    made = (CounterMetricFamily if row.kind == "counter" else GaugeMetricFamily)(name, row.about, labels=row.labels)
+    """Build a counter or gauge of the table from its label values and values."""
+    definition = BY_NAME[name]
+    metric_class = CounterMetricFamily if definition.kind == "counter" else GaugeMetricFamily
+    metric = metric_class(name, definition.about, labels=definition.labels)
     for labels, value in values:
-        made.add_metric(labels, value)
-    return made
+        metric.add_metric(labels, value)
+    return metric
 
 
 def build_info(robot: str, service: str) -> Metric:
-    """What runs, as labels."""
-    known, row = versions(), BY_NAME["presage_build"]
-    said = {"version": "presage", "zenoh": "eclipse-zenoh", "python": "python", "commit": "commit"}
-    values = {label: known.get(name, "unknown") for label, name in said.items()}
+    """Build the metric whose labels are the versions of the running program."""
+    known, definition = versions(), BY_NAME["presage_build"]
+    packages = {"version": "presage", "zenoh": "eclipse-zenoh", "python": "python", "commit": "commit"}
+    values = {label: known.get(name, "unknown") for label, name in packages.items()}
     labels = {"robot": robot, "service": service, "protocol": str(PROTOCOL), **values}
-    made = InfoMetricFamily(row.name, row.about, labels=row.labels)
-    made.add_metric([labels[name] for name in row.labels], {})
-    return made
+    metric = InfoMetricFamily(definition.name, definition.about, labels=definition.labels)
+    metric.add_metric([labels[name] for name in definition.labels], {})
+    return metric
 
 
 def new_registry(collector: Collector) -> CollectorRegistry:
-    """With the process's own CPU, memory and files beside the collector."""
+    """Create a registry with ``collector`` and the CPU, memory and open files of the process."""
     disable_created_metrics()  # type: ignore[no-untyped-call]
     registry = CollectorRegistry()
     ProcessCollector(registry=registry)
@@ -109,30 +169,35 @@ def new_registry(collector: Collector) -> CollectorRegistry:
 
 
 def topic_labels(key: str) -> tuple[str, str]:
-    """Robot and topic of a key; of a name that is no key of ours, nobody's."""
+    """Robot and topic of a key; for a name that is not a key of presage, an empty robot and the name itself."""
     parts = key.split("/", 2)
     return (parts[1], parts[2]) if len(parts) == 3 and parts[0] == ROOT else ("", key)
 
 
 class ServiceMetrics(Collector):
-    """Of one service. The loop tells what it does; a scrape, from another thread, reads."""
+    """Metrics of one service. The service's loop updates them; scrapes read them from another thread."""
 
     def __init__(self, robot: str, service: str, inbox: Inbox, counts: Callable[[], Mapping[str, Any]]) -> None:
-        """``counts()``: published and undecodable by key, failed, events by name, and began (s, monotonic)."""
+        """Collect from ``inbox`` and ``counts``.
+
+        ``counts()`` returns published and undecodable by key, failed, events by name, and began (s, monotonic clock).
+        """
         self.robot, self.service, self._inbox, self._counts = robot, service, inbox, counts
         self._last: dict[str, Belief | Status] = {}  # by robot
         self._health: Health | None = None
-        self._pulse_at = time.monotonic()
+        self._last_health_time = time.monotonic()
         self.registry = new_registry(self)
-        rows = [BY_NAME[name] for name in ("presage_message_latency_seconds", "presage_step_duration_seconds")]
+        definitions = [BY_NAME[name] for name in ("presage_message_latency_seconds", "presage_step_duration_seconds")]
         self._latency, self._duration = (
-            Histogram(row.name, row.about, row.labels, buckets=SECONDS, registry=self.registry) for row in rows
+            Histogram(each.name, each.about, each.labels, buckets=BUCKETS_S, registry=self.registry)
+            for each in definitions
         )
-        self._children: dict[str, tuple[Histogram, Histogram]] = {}  # by key; a look-up is no cheaper than observing
+        # By key: finding a histogram by its labels costs as much as an observation.
+        self._children: dict[str, tuple[Histogram, Histogram]] = {}
 
     @contextmanager
     def step(self, sample: Sample) -> Iterator[None]:
-        """While the sample is handled."""
+        """Measure latency and duration while the block handles ``sample``."""
         key = self._inbox.counted_as(sample.key)
         if key not in self._children:
             robot, topic = topic_labels(key)
@@ -148,37 +213,37 @@ class ServiceMetrics(Collector):
             duration.observe(time.perf_counter() - began)
 
     def published(self, key: str, message: Stamped) -> None:
-        """What was just sent."""
+        """Remember a message that was just published."""
         if isinstance(message, Health):
-            self._health, self._pulse_at = message, time.monotonic()
+            self._health, self._last_health_time = message, time.monotonic()
         elif isinstance(message, Belief | Status):
             self._last[topic_labels(key)[0]] = message
 
     def collect(self) -> Iterator[Metric]:
-        """All but the histograms, which are collectors of their own."""
-        whose, now, counts = (self.robot, self.service), time.monotonic(), self._counts()
-        with_waiting, dropped, oversized = self._inbox.arrivals()
-        bad = counts["undecodable"]
-        faults = {
-            "received": with_waiting,
-            # A key that came has its faults counted from 0: a rate needs a beginning.
-            "dropped": {key: dropped[key] for key in with_waiting},
-            "undecodable": {key: bad.get(key, 0) + oversized[key] for key in with_waiting},
+        """Yield all metrics but the histograms, which are collectors of their own."""
+        labels, now, counts = (self.robot, self.service), time.monotonic(), self._counts()
+        received, dropped, oversized = self._inbox.arrivals()
+        undecodable = counts["undecodable"]
+        counters = {
+            "received": received,
+            # All received keys, also with 0: Prometheus needs a first value to compute a rate.
+            "dropped": {key: dropped[key] for key in received},
+            "undecodable": {key: undecodable.get(key, 0) + oversized[key] for key in received},
         }
-        for what, by_key in faults.items():
-            yield family(f"presage_messages_{what}", self._by_topic(by_key))
-            yield family(f"presage_requests_{what}", [((*whose, k), n) for k, n in by_key.items() if not _is_key(k)])
+        for name, by_key in counters.items():
+            yield family(f"presage_messages_{name}", self._by_topic(by_key))
+            yield family(f"presage_requests_{name}", [((*labels, k), n) for k, n in by_key.items() if not _is_key(k)])
         yield family("presage_messages_published", self._by_topic(counts["published"]))
-        yield family("presage_steps_failed", [(whose, counts["failed"])])
+        yield family("presage_steps_failed", [(labels, counts["failed"])])
         events = dict(counts["events"])
         if (written := events.pop("written_bytes", None)) is not None:
-            yield family("presage_recorder_written_bytes", [(whose, written)])
-        yield family("presage_events", [((*whose, name), number) for name, number in events.items()])
-        yield family("presage_uptime_seconds", [(whose, now - counts["began"])])
-        yield family("presage_pulse_age_seconds", [(whose, now - self._pulse_at)])
-        yield build_info(*whose)
-        yield from self._of_health()
-        yield from self._of_states()
+            yield family("presage_recorder_written_bytes", [(labels, written)])
+        yield family("presage_events", [((*labels, name), number) for name, number in events.items()])
+        yield family("presage_uptime_seconds", [(labels, now - counts["began"])])
+        yield family("presage_pulse_age_seconds", [(labels, now - self._last_health_time)])
+        yield build_info(*labels)
+        yield from self._from_health()
+        yield from self._states()
 
     def _by_topic(self, by_key: Mapping[str, float]) -> Values:
         for key, number in by_key.items():
@@ -186,16 +251,17 @@ class ServiceMetrics(Collector):
                 robot, topic = topic_labels(key)
                 yield (robot, self.service, topic), number
 
-    def _of_health(self) -> Iterator[Metric]:
-        """What only the last pulse has."""
+    def _from_health(self) -> Iterator[Metric]:
+        """Metrics that are known only from the last health message."""
         rows = () if self._health is None else self._health.topics
         yield family("presage_message_rate_hertz", self._by_topic({row.key: row.rate for row in rows}))
         if self.service == "recorder":
-            for what in ("written", "missing"):
-                values = self._by_topic({row.key: getattr(row, what) for row in rows})
-                yield family(f"presage_recorder_messages_{what}", values)
+            for name in ("written", "missing"):
+                values = self._by_topic({row.key: getattr(row, name) for row in rows})
+                yield family(f"presage_recorder_messages_{name}", values)
 
-    def _of_states(self) -> Iterator[Metric]:
+    def _states(self) -> Iterator[Metric]:
+        """Metrics of the last belief and the last controller status."""
         last = dict(self._last)
         beliefs = {robot: message for robot, message in last.items() if isinstance(message, Belief)}
         if beliefs:
@@ -204,23 +270,26 @@ class ServiceMetrics(Collector):
         for name, kind in (("presage_estimator_state", Belief), ("presage_controller_state", Status)):
             states: list[tuple[tuple[str, ...], float]] = [
                 ((robot, self.service, state), float(state == message.state))
-                for robot, message in last.items() if isinstance(message, kind) for state in STATES[kind]
-            ]  # fmt: skip
+                for robot, message in last.items()
+                if isinstance(message, kind)
+                for state in STATES[kind]
+            ]
             if states:
                 yield family(name, states)
 
 
 def _is_key(name: str) -> bool:
-    """Whether it counts messages; what was asked is counted by the query's name."""
+    """Whether a counter's name is a message's key. Requests are counted under the name of the query."""
     return "/" in name or name == "others"
 
 
 def table() -> str:
-    """Of docs/operations.md."""
+    """The table of metrics in docs/operations.md, as Markdown."""
     head = ["| metric | kind | labels | of | what |", "|---|---|---|---|---|"]
-    return "\n".join(
-        [*head, *(f"| `{r.sample}` | {r.kind} | {', '.join(r.labels) or '-'} | {r.of} | {r.about} |" for r in ROWS)]
-    )
+    rows = [
+        f"| `{m.sample}` | {m.kind} | {', '.join(m.labels) or '-'} | {m.exported_by} | {m.about} |" for m in METRICS
+    ]
+    return "\n".join([*head, *rows])
 
 
 if __name__ == "__main__":

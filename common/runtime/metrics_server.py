@@ -19,16 +19,19 @@ LOOPBACK = "127.0.0.1"
 
 
 def split_address(setting: str) -> tuple[str, int]:
-    """Host and port; loopback unless another host is named. Raises UserError for a port that cannot be."""
+    """Host and port of the setting ``--metrics``; the host defaults to loopback. Raises UserError if it is invalid."""
     found = re.fullmatch(r"(?:(.+):)?(\d+)", setting)
     if found is None or int(found[2]) > 65535:
-        raise UserError(f"--metrics {setting}: PORT or HOST:PORT is meant, with a port up to 65535")
+        raise UserError(f"--metrics {setting}: give PORT or HOST:PORT, with a port up to 65535")
     return (found[1] or LOOPBACK).strip("[]"), int(found[2])
 
 
 @contextmanager
 def serve(registry: CollectorRegistry, setting: str) -> Iterator[str]:
-    """Answer scrapes, each in a thread of its own; gives the address. Raises UserError where it cannot listen."""
+    """Serve the registry over HTTP, with a thread for each request; yields the URL.
+
+    Raises UserError if the address cannot be listened on.
+    """
     host, port = split_address(setting)
     try:
         server, thread = start_http_server(port, host, registry)
@@ -47,15 +50,18 @@ def serve(registry: CollectorRegistry, setting: str) -> Iterator[str]:
 
 @contextmanager
 def measure(loop: Loop, setting: str) -> Iterator[ServiceMetrics]:
-    """The metrics of a loop, served until the block ends."""
+    """Serve the metrics of a loop until the block ends."""
     service = loop.service
 
     def counts() -> dict[str, Any]:
-        """Copies: a scrape reads them from a thread of its own."""
+        # Copies, because a scrape reads them from another thread.
         return {
-            "published": loop.published.copy(), "undecodable": loop.undecodable.copy(), "failed": loop.failed,
-            "events": dict(service.counters), "began": loop.began,
-        }  # fmt: skip
+            "published": loop.published.copy(),
+            "undecodable": loop.undecodable.copy(),
+            "failed": loop.failed,
+            "events": dict(service.counters),
+            "began": loop.began,
+        }
 
     metrics = ServiceMetrics(loop.bus.robot, service.name, loop.inbox, counts)
     with serve(metrics.registry, setting) as address:

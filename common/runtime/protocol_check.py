@@ -1,6 +1,7 @@
 """Refuses to start beside services that speak another protocol version.
 
-Who comes to others of another protocol does not start; who is there already says so and goes on.
+A service that starts later than one with another protocol version does not start. The service that was running before
+logs an error and continues.
 """
 
 from __future__ import annotations
@@ -19,90 +20,98 @@ from common.messages.requests import ConfigReply, Request
 from common.messages.topics import CONFIG
 from common.versions import PROTOCOL, versions
 
-COMPARED = ("presage", "eclipse-zenoh")  # packages whose versions should be the same everywhere
-WITHIN = 0.3  # s, that a start waits for a link, and then for answers; who answers later is judged later
-ANSWER = 5.0  # s, for an answer to come while the service works
-ATTEMPTS = 3
-SIMULTANEOUS_START_S = 1.0  # s between two starts of which nobody can say which was first
+COMPARED_PACKAGES = ("presage", "eclipse-zenoh")  # their versions should be the same everywhere
+START_TIMEOUT_S = 0.3  # at the start, for the first link and then for replies; later replies are checked by `poll`
+REPLY_TIMEOUT_S = 5.0  # while the service runs
+MAX_ATTEMPTS = 3
+SIMULTANEOUS_START_S = 1.0  # with start times closer than this, the order of two starts is not certain
 
 
 def build_config_reply(name: str, config: str, uptime: float = 0.0) -> ConfigReply:
-    """What a service says of itself; ``config`` is JSON, ``uptime`` s."""
+    """Build the reply to the query ``config``: settings as JSON, versions, protocol, host and uptime in s."""
     return ConfigReply(
         service=name, config=config, versions=versions(), protocol=PROTOCOL, host=platform.node()[:200], uptime=uptime
     )
 
 
 def same_protocol(mine: ConfigReply, other: ConfigReply) -> bool:
-    """Whether both speak the same protocol; who does not say is believed to."""
+    """Whether both speak the same protocol; assumed if one of them does not state it."""
     return not other.protocol or not mine.protocol or other.protocol == mine.protocol
 
 
 def started_later(mine: ConfigReply, other: ConfigReply) -> bool:
-    """Whether we are the one that came to the other; the older protocol where both came at once."""
+    """Whether ``mine`` was started after ``other``; of two simultaneous starts, the older protocol counts as later."""
     if abs(mine.uptime - other.uptime) < SIMULTANEOUS_START_S:
         return mine.protocol < other.protocol
     return mine.uptime < other.uptime
 
 
 def describe_version_differences(mine: ConfigReply, other: ConfigReply) -> str:
-    """Both sides' packages where they differ: ``presage 0.1.0 here, 0.2.0 there``; empty: they do not."""
-    pairs = [(name, mine.versions.get(name), other.versions.get(name)) for name in COMPARED]
+    """Package versions that differ, such as ``presage 0.1.0 here, 0.2.0 there``; empty if none does."""
+    pairs = [(name, mine.versions.get(name), other.versions.get(name)) for name in COMPARED_PACKAGES]
     return "; ".join(
         f"{name} {here} here, {there} there" for name, here, there in pairs if here and there != here and there
     )
 
 
 def describe_mismatch(mine: ConfigReply, other: ConfigReply) -> str:
-    """One line that names both protocols and hosts, and what to do."""
+    """Error message that names both protocols and hosts, and what to do."""
     return (
-        f"protocol {mine.protocol} here ({_at(mine)}), "
-        f"protocol {other.protocol} in the {other.service} ({_at(other)}): "
+        f"protocol {mine.protocol} here ({_describe_host(mine)}), "
+        f"protocol {other.protocol} in the {other.service} ({_describe_host(other)}): "
         "they would misread each other's messages; install the same version of presage on both"
     )
 
 
-def _at(service: ConfigReply) -> str:
+def _describe_host(service: ConfigReply) -> str:
     return f"presage {service.versions.get('presage', 'unknown')} on {service.host or 'an unknown host'}"
 
 
 class ProtocolCheck:
-    """One service's look at the others."""
+    """Compares the protocol version and packages of one service with those of the other services."""
 
-    def __init__(self, bus: Bus, me: str, log: Logger) -> None:
-        """Nothing is asked yet."""
-        self._bus, self._me, self._log = bus, me, log
+    def __init__(self, bus: Bus, service: str, log: Logger) -> None:
+        """Check for ``service``; nothing is queried before `check_at_start`."""
+        self._bus, self._service, self._log = bus, service, log
         self._inbox = Inbox(capacity=1000)
-        self._came: queue.SimpleQueue[str] = queue.SimpleQueue()  # from zenoh's thread
-        self._asked: dict[str, tuple[float, int]] = {}  # who owes an answer: when asked, how often
+        self._arrived: queue.SimpleQueue[str] = queue.SimpleQueue()  # services; filled by zenoh's thread
+        self._pending: dict[str, tuple[float, int]] = {}  # by service: time of the last query, number of queries
         self._warned: set[str] = set()
 
     def check_at_start(self, mine: ConfigReply) -> None:
-        """Before we are there for others; raises UserError where one that is there speaks another protocol."""
-        if not wait_until(self._bus.linked, WITHIN):
+        """Check the running services before this one is declared alive.
+
+        Raises UserError if one of them speaks another protocol.
+        """
+        if not wait_until(self._bus.linked, START_TIMEOUT_S):
             return
-        wait_until(self._asked_somebody, WITHIN)  # a session that has just opened does not know yet who is there
-        for other in self._answers():
+        # Repeated because a session that has just opened does not know the other services yet.
+        wait_until(self._query_all, START_TIMEOUT_S)
+        for other in self._replies():
             if not same_protocol(mine, other):
                 raise UserError(describe_mismatch(mine, other))
             self._compare(mine, other)
 
-    def _asked_somebody(self) -> bool:
-        self._bus.ask_each(CONFIG, Request(), self._inbox, WITHIN).wait(2 * WITHIN)
+    def _query_all(self) -> bool:
+        """Query all services; returns whether any replied."""
+        self._bus.ask_each(CONFIG, Request(), self._inbox, START_TIMEOUT_S).wait(2 * START_TIMEOUT_S)
         return len(self._inbox) > 0
 
     def watch(self) -> None:
-        """From now on hear of who comes, and of who is there."""
-        self._bus.watch_alive(lambda name, there: self._came.put(name) if there else None)
+        """Start to watch for services that are alive or become alive; `poll` checks them."""
+        self._bus.watch_alive(lambda name, alive: self._arrived.put(name) if alive else None)
 
-    def look(self, mine: Callable[[], ConfigReply]) -> None:
-        """Now and then: ask who came, judge who answered; raises UserError as `check_at_start` where we came later."""
-        self._ask()
+    def poll(self, mine: Callable[[], ConfigReply]) -> None:
+        """Query services that appeared and check those that replied; to be called about once a second.
+
+        Raises UserError if another protocol is spoken by a service that was started before this one.
+        """
+        self._query_arrived()
         if not len(self._inbox):
             return
         me = mine()
-        for other in self._answers():
-            self._asked.pop(other.service, None)
+        for other in self._replies():
+            self._pending.pop(other.service, None)
             if not same_protocol(me, other):
                 if started_later(me, other):
                     raise UserError(describe_mismatch(me, other))
@@ -110,20 +119,20 @@ class ProtocolCheck:
             elif started_later(me, other):
                 self._compare(me, other)
 
-    def _ask(self) -> None:
+    def _query_arrived(self) -> None:
         now = time.monotonic()
-        while not self._came.empty():
-            name = self._came.get()
-            if name != self._me and len(self._asked) < 1000:  # somebody may invent names
-                self._asked[name] = (-inf, 0)
-        for name, (at, times) in list(self._asked.items()):
-            if times >= ATTEMPTS:
-                del self._asked[name]
-            elif now - at >= ANSWER:
-                self._asked[name] = (now, times + 1)
-                self._bus.ask_each(CONFIG, Request(), self._inbox, ANSWER, name)
+        while not self._arrived.empty():
+            name = self._arrived.get()
+            if name != self._service and len(self._pending) < 1000:  # a hostile peer may invent names
+                self._pending[name] = (-inf, 0)
+        for name, (last_query, attempts) in list(self._pending.items()):
+            if attempts >= MAX_ATTEMPTS:
+                del self._pending[name]
+            elif now - last_query >= REPLY_TIMEOUT_S:
+                self._pending[name] = (now, attempts + 1)
+                self._bus.ask_each(CONFIG, Request(), self._inbox, REPLY_TIMEOUT_S, name)
 
-    def _answers(self) -> list[ConfigReply]:
+    def _replies(self) -> list[ConfigReply]:
         found = []
         while isinstance(answer := self._inbox.get(0), Answer):
             reply = answer.reply()
@@ -132,7 +141,7 @@ class ProtocolCheck:
         return found
 
     def _compare(self, mine: ConfigReply, other: ConfigReply) -> None:
-        """Other packages may work; it is worth one line."""
+        """Log different package versions once: they may still work together."""
         if (text := describe_version_differences(mine, other)) and text not in self._warned:
             self._warned.add(text)
             there = f"{other.service} on {other.host or 'an unknown host'}"

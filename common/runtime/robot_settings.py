@@ -13,16 +13,16 @@ from common.robot.base import Robot
 from common.robot.self_filter import SelfFilter
 from common.runtime.config import ServiceSettings
 
-BOUNDS = rf"{NUMBER}:{NUMBER}"
-LONGEST_BRAKE = 10.0  # s; who stops more slowly than that cannot be driven by looking ahead
+ANGLE_BOUNDS_PATTERN = rf"{NUMBER}:{NUMBER}"
+MAX_STOPPING_TIME_S = 10.0  # a robot that takes longer to stop cannot be kept from obstacles by its scanner
 
 
 class RobotSettings(ServiceSettings):
-    """A round base and its limits. Whoever drives and whoever brakes has to be told the same."""
+    """A round base and its limits. Controller, simulator and bridge have to get the same values."""
 
     drive: Annotated[
         Literal["holonomic", "differential"],
-        Field(description="of the robot: holonomic moves any way, differential turns to where it goes"),
+        Field(description="drive of the robot: holonomic moves in any direction, differential along its heading"),
     ] = "holonomic"
     radius: Annotated[
         float,
@@ -30,78 +30,90 @@ class RobotSettings(ServiceSettings):
             gt=0,
             le=5,
             allow_inf_nan=False,
-            description="of the robot, m: from base_link to its farthest corner; what it keeps from walls",
+            description="radius of the robot in m, from base_link to its farthest corner; kept free of walls",
         ),
     ] = 0.27
     max_speed: Annotated[
         float,
-        Field(gt=0, le=10, allow_inf_nan=False, description="m/s of its centre: no command is faster"),
+        Field(gt=0, le=10, allow_inf_nan=False, description="maximum speed of commands, m/s of the robot's centre"),
     ] = 1.0
     max_turn: Annotated[
         float,
-        Field(gt=0, le=20, allow_inf_nan=False, description="rad/s: no command turns faster"),
+        Field(gt=0, le=20, allow_inf_nan=False, description="maximum turn rate of commands, rad/s"),
     ] = 2.0
     acceleration: Annotated[
         float,
-        Field(gt=0, le=20, allow_inf_nan=False, description="m/s² with which it gains speed, and surely brakes"),
+        Field(
+            gt=0,
+            le=20,
+            allow_inf_nan=False,
+            description="maximum acceleration, m/s²; the robot has to be able to brake with it",
+        ),
     ] = 1.0
     turn_acceleration: Annotated[
         float,
-        Field(gt=0, le=100, allow_inf_nan=False, description="rad/s², the same of turning"),
+        Field(gt=0, le=100, allow_inf_nan=False, description="maximum angular acceleration and braking, rad/s²"),
     ] = 3.0
 
     def build_robot(self) -> Robot:
-        """Its limits; raises UserError where they do not go together."""
-        for speed, acceleration, unit in (
+        """Robot with these limits; raises UserError if it would take too long to stop."""
+        for speed_name, acceleration_name, unit in (
             ("max_speed", "acceleration", "m/s"),
             ("max_turn", "turn_acceleration", "rad/s"),
         ):
-            most, rate = getattr(self, speed), getattr(self, acceleration)
-            if most / rate > LONGEST_BRAKE:
-                first, second = (f"--{name.replace('_', '-')}" for name in (speed, acceleration))
+            speed, acceleration = getattr(self, speed_name), getattr(self, acceleration_name)
+            if speed / acceleration > MAX_STOPPING_TIME_S:
+                first, second = (f"--{name.replace('_', '-')}" for name in (speed_name, acceleration_name))
                 raise UserError(
-                    f"{first} {most:g} {unit} with {second} {rate:g} {unit}²: the robot would take {most / rate:.0f} s "
-                    f"to stop, {LONGEST_BRAKE:g} s are the most; a lower {first}, or a higher {second}"
+                    f"{first} {speed:g} {unit} with {second} {acceleration:g} {unit}²: the robot would take "
+                    f"{speed / acceleration:.0f} s to stop, more than {MAX_STOPPING_TIME_S:g} s; "
+                    f"lower {first} or raise {second}"
                 )
         return Robot(
-            drive=self.drive, radius=self.radius, max_speed=self.max_speed, max_turn=self.max_turn,
-            acceleration=self.acceleration, turn_acceleration=self.turn_acceleration,
-        )  # fmt: skip
+            drive=self.drive,
+            radius=self.radius,
+            max_speed=self.max_speed,
+            max_turn=self.max_turn,
+            acceleration=self.acceleration,
+            turn_acceleration=self.turn_acceleration,
+        )
 
 
 class SeenRobotSettings(RobotSettings):
-    """Of a robot whose scanner sees itself. Whoever takes scans and brakes has to be told the same."""
+    """Settings of a robot whose scanner sees parts of the robot. Controller and bridge have to get the same values."""
 
     ignore_angles: Annotated[
         str,
         Field(
-            pattern=rf"^$|^{BOUNDS}(,{BOUNDS})*$",
-            description="LOWER:UPPER,... deg in the scan's own frame, seen from above, where the robot itself is seen "
-            "(laser_filters' angular bounds): such beams say nothing, nothing there is braked for",
+            pattern=rf"^$|^{ANGLE_BOUNDS_PATTERN}(,{ANGLE_BOUNDS_PATTERN})*$",
+            description="LOWER:UPPER,... in degrees in the scan's frame, seen from above: sectors in which the scanner "
+            "sees the robot itself (as laser_filters' angular bounds). Beams in them are ignored, also when braking",
         ),
     ] = ""
     blind_radius: Annotated[
         float,
         Field(
-            ge=0, le=5, allow_inf_nan=False,
-            description="m about the scanner within which it sees the robot itself (laser_filters' lower threshold): "
-            "shorter beams say nothing, nothing nearer is braked for; 0: none",
+            ge=0,
+            le=5,
+            allow_inf_nan=False,
+            description="distance in m around the scanner in which it sees the robot itself (as laser_filters' lower "
+            "threshold). Shorter beams are ignored, also when braking; 0 ignores none",
         ),
-    ] = 0.0  # fmt: skip
+    ] = 0.0
 
     def build_self_filter(self) -> SelfFilter:
-        """What is cut out of each scan; raises UserError where bounds are none."""
+        """Filter of the beams that hit the robot; raises UserError for invalid angles."""
         sectors = []
         for text in filter(None, self.ignore_angles.split(",")):
             low, high = (float(each) for each in text.split(":"))
             if not -360 <= low < high <= 360:
                 raise UserError(
-                    f"--ignore-angles {text}: the lower bound goes first, both in degrees from -360 to 360, such as "
-                    "150:210 for 30 degrees to either side of behind"
+                    f"--ignore-angles {text}: give the lower bound first, both in degrees from -360 to 360, such as "
+                    "150:210 for the 60 degrees behind the robot"
                 )
             sectors.append((float(np.deg2rad(low)), float(np.deg2rad(high))))
         if sum(high - low for low, high in sectors) >= 2 * np.pi:
             raise UserError(
-                f"--ignore-angles {self.ignore_angles}: that is all round, and nothing would be seen at all"
+                f"--ignore-angles {self.ignore_angles}: these sectors cover the full circle and leave no beams"
             )
         return SelfFilter(tuple(sectors), self.blind_radius)

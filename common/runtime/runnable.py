@@ -6,12 +6,12 @@ from typing import Protocol
 
 
 class Runnable(Protocol):
-    """Whatever runs until it is told to stop."""
+    """A loop that runs until it is stopped."""
 
     def run(self) -> None:
-        """Until `stop`."""
+        """Run; returns after `stop` was called."""
         ...
 
     def stop(self) -> None:
-        """End after the current step; safe from a signal handler."""
+        """Make `run` return after its current step; safe to call from a signal handler."""
         ...

@@ -10,13 +10,13 @@ from common.messages.definitions import Scan
 from common.robot.base import Robot
 from common.robot.ranges import surfaces
 
-REACTION_TIME_S = 2 / 15  # s: the scan is up to one period old, and the command holds for another
-SIDE = 0.01  # m beside the footprint that must be free as well
-STEP = 1 / 60  # s between the points of a way looked at: 17 mm at 1 m/s, 0.1 mm off between two of them
+REACTION_TIME_S = 2 / 15  # the scan is up to one 15 Hz period old, and the command holds for another
+FOOTPRINT_MARGIN_M = 0.01  # must be free around the footprint
+PATH_STEP_S = 1 / 60  # between the points of a stopping path: 17 mm at 1 m/s, which is exact to 0.1 mm
 
 
 def scan_points(scan: Scan) -> Array:
-    """(K, 2) m in base_link of every beam that hit something; too close (-inf) counts as at range_min."""
+    """(K, 2) end points in m in base_link of the beams that hit something; too close (-inf) counts as at range_min."""
     close = np.isneginf(scan.ranges)
     hit = surfaces(scan.ranges) | close
     ranges = np.where(close, scan.range_min, scan.ranges.astype(np.float64))
@@ -26,11 +26,14 @@ def scan_points(scan: Scan) -> Array:
 
 
 def clip_twist(twist: Array, robot: Robot) -> Array:
-    """(3,) vx, vy m/s, wz rad/s within the robot's limits, direction kept; not finite: standing."""
+    """Limit a twist (3,) vx, vy m/s, wz rad/s to the robot's maximum velocities, keeping its direction.
+
+    Returns zeros if the twist is not finite.
+    """
     if not np.isfinite(twist).all():
         return np.zeros(3)
     linear = np.array([twist[0], twist[1] if robot.drive == "holonomic" else 0.0])
-    # Halved before squared: the greatest float must not overflow.
+    # Halved first, so that the largest float does not overflow.
     speed = float(np.hypot(linear[0] / 2, linear[1] / 2)) * 2
     if speed > robot.max_speed:
         linear = linear / np.abs(linear).max()
@@ -39,27 +42,28 @@ def clip_twist(twist: Array, robot: Robot) -> Array:
 
 
 def ramp(current: Array, wanted: Array, robot: Robot, dt: float, *, hard: bool = False) -> Array:
-    """(3,) the velocity after ``dt`` s of changing ``current`` to ``wanted`` as fast as the limits allow.
+    """(3,) velocity after ``dt`` s of changing from ``current`` to ``wanted`` within the acceleration limits.
 
-    ``hard``: as fast as the base can, which is meant for standing.
+    With ``hard``, brakes as hard as the base can (``robot.braking``); use it only to stop.
     """
-    # Hard is never less than at ease, whatever the base's own acceleration.
-    change, harder = wanted - current, max(1.0, robot.braking / robot.acceleration) if hard else 1.0
-    linear, most = float(np.hypot(change[0], change[1])), robot.acceleration * harder * dt
-    scale = min(1.0, most / linear) if linear > 0 else 1.0
-    turn = robot.turn_acceleration * harder * dt
-    return np.array([*(current[:2] + change[:2] * scale), current[2] + np.clip(change[2], -turn, turn)])
+    # Never below 1, in case the base's acceleration exceeds its braking.
+    change, factor = wanted - current, max(1.0, robot.braking / robot.acceleration) if hard else 1.0
+    linear, max_linear = float(np.hypot(change[0], change[1])), robot.acceleration * factor * dt
+    scale = min(1.0, max_linear / linear) if linear > 0 else 1.0
+    max_turn = robot.turn_acceleration * factor * dt
+    return np.array([*(current[:2] + change[:2] * scale), current[2] + np.clip(change[2], -max_turn, max_turn)])
 
 
 def limit_velocity(
     twist: Array, points: Array, robot: Robot, current: Array | None = None, hold: float = REACTION_TIME_S
 ) -> tuple[Array, bool]:
-    """The twist (3,) slowed so that the robot can brake before any of ``points`` (K, 2) m in base_link; whether it was.
+    """Slow a twist (3,) so that the robot can stop before any of the obstacle ``points`` (K, 2) m in base_link.
 
-    The footprint is round, so turning on the spot is free. Moving away is always allowed: a point counts only where
-    the robot comes nearer to it. ``current`` (3,) is the velocity the robot has now, ``twist`` itself where not given;
-    ``hold`` s is how long the result is followed until the next scan. Where ``current`` leaves no other way out, all
-    three components are 0. An admissible velocity in the sense of the dynamic window (Fox, Burgard, Thrun 1997).
+    Returns the limited twist and whether it was changed. This is an admissible velocity in the sense of the dynamic
+    window approach (Fox, Burgard, Thrun 1997). The footprint is round, so turning on the spot is always allowed, and so
+    is moving away: a point counts only while the robot approaches it. ``current`` (3,) is the robot's present velocity
+    and defaults to ``twist``; ``hold`` is the time in s for which the result is applied. Returns zeros if even stopping
+    at once comes too near to a point.
     """
     if not np.isfinite(twist).all():
         return np.zeros(3), True
@@ -83,40 +87,43 @@ def limit_velocity(
 
 
 def _straight_scale(twist: Array, points: Array, robot: Robot) -> float:
-    """By what to multiply the speed so that the robot, going straight on, stops ``robot.margin`` before any point."""
+    """Factor of the speed with which the robot, driving straight, can stop ``robot.margin`` before the first point."""
     speed = float(np.hypot(twist[0], twist[1]))
     if speed < 1e-9 or len(points) == 0:
         return 1.0
     ahead = twist[:2] / speed
     along, aside = points @ ahead, np.abs(points @ np.array([-ahead[1], ahead[0]]))
-    in_way = (along > 0) & (aside < robot.radius + SIDE)
+    in_way = (along > 0) & (aside < robot.radius + FOOTPRINT_MARGIN_M)
     if not in_way.any():
         return 1.0
-    reach = np.sqrt(np.maximum((robot.radius + SIDE) ** 2 - aside[in_way] ** 2, 0.0))
+    reach = np.sqrt(np.maximum((robot.radius + FOOTPRINT_MARGIN_M) ** 2 - aside[in_way] ** 2, 0.0))
     gap = max(0.0, float(np.min(along[in_way] - reach)) - robot.margin)
-    # v REACTION_TIME_S + v² / 2a <= gap
+    # Solve v REACTION_TIME_S + v² / 2a = gap for v.
     allowed = robot.acceleration * (np.sqrt(REACTION_TIME_S**2 + 2 * gap / robot.acceleration) - REACTION_TIME_S)
     return min(1.0, float(allowed) / speed)
 
 
 def stopping_path(current: Array, wanted: Array, robot: Robot, hold: float) -> Array:
-    """(T, 2) m in base_link of now: the way from ``current`` (3,) towards ``wanted`` for ``hold`` s, then to a stop.
+    """(T, 2) positions in m, in the present base_link, until the robot stands.
 
-    Both within the limits of acceleration, as `ramp` has them. A twist turns with the robot, so the way is curved.
+    The velocity changes from ``current`` (3,) towards ``wanted`` for ``hold`` s and then to zero, both within the
+    acceleration limits of `ramp`. A twist turns with the robot, so the path is curved.
     """
-    began = _ramped(current, wanted, robot, np.arange(0, hold, STEP) + STEP / 2)
-    then = _ramped(current, wanted, robot, np.array([hold]))[0]
-    longest = max(float(np.hypot(then[0], then[1])) / robot.acceleration, STEP)
-    velocity = np.concatenate([began, _ramped(then, np.zeros(3), robot, np.arange(0, longest, STEP) + STEP / 2)])
-    yaw = np.cumsum(velocity[:, 2]) * STEP - velocity[:, 2] * STEP / 2
+    dt = PATH_STEP_S
+    ramp_up = _ramp_velocities(current, wanted, robot, np.arange(0, hold, dt) + dt / 2)
+    at_end = _ramp_velocities(current, wanted, robot, np.array([hold]))[0]
+    braking_time = max(float(np.hypot(at_end[0], at_end[1])) / robot.acceleration, dt)
+    braking = _ramp_velocities(at_end, np.zeros(3), robot, np.arange(0, braking_time, dt) + dt / 2)
+    velocity = np.concatenate([ramp_up, braking])
+    yaw = np.cumsum(velocity[:, 2]) * dt - velocity[:, 2] * dt / 2
     cos, sin = np.cos(yaw), np.sin(yaw)
     vx, vy = velocity[:, 0], velocity[:, 1]
-    steps = np.stack([cos * vx - sin * vy, sin * vx + cos * vy], axis=-1) * STEP
+    steps = np.stack([cos * vx - sin * vy, sin * vx + cos * vy], axis=-1) * dt
     return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
 
 
-def _ramped(current: Array, wanted: Array, robot: Robot, times: Array) -> Array:
-    """(T, 3) velocities at ``times`` (T,) s of a ramp."""
+def _ramp_velocities(current: Array, wanted: Array, robot: Robot, times: Array) -> Array:
+    """(T, 3) velocities at ``times`` (T,) s of a `ramp` from ``current`` to ``wanted``."""
     change = wanted - current
     linear = max(float(np.hypot(change[0], change[1])), 1e-12)
     scale = np.minimum(1.0, robot.acceleration * times / linear)
@@ -125,9 +132,9 @@ def _ramped(current: Array, wanted: Array, robot: Robot, times: Array) -> Array:
 
 
 def _clear(current: Array, wanted: Array, points: Array, robot: Robot, hold: float) -> bool:
-    """Whether no point comes nearer than the footprint on the way to a stop."""
-    path, near = stopping_path(current, wanted, robot, hold), robot.radius + SIDE
+    """Whether the footprint approaches no point to contact on the stopping path."""
+    path, contact = stopping_path(current, wanted, robot, hold), robot.radius + FOOTPRINT_MARGIN_M
     travelled = float(np.hypot(*np.diff(path, axis=0).T).sum())
-    points = points[np.hypot(points[:, 0], points[:, 1]) < near + travelled]
+    points = points[np.hypot(points[:, 0], points[:, 1]) < contact + travelled]
     distance = np.hypot(path[:, None, 0] - points[:, 0], path[:, None, 1] - points[:, 1])
-    return not bool(((distance[1:] < near) & (np.diff(distance, axis=0) < -1e-7)).any())
+    return not bool(((distance[1:] < contact) & (np.diff(distance, axis=0) < -1e-7)).any())

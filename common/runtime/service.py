@@ -28,37 +28,40 @@ S = TypeVar("S", bound=ServiceSettings)
 
 
 class Service(ABC):
-    """A service's thin shell: what it hears, what it does then. Override what is needed."""
+    """Base class of a service: declares its inputs and handles what arrives. Override the methods that are needed.
+
+    All ``on_...`` methods are called from one thread, that of the loop.
+    """
 
     name: ClassVar[str]
     inputs: ClassVar[tuple[Topic, ...]] = ()
     queries: ClassVar[tuple[Query, ...]] = ()
-    keep_all: ClassVar[bool] = False  # every payload of every input, whatever the queue policy
-    all_robots: ClassVar[bool] = False  # it hears more than its own robot
-    single: ClassVar[bool] = False  # one instance leads; others wait until it is gone
-    serves_latched: ClassVar[tuple[Topic, ...]] = ()  # kept topics it remembers for those who come later
-    restores_latched: ClassVar[tuple[Topic, ...]] = ()  # kept topics whose last message it wants before anything else
+    keep_all: ClassVar[bool] = False  # queue every payload of every input, whatever the topic's queue policy
+    all_robots: ClassVar[bool] = False  # subscribes to topics of other robots too
+    single: ClassVar[bool] = False  # only one instance is active; others stand by until it is gone
+    serves_latched: ClassVar[tuple[Topic, ...]] = ()  # latched topics whose last message it stores for late joiners
+    restores_latched: ClassVar[tuple[Topic, ...]] = ()  # latched topics whose last message it needs when it starts
 
     def __init__(self, settings: ServiceSettings) -> None:
-        """Keep the settings; whatever may fail belongs in `open`."""
+        """Store the settings. Anything that may fail belongs in `open`."""
         self.settings = settings
         self.log: Logger = logger(self.name)
-        self.counters: Counter[str] = Counter()  # shown in health
-        self.note = ""  # shown in health
+        self.counters: Counter[str] = Counter()  # published in health
+        self.note = ""  # published in health
         self._loop: Loop | None = None
 
     @property
     def loop(self) -> Loop:
-        """The running loop."""
+        """The loop that runs this service; raises RuntimeError before it exists."""
         if self._loop is None:
-            raise RuntimeError(f"{self.name} does not run")
+            raise RuntimeError(f"service {self.name!r} is not running")
         return self._loop
 
     def open(self) -> None:
-        """Before the first message; raise UserError to end with one line."""
+        """Prepare for the first message. Raise UserError to end the process with a one-line message."""
 
     def on_sample(self, sample: Sample) -> None:
-        """A payload came; decoded and passed on unless a service wants the bytes."""
+        """Handle a received payload: by default decode it and call `on_message`. Override it to get the bytes."""
         try:
             message = sample.topic.message.decode(sample.payload)
         except DecodeError as error:
@@ -67,69 +70,75 @@ class Service(ABC):
         self.on_message(sample.topic, message)
 
     def extra_counts(self, key: str) -> dict[str, int]:  # noqa: ARG002
-        """More fields of this key's row in health."""
+        """Extra counters for the row of ``key`` in the health message."""
         return {}
 
     def on_message(self, topic: Topic, message: Stamped) -> None:
-        """A valid message came."""
+        """Handle a valid message of one of the inputs."""
 
     def on_restored(self, last: dict[Topic, Stamped]) -> None:
-        """What others remember of the topics it ``recalls``, once, before anything else comes."""
+        """Handle the last messages of ``restores_latched``: called at most once, within 5 s of the start."""
 
     def on_request(self, query: Query, request: Request) -> Reply:
-        """A valid request came; the answer."""
+        """Handle a valid request and return the reply. A UserError becomes a reply with ok=False."""
         return Reply(ok=False, reason=f"{self.name} does not answer {query.name} ({type(request).__name__})")
 
     def on_reply(self, query: Query, number: int, reply: Reply) -> None:
-        """What `request` asked for, or ok false and why there is no answer; each request gets exactly one."""
+        """Handle the reply to `request`: called exactly once for each request, with ok=False if it failed."""
 
     def due(self) -> float | None:
-        """Seconds until `on_timer` is wanted; None: not."""
+        """Seconds until `on_timer` is to be called, or None if no timer is set."""
         return None
 
     def on_timer(self) -> None:
-        """The time asked for in `due` has come."""
+        """Handle the timer: called when the time that `due` returned has passed."""
 
     def close(self) -> None:
-        """After the last message."""
+        """Release resources after the last message."""
 
     def publish(self, topic: Topic, message: Stamped) -> None:
-        """Send a message with the next sequence number of its key."""
+        """Publish a message with the next sequence number of its key."""
         self.loop.publish(topic, message)
 
     def make_loop(self, bus: Bus) -> Runnable:
-        """What runs this service on a session."""
+        """Create the loop that runs this service on a session."""
         return Loop(self, bus, Inbox())
 
     def request(self, query: Query, request: Request, timeout: float = 5.0) -> int:
-        """Ask without waiting: the number under which `on_reply` is called, within ``timeout`` s or so."""
+        """Send a request without waiting.
+
+        Returns the number with which `on_reply` is called, after about ``timeout`` s at the latest.
+        """
         return self.loop.request(query, request, timeout)
 
 
-class _Ending:
-    """Signal handler from the first moment on: a signal that comes before the loop ends it as it begins."""
+class _SignalHandler:
+    """Stops the loop at a signal. A signal that arrives before the loop exists stops it as soon as it starts."""
 
     def __init__(self) -> None:
-        self.asked = False
+        self.stop_requested = False
         self.loop: Runnable | None = None
 
     def __call__(self, _signal: int, _frame: FrameType | None) -> None:
-        self.asked = True
+        self.stop_requested = True
         if self.loop is not None:
             self.loop.stop()
 
     def run(self, loop: Runnable) -> None:
         self.loop = loop
-        if self.asked:
+        if self.stop_requested:
             loop.stop()
         loop.run()
 
 
 def main(settings_class: type[S], make: Callable[[S], Service], argv: list[str] | None = None) -> None:
-    """Run a service as a process; ends it with status 0, or 2 and one line where the user can mend something."""
-    ending = _Ending()
-    signal.signal(signal.SIGTERM, ending)
-    signal.signal(signal.SIGINT, ending)
+    """Run a service as a process until SIGTERM or Ctrl-C.
+
+    A UserError ends the process with status 2 and a one-line message.
+    """
+    handler = _SignalHandler()
+    signal.signal(signal.SIGTERM, handler)
+    signal.signal(signal.SIGINT, handler)
     begin_logging(settings_class.service, argv)
     try:
         settings = load_settings(settings_class, argv)
@@ -137,8 +146,8 @@ def main(settings_class: type[S], make: Callable[[S], Service], argv: list[str] 
             settings.log_level, as_json=settings.log_json, service=settings_class.service, robot=settings.robot
         )
         service = make(settings)
-        with open_bus(settings.link(), give_up=lambda: ending.asked) as bus:
-            ending.run(service.make_loop(bus))
+        with open_bus(settings.link(), give_up=lambda: handler.stop_requested) as bus:
+            handler.run(service.make_loop(bus))
         service.log.info("ended")
     except UserError as error:
         report_failure(settings_class.service, error)

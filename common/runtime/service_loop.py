@@ -26,39 +26,40 @@ if TYPE_CHECKING:
     from common.runtime.metrics import ServiceMetrics
     from common.runtime.service import Service
 
-HEALTH_PERIOD = 1.0  # s
-RECALL_WITHIN = 5.0  # s after its start in which a service asks what others remember
-SOURCE_SILENT = 0.3  # s after which another source of a topic is heard
+HEALTH_PERIOD_S = 1.0
+RESTORE_PERIOD_S = 5.0  # after its start, a service keeps querying latched topics for this long until one answers
+SOURCE_TIMEOUT_S = 0.3  # a source silent for longer is replaced by another source of the same topic
 
 
 class Loop:
     """Runs one service on one session."""
 
     def __init__(self, service: Service, bus: Bus, inbox: Inbox) -> None:
-        """What arrives once it has begun waits in ``inbox``."""
+        """Connect a service with a session; ``inbox`` queues what arrives for it."""
         self.service, self.bus, self.inbox = service, bus, inbox
         self.published: Counter[str] = Counter()  # by key
-        self.undecodable: Counter[str] = Counter()
-        self.failed = 0
-        self._asked = 0
+        self.undecodable: Counter[str] = Counter()  # by key
+        self.failed = 0  # steps that raised an exception
+        self._request_number = 0
         self._may_log = LogRateLimiter()
-        self._heart = Heartbeat(service.settings.heartbeat, service.name, bus.robot)
+        self._heartbeat = Heartbeat(service.settings.heartbeat, service.name, bus.robot)
         self._stopping = False
-        self.began = self._health_at = self._counted_at = time.monotonic()
-        self._before: Counter[str] = Counter()
-        self._sources = SourceSelector(SOURCE_SILENT)
-        self._recall_until = 0.0
-        self._lead = LeaderElection(bus, service.name, service.log, inbox.wake) if service.single else None
+        self.began = self._next_health = self._last_health = time.monotonic()
+        self._totals_at_last_health: Counter[str] = Counter()
+        self._sources = SourceSelector(SOURCE_TIMEOUT_S)
+        self._restore_until = 0.0
+        self._election = LeaderElection(bus, service.name, service.log, inbox.wake) if service.single else None
         self._metrics: ServiceMetrics | None = None
-        self._others = ProtocolCheck(bus, service.name, service.log)
-        service._loop = self  # noqa: SLF001 - the two halves of one thing
+        self._protocol_check = ProtocolCheck(bus, service.name, service.log)
+        service._loop = self  # noqa: SLF001 - a service publishes through its loop
 
     def run(self) -> None:
-        """Until `stop`; with an endpoint for metrics where one is asked for."""
+        """Run the service until `stop`, and serve its metrics if the settings name an address for them."""
         if not (address := self.service.settings.metrics):
             self._run()
             return
-        from common.runtime.metrics_server import measure  # noqa: PLC0415 - Prometheus's client only where it is used
+        # Imported here because the Prometheus client is slow to import and rarely used.
+        from common.runtime.metrics_server import measure  # noqa: PLC0415
 
         with measure(self, address) as self._metrics:
             self._run()
@@ -67,50 +68,57 @@ class Loop:
         self.open()
         try:
             while not self._stopping and not self.try_start():
-                self.inbox.get(HEALTH_PERIOD / 2)
-                self._heart.beat({}, linked=self.bus.linked(), note="standing by")
+                self.inbox.get(HEALTH_PERIOD_S / 2)
+                self._heartbeat.beat({}, linked=self.bus.linked(), note="standing by")
             while not self._stopping:
-                self._turn()
+                self._step()
         finally:
             self.service.close()
 
     def open(self) -> None:
-        """Before anything is heard; raises UserError where others speak another protocol, or the service cannot."""
-        self._others.check_at_start(self._config())
+        """Open the service before it receives anything.
+
+        Raises UserError if running services use another protocol version, or if the service itself cannot start.
+        """
+        self._protocol_check.check_at_start(self._config())
         self.service.open()
 
     def try_start(self) -> bool:
-        """Hear, answer, and say last that the service is there; False while another instance leads."""
-        if self._lead is not None and not self._lead.takes():
+        """Subscribe, serve queries and declare the service alive; returns False while another instance is active."""
+        if self._election is not None and not self._election.try_activate():
             return False
         service, bus = self.service, self.bus
         if not service.keep_all:
-            bus.watch_instances(self._sources.change, "*" if service.all_robots else None)
-        for kept in service.serves_latched:
-            bus.keep(kept)
-        self._recall_until = time.monotonic() + RECALL_WITHIN
-        self._recall()
+            bus.watch_instances(self._sources.update, "*" if service.all_robots else None)
+        for latched in service.serves_latched:
+            bus.serve_latched(latched)
+        self._restore_until = time.monotonic() + RESTORE_PERIOD_S
+        self._restore()
         for topic in service.inputs:
             bus.subscribe(topic, self.inbox, keep_all=service.keep_all)
         for query in service.queries:
             bus.serve(query, self.inbox)
         bus.serve(CONFIG, self.inbox, service.name)
         bus.declare_alive(service.name)
-        self._others.watch()
+        self._protocol_check.watch()
         service.log.info("ready", robot=bus.robot)
-        self._health_at = self._counted_at = time.monotonic()  # the first pulse now, and each after it a second on
+        self._next_health = self._last_health = time.monotonic()  # the first health message is due now
         return True
 
-    def _recall(self) -> None:
-        """Once somebody knows: after a router's death all have to find one another first."""
-        if self.service.restores_latched and time.monotonic() < self._recall_until and (found := self._recalled()):
-            self._recall_until = 0.0
+    def _restore(self) -> None:
+        """Query the latched topics until one answers: after a router's restart, sessions first have to reconnect."""
+        if (
+            self.service.restores_latched
+            and time.monotonic() < self._restore_until
+            and (found := self._query_latched())
+        ):
+            self._restore_until = 0.0
             self.guard(lambda: self.service.on_restored(found))
 
-    def _recalled(self) -> dict[Topic, Stamped]:
+    def _query_latched(self) -> dict[Topic, Stamped]:
         found: dict[Topic, Stamped] = {}
         for topic in self.service.restores_latched:
-            if (payload := self.bus.kept(topic)) is not None:
+            if (payload := self.bus.query_latched(topic)) is not None:
                 try:
                     found[topic] = topic.message.decode(payload)
                 except DecodeError as error:
@@ -118,12 +126,12 @@ class Loop:
         return found
 
     def stop(self) -> None:
-        """End after the current step; safe from a signal handler."""
+        """Make `run` return after its current step; safe to call from a signal handler."""
         self._stopping = True
         self.inbox.wake()
 
     def publish(self, topic: Topic, message: Stamped) -> None:
-        """Send with the key's next sequence number."""
+        """Publish a message with the next sequence number of its key."""
         key = topic.key(self.bus.robot, self.service.name)
         numbered = message.model_copy(update={"seq": self.published[key]})
         self.bus.put(topic, numbered.encode(), self.service.name)
@@ -132,21 +140,21 @@ class Loop:
             self._metrics.published(key, numbered)
 
     def request(self, query: Query, request: Request, timeout: float) -> int:
-        """Ask; the answer comes through the inbox like everything else."""
-        self._asked += 1
-        self.bus.request(query, request, self._asked, self.inbox, timeout)
-        return self._asked
+        """Send a request and return its number; the reply arrives through the inbox."""
+        self._request_number += 1
+        self.bus.request(query, request, self._request_number, self.inbox, timeout)
+        return self._request_number
 
     def reject(self, key: str, why: str) -> None:
-        """Count a payload that could not be used; say so once a second at most."""
+        """Count a payload that could not be used, and log it at most once a second."""
         name = self.inbox.counted_as(key)
         self.undecodable[name] += 1
         if self._may_log(name):
             self.service.log.warning("payload dropped", key=key, why=why, so_far=self.undecodable[name])
 
-    def _turn(self) -> None:
+    def _step(self) -> None:
         due = self.service.due()
-        until_health = self._health_at - time.monotonic()
+        until_health = self._next_health - time.monotonic()
         self.handle(self.inbox.get(max(0.0, min(until_health, 0.5 if due is None else due))))
         due = self.service.due()
         if due is not None and due <= 0:
@@ -154,11 +162,11 @@ class Loop:
         self.pulse()
 
     def handle(self, event: Sample | Call | Answer | None) -> None:
-        """What one entry of the inbox asks for; raises UserError where another instance leads by now."""
-        if self._lead is not None:
-            self._lead.check()
+        """Handle one entry of the inbox; raises UserError if an older instance has become active."""
+        if self._election is not None:
+            self._election.check()
         if isinstance(event, Sample):
-            if self._counts(event):
+            if self._accepts(event):
                 with nullcontext() if self._metrics is None else self._metrics.step(event):
                     self.guard(lambda: self.service.on_sample(event))
         elif isinstance(event, Call):
@@ -167,21 +175,21 @@ class Loop:
             self.guard(lambda: self.service.on_reply(event.query, event.number, event.reply()))
 
     def pulse(self) -> None:
-        """Health, once a second."""
-        if (now := time.monotonic()) >= self._health_at:
-            late = now - self._health_at > HEALTH_PERIOD  # after a long step one pulse, not all that were missed
-            self._health_at = (now if late else self._health_at) + HEALTH_PERIOD
+        """Publish health and repeat the periodic checks, once a second."""
+        if (now := time.monotonic()) >= self._next_health:
+            late = now - self._next_health > HEALTH_PERIOD_S  # after a long step, skip the health messages missed
+            self._next_health = (now if late else self._next_health) + HEALTH_PERIOD_S
             health = self._health(now)
             self.publish(HEALTH, health)
             counts = {row.key: row.model_dump(include={"received", "published", "written"}) for row in health.topics}
-            self._heart.beat(counts, linked=self.bus.linked(), note=health.note)
-            self._others.look(self._config)
-            if self._lead is not None:
-                self._lead.look()
-            self._recall()
+            self._heartbeat.beat(counts, linked=self.bus.linked(), note=health.note)
+            self._protocol_check.poll(self._config)
+            if self._election is not None:
+                self._election.refresh()
+            self._restore()
 
-    def _counts(self, sample: Sample) -> bool:
-        """Not where a second source publishes beside the one that is heard."""
+    def _accepts(self, sample: Sample) -> bool:
+        """Whether a sample is from the selected source of its key; samples of a second source are ignored."""
         if sample.topic.multiple_publishers or self.service.keep_all:
             return True
         if self._sources.accepts(sample.key, sample.topic.publisher, sample.source, time.monotonic()):
@@ -189,13 +197,14 @@ class Loop:
         self.service.counters["other_sources"] += 1
         if self._may_log(f"other {sample.key}"):
             self.service.log.warning(
-                "ignored: a second source of what only one should publish; `presage doctor` names them",
-                key=sample.key, session=sample.source,
-            )  # fmt: skip
+                "message ignored: two sources publish a topic that has one publisher; `presage doctor` lists them",
+                key=sample.key,
+                session=sample.source,
+            )
         return False
 
     def guard(self, step: Callable[[], None]) -> None:
-        """No input stops a service: what a step raises is counted and logged with its traceback."""
+        """Run a step; an exception other than UserError is counted and logged, so that no input stops the service."""
         try:
             step()
         except UserError:
@@ -229,9 +238,9 @@ class Loop:
 
     def _health(self, now: float) -> Health:
         inbox, total = self.inbox, Counter[str]()
-        total.update(dict(inbox.received))  # a copy: zenoh's threads go on counting
+        total.update(dict(inbox.received))  # a copy, because zenoh's threads change the counts
         total.update(self.published)
-        elapsed, self._counted_at = max(now - self._counted_at, 1e-3), now
+        elapsed, self._last_health = max(now - self._last_health, 1e-3), now
         rows = [
             TopicHealth(
                 key=key[:200],
@@ -239,12 +248,12 @@ class Loop:
                 published=self.published[key],
                 dropped=inbox.dropped[key],
                 undecodable=self.undecodable[key] + inbox.oversized[key],
-                rate=max(0, total[key] - self._before[key]) / elapsed,
+                rate=max(0, total[key] - self._totals_at_last_health[key]) / elapsed,
                 **self.service.extra_counts(key),
             )
             for key in sorted(total)[:200]
         ]
-        self._before = total
+        self._totals_at_last_health = total
         counters: dict[str, int] = {**self.service.counters, "failed": self.failed}
         return Health(
             stamp_ns=time.time_ns(),

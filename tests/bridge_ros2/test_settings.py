@@ -20,7 +20,7 @@ def test_a_mount_with_or_without_its_yaw(said, pose):
 
 @pytest.mark.parametrize("said", ["1", "1;2", "1,2,3,4", "a,b"])
 def test_a_wrong_mount_says_what_is_expected(said):
-    with pytest.raises(UserError, match=r"mount: '.*' is not as it should be: x,y\[,yaw_deg\] \(m, m, degrees\)"):
+    with pytest.raises(UserError, match=r"mount: '.*' is not valid; expected: x,y\[,yaw_deg\] \(m, m, degrees\)"):
         load_settings(BridgeRos2Settings, ["--mount", said])
 
 

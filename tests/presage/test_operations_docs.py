@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from common.messages.definitions import Belief
-from common.runtime.metrics import ROWS, STATES
+from common.runtime.metrics import METRICS, STATES
 from presage.diagnosis import bus_observation as listening
 from presage.diagnosis import installation, machine
 from presage.diagnosis import rules as judging
@@ -27,7 +27,7 @@ def rules() -> list[dict]:
 
 
 def test_alerts_ask_for_metrics_and_labels_that_exist():
-    known = {row.sample: row for row in ROWS} | {r.name + "_bucket": r for r in ROWS if r.kind == "histogram"}
+    known = {row.sample: row for row in METRICS} | {r.name + "_bucket": r for r in METRICS if r.kind == "histogram"}
     asked = 0
     for rule in rules():
         for name, chosen in re.findall(r"(presage_\w+)(?:\{([^}]*)\})?", rule["expr"]):

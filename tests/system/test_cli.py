@@ -46,7 +46,7 @@ WRONG = [
     (("demo", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
     (("demo", "--seed", "99999999999999999999"), "--seed"),
     (("demo", "--beams", "1000000", "--out", "{tmp}/d"), "beams: Input should be less than"),
-    (("demo", "--world", "{tmp}/bad.yaml"), "bad.yaml: no YAML"),
+    (("demo", "--world", "{tmp}/bad.yaml"), "bad.yaml: not valid YAML"),
     (("plot", "{tmp}/run.mcap", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
     (("plot", "{tmp}/run.mcap", "--out", "/proc/no.png"), "/proc/no.png: cannot be written to"),
     (("bench", "latency", "--beams", "1"), "tim571 with 1 beams"),

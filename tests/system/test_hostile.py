@@ -175,5 +175,5 @@ def test_the_recorder_has_it_all(system):
     for topic in TOPICS:
         key = topic.key(bus.robot, "intruder")
         assert counts[key] >= EXAMPLES, topic.name
-    with pytest.raises(UserError, match="nobody answers"):
+    with pytest.raises(UserError, match="no service answers"):
         bus.ask(CONFIG, Request(), ConfigReply, timeout=1, service="recorder")

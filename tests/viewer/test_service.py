@@ -401,4 +401,4 @@ def test_an_answer_that_does_not_come_is_said(viewer, bus):
         page.told("hello")
         answer = page.ask("pause")
         assert not answer["ok"]
-        assert "nobody answers" in answer["reason"]
+        assert "no service answers" in answer["reason"]

@@ -46,7 +46,7 @@ def test_of_all_who_see_the_same_at_most_one_takes_the_lead(events):
         group = leading if leads else waiting
         (group.add if there else group.discard)(name)
         for instances in everybody.values():
-            instances.change(name, leads=leads, there=there)
+            instances.update(name, leads=leads, alive=there)
     candidates = [name for name in waiting - leading if everybody[name].may_lead()]
     assert len(candidates) == (0 if leading or not waiting else 1)
     stay = [name for name in leading if not everybody[name].must_yield()]
@@ -57,10 +57,10 @@ def test_of_all_who_see_the_same_at_most_one_takes_the_lead(events):
 def test_what_this_session_said_before_is_nobody_else(me, other):
     """Zenoh may tell a session of a token of its own that is gone: a robot that came back was never served again."""
     instances = Instances(me.name)
-    instances.change(Instance(other.started_ms, me.host, me.pid, me.zid).name, leads=True, there=True)
+    instances.update(Instance(other.started_ms, me.host, me.pid, me.zid).name, leads=True, alive=True)
     assert instances.may_lead()
     assert not instances.must_yield()
-    instances.change(Instance(other.started_ms, me.host, me.pid + 1, me.zid).name, leads=True, there=True)
+    instances.update(Instance(other.started_ms, me.host, me.pid + 1, me.zid).name, leads=True, alive=True)
     assert not instances.may_lead()
 
 
@@ -82,14 +82,14 @@ def test_where_nobody_leads_the_first_source_is_heard_until_it_is_silent():
 def test_the_instance_that_leads_is_heard_and_nobody_else_however_silent_it_is():
     sources = SourceSelector(0.3)
     leader = Instance(1, "host", 2, "0123456789ab")
-    sources.change("robot", "simulator", leader.name, True)
+    sources.update("robot", "simulator", leader.name, True)
     assert not sources.accepts("presage/robot/scan", "simulator", "repeater", 0.0)
     assert sources.accepts("presage/robot/scan", "simulator", "0123456789abcdef", 5.0)
     assert not sources.accepts("presage/robot/scan", "simulator", "repeater", 50.0)
     assert sources.accepts("presage/robot/belief", "estimator", "anybody", 50.0)  # nobody leads there
     younger = Instance(2, "host", 1, "ba9876543210")
-    sources.change("robot", "simulator", younger.name, True)  # two halves of a network have met
+    sources.update("robot", "simulator", younger.name, True)  # two halves of a network have met
     assert not sources.accepts("presage/robot/scan", "simulator", "ba9876543210", 50.0)
-    sources.change("robot", "simulator", younger.name, False)
-    sources.change("robot", "simulator", leader.name, False)
+    sources.update("robot", "simulator", younger.name, False)
+    sources.update("robot", "simulator", leader.name, False)
     assert sources.accepts("presage/robot/scan", "simulator", "repeater", 50.0)

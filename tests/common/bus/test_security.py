@@ -41,7 +41,9 @@ def may_send(role: str, message: str, key: str, robots: tuple[str, ...] = ("*",)
 
 
 def test_every_role_of_the_table_is_one_and_every_topic_has_somebody_who_puts_it():
-    named = {role for topic in TOPICS for role in topic.publisher_roles} | {role for query in QUERIES for role in query.requester_roles}
+    named = {role for topic in TOPICS for role in topic.publisher_roles} | {
+        role for query in QUERIES for role in query.requester_roles
+    }
     assert named <= set(ROLES)
     assert set(ALL_ROLES) == set(ROLES) - {ROUTER}
     for topic in TOPICS:
@@ -155,7 +157,7 @@ def test_a_role_s_limits_are_said_before_the_router_is_silent(keys):
     mine.check(may_put, CMD_VEL, "one")
     with pytest.raises(UserError, match="'controller-one' is for one, not for robot 'two'"):
         mine.check(may_put, CMD_VEL, "two")
-    with pytest.raises(UserError, match="may not put scan: it takes one of simulator"):
+    with pytest.raises(UserError, match="may not publish scan; allowed roles: simulator"):
         mine.check(may_put, SCAN, "one")
 
 

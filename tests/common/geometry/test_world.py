@@ -130,7 +130,7 @@ def test_what_is_saved_loads(tmp_path):
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("name: [", "no YAML"),
+        ("name: [", "not valid YAML"),
         ("[" * 200_000, "bad.yaml: more than 100 levels"),
         ("obstacles:\n" + "- {}\n" * 600_000, "bad.yaml: more than 1000000 values"),
         ("name: x", "boundary: Field required"),

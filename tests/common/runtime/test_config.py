@@ -112,7 +112,7 @@ def test_empty_is_a_value_on_the_command_line_and_none_in_the_environment(monkey
         (["--size", "101"], ["size", "less than or equal to 100", "--size", "PRESAGE_SIZE"]),
         (["--size", "many"], ["size", "integer", "--size"]),
         (["--robot", "a/b"], ["robot", "--robot", "PRESAGE_ROBOT"]),
-        (["--robot", "*"], ["robot: '*' is not as it should be: name in the keys"]),
+        (["--robot", "*"], ["robot: '*' is not valid; expected: name of the robot"]),
         (["--log-level", "loud"], ["--log-level", "PRESAGE_LOG_LEVEL"]),
         (["--config", "nowhere.yaml"], ["nowhere.yaml", "cannot be read"]),
     ],
@@ -128,14 +128,14 @@ def test_a_wrong_argument_is_one_line_that_names_it(argv, words, tmp_path, monke
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("size: [", ["no YAML"]),
-        ("- 1\n- 2\n", ["a map of settings"]),
-        ("thing: 7\n", ["thing", "a map of settings"]),
+        ("size: [", ["not valid YAML"]),
+        ("- 1\n- 2\n", ["a mapping of settings"]),
+        ("thing: 7\n", ["thing", "a mapping of settings"]),
         ("thing: {colour: red}\n", ["colour", "settings.yaml"]),
         ("size: 1000\n", ["size", "settings.yaml"]),
         ("\xff\xfe", ["settings.yaml"]),
-        ("label: 2020-13-45\n", ["settings.yaml: no YAML", "month"]),
-        ("[" * 20_000, ["settings.yaml: no YAML"]),
+        ("label: 2020-13-45\n", ["settings.yaml: not valid YAML", "month"]),
+        ("[" * 20_000, ["settings.yaml: not valid YAML"]),
     ],
 )
 def test_a_wrong_file_is_one_line_that_names_it(file, text, words):
@@ -149,7 +149,7 @@ def test_a_wrong_file_is_one_line_that_names_it(file, text, words):
 def test_bytes_that_are_no_text_are_said_too(tmp_path):
     path = tmp_path / "binary.yaml"
     path.write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(UserError, match=r"binary\.yaml: no YAML"):
+    with pytest.raises(UserError, match=r"binary\.yaml: not valid YAML"):
         load_settings(Settings, ["--config", str(path)])
 
 

@@ -19,12 +19,12 @@ from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.messages.definitions import Belief, Health, Pose, Scan, Status, TopicHealth
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, SCAN, STATUS
-from common.runtime.metrics import ROWS, ServiceMetrics, table
+from common.runtime.metrics import METRICS, ServiceMetrics, table
 from common.runtime.metrics_server import split_address
 from tests.conftest import PATIENCE, ROOT
 
 SMALL = Path(__file__).parents[1] / "small_service.py"
-SAMPLES = {row.sample: row for row in ROWS}
+SAMPLES = {row.sample: row for row in METRICS}
 
 
 def read(text: str) -> dict[tuple[str, frozenset], float]:
@@ -34,7 +34,9 @@ def read(text: str) -> dict[tuple[str, frozenset], float]:
         if metric.name.startswith(("process_", "python_")):
             continue
         for sample in metric.samples:
-            row = SAMPLES.get(sample.name) or next(r for r in ROWS if r.kind == "histogram" and r.name == metric.name)
+            row = SAMPLES.get(sample.name) or next(
+                m for m in METRICS if m.kind == "histogram" and m.name == metric.name
+            )
             assert metric.documentation == row.about
             assert set(sample.labels) - {"le"} == set(row.labels), sample
             found[sample.name, frozenset(sample.labels.items())] = sample.value

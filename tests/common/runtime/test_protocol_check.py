@@ -132,7 +132,13 @@ def test_another_version_is_one_warning(process, bus):
 
 
 def test_of_two_that_do_not_fit_exactly_one_came_later():
-    for apart in (0.0, SIMULTANEOUS_START_S / 2, -SIMULTANEOUS_START_S / 2, 2 * SIMULTANEOUS_START_S, -2 * SIMULTANEOUS_START_S):
+    for apart in (
+        0.0,
+        SIMULTANEOUS_START_S / 2,
+        -SIMULTANEOUS_START_S / 2,
+        2 * SIMULTANEOUS_START_S,
+        -2 * SIMULTANEOUS_START_S,
+    ):
         one, two = said(protocol=1, uptime=10.0), said(protocol=2, uptime=10.0 + apart)
         assert started_later(one, two) != started_later(two, one)
     assert started_later(said(protocol=2, uptime=1.0), said(protocol=1, uptime=10.0))
@@ -173,6 +179,6 @@ def test_the_bus_asks_each_of_two_of_one_name(link, bus):
             return None not in calls
 
         assert wait_until(asked, PATIENCE)
-        assert len({answer.who for answer in iter(lambda: answers.get(0), None)}) == 2
-    with pytest.raises(UserError, match="nobody answers"):
+        assert len({answer.session for answer in iter(lambda: answers.get(0), None)}) == 2
+    with pytest.raises(UserError, match="no service answers"):
         bus.ask(CONFIG, Request(), ConfigReply, timeout=0.1, service="nobody")

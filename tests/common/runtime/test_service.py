@@ -135,7 +135,7 @@ def test_a_service_asks_without_waiting_even_itself(small):
         (3.0, 0.0, "1 teleport True at 3"),
         (-3.0, 0.0, "2 teleport False inside a wall"),
         (101.0, 0.0, "refused: small failed: ValueError: a bug in on_request"),
-        (1.0, 1.0, "4 predict False nobody answers"),
+        (1.0, 1.0, "4 predict False no service answers"),
     ]
     for count, (x, y, text) in enumerate(asked, 1):
         small.goal(x, y, cancel=True)
