@@ -1,9 +1,12 @@
 """The numbers of one drive.
 
-Definitions. A scan with a contact counts as moving where the true speed is above `MIN_MOVING_SPEED` before or after it. The path's
-ratio is (driven + straight on to the goal from where it ended) over the shortest way with clearance (`shortest`), so
-that stopping short of the goal saves nothing. The time's ratio is that until the controller says `reached`, from the
-first scan on, over `shortest.least_trip`; its bound's is that of a base which need not turn, and which none can beat.
+Definitions:
+
+- A scan with a contact counts as moving if the true speed is above `MIN_MOVING_SPEED` before or after it.
+- The path ratio is the driven length, plus the straight distance left to the goal, divided by the length of the
+  shortest path with clearance (`shortest_path`). Stopping short of the goal therefore gains nothing.
+- The time ratio is the time from the first scan until the controller reports `reached`, divided by `least_trip`.
+  `time_over_bound` divides by the time of a base that need not turn, a lower bound for every drive.
 """
 
 from __future__ import annotations
@@ -26,17 +29,17 @@ from services.simulator.people import RADIUS as PERSON_RADIUS
 
 MIN_MOVING_SPEED = 0.01  # m/s
 TOLERANCE = float(Goal(stamp_ns=0, pose=Pose(x=0, y=0)).tolerance)  # m
-MAX_REACHED_DISTANCE = TOLERANCE + 0.1  # m, a goal that is said to be reached is no farther away than this
-MAX_EVENTS = 200  # kept of a trial
+MAX_REACHED_DISTANCE = TOLERANCE + 0.1  # m; farther from the goal, a reported arrival is wrong
+MAX_EVENTS = 200  # stored per trial
 
 
 def measure(trace: RunTrace, trip: Trip, world: World, robot: Robot) -> dict[str, Any]:
-    """Plain values; s, m, scans. What is not known is None."""
+    """Statistics of a drive as a row of the results; None where a value is unknown."""
     path, seconds = trace.path(), _seconds(trace)
     left = float(np.hypot(*(path[-1, :2] - np.array(trip.goal))))
     shortest, driven = length(np.array(trip.shortest)), length(path)
-    nimble = robot.model_copy(update={"drive": "holonomic"})
-    least, bound = (least_trip(trip.shortest, trip.start[2], each, TOLERANCE) for each in (robot, nimble))
+    holonomic_robot = robot.model_copy(update={"drive": "holonomic"})
+    least, bound = (least_trip(trip.shortest, trip.start[2], each, TOLERANCE) for each in (robot, holonomic_robot))
     outcome = _outcome(trace, left)
     return {
         "outcome": outcome,
@@ -78,7 +81,7 @@ def _outcome(trace: RunTrace, left: float) -> str:
 
 
 def _why(trace: RunTrace, outcome: str, left: float) -> str:
-    """In a line, for what was not reached."""
+    """One line why the goal was not reached; empty if it was."""
     if outcome == "reached":
         return ""
     last = trace.statuses[max(trace.statuses)] if trace.statuses else None
@@ -87,7 +90,7 @@ def _why(trace: RunTrace, outcome: str, left: float) -> str:
 
 
 def _contacts(trace: RunTrace) -> dict[str, Any]:
-    """Scans with a contact, by whether the robot moved; and where the first were."""
+    """Numbers of scans with a contact, while moving and while standing, and the first ten contacts."""
     speed = np.array([np.hypot(truth.twist.vx, truth.twist.vy) for truth in trace.truths])
     moves = np.maximum(speed, np.concatenate([speed[:1], speed[:-1]])) > MIN_MOVING_SPEED
     touches = np.array([truth.contact for truth in trace.truths], bool)
@@ -99,7 +102,7 @@ def _contacts(trace: RunTrace) -> dict[str, Any]:
 
 
 def _contact(truth: Truth, speed: float) -> dict[str, Any]:
-    """When and where, how fast, and where the nearest person stood."""
+    """Time, pose and speed of a contact, and the nearest person's position."""
     x, y, yaw = (round(float(value), 3) for value in truth.pose.array())
     person = None
     if len(truth.people):
@@ -110,7 +113,7 @@ def _contact(truth: Truth, speed: float) -> dict[str, Any]:
 
 
 def _clearance(world: World, path: Array) -> Array:
-    """(N,) m from the way between each two places (N, 3) to the nearest wall."""
+    """Distance (N,), m, from each segment of the path (N, 3) to the nearest wall."""
     ends = np.stack([np.concatenate([path[:1], path[:-1]])[:, :2], path[:, :2]], axis=1)
     edges = shapely.boundary(world.free_space)
     return np.asarray(shapely.distance(shapely.linestrings(ends), edges))
@@ -122,8 +125,11 @@ def _clearance_to_people(trace: RunTrace, robot: Robot) -> float | None:
 
 
 def _localisation(trace: RunTrace) -> dict[str, Any]:
-    """Error since it first claims to know, and when that was; of the claims alone; for how long it claims nothing."""
-    count = min(len(trace.truths), len(trace.beliefs))  # one less where it was cut short
+    """Localisation errors from the first belief in state `tracking` on, its time, and for how long tracking was lost.
+
+    `claimed_error_max_m` covers only beliefs in state `tracking`.
+    """
+    count = min(len(trace.truths), len(trace.beliefs))  # an aborted run may lack the last belief
     tracking = np.array([belief.state == "tracking" for belief in trace.beliefs[:count]], bool)
     if not tracking.any():
         return dict.fromkeys(("tracking_s", "untracked_s", "error_median_m", "error_max_m", "claimed_error_max_m"))
@@ -139,7 +145,7 @@ def _localisation(trace: RunTrace) -> dict[str, Any]:
 
 
 def _times(trace: RunTrace) -> dict[str, Any]:
-    """Seconds in each state, and of those for each reason, its numbers left out."""
+    """Seconds spent in each state of the controller, and for each reason without its numbers."""
     stamps = sorted(trace.statuses)
     states: dict[str, float] = defaultdict(float)
     reasons: dict[str, float] = defaultdict(float)
@@ -155,12 +161,15 @@ def _times(trace: RunTrace) -> dict[str, Any]:
 
 
 def strip_numbers(reason: str) -> str:
-    """A reason without where and how far: "waiting: something that may move, 0.8 m away at (1, 3)" up to the comma."""
+    """A status reason without distances and coordinates.
+
+    "waiting: something that may move, 0.8 m away at (1, 3)" becomes "waiting: something that may move".
+    """
     return re.sub(r"(,? \d[\d.]* m away)?( at| to)? \(-?[\d.]+, -?[\d.]+\)", "", reason)
 
 
 def _steps(trace: RunTrace) -> dict[str, Any]:
-    """CPU time of the controller's steps, by its own counters."""
+    """Processor time of the controller's steps, from the counters in its health message."""
     counters = trace.health.counters if trace.health is not None else {}
     steps, us, most = (counters.get(name) for name in ("steps", "step_us", "step_us_max"))
     return {
@@ -170,7 +179,7 @@ def _steps(trace: RunTrace) -> dict[str, Any]:
 
 
 def _events(trace: RunTrace) -> list[list[Any]]:
-    """[s, state, reason] wherever one of the two changes, numbers aside."""
+    """List of [time in s, state, reason] wherever the state or the reason without its numbers changes."""
     events: list[list[Any]] = []
     before = ("", "")
     for stamp in sorted(trace.statuses):

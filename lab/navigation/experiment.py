@@ -1,8 +1,8 @@
 """`presage experiment navigation`.
 
 The real processes (router, simulator, estimator, controller) run in lockstep over zenoh. A trial ends when the
-controller says that the goal is reached, and is reached if that is true; or refused, or given up at the limit. The same
-number is the same start, goal and heading with every drive and every option.
+controller reports that the goal is reached or refused, or at the time limit. It counts as reached only if the robot
+truly is at the goal. A trial number always has the same start, goal and heading, whatever the drive and the options.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from lab.experiments.lockstep import run as run_in_lockstep
 from lab.experiments.trials import run_trials
 from lab.navigation import figure as driving_figure
 from lab.navigation.drive import MAX_REACHED_DISTANCE, TOLERANCE, measure
-from lab.navigation.shortest_path import MIN_TRIP_LENGTH, START_GOAL_MARGIN, WALL_GAP, draw_trip, load_ways
+from lab.navigation.shortest_path import MIN_TRIP_LENGTH, START_GOAL_MARGIN, WALL_GAP, draw_trip, load_shortest_paths
 
-EXPERIMENT_ID = 7  # of the experiment, in its seeds
+EXPERIMENT_ID = 7  # part of the random seeds
 WORLDS, DRIVES = ("maze", "office"), ("holonomic", "differential")
 OPTION_VALUES = {
     "drives": DRIVES, "start": ("known", "unknown"), "estimator": ("precise", "particle-filter"),
     "prior": ("motion", "odometry"),
 }  # fmt: skip
 WORST_TRIALS = 5  # trials named in the summary
-QUANTITIES = {  # of reached trials; others by name in `worst`
+QUANTITIES = {  # statistics over the trials that reached the goal; the other trials are listed under `worst`
     "path_over_shortest": ("median", "max"), "time_over_least": ("median", "max"), "seconds": ("median", "max"),
     "time_over_bound": ("median", "max"), "untracked_s": ("median", "max"), "claimed_error_max_m": ("max",),
     "error_median_m": ("median",), "error_max_m": ("max",), "tracking_s": ("median", "max"),
@@ -63,18 +63,18 @@ class Job:
 
     @property
     def group(self) -> str:
-        """As the table has it."""
+        """Name of the trial's group in the table, by world and drive."""
         return f"{Path(self.world).stem}, {self.drive}"
 
     def lockstep_run(self, journey: Journey, yaw: float) -> LockstepRun:
-        """For `lockstep.run`."""
-        seeks = "--epistemic" if self.epistemic else "--no-epistemic"
+        """Parameters for `lockstep.run`."""
+        epistemic_option = "--epistemic" if self.epistemic else "--no-epistemic"
         people = ("--people", str(self.people), "--people-speed", repr(self.people_speed)) if self.people else ()
         return LockstepRun(
             journey, yaw, self.world, self.beams, (self.seed * 100_003 + self.index) % 2**31,
             ("--estimator", self.estimator, "--prior", self.prior),
             round(self.limit * SCANNERS["tim571"].rate),
-            controller=("--preset", "geodesic", "--drive", self.drive, seeks),
+            controller=("--preset", "geodesic", "--drive", self.drive, epistemic_option),
             simulator=("--drive", self.drive, *people),
             start_known=self.start == "known",
             ends_with_status=True,
@@ -82,23 +82,26 @@ class Job:
 
 
 def check(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> None:
-    """Raises UserError for a world or a choice that there is not, before anything runs."""
+    """Checks the options before anything runs. Raises UserError for unknown or repeated values."""
     for world in worlds:
         load_world(world)
-    asked = {"drives": drives, "start": (job.start,), "estimator": (job.estimator,), "prior": (job.prior,)}
-    for option, values in asked.items():
+    given = {"drives": drives, "start": (job.start,), "estimator": (job.estimator,), "prior": (job.prior,)}
+    for option, values in given.items():
         for value in values:
             if value not in OPTION_VALUES[option]:
                 raise UserError(f"--{option} {value!r}: choose from {', '.join(OPTION_VALUES[option])}")
-    for option, these in (("worlds", worlds), ("drives", drives)):
-        if not these or len(set(these)) < len(these):
-            raise UserError(f"--{option} {','.join(these)!r}: give each once, and one at least")
+    for option, names in (("worlds", worlds), ("drives", drives)):
+        if not names or len(set(names)) < len(names):
+            raise UserError(f"--{option} {','.join(names)!r}: give at least one value, and each only once")
     if len({Path(world).stem for world in worlds}) < len(worlds):
-        raise UserError("--worlds: two files have one name; rename one of them")
+        raise UserError("--worlds: two of the files have the same name; rename one, because results are named after it")
 
 
 def result_name(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> str:
-    """`navigation`, and whatever is not as by default, so that no result overwrites that of another question."""
+    """Name of the result: `navigation` and the options that differ from the defaults.
+
+    Results of different options therefore do not overwrite each other.
+    """
     parts = [
         *([] if tuple(worlds) == WORLDS else [Path(world).stem for world in worlds]),
         *([] if tuple(drives) == DRIVES else drives),
@@ -114,18 +117,18 @@ def result_name(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> str:
 
 
 def trial(job: Job) -> dict[str, Any]:
-    """One drive; what became of it."""
+    """Runs one drive. Returns its statistics."""
     robot = Robot.model_validate({"drive": job.drive})
     trip = draw_trip(job.world, np.random.default_rng((job.seed, EXPERIMENT_ID, job.index)), robot)
     with session() as stack:
         trace = run_in_lockstep(job.lockstep_run(Journey(trip.start[:2], trip.goal), trip.start[2]), stack)
-    world, _ = load_ways(job.world, robot.radius)
-    about = {"group": job.group, "trial": job.index, **asdict(trip)}
-    return about | measure(trace, trip, world, robot)
+    world, _ = load_shortest_paths(job.world, robot.radius)
+    identity = {"group": job.group, "trial": job.index, **asdict(trip)}
+    return identity | measure(trace, trip, world, robot)
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Numbers of one world and drive; ways and times are of trials that were reached, safety is of all."""
+    """Statistics of one world and drive. Paths and times are of trials that reached the goal, safety is of all."""
     reached = [row for row in rows if row["reached"]]
     counted = {
         "trials": len(rows),
@@ -155,14 +158,14 @@ def _statistic(rows: Sequence[dict[str, Any]], quantity: str, statistic: str) ->
 
 
 def _reasons(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Seconds over all trials, the longest first."""
+    """Seconds for each reason over all trials: the ten longest, longest first."""
     names = {reason for row in rows for reason in row["reason_s"] if not reason.startswith("reached")}
     total = {name: round(sum(row["reason_s"].get(name, 0.0) for row in rows), 3) for name in names}
     return dict(sorted(total.items(), key=lambda pair: (-pair[1], pair[0]))[:10])
 
 
 def worst(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The numbers of those not reached, then of those that touched something moving or standing, then the slowest."""
+    """The worst trials: first those that did not reach the goal, then those with contacts, then the slowest."""
     order = sorted(
         rows, key=lambda r: (r["reached"], -r["contacts_moving"], -r["contacts_standing"], -r["time_over_least"])
     )
@@ -177,10 +180,10 @@ def _why(row: dict[str, Any]) -> str:
         parts.append(f"touched something in {touched} scans, first at {where}")
     if row["reached"]:
         parts.append(f"{row['time_over_least']:.2f} times the least time, {row['path_over_shortest']:.2f} the way")
-        said = {reason: s for reason, s in row["reason_s"].items() if not reason.startswith("reached")}
-        if said:
-            longest = max(said, key=lambda reason: said[reason])
-            parts.append(f"{said[longest]:.1f} s {longest}")
+        seconds_by_reason = {reason: s for reason, s in row["reason_s"].items() if not reason.startswith("reached")}
+        if seconds_by_reason:
+            longest = max(seconds_by_reason, key=lambda reason: seconds_by_reason[reason])
+            parts.append(f"{seconds_by_reason[longest]:.1f} s {longest}")
     return "; ".join(parts)
 
 
@@ -192,15 +195,22 @@ def run(
     check(job, worlds, drives)
     name = result_name(job, worlds, drives)
     groups = [replace(job, world=world, drive=drive) for world in worlds for drive in drives]
-    # The first of each before the second of any: a run cut short says something of all.
+    # The first trial of every group before the second of any, so that an interrupted run has results for all groups.
     jobs = [replace(group, index=index) for index in range(trials) for group in groups]
     rows = run_trials(name, trial, jobs, out, workers, console)
     by_group = {group.group: [row for row in rows if row["group"] == group.group] for group in groups}
     common = {key: value for key, value in asdict(job).items() if key not in ("index", "world", "drive", "seed")}
     parameters = common | {
-        "worlds": list(worlds), "drives": list(drives), "trials": trials, "tolerance_m": TOLERANCE, "truly_m": MAX_REACHED_DISTANCE,
-        "apart_m": MIN_TRIP_LENGTH, "spare_m": START_GOAL_MARGIN, "gap_m": WALL_GAP, "robot": Robot().model_dump(exclude={"drive"}),
-    }  # fmt: skip
+        "worlds": list(worlds),
+        "drives": list(drives),
+        "trials": trials,
+        "tolerance_m": TOLERANCE,
+        "truly_m": MAX_REACHED_DISTANCE,
+        "apart_m": MIN_TRIP_LENGTH,
+        "spare_m": START_GOAL_MARGIN,
+        "gap_m": WALL_GAP,
+        "robot": Robot().model_dump(exclude={"drive"}),
+    }
     result = results.Result(
         name, f"Navigation: {driving_figure.describe(job)}", job.seed, parameters,
         {group: summarise(of) for group, of in by_group.items()}, columns(rows), rows, [_note(job, trials)],
@@ -214,7 +224,7 @@ def _note(job: Job, trials: int) -> str:
 
 
 def columns(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
-    """One row a trial, of what is one value."""
+    """CSV columns: the single-valued quantities, one row per trial."""
     names = [name for name, value in rows[0].items() if not isinstance(value, (list, tuple, dict))]
     return {name: [row[name] for row in rows] for name in names}
 

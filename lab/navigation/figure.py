@@ -22,7 +22,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 
 
 def describe(job: Job) -> str:
-    """What is asked of the robot, in words."""
+    """The options that differ between experiments, in words."""
     parts = [f"start {job.start}", f"estimator {job.estimator}"]
     parts += [f"{job.people} people at {job.people_speed:g} m/s"] if job.people else []
     parts += [f"prior {job.prior}"] if job.prior != "motion" else []
@@ -31,19 +31,29 @@ def describe(job: Job) -> str:
 
 
 def draw(by_group: Mapping[str, Rows], worlds: Mapping[str, str], title: str) -> Figure:
-    """A map for each world and drive; below, how the paths' and times' ratios are distributed."""
+    """A map with the paths for each world and drive; below, the distributions of the path and time ratios."""
     count = len(by_group)
-    wide = min(2, count)
-    tall = -(-count // wide)
-    known = {group: load_world(world) for group, world in worlds.items()}
-    heights = [max(_height(known[group]) for group in list(known)[row * wide :][:wide]) for row in range(tall)]
-    figure = drawing.blank(6.6 * wide, 6.2 * sum(heights) + 0.5 * tall + 3.4)
+    columns = min(2, count)
+    rows_of_maps = -(-count // columns)
+    world_of_group = {group: load_world(world) for group, world in worlds.items()}
+    heights = [
+        max(_height(world_of_group[group]) for group in list(world_of_group)[row * columns :][:columns])
+        for row in range(rows_of_maps)
+    ]
+    figure = drawing.blank(6.6 * columns, 6.2 * sum(heights) + 0.5 * rows_of_maps + 3.4)
     figure.suptitle(title, fontsize=11)
-    grid = figure.add_gridspec(tall + 1, 2 * wide, height_ratios=[*(6.2 * h + 0.5 for h in heights), 2.6])
+    grid = figure.add_gridspec(rows_of_maps + 1, 2 * columns, height_ratios=[*(6.2 * h + 0.5 for h in heights), 2.6])
     for number, (group, rows) in enumerate(by_group.items()):
-        row, column = divmod(number, wide)
-        _map(drawing.dress(figure.add_subplot(grid[row, 2 * column : 2 * column + 2])), known[group], group, rows)
-    left, right = (figure.add_subplot(grid[tall, part]) for part in (slice(0, wide), slice(wide, 2 * wide)))
+        row, column = divmod(number, columns)
+        _map(
+            drawing.dress(figure.add_subplot(grid[row, 2 * column : 2 * column + 2])),
+            world_of_group[group],
+            group,
+            rows,
+        )
+    left, right = (
+        figure.add_subplot(grid[rows_of_maps, part]) for part in (slice(0, columns), slice(columns, 2 * columns))
+    )
     for axes, quantity, label in (
         (left, "path_over_shortest", "path over the shortest way with clearance"),
         (right, "time_over_least", "time over the least time"),
@@ -73,7 +83,7 @@ def _map(axes: Axes, world: World, group: str, rows: Rows) -> None:
 
 
 def _distribution(axes: Axes, by_group: Mapping[str, Rows], quantity: str, label: str) -> None:
-    """The share of all trials that was reached within a ratio."""
+    """Plots the share of all trials that reached the goal within a ratio."""
     last = 1.1
     for number, (group, rows) in enumerate(by_group.items()):
         ratios = np.sort([row[quantity] for row in rows if row["reached"]])
@@ -88,7 +98,7 @@ def _distribution(axes: Axes, by_group: Mapping[str, Rows], quantity: str, label
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
-    """As docs/navigation.md has it."""
+    """The Markdown table of docs/navigation.md."""
     number, mm = results.number, results.millimetres
     people = any(row["min_clearance_to_people_m"] is not None for row in summary.values())
     heads = [

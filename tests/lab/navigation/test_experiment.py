@@ -26,7 +26,15 @@ from lab.experiments.lockstep import LockstepRun, RunTrace, _append, _is_final
 from lab.navigation import drive as driven
 from lab.navigation import experiment as driving
 from lab.navigation import shortest_path as shortest
-from lab.navigation.shortest_path import Trip, Ways, draw_trip, least_trip, least_turn, length, load_ways
+from lab.navigation.shortest_path import (
+    ShortestPaths,
+    Trip,
+    draw_trip,
+    least_trip,
+    least_turn,
+    length,
+    load_shortest_paths,
+)
 
 QUIET = Console(quiet=True)
 ROBOT, TURNING = Robot(), Robot(drive="differential")
@@ -39,51 +47,51 @@ def block(*boxes, boundary=HALL.boundary, name="block"):
 
 
 def test_where_nothing_stands_between_the_way_is_straight():
-    way = Ways(HALL, 0.3).way(np.array([1.0, 1.0]), np.array([9.0, 5.0]))
-    assert way.tolist() == [[1.0, 1.0], [9.0, 5.0]]
+    path = ShortestPaths(HALL, 0.3).path(np.array([1.0, 1.0]), np.array([9.0, 5.0]))
+    assert path.tolist() == [[1.0, 1.0], [9.0, 5.0]]
 
 
 def test_round_a_box_two_tangents_and_two_quarters_of_a_circle():
     """A box from (4, 0) to (6, 3), start and goal as high as its top: up along a tangent, round, along, down."""
     r = 0.4
-    ways = Ways(block((5.0, 1.5, 2.0, 3.0)), r)
+    paths = ShortestPaths(block((5.0, 1.5, 2.0, 3.0)), r)
     start, goal = np.array([1.0, 3.0]), np.array([9.0, 3.0])
     tangent = np.sqrt(3.0**2 - r**2)
     turned = np.arcsin(r / 3.0)
     expected = 2 * tangent + 2 * turned * r + 2.0
-    assert length(ways.way(start, goal)) == pytest.approx(expected, abs=2e-3)
+    assert length(paths.path(start, goal)) == pytest.approx(expected, abs=2e-3)
 
 
 def test_of_two_ways_round_it_takes_the_shorter():
-    ways = Ways(block((5.0, 2.5, 0.2, 3.0)), 0.3)  # from 1 to 4 of 6
-    assert ways.way(np.array([2.0, 2.0]), np.array([8.0, 2.0]))[1:-1, 1].max() < 1.01
-    assert ways.way(np.array([2.0, 3.0]), np.array([8.0, 3.0]))[1:-1, 1].min() > 3.99
+    paths = ShortestPaths(block((5.0, 2.5, 0.2, 3.0)), 0.3)  # from 1 to 4 of 6
+    assert paths.path(np.array([2.0, 2.0]), np.array([8.0, 2.0]))[1:-1, 1].max() < 1.01
+    assert paths.path(np.array([2.0, 3.0]), np.array([8.0, 3.0]))[1:-1, 1].min() > 3.99
 
 
 def test_a_door_too_narrow_is_none():
     start, goal = np.array([1.0, 3.0]), np.array([9.0, 3.0])
     wall = block((5.0, 1.2, 0.2, 2.4), (5.0, 4.5, 0.2, 3.0))  # 0.6 m between
-    assert len(Ways(wall, 0.29).way(start, goal)) >= 3
-    assert Ways(wall, 0.31).way(start, goal).shape == (0, 2)
+    assert len(ShortestPaths(wall, 0.29).path(start, goal)) >= 3
+    assert ShortestPaths(wall, 0.31).path(start, goal).shape == (0, 2)
 
 
 @given(st.integers(0, 10_000))
 @settings(max_examples=20, deadline=None)
 def test_a_shortest_way_keeps_its_clearance_and_there_is_no_short_cut(seed):
-    world, ways = load_ways("maze")
+    world, paths = load_shortest_paths("maze")
     rng = np.random.default_rng(seed)
     start, middle, goal = world.sample_free(3, rng, ROBOT.radius + shortest.START_GOAL_MARGIN)
-    way = ways.way(start, goal)
-    keeps = shapely.distance(shapely.LineString(way), shapely.boundary(world.free_space))
+    path = paths.path(start, goal)
+    keeps = shapely.distance(shapely.LineString(path), shapely.boundary(world.free_space))
     assert keeps >= ROBOT.radius + shortest.WALL_GAP - shortest.ARC_TOLERANCE - 1e-5
-    assert length(way) >= np.hypot(*(goal - start)) - 1e-9
-    assert length(way) == pytest.approx(length(ways.way(goal, start)))
-    assert length(way) <= length(ways.way(start, middle)) + length(ways.way(middle, goal)) + 1e-9
+    assert length(path) >= np.hypot(*(goal - start)) - 1e-9
+    assert length(path) == pytest.approx(length(paths.path(goal, start)))
+    assert length(path) <= length(paths.path(start, middle)) + length(paths.path(middle, goal)) + 1e-9
     # Pulled tight: nothing is gained by leaving out a corner.
-    for k in range(1, len(way) - 1):
-        direct = shapely.LineString(way[[k - 1, k + 1]])
-        if shapely.covers(ways.room, direct):
-            assert direct.length == pytest.approx(length(way[k - 1 : k + 2]), abs=1e-6)
+    for k in range(1, len(path) - 1):
+        direct = shapely.LineString(path[[k - 1, k + 1]])
+        if shapely.covers(paths.room, direct):
+            assert direct.length == pytest.approx(length(path[k - 1 : k + 2]), abs=1e-6)
 
 
 def test_shortest_ways_are_no_longer_than_those_over_a_fine_grid():
@@ -91,18 +99,18 @@ def test_shortest_ways_are_no_longer_than_those_over_a_fine_grid():
     from services.controller.policies.free_space import FreeSpace  # noqa: PLC0415
     from services.controller.policies.geodesic_field import FreeSpaceGraph  # noqa: PLC0415
 
-    world, ways = load_ways("office")
+    world, paths = load_shortest_paths("office")
     graph = FreeSpaceGraph(FreeSpace.of(world), ROBOT.radius)
     for start, goal in world.sample_free(12, np.random.default_rng(3), 0.5).reshape(-1, 2, 2):
         field = graph.cost_field(goal)
-        exact, grid = length(ways.way(start, goal)), length(field.path(start))
+        exact, grid = length(paths.path(start, goal)), length(field.path(start))
         assert exact <= grid + 1e-6
         assert grid < 1.25 * exact + 0.1  # it costs what is near walls more, and so goes round them farther
 
 
 @pytest.mark.parametrize("world", ["maze", "office", "twins"])
 def test_a_trip_fits_is_long_enough_and_the_same_for_every_drive(world):
-    known, _ = load_ways(world)
+    known, _ = load_shortest_paths(world)
     trips = [draw_trip(world, np.random.default_rng((1, k)), ROBOT) for k in range(25)]
     for k, trip in enumerate(trips):
         assert trip == draw_trip(world, np.random.default_rng((1, k)), TURNING)
@@ -138,14 +146,14 @@ def test_no_base_within_its_limits_turns_sooner(angle, speed, acceleration):
 
 
 def test_the_least_time_known_cases():
-    way = [(0.0, 0.0), (0.0, 4.0), (3.0, 4.0)]
+    path = [(0.0, 0.0), (0.0, 4.0), (3.0, 4.0)]
     robot = Robot(max_speed=1.0, acceleration=1.0, max_turn=2.0, turn_acceleration=3.0)
     turning = robot.model_copy(update={"drive": "differential"})
     straight = 7.0 - 0.2 + 0.5
-    assert least_trip(way, 0.0, robot, 0.2) == pytest.approx(straight)
-    assert least_trip(way, np.pi / 2, turning, 0.2) == pytest.approx(straight)
+    assert least_trip(path, 0.0, robot, 0.2) == pytest.approx(straight)
+    assert least_trip(path, np.pi / 2, turning, 0.2) == pytest.approx(straight)
     quarter = np.pi / 2 / 2 + 2 / 3  # 1.57 rad, more than w^2/a = 1.33: it turns at its limit for a while
-    assert least_trip(way, np.pi, turning, 0.2) == pytest.approx(straight + quarter)
+    assert least_trip(path, np.pi, turning, 0.2) == pytest.approx(straight + quarter)
     assert least_turn(0.75, robot) == pytest.approx(1.0)
 
 
