@@ -24,7 +24,7 @@ from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.global_seeds import SPACING, Seeds, thin_places
+from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_places
 from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_ripple, learn_scales
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import RayCaster
@@ -102,7 +102,7 @@ def _estimator_for_twins(job: Job, geometry: Geometry) -> Estimator:
     if name == "particle-filter":
         return ParticleFilter(TWINS, ParticleSettings.tuned(), mount, job.seed)
     rng = np.random.default_rng(job.seed)
-    places = thin_places(TWINS.sample_free(6000, rng, 0.05), SPACING)
+    places = thin_places(TWINS.sample_free(6000, rng, 0.05), SEED_SPACING_M)
     if model == "exact":
         exact = RayCaster(TWINS)
         return PreciseEstimator(exact, Seeds.at(exact, places), geometry.mount, geometry.likelihood())

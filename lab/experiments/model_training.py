@@ -19,7 +19,7 @@ from services.estimator.paper.training import Data, usable_ranges
 from services.estimator.paper.weights import ModelCard
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.global_seeds import SPACING, Seeds, thin_places
+from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_places
 from services.estimator.precise.learning.field_learning import (
     Recipe,
     learn_field,
@@ -119,7 +119,7 @@ def learn_precise(scene: Scene, samples: int, recipe: Recipe | None = None) -> T
     model = FieldModel(field, learn_scales(field, held, mount, angles, scans, scanner.sigma))
     model = replace(model, ripple=learn_ripple(field, se2.compose(held, mount), angles))
     visited = se2.compose(data.poses, mount)[:, :2]
-    places = thin_places(np.concatenate([visited, reachable(field, visited)]), SPACING)
+    places = thin_places(np.concatenate([visited, reachable(field, visited)]), SEED_SPACING_M)
     return TrainedField(model, Seeds.at(model, places), time.process_time() - began)
 
 

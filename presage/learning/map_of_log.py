@@ -25,7 +25,7 @@ from presage.logs.log import Reading
 from presage.logs.scan_files import read_scans
 from presage.terminal.output import make_folder
 from services.estimator.precise.learning.calibration import Drive
-from services.estimator.precise.learning.surfaces import Beams, in_company
+from services.estimator.precise.learning.surfaces import Beams, has_neighbours
 
 LEAST, SHARE = 2, 0.6  # less, and noise lets walls grow towards the scanner; more, and corners wear away
 MARGIN = 0.5  # m around what was seen
@@ -75,7 +75,7 @@ def cells_of(drive: Drive, cell: float, progress: Console | None = None) -> tupl
     """(rows, columns), the lowest row first, and x, y m of the lower left corner; raises UserError."""
     beams = Beams.of(drive.poses, drive.mount, drive.angles, drive.ranges)
     ends = beams.ends()
-    seen = np.concatenate([ends[in_company(ends)], drive.poses[:, :2]])
+    seen = np.concatenate([ends[has_neighbours(ends)], drive.poses[:, :2]])
     corner = np.floor((seen.min(axis=0) - MARGIN) / cell) * cell
     columns, rows = (int(n) for n in np.ceil((seen.max(axis=0) + MARGIN - corner) / cell))
     if columns * rows > MAX_CELLS:

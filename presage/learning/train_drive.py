@@ -24,7 +24,7 @@ from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.calibration import Drive
-from services.estimator.precise.learning.drive_learning import LEAST_SCANS, Learned, learn_drive
+from services.estimator.precise.learning.drive_learning import MIN_SCANS, Learned, learn_drive
 from services.estimator.precise.learning.field_learning import Recipe
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import RayCaster
@@ -51,9 +51,9 @@ def train_from_drive(job: TrainDriveOptions, console: Console) -> Path:
     scans.say_notes(console)
     drive = drive_of(scans, job.log)
     drive, _ = split(drive, job.share)
-    if len(drive.ranges) < LEAST_SCANS:
+    if len(drive.ranges) < MIN_SCANS:
         raise UserError(
-            f"{job.log}: {len(drive.ranges)} scans with a reference pose; {LEAST_SCANS} are the least to learn from"
+            f"{job.log}: {len(drive.ranges)} scans with a reference pose; {MIN_SCANS} are the least to learn from"
         )
     world = load_world(job.world) if job.world else rectangle(drive, job.log)
     path = weights.path_of(job.out, world.name)

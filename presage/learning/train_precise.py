@@ -22,7 +22,7 @@ from common.versions import commit, versions
 from presage.learning.train_simulated import collect, scanner_on_bus
 from services.estimator.factory import LEAST_SIGMA
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.global_seeds import SPACING, thin_places
+from services.estimator.precise.global_seeds import SEED_SPACING_M, thin_places
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.evaluation import Quality, evaluate
 from services.estimator.precise.learning.field_learning import (
@@ -65,7 +65,7 @@ def train_precise(job: TrainPreciseOptions, link: Link, console: Console) -> Pat
         model, quality = _learn(job, scanner, poses, {"train": train, "test": test}, bar)
     seconds = time.monotonic() - began
     visited = se2.compose(poses["train"], np.array(scanner.mount))[:, :2]
-    places = thin_places(np.concatenate([visited, reachable(model.field, visited)]), SPACING)
+    places = thin_places(np.concatenate([visited, reachable(model.field, visited)]), SEED_SPACING_M)
     card = _card(job, world, scanner, model, quality, seconds)
     weights.save(path, model, places, card)
     _draw(weights.load(path)[0], card, path.with_suffix(".png"))

@@ -22,7 +22,7 @@ from services.estimator.particle_filter.sensor import Sensor
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.gauss_newton import View, polish
-from services.estimator.precise.global_seeds import SPACING, Seeds, thin_places
+from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_places
 from services.estimator.precise.learning import weights
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.settings import Settings
@@ -164,7 +164,7 @@ def generative_model(choice: Choice, world: World) -> tuple[GenerativeModel, Arr
     """The model of that name, places (S, 2) m a laser may be at, and the card of what was learned."""
     if choice.model == "exact":
         places = world.sample_free(max(4000, int(60 * world.free_area)), np.random.default_rng(0), 0.05)
-        return RayCaster(world), thin_places(places, SPACING), None
+        return RayCaster(world), thin_places(places, SEED_SPACING_M), None
     return weights.load(field_path(choice, world))
 
 

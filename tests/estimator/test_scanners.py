@@ -16,7 +16,7 @@ from services.estimator.factory import SIGMA, Choice, Geometry, prepare
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.gauss_newton import View, polish
-from services.estimator.precise.global_seeds import SPACING, Seeds, thin_places
+from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_places
 from tests.estimator.models import ROOM
 
 OFF_CENTRE = {"mount": (-0.12, 0.1, 2.0)}
@@ -41,7 +41,7 @@ def learned(name: str) -> FieldModel:
 
 
 def precise(model: FieldModel, scanner: Scanner) -> PreciseEstimator:
-    places = thin_places(ROOM.sample_free(2000, np.random.default_rng(0), 0.05), SPACING)
+    places = thin_places(ROOM.sample_free(2000, np.random.default_rng(0), 0.05), SEED_SPACING_M)
     geometry = Geometry.of(scanner)
     return PreciseEstimator(model, Seeds.at(model, places), geometry.mount, geometry.likelihood())
 

@@ -1,7 +1,8 @@
 """Uses scan matching to tell a changed scene from a kidnapping.
 
-A scan that fits the scans just before it was taken near them: nobody has carried the robot off meanwhile, however
-little the model explains of what is seen. What is seen behind the walls that it expects speaks against that (`DOUBT`).
+A scan that matches the scans just before it was taken near them, so the robot was not carried away, however little the
+model explains of the scan. Beams that end behind the walls that the model expects are evidence against this
+(`MAX_LATE_SHARE`).
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
-from services.estimator.precise.gauss_newton import NARROW, WIDE, Prior, View, descending, polishing
+from services.estimator.precise.gauss_newton import FINE_SIGMA_M, MEDIUM_SIGMA_M, Prior, View, descending, polishing
 from services.estimator.precise.motion_model import Candidate
 from services.estimator.precise.scan_memory import Match, RecentScans
 
@@ -22,128 +23,133 @@ if TYPE_CHECKING:
     from services.estimator.precise.settings import Settings
     from services.estimator.shared.asking import Conversation
 
-BEGINS, GOES_ON = 0.75, 0.45  # least share of a scan's points that were seen before: the first that is held; others
-TURNS = np.array([-0.3, -0.15, 0.15, 0.3])  # rad, tried besides where a scan does not go on so clearly:
-CLEARLY = 0.8
-REACH = 0.3  # m: a robot that may have gone further since the last scan may have been carried as well
-PROVEN = 3  # scans kept that the model explained, before it may explain less
-DRIFT = np.array([0.02, 0.02, 0.005])  # m, m, rad: standard deviation that every scan kept adds
-DOUBT, MEMORY = 0.35, 0.95  # share of the beams, averaged over so many scans, that may end behind what is expected
-PARTLY, LESS = 0.1, 4  # weight of what a model says that explains a scan in part, and the power of its share of `good`
-FAR = 16.0  # squared standard deviations
-AROUND = np.array([0.3, 0.3, 0.3])  # m, m, rad: how far a place that the model claims may be off
+# Least share of a scan's points that were seen before, for the first scan that is held by matching, and for later ones.
+MIN_SHARE_TO_BEGIN, MIN_SHARE_TO_CONTINUE = 0.75, 0.45
+CLEAR_SHARE = 0.8  # a match with less is tried again from other headings
+EXTRA_HEADINGS_RAD = np.array([-0.3, -0.15, 0.15, 0.3])
+MAX_REACH_M = 0.3  # if the robot can drive farther between two scans, a match does not exclude a kidnapping
+MIN_PROVEN_SCANS = 3  # scans that the model explained, needed before any scan is held by matching
+DRIFT_PER_SCAN = np.array([0.02, 0.02, 0.005])  # m, m, rad: standard deviation that each added scan contributes
+MAX_LATE_SHARE, LATE_MEMORY = 0.35, 0.95  # limit and decay of the average share of beams behind the expected surface
+# A model that explains only part of a scan has this weight, times a power of its share of a good inlier ratio.
+PARTIAL_WEIGHT, PARTIAL_EXPONENT = 0.1, 4
+MAX_SQUARED_DISTANCE = 16.0  # squared standard deviations within which two poses are consistent
+MODEL_POSE_SIGMAS = np.array([0.3, 0.3, 0.3])  # m, m, rad: standard deviation assumed for a pose found by the model
 
 
 class Continuity:
-    """The scans since the place was sure, in a frame of their own that the model's evidence moves as one."""
+    """The scans since the pose was certain, in a local frame that the model's evidence moves as a whole."""
 
     def __init__(self, mount: Array) -> None:
         """``mount`` (3,) is the laser in base_link."""
         self._scans = RecentScans(mount)
-        self.forget()
+        self.reset()
 
-    def forget(self, *, given: bool = False) -> None:
-        """Begin anew: the robot is elsewhere; ``given``: where is known, and need not be proven by scans."""
-        self._scans.forget()
-        self._frame = np.zeros(3)  # of the scans kept, in map
-        self._anchor = np.zeros((3, 3))  # covariance of the place that they hang on
-        self._late, self._proven = 0.0, PROVEN * given
-        self._seen_from: Array | None = None  # (3,) in that frame, of the last scan
-        self._holds = False  # the place, since some scans
-        self._often = True  # scans come, for a robot as fast as this
+    def reset(self, *, pose_given: bool = False) -> None:
+        """Discards all scans; a pose that was given by the user does not have to be proven by scans first."""
+        self._scans.clear()
+        self._frame = np.zeros(3)  # local frame in map
+        self._anchor_covariance = np.zeros((3, 3))  # of the pose at which the last scan was added
+        self._late, self._proven_scans = 0.0, MIN_PROVEN_SCANS * pose_given
+        self._matched_pose: Array | None = None  # (3,) of the present scan, in the local frame
+        self._holds = False  # the last scan was held by matching
+        self._scans_frequent = True  # compared with the robot's speed
 
-    def keep(self, pose: Array, covariance: Array, points: Array, *, explained: bool) -> None:
-        """A scan's points (K, 2) m in the laser, seen from ``pose`` (3,) that is known within ``covariance``."""
+    def add(self, pose: Array, covariance: Array, points: Array, *, explained: bool) -> None:
+        """Adds the present scan, points (K, 2) m in the laser frame, taken at ``pose`` (3,) within ``covariance``.
+
+        ``explained`` tells that the model explains the scan.
+        """
         if self._scans.empty:
             self._frame = np.array(pose)
-        local = self._seen_from
-        if local is None:  # the model alone has said where
+        local = self._matched_pose
+        if local is None:  # the pose comes from the model alone
             self._holds = False
             local = se2.between(self._frame, pose)
-        if self._scans.keep(local, points):
+        if self._scans.add(local, points):
             self._frame = se2.compose(pose, se2.inverse(local))
-            self._anchor = covariance + np.diag(DRIFT**2)
-            self._proven += explained
+            self._anchor_covariance = covariance + np.diag(DRIFT_PER_SCAN**2)
+            self._proven_scans += explained
 
-    def passed(self, reach: float) -> None:
-        """The next scan is another; the robot may have gone ``reach`` m since the last."""
-        self._seen_from, self._often = None, reach <= REACH
+    def begin_scan(self, reach: float) -> None:
+        """Announces the next scan; the robot can have driven ``reach`` m since the last one."""
+        self._matched_pose, self._scans_frequent = None, reach <= MAX_REACH_M
 
-    def hold(self, options: list[Candidate], start: Array, points: Array, late: float) -> Candidate | None:
-        """Where a scan goes on from those kept, if it does.
+    def match(self, options: list[Candidate], start: Array, points: Array, late: float) -> Candidate | None:
+        """Returns the pose at which the present scan continues the stored ones; None if it does not.
 
-        ``options``: where the robot may have moved, the widest last; ``start`` (3,): where else to begin; points (K, 2)
-        m in the laser; ``late``: the share of the beams that end behind what is expected.
+        ``options`` are the motion candidates, the widest last. ``start`` (3,) is a further start of the descent.
+        ``points`` (K, 2) m are in the laser frame. ``late`` is the share of beams behind the expected surface.
         """
-        if self._proven < PROVEN or not self._often:
+        if self._proven_scans < MIN_PROVEN_SCANS or not self._scans_frequent:
             return None
-        self._late += (1 - MEMORY) * (late - self._late)
+        self._late += (1 - LATE_MEMORY) * (late - self._late)
         match = self._match(np.array([*(option.mean for option in options), start]), points, options[-1])
-        least = GOES_ON if self._holds else BEGINS
+        min_share = MIN_SHARE_TO_CONTINUE if self._holds else MIN_SHARE_TO_BEGIN
         self._holds = False
-        if match is None or match.share < least or match.blind or self._late > DOUBT:
+        if match is None or match.share < min_share or match.blind or self._late > MAX_LATE_SHARE:
             return None
-        self._seen_from, self._holds = match.pose, True
-        turn = _turned(self._frame[2])
-        spread = self._anchor + turn @ match.covariance @ turn.T
-        return Candidate("recent scans", se2.compose(self._frame, match.pose), spread, 1.0)
+        self._matched_pose, self._holds = match.pose, True
+        turn = _rotation(self._frame[2])
+        covariance = self._anchor_covariance + turn @ match.covariance @ turn.T
+        return Candidate("recent scans", se2.compose(self._frame, match.pose), covariance, 1.0)
 
     def _match(self, starts: Array, points: Array, widest: Candidate) -> Match | None:
-        back = _turned(-self._frame[2])
+        turn = _rotation(-self._frame[2])
         prior = replace(
-            widest, mean=se2.between(self._frame, widest.mean), covariance=back @ widest.covariance @ back.T
+            widest, mean=se2.between(self._frame, widest.mean), covariance=turn @ widest.covariance @ turn.T
         )
         local = se2.between(self._frame, starts)
         found = [self._scans.match(local, points, prior)]
-        if found[0] is None or found[0].share < CLEARLY:
-            turned = np.repeat(local[:1], len(TURNS), axis=0)
-            turned[:, 2] = se2.wrap(turned[:, 2] + TURNS)
+        if found[0] is None or found[0].share < CLEAR_SHARE:
+            turned = np.repeat(local[:1], len(EXTRA_HEADINGS_RAD), axis=0)
+            turned[:, 2] = se2.wrap(turned[:, 2] + EXTRA_HEADINGS_RAD)
             found.append(self._scans.match(turned, points, prior))
         return max((each for each in found if each is not None), key=lambda each: each.score, default=None)
 
 
-def looked_at(view: View, held: Candidate, settings: Settings) -> Conversation[tuple[Array, Evidence]]:
-    """Pose (1, 3) and evidence of the model near ``held``, where it has changed or was never learned.
+def refine_in_changed_scene(view: View, held: Candidate, settings: Settings) -> Conversation[tuple[Array, Evidence]]:
+    """Returns a pose (1, 3) near ``held`` and the model's evidence there, where the scene changed or was not learned.
 
-    What was moved moves many beams alike, so such evidence counts little; where next to nothing is explained it is
-    chance, and none is left.
+    Something that was moved moves many beams alike, so this evidence gets a low weight. If the model explains next to
+    nothing, its matches are chance: the pose is then ``held``, and the evidence gets no weight.
     """
-    starts = held.mean + _spread_out(held.covariance)
+    starts = held.mean + _sigma_points(held.covariance)
     starts[:, 2] = se2.wrap(starts[:, 2])
-    prior = Prior.alike(len(starts), held.mean, held.covariance)
-    for widen in (WIDE, NARROW):
-        starts, _ = yield from descending(view, starts, prior, widen, 4)
+    prior = Prior.repeated(len(starts), held.mean, held.covariance)
+    for extra_sigma in (MEDIUM_SIGMA_M, FINE_SIGMA_M):
+        starts, _ = yield from descending(view, starts, prior, extra_sigma, 4)
     poses, evidence = yield from polishing(view, starts, prior)
     best = int(np.argmin(evidence.accuracy + prior.energy(poses)))
     poses, evidence = poses[best : best + 1], evidence.part(np.array([best]))
-    share = float(evidence.explained[0]) / settings.good
-    if evidence.explained[0] < settings.believable:
+    share = float(evidence.inlier_ratio[0]) / settings.good_inlier_ratio
+    if evidence.inlier_ratio[0] < settings.min_inlier_ratio:
         poses, share = held.mean[None].copy(), 0.0
         evidence = yield from view.looking(poses)
-    weight = PARTLY * min(1.0, share) ** LESS
-    parts = ("xi", "curvature", "of_noise", "of_model")
-    return poses, replace(evidence, **{name: weight * getattr(evidence, name) for name in parts})
+    weight = PARTIAL_WEIGHT * min(1.0, share) ** PARTIAL_EXPONENT
+    weighted = ("xi", "curvature", "xi_noise_covariance", "xi_model_covariance")
+    return poses, replace(evidence, **{name: weight * getattr(evidence, name) for name in weighted})
 
 
-def agree(pose: Array, held: Candidate) -> bool:
-    """Whether ``pose`` (3,) lies where ``held`` says."""
-    return held.squared_distance(pose) < FAR
+def is_consistent(pose: Array, held: Candidate) -> bool:
+    """Whether ``pose`` (3,) agrees with the pose from scan matching within its covariance."""
+    return held.squared_distance(pose) < MAX_SQUARED_DISTANCE
 
 
-def around(pose: Array) -> Candidate:
-    """Where a robot is whose place (3,) the model claims."""
-    return Candidate("here", pose, np.diag(AROUND**2), 1.0)
+def candidate_at(pose: Array) -> Candidate:
+    """A prior for scan matching around ``pose`` (3,) that the model found."""
+    return Candidate("here", pose, np.diag(MODEL_POSE_SIGMAS**2), 1.0)
 
 
-def _spread_out(covariance: Array) -> Array:
-    """(13, 3) offsets: none, and one and two standard deviations along each axis of (3, 3)."""
+def _sigma_points(covariance: Array) -> Array:
+    """Offsets (13, 3): zero, and one and two standard deviations along each axis of ``covariance`` (3, 3)."""
     values, vectors = np.linalg.eigh(covariance)
     axes = (np.sqrt(np.maximum(values, 0.0)) * vectors).T
     return np.concatenate([np.zeros((1, 3)), axes, -axes, 2 * axes, -2 * axes])
 
 
-def _turned(yaw: float) -> Array:
-    """(3, 3) of a covariance of x, y, yaw in a frame turned by ``yaw`` rad."""
+def _rotation(yaw: float) -> Array:
+    """Matrix (3, 3) that rotates a covariance of x, y, yaw by ``yaw`` rad."""
     matrix = np.eye(3)
     matrix[:2, :2] = se2.rotate(float(yaw), np.eye(2)).T
     return matrix

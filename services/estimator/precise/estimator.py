@@ -9,13 +9,28 @@ import numpy as np
 
 from common.geometry import se2
 from services.estimator.precise import continuity, obstruction
-from services.estimator.precise import hypotheses as mixture
-from services.estimator.precise import search as searching
 from services.estimator.precise.continuity import Continuity
-from services.estimator.precise.gauss_newton import WIDEST, Prior, View, polishing
-from services.estimator.precise.hypotheses import Mode
+from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, Prior, View, polishing
+from services.estimator.precise.hypotheses import (
+    SAME_POSITION_M,
+    Mode,
+    clip_to_map,
+    observed_directions,
+    project_evidence,
+    rank_hypotheses,
+    same_place,
+    update_mode,
+)
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.motion_model import Candidate, candidates, fuse, unseen, within_map, within_reach
+from services.estimator.precise.motion_model import (
+    Candidate,
+    fuse,
+    limit_to_map,
+    predict_motion,
+    reachable_poses,
+    widen_unobserved,
+)
+from services.estimator.precise.search import search_around, search_everywhere, search_near
 from services.estimator.precise.settings import Settings
 from services.estimator.shared.asking import Conversation, Search, alone
 from services.estimator.shared.generative_models import Expect, Expected
@@ -27,14 +42,16 @@ if TYPE_CHECKING:
     from services.estimator.precise.likelihood import Evidence
     from services.estimator.shared.generative_models import GenerativeModel
 
-FIRST_WAIT, LONGEST_WAIT = 5, 150  # scans between searches while the scan fits badly,
-LOST_WAIT, DOUBTFUL_WAIT = 2, 8  # at most that many while nothing, or little, speaks for the place
-UNKNOWN = 100.0  # m, stated where nothing is known
-ENOUGH_BEAMS = 2000  # of a scan with twice as many or more, every k-th is used: a search takes time for each beam
+# Scans between two searches while scans fit badly: the interval doubles from the first to the longest.
+FIRST_SEARCH_INTERVAL, MAX_SEARCH_INTERVAL = 5, 150
+MAX_INTERVAL_IF_LOST, MAX_INTERVAL_IF_DOUBTFUL = 2, 8
+UNKNOWN_SIGMA_M = 100.0  # published where the model does not know what to expect
+TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
+AVERAGE_UPDATE_SHARE = 0.1  # weight of the present scan in the averages of inlier ratio and accuracy
 
 
 class PreciseEstimator:
-    """Perception at the limit of the sensor."""
+    """Estimator whose error is near the limit set by the scanner's noise (docs/precise.md)."""
 
     name = "precise"
 
@@ -48,9 +65,9 @@ class PreciseEstimator:
         rng: np.random.Generator | None = None,
         bounds: tuple[float, float, float, float] | None = None,
     ) -> None:
-        """``mount`` (3,) is the laser in base_link; ``rng`` only places the starts near a pose that is given.
+        """``mount`` (3,) is the laser in base_link; ``rng`` places the starts of a search near a given pose.
 
-        The belief stays within ``bounds``, x0, y0, x1, y1 of the map in m.
+        The belief stays within ``bounds``, the map's x0, y0, x1, y1 in m.
         """
         self.model, self.seeds, self.mount = model, seeds, np.array(mount, float)
         self.likelihood, self.settings = likelihood or Likelihood(), settings or Settings()
@@ -59,209 +76,245 @@ class PreciseEstimator:
         self.restart()
 
     def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:
-        """Begin anew, near ``pose`` with ``covariance`` (default 0.5 m, 0.5 m, 0.3 rad) or knowing nothing."""
+        """Starts from ``pose`` within ``covariance`` (default 0.5 m, 0.5 m, 0.3 rad), or from an unknown pose."""
         self.modes: list[Mode] = []
-        self._near: tuple[Array, Array] | None = None
+        self._initial: tuple[Array, Array] | None = None
         if pose is not None:
             spread = np.diag([0.25, 0.25, 0.09]) if covariance is None else np.asarray(covariance, float)
-            self._near = (np.asarray(pose, float), spread)
+            self._initial = (np.asarray(pose, float), spread)
         self._was_tracking = False
         self._stamp: float | None = None
         self._odom: Array | None = None
-        self._usual, self._energy = 1.0, 0.0  # share of beams explained, and accuracy, lately
-        self._since, self._wait = 0, FIRST_WAIT  # scans that fitted badly, and after how many to search
-        self._believed = False  # the last scan
+        self._mean_inlier_ratio, self._mean_accuracy = 1.0, 0.0  # of the last scans
+        self._poor_scans, self._search_interval = 0, FIRST_SEARCH_INTERVAL
+        self._was_believed = False  # at the last scan
         self._continuity = Continuity(self.mount)
-        self._held = False
+        self._held_by_scans = False  # the pose comes from matching recent scans, since the model explains too little
 
     def update(self, observation: Observation) -> Posterior:
-        """One more scan."""
+        """Returns the posterior after one more scan."""
         return alone(self.updating(observation))
 
     def updating(self, observation: Observation) -> Conversation[Posterior]:
-        """The same as a conversation: see `asking`."""
+        """`update` as a generator; see `services.estimator.shared.asking`."""
         view = View(
             self.model, self.likelihood, self.mount, observation.angles, observation.ranges, observation.range_max
-        ).thinned(ENOUGH_BEAMS)
-        self._continuity.passed(self.settings.motion.speed * self._period(observation.stamp))
+        ).thinned(TARGET_BEAMS)
+        self._continuity.begin_scan(self.settings.motion.speed * self._period(observation.stamp))
         if self.modes:
             yield from self._track(view, observation)
-        if not self.modes or self._suspicious(view):
+        if not self.modes or self._needs_search(view):
             yield Search()
             yield from self._relocalise(view)
-        self.modes = mixture.within(self.modes, self.bounds)
+        self.modes = clip_to_map(self.modes, self.bounds)
         self._stamp, self._odom = observation.stamp, observation.odom
         best = self.modes[0]
-        self._remember(view, best)
-        self._usual += 0.1 * (best.explained - self._usual)
-        self._energy += 0.1 * (best.accuracy - self._energy)
+        self._remember_scan(view, best)
+        self._mean_inlier_ratio += AVERAGE_UPDATE_SHARE * (best.inlier_ratio - self._mean_inlier_ratio)
+        self._mean_accuracy += AVERAGE_UPDATE_SHARE * (best.accuracy - self._mean_accuracy)
         return (yield from self._posterior(view, best, observation.angles))
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
-        """See Estimator; sigma is the scanner's noise and the model's stated error together."""
+        """Predicts scans (see Estimator); sigma combines the scanner's noise and the model's stated error."""
         return self._with_noise(self.model.expect(se2.compose(poses, self.mount), angles))
 
     def _with_noise(self, expected: Expected) -> Predicted:
         unknown = np.isinf(expected.scale)
-        sigma = np.where(unknown, UNKNOWN, np.hypot(expected.scale, self.likelihood.deviation(expected.ranges)))
+        sigma = np.where(unknown, UNKNOWN_SIGMA_M, np.hypot(expected.scale, self.likelihood.deviation(expected.ranges)))
         return Predicted(np.where(unknown, np.inf, expected.ranges), sigma)
 
     def _track(self, view: View, observation: Observation) -> Conversation[None]:
-        """Each hypothesis on: where it may have moved, where the scan says it is, both fused."""
+        """Predicts each hypothesis, matches the scan near it, and fuses both."""
         period = self._period(observation.stamp)
         odom = None
         if observation.odom is not None and self._odom is not None:
             odom = se2.between(self._odom, observation.odom)
+        # For each hypothesis the motions that the robot may have made; the last one is the widest.
         options = [
-            candidates(self.settings.motion, mode.pose, mode.noise, period, odom, observation.command, mode.velocity)
+            predict_motion(
+                self.settings.motion, mode.pose, mode.noise_covariance, period, odom, observation.command, mode.velocity
+            )
             for mode in self.modes
         ]
         starts = np.array([each[-2].mean for each in options])
-        wide = Prior(
+        widest = Prior(
             np.array([each[-1].mean for each in options]),
             np.array([np.linalg.inv(each[-1].covariance) for each in options]),
         )
-        poses, evidence = yield from polishing(view, starts, wide)
-        if evidence.explained[0] < self._usual - self.settings.drop:
-            around = np.zeros((0, 3))
+
+        # Match the scan near the predicted poses, and over a wider area if it fits badly there.
+        poses, evidence = yield from polishing(view, starts, widest)
+        if evidence.inlier_ratio[0] < self._mean_inlier_ratio - self.settings.inlier_ratio_drop:
+            extra_starts = np.zeros((0, 3))
             if odom is None:
-                around = within_reach(self.settings.motion, self.modes[0].pose, period, WIDEST)
-            tried, retried = yield from searching.further(view, starts, wide, around)
-            if retried.explained[0] > evidence.explained[0]:
-                poses, evidence = tried, retried
-        held = self._hold(view, evidence, options[0], poses[0])
+                extra_starts = reachable_poses(self.settings.motion, self.modes[0].pose, period, COARSE_SIGMA_M)
+            wider_poses, wider_evidence = yield from search_around(view, starts, widest, extra_starts)
+            if wider_evidence.inlier_ratio[0] > evidence.inlier_ratio[0]:
+                poses, evidence = wider_poses, wider_evidence
+
+        held = self._match_recent_scans(view, evidence, options[0], poses[0])
         if held is not None:
-            # Nobody has carried the robot off: what looks like another place is this one, changed.
+            # Not a kidnapping: scan matching confirms continuity, so the scene has changed.
             self.modes, options, evidence = self.modes[:1], [[held]], evidence.part(np.array([0]))
-            poses, evidence = yield from continuity.looked_at(view, held, self.settings)
+            poses, evidence = yield from continuity.refine_in_changed_scene(view, held, self.settings)
+
+        # Fuse each hypothesis with its evidence.
         modes = []
         for k, (mode, each) in enumerate(zip(self.modes, options, strict=True)):
-            # Once blind, a ripple a little larger than the others must not be taken for a feature.
-            doubt = 3 if mode.blind else 1
-            keep, blind = mixture.seen(evidence.curvature[k], self.model.ripple * doubt)
-            holding = doubt * self.settings.holding * len(view.angles)
-            if blind is not None and obstruction.held(view, poses[k], blind) > holding:
-                keep, blind = np.eye(3), None
-            mixture.project(evidence, k, keep)
-            if blind is not None and odom is None and held is None:
-                each = [unseen(self.settings.motion, option, blind, mode.blind, period) for option in each]  # noqa: PLW2901
-            each = [within_map(option, self.seeds.spread) for option in each]  # noqa: PLW2901
-            parts = [fuse(option, poses[k], evidence.xi[k], evidence.curvature[k]) for option in each]
-            fused = min(parts, key=lambda part: part.surprise)
-            modes.append(mixture.moved(mode, fused, evidence, k, period, blind=blind is not None and held is None))
-        self.modes = mixture.led(modes, self.settings)
+            # While a direction is unobserved, a ripple a little larger than the others must not pass for a feature.
+            caution = 3 if mode.unobserved_scans else 1
+            projection, unobserved = observed_directions(evidence.curvature[k], self.model.ripple * caution)
+            min_beams = caution * self.settings.min_constraining_ratio * len(view.angles)
+            if unobserved is not None and obstruction.constraining_beams(view, poses[k], unobserved) > min_beams:
+                projection, unobserved = np.eye(3), None
+            project_evidence(evidence, k, projection)
+            if unobserved is not None and odom is None and held is None:
+                each = [  # noqa: PLW2901
+                    widen_unobserved(self.settings.motion, option, unobserved, mode.unobserved_scans, period)
+                    for option in each
+                ]
+            each = [limit_to_map(option, self.seeds.spread) for option in each]  # noqa: PLW2901
+            fused = [fuse(option, poses[k], evidence.xi[k], evidence.curvature[k]) for option in each]
+            best = min(fused, key=lambda one: one.surprise)
+            is_unobserved = unobserved is not None and held is None
+            modes.append(update_mode(mode, best, evidence, k, period, unobserved=is_unobserved))
+        self.modes = rank_hypotheses(modes, self.settings)
 
-    def _hold(self, view: View, evidence: Evidence, options: list[Candidate], start: Array) -> Candidate | None:
-        """Where the scans of a moment ago say the robot is, if the model does not explain what is seen."""
-        settings, explained = self.settings, float(evidence.explained[0])
-        before, self._held = self._held, False
-        weak = explained < max(settings.good, self._usual - settings.drop)
-        if not self.modes[0].trusted or not (weak or (before and explained < settings.satisfied)):
+    def _match_recent_scans(
+        self, view: View, evidence: Evidence, options: list[Candidate], start: Array
+    ) -> Candidate | None:
+        """Returns the pose that recent scans give, if the model does not explain the scan; else None."""
+        settings, inlier_ratio = self.settings, float(evidence.inlier_ratio[0])
+        was_held, self._held_by_scans = self._held_by_scans, False
+        weak = inlier_ratio < max(settings.good_inlier_ratio, self._mean_inlier_ratio - settings.inlier_ratio_drop)
+        inconclusive = inlier_ratio < settings.conclusive_inlier_ratio
+        if not self.modes[0].tracked or not (weak or (was_held and inconclusive)):
             return None
         expected = self._expected(view, start)
-        if explained >= settings.glimpse and obstruction.crowded(view, expected, settings.contradicted):
+        if inlier_ratio >= settings.min_occluded_inlier_ratio and obstruction.is_only_blocked(
+            view, expected, settings.max_contradicting_ratio
+        ):
             return None
-        held = self._continuity.hold(options, start, view.points, obstruction.late(view, expected))
-        if held is None or (not weak and continuity.agree(start, held)):
+        held = self._continuity.match(options, start, view.points, obstruction.late_ratio(view, expected))
+        if held is None or (not weak and continuity.is_consistent(start, held)):
             return None
-        self._held = True
+        self._held_by_scans = True
         return held
 
-    def _remember(self, view: View, best: Mode) -> None:
-        """For the scans to come: where this one was seen from, if that is known."""
-        if not best.trusted:
-            self._held = False
-            self._continuity.forget()
-        elif self._held or best.explained >= self.settings.good:
-            explained = best.explained >= self.settings.good
-            self._continuity.keep(best.pose, self._covariance(best), view.points, explained=explained)
+    def _remember_scan(self, view: View, best: Mode) -> None:
+        """Stores the scan for matching, if its pose is known; forgets all scans if the pose is not tracked."""
+        explained = best.inlier_ratio >= self.settings.good_inlier_ratio
+        if not best.tracked:
+            self._held_by_scans = False
+            self._continuity.reset()
+        elif self._held_by_scans or explained:
+            self._continuity.add(best.pose, self._covariance(best), view.points, explained=explained)
 
-    def _suspicious(self, view: View) -> bool:
-        """The scan fits worse at once, or has fitted badly for long, or not as a belief must."""
+    def _needs_search(self, view: View) -> bool:
+        """Whether the scan suddenly fits worse, has fitted badly for long, or fits too badly to be believed."""
         best, settings = self.modes[0], self.settings
-        fell = best.explained < self._usual - settings.drop or best.accuracy > self._energy + settings.rise
-        if self._held:
-            self._since += 1
-            return self._since >= LONGEST_WAIT
-        believable, doubtful = self._believable(view), self._doubtful(view)
-        if best.explained >= settings.satisfied:
-            self._since, self._wait = 0, FIRST_WAIT
-            return fell
-        if not believable and not best.trusted:
+        dropped = (
+            best.inlier_ratio < self._mean_inlier_ratio - settings.inlier_ratio_drop
+            or best.accuracy > self._mean_accuracy + settings.energy_jump_nats
+        )
+        if self._held_by_scans:
+            self._poor_scans += 1
+            return self._poor_scans >= MAX_SEARCH_INTERVAL
+        believable, doubtful = self._is_believable(view), self._is_doubtful(view)
+        if best.inlier_ratio >= settings.conclusive_inlier_ratio:
+            self._poor_scans, self._search_interval = 0, FIRST_SEARCH_INTERVAL
+            return dropped
+        if not believable and not best.tracked:
             return True
-        if self._believed and not believable:
-            self._since, self._wait = 0, 1  # at once, and soon again
-        self._since += 1
-        longest = LOST_WAIT if not believable else DOUBTFUL_WAIT if doubtful else LONGEST_WAIT
-        return fell or self._since >= min(self._wait, longest)
+        if self._was_believed and not believable:
+            self._poor_scans, self._search_interval = 0, 1  # search at once, and soon again
+        self._poor_scans += 1
+        longest = MAX_SEARCH_INTERVAL
+        if not believable:
+            longest = MAX_INTERVAL_IF_LOST
+        elif doubtful:
+            longest = MAX_INTERVAL_IF_DOUBTFUL
+        return dropped or self._poor_scans >= min(self._search_interval, longest)
 
-    def _believable(self, view: View) -> bool:
-        """Whether enough of the scan is explained, or the rest may be hidden."""
-        return self.modes[0].explained >= self.settings.believable or self._hidden(view)
+    def _is_believable(self, view: View) -> bool:
+        """Whether the model explains enough of the scan, or the rest may be occluded."""
+        return self.modes[0].inlier_ratio >= self.settings.min_inlier_ratio or self._is_occluded(view)
 
-    def _goes_on(self, view: View) -> bool:
-        """Whether the robot was tracked and the scan goes on from those before it."""
+    def _is_continuous(self, view: View) -> bool:
+        """Whether the robot was tracked and the scan continues those before it."""
         best = self.modes[0]
-        if self._held or not best.trusted or best.explained < self.settings.good:
-            return self._held
-        late = obstruction.late(view, self._expected(view, best.pose))
-        return self._continuity.hold([continuity.around(best.pose)], best.pose, view.points, late) is not None
+        if self._held_by_scans or not best.tracked or best.inlier_ratio < self.settings.good_inlier_ratio:
+            return self._held_by_scans
+        late = obstruction.late_ratio(view, self._expected(view, best.pose))
+        options = [continuity.candidate_at(best.pose)]
+        return self._continuity.match(options, best.pose, view.points, late) is not None
 
     def _expected(self, view: View, pose: Array) -> Expected:
         return view.model.expect(se2.compose(pose, view.mount)[None], view.angles)
 
-    def _hidden(self, view: View) -> bool:
-        """Whether the place was tracked, shows a glimpse of itself still, and little contradicts it."""
+    def _is_occluded(self, view: View) -> bool:
+        """Whether the pose was tracked, the model still explains a few beams, and few beams contradict it."""
         best, settings = self.modes[0], self.settings
-        glimpsed = best.trusted and best.explained >= settings.glimpse
-        return glimpsed and self._contradicted(view) <= settings.contradicted
+        partly_visible = best.tracked and best.inlier_ratio >= settings.min_occluded_inlier_ratio
+        return partly_visible and self._contradicting_ratio(view) <= settings.max_contradicting_ratio
 
-    def _doubtful(self, view: View) -> bool:
-        """Whether much of the scan is not explained, and some of it cannot be."""
+    def _is_doubtful(self, view: View) -> bool:
+        """Whether the model explains little of the scan, and too many beams contradict the pose."""
         settings = self.settings
-        return self.modes[0].explained < settings.doubtful and self._contradicted(view) > settings.contradicted
+        explains_little = self.modes[0].inlier_ratio < settings.doubtful_inlier_ratio
+        return explains_little and self._contradicting_ratio(view) > settings.max_contradicting_ratio
 
-    def _contradicted(self, view: View) -> float:
-        return obstruction.contradicted(view, self._expected(view, self.modes[0].pose))
+    def _contradicting_ratio(self, view: View) -> float:
+        return obstruction.contradicting_ratio(view, self._expected(view, self.modes[0].pose))
 
     def _relocalise(self, view: View) -> Conversation[None]:
-        """Search from nothing; keep what is tracked where nothing better is found."""
-        if self._near is not None:
-            near, self._near = self._near, None
-            found = yield from searching.near(view, *near, self.seeds, self.settings, self._rng)
-            if found[0].explained >= self.settings.believable:  # who says where it is has tracked it until now
-                found[0] = replace(found[0], trusted=True)
-                self._continuity.forget(given=True)
+        """Searches near the initial pose or in the whole map; keeps the hypotheses if nothing better is found."""
+        if self._initial is not None:
+            initial, self._initial = self._initial, None
+            found = yield from search_near(view, *initial, self.seeds, self.settings, self._rng)
+            if found[0].inlier_ratio >= self.settings.min_inlier_ratio:
+                # A pose that was given counts as tracked until now.
+                found[0] = replace(found[0], tracked=True)
+                self._continuity.reset(pose_given=True)
         else:
             found = yield from self._search(view)
         if self.modes:
-            before = self.modes[0]
-            now = max(before.energy, before.accuracy + before.complexity)  # the average still praises earlier scans
-            worse = found[0].energy > now - 3 * self.settings.evidence_error
-            if worse or self._unlikely(view, found[0]):
-                found = self.modes  # nothing better: this is how it looks here now; search again later
-                self._since, self._wait = 0, min(2 * self._wait, LONGEST_WAIT)
-            elif mixture.same(found[0].pose[None], before.pose)[0]:
-                found[0] = replace(found[0], age=before.age, velocity=before.velocity, trusted=before.trusted)
-            elif before.trusted:
+            previous = self.modes[0]
+            # Not the average alone, which still includes scans that fitted better.
+            energy = max(previous.energy, previous.accuracy + previous.complexity)
+            worse = found[0].energy > energy - 3 * self.settings.evidence_error_nats
+            if worse or self._is_implausible_jump(view, found[0]):
+                # The place has changed, or the model errs here: keep the hypotheses and search again later.
+                found = self.modes
+                self._double_search_interval()
+            elif same_place(found[0].pose[None], previous.pose)[0]:
+                found[0] = replace(found[0], age=previous.age, velocity=previous.velocity, tracked=previous.tracked)
+            elif previous.tracked:
                 found = [*self.modes, *found]
-                self._since, self._wait = 0, min(2 * self._wait, LONGEST_WAIT)
-        self.modes = mixture.led(found, self.settings)
-        self._usual, self._energy = self.modes[0].explained, self.modes[0].accuracy
+                self._double_search_interval()
+        self.modes = rank_hypotheses(found, self.settings)
+        self._mean_inlier_ratio, self._mean_accuracy = self.modes[0].inlier_ratio, self.modes[0].accuracy
 
-    def _unlikely(self, view: View, found: Mode) -> bool:
-        """Elsewhere, though nothing contradicts the place that was tracked: a door has closed, a crowd has gathered."""
-        if not (self._goes_on(view) or self._hidden(view)):
+    def _double_search_interval(self) -> None:
+        self._poor_scans, self._search_interval = 0, min(2 * self._search_interval, MAX_SEARCH_INTERVAL)
+
+    def _is_implausible_jump(self, view: View, found: Mode) -> bool:
+        """Whether ``found`` is elsewhere, although nothing contradicts the tracked pose.
+
+        This happens where a door was shut or people gather.
+        """
+        if not (self._is_continuous(view) or self._is_occluded(view)):
             return False
         best = self.modes[0]
-        spread = self._covariance(best)[:2, :2] + np.eye(2) * mixture.SAME_PLACE**2
+        covariance = self._covariance(best)[:2, :2] + np.eye(2) * SAME_POSITION_M**2
         off = found.pose[:2] - best.pose[:2]
-        return bool(off @ np.linalg.solve(spread, off) > continuity.FAR)
+        return bool(off @ np.linalg.solve(covariance, off) > continuity.MAX_SQUARED_DISTANCE)
 
     def _search(self, view: View) -> Conversation[list[Mode]]:
-        # A place that is tracked and still fits somewhat need not be beaten by what is hard to find.
-        held = bool(self.modes) and self.modes[0].trusted and self.modes[0].explained >= self.settings.good
-        return (yield from searching.anywhere(view, self.seeds, self.settings, thorough=not held))
+        best = self.modes[0] if self.modes else None
+        # A tracked pose that still fits well need not compete with poses that are hard to find.
+        fits = best is not None and best.tracked and best.inlier_ratio >= self.settings.good_inlier_ratio
+        return (yield from search_everywhere(view, self.seeds, self.settings, thorough=not fits))
 
     def _period(self, stamp: float | None) -> float:
         if stamp is None or self._stamp is None or stamp <= self._stamp:
@@ -269,15 +322,23 @@ class PreciseEstimator:
         return stamp - self._stamp
 
     def _posterior(self, view: View, best: Mode, angles: Array) -> Conversation[Posterior]:
-        seen: Expected = yield Expect(self.model, se2.compose(best.pose[None], self.mount), angles)
-        expected = self._with_noise(seen)
-        believable = self._believable(view)
-        self._believed = believable or self._held
+        expected: Expected = yield Expect(self.model, se2.compose(best.pose[None], self.mount), angles)
+        predicted = self._with_noise(expected)
+        believable = self._is_believable(view)
+        self._was_believed = believable or self._held_by_scans
         state = self._state(view, best, believable=believable)
-        unknown = self.seeds.spread * (not self._believed)
+        unknown = self.seeds.spread * (not self._was_believed)
         hypotheses = tuple(Hypothesis(mode.pose, self._covariance(mode) + unknown, mode.weight) for mode in self.modes)
-        evidence = (best.accuracy, best.complexity, best.xi, best.curvature)
-        return Posterior(state, hypotheses, *evidence, expected.ranges[0], expected.sigma[0])
+        return Posterior(
+            state=state,
+            hypotheses=hypotheses,
+            accuracy=best.accuracy,
+            complexity=best.complexity,
+            xi=best.xi,
+            curvature=best.curvature,
+            predicted=predicted.ranges[0],
+            sigma=predicted.sigma[0],
+        )
 
     def _covariance(self, mode: Mode) -> Array:
         floor = np.array([self.settings.floor_position] * 2 + [self.settings.floor_heading])
@@ -287,14 +348,23 @@ class PreciseEstimator:
         settings = self.settings
         if not believable:
             return "lost" if self._was_tracking else "localising"
-        if len(self.modes) > 1 and self.modes[1].weight > settings.ambiguous:
+        if len(self.modes) > 1 and self.modes[1].weight > settings.ambiguous_weight:
             return "ambiguous"
-        if best.trusted and self._doubtful(view):
+        if best.tracked and self._is_doubtful(view):
             return "lost"
-        vague = np.linalg.eigvalsh(self._covariance(best)[:2, :2])[-1] > settings.vague**2
-        sure = best.trusted or best.explained >= settings.sure
-        if vague or not (sure or (best.age >= settings.patience and self._contradicted(view) <= settings.contradicted)):
+        variance = np.linalg.eigvalsh(self._covariance(best)[:2, :2])[-1]
+        if variance > settings.max_tracking_deviation**2:
+            return "localising"
+        proven = (
+            best.tracked
+            or best.inlier_ratio >= settings.tracking_inlier_ratio
+            or (
+                best.age >= settings.min_scans_before_tracking
+                and self._contradicting_ratio(view) <= settings.max_contradicting_ratio
+            )
+        )
+        if not proven:
             return "localising"
         self._was_tracking = True
-        self.modes[0] = replace(best, trusted=True)
+        self.modes[0] = replace(best, tracked=True)
         return "tracking"

@@ -1,8 +1,9 @@
 """The generative model: a learned distance field that predicts ranges.
 
-The field phi (m) is positive in free space and zero on surfaces, stored on a square grid and interpolated bilinearly.
-A beam from p in direction u ends where phi(p + r u) = 0, found by sphere tracing (Hart 1996, "Sphere tracing"), so the
-range's derivative is that of the implicit function: dr = -(n . dp + r n . u' dyaw) / (n . u), n the gradient of phi.
+The field phi (m) is positive in free space and zero on surfaces. It is stored on a square grid and interpolated
+bilinearly. A beam from p in direction u ends where phi(p + r u) = 0, found by sphere tracing (Hart 1996, "Sphere
+tracing"). The derivative of the range is that of the implicit function: dr = -(n . dp + r n . u' dyaw) / (n . u), with
+n the gradient of phi.
 """
 
 from __future__ import annotations
@@ -22,44 +23,45 @@ if TYPE_CHECKING:
 
 Floats = npt.NDArray[np.float32]
 
-# Edges of the classes of beams that are predicted alike well: how close the beam passed by another surface (m), how
-# deep behind its end the surface still lies, relative to a plane, and the cosine of incidence.
+# Beams are divided into classes of about equal prediction error, by these edges: how close the beam passed another
+# surface (m), how deep the surface is behind the beam's end, relative to a plane, and the cosine of incidence.
 DIP_EDGES = np.array([0.001, 0.002, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1])
 DEPTH_EDGES = np.array([0.0, 0.25, 0.5, 0.75])
 FACING_EDGES = np.array([0.05, 0.1, 0.2, 0.5])
-SEEN_CELL = 0.2  # m: neighbouring beams must not leave gaps between them
+SEEN_CELL_M = 0.2  # so large that neighbouring beams leave no gaps
 CLASSES = (len(DIP_EDGES) + 1, len(DEPTH_EDGES) + 1, len(FACING_EDGES) + 1)
 
 
 @dataclass(frozen=True)
 class Traced:
-    """What beams (N, B) meet."""
+    """Traced beams: arrays (N, B) for N laser poses and B beams."""
 
-    ranges: Array  # m; +inf: nothing within the grid
-    jacobian: Array  # (N, B, 3) by x, y (m/m) and yaw (m/rad) of the laser
-    dip: Array  # m, nearest pass by another surface; +inf: none
-    edge: Array  # depth behind the end relative to a plane: 1 on a wall, near 0 at an edge
+    ranges: Array  # m; +inf if nothing is met within the grid
+    jacobian: Array  # (N, B, 3) derivative of the ranges by x, y (m/m) and yaw (m/rad) of the laser
+    dip: Array  # m, least distance at which the beam passed another surface; +inf if it passed none
+    edge: Array  # depth behind the end, relative to a plane: 1 on a wall, near 0 at an edge
     facing: Array  # cosine of incidence
 
     def classes(self) -> npt.NDArray[np.intp]:
-        """(N, B) index into the table of scales."""
+        """Index (N, B) of each beam's class in the table of scales."""
         parts = (
-            np.digitize(self.dip, DIP_EDGES), np.digitize(self.edge, DEPTH_EDGES),
+            np.digitize(self.dip, DIP_EDGES),
+            np.digitize(self.edge, DEPTH_EDGES),
             np.digitize(self.facing, FACING_EDGES),
-        )  # fmt: skip
+        )
         return np.ravel_multi_index(parts, CLASSES)
 
 
 @dataclass(frozen=True)
 class DistanceField:
-    """phi on a grid: node (i, j) lies at origin + resolution * (j, i)."""
+    """The field phi on a grid, whose node (i, j) lies at origin + resolution * (j, i)."""
 
     phi: Floats  # (ny, nx) m
     origin: tuple[float, float]  # m in map, of node (0, 0)
     resolution: float  # m
 
     def trace(self, lasers: Array, angles: Array) -> Traced:
-        """From laser poses (N, 3) in map along angles (B,) rad in laser."""
+        """Traces beams from laser poses (N, 3) in map along angles (B,) rad in the laser frame."""
         lasers, angles = np.asarray(lasers, float).reshape(-1, 3), np.asarray(angles, float)
         shape = (len(lasers), len(angles))
         ranges, dip, edge, facing = (np.empty(shape) for _ in range(4))
@@ -70,48 +72,51 @@ class DistanceField:
 
 @dataclass(frozen=True)
 class Seen:
-    """Cells of a square grid that a beam of the samples has passed: of the others nothing is known."""
+    """Cells of a square grid that a beam of the training scans has passed; nothing is known about the other cells."""
 
-    cells: npt.NDArray[np.bool_]  # (ny, nx); cell (i, j) begins at origin + SEEN_CELL * (j, i)
+    cells: npt.NDArray[np.bool_]  # (ny, nx); cell (i, j) begins at origin + SEEN_CELL_M * (j, i)
     origin: tuple[float, float]  # m in map
 
     def at(self, field: DistanceField) -> npt.NDArray[np.bool_]:
-        """(ny, nx) for the nodes of a field."""
+        """Whether each node of a field lies in a seen cell: (ny, nx)."""
         ny, nx = field.phi.shape
         i, j = (
-            np.clip(((start + field.resolution * np.arange(n) - own) / SEEN_CELL).astype(int), 0, m - 1)
-            for start, own, n, m in zip(field.origin[::-1], self.origin[::-1], (ny, nx), self.cells.shape, strict=True)
+            np.clip(((start + field.resolution * np.arange(n) - own_start) / SEEN_CELL_M).astype(int), 0, m - 1)
+            for start, own_start, n, m in zip(
+                field.origin[::-1], self.origin[::-1], (ny, nx), self.cells.shape, strict=True
+            )
         )
         return self.cells[np.ix_(i, j)]
 
     def contains(self, points: Array) -> npt.NDArray[np.bool_]:
-        """(N,) whether somebody has looked there; points (N, 2) m in map."""
-        j, i = np.floor((points - self.origin) / SEEN_CELL).astype(int).T
+        """Whether each of points (N, 2) m in map lies in a seen cell: (N,)."""
+        j, i = np.floor((points - self.origin) / SEEN_CELL_M).astype(int).T
         inside = (i >= 0) & (j >= 0) & (i < self.cells.shape[0]) & (j < self.cells.shape[1])
         found = np.zeros(len(points), np.bool_)
         found[inside] = self.cells[i[inside], j[inside]]
         return found
 
     def limit(self, lasers: Array, angles: Array, ranges: Array, jacobian: Array, scale: Array) -> None:
-        """Let beams (N, B) end where they enter what nobody has seen, with an infinite scale."""
+        """Ends beams (N, B) where they enter cells that were not seen, with an infinite scale there, in place."""
         lasers, angles = np.asarray(lasers, float).reshape(-1, 3), np.asarray(angles, float)
-        kernels.unseen(self.cells, *self.origin, SEEN_CELL, lasers, angles, SEEN_CELL, ranges, jacobian, scale)
+        kernels.end_in_unseen_cells(
+            self.cells, *self.origin, SEEN_CELL_M, lasers, angles, SEEN_CELL_M, ranges, jacobian, scale
+        )
 
 
 @dataclass(frozen=True)
 class FieldModel:
-    """A distance field with learned precision."""
+    """A generative model: a distance field with a learned precision for each class of beams."""
 
     field: DistanceField
     scales: Array = dataclasses.field(
         default_factory=lambda: np.full(int(np.prod(CLASSES)), 1e-3)
-    )  # m, error of each class
-
+    )  # m, standard deviation of the prediction error in each class
     ripple: float = 0.0  # rad, see GenerativeModel
-    seen: Seen | None = None  # where somebody has looked; none: everywhere
+    seen: Seen | None = None  # None if the whole grid counts as seen
 
     def expect(self, lasers: Array, angles: Array) -> Expected:
-        """See GenerativeModel."""
+        """Predicts scans; see GenerativeModel."""
         traced = self.field.trace(lasers, angles)
         scale = self.scales[traced.classes()]
         if self.seen is not None:

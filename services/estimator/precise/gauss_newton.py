@@ -1,7 +1,10 @@
 """Gauss-Newton descent on the free energy for many poses at once.
 
-The step is (H + P^-1 + lambda D)^-1 (xi + P^-1 (prior - x)), H the Gauss-Newton Hessian of accuracy (the Fisher
-information of the density), D its diagonal. A step that does not lower F is taken back and lambda raised.
+The step is (H + P^-1 + lambda D)^-1 (xi + P^-1 (prior - x)). H is the Gauss-Newton Hessian of accuracy (the Fisher
+information of the density), D its diagonal. A step that does not lower F is undone, and lambda is raised.
+
+Functions come in pairs: `descend` returns its result, `descending` is the same as a generator that leaves predictions
+to the caller (see `services.estimator.shared.asking`).
 """
 
 from __future__ import annotations
@@ -24,16 +27,18 @@ if TYPE_CHECKING:
     from services.estimator.precise.likelihood import Likelihood
     from services.estimator.shared.generative_models import GenerativeModel
 
-MAX_STEP = np.array([0.5, 0.5, 0.3])  # m, m, rad: beyond it the linearisation is not trusted
-CONVERGED = np.array([1e-4, 1e-4, 2e-5])  # m, m, rad: a tenth of what a scan can tell
-SETTLED = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: nearer, F is a parabola and the rest is algebra
-WIDEST, WIDE, NARROW = 0.3, 0.1, 0.03  # m, added to every beam's deviation on the way down from a seed
-DAMPING = np.diag([1.0, 1.0, 1.0]) * 1e-6  # 1/m², 1/rad²: directions of which nothing is known stay put
+MAX_STEP = np.array([0.5, 0.5, 0.3])  # m, m, rad: beyond this distance the linearisation is not valid
+CONVERGED_STEP = np.array([1e-4, 1e-4, 2e-5])  # m, m, rad: a tenth of the precision of one scan
+SETTLED_STEP = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: this near, F is quadratic and needs no further evaluation
+# Added in quadrature to every beam's standard deviation during a descent from a seed, so that the minimum is wide at
+# first.
+COARSE_SIGMA_M, MEDIUM_SIGMA_M, FINE_SIGMA_M = ANNEALING_SCHEDULE_M = (0.3, 0.1, 0.03)
+DAMPING = np.diag([1.0, 1.0, 1.0]) * 1e-6  # 1/m², 1/rad²: no step along directions without information
 
 
 @dataclass(frozen=True)
 class View:
-    """One scan as the descent sees it."""
+    """One scan, with the model and the likelihood by which poses are compared with it."""
 
     model: GenerativeModel
     likelihood: Likelihood
@@ -43,37 +48,41 @@ class View:
     range_max: float  # m
 
     def thinned(self, beams: int) -> View:
-        """Every k-th beam, so that about ``beams`` are left."""
+        """Returns a view with every k-th beam, so that about ``beams`` are left."""
         k = max(1, len(self.angles) // beams)
-        # Contiguous: of a strided array numba would compile every loop once more.
+        # numba would compile every loop once more for strided arrays, so these are contiguous.
         angles, ranges = np.ascontiguousarray(self.angles[::k]), np.ascontiguousarray(self.ranges[::k])
         return View(self.model, self.likelihood, self.mount, angles, ranges, self.range_max)
 
     @cached_property
     def points(self) -> Array:
-        """(K, 2) m in the laser, where beams ended."""
+        """End points (K, 2) of the beams that returned, m in the laser frame."""
         hit = surfaces(self.ranges) & (self.ranges < self.range_max)
         angles = self.angles[hit]
         return np.asarray(self.ranges[hit, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1))
 
-    def evidence(self, poses: Array, widen: float = 0.0) -> Evidence:
-        """What the scan says about base_link poses (N, 3), derivatives by these."""
-        return alone(self.looking(poses, widen))
+    def evidence(self, poses: Array, extra_sigma: float = 0.0) -> Evidence:
+        """Returns the evidence of the scan at base_link poses (N, 3), with derivatives by these poses.
 
-    def looking(self, poses: Array, widen: float = 0.0) -> Conversation[Evidence]:
-        """The same; the scans expected are asked for."""
+        ``extra_sigma`` m is added in quadrature to every beam's standard deviation.
+        """
+        return alone(self.looking(poses, extra_sigma))
+
+    def looking(self, poses: Array, extra_sigma: float = 0.0) -> Conversation[Evidence]:
+        """`evidence` as a generator."""
         lasers = se2.compose(poses, self.mount)
         expected: Expected = yield Expect(self.model, lasers, self.angles)
-        found = self.likelihood.evaluate(self.ranges, self.range_max, expected, widen)
-        # A turn of base_link moves the laser sideways: J_base = J_laser T.
+        at_laser = self.likelihood.evaluate(self.ranges, self.range_max, expected, extra_sigma)
+        # A rotation of base_link moves the laser sideways: J_base = J_laser T.
         T = np.tile(np.eye(3), (len(poses), 1, 1))
         T[:, 0, 2], T[:, 1, 2] = poses[:, 1] - lasers[:, 1], lasers[:, 0] - poses[:, 0]
         Tt = T.transpose(0, 2, 1)
+        matrices = (at_laser.curvature, at_laser.xi_noise_covariance, at_laser.xi_model_covariance)
         return Evidence(
-            found.accuracy,
-            found.explained,
-            (Tt @ found.xi[..., None])[..., 0],
-            *(Tt @ matrix @ T for matrix in (found.curvature, found.of_noise, found.of_model)),
+            at_laser.accuracy,
+            at_laser.inlier_ratio,
+            (Tt @ at_laser.xi[..., None])[..., 0],
+            *(Tt @ matrix @ T for matrix in matrices),
         )
 
 
@@ -85,62 +94,62 @@ class Prior:
     information: Array  # (N, 3, 3)
 
     @classmethod
-    def alike(cls, count: int, mean: Array, covariance: Array) -> Prior:
-        """The same (3,), (3, 3) for each of ``count``."""
+    def repeated(cls, count: int, mean: Array, covariance: Array) -> Prior:
+        """The same Gaussian (3,), (3, 3) for each of ``count`` hypotheses."""
         information = np.linalg.inv(covariance)
         return cls(np.tile(mean, (count, 1)), np.tile(information, (count, 1, 1)))
 
     def energy(self, poses: Array) -> Array:
-        """(N,) nats, the quadratic part."""
-        off = difference(poses, self.mean)
-        return np.asarray(0.5 * np.einsum("ni,nij,nj->n", off, self.information, off))
+        """Negative log density (N,) of poses (N, 3) in nats, without its constant."""
+        offset = difference(poses, self.mean)
+        return np.asarray(0.5 * np.einsum("ni,nij,nj->n", offset, self.information, offset))
 
 
 def difference(a: Array, b: Array) -> Array:
-    """(N, 3) a - b, the angle wrapped."""
+    """Componentwise a - b (N, 3) of poses, with the angle wrapped."""
     off = a - b
     off[:, 2] = se2.wrap(off[:, 2])
     return np.asarray(off)
 
 
-def of_position(curvature: Array) -> Array:
-    """(2, 2) what ``curvature`` (3, 3) says of the position, the heading being unknown (Schur complement)."""
+def position_information(curvature: Array) -> Array:
+    """Information (2, 2) about the position in ``curvature`` (3, 3), with the heading unknown (Schur complement)."""
     across = np.outer(curvature[:2, 2], curvature[2, :2])
     return np.asarray(curvature[:2, :2] - across / max(float(curvature[2, 2]), 1e-12))
 
 
 def descend(
-    view: View, poses: Array, prior: Prior | None = None, widen: float = 0.0, iterations: int = 10
+    view: View, poses: Array, prior: Prior | None = None, extra_sigma: float = 0.0, iterations: int = 10
 ) -> tuple[Array, Evidence]:
-    """Poses (N, 3) after the descent from ``poses``, and the evidence there."""
-    return alone(descending(view, poses, prior, widen, iterations))
+    """Returns poses (N, 3) after the descent from ``poses``, and the evidence there."""
+    return alone(descending(view, poses, prior, extra_sigma, iterations))
 
 
 def descending(
-    view: View, poses: Array, prior: Prior | None = None, widen: float = 0.0, iterations: int = 10
+    view: View, poses: Array, prior: Prior | None = None, extra_sigma: float = 0.0, iterations: int = 10
 ) -> Conversation[tuple[Array, Evidence]]:
-    """What `descend` does, as a conversation."""
+    """`descend` as a generator."""
     best = np.array(poses, float)
-    evidence = yield from view.looking(best, widen)
+    evidence = yield from view.looking(best, extra_sigma)
     energy = evidence.accuracy + (prior.energy(best) if prior else 0.0)
-    damping, live = np.full(len(best), 1e-3), np.ones(len(best), bool)
+    damping, active = np.full(len(best), 1e-3), np.ones(len(best), bool)
     for _ in range(iterations):
         step = _steps(best, evidence, prior, damping)
-        live &= (np.abs(step) > CONVERGED).any(axis=1)
-        if not live.any():
+        active &= (np.abs(step) > CONVERGED_STEP).any(axis=1)
+        if not active.any():
             break
-        trial = best[live] + step[live]
+        trial = best[active] + step[active]
         trial[:, 2] = se2.wrap(trial[:, 2])
-        tried = yield from view.looking(trial, widen)
-        part = Prior(prior.mean[live], prior.information[live]) if prior else None
-        new = tried.accuracy + (part.energy(trial) if part else 0.0)
-        better = new < energy[live]
-        rows = np.flatnonzero(live)[better]
-        best[rows], energy[rows] = trial[better], new[better]
-        for name in ("accuracy", "explained", "xi", "curvature", "of_noise", "of_model"):
-            getattr(evidence, name)[rows] = getattr(tried, name)[better]
-        damping[live] = np.where(better, damping[live] * 0.1, damping[live] * 30)
-        live &= damping < 1e4
+        trial_evidence = yield from view.looking(trial, extra_sigma)
+        trial_prior = Prior(prior.mean[active], prior.information[active]) if prior else None
+        trial_energy = trial_evidence.accuracy + (trial_prior.energy(trial) if trial_prior else 0.0)
+        better = trial_energy < energy[active]
+        rows = np.flatnonzero(active)[better]
+        best[rows], energy[rows] = trial[better], trial_energy[better]
+        for name in vars(evidence):
+            getattr(evidence, name)[rows] = getattr(trial_evidence, name)[better]
+        damping[active] = np.where(better, damping[active] * 0.1, damping[active] * 30)
+        active &= damping < 1e4
     return best, evidence
 
 
@@ -150,19 +159,20 @@ def _steps(poses: Array, evidence: Evidence, prior: Prior | None, damping: Array
         H = H + prior.information
         slope = slope + np.einsum("nij,nj->ni", prior.information, difference(prior.mean, poses))
     H = H + damping[:, None, None] * H * np.eye(3)
-    return limited(np.linalg.solve(H, slope[..., None])[..., 0], MAX_STEP)
+    return limit_steps(np.linalg.solve(H, slope[..., None])[..., 0], MAX_STEP)
 
 
-def limited(steps: npt.NDArray[np.floating[Any]], largest: Array) -> Array:
-    """Steps (..., 3) made shorter, in their direction, so that no component exceeds ``largest`` (3,)."""
+def limit_steps(steps: npt.NDArray[np.floating[Any]], largest: Array) -> Array:
+    """Shortens steps (..., 3) without changing their direction, so that no component exceeds ``largest`` (3,)."""
     return np.asarray(steps / np.maximum((np.abs(steps) / largest).max(axis=-1, keepdims=True), 1.0))
 
 
 def polish(view: View, poses: Array, prior: Prior | None = None, iterations: int = 5) -> tuple[Array, Evidence]:
-    """The last millimetres, full steps: beams that jump between surfaces ripple F there, and would stop a line search.
+    """Finds the minimum to a fraction of a millimetre with full steps, from poses (N, 3) already near it.
 
-    Each step minimises F with the beams' weights held (iteratively reweighted least squares). Returns the last poses
-    that were evaluated, at most ``SETTLED`` from the minimum, and the evidence there.
+    Near the minimum F has ripples, because beams jump between surfaces, and a line search would stop there. Each step
+    minimises F with the beams' weights held constant (iteratively reweighted least squares). Returns the last poses
+    that were evaluated, at most ``SETTLED_STEP`` from the minimum, and the evidence there.
     """
     return alone(polishing(view, poses, prior, iterations))
 
@@ -170,12 +180,12 @@ def polish(view: View, poses: Array, prior: Prior | None = None, iterations: int
 def polishing(
     view: View, poses: Array, prior: Prior | None = None, iterations: int = 5
 ) -> Conversation[tuple[Array, Evidence]]:
-    """What `polish` does, as a conversation."""
+    """`polish` as a generator."""
     poses = np.array(poses, float)
     evidence = yield from view.looking(poses)
     for _ in range(iterations - 1):
         step = _steps(poses, evidence, prior, np.zeros(len(poses)))
-        if (np.abs(step) < SETTLED).all():
+        if (np.abs(step) < SETTLED_STEP).all():
             break
         poses = poses + step
         poses[:, 2] = se2.wrap(poses[:, 2])

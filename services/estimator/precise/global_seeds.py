@@ -18,98 +18,96 @@ if TYPE_CHECKING:
     from services.estimator.shared.asking import Pieces
     from services.estimator.shared.generative_models import GenerativeModel
 
-BINS = 360  # of a cached panorama
-SPACING = 0.3  # m between the places a search begins at
-LOOKS = 40  # into a panorama take as long as the prediction of one beam
-TOLERANCE = 0.35  # m, misfit of a beam that still speaks for a place about as far from the truth
+PANORAMA_BINS = 360
+SEED_SPACING_M = 0.3  # between the places at which a search begins
+LOOKUPS_PER_BEAM = 40  # lookups in a panorama that take as long as the prediction of one beam
+MISFIT_TOLERANCE_M = 0.35  # error of a beam at a place about as far from the true one
 
 
 @dataclass(frozen=True)
 class Seeds:
-    """Panoramas expected at places over free space."""
+    """Places in free space, with the panorama of ranges that the model expects at each."""
 
     places: Array  # (S, 2) m in map, of the laser
     panoramas: np.ndarray[
         tuple[int, ...], np.dtype[np.float32]
-    ]  # (S, BINS) m in direction 2 pi k / BINS; NaN: not known
+    ]  # (S, PANORAMA_BINS) m in direction 2 pi k / PANORAMA_BINS; NaN if unknown
 
     @classmethod
     def at(cls, model: GenerativeModel, places: Array) -> Seeds:
-        """Ask the model for every place (S, 2)."""
+        """Predicts the panorama at every place (S, 2)."""
         lasers = np.column_stack([places, np.zeros(len(places))])
-        directions = np.linspace(0.0, 2 * np.pi, BINS, endpoint=False)
+        directions = np.linspace(0.0, 2 * np.pi, PANORAMA_BINS, endpoint=False)
         parts = []
         for part in np.array_split(lasers, max(1, len(lasers) // 500)):
-            seen = model.expect(part, directions)
-            parts.append(np.where(np.isinf(seen.scale), np.nan, seen.ranges).astype(np.float32))
+            expected = model.expect(part, directions)
+            parts.append(np.where(np.isinf(expected.scale), np.nan, expected.ranges).astype(np.float32))
         return cls(np.asarray(places, float), np.concatenate(parts))
 
     @property
     def volume(self) -> float:
-        """M² rad that places and headings stand for."""
-        return max(1, len(self.places)) * SPACING**2 * 2 * np.pi
+        """Volume in m² rad of the poses that the seeds represent."""
+        return max(1, len(self.places)) * SEED_SPACING_M**2 * 2 * np.pi
 
     @property
     def spread(self) -> Array:
-        """(3, 3) covariance of a pose of which nothing is known."""
+        """Covariance (3, 3) of a completely unknown pose: uniform over the map and all headings."""
         extent = np.ptp(self.places, axis=0) if len(self.places) else np.ones(2)
-        return np.diag([*np.maximum(extent, SPACING) ** 2 / 12, np.pi**2 / 3])
+        return np.diag([*np.maximum(extent, SEED_SPACING_M) ** 2 / 12, np.pi**2 / 3])
 
     def rank(self, view: View, count: int) -> Array:
-        """(count, 3) base_link poses that fit the scan best, best first; a place gives at most two headings."""
+        """The ``count`` base_link poses (count, 3) that fit the scan best, best first; at most two per place."""
         return Ranking(self, view, count).answer()
 
 
 @dataclass(frozen=True)
 class Ranking:
-    """The question a search begins with (see `asking`), answered by the starts of a descent: `Seeds.rank`."""
+    """`Seeds.rank` as a question (see `services.estimator.shared.asking`)."""
 
     seeds: Seeds
     view: View
     count: int
     headings: int = 120
-    thinned: int = 72  # beams that are compared
+    thinned: int = 72  # beams of the scan that are compared
 
     @property
     def alike(self) -> Hashable:
-        """Each on its own: there is nothing to share."""
+        """Every ranking is answered alone, since rankings share no computation."""
         return id(self)
 
     @property
     def beams(self) -> int:
-        """Of predictions that take as long as these looks into a table."""
-        return len(self.seeds.places) * self.headings * self.thinned // LOOKS
+        """Number of beam predictions that take as long as this ranking."""
+        return len(self.seeds.places) * self.headings * self.thinned // LOOKUPS_PER_BEAM
 
     def answer(self) -> Array:
-        """Now."""
+        """Returns the ranked poses."""
         return without_pause(self.in_pieces(self.beams + 1))
 
     def answer_all(self, questions: Sequence[Ranking]) -> list[Array]:
-        """One after the other."""
+        """Returns the answers to several rankings."""
         return [question.answer() for question in questions]
 
     def in_pieces(self, beams: int) -> Pieces[Array]:
-        """A few places at a time."""
+        """Ranks a few places at a time."""
         seeds, thin = self.seeds, self.view.thinned(self.thinned)
-        bins = np.round(thin.angles / (2 * np.pi / BINS)).astype(np.int64)
+        bins = np.round(thin.angles / (2 * np.pi / PANORAMA_BINS)).astype(np.int64)
         measured = thin.ranges.astype(np.float32)
         costs = np.empty((len(seeds.places), self.headings), np.float32)
-        rows = max(1, beams * LOOKS // (self.headings * self.thinned))
+        rows = max(1, beams * LOOKUPS_PER_BEAM // (self.headings * self.thinned))
+        tolerance, range_max = np.float32(MISFIT_TOLERANCE_M), np.float32(self.view.range_max)
         for begin in range(0, len(costs), rows):
             if begin:
                 yield
             part = slice(begin, begin + rows)
-            kernels.rank(
-                seeds.panoramas[part], bins, measured, np.float32(TOLERANCE), np.float32(self.view.range_max),
-                costs[part],
-            )  # fmt: skip
-        place, heading = _least(costs, self.count)
+            kernels.rank_places(seeds.panoramas[part], bins, measured, tolerance, range_max, costs[part])
+        place, heading = _least_costs(costs, self.count)
         lasers = np.column_stack([seeds.places[place], se2.wrap(heading * (2 * np.pi / self.headings))])
         return se2.compose(lasers, se2.inverse(self.view.mount))
 
 
-def _least(costs: np.ndarray[tuple[int, ...], np.dtype[np.float32]], count: int) -> tuple[Array, Array]:
-    """Place and heading of the ``count`` least costs, two headings apart at most for each place."""
+def _least_costs(costs: np.ndarray[tuple[int, ...], np.dtype[np.float32]], count: int) -> tuple[Array, Array]:
+    """Indices of place and heading of the ``count`` least costs, with at most two separate headings per place."""
     rows = np.arange(len(costs))
     first = costs.argmin(axis=1)
     rest = costs.copy()
@@ -123,7 +121,7 @@ def _least(costs: np.ndarray[tuple[int, ...], np.dtype[np.float32]], count: int)
 
 
 def thin_places(points: Array, spacing: float) -> Array:
-    """Of points (N, 2) m one for each square of a grid of ``spacing`` m, the one nearest its centre."""
+    """Selects from points (N, 2) m the one nearest the centre of each square of a grid of ``spacing`` m."""
     cell = np.floor(points / spacing)
     off = np.abs(points / spacing - cell - 0.5).max(axis=1)
     order = np.lexsort([off, cell[:, 1], cell[:, 0]])

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from common.geometry import se2
-from services.estimator.precise.gauss_newton import MAX_STEP, Prior, difference, limited, of_position
-from services.estimator.precise.motion_model import smoothed
+from services.estimator.precise.gauss_newton import MAX_STEP, Prior, difference, limit_steps, position_information
+from services.estimator.precise.motion_model import smooth_velocity
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -18,74 +18,75 @@ if TYPE_CHECKING:
     from services.estimator.precise.motion_model import Fused
     from services.estimator.precise.settings import Settings
 
-SAME_PLACE, SAME_YAW = 0.1, 0.1  # m, rad: nearer modes are one
-MEMORY = 0.8  # of the evidence of earlier scans; a model's error repeats, so evidence must not add up for ever
-BLIND, RIPPLES = 1e-4, 7.0  # information along, as a share of that across, that counts as none; of the ripple's
-GOOD_SCANS = 10  # in which a rival must have looked as scans of their place do
-NEGLIGIBLE = 1e-4  # weight below which a hypothesis is refuted
+SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # hypotheses nearer to one another than this are merged
+ENERGY_MEMORY = 0.8  # weight of earlier scans: the model's error repeats, so evidence must not add up without limit
+# A direction counts as unobserved if its information is less than this share of the information across it; a learned
+# field adds a multiple of its squared ripple to the share.
+MIN_INFORMATION_RATIO, RIPPLE_FACTOR = 1e-4, 7.0
+MIN_RIVAL_SCANS = 10  # scans for which a rival with a good inlier ratio must persist
+MIN_WEIGHT = 1e-4  # hypotheses with less weight are dropped
 
 
 @dataclass(frozen=True)
 class Mode:
-    """One hypothesis and what the last scan says about it."""
+    """One hypothesis about the pose (a mode of the posterior), and the evidence of the last scan."""
 
     pose: Array  # (3,) base_link in map
-    noise: Array  # (3, 3) covariance that scanner noise and motion leave: fusion makes it smaller
-    error: Array  # (3, 3) covariance that the model's error leaves, for independent beams: fusion does not
-    explained: float  # share of beams
+    noise_covariance: Array  # (3, 3) caused by scanner noise and motion: fusion of scans reduces it
+    model_covariance: Array  # (3, 3) caused by the model's error, for independent beams: fusion does not reduce it
+    inlier_ratio: float  # of the last scan
     accuracy: float  # nats, of the last scan
     complexity: float  # nats
-    energy: float  # nats, F averaged over the last scans: what weights come from
+    energy: float  # nats, F averaged over the last scans, from which weights are computed
     xi: Array  # (3,)
     curvature: Array  # (3, 3)
-    velocity: Array | None = None  # (3,) in base_link; None: not known yet
+    velocity: Array | None = None  # (3,) in base_link; None while unknown
     weight: float = 1.0
-    blind: int = 0  # scans in a row that say nothing along some direction
+    unobserved_scans: int = 0  # number of consecutive scans without information along some direction
     age: int = 0  # scans since it was found
-    trusted: bool = False  # it was the one tracked
+    tracked: bool = False  # tracking was reported here, or the robot was started here, and no rival has replaced it
 
     def covariance(self, inflation: float) -> Array:
-        """(3, 3) of x, y, yaw in map."""
-        return np.asarray(inflation * (self.noise + self.error))
+        """Covariance (3, 3) of x, y, yaw in map."""
+        return np.asarray(inflation * (self.noise_covariance + self.model_covariance))
 
 
-def seen(curvature: Array, ripple: float) -> tuple[Array, Array | None]:
-    """What a scan tells of the position: (3, 3) projection onto it, and the direction (2,) it tells nothing of.
+def observed_directions(curvature: Array, ripple: float) -> tuple[Array, Array | None]:
+    """Returns a projection (3, 3) onto what a scan observes, and the direction (2,) it does not observe, if any.
 
-    Along a corridor without features a learned field still has ripples: walls tilted by ``ripple`` rad, which add about
-    ripple² of the curvature across. Not clearly more than that is taken for none.
+    In a corridor without features a learned field still has ripples: walls tilted by about ``ripple`` rad, which add
+    about ripple² of the curvature across. Information that is not clearly more than that counts as none.
     """
-    values, vectors = np.linalg.eigh(of_position(curvature))
-    if values[0] >= (BLIND + RIPPLES * ripple**2) * values[1] and values[1] > 0:
+    values, vectors = np.linalg.eigh(position_information(curvature))
+    if values[0] >= (MIN_INFORMATION_RATIO + RIPPLE_FACTOR * ripple**2) * values[1] and values[1] > 0:
         return np.eye(3), None
-    keep, blind = np.eye(3), vectors[:, 0]
-    keep[:2, :2] -= np.outer(blind, blind)
-    return keep, blind
+    projection, unobserved = np.eye(3), vectors[:, 0]
+    projection[:2, :2] -= np.outer(unobserved, unobserved)
+    return projection, unobserved
 
 
-def project(evidence: Evidence, k: int, keep: Array) -> None:
-    """Leave of the k-th evidence what `seen` keeps."""
-    evidence.xi[k] = keep @ evidence.xi[k]
-    for matrix in (evidence.curvature, evidence.of_noise, evidence.of_model):
-        matrix[k] = keep @ matrix[k] @ keep
+def project_evidence(evidence: Evidence, k: int, projection: Array) -> None:
+    """Applies a projection from `observed_directions` to the k-th evidence, in place."""
+    evidence.xi[k] = projection @ evidence.xi[k]
+    for matrix in (evidence.curvature, evidence.xi_noise_covariance, evidence.xi_model_covariance):
+        matrix[k] = projection @ matrix[k] @ projection
 
 
-def found(
-    pose: Array, evidence: Evidence, k: int, prior: Prior | None, volume: float, spread: Array, ripple: float
+def mode_from_search(
+    pose: Array, evidence: Evidence, k: int, prior: Prior | None, volume: float, unknown: Array, ripple: float
 ) -> Mode:
-    """A mode of the search; of a direction that nothing is known of, ``spread`` (3, 3) remains.
+    """A hypothesis found by a search, from the k-th evidence at ``pose`` (3,).
 
-    Without a prior every pose was as likely, in ``volume`` m² rad: complexity is the KL divergence from that.
+    Without a prior every pose in ``volume`` m² rad was equally likely, and complexity is the Kullback-Leibler
+    divergence from that. ``unknown`` (3, 3), the covariance of an unknown pose, remains along unobserved directions.
     """
-    keep, _ = seen(evidence.curvature[k], ripple)
-    project(evidence, k, keep)
-    information = prior.information[k] if prior else np.linalg.inv(spread)
+    projection, _ = observed_directions(evidence.curvature[k], ripple)
+    project_evidence(evidence, k, projection)
+    information = prior.information[k] if prior else np.linalg.inv(unknown)
     inverse = np.linalg.inv(evidence.curvature[k] + information)
     slope = evidence.xi[k] + (prior.information[k] @ difference(prior.mean[k : k + 1], pose[None])[0] if prior else 0)
-    pose = pose + limited(inverse @ slope, MAX_STEP)
+    pose = pose + limit_steps(inverse @ slope, MAX_STEP)
     pose[2] = se2.wrap(pose[2])
-    noise = inverse @ (evidence.of_noise[k] + information) @ inverse
-    error = inverse @ evidence.of_model[k] @ inverse
     accuracy = float(evidence.accuracy[k])
     logdet = float(np.linalg.slogdet(evidence.curvature[k] + information)[1])
     if prior:
@@ -95,48 +96,67 @@ def found(
     else:
         complexity = float(np.log(volume)) + 0.5 * (logdet - 3 * np.log(2 * np.pi * np.e))
     return Mode(
-        pose, noise, error, float(evidence.explained[k]), accuracy, complexity, accuracy + complexity,
-        evidence.xi[k], evidence.curvature[k],
-    )  # fmt: skip
+        pose=pose,
+        noise_covariance=inverse @ (evidence.xi_noise_covariance[k] + information) @ inverse,
+        model_covariance=inverse @ evidence.xi_model_covariance[k] @ inverse,
+        inlier_ratio=float(evidence.inlier_ratio[k]),
+        accuracy=accuracy,
+        complexity=complexity,
+        energy=accuracy + complexity,
+        xi=evidence.xi[k],
+        curvature=evidence.curvature[k],
+    )
 
 
-def moved(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: float, *, blind: bool) -> Mode:
-    """The mode after a scan: noise shrinks by the scan's information, the model's error is this scan's own."""
+def update_mode(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: float, *, unobserved: bool) -> Mode:
+    """The hypothesis after a scan, from its fused prior and the k-th evidence.
+
+    The scan's information reduces the noise covariance; the model covariance is that of this scan alone. ``unobserved``
+    tells that the scan has no information along some direction.
+    """
     inverse = np.linalg.inv(fused.information)
     information = fused.information - evidence.curvature[k]
-    noise = inverse @ (evidence.of_noise[k] + information) @ inverse
-    alone = np.linalg.inv(evidence.curvature[k] + np.eye(3))
+    inverse_of_scan = np.linalg.inv(evidence.curvature[k] + np.eye(3))
     accuracy = float(evidence.accuracy[k])
-    # Of a motion that is half unseen nothing is carried on.
+    # A velocity that is not observed in every direction is not carried on.
     velocity = None
-    if not blind and not mode.blind:
-        velocity = smoothed(mode.velocity, se2.between(mode.pose, fused.mean) / period, period)
-    energy = MEMORY * mode.energy + (1 - MEMORY) * (accuracy + fused.complexity)
+    if not unobserved and not mode.unobserved_scans:
+        velocity = smooth_velocity(mode.velocity, se2.between(mode.pose, fused.mean) / period, period)
     return Mode(
-        fused.mean, noise, alone @ evidence.of_model[k] @ alone, float(evidence.explained[k]), accuracy,
-        fused.complexity, energy, evidence.xi[k], evidence.curvature[k], velocity,
-        blind=mode.blind + 1 if blind else 0, age=mode.age + 1, trusted=mode.trusted,
-    )  # fmt: skip
+        pose=fused.mean,
+        noise_covariance=inverse @ (evidence.xi_noise_covariance[k] + information) @ inverse,
+        model_covariance=inverse_of_scan @ evidence.xi_model_covariance[k] @ inverse_of_scan,
+        inlier_ratio=float(evidence.inlier_ratio[k]),
+        accuracy=accuracy,
+        complexity=fused.complexity,
+        energy=ENERGY_MEMORY * mode.energy + (1 - ENERGY_MEMORY) * (accuracy + fused.complexity),
+        xi=evidence.xi[k],
+        curvature=evidence.curvature[k],
+        velocity=velocity,
+        unobserved_scans=mode.unobserved_scans + 1 if unobserved else 0,
+        age=mode.age + 1,
+        tracked=mode.tracked,
+    )
 
 
-def within(modes: list[Mode], bounds: tuple[float, float, float, float]) -> list[Mode]:
-    """The modes, none outside the map, which goes from x0, y0 to x1, y1 (m)."""
+def clip_to_map(modes: list[Mode], bounds: tuple[float, float, float, float]) -> list[Mode]:
+    """The hypotheses with their positions clipped to the map's bounds x0, y0, x1, y1 (m)."""
     x0, y0, x1, y1 = bounds
     low, high = np.array([x0, y0, -np.inf]), np.array([x1, y1, np.inf])
     return [replace(mode, pose=np.clip(mode.pose, low, high)) for mode in modes]
 
 
-def same(poses: Array, pose: Array) -> npt.NDArray[np.bool_]:
-    """(N,) which of poses (N, 3) are the place that ``pose`` (3,) is."""
+def same_place(poses: Array, pose: Array) -> npt.NDArray[np.bool_]:
+    """Whether each of poses (N, 3) is so near to ``pose`` (3,) that both are one hypothesis: (N,)."""
     off = np.abs(difference(poses, pose))
-    return np.asarray((off[:, :2] < SAME_PLACE).all(axis=1) & (off[:, 2] < SAME_YAW))
+    return np.asarray((off[:, :2] < SAME_POSITION_M).all(axis=1) & (off[:, 2] < SAME_HEADING_RAD))
 
 
-def distinct(poses: Array, energy: Array, count: int) -> list[int]:
-    """Indices of the ``count`` least energies, no two at the same place."""
+def select_distinct(poses: Array, energy: Array, count: int) -> list[int]:
+    """Indices of up to ``count`` poses with the least energy, no two at the same place."""
     kept: list[int] = []
     for k in np.argsort(energy, kind="stable"):
-        if not same(poses[kept], poses[k]).any():
+        if not same_place(poses[kept], poses[k]).any():
             kept.append(int(k))
         if len(kept) == count:
             break
@@ -144,39 +164,41 @@ def distinct(poses: Array, energy: Array, count: int) -> list[int]:
 
 
 def weigh(modes: list[Mode], evidence_error: float, count: int) -> list[Mode]:
-    """Merged, weighed by energy, best first, refuted ones dropped.
+    """Merges hypotheses, weighs them by energy, sorts them best first, and drops those of negligible weight.
 
-    F between places is only known up to the model's error, a few beams at about 9 nats: ``evidence_error`` nats.
+    Differences in F between places are known only up to the model's error, a few beams of about 9 nats each: up to
+    ``evidence_error`` nats. A tracked hypothesis stays first; `rank_hypotheses` decides when another replaces it.
     """
     energy = np.array([mode.energy for mode in modes])
-    holder = next((k for k, mode in enumerate(modes) if mode.trusted), None)
-    if holder is not None:  # nobody goes before the place that was tracked but as `led` has it
-        energy = np.maximum(energy, energy[holder])
-        energy[holder] = np.nextafter(energy[holder], -np.inf)
-    kept = distinct(np.array([mode.pose for mode in modes]), energy, count)
+    tracked = next((k for k, mode in enumerate(modes) if mode.tracked), None)
+    if tracked is not None:
+        energy = np.maximum(energy, energy[tracked])
+        energy[tracked] = np.nextafter(energy[tracked], -np.inf)
+    kept = select_distinct(np.array([mode.pose for mode in modes]), energy, count)
     ordered = [modes[k] for k in kept]
     weights = np.exp(-(energy[kept] - energy[kept[0]]) / evidence_error)
     weights /= weights.sum()
     return [
-        replace(mode, weight=float(weight / weights[weights > NEGLIGIBLE].sum()))
+        replace(mode, weight=float(weight / weights[weights > MIN_WEIGHT].sum()))
         for mode, weight in zip(ordered, weights, strict=True)
-        if weight > NEGLIGIBLE
+        if weight > MIN_WEIGHT
     ]
 
 
-def led(modes: list[Mode], settings: Settings) -> list[Mode]:
-    """The hypotheses by weight; who was tracked leads until another has proven itself."""
-    holder = next((mode for mode in modes if mode.trusted), None)
-    if holder is not None and any(succeeds(mode, holder, settings) for mode in modes):
-        modes = [replace(mode, trusted=False) for mode in modes]
-    return weigh(modes, settings.evidence_error, settings.hypotheses)
+def rank_hypotheses(modes: list[Mode], settings: Settings) -> list[Mode]:
+    """Sorts hypotheses by weight, but keeps the tracked one first until a rival has proven itself."""
+    tracked = next((mode for mode in modes if mode.tracked), None)
+    if tracked is not None and any(_replaces_tracked(mode, tracked, settings) for mode in modes):
+        modes = [replace(mode, tracked=False) for mode in modes]
+    return weigh(modes, settings.evidence_error_nats, settings.max_hypotheses)
 
 
-def succeeds(rival: Mode, holder: Mode, settings: Settings) -> bool:
-    """Whether the robot was carried to where ``rival`` is, not only its surroundings changed.
+def _replaces_tracked(rival: Mode, tracked: Mode, settings: Settings) -> bool:
+    """Whether the robot was carried to the rival's pose, as opposed to a change of its surroundings.
 
-    One scan of a place that changed may look like another place, by hundreds of nats; scans from several places do not.
+    One scan of a changed place may fit another place better by hundreds of nats; scans from several poses do not.
     """
-    soon = GOOD_SCANS if rival.explained >= settings.good else settings.probation
-    proven = rival.age >= soon or rival.explained >= settings.satisfied
-    return proven and rival.energy < holder.energy - 3 * settings.evidence_error
+    is_good = rival.inlier_ratio >= settings.good_inlier_ratio
+    scans_needed = MIN_RIVAL_SCANS if is_good else settings.rival_probation_scans
+    proven = rival.age >= scans_needed or rival.inlier_ratio >= settings.conclusive_inlier_ratio
+    return proven and rival.energy < tracked.energy - 3 * settings.evidence_error_nats

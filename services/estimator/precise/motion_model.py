@@ -1,8 +1,15 @@
 """How the robot may have moved since the last scan, and fusion with the scan.
 
-With odometry: dead reckoning with its noise. Without: the robot stands, or goes on as it did (or as it was commanded),
-with what it can accelerate. Always, with small probability: any motion the robot is capable of. Which holds is decided
-by evidence, so that a standing robot's scans are fused and a moving one's belief does not trail.
+The prior is a mixture of motions, here called candidates:
+
+- With odometry: dead reckoning with its noise.
+- Without odometry: the robot stands still, or it keeps its velocity (or follows the velocity command), within the
+limits
+  of its acceleration.
+- Always, with a small probability: any motion the robot is capable of.
+
+The evidence of the scan selects the candidate. So the scans of a standing robot are averaged, and the belief of a
+moving robot does not lag.
 """
 
 from __future__ import annotations
@@ -13,38 +20,38 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
-from services.estimator.precise.gauss_newton import MAX_STEP, limited
+from services.estimator.precise.gauss_newton import MAX_STEP, limit_steps
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
 
 
-SMOOTH = 1 / 15  # s, over which velocity is read off the poses at least, however fast scans come
-PLAUSIBLE = 3.0  # standard deviations: motion beyond it is not taken for the robot's
-FARTHEST = 5 * MAX_STEP  # m, m, rad beyond what is plausible: as far as the last steps of a descent go
+SMOOTHING_TIME_S = 1 / 15  # the velocity is averaged over at least this time, however high the scan rate is
+MAX_MOTION_SIGMAS = 3.0  # standard deviations: faster motion is not attributed to the robot
+MAX_EXTRA_STEP = 5 * MAX_STEP  # m, m, rad beyond that: the reach of the last steps of a descent
 
 
 @dataclass(frozen=True)
 class MotionNoise:
-    """Of each axis of base_link; standard deviations where not said otherwise."""
+    """Noise of the motion model for each axis of base_link; standard deviations unless stated otherwise."""
 
-    period: float = 1 / 15  # s between scans, where stamps do not say
+    period: float = 1 / 15  # s between scans, used if the stamps do not tell
     acceleration: float = 1.0  # m/s²
     turn_acceleration: float = 3.0  # rad/s²
     speed: float = 1.0  # m/s
     turn: float = 2.0  # rad/s
-    turn_by_turn: float = 1e-3  # odometry's variance, rad² a radian turned (Thrun et al. 2005, table 5.6)
-    turn_by_path: float = 5e-4  # rad² a metre travelled
-    path_by_path: float = 1e-3  # m² a metre
-    path_by_turn: float = 1e-4  # m² a radian
-    command_share: float = 0.2  # of the commanded velocity
-    standing: float = 1e-4  # m and rad a scan: what a robot that stands may still move
+    turn_by_turn: float = 1e-3  # variance of odometry, rad² per radian turned (Thrun et al. 2005, table 5.6)
+    turn_by_path: float = 5e-4  # rad² per metre travelled
+    path_by_path: float = 1e-3  # m² per metre travelled
+    path_by_turn: float = 1e-4  # m² per radian turned
+    command_share: float = 0.2  # as a share of the commanded velocity
+    standing: float = 1e-4  # m and rad per scan: motion of a robot that stands still
     surprise: float = 0.02  # probability of any other motion
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One way the robot may have moved: a Gaussian over where it is now."""
+    """One way the robot may have moved, as a Gaussian over its present pose."""
 
     name: str
     mean: Array  # (3,)
@@ -52,13 +59,13 @@ class Candidate:
     probability: float
 
     def squared_distance(self, pose: Array) -> float:
-        """Of ``pose`` (3,) from the mean, squared standard deviations (Mahalanobis)."""
+        """Squared Mahalanobis distance of ``pose`` (3,) from the mean."""
         off = pose - self.mean
         off[2] = se2.wrap(off[2])
         return float(off @ np.linalg.solve(self.covariance, off))
 
 
-def candidates(
+def predict_motion(
     noise: MotionNoise,
     pose: Array,
     covariance: Array,
@@ -67,68 +74,77 @@ def candidates(
     command: Array | None = None,
     velocity: Array | None = None,
 ) -> list[Candidate]:
-    """Priors for now from the last posterior (3,), (3, 3); the last one is the widest.
+    """Returns the candidates after ``period`` s, from the last posterior (3,), (3, 3); the last one is the widest.
 
-    ``odom`` (3,): motion since then in base_link; ``command`` and ``velocity`` (3,): m/s, m/s, rad/s in base_link.
+    ``odom`` (3,) is the motion since then in base_link. ``command`` and ``velocity`` (3,) are in m/s, m/s, rad/s in
+    base_link; without odometry a command takes precedence over the velocity.
     """
-    reach = np.array([noise.speed, noise.speed, noise.turn]) * period
+    max_motion = np.array([noise.speed, noise.speed, noise.turn]) * period
     rest = 1 - noise.surprise
     found = []
     if odom is not None:
         moved, turned = float(np.hypot(odom[0], odom[1])), abs(float(odom[2]))
-        across = np.sqrt(noise.path_by_path * moved + noise.path_by_turn * turned) + noise.standing
-        around = np.sqrt(noise.turn_by_turn * turned + noise.turn_by_path * moved) + noise.standing
-        found.append(_moved("odometry", pose, covariance, odom, np.array([across, across, around]), rest))
+        position = np.sqrt(noise.path_by_path * moved + noise.path_by_turn * turned) + noise.standing
+        heading = np.sqrt(noise.turn_by_turn * turned + noise.turn_by_path * moved) + noise.standing
+        found.append(_propagate("odometry", pose, covariance, odom, np.array([position, position, heading]), rest))
     else:
-        found.append(_moved("standing", pose, covariance, np.zeros(3), np.full(3, noise.standing), rest / 2))
+        found.append(_propagate("standing", pose, covariance, np.zeros(3), np.full(3, noise.standing), rest / 2))
         limits = np.array([noise.acceleration, noise.acceleration, noise.turn_acceleration])
-        change = limits * period * max(period, SMOOTH)
+        change = limits * period * max(period, SMOOTHING_TIME_S)
         if command is not None:
             change = change + noise.command_share * np.abs(command) * period
-            found.append(_moved("commanded", pose, covariance, command * period, change, rest / 2))
+            found.append(_propagate("commanded", pose, covariance, command * period, change, rest / 2))
         elif velocity is not None:
-            velocity = limited(velocity, PLAUSIBLE * np.array([noise.speed, noise.speed, noise.turn]))
-            deviation = np.sqrt(change**2 + _read_off(pose, covariance, period))
-            found.append(_moved("going on", pose, covariance, velocity * period, deviation, rest / 2))
+            velocity = limit_steps(velocity, MAX_MOTION_SIGMAS * np.array([noise.speed, noise.speed, noise.turn]))
+            deviation = np.sqrt(change**2 + _velocity_variance(pose, covariance, period))
+            found.append(_propagate("going on", pose, covariance, velocity * period, deviation, rest / 2))
     centre = odom if odom is not None else np.zeros(3)
-    found.append(_moved("any motion", pose, covariance, centre, reach + np.abs(centre), noise.surprise))
+    found.append(_propagate("any motion", pose, covariance, centre, max_motion + np.abs(centre), noise.surprise))
     return found
 
 
-def smoothed(before: Array | None, now: Array, period: float) -> Array:
-    """(3,) velocity from that of the last two poses ``now`` and the one ``before``: over `SMOOTH` s at least."""
-    share = period / SMOOTH
-    return now if before is None or share >= 1 else before + share * (now - before)
+def smooth_velocity(previous: Array | None, current: Array, period: float) -> Array:
+    """Averages the velocity (3,) exponentially over at least `SMOOTHING_TIME_S`.
+
+    ``current`` is the velocity between the last two poses, ``period`` s apart, ``previous`` the average before.
+    """
+    share = period / SMOOTHING_TIME_S
+    return current if previous is None or share >= 1 else previous + share * (current - previous)
 
 
-def _read_off(pose: Array, covariance: Array, period: float) -> Array:
-    """(3,) variances in base_link that going on adds, its velocity having been read off poses of ``covariance``.
+def _velocity_variance(pose: Array, covariance: Array, period: float) -> Array:
+    """Variances (3,) in base_link of the predicted motion, because the velocity was derived from uncertain poses.
 
     With p the pose, q the one before and g the share of p - q in the velocity, p + g (p - q) has (1 + 2 g + 2 g²) times
-    the variance of p. With a slow scanner that is little beside what the robot can accelerate.
+    the variance of p. With a slow scanner this is little compared with the possible acceleration.
     """
-    share = min(1.0, period / SMOOTH)
+    share = min(1.0, period / SMOOTHING_TIME_S)
     axes = np.eye(3)
     axes[:2, :2] = se2.rotate(float(pose[2]), np.eye(2))
     return np.asarray(2 * share * (1 + share) * np.diagonal(axes @ covariance @ axes.T))
 
 
-def _moved(name: str, pose: Array, covariance: Array, step: Array, deviation: Array, probability: float) -> Candidate:
+def _propagate(
+    name: str, pose: Array, covariance: Array, step: Array, deviation: Array, probability: float
+) -> Candidate:
     by_pose, by_step = se2.compose_jacobians(pose, step)
-    spread = by_pose @ covariance @ by_pose.T + (by_step * deviation**2) @ by_step.T
-    return Candidate(name, se2.compose(pose, step), spread, probability)
+    propagated = by_pose @ covariance @ by_pose.T + (by_step * deviation**2) @ by_step.T
+    return Candidate(name, se2.compose(pose, step), propagated, probability)
 
 
-def unseen(noise: MotionNoise, option: Candidate, blind: Array, scans: int, period: float) -> Candidate:
-    """Along a direction (2,) no scan sees, the robot may have gone at full speed: the deviation grows with time."""
+def widen_unobserved(noise: MotionNoise, option: Candidate, direction: Array, scans: int, period: float) -> Candidate:
+    """Adds the motion at full speed along ``direction`` (2,), which the last ``scans`` scans did not observe.
+
+    The standard deviation grows in proportion to time.
+    """
     covariance = option.covariance.copy()
-    covariance[:2, :2] += np.outer(blind, blind) * (noise.speed * period) ** 2 * (2 * scans + 1)
+    covariance[:2, :2] += np.outer(direction, direction) * (noise.speed * period) ** 2 * (2 * scans + 1)
     return replace(option, covariance=covariance)
 
 
-def within_map(option: Candidate, spread: Array) -> Candidate:
-    """With no more variance of the position than ``spread`` (3, 3), that of a position of which nothing is known."""
-    excess = np.sqrt(np.diag(option.covariance) / np.diag(spread))
+def limit_to_map(option: Candidate, unknown: Array) -> Candidate:
+    """Limits the variance of the position to that of a completely unknown pose, ``unknown`` (3, 3)."""
+    excess = np.sqrt(np.diag(option.covariance) / np.diag(unknown))
     excess[2] = 1.0
     if (excess <= 1).all():
         return option
@@ -136,8 +152,11 @@ def within_map(option: Candidate, spread: Array) -> Candidate:
     return replace(option, covariance=option.covariance * np.outer(scale, scale))
 
 
-def within_reach(noise: MotionNoise, pose: Array, period: float, basin: float) -> Array:
-    """(K, 3) poses to which a robot may have driven unseen; none where a descent reaches as far, ``basin`` m or rad."""
+def reachable_poses(noise: MotionNoise, pose: Array, period: float, basin: float) -> Array:
+    """Poses (K, 3) that the robot may have reached without odometry, as further starts of a descent.
+
+    Returns none if the robot cannot leave the basin of attraction of a descent, ``basin`` m or rad.
+    """
     if noise.speed * period < basin and noise.turn * period < basin:
         return np.zeros((0, 3))
     ahead, turned = np.meshgrid(np.array([0.0, 0.5, 1.0]) * noise.speed, np.linspace(-1, 1, 5) * noise.turn)
@@ -152,16 +171,19 @@ class Fused:
     candidate: Candidate
     mean: Array  # (3,)
     information: Array  # (3, 3) H + P^-1
-    complexity: float  # nats, KL of the posterior from the prior
-    surprise: float  # nats, -ln of prior probability times evidence, less the scan's constant
+    complexity: float  # nats, Kullback-Leibler divergence of the posterior from the prior
+    surprise: float  # nats, -ln(prior probability times evidence), without the scan's constant
 
 
 def fuse(candidate: Candidate, mode: Array, slope: Array, curvature: Array) -> Fused:
-    """Laplace: the scan's -ln p is a parabola, ``slope`` (3,) minus its gradient at ``mode``, ``curvature`` its own.
+    """Updates a candidate by Laplace's approximation of the scan's likelihood.
 
-    Along a direction without curvature the parabola is a straight line, whose minimum with a vague prior may be
-    kilometres away. The step is therefore limited to a trust region: `MAX_STEP` beyond ``mode``, where the parabola was
-    expanded, and `FARTHEST` beyond what the candidate's covariance makes plausible.
+    The scan's -ln p is approximated by a parabola at ``mode`` (3,), with ``slope`` (3,) minus its gradient there and
+    ``curvature`` (3, 3) its Hessian.
+
+    Along a direction without curvature the parabola is a straight line, and with a wide prior the minimum may be
+    kilometres away. The step is therefore limited to a trust region: `MAX_STEP` beyond ``mode``, and `MAX_EXTRA_STEP`
+    beyond what the candidate's covariance makes plausible.
     """
     information = np.linalg.inv(candidate.covariance)
     total = curvature + information
@@ -170,14 +192,14 @@ def fuse(candidate: Candidate, mode: Array, slope: Array, curvature: Array) -> F
     # Minus the gradient of the parabola at the candidate's mean.
     pull = slope + curvature @ off
     step = np.linalg.solve(total, pull)
-    sound = curvature + 1e-9 * np.trace(curvature) * np.eye(3) + 1e-9 * np.eye(3)
-    misfit = float(pull @ np.linalg.solve(sound, pull) - pull @ step)
+    regularised = curvature + 1e-9 * np.trace(curvature) * np.eye(3) + 1e-9 * np.eye(3)
+    misfit = float(pull @ np.linalg.solve(regularised, pull) - pull @ step)
     logdet = float(np.linalg.slogdet(total)[1] - np.linalg.slogdet(information)[1])
-    evidence = 0.5 * misfit + 0.5 * logdet - np.log(candidate.probability)
-    plausible = PLAUSIBLE * np.sqrt(np.diag(candidate.covariance))
-    step = limited(step, np.minimum(np.abs(off) + MAX_STEP, plausible + FARTHEST))
+    surprise = 0.5 * misfit + 0.5 * logdet - np.log(candidate.probability)
+    plausible = MAX_MOTION_SIGMAS * np.sqrt(np.diag(candidate.covariance))
+    step = limit_steps(step, np.minimum(np.abs(off) + MAX_STEP, plausible + MAX_EXTRA_STEP))
     posterior = np.linalg.inv(total)
     kl = 0.5 * (float(np.trace(information @ posterior)) - 3 + float(step @ information @ step) + logdet)
     mean = candidate.mean + step
     mean[2] = se2.wrap(mean[2])
-    return Fused(candidate, mean, total, kl, float(evidence))
+    return Fused(candidate, mean, total, kl, float(surprise))

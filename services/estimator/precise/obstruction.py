@@ -1,4 +1,8 @@
-"""Decides whether unexplained beams contradict a pose or are only blocked."""
+"""Decides whether unexplained beams contradict a pose or are only blocked.
+
+Something in the way of a beam makes it end early, at the right pose too. A beam ends late, behind the expected surface,
+only at a wrong pose (or where something was taken away).
+"""
 
 from __future__ import annotations
 
@@ -7,47 +11,45 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
-from services.estimator.shared.generative_models import CORNER
+from services.estimator.shared.generative_models import CORNER_ANGLE_RAD
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.estimator.precise.gauss_newton import View
     from services.estimator.shared.generative_models import Expected
 
-CLEARLY = 4.0  # standard deviations
+LATE_SIGMAS = 4.0  # standard deviations behind the expected surface, from which a beam counts as late
+MIN_ACCOUNTED_SHARE = 0.95
 
 
-def contradicted(view: View, expected: Expected) -> float:
-    """Share of the ranges that end clearly behind the surface ``expected`` (of one pose) there.
-
-    Whatever stands in the way ends a beam early, at the right place too; nothing but a wrong place (or a thing that was
-    taken away) ends it late.
-    """
-    both = np.isfinite(view.ranges) & np.isfinite(expected.ranges[0])
-    return late(view, expected) * len(both) / max(1, int(both.sum()))
+def contradicting_ratio(view: View, expected: Expected) -> float:
+    """Share of late beams among those that returned and have an expected surface; ``expected`` is for one pose."""
+    comparable = np.isfinite(view.ranges) & np.isfinite(expected.ranges[0])
+    return late_ratio(view, expected) * len(comparable) / max(1, int(comparable.sum()))
 
 
-def late(view: View, expected: Expected) -> float:
-    """The same as a share of all beams: where little is expected, little can contradict."""
-    return float((np.isfinite(view.ranges) & (view.ranges > _behind(view, expected))).mean())
+def late_ratio(view: View, expected: Expected) -> float:
+    """Share of late beams among all beams, which is small if the model expects few surfaces."""
+    return float((np.isfinite(view.ranges) & (view.ranges > _late_from(view, expected))).mean())
 
 
-def crowded(view: View, expected: Expected, contradicted: float) -> bool:
-    """Whether what stands in the way is all that the model does not explain: (nearly) every beam is expected to end."""
+def is_only_blocked(view: View, expected: Expected, max_contradicting_ratio: float) -> bool:
+    """Whether the model knows nearly every beam and none is late, so that obstacles alone can explain the misfit."""
     known = np.isfinite(expected.scale[0])
-    return float((known & (view.ranges <= _behind(view, expected))).mean()) > 0.95 - contradicted
+    accounted = float((known & (view.ranges <= _late_from(view, expected))).mean())
+    return accounted > MIN_ACCOUNTED_SHARE - max_contradicting_ratio
 
 
-def held(view: View, pose: Array, direction: Array) -> float:
-    """Beams on surfaces turned towards ``direction`` (2,), by how far they are explained: they hold ``pose`` there."""
+def constraining_beams(view: View, pose: Array, direction: Array) -> float:
+    """Expected number of inlier beams on surfaces that face ``direction`` (2,), and so fix ``pose`` (3,) along it."""
     expected = view.model.expect(se2.compose(pose, view.mount)[None], view.angles)
     normal, surface, scale = expected.jacobian[0, :, :2], expected.ranges[0], expected.scale[0]
-    turned = np.abs(normal @ direction) > np.sin(CORNER) * np.hypot(*normal.T)
-    there = turned & np.isfinite(view.ranges) & np.isfinite(surface)
-    return float(view.likelihood.inlier(view.ranges[there], surface[there], scale[there], view.range_max).sum())
+    facing = np.abs(normal @ direction) > np.sin(CORNER_ANGLE_RAD) * np.hypot(*normal.T)
+    used = facing & np.isfinite(view.ranges) & np.isfinite(surface)
+    return float(view.likelihood.inlier(view.ranges[used], surface[used], scale[used], view.range_max).sum())
 
 
-def _behind(view: View, expected: Expected) -> Array:
-    """(B,) m: what is seen beyond is clearly behind the surface expected."""
+def _late_from(view: View, expected: Expected) -> Array:
+    """Ranges (B,) in m beyond which a beam is clearly behind the expected surface."""
     surface = expected.ranges[0]
-    return np.asarray(surface + CLEARLY * np.hypot(expected.scale[0], view.likelihood.deviation(surface)))
+    return np.asarray(surface + LATE_SIGMAS * np.hypot(expected.scale[0], view.likelihood.deviation(surface)))

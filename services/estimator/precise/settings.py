@@ -9,28 +9,43 @@ from services.estimator.precise.motion_model import MotionNoise
 
 @dataclass(frozen=True)
 class Settings:
-    """What can be set; defaults hold for every shipped world."""
+    """Thresholds and limits of the precise estimator; the defaults hold for every shipped world.
 
-    seeds: int = 48  # poses descended in the first round of a search
-    more_seeds: int = 240  # in the second, where the first explains too little
-    beams: int = 150  # of the descent from seeds; the last steps take all
-    satisfied: float = 0.9  # share of beams explained that ends a search
-    good: float = 0.75  # share of beams from which another place may soon follow one that was tracked
-    doubtful: float = 0.45  # share of beams below which what contradicts a place voids the claim to it
-    believable: float = 0.45  # least share of beams that a belief must explain
-    glimpse: float = 0.15  # the same, of one that was tracked, while what it does not explain stands in the way
-    contradicted: float = 0.05  # share of the beams that may end behind what such a belief expects
-    holding: float = 0.004  # share of the beams on surfaces turned that way that hold a place along a direction
-    drop: float = 0.1  # fall of the share explained that calls for a search
-    evidence_error: float = 20.0  # nats by which a model's error may set two places apart
-    ambiguous: float = 0.05  # weight of a second hypothesis from which the belief is ambiguous
-    hypotheses: int = 8
-    inflation: float = 1.0  # of the covariance, for errors of the model that hang together
-    floor_position: float = 0.0  # m, standard deviation that no scan takes away, in x and in y
+    The inlier ratio is the expected share of a scan's beams that the model explains (`Evidence.inlier_ratio`).
+    """
+
+    # Search
+    search_seeds: int = 48  # poses from which the first round of a global search descends
+    thorough_search_seeds: int = 240  # the same for the second round, if the first explains too little
+    search_beams: int = 150  # beams used by the first descents of a search; the last ones use all beams
+    conclusive_inlier_ratio: float = 0.9  # inlier ratio that ends a search
+    inlier_ratio_drop: float = 0.1  # fall of the inlier ratio below its average that triggers a search
+    energy_jump_nats: float = 150.0  # rise of accuracy above its average that triggers a search
+
+    # Belief
+    good_inlier_ratio: float = 0.75  # a scan with fewer inliers is not used as proof of a pose
+    min_inlier_ratio: float = 0.45  # below it the pose is not believed, unless the missing beams are only blocked
+    min_occluded_inlier_ratio: float = 0.15  # the same for a tracked pose whose missing beams are only blocked
+    doubtful_inlier_ratio: float = 0.45  # below it a tracked pose that beams contradict is reported as lost
+    max_contradicting_ratio: float = 0.05  # beams that may end behind the surface expected, as a share
+    min_constraining_ratio: float = 0.004  # share of beams needed to fix the position along a corridor
+
+    # State
+    tracking_inlier_ratio: float = 0.75  # one scan with this inlier ratio is enough to report tracking
+    min_scans_before_tracking: int = 30  # with a smaller ratio, a hypothesis must persist for this many scans
+    max_tracking_deviation: float = 0.5  # m, standard deviation of the position above which tracking is not reported
+    ambiguous_weight: float = 0.05  # weight of the second hypothesis above which the belief is ambiguous
+
+    # Hypotheses
+    max_hypotheses: int = 8
+    evidence_error_nats: float = 20.0  # difference in energy between two poses that the model's error may cause
+    rival_probation_scans: int = (
+        100  # a rival without good inlier ratio must persist so long to replace the tracked pose
+    )
+
+    # Covariance
+    inflation: float = 1.0  # factor on the covariance, because errors of the model are correlated between beams
+    floor_position: float = 0.0  # m, standard deviation in x and in y that no number of scans removes
     floor_heading: float = 0.0  # rad
-    sure: float = 0.75  # share of beams from which one scan is enough to say tracking
-    patience: int = 30  # scans that a place must persist with less
-    probation: int = 100  # scans for which a place that explains less than that must persist to follow another
-    rise: float = 150.0  # nats by which accuracy must worsen at once to call for a search
-    vague: float = 0.5  # m, standard deviation of a position that is not known
+
     motion: MotionNoise = field(default_factory=MotionNoise)

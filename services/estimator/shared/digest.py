@@ -14,28 +14,29 @@ if TYPE_CHECKING:
 
 
 def sha256(data: bytes) -> str:
-    """Hexadecimal."""
+    """Returns the SHA-256 of ``data`` in hexadecimal."""
     return hashlib.sha256(data).hexdigest()
 
 
 def check_digest(path: Path, data: bytes, expected: str, command: str) -> None:
-    """Raise UserError where ``data``, read from ``path``, are not what the card describes.
+    """Raises UserError if the digest of ``data``, read from ``path``, is not ``expected``, the one in the model card.
 
-    Cards written before the digest existed have an empty one. They are accepted with a warning, since old recordings
-    hold such cards. ``command`` is the one that trains the weights.
+    Cards written before digests existed have an empty one. They are accepted with a warning, because old recordings
+    contain such cards. ``command`` is the command that trains the weights.
     """
     if not expected:
-        _warn(path, command)
+        _warn_once(path, command)
     elif sha256(data) != expected:
         raise UserError(
-            f"weights {path}: the file is damaged, or belongs to another card: its SHA-256 is not the one in "
-            f"{path.with_suffix('.json').name}. Restore both files, or train again with: {command}"
+            f"weights {path}: the file is damaged or belongs to another model card, because its SHA-256 is not the "
+            f"one in {path.with_suffix('.json').name}. Restore both files, or train again with: {command}"
         )
 
 
 @functools.cache
-def _warn(path: Path, command: str) -> None:
-    """Once for each file."""
+def _warn_once(path: Path, command: str) -> None:
     logging.getLogger("estimator").warning(
-        "%s: its model card has no digest, so damage cannot be detected; training again adds one: %s", path, command
+        "%s: the model card has no digest, so damage to the file cannot be detected; train again to add one: %s",
+        path,
+        command,
     )

@@ -11,10 +11,11 @@ from services.estimator.shared.kernels import FACING, jit
 
 @jit
 def cast_cells(occupied, clear, frame, lasers, angles, ranges, jacobian):
-    """Where cells are nearer than ``ranges`` (N, B) m, their distance, and its derivative into jacobian (N, B, 3).
+    """Casts rays against the cells of a grid, from lasers (N, 3) in map along angles (B,).
 
-    ``occupied`` and ``clear`` (rows, columns) of `CellRays`; ``frame``: x, y m and yaw rad in map of the lower left
-    corner of their first cell, and m a cell; lasers (N, 3) in map, angles (B,).
+    Where a cell is nearer than ``ranges`` (N, B) m, writes its distance there, and the derivative to jacobian (N, B,
+    3). ``occupied`` and ``clear`` (rows, columns) are those of `CellRays`. ``frame`` holds x, y (m) and yaw (rad) in
+    map of the lower left corner of the first cell, and the size of a cell in m.
     """
     rows, columns = occupied.shape
     size, cos, sin = frame[3], math.cos(frame[2]), math.sin(frame[2])
@@ -36,8 +37,8 @@ def cast_cells(occupied, clear, frame, lasers, angles, ranges, jacobian):
                 continue
             column = min(max(math.floor(px + at * ux), 0), columns - 1)
             row = min(max(math.floor(py + at * uy), 0), rows - 1)
-            began, hit, most = occupied[row, column], False, ranges[k, b] / size
-            while at < most:
+            start_occupied, hit, max_length = occupied[row, column], False, ranges[k, b] / size
+            while at < max_length:
                 radius = np.int64(clear[row, column])  # int() would keep it unsigned
                 to_x = np.inf if ux == 0.0 else (column + (radius + 1 if ux > 0 else -radius) - px) / ux
                 to_y = np.inf if uy == 0.0 else (row + (radius + 1 if uy > 0 else -radius) - py) / uy
@@ -54,8 +55,8 @@ def cast_cells(occupied, clear, frame, lasers, angles, ranges, jacobian):
                     column = min(max(math.floor(px + at * ux), low), high)
                 if column < 0 or column >= columns or row < 0 or row >= rows:
                     break
-                if occupied[row, column] != began:
-                    hit = at < most
+                if occupied[row, column] != start_occupied:
+                    hit = at < max_length
                     break
             if not hit:
                 continue

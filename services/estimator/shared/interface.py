@@ -15,80 +15,84 @@ State = Literal["localising", "tracking", "ambiguous", "lost"]
 
 @dataclass(frozen=True)
 class Observation:
-    """One scan, and what else is known of the motion that led to it."""
+    """One scan, and other information about the motion since the last scan."""
 
-    ranges: Array  # (B,) m; +inf nothing within range_max, -inf says nothing (common/robot/ranges.py)
+    ranges: Array  # (B,) m; +inf: no return within range_max, -inf: not measured (common/robot/ranges.py)
     angles: Array  # (B,) rad in laser
     range_max: float  # m
-    stamp: float | None = None  # s, of the measurement; None: no clock, scans count
+    stamp: float | None = (
+        None  # s, time of the measurement; None if there is no clock, and scans come at a nominal rate
+    )
     odom: Array | None = None  # (3,) base_link in odom at the stamp
-    command: Array | None = None  # (3,) m/s, m/s, rad/s in base_link: the last velocity command
-    goal: Array | None = None  # (3,) base_link in map that is preferred; only the paper's equation 3 has a use for it
+    command: Array | None = None  # (3,) the last velocity command: m/s, m/s, rad/s in base_link
+    goal: Array | None = None  # (3,) preferred pose, base_link in map; used only by the paper's equation 3
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One Gaussian of a mixture."""
+    """One Gaussian of the posterior, which is a mixture."""
 
     pose: Array  # (3,) base_link in map
-    covariance: Array | None  # (3, 3) of x, y, yaw in map; None: this estimator has none
-    weight: float  # of the mixture, sums to 1
+    covariance: Array | None  # (3, 3) of x, y, yaw in map; None if the estimator has no covariance
+    weight: float  # weights of a mixture sum to 1
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """The belief after a scan; the best hypothesis first."""
+    """The belief after a scan."""
 
     state: State
-    hypotheses: tuple[Hypothesis, ...]
-    accuracy: float  # nats, -ln p(o | pose), over the best hypothesis
-    complexity: float  # nats, how far the posterior is from the prior
+    hypotheses: tuple[Hypothesis, ...]  # best first
+    accuracy: float  # nats, -ln p(o | pose) at the best hypothesis
+    complexity: float  # nats, Kullback-Leibler divergence of the posterior from the prior
     xi: Array  # (3,) minus the gradient of accuracy at the pose, in map
     curvature: Array  # (3, 3) Gauss-Newton Hessian of accuracy, in map
-    predicted: Array  # (B,) m expected at the pose
-    sigma: Array = field(default_factory=lambda: np.zeros(0))  # (B,) m, its stated standard deviation; empty: none
+    predicted: Array  # (B,) m, ranges expected at the pose
+    sigma: Array = field(
+        default_factory=lambda: np.zeros(0)
+    )  # (B,) m, standard deviation of these; empty if the estimator states none
 
     @property
     def pose(self) -> Array:
-        """(3,) base_link in map, of the best hypothesis."""
+        """Pose (3,) of the best hypothesis, base_link in map."""
         return self.hypotheses[0].pose
 
     @property
     def covariance(self) -> Array | None:
-        """(3, 3) of the best hypothesis; None where the estimator has none."""
+        """Covariance (3, 3) of the best hypothesis; None if the estimator has no covariance."""
         return self.hypotheses[0].covariance
 
     @property
     def free_energy(self) -> float:
-        """Nats: accuracy + complexity."""
+        """Free energy in nats: accuracy + complexity."""
         return self.accuracy + self.complexity
 
 
 @dataclass(frozen=True)
 class Predicted:
-    """The scans expected from N poses along B beams."""
+    """Scans predicted at N poses along B beams."""
 
-    ranges: Array  # (N, B) m; +inf: no return expected
-    sigma: Array  # (N, B) m, their stated standard deviation
+    ranges: Array  # (N, B) m; +inf if no return is expected
+    sigma: Array  # (N, B) m, standard deviation of the ranges
 
 
 class Estimator(Protocol):
-    """Perception, whatever its method."""
+    """Estimates the pose of one robot from its scans."""
 
     name: str
 
     def update(self, observation: Observation) -> Posterior:
-        """The posterior after one more scan."""
+        """Returns the posterior after one more scan."""
         ...
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
-        """What would be seen from base_link poses (N, 3) in map along beams at ``angles`` (B,) rad in laser.
+        """Predicts scans at base_link poses (N, 3) in map, along beams at ``angles`` (B,) rad in the laser frame.
 
-        Wherever the poses are, inside walls too; the belief does not change. Raises UserError where the model cannot
+        The poses may be anywhere, also inside walls. The belief does not change. Raises UserError if the model cannot
         predict such poses or beams.
         """
         ...
 
     def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:
-        """Begin anew: near ``pose`` (3,) with ``covariance`` (3, 3), or knowing nothing."""
+        """Discards the belief, and starts near ``pose`` (3,) with ``covariance`` (3, 3), or from an unknown pose."""
         ...

@@ -1,6 +1,6 @@
 """Inner loops over beams, compiled by numba.
 
-Compiled once a machine (numba keeps the result beside this file, or in NUMBA_CACHE_DIR), loaded afterwards.
+numba keeps the compiled code beside this file, or in NUMBA_CACHE_DIR, so it is compiled once per machine.
 """
 
 from __future__ import annotations
@@ -10,19 +10,22 @@ import math
 import numba
 import numpy as np
 
-MIN_STEP = 0.25  # cells; a shorter stride would creep along walls, a longer one jump over corners
+MIN_STEP_CELLS = 0.25  # shorter steps would take long along walls, longer ones would jump over corners
 MAX_STEPS = 2000
-SHORT = 0.6  # of the misfit of a beam too long is that of one too short: much may shorten beams, little lengthens
-UNKNOWN = 0.4  # misfit of a beam of which nothing is expected
-FACING = 0.02  # least |n . u| that is divided by
-GRAZING = 0.05  # |n . u| below which (three degrees from the surface, or an edge) no derivative is claimed
+SHORT_MISFIT_FACTOR = 0.6  # a beam that is too short counts less than one too long, because it may be blocked
+UNKNOWN_MISFIT = 0.4  # of a beam for which the model expects nothing
+FACING = 0.02  # lower limit of |n . u| in divisions
+GRAZING = 0.05  # no derivative is computed if |n . u| is less (below three degrees of incidence, or at an edge)
 
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @jit
 def lookup(phi, x, y):
-    """Bilinear phi (m) at grid coordinates (cells), its derivatives by x and y (m a cell), whether it is inside."""
+    """Interpolates phi (m) bilinearly at grid coordinates (cells).
+
+    Returns phi, its derivatives by x and y (m per cell), and whether the point is inside the grid.
+    """
     ny, nx = phi.shape
     if not (0 <= x < nx - 1 and 0 <= y < ny - 1):
         return 0.0, 0.0, 0.0, False
@@ -36,8 +39,11 @@ def lookup(phi, x, y):
 
 @jit
 def trace_one(phi, h, x, y, ux, uy):
-    """Sphere tracing in grid coordinates: length of the beam and nearest pass by another surface (m), inf for none."""
-    t, step, before, falling, dip = 0.0, 0.0, 0.0, False, np.inf
+    """Traces one beam by sphere tracing, in grid coordinates.
+
+    Returns the length of the beam and the least distance at which it passed another surface, both in m; inf if none.
+    """
+    t, step, previous, falling, dip = 0.0, 0.0, 0.0, False, np.inf
     for _ in range(MAX_STEPS):
         value, _, _, inside = lookup(phi, x + t * ux, y + t * uy)
         if not inside:
@@ -46,25 +52,26 @@ def trace_one(phi, h, x, y, ux, uy):
         if value <= 0.0:
             if step == 0.0:
                 return 0.0, dip
-            t -= step * -value / (before - value)  # regula falsi with the last point outside
+            t -= step * -value / (previous - value)  # regula falsi with the last point in free space
             value, gx, gy, _ = lookup(phi, x + t * ux, y + t * uy)
             slope = gx * ux + gy * uy
             if slope < -FACING * h:  # one Newton step onto the surface
                 t -= min(max(value / slope, -1.0), 1.0)
             return max(t, 0.0) * h, dip
-        if falling and value > before:
-            dip = min(dip, before * h)
-        falling, before = value < before, value
-        step = max(0.98 * value, MIN_STEP)
+        if falling and value > previous:
+            dip = min(dip, previous * h)
+        falling, previous = value < previous, value
+        step = max(0.98 * value, MIN_STEP_CELLS)
         t += step
     return np.inf, dip
 
 
 @jit
 def trace(phi, ox, oy, h, lasers, angles, ranges, jacobian, dip, edge, facing):
-    """Beams ``angles`` (B,) of lasers (N, 3): fills ranges (N, B), jacobian (N, B, 3), and (N, B) dip, edge, facing.
+    """Traces beams at ``angles`` (B,) from lasers (N, 3), and fills the fields of `field.Traced`.
 
-    dr = -(n . dp + r n . u' dyaw) / (n . u). Edge: how deep, relative to a plane, one cell behind the surface lies.
+    These are ranges (N, B), jacobian (N, B, 3), and dip, edge and facing (N, B). The derivative of a range is
+    dr = -(n . dp + r n . u' dyaw) / (n . u). Edge is the depth one cell behind the surface, relative to a plane.
     """
     for k in range(lasers.shape[0]):
         x, y = (lasers[k, 0] - ox) / h, (lasers[k, 1] - oy) / h
@@ -90,7 +97,10 @@ def trace(phi, ox, oy, h, lasers, angles, ranges, jacobian, dip, edge, facing):
 
 @jit
 def cast(segments, circles, lasers, angles, ranges, jacobian):
-    """Exact rays of lasers (N, 3) against segments (S, 4), circles (C, 3): fills ranges (N, B), jacobian (N, B, 3)."""
+    """Casts exact rays from lasers (N, 3) against segments (S, 4) and circles (C, 3).
+
+    Fills ranges (N, B) and jacobian (N, B, 3).
+    """
     for k in range(lasers.shape[0]):
         px, py = lasers[k, 0], lasers[k, 1]
         for b in range(angles.shape[0]):
@@ -129,13 +139,14 @@ def cast(segments, circles, lasers, angles, ranges, jacobian):
 
 @jit
 def accumulate(
-    measured, expected, jacobian, scale, sigma, relative, widen, short, random, range_max, unseen,
+    measured, expected, jacobian, scale, sigma, relative, extra_sigma, short, random, range_max, unseen,
     total, gradient, matrices,
 ):  # fmt: skip
-    """Sums over beams of -ln p(o | pose) and its derivatives; see `services.estimator.precise.likelihood`.
+    """Sums -ln p(o | pose) and its derivatives over the beams; see `services.estimator.precise.likelihood`.
 
-    Fills total (N, 3) energy, explained, used; gradient (N, 3); matrices (N, 3, 3, 3): curvature, and its parts from
-    the scanner's noise and from the model's error.
+    Adds to total (N, 3), whose columns are the energy, the expected number of inliers and the number of used beams; to
+    gradient (N, 3); and to matrices (N, 3, 3, 3), which are the curvature and the covariances of the gradient caused by
+    the scanner's noise and by the model's error.
     """
     flat = random / range_max
     for k in range(expected.shape[0]):
@@ -143,7 +154,7 @@ def accumulate(
             o, g = measured[b], expected[k, b]
             if o == -np.inf or np.isnan(o):
                 continue
-            if scale[k, b] == np.inf:  # nobody has looked beyond g: any range from there on is as likely
+            if scale[k, b] == np.inf:  # unknown beyond g: all ranges beyond are equally likely
                 if o < g:
                     total[k, 2] += 1.0
                     total[k, 0] -= math.log((1.0 - unseen) * (flat + short / max(g, 1e-3)))
@@ -161,7 +172,7 @@ def accumulate(
                 total[k, 0] -= math.log(unseen / range_max)
                 continue
             noise, model = sigma * sigma + relative * relative * g * g, scale[k, b] * scale[k, b]
-            variance = noise + model + widen * widen
+            variance = noise + model + extra_sigma * extra_sigma
             e = o - g
             core = (1.0 - short - random) * math.exp(-0.5 * e * e / variance) / math.sqrt(2 * math.pi * variance)
             early = short / max(g, 1e-3) if o < g else 0.0
@@ -182,8 +193,11 @@ def accumulate(
 
 
 @jit
-def rank(panoramas, bins, measured, tolerance, range_max, costs):
-    """Misfit of every place and heading: fills costs (S, H) with the mean over beams of e² / (e² + tolerance²)."""
+def rank_places(panoramas, bins, measured, tolerance, range_max, costs):
+    """Fills costs (S, H) of every place and heading with the mean over beams of e² / (e² + tolerance²).
+
+    Shortened beams count less, see `SHORT_MISFIT_FACTOR`.
+    """
     size, headings = panoramas.shape[1], costs.shape[1]
     for s in range(panoramas.shape[0]):
         for h in range(headings):
@@ -195,28 +209,29 @@ def rank(panoramas, bins, measured, tolerance, range_max, costs):
                     continue
                 g = panoramas[s, (bins[b] + shift) % size]
                 if np.isnan(g):
-                    total, used = total + UNKNOWN, used + 1
+                    total, used = total + UNKNOWN_MISFIT, used + 1
                     continue
                 e = min(o, range_max) - min(g, range_max)
                 misfit = e * e / (e * e + tolerance * tolerance)
-                total += misfit if e > 0.0 else SHORT * misfit
+                total += misfit if e > 0.0 else SHORT_MISFIT_FACTOR * misfit
                 used += 1
             costs[s, h] = total / max(used, 1)
 
 
 @jit
-def crossings(starts, unit, ranges, h, surface, mx, my, nx, ny, margin, crossed):
-    """Beams that went through a surface element: counted in crossed (ny, nx), by the cell of the element.
+def count_crossings(starts, unit, ranges, h, surface, mx, my, nx, ny, margin, crossed):
+    """Counts in crossed (ny, nx) the beams that passed through the surface element of each cell.
 
-    In metres from node (0, 0): starts (R, 2), unit directions (R, 2), ranges (R,), of each ``surface`` cell of ``h`` m
-    the element's mean and normal. Through: across its plane within the cell, and ``margin`` m behind it at the end.
+    Beams have starts (R, 2), unit directions (R, 2) and ranges (R,), in m from node (0, 0). Cells of ``h`` m with
+    ``surface`` set have an element with mean (mx, my) and normal (nx, ny). A beam passes through it if it crosses the
+    element's plane within the cell, and ends at least ``margin`` m behind it.
     """
     rows, columns = surface.shape
     for b in range(ranges.shape[0]):
         x, y, ux, uy = starts[b, 0] / h, starts[b, 1] / h, unit[b, 0], unit[b, 1]
         j, i = int(x), int(y)
         sx, sy = (1 if ux > 0 else -1), (1 if uy > 0 else -1)
-        # Amanatides and Woo 1987: from cell to cell, by the next edge in x or in y.
+        # Amanatides and Woo 1987: step from cell to cell, across the nearer edge in x or in y.
         ax = ((j + (ux > 0)) - x) / ux if ux != 0.0 else np.inf
         ay = ((i + (uy > 0)) - y) / uy if uy != 0.0 else np.inf
         end, t = ranges[b] / h, 0.0
@@ -238,8 +253,11 @@ def crossings(starts, unit, ranges, h, surface, mx, my, nx, ny, margin, crossed)
 
 
 @jit
-def look(starts, unit, ranges, h, seen):
-    """Beams from starts (R, 2) along unit directions (R, 2) for ranges (R,), m from node (0, 0): marks cells passed."""
+def mark_seen_cells(starts, unit, ranges, h, seen):
+    """Marks in ``seen`` the cells of ``h`` m that beams pass.
+
+    Beams have starts (R, 2), unit directions (R, 2) and ranges (R,), in m from node (0, 0).
+    """
     rows, columns = seen.shape
     for b in range(ranges.shape[0]):
         for k in range(int(ranges[b] / (0.5 * h)) + 1):
@@ -250,19 +268,19 @@ def look(starts, unit, ranges, h, seen):
 
 
 @jit
-def unseen(seen, ox, oy, h, lasers, angles, allowed, ranges, jacobian, scale):
-    """Of beams that pass more than ``allowed`` m of cells nobody looked into, before they end: end there, scale inf."""
+def end_in_unseen_cells(seen, ox, oy, h, lasers, angles, allowed, ranges, jacobian, scale):
+    """Ends each beam where it has passed more than ``allowed`` m of unseen cells, with infinite scale there."""
     rows, columns = seen.shape
     for k in range(lasers.shape[0]):
         for b in range(angles.shape[0]):
             ux, uy = math.cos(lasers[k, 2] + angles[b]), math.sin(lasers[k, 2] + angles[b])
-            dark, t, step = 0.0, 0.0, 0.5 * h
+            unseen_length, t, step = 0.0, 0.0, 0.5 * h
             while t < ranges[k, b]:
                 x, y = (lasers[k, 0] + t * ux - ox) / h, (lasers[k, 1] + t * uy - oy) / h
                 inside = 0 <= x < columns and 0 <= y < rows
                 if not inside or not seen[int(y), int(x)]:
-                    dark += step
-                    if dark > allowed:
+                    unseen_length += step
+                    if unseen_length > allowed:
                         ranges[k, b], scale[k, b] = t, np.inf
                         jacobian[k, b, :] = 0.0
                         break

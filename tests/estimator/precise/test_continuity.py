@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from common.geometry import se2
 from common.geometry.world import World
 from lab.accuracy.scenes import Scene
-from services.estimator.precise.continuity import BEGINS, PROVEN, Continuity
+from services.estimator.precise.continuity import MIN_PROVEN_SCANS, MIN_SHARE_TO_BEGIN, Continuity
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.global_seeds import Seeds, thin_places
@@ -67,7 +67,7 @@ def test_a_scan_lies_where_it_was_taken(x, y, yaw, seed):
     scene = Scene.of(ROOM, 361, seed)
     recent = RecentScans(np.array(scene.scanner.mount))
     here = np.array([3.0, 1.5, 0.4])
-    assert recent.keep(here, scan(scene, here))
+    assert recent.add(here, scan(scene, here))
     there = se2.compose(here, [x, y, yaw])
     match = recent.match(here[None], scan(scene, there), Candidate("any", here, STEP, 1.0))
     assert match is not None
@@ -82,10 +82,10 @@ def test_a_scan_from_elsewhere_does_not_go_on():
     scene = Scene.of(HALL, 361, 1)
     recent = RecentScans(np.array(scene.scanner.mount))
     here = np.array([3.0, 2.0, 0.0])
-    recent.keep(here, scan(scene, here))
+    recent.add(here, scan(scene, here))
     for there in ([12.5, 3.5, 2.0], [14.0, 1.2, -2.0], [9.0, 1.0, 1.0]):
         match = recent.match(here[None], scan(scene, there), Candidate("any", here, STEP, 1.0))
-        assert match is None or match.share < BEGINS
+        assert match is None or match.share < MIN_SHARE_TO_BEGIN
 
 
 def test_along_a_hall_without_features_a_match_is_blind():
@@ -93,7 +93,7 @@ def test_along_a_hall_without_features_a_match_is_blind():
     scene = Scene.of(bare, 361, 1)
     recent = RecentScans(np.array(scene.scanner.mount))
     here = np.array([30.0, 1.0, 0.0])
-    recent.keep(here, scan(scene, here))
+    recent.add(here, scan(scene, here))
     match = recent.match(here[None], scan(scene, here), Candidate("any", here, STEP, 1.0))
     assert match is not None
     assert match.blind
@@ -101,7 +101,7 @@ def test_along_a_hall_without_features_a_match_is_blind():
 
 def test_too_few_points_tell_nothing():
     recent = RecentScans(np.zeros(3))
-    assert not recent.keep(np.zeros(3), np.zeros((3, 2)))
+    assert not recent.add(np.zeros(3), np.zeros((3, 2)))
     assert recent.match(np.zeros((1, 3)), np.ones((100, 2)), Candidate("any", np.zeros(3), STEP, 1.0)) is None
 
 
@@ -115,13 +115,13 @@ def test_what_it_says_does_not_depend_on_the_frame(yaw, x):
 
     def held(move):
         made = Continuity(np.array(scene.scanner.mount))
-        made.forget(given=True)
+        made.reset(pose_given=True)
         for pose, seen in zip(poses[:4], points[:4], strict=True):
-            made.keep(se2.compose(move, pose), np.diag([1e-4, 1e-4, 1e-5]), seen, explained=True)
+            made.add(se2.compose(move, pose), np.diag([1e-4, 1e-4, 1e-5]), seen, explained=True)
         start = se2.compose(move, poses[4])
         turn = np.eye(3)
         turn[:2, :2] = se2.rotate(float(move[2]), np.eye(2)).T
-        found = made.hold([Candidate("any", start, turn @ STEP @ turn.T, 1.0)], start, points[4], 0.0)
+        found = made.match([Candidate("any", start, turn @ STEP @ turn.T, 1.0)], start, points[4], 0.0)
         assert found is not None
         return found.mean, turn.T @ found.covariance @ turn
 
@@ -136,19 +136,19 @@ def test_a_place_must_be_proven_and_not_be_contradicted():
     made = Continuity(np.array(scene.scanner.mount))
     here = np.array([2.5, 1.5, 0.0])
     option = [Candidate("any", here, STEP, 1.0)]
-    for k in range(PROVEN):
-        assert made.hold(option, here, scan(scene, here), 0.0) is None
-        made.keep(
+    for k in range(MIN_PROVEN_SCANS):
+        assert made.match(option, here, scan(scene, here), 0.0) is None
+        made.add(
             se2.compose(here, [0.3 * k, 0, 0]),
             np.eye(3) * 1e-4,
             scan(scene, here + np.array([0.3 * k, 0, 0])),
             explained=True,
         )
-    assert made.hold(option, here, scan(scene, here), 0.0) is not None
-    made.passed(1.0)
-    assert made.hold(option, here, scan(scene, here), 0.0) is None  # it may have gone a metre
-    made.passed(0.1)
-    held = [made.hold(option, here, scan(scene, here), 0.9) is not None for _ in range(30)]
+    assert made.match(option, here, scan(scene, here), 0.0) is not None
+    made.begin_scan(1.0)
+    assert made.match(option, here, scan(scene, here), 0.0) is None  # it may have gone a metre
+    made.begin_scan(0.1)
+    held = [made.match(option, here, scan(scene, here), 0.9) is not None for _ in range(30)]
     assert held[0]
     assert not held[-1]
 

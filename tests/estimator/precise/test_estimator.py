@@ -14,7 +14,7 @@ from lab.accuracy import bound, tasks
 from lab.accuracy.runner import quick_field
 from lab.accuracy.scenes import TWINS, Scene
 from services.estimator.factory import Choice, Geometry, prepare
-from services.estimator.precise.estimator import ENOUGH_BEAMS, PreciseEstimator
+from services.estimator.precise.estimator import TARGET_BEAMS, PreciseEstimator
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.interface import Observation
@@ -55,7 +55,7 @@ def test_the_cost_of_a_search_does_not_grow_with_the_beams(monkeypatch):
     posterior = feed(made, scene, pose, 1)[0]
     assert np.abs(off(posterior, pose)).max() < 0.01
     assert posterior.predicted.shape == posterior.sigma.shape == (MAX_BEAMS,)
-    assert max(beams for poses, beams in looked_at if poses > 1) < 2 * ENOUGH_BEAMS
+    assert max(beams for poses, beams in looked_at if poses > 1) < 2 * TARGET_BEAMS
 
 
 def test_one_scan_finds_the_place_and_twenty_are_worth_more():

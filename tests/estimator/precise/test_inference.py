@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from common.geometry import se2
 from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View, descend, difference, polish
 from services.estimator.precise.global_seeds import Seeds, thin_places
-from services.estimator.precise.hypotheses import Mode, distinct, weigh
+from services.estimator.precise.hypotheses import Mode, select_distinct, weigh
 from services.estimator.precise.likelihood import Likelihood
-from services.estimator.precise.motion_model import Candidate, MotionNoise, candidates, fuse
+from services.estimator.precise.motion_model import Candidate, MotionNoise, fuse, predict_motion
 from services.estimator.shared.generative_models import Expected, RayCaster
 from services.estimator.shared.kernels import FACING
 from tests.estimator.models import ROOM
@@ -135,7 +135,7 @@ def test_the_descent_lowers_f_and_finds_the_truth(seed):
     poses, evidence = polish(seen, poses)
     best = int(evidence.accuracy.argmin())
     assert np.hypot(*(poses[best] - TRUTH)[:2]) < 0.02
-    assert evidence.explained[best] > 0.9
+    assert evidence.inlier_ratio[best] > 0.9
 
 
 def test_a_prior_holds_where_the_scan_says_nothing():
@@ -181,15 +181,15 @@ def test_fusing_takes_no_step_beyond_the_trust_region(numbers, curvatures, devia
 
 def test_motion_priors():
     noise, P = MotionNoise(), 1e-6 * np.eye(3)
-    standing, going, wide = candidates(noise, TRUTH, P, 0.1, velocity=np.array([1.0, 0, 0]))
+    standing, going, wide = predict_motion(noise, TRUTH, P, 0.1, velocity=np.array([1.0, 0, 0]))
     assert standing.mean == pytest.approx(TRUTH)
     assert going.mean == pytest.approx(se2.compose(TRUTH, [0.1, 0, 0]))
     assert [np.trace(c.covariance[:2, :2]) for c in (standing, going, wide)] == sorted(
         np.trace(c.covariance[:2, :2]) for c in (standing, going, wide)
     )
-    odom, _ = candidates(noise, TRUTH, P, 0.1, odom=np.array([0.1, 0, 0.2]), velocity=np.ones(3))
+    odom, _ = predict_motion(noise, TRUTH, P, 0.1, odom=np.array([0.1, 0, 0.2]), velocity=np.ones(3))
     assert odom.mean == pytest.approx(se2.compose(TRUTH, [0.1, 0, 0.2]))
-    commanded = candidates(noise, TRUTH, P, 0.1, command=np.array([0.5, 0, 0]), velocity=np.ones(3))[1]
+    commanded = predict_motion(noise, TRUTH, P, 0.1, command=np.array([0.5, 0, 0]), velocity=np.ones(3))[1]
     assert commanded.name == "commanded"
     assert commanded.mean == pytest.approx(se2.compose(TRUTH, [0.05, 0, 0]))
     assert sum(c.probability for c in (standing, going, wide)) == pytest.approx(1)
@@ -208,7 +208,7 @@ def test_modes_are_merged_weighed_and_dropped():
 
 def test_headings_a_turn_apart_are_one():
     poses = np.array([[0, 0, np.pi - 0.01], [0, 0, -np.pi + 0.01], [0, 0, 0.0]])
-    assert distinct(poses, np.array([1.0, 0.0, 2.0]), 8) == [1, 2]
+    assert select_distinct(poses, np.array([1.0, 0.0, 2.0]), 8) == [1, 2]
 
 
 def test_ranking_puts_the_truth_among_the_first():

@@ -37,9 +37,9 @@ def test_people_contradict_nothing_and_another_place_does():
     here, there = np.array([2.5, 2.0, 0.3]), np.array([5.0, 3.0, -1.0])
     clean = RayCaster(ROOM).expect(here[None], scene.scanner.angles()).ranges[0]
     view = view_of(made, scene, crowd(clean, 0.7) + RNG.normal(0, 0.02, len(clean)))
-    assert obstruction.contradicted(view, expected_at(view, here)) < 0.01
+    assert obstruction.contradicting_ratio(view, expected_at(view, here)) < 0.01
     whole = view_of(made, scene, clean)
-    assert obstruction.contradicted(whole, expected_at(whole, there)) > 0.2
+    assert obstruction.contradicting_ratio(whole, expected_at(whole, there)) > 0.2
 
 
 def test_where_no_return_is_expected_nothing_contradicts():
@@ -48,10 +48,10 @@ def test_where_no_return_is_expected_nothing_contradicts():
     nothing = Expected(np.full((1, count), np.inf), np.full((1, count), 0.01), np.zeros((1, count, 3)))
     for measured in (np.inf, 2.0, -np.inf):
         view = view_of(made, scene, np.full(count, measured))
-        assert obstruction.crowded(view, nothing, 0.02)
-        assert obstruction.late(view, nothing) == obstruction.contradicted(view, nothing) == 0
+        assert obstruction.is_only_blocked(view, nothing, 0.02)
+        assert obstruction.late_ratio(view, nothing) == obstruction.contradicting_ratio(view, nothing) == 0
     unknown = Expected(nothing.ranges, np.full((1, count), np.inf), nothing.jacobian)
-    assert not obstruction.crowded(view_of(made, scene, np.full(count, np.inf)), unknown, 0.02)
+    assert not obstruction.is_only_blocked(view_of(made, scene, np.full(count, np.inf)), unknown, 0.02)
 
 
 def test_what_holds_a_place_along_a_hall_is_what_stands_across():
@@ -63,11 +63,11 @@ def test_what_holds_a_place_along_a_hall_is_what_stands_across():
     along, across = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     ends = np.flatnonzero(np.abs(np.sin(scene.scanner.angles())) * clean < 0.99)  # beams that reach the wall at x = 20
     view = view_of(made, scene, clean)
-    assert obstruction.held(view, pose, along) == pytest.approx(len(ends), rel=0.1)
-    assert obstruction.held(view, pose, across) > 10 * len(ends)
+    assert obstruction.constraining_beams(view, pose, along) == pytest.approx(len(ends), rel=0.1)
+    assert obstruction.constraining_beams(view, pose, across) > 10 * len(ends)
     hidden = clean.copy()
     hidden[ends] = 0.8
-    assert obstruction.held(view_of(made, scene, hidden), pose, along) < 0.1
+    assert obstruction.constraining_beams(view_of(made, scene, hidden), pose, along) < 0.1
 
 
 def test_in_a_crowd_a_tracked_robot_keeps_its_place_and_carried_off_it_is_found():

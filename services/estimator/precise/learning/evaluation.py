@@ -15,28 +15,34 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.estimator.shared.generative_models import GenerativeModel
 
-DRAWS = 4  # of noise for each test scan
+NOISE_DRAWS = 4  # noisy copies of each test scan
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Figures of the model card."""
+    """Errors of a model, as the model card states them."""
 
     range_error_median: float  # m
     range_error_mean: float  # m
     share_above_5_cm: float
-    position_error_median: float  # m, of the pose found from scans without noise
+    position_error_median: float  # m, of poses found from scans without noise
     position_error_rms: float  # m
-    inflation: float  # of the covariance: mean normalised squared error of scans with noise, at least 1
+    inflation: float  # factor on the covariance: mean normalised squared error of poses from noisy scans, at least 1
 
 
 def evaluate(
-    model: GenerativeModel, poses: Array, mount: Array, angles: Array, ranges: Array, range_max: float, sigma: float,
+    model: GenerativeModel,
+    poses: Array,
+    mount: Array,
+    angles: Array,
+    ranges: Array,
+    range_max: float,
+    sigma: float,
     relative: float = 0.0,
-) -> Quality:  # fmt: skip
-    """From scans (N, B) m without noise at base_link poses (N, 3).
+) -> Quality:
+    """Compares the model with noiseless scans ``ranges`` (N, B) m at base_link poses (N, 3).
 
-    ``sigma`` m is the noise of the scanner in use, ``relative`` its part that grows with the range.
+    ``sigma`` m is the scanner's noise, ``relative`` its part that grows with the range, as a share of the range.
     """
     likelihood = Likelihood(sigma, relative=relative)
     expected = model.expect(se2.compose(poses, mount), angles)
@@ -44,14 +50,14 @@ def evaluate(
     error = np.abs(ranges[both] - expected.ranges[both])
     offsets, misfits, rng = [], [], np.random.default_rng(0)
     for pose, scan in zip(poses, ranges, strict=True):
-        for draw in range(1 + DRAWS):  # the first without noise
+        for draw in range(1 + NOISE_DRAWS):  # the first one without noise
             noise = likelihood.deviation(scan) * rng.standard_normal(len(scan)) if draw else 0.0
             view = View(model, likelihood, mount, angles, scan + noise, range_max)
             found, evidence = polish(view, pose[None])
-            alone = np.linalg.inv(evidence.curvature[0] + 1e-6 * np.eye(3))
-            off = difference(found, pose[None])[0] + alone @ evidence.xi[0]  # to the very minimum
+            inverse = np.linalg.inv(evidence.curvature[0] + 1e-6 * np.eye(3))
+            off = difference(found, pose[None])[0] + inverse @ evidence.xi[0]  # the last step to the minimum
             if draw:
-                covariance = alone @ (evidence.of_noise[0] + evidence.of_model[0]) @ alone
+                covariance = inverse @ (evidence.xi_noise_covariance[0] + evidence.xi_model_covariance[0]) @ inverse
                 misfits.append(float(off @ np.linalg.pinv(covariance, hermitian=True) @ off) / 3)
             else:
                 offsets.append(float(np.hypot(off[0], off[1])))

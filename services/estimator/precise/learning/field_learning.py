@@ -1,10 +1,10 @@
 """Learns the distance field from posed scans.
 
-1. Points where beams end are pooled in cells; their covariance gives a surface element (mean, normal) for each cell.
-2. phi near surfaces is the weighted distance to the elements around (implicit moving least squares, Kolluri 2008);
-   elsewhere the distance to the nearest surface.
-3. Sweeps of prediction: phi moves, where beams end, along the gradient of the squared prediction error (diagonal
-   Gauss-Newton steps), as perception moves the belief.
+1. The end points of beams are pooled in cells; their covariance gives a surface element (mean, normal) for each cell.
+2. Near surfaces, phi is the weighted distance to the elements around (implicit moving least squares, Kolluri 2008);
+   elsewhere it is the distance to the nearest surface.
+3. Sweeps of prediction: where beams end, phi is corrected along the gradient of the squared prediction error (diagonal
+   Gauss-Newton steps), in the same way as perception corrects the belief.
 """
 
 from __future__ import annotations
@@ -15,25 +15,33 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.geometry.se2 import Array, compose, wrap
-from services.estimator.precise.field import CLASSES, SEEN_CELL, DistanceField, Floats, Seen
-from services.estimator.precise.learning.surfaces import LEVEL_POINTS, PRESENT, THROUGH, Beams, in_company, surfaces
+from services.estimator.precise.field import CLASSES, SEEN_CELL_M, DistanceField, Floats, Seen
+from services.estimator.precise.learning.surfaces import (
+    MIN_POINTS_PER_CELL,
+    MIN_PRESENT_SHARE,
+    PASSED_DEPTH_M,
+    Beams,
+    field_of_surfaces,
+    has_neighbours,
+)
 from services.estimator.shared import kernels
-from services.estimator.shared.generative_models import CORNER
+from services.estimator.shared.generative_models import CORNER_ANGLE_RAD
 
-CARVED = 0.5  # cells from a surface, at least, of a node that beams go through
-EM_STEPS, OUTLIER, FLAT = 15, 0.1, 25.0  # FLAT: m over which the flat part of the density extends
-CLIP = 0.1  # m, a larger error is another surface's
-GRAZING = 0.15  # least |n . u| of a beam that shapes the field
-RARE, RARE_SCALE = 20, 0.05  # a class seen seldom: as if it had been seen so often, with this error (m), besides
-LEAST_SCALE = 1e-3  # m
+CARVED_DISTANCE_CELLS = 0.5  # phi of a node through which beams pass is at least so much
+EM_STEPS = 15
+OUTLIER_SHARE, OUTLIER_RANGE_M = 0.1, 25.0  # of the uniform part of the density
+MAX_ERROR_M = 0.1  # a larger error means that the beam ended at another surface
+MIN_FACING = 0.15  # least |n . u| of a beam that shapes the field
+PRIOR_COUNT, PRIOR_SCALE_M = 20, 0.05  # pseudo-count of each class, and its error, for classes that are seldom seen
+MIN_SCALE_M = 1e-3
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What learning depends on, besides the samples."""
+    """Parameters of learning."""
 
     resolution: float = 0.04  # m
-    sweeps: int = 10
+    sweeps: int = 10  # of step 3
     beams_a_sweep: int = 2_000_000
     seed: int = 0
 
@@ -43,32 +51,35 @@ def learn_field(
     recipe: Recipe,
     report: Callable[[str, float], None] = lambda _title, _done: None,
 ) -> DistanceField:
-    """The field that predicts the beams; ``report`` hears of stages and the share done."""
+    """Learns the field that predicts the beams; ``report`` is called with the stage and the share done."""
     report("surfaces", 0.0)
-    beams = beams.part(in_company(beams.ends()))
-    field = surfaces(beams, recipe.resolution)
+    beams = beams.part(has_neighbours(beams.ends()))
+    field = field_of_surfaces(beams, recipe.resolution)
     rng = np.random.default_rng(recipe.seed)
     phi = field.phi.copy()
     for sweep in range(recipe.sweeps):
         report("prediction errors", sweep / recipe.sweeps)
-        some = rng.integers(0, len(beams.ranges), min(recipe.beams_a_sweep, len(beams.ranges)))
-        rate = 1 / (1 + sweep / 2)  # falls, so that the noise of the last sweeps averages out
-        phi = _descend(DistanceField(phi, field.origin, field.resolution), beams.part(some), rate)
+        sample = rng.integers(0, len(beams.ranges), min(recipe.beams_a_sweep, len(beams.ranges)))
+        rate = 1 / (1 + sweep / 2)  # decreases, so that the noise averages out in the last sweeps
+        phi = _descend(DistanceField(phi, field.origin, field.resolution), beams.part(sample), rate)
     return DistanceField(phi, field.origin, field.resolution)
 
 
-def looked_into(beams: Beams) -> Seen:
-    """The cells that the beams have passed or ended in."""
+def seen_cells(beams: Beams) -> Seen:
+    """The cells in which the beams passed or ended."""
     ends = beams.ends()
-    low = np.minimum(ends.min(0), beams.starts.min(0)) - SEEN_CELL
-    shape = np.ceil((np.maximum(ends.max(0), beams.starts.max(0)) - low) / SEEN_CELL).astype(int)[::-1] + 1
+    low = np.minimum(ends.min(0), beams.starts.min(0)) - SEEN_CELL_M
+    shape = np.ceil((np.maximum(ends.max(0), beams.starts.max(0)) - low) / SEEN_CELL_M).astype(int)[::-1] + 1
     cells = np.zeros(shape, np.bool_)
-    kernels.look(beams.starts - low, beams.unit(), beams.ranges, SEEN_CELL, cells)
+    kernels.mark_seen_cells(beams.starts - low, beams.unit(), beams.ranges, SEEN_CELL_M, cells)
     return Seen(cells, (float(low[0]), float(low[1])))
 
 
 def reachable(field: DistanceField, visited: Array, clearance: float = 0.1, seen: Seen | None = None) -> Array:
-    """(K, 2) m in map: nodes at least ``clearance`` m from surfaces that hang together with visited places (N, 2)."""
+    """Places (K, 2), m in map, that are connected with the visited places (N, 2) through free space.
+
+    They are the nodes of the field at least ``clearance`` m from surfaces, and within the cells ``seen`` if given.
+    """
     free = field.phi > clearance
     if seen is not None:
         free &= seen.at(field)
@@ -91,27 +102,32 @@ def reachable(field: DistanceField, visited: Array, clearance: float = 0.1, seen
 
 
 def learn_ripple(field: DistanceField, lasers: Array, angles: Array, apart: int = 10) -> float:
-    """Rad by which normals of flat surfaces err: of a beam's against the mean of those ``apart`` beams to its sides.
+    """Standard deviation in rad of the normals of flat surfaces in the field.
 
-    Beyond 0.3 rad it is a corner, not a ripple.
+    Compares the normal at a beam's end with the mean of those ``apart`` beams to either side. Larger differences than
+    0.3 rad are corners and do not count.
     """
     normal = field.trace(lasers, angles).jacobian[..., :2]
     yaw = np.arctan2(normal[..., 1], normal[..., 0])
     left, right = (
         wrap(yaw[:, shift : yaw.shape[1] - 2 * apart + shift] - yaw[:, apart:-apart]) for shift in (0, 2 * apart)
     )
-    flat = (np.abs(left) < CORNER) & (np.abs(right) < CORNER)
-    # The mean of two errors less one's own: 1.5 times the variance of one.
+    flat = (np.abs(left) < CORNER_ANGLE_RAD) & (np.abs(right) < CORNER_ANGLE_RAD)
+    # A mean of two errors minus a third error has 1.5 times the variance of one error.
     return float(np.sqrt(np.mean(((left + right)[flat] / 2) ** 2) / 1.5)) if flat.any() else 0.0
 
 
 def _descend(field: DistanceField, beams: Beams, rate: float) -> Floats:
-    """One sweep: dr = dphi / |n . u|, so an error e = o - r asks for e |n . u| where the beam ends, by 1 / |n . u|²."""
+    """One sweep of prediction.
+
+    Since dr = dphi / |n . u|, an error e = o - r requires dphi = e |n . u| where the beam ends, with weight 1 / |n .
+    u|².
+    """
     traced = field.trace(np.column_stack([beams.starts, beams.directions]), np.zeros(1))
     ranges, facing = traced.ranges[:, 0], traced.facing[:, 0]
     error = beams.ranges - ranges
-    good = np.isfinite(ranges) & (np.abs(error) < CLIP) & (facing > GRAZING)
-    field = _carved(field, beams, ranges, good, np.where(np.isfinite(ranges), error, 0.0) * facing)
+    good = np.isfinite(ranges) & (np.abs(error) < MAX_ERROR_M) & (facing > MIN_FACING)
+    field = _carve(field, beams, ranges, good, np.where(np.isfinite(ranges), error, 0.0) * facing)
     facing = facing[good]
     where = (beams.starts[good] + ranges[good, None] * beams.unit()[good] - field.origin) / field.resolution
     node = np.minimum(np.maximum(where.astype(int), 0), np.array(field.phi.shape)[::-1] - 2)
@@ -126,37 +142,42 @@ def _descend(field: DistanceField, beams: Beams, rate: float) -> Floats:
     return np.asarray(field.phi + rate * step.reshape(ny, nx), np.float32)
 
 
-def _carved(field: DistanceField, beams: Beams, ranges: Array, hit: np.ndarray, behind: Array) -> DistanceField:
-    """The field with what most beams went through taken out: planes carried on past an edge, things that moved away.
+def _carve(field: DistanceField, beams: Beams, ranges: Array, hit: np.ndarray, behind: Array) -> DistanceField:
+    """Removes surfaces that most beams passed through: planes extended past an edge, things that moved away.
 
-    ``behind`` (R,) m: how far behind the surface a beam ended, across it.
+    ``hit`` (R,) tells which beams ended at the surface. ``behind`` (R,) m is how far behind the surface, perpendicular
+    to it, a beam ended.
     """
-    through = np.isfinite(ranges) & (behind > THROUGH)
+    through = np.isfinite(ranges) & (behind > PASSED_DEPTH_M)
     counts = []
     for which in (hit, through):
         where = (beams.starts[which] + ranges[which, None] * beams.unit()[which] - field.origin) / field.resolution
         node = np.clip(np.round(where).astype(int), 0, np.array(field.phi.shape)[::-1] - 1)
         counts.append(np.bincount(node[:, 1] * field.phi.shape[1] + node[:, 0], minlength=field.phi.size))
-    ended, went = (count.reshape(field.phi.shape) for count in counts)
-    absent = (went >= LEVEL_POINTS) & (ended < PRESENT * (ended + went))
-    phi = np.where(absent, np.maximum(field.phi, CARVED * field.resolution), field.phi).astype(np.float32)
+    ended, passed = (count.reshape(field.phi.shape) for count in counts)
+    absent = (passed >= MIN_POINTS_PER_CELL) & (ended < MIN_PRESENT_SHARE * (ended + passed))
+    phi = np.where(absent, np.maximum(field.phi, CARVED_DISTANCE_CELLS * field.resolution), field.phi).astype(
+        np.float32
+    )
     return DistanceField(phi, field.origin, field.resolution)
 
 
 def learn_scales(field: DistanceField, poses: Array, mount: Array, angles: Array, ranges: Array, sigma: float) -> Array:
-    """The model's own error (m) in each class of beams, from scans (N, B) it has not learned from: learned precision.
+    """Standard deviation (m) of the model's error in each class of beams, the learned precision.
 
-    Expectation maximisation of the likelihood's density, whose flat part takes what misses.
+    Fitted by expectation maximisation to scans ``ranges`` (N, B) from which the model has not learned; a uniform
+    density takes the outliers.
     """
     traced = field.trace(compose(poses, mount), angles)
     both = np.isfinite(ranges) & np.isfinite(traced.ranges)
     square, kind = (ranges[both] - traced.ranges[both]) ** 2, traced.classes()[both]
     size = int(np.prod(CLASSES))
-    variance = np.full(size, RARE_SCALE**2)
+    variance = np.full(size, PRIOR_SCALE_M**2)
     for _ in range(EM_STEPS):
         s2 = variance[kind] + sigma**2
-        core = (1 - OUTLIER) * np.exp(-0.5 * square / s2) / np.sqrt(2 * np.pi * s2)
-        inlier = core / (core + OUTLIER / FLAT)
+        core = (1 - OUTLIER_SHARE) * np.exp(-0.5 * square / s2) / np.sqrt(2 * np.pi * s2)
+        inlier = core / (core + OUTLIER_SHARE / OUTLIER_RANGE_M)
         count, total = np.bincount(kind, inlier, size), np.bincount(kind, inlier * square, size)
-        variance = np.maximum((total + RARE * (RARE_SCALE**2 + sigma**2)) / (count + RARE) - sigma**2, LEAST_SCALE**2)
+        prior_total = PRIOR_COUNT * (PRIOR_SCALE_M**2 + sigma**2)
+        variance = np.maximum((total + prior_total) / (count + PRIOR_COUNT) - sigma**2, MIN_SCALE_M**2)
     return np.asarray(np.sqrt(variance))

@@ -11,17 +11,17 @@ from common.geometry.se2 import Array, compose
 from services.estimator.precise.field import DistanceField, Floats
 from services.estimator.shared import kernels
 
-POOL = 1  # cells to each side that share their points to find a normal
-REACH = 2.0  # cells around a surface element that it shapes
-LEVEL_POINTS = 3  # points a cell needs to count as surface
-THROUGH = 0.06  # m behind a surface at which a beam has gone through it
-PRESENT = 0.3  # least share of the beams that meet a surface and end there
-STRAY_CELL = 1.0  # m
+POOL_CELLS = 1  # cells to each side whose points are pooled to find a normal
+ELEMENT_RADIUS_CELLS = 2.0  # around a surface element, within which it shapes the field
+MIN_POINTS_PER_CELL = 3  # cells with fewer points are no surface
+PASSED_DEPTH_M = 0.06  # a beam that ends so far behind a surface has passed through it
+MIN_PRESENT_SHARE = 0.3  # least share of the beams meeting a surface that end there; with fewer it is removed
+STRAY_CELL_M = 1.0
 
 
 @dataclass(frozen=True)
 class Beams:
-    """Single beams of posed scans: starts (R, 2) m in map, directions (R,) rad in map, ranges (R,) m."""
+    """Single beams of scans with known poses: starts (R, 2) m and directions (R,) rad in map, ranges (R,) m."""
 
     starts: Array
     directions: Array
@@ -29,40 +29,43 @@ class Beams:
 
     @classmethod
     def of(cls, poses: Array, mount: Array, angles: Array, ranges: Array) -> Beams:
-        """Every beam that returned, of scans ranges (N, B) from base_link poses (N, 3)."""
+        """Every beam that returned, from scans ``ranges`` (N, B) at base_link poses (N, 3)."""
         lasers = compose(poses, mount)
         returned = np.isfinite(ranges) & (ranges > 0)
         row, column = np.nonzero(returned)
         return cls(lasers[row, :2], lasers[row, 2] + angles[column], ranges[returned])
 
     def ends(self) -> Array:
-        """(R, 2) m in map."""
+        """End points (R, 2), m in map."""
         return np.asarray(self.starts + self.ranges[:, None] * self.unit())
 
     def unit(self) -> Array:
-        """(R, 2) unit directions."""
+        """Unit directions (R, 2) in map."""
         return np.stack([np.cos(self.directions), np.sin(self.directions)], -1)
 
     def part(self, which: np.ndarray) -> Beams:
-        """Some of them."""
+        """Returns some of the beams."""
         return Beams(self.starts[which], self.directions[which], self.ranges[which])
 
     def joined(self, other: Beams) -> Beams:
-        """And those of another."""
+        """Returns these beams and those of ``other``."""
         mine, theirs = (vars(each).values() for each in (self, other))
         return Beams(*(np.concatenate(pair) for pair in zip(mine, theirs, strict=True)))
 
 
-def in_company(ends: Array) -> np.ndarray:
-    """(R,) which beams ended near others: a few stray ones would make the grid as large as the scanner's range."""
-    cell = np.floor(ends / STRAY_CELL).astype(np.int64)
+def has_neighbours(ends: Array) -> np.ndarray:
+    """Whether each end point (R, 2) has others near it: (R,).
+
+    Without this filter a few stray beams would make the grid as large as the scanner's range.
+    """
+    cell = np.floor(ends / STRAY_CELL_M).astype(np.int64)
     cell -= cell.min(axis=0)
     index = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
-    return np.asarray(np.bincount(index)[index] >= LEVEL_POINTS)
+    return np.asarray(np.bincount(index)[index] >= MIN_POINTS_PER_CELL)
 
 
-def surfaces(beams: Beams, h: float) -> DistanceField:
-    """Phi (m) from the surface elements of cells of ``h`` m, less those that most beams went through."""
+def field_of_surfaces(beams: Beams, h: float) -> DistanceField:
+    """The field from surface elements in cells of ``h`` m, without those that most beams passed through."""
     ends, unit = beams.ends(), beams.unit()
     low = np.minimum(ends.min(0), beams.starts.min(0)) - 4 * h
     shape = np.ceil((np.maximum(ends.max(0), beams.starts.max(0)) + 4 * h - low) / h).astype(int)[::-1] + 1
@@ -71,43 +74,45 @@ def surfaces(beams: Beams, h: float) -> DistanceField:
 
     def pooled(values: Array | None) -> Array:
         grid = np.bincount(index, values, int(shape.prod())).reshape(shape)
-        padded = np.pad(grid, POOL)
-        side = 2 * POOL + 1
+        padded = np.pad(grid, POOL_CELLS)
+        side = 2 * POOL_CELLS + 1
         return sum(  # type: ignore[return-value]
             padded[i : i + shape[0], j : j + shape[1]] for i in range(side) for j in range(side)
         )
 
     own = np.bincount(index, minlength=int(shape.prod())).reshape(shape)
-    local = ends - low  # smaller numbers, better sums
+    local = ends - low  # smaller numbers, so that sums of squares lose less precision
     count = np.maximum(pooled(None), 1)
     mx, my = pooled(local[:, 0]) / count, pooled(local[:, 1]) / count
     xx, yy = pooled(local[:, 0] ** 2) / count - mx**2, pooled(local[:, 1] ** 2) / count - my**2
     xy = pooled(local[:, 0] * local[:, 1]) / count - mx * my
     dx, dy = pooled(unit[:, 0]), pooled(unit[:, 1])
-    surface = own >= LEVEL_POINTS
-    angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the long axis
+    surface = own >= MIN_POINTS_PER_CELL
+    angle = 0.5 * np.arctan2(2 * xy, xx - yy)  # of the surface, the long axis of the points
     nx, ny = -np.sin(angle), np.cos(angle)
-    flip = np.where(nx * dx + ny * dy > 0, -1.0, 1.0)  # against the beams: towards free space
+    flip = np.where(nx * dx + ny * dy > 0, -1.0, 1.0)  # against the beams, that is, towards free space
     nx, ny = nx * flip, ny * flip
     crossed = np.zeros(own.shape)
-    kernels.crossings(beams.starts - low, unit, beams.ranges, h, surface, mx, my, nx, ny, THROUGH, crossed)
-    surface &= own >= PRESENT * (own + crossed)
+    kernels.count_crossings(beams.starts - low, unit, beams.ranges, h, surface, mx, my, nx, ny, PASSED_DEPTH_M, crossed)
+    surface &= own >= MIN_PRESENT_SHARE * (own + crossed)
     return DistanceField(_distances(surface, mx, my, nx, ny, own, h), (float(low[0]), float(low[1])), h)
 
 
 def _distances(surface: np.ndarray, mx: Array, my: Array, nx: Array, ny: Array, own: Array, h: float) -> Floats:
-    """Phi at the nodes from surface elements: near them by their planes, elsewhere by the nearest."""
+    """Distances phi at the nodes: near surface elements from their planes, elsewhere to the nearest element."""
     rows, columns = np.nonzero(surface)
     ex, ey, ax, ay = (a[surface] for a in (mx, my, nx, ny))
     total, weight = np.zeros(surface.shape), np.zeros(surface.shape)
-    span = int(np.ceil(REACH)) + 1
+    span = int(np.ceil(ELEMENT_RADIUS_CELLS)) + 1
     for di in range(-span, span + 1):
         for dj in range(-span, span + 1):
             i, j = rows + di, columns + dj
             inside = (i >= 0) & (j >= 0) & (i < surface.shape[0]) & (j < surface.shape[1])
             vx, vy = j * h - ex, i * h - ey
             square = (vx**2 + vy**2) / h**2
-            w = np.where(inside & (square < REACH**2), np.exp(-1.5 * square) * np.sqrt(own[surface]), 0.0)
+            w = np.where(
+                inside & (square < ELEMENT_RADIUS_CELLS**2), np.exp(-1.5 * square) * np.sqrt(own[surface]), 0.0
+            )
             np.add.at(total, (i[inside], j[inside]), (w * (ax * vx + ay * vy))[inside])
             np.add.at(weight, (i[inside], j[inside]), w[inside])
     near = weight > 0

@@ -24,41 +24,44 @@ PRESET = "precise"
 
 
 class FieldCard(BaseModel):
-    """Where a field comes from and how well it predicts."""
+    """Model card of a field: how it was made, and its errors on test scans."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     preset: str = PRESET
     world: World
-    scanner: Scanner  # it was learned with; it predicts any other
+    scanner: Scanner  # used for learning; the field can predict scans of any other
     samples: int
     seed: int
     resolution: float  # m
     origin: tuple[float, float]  # m
     sweeps: int
-    ripple: float  # rad, by which flat surfaces are tilted
-    inflation: float  # of the covariance, for errors of the model that hang together
+    ripple: float  # rad, see GenerativeModel
+    inflation: float  # factor on the covariance, because errors of the model are correlated between beams
     test_samples: int
     test_range_error_median_m: float
     test_range_error_mean_m: float
     test_share_above_5_cm: float
-    test_position_error_rms_m: float  # of the pose found from scans without noise: what the model alone leaves
+    test_position_error_rms_m: float  # of poses found from scans without noise, so caused by the model alone
     learning_s: float
     source: str = "simulated scans"
-    calibration: Calibration | None = None  # on real scans; none: the estimator's defaults hold
+    calibration: Calibration | None = None  # on real scans; None if the estimator's defaults hold
     commit: str
     command: str
     versions: dict[str, str]
-    weights_sha256: str = ""  # of the file beside the card, hexadecimal; empty in older cards
+    weights_sha256: str = ""  # SHA-256 of the weights file, hexadecimal; empty in older cards
 
 
 def path_of(folder: Path, world: str) -> Path:
-    """Where the field of a world lies."""
+    """The file of a world's field in ``folder``."""
     return folder / f"{world}-{PRESET}.safetensors"
 
 
 def save(path: Path, model: FieldModel, places: Array, card: FieldCard) -> None:
-    """The field in half precision (fine near zero, where it matters); whole files or none."""
+    """Writes the field and its card atomically.
+
+    The field is stored in half precision, whose resolution is finest near zero, at surfaces.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     tensors: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]] = {
         "phi": model.field.phi.astype(np.float16),
@@ -78,7 +81,10 @@ def save(path: Path, model: FieldModel, places: Array, card: FieldCard) -> None:
 
 
 def load(path: Path) -> tuple[FieldModel, Array, FieldCard]:
-    """Model, places (S, 2) of the laser in free space, card; raises UserError where a file is not what it should be."""
+    """Returns the model, places (S, 2) in free space where the laser can be, and the card.
+
+    Raises UserError if a file is missing, damaged or inconsistent.
+    """
     try:
         card = FieldCard.model_validate_json(path.with_suffix(".json").read_text(encoding="utf-8"))
         data = path.read_bytes()
@@ -92,11 +98,13 @@ def load(path: Path) -> tuple[FieldModel, Array, FieldCard]:
         where = ".".join(map(str, first["loc"]))
         raise UserError(f"model card {path.with_suffix('.json')}: {where}: {first['msg']}") from None
     except (safetensors.SafetensorError, KeyError, ValueError) as error:
-        raise UserError(f"weights {path}: no field ({' '.join(str(error).split())[:200]})") from None
+        raise UserError(
+            f"weights {path}: this is not a file of field weights ({' '.join(str(error).split())[:200]})"
+        ) from None
     if phi.ndim != 2 or min(phi.shape) < 2 or scales.shape != (int(np.prod(CLASSES)),) or places.shape[1:] != (2,):
-        raise UserError(f"weights {path}: arrays of another shape than a field's")
+        raise UserError(f"weights {path}: an array does not have the shape that a field needs")
     if not all(np.isfinite(a).all() for a in (phi, scales, places)):
-        raise UserError(f"weights {path}: not all numbers are finite")
+        raise UserError(f"weights {path}: the file contains numbers that are not finite")
     field = DistanceField(phi.astype(np.float32), card.origin, card.resolution)
     model = FieldModel(field, scales.astype(np.float64), card.ripple, _seen(tensors, path))
     return model, places.astype(np.float64), card
@@ -107,47 +115,50 @@ def _seen(tensors: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]],
         return None
     cells, origin = tensors["seen"], tensors.get("seen_origin", np.zeros(0))
     if cells.ndim != 2 or origin.shape != (2,) or not np.isfinite(origin.astype(float)).all():
-        raise UserError(f"weights {path}: what was looked into has another shape than a grid's")
+        raise UserError(f"weights {path}: the grid of seen cells does not have the expected shape")
     x, y = origin.astype(float)
     return Seen(cells.astype(bool), (float(x), float(y)))
 
 
 def train_command(world: str, folder: Path = FOLDER) -> str:
-    """What a user types to make a missing field."""
+    """The command that trains the field of a world."""
     out = "" if folder == FOLDER else f" --out {folder}"
     return f"presage train --world {world} --preset {PRESET}{out}"
 
 
-def find(folder: Path, world: World, asked: str) -> Path:
-    """The field of a world the user named ``asked``; raises UserError with the command that makes it."""
+def find(folder: Path, world: World, world_argument: str) -> Path:
+    """Returns the file of a world's field; ``world_argument`` is how the user named the world.
+
+    Raises UserError, with the command that trains the field, if there is none or its world differs.
+    """
     path = path_of(folder, world.name)
     if not path.exists():
         raise UserError(
-            f"no field of world {world.name!r} in {folder}; make it with: {train_command(asked, folder)}; "
-            "or do without, by rays cast in the world itself: --model exact"
+            f"no field of world {world.name!r} in {folder}; train it with: {train_command(world_argument, folder)}; "
+            "or use --model exact, which casts rays in the world itself and needs no training"
         )
     _, _, card = load(path)
     if not same_walls(card.world, world):
         raise UserError(
-            f"{path} was learned in another world of the same name {world.name!r}: its walls differ. Give your world a "
-            f"name of its own, or learn anew with: {train_command(asked, folder)}"
+            f"{path} was trained in another world of the same name {world.name!r}: its walls differ. Rename your "
+            f"world, or train it again with: {train_command(world_argument, folder)}"
         )
     return path
 
 
 def refuse_to_overwrite(path: Path, world: World) -> None:
-    """Another world's field of the same name is not ours to throw away."""
+    """Raises UserError if ``path`` holds the field of another world with the same name."""
     try:
         _, _, card = load(path)
     except UserError:
         return
     if not same_walls(card.world, world):
         raise UserError(
-            f"{path} belongs to another world of the same name {world.name!r}: give your world a name of its own, "
-            "or another folder with --out"
+            f"{path} belongs to another world of the same name {world.name!r}. Rename your world, or write to another "
+            "folder with --out"
         )
 
 
 def same_walls(a: World, b: World) -> bool:
-    """Whether two worlds look alike to a laser."""
+    """Whether two worlds have the same walls and obstacles."""
     return np.array_equal(a.segments, b.segments) and np.array_equal(a.circles, b.circles)

@@ -8,9 +8,9 @@ import pytest
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.global_seeds import Seeds
-from services.estimator.precise.learning.calibration import learn_motion, learn_shares, noise_of
+from services.estimator.precise.learning.calibration import estimate_noise, learn_motion, learn_shares
 from services.estimator.precise.learning.drive_learning import learn_drive
-from services.estimator.precise.learning.field_learning import Recipe, learn_field, looked_into
+from services.estimator.precise.learning.field_learning import Recipe, learn_field, seen_cells
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.shared.generative_models import Expected
@@ -48,7 +48,7 @@ def test_the_noise_is_told_from_scans_alone():
     blocked = np.where(np.abs(ANGLES - 0.3) < 0.1, 0.7, clean)
     blocked[:, 5] = np.inf
     for sigma in (0.005, 0.03):
-        found = noise_of(blocked + sigma * rng.standard_normal(clean.shape), ANGLES)
+        found = estimate_noise(blocked + sigma * rng.standard_normal(clean.shape), ANGLES)
         assert found == pytest.approx(sigma, rel=0.25)
 
 
@@ -77,7 +77,7 @@ def test_nothing_is_expected_where_nobody_looked():
     poses = np.array([[2.0, 4.0, yaw] for yaw in np.linspace(2.8, 3.5, 100)])  # never towards the right
     ranges = BEFORE.ray_distances(poses, ANGLES)
     beams = Beams.of(poses, np.zeros(3), ANGLES, ranges)
-    seen = looked_into(beams)
+    seen = seen_cells(beams)
     assert seen.contains(np.array([[1.0, 4.0]]))[0]
     assert not seen.contains(np.array([[8.5, 1.0], [50.0, 0.0]])).any()
     from services.estimator.precise.field import FieldModel  # noqa: PLC0415
@@ -112,7 +112,7 @@ def test_it_localises_the_second_half_among_moved_furniture(drive, learned):
     )
     half = SCANS // 2
     view = View(made.model, made.likelihood, drive.mount, ANGLES, drive.ranges[half], RANGE_MAX)
-    assert view.evidence(drive.poses[half : half + 1]).explained[0] > settings.believable
+    assert view.evidence(drive.poses[half : half + 1]).inlier_ratio[0] > settings.min_inlier_ratio
     for odometry, start in ((True, drive.poses[half]), (False, drive.poses[half]), (True, None)):
         made.restart(start, None if start is None else np.diag([0.01, 0.01, 0.0025]))
         errors, wrong = [], 0
