@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def make(settings: ViewerSettings) -> Service:
-    """Imports the web server here, so that --help answers at once."""
+    """Returns the service. Imports the web server only here, so that --help answers at once."""
     from services.viewer.service import ViewerService  # noqa: PLC0415
 
     return ViewerService(settings)

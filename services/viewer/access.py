@@ -12,7 +12,7 @@ COOKIE = "presage_token"
 
 
 def same_origin(origin: str | None, host: str | None) -> bool:
-    """Whether a socket is asked for by a page of this very server. Browsers always say whose page it is."""
+    """Whether a web socket is requested by a page of this server. Browsers always send the page's origin."""
     if not origin or not host:
         return False
     try:
@@ -27,7 +27,7 @@ def same_origin(origin: str | None, host: str | None) -> bool:
 
 
 def split_host(host: str, default: int) -> tuple[str | None, int]:
-    """Name, in small letters and without brackets, and port of a Host header; no name where it is none."""
+    """Name (lower case, without brackets) and port of a Host header. The name is None if the header is invalid."""
     try:
         parts = urlsplit(f"//{host}")
         name, port = parts.hostname, parts.port or default
@@ -37,10 +37,10 @@ def split_host(host: str, default: int) -> tuple[str | None, int]:
 
 
 def known_host(host: str | None, names: Collection[str]) -> bool:
-    """Whether the page was asked for under an address, or a name that is surely this machine's.
+    """Whether the Host header is an IP address, localhost or one of ``names``.
 
-    A page of another host that makes its own name point here (DNS rebinding) has the same origin as it; its name
-    gives it away.
+    This guards against DNS rebinding: a page of another host whose name resolves to this machine passes the check of
+    the origin, but sends its own name as the host.
     """
     name = split_host(host, 80)[0] if host else None
     if name is None:
@@ -55,7 +55,7 @@ def known_host(host: str | None, names: Collection[str]) -> bool:
 
 
 def token_of(cookie: str | None, query: str) -> str:
-    """The token a visitor brings: of the address first, then of the cookie; empty where there is none."""
+    """The visitor's token, from the query string or else from the cookie. Empty if there is none."""
     given = parse_qs(query).get("token")
     if given:
         return given[0]
@@ -67,5 +67,5 @@ def token_of(cookie: str | None, query: str) -> str:
 
 
 def is_token(given: str, token: str) -> bool:
-    """Whether it is the one; takes as long for each wrong one."""
+    """Compares tokens in constant time."""
     return secrets.compare_digest(given.encode(), token.encode())

@@ -1,6 +1,7 @@
 """Goals, teleports, obstacles and driving over the bus.
 
-Every action ends in an `ActionResult`; what cannot be done is said by raising UserError with the reason.
+Every action returns an `ActionResult`. An action that cannot be carried out raises UserError with the reason, which
+`Control.do` turns into a result.
 """
 
 from __future__ import annotations
@@ -45,9 +46,9 @@ from services.viewer import visitor_requests as requests
 from services.viewer.state.health_rows import how_to_start
 from services.viewer.state.roster import Roster
 
-ANSWER_TIMEOUT_S = 3.0  # s, for an answer
-YAW_TOLERANCE_RAD = 0.15  # rad, of a goal that was given one
-SUBSCRIBER_TIMEOUT_S = 2.0  # s, for a subscriber to be known: a put before that is lost
+ANSWER_TIMEOUT_S = 3.0
+YAW_TOLERANCE_RAD = 0.15  # for goals with a heading
+SUBSCRIBER_TIMEOUT_S = 2.0  # wait for the subscriber, because a message before that is lost
 CLOCK_QUERIES = {"pause": PAUSE, "resume": RESUME, "step": STEP}
 CLOCK_RESULTS = {"pause": "paused", "resume": "running", "step": "one scan further"}
 R = TypeVar("R", bound=Reply)
@@ -55,7 +56,7 @@ R = TypeVar("R", bound=Reply)
 
 @dataclass(frozen=True)
 class ActionResult:
-    """What a visitor is told."""
+    """The answer to a browser's request."""
 
     ok: bool
     reason: str = ""
@@ -64,20 +65,20 @@ class ActionResult:
 
 @dataclass(frozen=True)
 class RobotLookup:
-    """What the viewer knows of a robot that an action needs."""
+    """Access to the state of a robot, by its name."""
 
-    status: Callable[[str], Status | None]  # the controller's last word about a robot
-    stamp_ns: Callable[[str], int]  # of the newest scan
+    status: Callable[[str], Status | None]  # the controller's last status
+    stamp_ns: Callable[[str], int]  # stamp of the newest sensor message
 
 
 class Control:
-    """Actions on robots."""
+    """Carries out actions on robots."""
 
-    def __init__(self, bus: Bus, roster: Roster, sight: RobotLookup, connect: str = "") -> None:
-        """``connect``: endpoints to name where a service is missing, if they are not the default."""
-        self._bus, self._roster, self._sight, self._connect = bus, roster, sight, connect
-        self._numbers: defaultdict[str, Iterator[int]] = defaultdict(itertools.count)  # of drives, by robot
-        self._do: dict[type[requests.Action], Callable[[str, Any], ActionResult]] = {
+    def __init__(self, bus: Bus, roster: Roster, lookup: RobotLookup, connect: str = "") -> None:
+        """``connect``: endpoints for the advice how to start a missing service; empty if they are the default."""
+        self._bus, self._roster, self._lookup, self._connect = bus, roster, lookup, connect
+        self._numbers: defaultdict[str, Iterator[int]] = defaultdict(itertools.count)  # of drive messages, by robot
+        self._handlers: dict[type[requests.Action], Callable[[str, Any], ActionResult]] = {
             requests.GoTo: self._goal,
             requests.Cancel: self._cancel,
             requests.Teleport: self._teleport,
@@ -91,16 +92,16 @@ class Control:
         }
 
     def do(self, robot: str, action: requests.Action) -> ActionResult:
-        """Done, or why not; never raises."""
+        """Carries out an action. Returns the reason if that fails; does not raise UserError."""
         if "replay" in self._roster.services(robot):
             return ActionResult(ok=False, reason="this is a recording: choose the live robot to act on it")
         try:
-            return self._do[type(action)](robot, action)
+            return self._handlers[type(action)](robot, action)
         except UserError as error:
             return ActionResult(ok=False, reason=str(error))
 
     def ask(self, robot: str, query: Query, request: Request, reply: type[R]) -> R:
-        """A service's answer; raises UserError where it is not there, does not answer, or says no."""
+        """A service's answer. Raises UserError if the service is not running, does not answer or refuses."""
         self._check_running(robot, query.server)
         answer = self._bus.ask(query, request, reply, ANSWER_TIMEOUT_S, robot=robot)
         if not answer.ok:
@@ -108,7 +109,7 @@ class Control:
         return answer
 
     def query(self, robot: str, query: Query, request: Request, reply: type[R]) -> R:
-        """Whatever anybody answers, a refusal included."""
+        """The answer of any service, which may be a refusal. Raises UserError if none answers."""
         return self._bus.ask(query, request, reply, ANSWER_TIMEOUT_S, robot=robot)
 
     def _check_running(self, robot: str, service: str) -> None:
@@ -117,23 +118,23 @@ class Control:
             raise UserError(f"the {service} is not running; start it with: {start}")
 
     def _check_subscriber(self, robot: str, topic: Topic, service: str) -> None:
-        """Make sure that a put will be heard."""
+        """Waits until the service has subscribed to the topic. Raises UserError if it does not."""
         self._check_running(robot, service)
         if not self._bus.wait_matching(topic, SUBSCRIBER_TIMEOUT_S, key=topic.key(robot)):
             raise UserError(f"the {service} does not listen to {topic.name}: is it of this version?")
 
     def _goal(self, robot: str, action: requests.GoTo) -> ActionResult:
         self._check_subscriber(robot, GOAL, "controller")
-        # The time numbers it: the status says which goal it is about, whoever gave the others.
+        # Numbered by the time, so that the controller's status can be matched to this goal among those of others.
         goal = Goal(
-            stamp_ns=self._sight.stamp_ns(robot),
+            stamp_ns=self._lookup.stamp_ns(robot),
             seq=time.time_ns(),
             pose=Pose(x=action.x, y=action.y, yaw=action.yaw or 0.0),
             tolerance=action.tolerance or 0.2,
             yaw_tolerance=None if action.yaw is None else YAW_TOLERANCE_RAD,
         )
         self._bus.put(GOAL, goal.encode(), key=GOAL.key(robot))
-        status = self._status(robot, lambda status: status.goal_seq == goal.seq)
+        status = self._wait_for_status(robot, lambda status: status.goal_seq == goal.seq)
         if status is None:
             raise UserError(f"the controller did not take the goal within {ANSWER_TIMEOUT_S:g} s")
         if status.state == "blocked":
@@ -142,23 +143,23 @@ class Control:
 
     def _cancel(self, robot: str, _action: requests.Cancel) -> ActionResult:
         self._check_subscriber(robot, GOAL, "controller")
-        goal = Goal(stamp_ns=self._sight.stamp_ns(robot), seq=time.time_ns(), pose=Pose(x=0.0, y=0.0), cancel=True)
+        goal = Goal(stamp_ns=self._lookup.stamp_ns(robot), seq=time.time_ns(), pose=Pose(x=0.0, y=0.0), cancel=True)
         self._bus.put(GOAL, goal.encode(), key=GOAL.key(robot))
-        if self._status(robot, lambda status: status.goal is None) is None:
+        if self._wait_for_status(robot, lambda status: status.goal is None) is None:
             raise UserError(f"the controller did not cancel the goal within {ANSWER_TIMEOUT_S:g} s")
         return ActionResult(ok=True, reason="goal cancelled")
 
-    def _status(self, robot: str, wanted: Callable[[Status], bool]) -> Status | None:
-        """The first status seen that is as ``wanted``; None if there is none in time."""
+    def _wait_for_status(self, robot: str, condition: Callable[[Status], bool]) -> Status | None:
+        """The first status that meets the condition. Returns None if there is none within the timeout."""
         found: list[Status] = []
 
-        def there() -> bool:
-            status = self._sight.status(robot)
-            if status is not None and wanted(status):
+        def check() -> bool:
+            status = self._lookup.status(robot)
+            if status is not None and condition(status):
                 found.append(status)
             return bool(found)
 
-        return found[0] if wait_until(there, ANSWER_TIMEOUT_S) else None
+        return found[0] if wait_until(check, ANSWER_TIMEOUT_S) else None
 
     def _teleport(self, robot: str, action: requests.Teleport) -> ActionResult:
         pose = Pose(x=action.x, y=action.y, yaw=action.yaw)
@@ -204,14 +205,19 @@ class Control:
         else:
             self._check_running(robot, "controller")
         twist = Twist(vx=action.vx, vy=action.vy, wz=action.wz)
-        drive = Drive(stamp_ns=self._sight.stamp_ns(robot), seq=next(self._numbers[robot]), twist=twist)
+        drive = Drive(stamp_ns=self._lookup.stamp_ns(robot), seq=next(self._numbers[robot]), twist=twist)
         self._bus.put(DRIVE, drive.encode(), key=key)
         return ActionResult(ok=True)
 
     def _record(self, robot: str, action: requests.Record) -> ActionResult:
         reply = self.ask(robot, RECORDING, RecordRequest(action=action.action), RecordReply)
         more = {
-            "recording": reply.recording, "file": reply.file, "messages": reply.messages, "seconds": reply.seconds,
-        }  # fmt: skip
-        how = f"recording into {reply.file}" if reply.recording else f"recorded {reply.file}" if reply.file else "idle"
-        return ActionResult(ok=True, reason=how, more=more)
+            "recording": reply.recording,
+            "file": reply.file,
+            "messages": reply.messages,
+            "seconds": reply.seconds,
+        }
+        state = f"recorded {reply.file}" if reply.file else "idle"
+        if reply.recording:
+            state = f"recording into {reply.file}"
+        return ActionResult(ok=True, reason=state, more=more)

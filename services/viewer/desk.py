@@ -1,6 +1,6 @@
 """Carries out browsers' requests, and sends them the world, robots and recordings.
 
-Runs in the web server's loop; whatever waits for the bus or for a child does so in a thread of the pool.
+Runs in the web server's event loop. Calls that block, on the bus or on a child process, run in a thread pool.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from services.viewer.playback import Playback
 from services.viewer.state.roster import Roster
 from services.viewer.visitors import Hub, Visitor
 
-WORLD_PERIOD_S = 5.0  # s; others may change it too
-MIN_WORLD_PERIOD_S = 0.1  # s between two questions, however fast somebody drags an obstacle
-PLAYER_PERIOD_S = 0.2  # s
-UNWATCHED_TIMEOUT_S = 60.0  # s without anybody who watches it, then a recording is closed
-END_MARGIN_S = 0.05  # s before a recording's end from which play begins anew
+WORLD_PERIOD_S = 5.0  # how often the world is queried, because other programs may change it too
+MIN_WORLD_PERIOD_S = 0.1  # between two queries, e.g. while a visitor drags an obstacle
+PLAYER_PERIOD_S = 0.2  # how often the player's state is queried
+UNWATCHED_TIMEOUT_S = 60.0  # a recording without visitors is closed after this
+END_MARGIN_S = 0.05  # so close to a recording's end, play restarts from the beginning
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -35,7 +35,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class DeskContext:
-    """What the desk works with."""
+    """The objects that the desk works with."""
 
     hub: Hub
     control: Control
@@ -44,34 +44,33 @@ class DeskContext:
     pool: Executor
     control_allowed: bool
     version: str
-    on_new_recording: Callable[[str], None]  # another recording under a robot's name: what was heard of it is no more
+    on_new_recording: Callable[[str], None]  # called with a robot's name when another recording replaces its messages
 
 
 class Desk:
-    """One for all visitors."""
+    """Handles the requests of all visitors."""
 
     def __init__(self, context: DeskContext) -> None:
-        """Nothing is known yet."""
         self.context = context
         self.worlds: dict[str, WorldReply] = {}  # by robot
-        self._texts: dict[str, str] = {}  # the same for visitors
-        self._stale: set[str] = set()
-        self._ask = asyncio.Event()
+        self._world_texts: dict[str, str] = {}  # by robot; the worlds as JSON messages for visitors
+        self._stale: set[str] = set()  # robots whose world has to be queried again
+        self._refresh = asyncio.Event()
 
     # ---- one visitor
 
     def show_robot(self, visitor: Visitor, robot: str) -> None:
-        """Show a robot from now on."""
+        """Makes the visitor watch a robot, and sends the list of robots and the robot's world."""
         context = self.context
         context.hub.watch(visitor, robot)
         self._hello(visitor)
-        if robot in self._texts:
-            visitor.queue_text(self._texts[robot], "world")
+        if robot in self._world_texts:
+            visitor.queue_text(self._world_texts[robot], "world")
         else:
             self.refresh_world(robot)
 
-    async def act(self, visitor: Visitor, action: requests.Action) -> ActionResult:  # noqa: PLR0911 - one a kind
-        """Done, or why not."""
+    async def act(self, visitor: Visitor, action: requests.Action) -> ActionResult:  # noqa: PLR0911 - one per action
+        """Carries out a visitor's action. Returns the reason if that fails."""
         if not self.context.control_allowed and not isinstance(action, requests.Watch):
             return ActionResult(ok=False, reason="visitors of this page only watch (it runs without --allow-control)")
         try:
@@ -128,25 +127,25 @@ class Desk:
             await self._in_thread(
                 context.playback.open, name, lambda: "replay" in context.roster.services(robot)
             )  # fmt: skip
-        finally:  # the one open before is closed, whatever comes of this
+        finally:  # the recording that was open before is closed even if this one cannot be opened
             self.worlds.pop(robot, None)
-            self._texts.pop(robot, None)
+            self._world_texts.pop(robot, None)
             context.on_new_recording(robot)
             if not context.playback.name:
-                self._closed("")
+                self._on_closed("")
         for other in {visitor, *context.hub.watching(robot)}:
             self.show_robot(other, robot)
-        await self._in_thread(self._show_place)
+        await self._in_thread(self._show_position)
         return ActionResult(ok=True, reason=name)
 
     async def _close(self) -> ActionResult:
         if not self.context.playback.name:
             raise UserError("no recording is open")
         await self._in_thread(self.context.playback.close)
-        self._closed("")
+        self._on_closed("")
         return ActionResult(ok=True, reason="closed")
 
-    # ---- the recording; in a thread
+    # ---- the open recording; these methods run in a thread
 
     def _play(self, action: requests.ControlPlayer) -> ActionResult:
         if not self.context.playback.name:
@@ -159,11 +158,11 @@ class Desk:
                 self._player("seek", 0.0)
         state = self._player(action.action, action.value or 0.0)
         if action.action == "seek" and state.paused:
-            self._show_place()
+            self._show_position()
         return ActionResult(ok=True)
 
-    def _show_place(self) -> None:
-        """A frame of where it stands, paused: a scan, and with the second step what answered it."""
+    def _show_position(self) -> None:
+        """Plays two steps of a paused recording, so that the page shows a scan together with its answers."""
         self._player("step", 2)
 
     def _player(self, action: Any, value: float = 0.0) -> PlayerReply:
@@ -173,37 +172,37 @@ class Desk:
     # ---- all visitors
 
     def refresh_world(self, robot: str) -> None:
-        """The robot's world may be another."""
+        """Requests that the robot's world is queried again soon."""
         self._stale.add(robot)
-        self._ask.set()
+        self._refresh.set()
 
     def robots_changed(self, changed: frozenset[str]) -> None:
-        """Services of these came or went."""
+        """Sends the new list of robots, after services of these robots came or went."""
         for visitor in self.context.hub.all_visitors():
             self._hello(visitor)
         for robot in changed & self.context.hub.watched:
             self.refresh_world(robot)
 
     async def run(self) -> None:
-        """Until cancelled."""
+        """Follows worlds and the player until cancelled."""
         await asyncio.gather(self._follow_worlds(), self._follow_player())
 
     async def _follow_worlds(self) -> None:
         clock = asyncio.get_running_loop().time
-        asked: dict[str, float] = {}
+        queried_at: dict[str, float] = {}
         while True:
             for robot in self.context.hub.watched:
-                if robot in self._stale or clock() - asked.get(robot, -WORLD_PERIOD_S) >= WORLD_PERIOD_S:
+                if robot in self._stale or clock() - queried_at.get(robot, -WORLD_PERIOD_S) >= WORLD_PERIOD_S:
                     self._stale.discard(robot)
-                    asked[robot] = clock()
-                    await self._look(robot)
+                    queried_at[robot] = clock()
+                    await self._query_world(robot)
             await asyncio.sleep(MIN_WORLD_PERIOD_S)
             with suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._ask.wait(), 1.0)
-            self._ask.clear()
+                await asyncio.wait_for(self._refresh.wait(), 1.0)
+            self._refresh.clear()
 
-    async def _look(self, robot: str) -> None:
-        """Ask for the world, and tell if it is another."""
+    async def _query_world(self, robot: str) -> None:
+        """Queries the robot's world and sends it to visitors if it has changed."""
         services = self.context.roster.services(robot)
         if not services & {"simulator", "replay"}:
             return
@@ -212,38 +211,38 @@ class Desk:
                 self.context.control.query, robot, WORLD, Request(), WorldReply
             )  # fmt: skip
         except UserError:
-            return  # it is asked again
+            return  # the next query may succeed
         if reply == self.worlds.get(robot):
             return
         self.worlds[robot] = reply
         parts = {"world": reply.world, "scanner": reply.scanner, "robot": reply.robot}
         plain = {name: part.model_dump(mode="json") if part is not None else None for name, part in parts.items()}
-        self._texts[robot] = json.dumps({"type": "world", **plain})
-        self.context.hub.queue_text(robot, "world", self._texts[robot])
+        self._world_texts[robot] = json.dumps({"type": "world", **plain})
+        self.context.hub.queue_text(robot, "world", self._world_texts[robot])
 
     async def _follow_player(self) -> None:
         playback, hub = self.context.playback, self.context.hub
-        alone = 0.0  # s without anybody who watches
+        unwatched_s = 0.0
         while True:
             await asyncio.sleep(PLAYER_PERIOD_S)
-            alone = 0.0 if not playback.name or hub.watching(playback.robot) else alone + PLAYER_PERIOD_S
+            unwatched_s = 0.0 if not playback.name or hub.watching(playback.robot) else unwatched_s + PLAYER_PERIOD_S
             if not playback.name:
                 continue
-            if (complaint := await self._in_thread(playback.ended)) is not None:
-                self._closed(complaint)
-            elif alone > UNWATCHED_TIMEOUT_S:
+            if (error := await self._in_thread(playback.ended)) is not None:
+                self._on_closed(error)
+            elif unwatched_s > UNWATCHED_TIMEOUT_S:
                 await self._in_thread(playback.close)
-            elif alone == 0.0:
+            elif unwatched_s == 0.0:
                 with suppress(UserError):
                     state = await self._in_thread(self._player, "status")
-                    said = json.dumps({"type": "player", **state.model_dump(mode="json"), "file": playback.name})
-                    hub.queue_text(playback.robot, "player", said)
+                    text = json.dumps({"type": "player", **state.model_dump(mode="json"), "file": playback.name})
+                    hub.queue_text(playback.robot, "player", text)
 
-    def _closed(self, reason: str) -> None:
-        """Who watched the recording sees our robot again."""
+    def _on_closed(self, reason: str) -> None:
+        """Shows the live robot again to visitors who watched the recording."""
         playback, hub = self.context.playback, self.context.hub
         self.worlds.pop(playback.robot, None)
-        self._texts.pop(playback.robot, None)
+        self._world_texts.pop(playback.robot, None)
         for visitor in hub.watching(playback.robot):
             self.show_robot(visitor, self.context.roster.robot)
             visitor.queue_text(json.dumps({"type": "closed", "reason": reason}))

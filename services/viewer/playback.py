@@ -16,49 +16,50 @@ from common.bus.bus import wait_until
 from common.errors import UserError
 from common.processes import end_with_this_process
 
-START_TIMEOUT_S = 30.0  # s; a large file without an index is read through
-STOP_TIMEOUT_S = 5.0  # s
+START_TIMEOUT_S = 30.0  # long, because a file without an index is read completely
+STOP_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True)
 class Child:
-    """The replay, and what it complains of."""
+    """The process of a replay."""
 
     process: subprocess.Popen[bytes]
-    complaints: IO[bytes]
-    name: str
+    stderr: IO[bytes]
+    name: str  # file name of the recording
 
 
 class Playback:
-    """At most one recording is open. Blocks: to be called from threads that may wait."""
+    """Replays at most one recording in a child process. Its methods block, so call them from a worker thread."""
 
     def __init__(self, folder: Path, robot: str, connect: str) -> None:
-        """Recordings in ``folder``; shown as ``robot``-replay, over the endpoints ``connect``."""
+        """Replays files of ``folder`` under the robot name ``robot``-replay, over the endpoints ``connect``."""
         self.folder, self._connect = folder, connect
-        self.robot = f"{robot[:57]}-replay"  # a name has 64 characters at most
+        self.robot = f"{robot[:57]}-replay"  # a robot's name has at most 64 characters
         self._child: Child | None = None
         self._lock = threading.Lock()
         self._leaving = False
 
     @property
     def name(self) -> str:
-        """Of the open recording; empty where none is."""
+        """File name of the open recording. Empty if none is open."""
         child = self._child
         return child.name if child is not None else ""
 
     def files(self) -> list[dict[str, Any]]:
-        """Name, size in bytes and, where it can be read quickly, duration in s; the newest first."""
+        """Recordings of the folder as rows of `describe_file`, the newest first, at most 500."""
         try:
             paths = [path for path in self.folder.glob("*.mcap") if path.is_file()]
             dated = sorted(((path.stat().st_mtime, path) for path in paths), reverse=True)
         except OSError:
             return []
-        return [described(path) for _, path in dated[:500]]
+        return [describe_file(path) for _, path in dated[:500]]
 
     def open(self, name: str, alive: Callable[[], bool]) -> None:
-        """Start; raises UserError where there is no such recording or it cannot be played. One open before is closed.
+        """Closes the open recording, if any, and starts to replay another.
 
-        ``alive``: whether the replay's service is there.
+        ``alive`` returns whether the replay's service is alive. Raises UserError if there is no such recording or it
+        cannot be played.
         """
         if name not in {path.name for path in self.folder.glob("*.mcap")}:
             raise UserError(f"no recording {name!r} in {self.folder}")
@@ -66,26 +67,26 @@ class Playback:
             self._end()
             wait_until(lambda: not alive() or self._leaving, STOP_TIMEOUT_S)
             if self._leaving:
-                raise UserError("the viewer ends")
+                raise UserError("the viewer is shutting down")
             child = self._child = self._start(name)
-            over = lambda: alive() or self._leaving or child.process.poll() is not None  # noqa: E731
-            if wait_until(over, START_TIMEOUT_S) and alive():
+            started_or_failed = lambda: alive() or self._leaving or child.process.poll() is not None  # noqa: E731
+            if wait_until(started_or_failed, START_TIMEOUT_S) and alive():
                 return
             why = self._end() or f"it did not start within {START_TIMEOUT_S:g} s"
         raise UserError(f"{name} cannot be played: {why}")
 
     def close(self) -> None:
-        """End it, if there is one."""
+        """Ends the replay, if there is one."""
         with self._lock:
             self._end()
 
     def leave(self) -> None:
-        """Close it, and open none any more: the viewer ends."""
+        """Ends the replay and refuses to start another, because the viewer is shutting down."""
         self._leaving = True
         self.close()
 
     def ended(self) -> str | None:
-        """The last complaint of a replay that ended by itself, which is closed then; None where all is well."""
+        """Closes a replay that ended by itself and returns its last error line. Returns None if it is still running."""
         child = self._child
         if child is None or child.process.poll() is None:
             return None
@@ -95,19 +96,19 @@ class Playback:
     def _start(self, name: str) -> Child:
         command = [sys.executable, "-m", "presage", "replay", str(self.folder / name), "--robot", self.robot]
         command += ["--connect", self._connect, "--force", "--paused", "--stay"]
-        complaints = tempfile.TemporaryFile()  # noqa: SIM115 - closed in _end
-        process = subprocess.Popen(  # noqa: S603 - our own module; the name is one of the folder's
+        stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed in _end
+        process = subprocess.Popen(  # noqa: S603 - runs this package; `open` checked the name against the folder
             command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
-            stderr=complaints,
+            stderr=stderr,
             start_new_session=True,
             preexec_fn=end_with_this_process(),  # noqa: PLW1509 - one call, before any thread of the child
         )
-        return Child(process, complaints, name)
+        return Child(process, stderr, name)
 
     def _end(self) -> str:
-        """Its last complaint."""
+        """Ends the child process and returns its last error line, or an empty string."""
         child, self._child = self._child, None
         if child is None:
             return ""
@@ -118,23 +119,23 @@ class Playback:
             except subprocess.TimeoutExpired:
                 child.process.kill()
                 child.process.wait()
-        child.complaints.seek(0)
-        lines = child.complaints.read(100_000).decode(errors="replace").strip().splitlines()
-        child.complaints.close()
+        child.stderr.seek(0)
+        lines = child.stderr.read(100_000).decode(errors="replace").strip().splitlines()
+        child.stderr.close()
         return lines[-1].removeprefix("presage: ")[:500] if lines else ""
 
 
-def described(path: Path) -> dict[str, Any]:
-    """Of a file: name, size in bytes, when it was last written to (s since 1970), duration in s where it is known."""
+def describe_file(path: Path) -> dict[str, Any]:
+    """Name, size in bytes, time of the last modification (s since 1970) and, if known, duration in s."""
     status = path.stat()
     row = {"name": path.name, "size": status.st_size, "modified": status.st_mtime}
-    # Without mcap, or of a file without an end, the duration is not known: the list is no place to complain.
+    # Without the package mcap, or for an unfinished file, the duration stays unknown. A list is no place for an error.
     with suppress(Exception):
-        from mcap.reader import make_reader  # noqa: PLC0415 - the viewer runs without it
+        from mcap.reader import make_reader  # noqa: PLC0415 - optional for the viewer
 
         with path.open("rb") as stream:
             summary = make_reader(stream).get_summary()
         if summary is not None and summary.statistics is not None:
-            times = summary.statistics
-            row["duration"] = (times.message_end_time - times.message_start_time) * 1e-9
+            statistics = summary.statistics
+            row["duration"] = (statistics.message_end_time - statistics.message_start_time) * 1e-9
     return row

@@ -31,10 +31,10 @@ from services.viewer.visitor_session import Session
 
 PAGE_FOLDER = Path(__file__).resolve().parent / "static"
 MAX_VISITORS = 100
-MAX_MESSAGE_BYTES = 1 << 16  # bytes; what is longer ends the connection, what is shorter gets an answer
-SEND_BUFFER_BYTES = 1 << 15  # bytes the kernel keeps for a visitor: what waits there is old when it is seen
-TCP_TIMEOUT_MS = 30_000  # ms without a sign of what was sent, then the connection is dead
-PORTS_TO_TRY = 20  # tried, from the first
+MAX_MESSAGE_BYTES = 1 << 16  # a longer message from a browser closes its connection
+SEND_BUFFER_BYTES = 1 << 15  # kernel buffer per visitor; small, so that a slow visitor does not see old frames
+TCP_TIMEOUT_MS = 30_000  # unacknowledged data closes a connection after this
+PORTS_TO_TRY = 20  # starting with FIRST_PORT
 CONTENT_SECURITY_POLICY = (
     "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'"
@@ -51,13 +51,13 @@ SECURITY_HEADERS = {
 
 @dataclass(frozen=True)
 class AccessMiddleware:
-    """Lets in who may: by token, host and origin; adds the headers that keep the page to itself."""
+    """Admits requests by token, host and origin, and adds security headers to responses."""
 
     app: ASGIApp
     token: str
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass on, or refuse."""
+        """Passes a request on to the application, or refuses it."""
         if scope["type"] == "lifespan":
             await self.app(scope, receive, send)
             return
@@ -87,24 +87,26 @@ class AccessMiddleware:
             if not is_token(given, self.token):
                 return PlainTextResponse("a token is needed: open the link with ?token=... that was printed\n", 401)
         elif not known_host(host, {socket.gethostname().lower(), f"{socket.gethostname().lower()}.local"}):
-            return PlainTextResponse("by this name a token is needed: use the machine's address, or --token\n", 403)
+            return PlainTextResponse(
+                "a token is needed under this host name: use the machine's IP address, or start with --token\n", 403
+            )
         if scope["type"] == "websocket" and not same_origin(headers.get("origin"), host):
             return PlainTextResponse("only this server's own page may connect\n", 403)
         return None
 
 
 class UnbufferedWebSocketProtocol(WebSocketsSansIOProtocol):
-    """A frame that the kernel has not taken holds the next one back, so that the newest goes next."""
+    """Blocks a send until the kernel has taken the data, so that a slow visitor gets the newest frame next."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """No buffer of our own."""
+        """Disables the transport's write buffer."""
         super().connection_made(transport)
         if isinstance(transport, asyncio.WriteTransport):
             transport.set_write_buffer_limits(high=0)
 
 
 def create_app(desk: Desk, token: str, started: Callable[[asyncio.AbstractEventLoop], None]) -> Starlette:
-    """The application; ``started`` is called with its loop."""
+    """Returns the web application. Calls ``started`` with its event loop."""
 
     @asynccontextmanager
     async def lifespan(_app: Starlette) -> AsyncIterator[None]:
@@ -126,39 +128,52 @@ def create_app(desk: Desk, token: str, started: Callable[[asyncio.AbstractEventL
 
 
 class WebServer:
-    """uvicorn in a thread."""
+    """Runs uvicorn in a thread."""
 
     def __init__(self, app: Starlette, listener: socket.socket) -> None:
-        """Not yet running."""
         config = uvicorn.Config(
-            app, log_config=None, log_level="warning", access_log=False, proxy_headers=False, server_header=False,
-            ws=UnbufferedWebSocketProtocol, ws_max_size=MAX_MESSAGE_BYTES, ws_per_message_deflate=False, ws_ping_interval=10, ws_ping_timeout=20,
-            limit_concurrency=4 * MAX_VISITORS, timeout_graceful_shutdown=1, lifespan="on",
-        )  # fmt: skip
+            app,
+            log_config=None,
+            log_level="warning",
+            access_log=False,
+            proxy_headers=False,
+            server_header=False,
+            ws=UnbufferedWebSocketProtocol,
+            ws_max_size=MAX_MESSAGE_BYTES,
+            ws_per_message_deflate=False,
+            ws_ping_interval=10,
+            ws_ping_timeout=20,
+            limit_concurrency=4 * MAX_VISITORS,
+            timeout_graceful_shutdown=1,
+            lifespan="on",
+        )
         self._server = uvicorn.Server(config)
         run = self._server.run
         self._thread = threading.Thread(target=lambda: run(sockets=[listener]), name="web", daemon=True)
 
     def start(self) -> None:
-        """Return once visitors may come; raises UserError where that fails."""
+        """Starts the server and returns once it accepts connections. Raises UserError if that fails."""
         self._thread.start()
         wait_until(lambda: self._server.started or not self._thread.is_alive(), 20)
         if not self._server.started:
-            raise UserError("the web server did not start; its lines are above")
+            raise UserError("the web server did not start; see its log lines above")
 
     def stop(self) -> None:
-        """End it, visitors or not."""
+        """Stops the server, even if visitors are connected."""
         self._server.should_exit = True
         self._thread.join(5)
 
     @property
     def running(self) -> bool:
-        """Whether it still serves."""
+        """Whether the server's thread is running."""
         return self._thread.is_alive()
 
 
 def listen(settings: ViewerSettings) -> socket.socket:
-    """Listens at the port asked for, or the first free one from `FIRST_PORT`; raises UserError where it cannot."""
+    """Returns a socket listening on the configured port, or else on the first free one from `FIRST_PORT`.
+
+    Raises UserError if no port can be used.
+    """
     wanted = [settings.port] if settings.port is not None else [*range(FIRST_PORT, FIRST_PORT + PORTS_TO_TRY), 0]
     for port in wanted:
         try:
@@ -167,8 +182,8 @@ def listen(settings: ViewerSettings) -> socket.socket:
             if error.errno == errno.EADDRINUSE and port != wanted[-1]:
                 continue
             raise UserError(
-                f"{settings.host} port {port} cannot be used ({error.strerror}): choose another with --port, 0 for any "
-                "free one, or another address with --host"
+                f"{settings.host} port {port} cannot be used ({error.strerror}): choose another port with --port, 0 "
+                "for any free one, or another address with --host"
             ) from None
     raise AssertionError
 
@@ -180,11 +195,11 @@ def _bind(host: str, port: int) -> socket.socket:
     listener = socket.socket(family, kind, protocol)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)  # connections inherit it
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)  # inherited by connections
         if hasattr(socket, "TCP_USER_TIMEOUT"):
             listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, TCP_TIMEOUT_MS)
         listener.bind(address)
-        listener.listen()  # bound twice, by two viewers at once, one fails here
+        listener.listen()  # if two viewers bind the port at the same time, one of them fails here
     except OSError:
         listener.close()
         raise
@@ -192,7 +207,7 @@ def _bind(host: str, port: int) -> socket.socket:
 
 
 def link(settings: ViewerSettings, listener: socket.socket) -> str:
-    """The page's address for a browser on this machine."""
+    """Address of the page, for a browser on this machine, including the token."""
     port = listener.getsockname()[1]
     host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(settings.host, settings.host)  # noqa: S104 - compared with
     host = f"[{host}]" if ":" in host and not host.startswith("[") else host

@@ -1,7 +1,7 @@
 """The process: messages in, frames out to the web server's thread.
 
-Two threads meet in the hub: this loop hands it finished bytes, it says which robots are watched. A robot that nobody
-watches costs little: of its messages those are read that the charts' last minute is made of.
+The service's thread encodes frames and passes the bytes to the hub, which runs in the web server's thread and knows
+which robots are watched. Of a robot without visitors only the messages for the charts and the log are decoded.
 """
 
 from __future__ import annotations
@@ -32,31 +32,30 @@ from services.viewer.state.robot_view import ALWAYS_READ_TOPICS, SHOWN_TOPICS, R
 from services.viewer.state.roster import Roster
 from services.viewer.visitors import Hub, Visitor
 
-TICK_PERIOD_S = 1.0  # s
-SCAN_TIMEOUT_S = 2.0  # s since the last scan
-UNWATCHED_TIMEOUT_S = 600.0  # s without a visitor, then another robot is followed no more
+TICK_PERIOD_S = 1.0
+SCAN_TIMEOUT_S = 2.0  # since the last scan; after this no scanner is running
+UNWATCHED_TIMEOUT_S = 600.0  # other robots are unsubscribed after this time without a visitor
 
 
 @dataclass
 class FollowedRobot:
-    """One robot."""
+    """A robot whose messages are subscribed."""
 
     view: RobotView
     health: HealthHistory = field(default_factory=HealthHistory)
-    unread: dict[Topic, Sample] = field(default_factory=dict)  # the newest of each, until somebody watches
-    scan_at: float = -1e9  # s, a clock that only goes forward
-    watched_at: float = field(default_factory=time.monotonic)
-    ends: list[Callable[[], None]] = field(default_factory=list)  # of the subscriptions
+    unread: dict[Topic, Sample] = field(default_factory=dict)  # the newest of each topic, until a visitor watches
+    scan_at: float = -1e9  # monotonic time of the last scan, s
+    watched_at: float = field(default_factory=time.monotonic)  # monotonic time at which a visitor last watched, s
+    unsubscribe: list[Callable[[], None]] = field(default_factory=list)
 
 
 class ViewerService(Service):
-    """The page as a process."""
+    """Serves the live page."""
 
     name: ClassVar[str] = "viewer"
     all_robots: ClassVar[bool] = True
 
     def __init__(self, settings: ViewerSettings) -> None:
-        """Sockets are opened in `open`."""
         super().__init__(settings)
         self.options = settings
         self.hub = Hub(self._wake)
@@ -64,26 +63,30 @@ class ViewerService(Service):
         self.playback = Playback(settings.recordings, settings.robot, settings.connect)
         self.pool = ThreadPoolExecutor(16, "action")
         self.robots: dict[str, FollowedRobot] = {}
-        self._renew: set[str] = set()  # robots under whose name another recording runs
+        self._reopened: set[str] = set()  # robots of replays that now show another recording
         self._changed: deque[str] = deque()  # robots whose services came or went
-        self._connect = "" if settings.connect == DEFAULT_ENDPOINT else settings.connect  # to be named in advice
+        self._connect = "" if settings.connect == DEFAULT_ENDPOINT else settings.connect  # for the advice to visitors
         self._tick_at = 0.0
         self._web: WebServer | None = None
 
     def open(self) -> None:
-        """Listen to the robot, then to visitors."""
+        """Subscribes to the robot's topics and starts the web server."""
         options = self.options
         listener = listen(options)
         self._follow(options.robot)
         self.loop.bus.watch_robots(self._came_or_went)
-        sight = RobotLookup(self._status, self._stamp_ns)
-        control = Control(self.loop.bus, self.roster, sight, self._connect)
-        version = versions().get("presage", versions()["commit"])
-        self.desk = Desk(
-            DeskContext(
-                self.hub, control, self.playback, self.roster, self.pool, options.control, version, self._renew.add
-            )
-        )  # fmt: skip
+        lookup = RobotLookup(self._status, self._stamp_ns)
+        context = DeskContext(
+            hub=self.hub,
+            control=Control(self.loop.bus, self.roster, lookup, self._connect),
+            playback=self.playback,
+            roster=self.roster,
+            pool=self.pool,
+            control_allowed=options.control,
+            version=versions().get("presage", versions()["commit"]),
+            on_new_recording=self._reopened.add,
+        )
+        self.desk = Desk(context)
         self._web = WebServer(create_app(self.desk, options.token, self.hub.set_loop), listener)
         self._web.start()
         where = f"page: {link(options, listener)}"
@@ -92,19 +95,21 @@ class ViewerService(Service):
         else:
             print(where, flush=True)
         if not options.on_loopback and not options.token:
-            self.log.warning("whoever reaches this machine sees the page", advice="PRESAGE_VIEWER_TOKEN asks for one")
+            self.log.warning(
+                "anyone who reaches this machine can see the page", advice="set PRESAGE_VIEWER_TOKEN to require a token"
+            )
 
     def close(self) -> None:
-        """Visitors first, then the recording."""
+        """Stops the web server and closes the open recording."""
         if self._web is not None:
             self._web.stop()
         self.playback.leave()
         self.pool.shutdown(wait=False, cancel_futures=True)
 
-    # ---- what comes
+    # ---- messages from the bus
 
     def on_sample(self, sample: Sample) -> None:
-        """Read it, or keep the newest for the first who watches."""
+        """Decodes the sample if it is needed now, or keeps the newest one for the next visitor."""
         robot = sample.key.split("/")[1]
         followed = self.robots.get(robot)
         if followed is None or sample.topic not in SHOWN_TOPICS:
@@ -151,21 +156,21 @@ class ViewerService(Service):
         self._changed.append(robot)
         self._wake()
 
-    # ---- what is due
+    # ---- periodic work
 
     def due(self) -> float | None:
-        """Until a newcomer is to be told, a scan has waited enough, or a second is over."""
-        if self.hub.newcomers or self._changed or self._renew:
+        """Seconds until `on_timer` is needed: for new visitors, a frame whose wait ends, or the next tick."""
+        if self.hub.newcomers or self._changed or self._reopened:
             return 0.0
         now = time.monotonic()
         waits = [wait for f in self.robots.values() if (wait := f.view.due(now)) is not None]
         return max(0.0, min([self._tick_at - now, *waits]))
 
     def on_timer(self) -> None:
-        """Whatever of that it is."""
+        """Sends what is due; see `due`."""
         now = time.monotonic()
-        while self._renew:
-            if (followed := self.robots.get(robot := self._renew.pop())) is not None:
+        while self._reopened:
+            if (followed := self.robots.get(robot := self._reopened.pop())) is not None:
                 followed.view, followed.unread = RobotView(robot, live=False), {}
         if changed := {self._changed.popleft() for _ in range(len(self._changed))}:
             self.hub.call_soon(partial(self.desk.robots_changed, frozenset(changed)))
@@ -178,27 +183,29 @@ class ViewerService(Service):
             self._tick()
 
     def _welcome(self, visitor: Visitor, robot: str) -> None:
-        """What has been, for who has just come."""
+        """Sends a new visitor the robot's state and history."""
         followed = self._follow(robot)
         for sample in sorted(followed.unread.values(), key=lambda sample: sample.received_ns):
             self._read(robot, followed, sample)
         followed.unread.clear()
         view = followed.view
-        known = {
-            "history": _history(view), "services": self._services(robot, followed), "journal": _journal(view),
+        texts = {
+            "history": _history(view),
+            "services": self._services(robot, followed),
+            "journal": _journal(view),
             "field": view.fields.shown,
-        }  # fmt: skip
+        }
 
-        def tell() -> None:
-            if visitor.robot != robot:
+        def send() -> None:
+            if visitor.robot != robot:  # the visitor has switched to another robot meanwhile
                 return
-            for kind, what in known.items():
-                if what is not None:
-                    visitor.queue_text(what, kind)
+            for kind, text in texts.items():
+                if text is not None:
+                    visitor.queue_text(text, kind)
             if view.frame is not None:
                 visitor.queue_frame(view.frame)
 
-        self.hub.call_soon(tell)
+        self.hub.call_soon(send)
 
     def _tick(self) -> None:
         watched, now = self.hub.watched, time.monotonic()
@@ -207,7 +214,7 @@ class ViewerService(Service):
         for robot, followed in list(self.robots.items()):
             idle = now - followed.watched_at
             if idle > UNWATCHED_TIMEOUT_S or (idle > 0 and not self.roster.services(robot)):
-                self._leave(robot)
+                self._unfollow(robot)
         for robot, followed in self.robots.items():
             followed.view.live = "replay" not in self.roster.services(robot)
             if robot in watched:
@@ -220,28 +227,32 @@ class ViewerService(Service):
 
     def _services(self, robot: str, followed: FollowedRobot) -> str:
         now, alive, linked = time.monotonic(), self.roster.services(robot), self.loop.bus.linked()
-        lacking = missing(alive, linked=linked, scans=now - followed.scan_at < SCAN_TIMEOUT_S)
-        rows = [{"name": name, "start": how_to_start(name, robot, self._connect)} for name in lacking]
-        return json.dumps({
-            "type": "services", "services": followed.health.rows(alive, now), "missing": rows, "linked": linked,
-        })  # fmt: skip
+        names = missing(alive, linked=linked, scans=now - followed.scan_at < SCAN_TIMEOUT_S)
+        message = {
+            "type": "services",
+            "services": followed.health.rows(alive, now),
+            "missing": [{"name": name, "start": how_to_start(name, robot, self._connect)} for name in names],
+            "linked": linked,
+        }
+        return json.dumps(message)
 
     def _follow(self, robot: str) -> FollowedRobot:
-        """Subscribe, once."""
+        """Subscribes to the robot's topics, unless that was done before."""
         if robot not in self.robots:
             live = "replay" not in self.roster.services(robot)
             followed = self.robots[robot] = FollowedRobot(RobotView(robot, live=live))
             for topic in TOPICS:
-                # A step of a replay comes at once: the newest alone would be half of the next moment.
+                # A replay publishes the messages of one step at once. All are kept, because the newest of each topic
+                # may belong to different stamps.
                 end = self.loop.bus.subscribe(topic, self.loop.inbox, keep_all=not live, robot=robot)
-                followed.ends.append(end)
+                followed.unsubscribe.append(end)
         return self.robots[robot]
 
-    def _leave(self, robot: str) -> None:
-        for end in self.robots.pop(robot).ends:
-            end()
+    def _unfollow(self, robot: str) -> None:
+        for unsubscribe in self.robots.pop(robot).unsubscribe:
+            unsubscribe()
 
-    # ---- for other threads
+    # ---- called from other threads
 
     def _wake(self) -> None:
         if self._loop is not None:

@@ -14,10 +14,11 @@ FIRST_PORT = 8080
 
 
 class ViewerSettings(ServiceSettings):
-    """Viewer: the live page, and the socket behind it.
+    """Viewer: serves the live page.
 
-    Whoever reaches the page watches. On loopback they may also act (goals, teleport, driving); elsewhere only with
-    --allow-control. A token keeps others out: PRESAGE_VIEWER_TOKEN, so that it is in no list of processes.
+    Anyone who reaches the page can watch. On loopback, visitors can also act (goals, teleport, driving); on other
+    addresses only with --allow-control. A token keeps others out. Set it with PRESAGE_VIEWER_TOKEN, because
+    command-line arguments are visible in the list of processes.
 
     Examples:
       python -m services.viewer                                      http://127.0.0.1:8080/, or the next free port
@@ -31,20 +32,29 @@ class ViewerSettings(ServiceSettings):
 
     host: Annotated[str, Field(min_length=1, max_length=255, description="address to listen on")] = "127.0.0.1"
     port: Annotated[
-        int | None, Field(ge=0, le=65535, description=f"0: any free one; none: {FIRST_PORT}, or the next free one")
+        int | None,
+        Field(ge=0, le=65535, description=f"port; 0 for any free one; defaults to {FIRST_PORT} or the next free one"),
     ] = None
     token: Annotated[
-        str, Field(pattern=r"^[A-Za-z0-9_.~-]{0,200}$", description="asked of visitors; letters, digits, _ . ~ -")
+        str,
+        Field(
+            pattern=r"^[A-Za-z0-9_.~-]{0,200}$",
+            description="token that visitors need, of letters, digits and _ . ~ -; empty for none",
+        ),
     ] = ""
-    allow_control: Annotated[bool, Field(description="visitors beyond loopback may act too, not only watch")] = False
+    allow_control: Annotated[bool, Field(description="let visitors from other machines act, not only watch")] = False
     recordings: Annotated[Path, Field(description="folder of recordings that visitors may open")] = Path("recordings")
     address: Annotated[
-        str, Field(pattern=r"^$|^https?://[^\s/]+$", description="the page's address as visitors see it, to be printed")
+        str,
+        Field(
+            pattern=r"^$|^https?://[^\s/]+$",
+            description="address under which visitors reach the page, for the printed link",
+        ),
     ] = ""
 
     @property
     def on_loopback(self) -> bool:
-        """Whether nobody beyond this machine can connect."""
+        """Whether only this machine can connect."""
         if self.host == "localhost":
             return True
         try:
@@ -58,5 +68,5 @@ class ViewerSettings(ServiceSettings):
         return self.allow_control or self.on_loopback
 
     def effective(self) -> dict[str, Any]:
-        """Every setting as it holds, but for the token, which must not get into recordings."""
+        """All settings in effect. The token is masked, because recordings store them."""
         return {**super().effective(), "token": "set" if self.token else ""}

@@ -11,29 +11,29 @@ from common.errors import first_fault
 from common.geometry.world import Obstacle
 from common.limits import Angle, Coordinate
 
-MAX_TEXT_CHARS = 4096  # characters; an obstacle of a hundred corners fits
+MAX_TEXT_CHARS = 4096  # enough for an obstacle with a hundred corners
 
 Speed = Annotated[float, Field(allow_inf_nan=False, ge=-100, le=100)]
 RobotName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
 
 
 class InvalidRequestError(ValueError):
-    """A message that asks nothing that can be done; with the ``id`` it had, if any."""
+    """An invalid message from a browser."""
 
     def __init__(self, reason: str, number: int | None = None) -> None:
-        """``reason`` in words a visitor understands."""
+        """``reason`` is shown to the visitor; ``number`` is the message's ``id``, if it has one."""
         super().__init__(reason)
         self.number = number
 
 
 class Action(BaseModel):
-    """One message of a visitor; fields it does not know are ignored."""
+    """One request of a visitor. Unknown fields are ignored."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="ignore")
 
 
 class Watch(Action):
-    """Show that robot."""
+    """Show another robot."""
 
     do: Literal["watch"]
     robot: RobotName
@@ -50,7 +50,7 @@ class GoTo(Action):
 
 
 class Cancel(Action):
-    """Forget the goal."""
+    """Cancel the goal."""
 
     do: Literal["cancel"]
 
@@ -65,7 +65,7 @@ class Teleport(Action):
 
 
 class Localise(Action):
-    """Begin localisation anew, from a place or from nothing."""
+    """Restart localisation, near a pose or on the whole map."""
 
     do: Literal["localise"]
     x: Coordinate | None = None
@@ -74,7 +74,7 @@ class Localise(Action):
 
 
 class EditObstacle(Action):
-    """Change the furniture."""
+    """Add, move or remove an obstacle."""
 
     do: Literal["obstacle"]
     action: Literal["add", "move", "remove"]
@@ -83,20 +83,20 @@ class EditObstacle(Action):
 
 
 class ControlClock(Action):
-    """Of the simulation."""
+    """Pause, resume or step the simulation."""
 
     do: Literal["pause", "resume", "step"]
 
 
 class Reset(Action):
-    """Begin the simulation anew."""
+    """Restart the simulation."""
 
     do: Literal["reset"]
     seed: Annotated[int, Field(ge=0, lt=2**63)] | None = None
 
 
 class SetSpeed(Action):
-    """Times real time."""
+    """Set the simulation's speed as a multiple of real time."""
 
     do: Literal["speed"]
     factor: Annotated[float, Field(allow_inf_nan=False, gt=0, le=1000)]
@@ -112,27 +112,27 @@ class DriveByHand(Action):
 
 
 class Record(Action):
-    """Begin or end a recording, or ask how it stands."""
+    """Start or stop a recording, or query its state."""
 
     do: Literal["record"]
     action: Literal["start", "stop", "status"]
 
 
 class ListRecordings(Action):
-    """Which there are."""
+    """List the recordings."""
 
     do: Literal["recordings"]
 
 
 class Open(Action):
-    """Show a recording."""
+    """Open a recording."""
 
     do: Literal["open"]
     name: Annotated[str, Field(min_length=1, max_length=255)]
 
 
 class Close(Action):
-    """Show it no more."""
+    """Close the open recording."""
 
     do: Literal["close"]
 
@@ -145,35 +145,52 @@ class ControlPlayer(Action):
     value: Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)] | None = None
 
 
-KINDS = (
-    Watch, GoTo, Cancel, Teleport, Localise, EditObstacle, ControlClock, Reset, SetSpeed, DriveByHand, Record, ListRecordings, Open, Close, ControlPlayer,
-)  # fmt: skip
-_BY_NAME: dict[str, TypeAdapter[Any]] = {
-    name: TypeAdapter(kind) for kind in KINDS for name in kind.model_fields["do"].annotation.__args__  # type: ignore[union-attr]
-}  # fmt: skip
+ACTIONS = (
+    Watch,
+    GoTo,
+    Cancel,
+    Teleport,
+    Localise,
+    EditObstacle,
+    ControlClock,
+    Reset,
+    SetSpeed,
+    DriveByHand,
+    Record,
+    ListRecordings,
+    Open,
+    Close,
+    ControlPlayer,
+)
+# By the names that the field ``do`` may have.
+_ADAPTERS: dict[str, TypeAdapter[Any]] = {
+    name: TypeAdapter(action)
+    for action in ACTIONS
+    for name in action.model_fields["do"].annotation.__args__  # type: ignore[union-attr]
+}
 
 
 def parse(text: str) -> tuple[int | None, Action]:
-    """The message's id and what it asks; raises InvalidRequestError, and nothing else, whatever the text is."""
+    """Returns the message's id and action. Raises InvalidRequestError, and nothing else, for any invalid text."""
     if len(text) > MAX_TEXT_CHARS:
         raise InvalidRequestError(f"a message of {len(text)} characters is too long: {MAX_TEXT_CHARS} are read")
     try:
         data = json.loads(text)
-    except (ValueError, RecursionError):  # a number of 5000 digits, 4000 brackets
-        raise InvalidRequestError("this is no JSON") from None
+    except (ValueError, RecursionError):  # also raised for a number of 5000 digits or for 4000 brackets
+        raise InvalidRequestError("the message is not valid JSON") from None
     if not isinstance(data, dict):
         raise InvalidRequestError('a JSON object is expected, such as {"id": 1, "do": "cancel"}')
     number = data.get("id")
     if isinstance(number, bool) or not isinstance(number, int) or abs(number) > 2**53:
         number = None
     name = data.get("do")
-    adapter = _BY_NAME.get(name) if isinstance(name, str) else None
+    adapter = _ADAPTERS.get(name) if isinstance(name, str) else None
     if adapter is None:
-        raise InvalidRequestError(f"nothing is done by that name; there are: {', '.join(_BY_NAME)}", number)
+        raise InvalidRequestError(f"unknown action; the actions are: {', '.join(_ADAPTERS)}", number)
     try:
         action: Action = adapter.validate_python(data)
     except ValidationError as error:
         raise InvalidRequestError(first_fault(error)[:500], number) from None
-    except Exception as error:  # noqa: BLE001 - whatever a hostile number does inside shapely
-        raise InvalidRequestError(f"this makes no sense ({type(error).__name__})", number) from None
+    except Exception as error:  # noqa: BLE001 - extreme numbers can raise any error inside shapely
+        raise InvalidRequestError(f"invalid values ({type(error).__name__})", number) from None
     return number, action

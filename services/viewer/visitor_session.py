@@ -17,16 +17,15 @@ from services.viewer.desk import Desk
 from services.viewer.visitors import TooSlowError, Visitor
 
 T = TypeVar("T")
-MAX_QUEUED = 32  # actions of one visitor that wait for their turn
-MESSAGES_PER_S, MAX_BURST = 60.0, 120.0  # messages a second of one visitor; more are read later
-CLOSE_CODE_TOO_SLOW = 1008  # close code: policy violation
+MAX_QUEUED = 32  # actions of one visitor that wait to be carried out
+MESSAGES_PER_S, MAX_BURST = 60.0, 120.0  # rate limit per visitor; further messages are read later
+CLOSE_CODE_TOO_SLOW = 1008  # web socket close code: policy violation
 
 
 class Session:
-    """From the socket's opening to its end."""
+    """Handles one web socket from its opening to its end."""
 
     def __init__(self, websocket: WebSocket, desk: Desk) -> None:
-        """Not yet accepted."""
         self._websocket, self._desk = websocket, desk
         self._counters = desk.context.hub.counters
         self._visitor = Visitor(_sender(websocket.send_text), _sender(websocket.send_bytes))
@@ -34,7 +33,7 @@ class Session:
         self._allowed, self._allowed_at = MAX_BURST, asyncio.get_running_loop().time()
 
     async def run(self) -> None:
-        """Until either side ends it."""
+        """Accepts the socket and serves it until either side closes it."""
         await self._websocket.accept()
         hub = self._desk.context.hub
         tasks = [asyncio.create_task(work()) for work in (self._visitor.run, self._read, self._work)]
@@ -58,10 +57,10 @@ class Session:
         while True:
             message = await self._websocket.receive()
             if message["type"] == "websocket.disconnect":
-                if message.get("code") in {1007, 1009}:  # no UTF-8, or longer than the server takes
+                if message.get("code") in {1007, 1009}:  # invalid UTF-8, or longer than MAX_MESSAGE_BYTES
                     self._counters["malformed"] += 1
                 return
-            await self._keep_pace()
+            await self._limit_rate()
             text = message.get("text")
             try:
                 number, action = requests.parse(text) if text is not None else _refuse_bytes()
@@ -72,14 +71,14 @@ class Session:
             await self._take(number, action)
 
     async def _take(self, number: int | None, action: requests.Action) -> None:
-        if isinstance(action, requests.DriveByHand):  # it does not wait behind a slow answer
+        if isinstance(action, requests.DriveByHand):  # not queued, so that it does not wait for a slow action
             self._answer(number, await self._desk.act(self._visitor, action))
             return
         try:
             self._queue.put_nowait((number, action))
         except asyncio.QueueFull:
             self._counters["turned_away"] += 1
-            self._answer(number, ActionResult(ok=False, reason="too much waits already; once more, slower"))
+            self._answer(number, ActionResult(ok=False, reason="too many requests are waiting; try again later"))
 
     async def _work(self) -> None:
         while True:
@@ -89,11 +88,11 @@ class Session:
     def _answer(self, number: int | None, answer: ActionResult) -> None:
         self._counters["answers"] += 1
         self._counters["refused"] += not answer.ok
-        said = {"type": "answer", "id": number, "ok": answer.ok, "reason": answer.reason, **answer.more}
-        self._visitor.queue_text(json.dumps(said))
+        message = {"type": "answer", "id": number, "ok": answer.ok, "reason": answer.reason, **answer.more}
+        self._visitor.queue_text(json.dumps(message))
 
-    async def _keep_pace(self) -> None:
-        """Wait where messages come faster than anybody clicks; TCP passes it on."""
+    async def _limit_rate(self) -> None:
+        """Delays reading if messages exceed the rate limit; TCP's flow control then slows the sender."""
         now = asyncio.get_running_loop().time()
         self._allowed = min(MAX_BURST, self._allowed + (now - self._allowed_at) * MESSAGES_PER_S) - 1.0
         self._allowed_at = now
@@ -102,12 +101,12 @@ class Session:
 
 
 def _sender(send: Callable[[T], Awaitable[None]]) -> Callable[[T], Awaitable[None]]:
-    """``send``, where a socket that the server has closed already (a frame too long) is one that is gone."""
+    """Wraps ``send`` to raise WebSocketDisconnect if the server has already closed the socket (message too long)."""
 
     async def checked(data: T) -> None:
         try:
             await send(data)
-        except RuntimeError as error:  # the server's word for it: "after sending 'websocket.close'"
+        except RuntimeError as error:  # uvicorn: "... after sending 'websocket.close'"
             raise WebSocketDisconnect(1006, str(error)) from None
 
     return checked

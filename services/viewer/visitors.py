@@ -1,7 +1,7 @@
 """Connected browsers and their send queues.
 
-All of it runs in the web server's loop; other threads come in through `Hub.call_soon`. Nobody waits for anybody: a frame is
-offered to all, and whoever has not taken the last one misses it.
+Everything runs in the web server's event loop; other threads use `Hub.call_soon`. A slow visitor does not delay others:
+each visitor has its own queue, in which a new frame replaces the one that is still waiting.
 """
 
 from __future__ import annotations
@@ -11,94 +11,96 @@ import itertools
 from collections import Counter, OrderedDict, deque
 from collections.abc import Awaitable, Callable
 
-MAX_QUEUED_TEXTS = 200  # texts for one visitor; who lets more wait is sent away
+MAX_QUEUED_TEXTS = 200  # a visitor with more waiting texts is disconnected
 
 
 class TooSlowError(Exception):
-    """A visitor who does not take what it is told."""
+    """A visitor does not read the messages sent to it."""
 
 
 class Visitor:
     """One open page."""
 
-    def __init__(self, text: Callable[[str], Awaitable[None]], data: Callable[[bytes], Awaitable[None]]) -> None:
-        """``text`` and ``data`` send, and take as long as the visitor does."""
+    def __init__(
+        self, send_text: Callable[[str], Awaitable[None]], send_bytes: Callable[[bytes], Awaitable[None]]
+    ) -> None:
+        """``send_text`` and ``send_bytes`` return when the connection has taken the data."""
         self.robot = ""
         self.sent = self.skipped = 0  # frames
-        self._text, self._data = text, data
+        self._send_text, self._send_bytes = send_text, send_bytes
         self._texts: OrderedDict[object, str | bytes] = OrderedDict()
         self._frame: bytes | None = None
         self._serial = itertools.count()
-        self._something = asyncio.Event()
+        self._wakeup = asyncio.Event()
         self._overrun = False
 
     def queue_text(self, text: str | bytes, kind: str = "") -> None:
-        """Something to be sent; what still waits of the same ``kind`` is replaced, in its place."""
+        """Queues a message. It replaces a waiting message of the same non-empty ``kind``, at its position."""
         if len(self._texts) >= MAX_QUEUED_TEXTS:
             self._overrun = True
         else:
             self._texts[kind or next(self._serial)] = text
-        self._something.set()
+        self._wakeup.set()
 
     def queue_frame(self, frame: bytes) -> None:
-        """The newest frame; one that still waits is gone."""
+        """Queues the newest frame. It replaces a frame that is still waiting."""
         self.skipped += self._frame is not None
         self._frame = frame
-        self._something.set()
+        self._wakeup.set()
 
     def drop_robot_data(self) -> None:
-        """Frames and news of another robot."""
+        """Removes the waiting frame and all messages with a kind, which belong to the previous robot."""
         self._frame = None
         for kind in [kind for kind in self._texts if isinstance(kind, str)]:
             del self._texts[kind]
 
     async def run(self) -> None:
-        """Send until cancelled; raises TooSlowError where too much waits."""
+        """Sends until cancelled. Raises TooSlowError if too many messages are waiting."""
         while True:
-            await self._something.wait()
-            self._something.clear()
+            await self._wakeup.wait()
+            self._wakeup.clear()
             while self._texts or self._frame is not None:
                 if self._overrun:
                     raise TooSlowError
                 if self._texts:
-                    said = self._texts.popitem(last=False)[1]
-                    await (self._data(said) if isinstance(said, bytes) else self._text(said))
+                    text = self._texts.popitem(last=False)[1]
+                    await (self._send_bytes(text) if isinstance(text, bytes) else self._send_text(text))
                 elif (frame := self._frame) is not None:
                     self._frame = None
-                    await self._data(frame)
+                    await self._send_bytes(frame)
                     self.sent += 1
 
 
 class Hub:
-    """Visitors by the robot they watch."""
+    """All visitors, and the robots they watch."""
 
     def __init__(self, changed: Callable[[], None] = lambda: None) -> None:
-        """``changed`` is called, in the web server's loop, when `newcomers` or `watched` did."""
+        """``changed`` is called in the web server's loop when `newcomers` or `watched` changes."""
         self.counters: Counter[str] = Counter()
-        self.watched: frozenset[str] = frozenset()  # robots; replaced as a whole, for readers in other threads
-        self.newcomers: deque[tuple[Visitor, str]] = deque()  # who wants to be told what has been
+        self.watched: frozenset[str] = frozenset()  # robots; replaced as a whole, because other threads read it
+        self.newcomers: deque[tuple[Visitor, str]] = deque()  # visitors who need the history of a robot
         self._visitors: set[Visitor] = set()
         self._changed = changed
         self._loop: asyncio.AbstractEventLoop | None = None
 
     def set_loop(self, loop: asyncio.AbstractEventLoop) -> None:
-        """The loop of the web server."""
+        """Sets the web server's event loop."""
         self._loop = loop
 
     def call_soon(self, what: Callable[[], None]) -> None:
-        """From another thread: do it in the loop, soon. Nothing happens before it runs and after it ended."""
+        """Calls a function in the event loop, from another thread. Does nothing while the loop is not running."""
         if self._loop is None:
             return
         try:
             self._loop.call_soon_threadsafe(what)
-        except RuntimeError:  # it has just been closed
+        except RuntimeError:  # the loop has just been closed
             self._loop = None
 
     def __len__(self) -> int:
         return len(self._visitors)
 
     def watching(self, robot: str) -> list[Visitor]:
-        """Who watches it."""
+        """Visitors who watch the robot."""
         return [visitor for visitor in self._visitors if visitor.robot == robot]
 
     def all_visitors(self) -> list[Visitor]:
@@ -106,31 +108,31 @@ class Hub:
         return list(self._visitors)
 
     def watch(self, visitor: Visitor, robot: str) -> None:
-        """From now on that robot."""
+        """Makes a visitor watch a robot."""
         self._visitors.add(visitor)
         visitor.drop_robot_data()
         visitor.robot = robot
         self.newcomers.append((visitor, robot))
-        self._count()
+        self._update_watched()
 
     def remove(self, visitor: Visitor) -> None:
-        """It is gone."""
+        """Removes a visitor who has disconnected."""
         self._visitors.discard(visitor)
         self.counters["frames_sent"] += visitor.sent
         self.counters["frames_skipped"] += visitor.skipped
-        self._count()
+        self._update_watched()
 
     def queue_frame(self, robot: str, frame: bytes) -> None:
-        """To all who watch the robot."""
+        """Queues a frame for all visitors who watch the robot."""
         for visitor in self._visitors:
             if visitor.robot == robot:
                 visitor.queue_frame(frame)
 
     def queue_text(self, robot: str, kind: str, text: str | bytes) -> None:
-        """To all who watch the robot."""
+        """Queues a message for all visitors who watch the robot."""
         for visitor in self.watching(robot):
             visitor.queue_text(text, kind)
 
-    def _count(self) -> None:
+    def _update_watched(self) -> None:
         self.watched = frozenset(visitor.robot for visitor in self._visitors)
         self._changed()

@@ -1,7 +1,8 @@
 """One frame for the page as bytes.
 
-Layout: uint32 little-endian N, N bytes of JSON (padded with spaces so that 4 + N is a multiple of 4), then the arrays,
-little-endian float32, one after another. The header's ``arrays`` gives [offset, count] of each, in floats after it.
+Layout: N as a little-endian uint32, then N bytes of JSON (padded with spaces so that 4 + N is a multiple of 4), then
+the arrays one after another, as little-endian float32. The header's field ``arrays`` gives [offset, count] of each
+array, counted in floats from the end of the header.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ COMPACT = (",", ":")
 
 
 def encode(header: Json, arrays: Mapping[str, npt.NDArray[np.float32]]) -> bytes:
-    """The frame; the header gets ``arrays``. A number that JSON does not have raises ValueError."""
+    """Encodes a frame, and adds ``arrays`` to the header. Raises ValueError if the header has a non-finite number."""
     places, offset = {}, 0
     for name, array in arrays.items():
         places[name] = [offset, len(array)]
@@ -35,48 +36,51 @@ def encode(header: Json, arrays: Mapping[str, npt.NDArray[np.float32]]) -> bytes
 def arrays_of(
     scan: Scan, prediction: Prediction | None, plan: Plan | None, truth: Truth | None
 ) -> dict[str, npt.NDArray[np.float32]]:
-    """Measured ranges, expected ranges and their stated sigma, m; points in map as x, y, x, y, ..., m; empty: none."""
-    none = np.zeros(0, np.float32)
+    """Arrays of a frame, in m: measured and predicted ranges and their sigma, and points in map as x, y, x, y, ...
+
+    The array of a missing message is empty.
+    """
+    empty = np.zeros(0, np.float32)
     return {
         "ranges": scan.ranges,
-        "predicted": prediction.ranges if prediction is not None else none,
-        "sigma": prediction.sigma if prediction is not None else none,
-        "path": plan.path.ravel() if plan is not None else none,
-        "motion": plan.motion.ravel() if plan is not None else none,
-        "obstacles": plan.obstacles.ravel() if plan is not None else none,
-        "people": truth.people.ravel() if truth is not None else none,
+        "predicted": prediction.ranges if prediction is not None else empty,
+        "sigma": prediction.sigma if prediction is not None else empty,
+        "path": plan.path.ravel() if plan is not None else empty,
+        "motion": plan.motion.ravel() if plan is not None else empty,
+        "obstacles": plan.obstacles.ravel() if plan is not None else empty,
+        "people": truth.people.ravel() if truth is not None else empty,
     }
 
 
 def pose_of(pose: Pose) -> Json:
-    """Place in m, yaw in rad."""
+    """Position in m and yaw in rad."""
     return {"x": pose.x, "y": pose.y, "yaw": pose.yaw}
 
 
 def twist_of(twist: Twist) -> Json:
-    """Velocity in m/s, turn in rad/s."""
+    """Velocity in m/s and turn rate in rad/s."""
     return {"vx": twist.vx, "vy": twist.vy, "wz": twist.wz}
 
 
 def truth_of(truth: Truth | None) -> Json | None:
-    """Pose in map, and what happens to the body."""
+    """True pose in map, and whether the robot touches something or is held by the obstacle stop."""
     if truth is None:
         return None
     return {**pose_of(truth.pose), "contact": truth.contact, "stopped": truth.stopped}
 
 
 def odom_of(odom: Odom | None) -> Json | None:
-    """Pose in odom and velocity in base_link."""
+    """Pose in odom, and velocity in base_link."""
     return None if odom is None else {**pose_of(odom.pose), **twist_of(odom.twist)}
 
 
 def cmd_of(command: CmdVel | None) -> Json | None:
-    """The velocity commanded."""
+    """Commanded velocity."""
     return None if command is None else twist_of(command.twist)
 
 
 def belief_of(belief: Belief | None) -> Json | None:
-    """The posterior; ``cov`` is (3, 3) of x, y, yaw, row by row."""
+    """Belief with its hypotheses. ``cov`` is the (3, 3) covariance of x, y, yaw, row by row."""
     if belief is None:
         return None
     return {
@@ -87,26 +91,24 @@ def belief_of(belief: Belief | None) -> Json | None:
         "free_energy": belief.free_energy,
         "accuracy": belief.accuracy,
         "complexity": belief.complexity,
-        "hypotheses": [
-            {**pose_of(h.pose), "weight": h.weight, "cov": _flat(h.covariance)} for h in belief.hypotheses
-        ],
+        "hypotheses": [{**pose_of(h.pose), "weight": h.weight, "cov": _flat(h.covariance)} for h in belief.hypotheses],
         "estimator": belief.estimator,
-    }  # fmt: skip
+    }
 
 
 def status_of(status: Status | None, goals: Mapping[int, Goal]) -> Json | None:
-    """What the controller does, and why; what is asked of the goal where it is one of ``goals``, by number."""
+    """The controller's status. Includes the goal's tolerances if the goal is one of ``goals`` (by sequence number)."""
     if status is None:
         return None
     goal: Json | None = pose_of(status.goal) if status.goal is not None else None
-    asked = goals.get(status.goal_seq)
-    if goal is not None and asked is not None and asked.pose == status.goal:
-        goal |= {"tolerance": asked.tolerance, "yaw_tolerance": asked.yaw_tolerance}
+    message = goals.get(status.goal_seq)
+    if goal is not None and message is not None and message.pose == status.goal:
+        goal |= {"tolerance": message.tolerance, "yaw_tolerance": message.yaw_tolerance}
     return {"state": status.state, "reason": status.reason[:500], "distance": status.distance, "goal": goal}
 
 
 def scan_of(scan: Scan) -> Json:
-    """The scan's geometry."""
+    """Beam angles, maximum range and mount of a scan."""
     return {
         "angle_min": scan.angle_min,
         "angle_increment": scan.angle_increment,

@@ -8,56 +8,55 @@ from typing import Any
 
 from common.messages.definitions import Health, TopicHealth
 
-EXPECTED = ("simulator", "estimator", "controller")  # what a robot needs to move by itself
-FORGET_AFTER_S = 30.0  # s after its last pulse, a service that is not alive is no longer listed
-MAX_SERVICES = 50  # services; somebody may invent names
+EXPECTED = ("simulator", "estimator", "controller")  # services that a robot needs to navigate
+FORGET_AFTER_S = 30.0  # after its last health message, a service that is not alive is no longer listed
+MAX_SERVICES = 50  # so that invented names cannot fill the memory
 
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class HealthPair:
-    """The last two of a service, and when the last came."""
+    """The last two health messages of a service."""
 
     now: Health
     before: Health | None
-    at: float  # s, a clock that only goes forward
+    at: float  # monotonic time at which the last one was received, s
 
 
 class HealthHistory:
-    """Health messages of one robot."""
+    """Health messages of one robot's services."""
 
     def __init__(self) -> None:
-        """None heard."""
         self._by_service: dict[str, HealthPair] = {}
 
     def add(self, health: Health, at: float) -> None:
-        """Take one."""
+        """Stores a message received at monotonic time ``at`` in s."""
         before = self._by_service.get(health.service)
         if before is None and len(self._by_service) >= MAX_SERVICES:
             return
-        # A service that was started anew counts from 0 again; two recorders may run, each with counts of its own.
+        # Counts can only be compared within one process: a restarted service, or a second recorder, has its own.
         same = before is not None and before.now.instance == health.instance and before.now.uptime < health.uptime
         self._by_service[health.service] = HealthPair(health, before.now if before is not None and same else None, at)
 
     def rows(self, alive: Collection[str], at: float) -> list[Row]:
-        """One a service, alive or heard of lately, in order of their names."""
+        """One row for each service that is alive or sent health lately, in order of their names."""
         for name in [n for n, p in self._by_service.items() if n not in alive and at - p.at > FORGET_AFTER_S]:
             del self._by_service[name]
         names = sorted({*sorted(alive)[:MAX_SERVICES], *self._by_service})
         return [self._row(name, name in alive, at) for name in names]
 
     def _row(self, name: str, alive: bool, at: float) -> Row:  # noqa: FBT001
-        pulse = self._by_service.get(name)
-        if pulse is None:
+        pair = self._by_service.get(name)
+        if pair is None:
             return {"name": name, "alive": alive, "age_s": None, "note": "", "rates": [], "uptime_s": None}
-        health, before = pulse.now, pulse.before
+        health, before = pair.now, pair.before
         earlier = {row.key: row for row in before.topics} if before is not None else {}
         seconds = health.uptime - before.uptime if before is not None else 0.0
         return {
             "name": name,
             "alive": alive,
-            "age_s": round(at - pulse.at, 1),
+            "age_s": round(at - pair.at, 1),
             "note": health.note[:500],
             "rates": [rates(row, earlier.get(row.key), seconds) for row in health.topics],
             "uptime_s": round(health.uptime, 1),
@@ -65,7 +64,10 @@ class HealthHistory:
 
 
 def rates(row: TopicHealth, before: TopicHealth | None, seconds: float) -> Row:
-    """Of one key in one service; Hz between two messages ``seconds`` apart, or as the service says."""
+    """Rates of one key in one service, in Hz.
+
+    Computed from the counts of two health messages ``seconds`` apart. With only one message, the rate it states.
+    """
     topic = "/".join(row.key.split("/")[2:]) or row.key
     if before is not None and seconds > 0:
         published, received = (
@@ -84,7 +86,7 @@ def rates(row: TopicHealth, before: TopicHealth | None, seconds: float) -> Row:
 
 
 def how_to_start(service: str, robot: str, connect: str = "") -> str:
-    """The command; ``connect`` where it is not the default."""
+    """Command that starts a service. ``connect``: endpoints, or empty for the default."""
     words = ["python -m", "common.router" if service == "router" else f"services.{service}"]
     if service != "router":
         words += [f"--robot {robot}"] * (robot != "robot") + [f"--connect {connect}"] * bool(connect)
@@ -92,8 +94,11 @@ def how_to_start(service: str, robot: str, connect: str = "") -> str:
 
 
 def missing(alive: Collection[str], *, linked: bool, scans: bool) -> list[str]:
-    """Services a robot lacks to go by itself. A replay lacks none; scans may come from a real robot as well."""
+    """Services that a robot still needs to navigate. A replay needs none.
+
+    ``scans``: whether scans arrive. If so, no simulator is needed, because a real robot may send them.
+    """
     if "replay" in alive:
         return []
-    there = {*alive, *(["simulator"] if scans else [])}
-    return [*([] if linked else ["router"]), *(name for name in EXPECTED if name not in there)]
+    present = {*alive, *(["simulator"] if scans else [])}
+    return [*([] if linked else ["router"]), *(name for name in EXPECTED if name not in present)]

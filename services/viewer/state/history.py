@@ -6,19 +6,19 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
-SPAN_S = 60.0  # s of stamps
-MAX_SAMPLES = 5000  # samples, whatever the rate
+SPAN_S = 60.0  # by the stamps
+MAX_SAMPLES = 5000
 
 
 @dataclass(frozen=True)
 class ChartSample:
-    """One belief's worth."""
+    """Values of one belief."""
 
-    t: float  # s, its stamp
+    t: float  # stamp, s
     free_energy: float  # nats
     accuracy: float  # nats
     complexity: float  # nats
-    error: float | None  # m, from the truth
+    error: float | None  # m, distance from the true position
     speed: float | None  # m/s
 
 
@@ -26,11 +26,10 @@ class History:
     """Samples in order of their stamps."""
 
     def __init__(self) -> None:
-        """Empty."""
         self._samples: deque[ChartSample] = deque(maxlen=MAX_SAMPLES)
 
     def add(self, sample: ChartSample) -> None:
-        """The newest; those of its stamp or later are gone then, and those more than `SPAN_S` older."""
+        """Adds the newest sample. Removes samples with its stamp or later, and those more than `SPAN_S` older."""
         samples = self._samples
         while samples and samples[-1].t >= sample.t:
             samples.pop()
@@ -39,10 +38,10 @@ class History:
         samples.append(sample)
 
     def clear(self) -> None:
-        """Forget all."""
+        """Removes all samples."""
         self._samples.clear()
 
     def columns(self) -> dict[str, list[Any]]:
-        """One list a quantity, all of one length."""
+        """One list per quantity, all of the same length."""
         names = ("t", "free_energy", "accuracy", "complexity", "error", "speed")
         return {name: [getattr(sample, name) for sample in self._samples] for name in names}

@@ -1,7 +1,7 @@
 """Messages of a replay by stamp.
 
-A replay that is scrubbed stops between a scan and its belief, and a step's messages come at once, in whatever order
-the network brings them. So they are gathered until it is quiet, and then the fullest moment is shown.
+After a seek, a replay may stop between a scan and its belief, and the messages of one step arrive at once and in any
+order. So messages are collected until none arrives for a while; then the stamp with the most messages is shown.
 """
 
 from __future__ import annotations
@@ -11,41 +11,41 @@ from collections import OrderedDict
 from common.messages.definitions import Stamped
 from common.messages.topics import PLAN, SCAN, Topic
 
-QUIET_TIME_S = 0.03  # s without a message: what was sent has come
-MAX_GATHERING_S = 0.06  # s, of one that plays on without a pause
-MAX_STAMPS = 64  # stamps
+QUIET_TIME_S = 0.03  # without a message: all messages of a step have arrived
+MAX_GATHERING_S = 0.06  # longest collection, for a replay that plays without a pause
+MAX_STAMPS = 64
 
-MessagesByTopic = dict[str, Stamped]  # by topic's name
+MessagesByTopic = dict[str, Stamped]  # by the topic's name
 
 
 class ReplayMoments:
-    """Those that may still be shown."""
+    """Messages of a replay that may still be shown."""
 
     def __init__(self) -> None:
-        """None."""
         self._by_stamp: OrderedDict[int, MessagesByTopic] = OrderedDict()
-        self._shown = (-1, 0)  # stamp, and how many messages it had
-        self._first = self._last = 0.0  # s, when messages came that nobody looked at yet
-        self._news = False
+        self._shown = (-1, 0)  # stamp last shown, and its number of messages at that time
+        self._first = self._last = 0.0  # when the first and last new message arrived, s
+        self._has_new = False  # messages have arrived since the last `choose`
 
     def take(self, topic: Topic, message: Stamped, at: float) -> None:
-        """Add a message."""
+        """Adds a message received at time ``at`` in s."""
         self._by_stamp.setdefault(message.stamp_ns, {})[topic.name] = message
         if len(self._by_stamp) > MAX_STAMPS:
             self._by_stamp.popitem(last=False)
-        self._first = self._first if self._news else at
-        self._last, self._news = at, True
+        self._first = self._first if self._has_new else at
+        self._last, self._has_new = at, True
 
     def due(self, at: float) -> float | None:
-        """Seconds until `choose` may be asked; None: nothing came."""
-        return min(self._last + QUIET_TIME_S, self._first + MAX_GATHERING_S) - at if self._news else None
+        """Seconds until `choose` should be called. Returns None if there is no new message."""
+        return min(self._last + QUIET_TIME_S, self._first + MAX_GATHERING_S) - at if self._has_new else None
 
     def choose(self) -> MessagesByTopic | None:
-        """The fullest of those not shown as they are, of several the newest; what is older is forgotten.
+        """Messages of the stamp with the most messages among those not yet shown; the newest stamp if several match.
 
-        A plan does not count: where the robot stands there is none.
+        Plans are not counted, because a standing robot has none. Older stamps are removed. Returns None if there is
+        nothing new to show.
         """
-        self._news = False
+        self._has_new = False
         stamp, count = max(
             ((s, len(m)) for s, m in self._by_stamp.items() if SCAN.name in m and self._is_new(s, len(m))),
             key=lambda moment: (moment[1] - (PLAN.name in self._by_stamp[moment[0]]), moment[0]),
@@ -59,10 +59,10 @@ class ReplayMoments:
         return self._by_stamp[stamp]
 
     def clear(self) -> None:
-        """Time went back."""
+        """Removes all messages, after stamps went back."""
         self._by_stamp.clear()
-        self._shown, self._news = (-1, 0), False
+        self._shown, self._has_new = (-1, 0), False
 
     def _is_new(self, stamp: int, count: int) -> bool:
-        shown, had = self._shown
-        return stamp > shown or (stamp == shown and count > had)
+        shown_stamp, shown_count = self._shown
+        return stamp > shown_stamp or (stamp == shown_stamp and count > shown_count)

@@ -1,7 +1,8 @@
 """One robot's latest state.
 
-A frame shows one moment: scan, truth, belief, prediction and command of the same stamp. What answers a scan comes some
-milliseconds after it and is waited for, shortly, from those who have spoken lately. Of a replay see `ReplayMoments`.
+A frame shows scan, truth, belief, prediction and command of the same stamp. The answers to a scan arrive some
+milliseconds after it, so the frame waits for them briefly, but only for topics that had messages lately. Frames of a
+replay are chosen by `ReplayMoments`.
 """
 
 from __future__ import annotations
@@ -44,72 +45,76 @@ from services.viewer.state.history import ChartSample, History
 from services.viewer.state.replay_moments import ReplayMoments
 from services.viewer.state.status_log import StatusLog
 
-ANSWER_TIMEOUT_S = 0.05  # s of the wall's clock after a scan in which its answers are waited for
-SILENCE_TIMEOUT_S = 2.0  # s behind the scan, by stamps and by the wall: no longer waited for, no longer shown
-ALWAYS_READ_TOPICS = (BELIEF, TRUTH, STATUS, GOAL, HEALTH)  # read though nobody watches
+ANSWER_TIMEOUT_S = 0.05  # wall time for which a frame waits for the answers to its scan
+SILENCE_TIMEOUT_S = 2.0  # behind the scan, by stamps and by wall time; older messages are not waited for and not shown
+ALWAYS_READ_TOPICS = (BELIEF, TRUTH, STATUS, GOAL, HEALTH)  # decoded even if no visitor watches the robot
 SHOWN_TOPICS = (*ALWAYS_READ_TOPICS, SCAN, ODOM, PREDICTION, CMD_VEL, PLAN, PREFERENCE)
-SENSOR_TOPICS = (ODOM, TRUTH, SCAN)  # what a new stamp begins with
+SENSOR_TOPICS = (ODOM, TRUTH, SCAN)  # the first messages of a new stamp
 ANSWER_TOPICS = (ODOM, TRUTH, BELIEF, PREDICTION, CMD_VEL, PLAN)
-MAX_TRUTHS = 256  # stamps; a belief may come that much later than its truth
-MAX_GOALS = 8  # the last ones given
+MAX_TRUTHS = 256  # kept, because a belief arrives later than the truth of its stamp
+MAX_GOALS = 8  # kept, the last ones received
 
 M = TypeVar("M", bound=Stamped)
 
 
 @dataclass(frozen=True)
 class ReceivedMessage:
-    """A message and when it came."""
+    """A message and its times."""
 
     message: Stamped
-    at: float  # s, a clock that only goes forward
-    published_ns: int  # wall time at its publisher, 0 if unknown
+    at: float  # monotonic time of reception, s
+    published_ns: int  # wall time at the publisher, 0 if unknown
 
 
 class RobotView:
     """Latest messages of one robot."""
 
     def __init__(self, robot: str, *, live: bool = True) -> None:
-        """Nothing heard; ``live``: not a replay."""
+        """``live``: the robot is not a replay."""
         self.robot, self.live = robot, live
         self.history, self.journal, self.fields = History(), StatusLog(), GoalFields()
-        self.time_restarted = self.log_changed = False  # stamps went back; the journal grew. For who tells visitors
-        self.frame: bytes | None = None  # the last one
-        self._heard: dict[str, ReceivedMessage] = {}
+        self.time_restarted = False  # stamps went back; reset by the caller once visitors have the new history
+        self.log_changed = False  # the journal has new rows; reset by the caller once visitors have them
+        self.frame: bytes | None = None  # the last frame
+        self._received: dict[str, ReceivedMessage] = {}  # the last message by topic name
         self._truths: OrderedDict[int, Truth] = OrderedDict()  # by stamp
-        self._goals: OrderedDict[int, Goal] = OrderedDict()  # by number
-        self._moments = ReplayMoments()  # of a replay
-        self._waiting: tuple[int, float] | None = None  # stamp of the scan that waits for its answers, and since when
+        self._goals: OrderedDict[int, Goal] = OrderedDict()  # by sequence number
+        self._moments = ReplayMoments()  # used if not live
+        self._waiting: tuple[int, float] | None = None  # stamp of the scan that waits for answers, and since when
         self._latency_ms: float | None = None
 
     def add(self, topic: Topic, message: Stamped, at: float, published_ns: int = 0) -> bytes | None:
-        """Take a message; a frame, where one is complete with it or complete no more."""
+        """Stores a message received at monotonic time ``at`` in s.
+
+        Returns a frame if this message completes one, or if it begins a new stamp while a frame is still incomplete.
+        """
         if isinstance(message, Preference | Goal):
-            self._keep_aside(message)
+            self._store_goal(message)
             return None
-        last, frame = self._heard.get(topic.name), None
+        last, frame = self._received.get(topic.name), None
         if topic in SENSOR_TOPICS and last is not None and message.stamp_ns < last.message.stamp_ns:
-            self._begin_anew()
+            self._restart()
         elif topic in SENSOR_TOPICS and self._waiting is not None and message.stamp_ns != self._waiting[0]:
             frame = self._frame(at)
         if isinstance(message, Truth) and last is not None and isinstance(last.message, Truth):
             self.log_changed |= self.journal.add_carry(last.message, message)
-        self._heard[topic.name] = ReceivedMessage(message, at, published_ns)
-        self._keep(message)
+        self._received[topic.name] = ReceivedMessage(message, at, published_ns)
+        self._update(message)
         if not self.live:
             self._moments.take(topic, message, at)
             return None
         if isinstance(message, Scan):
             self._waiting = (message.stamp_ns, at)
-        return self._frame(at) if self._answered(at) else frame
+        return self._frame(at) if self._is_complete(at) else frame
 
     def due(self, at: float) -> float | None:
-        """Seconds until what came is to be shown, complete or not; None: nothing waits."""
+        """Seconds until the waiting frame is sent, even if incomplete. Returns None if no frame is waiting."""
         if not self.live:
             return self._moments.due(at)
         return self._waiting[1] + ANSWER_TIMEOUT_S - at if self._waiting is not None else None
 
     def overdue(self, at: float) -> bytes | None:
-        """The frame of what has waited long enough, with what there is."""
+        """The waiting frame, if its wait is over, with the messages received so far."""
         due = self.due(at)
         if due is None or due > 0:
             return None
@@ -118,39 +123,42 @@ class RobotView:
         moment = self._moments.choose()
         if moment is None:
             return None
-        self._heard.update({name: ReceivedMessage(message, at, 0) for name, message in moment.items()})
+        self._received.update({name: ReceivedMessage(message, at, 0) for name, message in moment.items()})
         return self._frame(at)
 
     def fresh(self, topic: Topic, kind: type[M], at: float) -> M | None:
-        """The last message of a topic, unless it fell silent. While time stands still nobody falls silent."""
-        heard = self._heard.get(topic.name)
-        if heard is None or not isinstance(heard.message, kind):
+        """The last message of a topic. Returns None if it is too old, by its stamp and by wall time.
+
+        While a simulation is paused, stamps do not advance and messages do not become too old.
+        """
+        last = self._received.get(topic.name)
+        if last is None or not isinstance(last.message, kind):
             return None
-        behind = (self.stamp_ns - heard.message.stamp_ns) * 1e-9
-        return None if self.live and behind > SILENCE_TIMEOUT_S and at - heard.at > SILENCE_TIMEOUT_S else heard.message
+        behind = (self.stamp_ns - last.message.stamp_ns) * 1e-9
+        return None if self.live and behind > SILENCE_TIMEOUT_S and at - last.at > SILENCE_TIMEOUT_S else last.message
 
     @property
     def status(self) -> Status | None:
-        """The controller's last word, however old."""
-        heard = self._heard.get(STATUS.name)
-        return heard.message if heard is not None and isinstance(heard.message, Status) else None
+        """The controller's last status, however old."""
+        last = self._received.get(STATUS.name)
+        return last.message if last is not None and isinstance(last.message, Status) else None
 
     @property
     def stamp_ns(self) -> int:
-        """Of the newest of what begins a stamp; 0 before the first."""
-        return max((h.message.stamp_ns for t in SENSOR_TOPICS if (h := self._heard.get(t.name))), default=0)
+        """Stamp of the newest sensor message. 0 before the first."""
+        return max((last.message.stamp_ns for t in SENSOR_TOPICS if (last := self._received.get(t.name))), default=0)
 
-    def _begin_anew(self) -> None:
-        """After a reset, or a replay's jump back: what is known is about another time."""
-        self._heard.clear()
+    def _restart(self) -> None:
+        """Discards all messages, after a reset or a replay's jump back."""
+        self._received.clear()
         self._moments.clear()
         self._truths.clear()
         self.history.clear()
         self.journal.clear()
         self._waiting, self._latency_ms, self.time_restarted, self.log_changed = None, None, True, True
 
-    def _keep_aside(self, message: Preference | Goal) -> None:
-        """What is about no scan."""
+    def _store_goal(self, message: Preference | Goal) -> None:
+        """Stores a message that does not belong to a scan."""
         if isinstance(message, Preference):
             self.fields.add(message, self.robot, live=self.live)
             return
@@ -158,14 +166,15 @@ class RobotView:
         if len(self._goals) > MAX_GOALS:
             self._goals.popitem(last=False)
 
-    def _keep(self, message: Stamped) -> None:
+    def _update(self, message: Stamped) -> None:
+        """Updates history, log and latency with a message."""
         if isinstance(message, Truth):
             self._truths[message.stamp_ns] = message
             if len(self._truths) > MAX_TRUTHS:
                 self._truths.popitem(last=False)
-            belief = self._heard.get(BELIEF.name)
-            if belief is not None and belief.message.stamp_ns == message.stamp_ns:  # the network turned them round
-                self._keep(belief.message)
+            belief = self._received.get(BELIEF.name)
+            if belief is not None and belief.message.stamp_ns == message.stamp_ns:  # it arrived before its truth
+                self._update(belief.message)
         elif isinstance(message, Belief):
             t, error, speed = message.stamp_ns * 1e-9, self._error(message), self._speed()
             self.history.add(ChartSample(t, message.free_energy, message.accuracy, message.complexity, error, speed))
@@ -175,41 +184,41 @@ class RobotView:
             self.log_changed |= self.journal.add(message)
 
     def _error(self, belief: Belief) -> float | None:
-        """m, between the belief and the truth of its stamp."""
+        """Distance in m between the belief and the true position at its stamp."""
         truth = self._truths.get(belief.stamp_ns)
         if truth is None:
             return None
         return _length(belief.pose.x - truth.pose.x, belief.pose.y - truth.pose.y)
 
     def _speed(self) -> float | None:
-        """m/s, the true one, or what dead reckoning says."""
+        """Speed in m/s: the true one, or else that of the odometry."""
         for topic in (TRUTH, ODOM):
-            heard = self._heard.get(topic.name)
-            if heard is not None and isinstance(heard.message, Truth | Odom):
-                return _length(heard.message.twist.vx, heard.message.twist.vy)
+            last = self._received.get(topic.name)
+            if last is not None and isinstance(last.message, Truth | Odom):
+                return _length(last.message.twist.vx, last.message.twist.vy)
         return None
 
     def _latency(self, command: CmdVel) -> float | None:
-        """ms, from the scan's publication to that of the command that answers it; None where they are not a pair."""
-        scan, published = self._heard.get(SCAN.name), self._heard[CMD_VEL.name].published_ns
+        """Time in ms from the publication of a scan to that of its command. Returns None if the stamps differ."""
+        scan, published_ns = self._received.get(SCAN.name), self._received[CMD_VEL.name].published_ns
         if not self.live or scan is None or scan.message.stamp_ns != command.stamp_ns:
             return None
-        if scan.published_ns == 0 or published < scan.published_ns:
+        if scan.published_ns == 0 or published_ns < scan.published_ns:
             return None
-        return (published - scan.published_ns) * 1e-6
+        return (published_ns - scan.published_ns) * 1e-6
 
-    def _answered(self, at: float) -> bool:
-        """Whether all who spoke lately have spoken about the waiting scan."""
+    def _is_complete(self, at: float) -> bool:
+        """Whether every answer topic with recent messages has one for the waiting scan."""
         if self._waiting is None:
             return False
         last = (self.fresh(topic, Stamped, at) for topic in ANSWER_TOPICS)
-        known = [message for message in last if message is not None and not _is_over(message)]
-        # Where nobody has answered yet it is too early to say that nobody will.
+        known = [message for message in last if message is not None and not _is_empty_plan(message)]
+        # Before the first answer it is not known which topics to wait for, so the frame waits for the timeout.
         return bool(known) and all(message.stamp_ns >= self._waiting[0] for message in known)
 
     def _frame(self, at: float) -> bytes | None:
         self._waiting = None
-        scan = self._heard[SCAN.name].message
+        scan = self._received[SCAN.name].message
         if not isinstance(scan, Scan):
             return None
         belief = self.fresh(BELIEF, Belief, at)
@@ -234,11 +243,11 @@ class RobotView:
 
 
 def _length(x: float, y: float) -> float | None:
-    """None where it is beyond all numbers."""
+    """Length of a vector. Returns None if it is not finite."""
     length = math.hypot(x, y)
     return length if math.isfinite(length) else None
 
 
-def _is_over(message: Stamped) -> bool:
-    """A plan with nothing in it is the last one for a while."""
+def _is_empty_plan(message: Stamped) -> bool:
+    """Whether the message is an empty plan, after which no plan is expected."""
     return isinstance(message, Plan) and not len(message.path) and not len(message.obstacles)

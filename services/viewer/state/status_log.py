@@ -9,22 +9,24 @@ from typing import Any
 
 from common.messages.definitions import Status, Truth
 
-MAX_ROWS = 20  # rows
-DISTANCE_MARGIN, ANGLE_MARGIN = 0.1, 0.3  # m and rad of a displacement that are no carry, whatever the speed
-ACCELERATION, TURN_ACCELERATION = 2.0, 12.0  # m/s² and rad/s², more than robots have
+MAX_ROWS = 20
+DISTANCE_MARGIN, ANGLE_MARGIN = 0.1, 0.3  # m and rad; smaller displacements are never reported
+ACCELERATION, TURN_ACCELERATION = 2.0, 12.0  # m/s² and rad/s²; more than robots reach
 NUMBERS = re.compile(r"[-+\d.,()]+")
 
 
 class StatusLog:
-    """One row for each change of state, or of reason; none for one that is over or has other numbers in it."""
+    """Has one row for each change of state or reason.
+
+    A reason that ends, or that only differs in its numbers, makes no new row.
+    """
 
     def __init__(self) -> None:
-        """Empty."""
         self._rows: deque[dict[str, Any]] = deque(maxlen=MAX_ROWS)
-        self._last: dict[str, Any] | None = None  # the last row of a status
+        self._last: dict[str, Any] | None = None  # the last row made by a status
 
     def add(self, status: Status) -> bool:
-        """Take a status; whether it made a row."""
+        """Processes a status. Returns whether it made a new row."""
         reason = status.reason[:500]
         last = self._last
         same = last is not None and last["state"] == status.state
@@ -44,12 +46,12 @@ class StatusLog:
         return True
 
     def clear(self) -> None:
-        """Time went back."""
+        """Removes all rows, after stamps went back."""
         self._rows.clear()
         self._last = None
 
     def rows(self) -> list[dict[str, Any]]:
-        """Time in s, state and reason; the oldest first."""
+        """Rows with time in s, state and reason, the oldest first."""
         return list(self._rows)
 
 
