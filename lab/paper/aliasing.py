@@ -1,7 +1,7 @@
 """Similar objects.
 
-Three worlds: the corridor with its four different objects, for comparison; the same hall with four equal boxes, evenly
-spaced; and two rooms alike, at places of which no scan says which room it is.
+Three worlds: the corridor with its four different objects, for comparison; the same hall with four equal, evenly spaced
+boxes; and two identical rooms, at places where the scans of both rooms are the same.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
 from services.estimator.shared.interface import Estimator, Posterior
 
-EXPERIMENT_ID = 5  # of the experiment, in its seeds
-PLACES_SEED, LEARNING_SEED, SCANS_SEED = 0, 1, 2  # in the seeds
-HEADING = float(np.pi / 2)  # rad, the paper's one; nobody else is told
+EXPERIMENT_ID = 5  # part of the random seeds
+PLACES_SEED, LEARNING_SEED, SCANS_SEED = 0, 1, 2  # parts of the random seeds
+HEADING = float(np.pi / 2)  # rad, of all places; only the paper's estimator is given it
 ALIKE = World(
     name="alike",
     boundary=[(0, 0), (18, 0), (18, 4.5), (0, 4.5)],
@@ -43,7 +43,7 @@ TITLES = {
     "twins": "twins: two rooms alike",
 }  # fmt: skip
 ESTIMATORS = ("paper", "precise", "particle-filter")
-MOMENTS = (1, 10, 50)  # scans after which it is asked how well they did
+MOMENTS = (1, 10, 50)  # numbers of scans after which the results are evaluated
 
 
 @dataclass(frozen=True)
@@ -56,41 +56,44 @@ class Job:
     places: int = 50
     iterations: int = 50
     beams: int = 622
-    samples: int = 13_000  # of the paper's decoder
+    samples: int = 13_000  # training scans of the paper's decoder
     steps: int = learning.GRADIENT_STEPS
-    scans: int = 2000  # that the field is learned from
+    scans: int = 2000  # training scans of the distance field
     descent: Descent = PAPER_DESCENT
 
 
 def world_of(name: str) -> World:
-    """One of the three."""
+    """One of the experiment's worlds, by name."""
     return {"alike": ALIKE, "twins": TWINS}.get(name) or load_world(name)
 
 
 def scene_of(job: Job, *seed: int) -> Scene:
-    """The job's world; places and scans are the same for every estimator."""
+    """The job's world with random numbers that do not depend on the estimator."""
     return Scene.of(world_of(job.world), job.beams, (job.seed, EXPERIMENT_ID, list(TITLES).index(job.world), *seed))
 
 
 def sample_places(scene: Scene, count: int) -> Array:
-    """(count, 3) places at the one heading; among twins only such as give the very scan of their twin."""
+    """Random poses (count, 3) with `HEADING`.
+
+    In the world of two rooms only poses whose scan is the same in the other room.
+    """
     if scene.world.name != TWINS.name:
         poses = scene.poses(count)
         poses[:, 2] = HEADING
         return poses
-    found: list[Array] = []
-    while sum(map(len, found)) < count:
+    accepted: list[Array] = []
+    while sum(map(len, accepted)) < count:
         poses = np.column_stack([scene.rng.uniform([0, 0], [TWIN_OFFSET, 4.0], (500, 2)), np.full(500, HEADING)])
         poses = poses[scene.world.clearance(poses[:, :2]) > ROBOT.radius]
-        found.append(poses[alike(scene, poses)])
-    poses = np.concatenate(found)[:count]
+        accepted.append(poses[alike(scene, poses)])
+    poses = np.concatenate(accepted)[:count]
     poses[:, 0] += TWIN_OFFSET * scene.rng.integers(2, size=count)
     return np.asarray(poses)
 
 
 def trial(job: Job) -> dict[str, Any]:
-    """What the estimator learns and then believes at each place."""
-    make = _maker(job)
+    """Trains the job's estimator, then runs it at each place."""
+    make = _estimator_factory(job)
     rows = []
     for number, pose in enumerate(sample_places(scene_of(job, PLACES_SEED), job.places)):
         scene = scene_of(job, SCANS_SEED, number)
@@ -101,8 +104,8 @@ def trial(job: Job) -> dict[str, Any]:
     return {"world": job.world, "estimator": job.estimator, "places": rows}
 
 
-def _maker(job: Job) -> Callable[[int], Estimator]:
-    """New estimators that know nothing but the world, learned here; by the place's number."""
+def _estimator_factory(job: Job) -> Callable[[int], Estimator]:
+    """Trains the model. Returns a function that makes a new estimator, without start pose, for a place's number."""
     scene = scene_of(job, LEARNING_SEED, ESTIMATORS.index(job.estimator))
     if job.estimator == "paper":
         decoder = learning.train_paper(scene, HEADING, job.samples, job.steps, job.seed)
@@ -115,28 +118,37 @@ def _maker(job: Job) -> Callable[[int], Estimator]:
 
 
 def _row(pose: Array, posteriors: Sequence[Posterior], *, twins: bool) -> dict[str, Any]:
-    """One place: errors and wrong claims after every scan, and at the end whether both of two like places are kept."""
+    """Results at one place: error and wrong claim after every scan.
+
+    With ``twins`` also whether the last belief contains both of the two indistinguishable places.
+    """
     off = [round(float(np.hypot(*(p.pose - pose)[:2])), 6) for p in posteriors]
     wrong = [int(p.state == "tracking" and error > FOUND_DISTANCE) for p, error in zip(posteriors, off, strict=True)]
     last = posteriors[-1]
-    found = {"pose": pose.tolist(), "believed": last.pose.tolist(), "error_m": off, "wrong": wrong, "claim": last.state}
+    statistics = {
+        "pose": pose.tolist(),
+        "believed": last.pose.tolist(),
+        "error_m": off,
+        "wrong": wrong,
+        "claim": last.state,
+    }
     if not twins:
-        return found
+        return statistics
     twin = twin_of(pose)
     near = [any(np.hypot(*(h.pose - at)[:2]) < CLOSE_DISTANCE for h in last.hypotheses) for at in (pose, twin)]
     either = min(off[-1], float(np.hypot(*(last.pose - twin)[:2])))
-    return {**found, "both_kept": int(last.state == "ambiguous" and all(near)), "either_error_m": round(either, 6)}
+    return {**statistics, "both_kept": int(last.state == "ambiguous" and all(near)), "either_error_m": round(either, 6)}
 
 
 def summarise(row: dict[str, Any]) -> dict[str, Any]:
-    """Numbers of one estimator in one world."""
+    """Statistics of one estimator in one world."""
     places = row["places"]
     errors, wrong = (np.array([place[name] for place in places]) for name in ("error_m", "wrong"))
     moments = [k for k in MOMENTS if k <= errors.shape[1]]
-    found: dict[str, Any] = {"world": row["world"], "estimator": row["estimator"], "places": len(places)}
-    found |= {f"within_0.2_m_after_{k}": int((errors[:, k - 1] < CLOSE_DISTANCE).sum()) for k in moments}
-    found |= {f"tracking_but_wrong_after_{k}": int(wrong[:, k - 1].sum()) for k in moments}
-    found |= {
+    statistics: dict[str, Any] = {"world": row["world"], "estimator": row["estimator"], "places": len(places)}
+    statistics |= {f"within_0.2_m_after_{k}": int((errors[:, k - 1] < CLOSE_DISTANCE).sum()) for k in moments}
+    statistics |= {f"tracking_but_wrong_after_{k}": int(wrong[:, k - 1].sum()) for k in moments}
+    statistics |= {
         "tracking_but_wrong_ever": int(wrong.any(axis=1).sum()),
         "final_error_median_m": float(np.median(errors[:, -1])),
         "final_error_mean_m": float(errors[:, -1].mean()),
@@ -144,14 +156,14 @@ def summarise(row: dict[str, Any]) -> dict[str, Any]:
     }
     if "both_kept" in places[0]:
         either = np.array([place["either_error_m"] for place in places])
-        found["both_kept"] = sum(place["both_kept"] for place in places)
-        found["at_either_within_0.2_m"] = int((either < CLOSE_DISTANCE).sum())
-    return found
+        statistics["both_kept"] = sum(place["both_kept"] for place in places)
+        statistics["at_either_within_0.2_m"] = int((either < CLOSE_DISTANCE).sum())
+    return statistics
 
 
 def run(job: Job, out: Path, workers: int, console: Console, worlds: Sequence[str] = tuple(TITLES)) -> results.Result:
     """Every estimator in every world; writes aliasing.json, .csv, .pdf and .png into ``out``."""
-    # What takes longest first: the decoders' training.
+    # The longest jobs first: the training of the paper's decoders.
     jobs = [replace(job, world=world, estimator=name) for name in ESTIMATORS for world in worlds]
     rows = run_trials("aliasing", trial, jobs, out, workers, console)
     rows = [row for world in worlds for row in rows if row["world"] == world]
@@ -171,7 +183,7 @@ def run(job: Job, out: Path, workers: int, console: Console, worlds: Sequence[st
 
 
 def draw(rows: Sequence[dict[str, Any]], summary: dict[str, dict[str, Any]]) -> Figure:
-    """A row a world: its map, with what the paper's estimator believed; shares of places as bars."""
+    """One row per world: a map with the final beliefs of the paper's estimator, and bars with shares of places."""
     worlds = list(dict.fromkeys(row["world"] for row in rows))
     figure = drawing.blank(14, 3.5 * len(worlds))
     panels = figure.subplots(len(worlds), 2, squeeze=False, width_ratios=(1.15, 1))
@@ -186,7 +198,7 @@ def draw(rows: Sequence[dict[str, Any]], summary: dict[str, dict[str, Any]]) -> 
 
 
 def _map(axes: Axes, world: World, places: Sequence[dict[str, Any]]) -> None:
-    """Walls, furniture, true places, and lines to where the belief ended where that is somewhere else."""
+    """Draws the world, the true places, and lines to the final beliefs that are wrong."""
     drawing.world_map(axes, world)
     true, believed = (np.array([place[key] for place in places])[:, :2] for key in ("pose", "believed"))
     off = np.hypot(*(believed - true).T) > FOUND_DISTANCE
@@ -200,26 +212,26 @@ def _map(axes: Axes, world: World, places: Sequence[dict[str, Any]]) -> None:
 
 
 def _bars(axes: Axes, summary: dict[str, dict[str, Any]]) -> None:
-    """Shares of places, a group for each question."""
+    """Draws bars of the shares of places, in groups of one bar per estimator."""
     one = next(iter(summary.values()))
-    asked = [
+    groups = [
         (f"after {k}\nscan{'s' * (k != '1')}", name)
         for name in one
         if name.startswith("within")
         for k in [name.rsplit("_", 1)[1]]
     ]
-    good = len(asked)
+    good = len(groups)
     last = max(int(name.rsplit("_", 1)[1]) for name in one if name.startswith("within"))
-    asked.append((f"says: here, but\n> {FOUND_DISTANCE} m off", f"tracking_but_wrong_after_{last}"))
+    groups.append((f"says: here, but\n> {FOUND_DISTANCE} m off", f"tracking_but_wrong_after_{last}"))
     if "both_kept" in one:
-        asked.append(("says: one of\nthese two", "both_kept"))
-    at, width = np.arange(len(asked)) + 0.35 * (np.arange(len(asked)) >= good), 0.8 / len(summary)
+        groups.append(("says: one of\nthese two", "both_kept"))
+    at, width = np.arange(len(groups)) + 0.35 * (np.arange(len(groups)) >= good), 0.8 / len(summary)
     for number, (name, row) in enumerate(summary.items()):
-        shares = [row[quantity] / row["places"] for _, quantity in asked]
+        shares = [row[quantity] / row["places"] for _, quantity in groups]
         x = at + (number - (len(summary) - 1) / 2) * width
         bars = axes.bar(x, shares, 0.92 * width, color=drawing.COLOURS[name], label=name)
-        axes.bar_label(bars, [f"{row[quantity]}" for _, quantity in asked], fontsize=9, padding=1)
-    axes.set_xticks(at, [label for label, _ in asked])
+        axes.bar_label(bars, [f"{row[quantity]}" for _, quantity in groups], fontsize=9, padding=1)
+    axes.set_xticks(at, [label for label, _ in groups])
     axes.grid(visible=False, axis="x")
     axes.axvline(good - 0.5 + 0.17, color="#AAAAAA", linewidth=0.8)
     if "both_kept" in one:
@@ -230,7 +242,7 @@ def _bars(axes: Axes, summary: dict[str, dict[str, Any]]) -> None:
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
-    """As docs/experiments.md has it."""
+    """The Markdown table of docs/experiments.md."""
     moments = [name for name in next(iter(summary.values())) if name.startswith("within")]
     heads = (
         "world", "estimator", *(f"within 0.2 m after {name.rsplit('_', 1)[1]}" for name in moments), "of",

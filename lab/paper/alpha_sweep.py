@@ -30,7 +30,7 @@ class Job:
 
 
 def trial(job: Job) -> dict[str, Any]:
-    """E1's trial at another step size."""
+    """E1's trial with the job's step size."""
     descent = Descent(alpha=job.alpha, iterations=job.steps)
     return localisation.trial(replace(job.place, estimators=("paper",), descent=descent))
 
@@ -38,42 +38,44 @@ def trial(job: Job) -> dict[str, Any]:
 def run(
     job: localisation.Job, trials: int, out: Path, workers: int, console: Console, alphas: tuple[float, ...] = ALPHAS
 ) -> results.Result:
-    """All step sizes at the places of E1; writes alpha.json, .csv, .pdf and .png into ``out``."""
+    """Runs all step sizes at the places of E1. Writes alpha.json, .csv, .pdf and .png into ``out``."""
     grid = [(steps, alpha) for steps in STEPS_PER_SCAN for alpha in alphas]
     jobs = [Job(alpha, steps, replace(job, index=k)) for steps, alpha in grid for k in range(trials)]
     rows = run_trials("alpha", trial, jobs, out, workers, console)
     summary: dict[str, dict[str, Any]] = {}
     for number, (steps, alpha) in enumerate(grid):
         own = rows[number * trials : (number + 1) * trials]
-        found = localisation.summarise(own, "paper")
-        summary[f"{alpha:g} m², {steps} a scan"] = {"alpha_m2": alpha, "steps_a_scan": steps, **found}
+        statistics = localisation.summarise(own, "paper")
+        summary[f"{alpha:g} m², {steps} a scan"] = {"alpha_m2": alpha, "steps_a_scan": steps, **statistics}
     columns = ("alpha_m2", "steps_a_scan", "final_error_mean_m", "final_error_median_m", "found_within_0.2_m")
     curves = {name: [row[name] for row in summary.values()] for name in columns}
     parameters = {"alphas": alphas, "steps": STEPS_PER_SCAN, "trials": trials, "e1": asdict(job)}
     result = results.Result(
         "alpha", "Step size of the paper's perception", job.seed, parameters, summary, curves,
-        notes=[f"best with {steps} a scan: {best(summary, steps):g} m² (most within 0.2 m)" for steps in STEPS_PER_SCAN],
+        notes=[f"best with {each} a scan: {best(summary, each):g} m² (most within 0.2 m)" for each in STEPS_PER_SCAN],
     )  # fmt: skip
     result.write(out, draw(summary, trials))
     return result
 
 
 def best(summary: dict[str, dict[str, Any]], steps: int) -> float:
-    """The step size that brings most places within 0.2 m; of equals the one of the smaller median error."""
+    """The step size with the most places within 0.2 m; among equals the one with the smaller median error."""
     own = [row for row in summary.values() if row["steps_a_scan"] == steps]
     return float(max(own, key=lambda r: (r["found_within_0.2_m"], -r["final_error_median_m"]))["alpha_m2"])
 
 
 def draw(summary: dict[str, dict[str, Any]], trials: int) -> Figure:
-    """Share found, and median error, against alpha."""
+    """Share of places found, and median error, over alpha."""
     figure, (share, error) = drawing.figure_of(2, height=3.6)
-    for steps, colour, mark in zip(STEPS_PER_SCAN, (drawing.COLOURS["paper"], drawing.COLOURS["precise"]), "os", strict=True):
+    for steps, colour, mark in zip(
+        STEPS_PER_SCAN, (drawing.COLOURS["paper"], drawing.COLOURS["precise"]), "os", strict=True
+    ):
         own = [row for row in summary.values() if row["steps_a_scan"] == steps]
         alphas = [row["alpha_m2"] for row in own]
         for limit, style in (("0.5", "--"), ("0.2", "-")):
-            found = [row[f"found_within_{limit}_m"] / trials for row in own]
+            shares = [row[f"found_within_{limit}_m"] / trials for row in own]
             label = f"within {limit} m, {steps} step{'s' if steps > 1 else ''} a scan"
-            share.plot(alphas, found, style + mark, color=colour, label=label)
+            share.plot(alphas, shares, style + mark, color=colour, label=label)
         medians = [row["final_error_median_m"] for row in own]
         error.plot(alphas, medians, "-" + mark, color=colour, label=f"{steps} step{'s' if steps > 1 else ''} a scan")
     share.set(ylabel="share of places", ylim=(0, 1.02), title="places found after 50 scans")
@@ -88,7 +90,7 @@ def draw(summary: dict[str, dict[str, Any]], trials: int) -> Figure:
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
-    """As docs/experiments.md has it."""
+    """The Markdown table of docs/experiments.md."""
     heads = ("step size", "within 0.2 m", "within 0.5 m", "median (m)", "mean ± std (m)", "in front: mean ± std (m)")
     rows = [
         [

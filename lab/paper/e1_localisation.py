@@ -1,8 +1,9 @@
 """E1: a standing robot.
 
-100 trials of 50 iterations at places uniform over free space; those in front of the objects, the paper's unobstructed
-middle, are told apart. An iteration is one scan with fresh noise, and one gradient step of preset paper. Its belief
-begins at the map's centre, the particle filter's particles anywhere in free space; nobody has odometry.
+100 trials of 50 iterations at places uniform over free space. Places in front of the objects, the unobstructed middle
+of the paper, are also reported separately. An iteration is one scan with fresh noise, and one gradient step of preset
+paper. Its belief starts at the map's centre; the particle filter's particles start anywhere in free space. No estimator
+has odometry.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from lab.experiments.trials import run_trials
 from presage.plotting import style as drawing
 from services.estimator.paper.perception import Descent
 
-EXPERIMENT_ID = 1  # of the experiment, in its seeds
+EXPERIMENT_ID = 1  # part of the random seeds
 ESTIMATORS = (
     "paper",
     f"paper, {TEN_STEPS}",
@@ -33,13 +34,13 @@ ESTIMATORS = (
     "particle-filter, heading known",
     "amcl-defaults",
 )
-FOUND_DISTANCE = 0.5  # m
-CLOSE_DISTANCE = 0.2  # m
+FOUND_DISTANCE = 0.5  # m; an error below it counts as found
+CLOSE_DISTANCE = 0.2  # m; an error below it counts as close
 
 
 @dataclass(frozen=True)
 class Job:
-    """One trial: one place, the same scans to everybody."""
+    """One trial: one place, with the same scans for every estimator."""
 
     index: int
     seed: int
@@ -50,32 +51,32 @@ class Job:
 
 
 def trial(job: Job) -> dict[str, Any]:
-    """Errors in m after each iteration, and what was claimed at the end, by estimator; the bound beside them."""
+    """Runs one trial. Returns each estimator's error (m) after every iteration and its final state, and the bound."""
     scene = job.field.scene(job.seed, EXPERIMENT_ID, job.index)
     pose = scene.poses(1)[0]
     pose[2] = job.field.heading
     clean = scene.clean(pose[None])[0]
     scans = [scene.observe(clean, k / scene.scanner.rate) for k in range(job.iterations)]
     one_scan = bound.single(scene, pose[None])
-    found: dict[str, Any] = {
+    outcome: dict[str, Any] = {
         "pose": pose.tolist(), "in_front": bool(pose[1] < job.field.front()), "bound": one_scan[0].tolist(),
         "error_m": {}, "claim": {},
     }  # fmt: skip
     for name in job.estimators:
         estimator = create_estimator(name, job.field, scene, job.seed * 100_003 + job.index, job.descent)
         posteriors = [estimator.update(scan) for scan in scans]
-        found["error_m"][name] = [round(float(np.hypot(*(p.pose - pose)[:2])), 6) for p in posteriors]
-        found["claim"][name] = posteriors[-1].state
-    return found
+        outcome["error_m"][name] = [round(float(np.hypot(*(p.pose - pose)[:2])), 6) for p in posteriors]
+        outcome["claim"][name] = posteriors[-1].state
+    return outcome
 
 
 def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
-    """Numbers of one estimator over all trials."""
+    """Statistics of one estimator over all trials."""
     errors = np.array([each["error_m"][name] for each in trials])
     limit = bounds(trials, knows_heading(name)) / errors.shape[1]
     last, claims = errors[:, -1], [each["claim"][name] == "tracking" for each in trials]
     front = np.array([each["in_front"] for each in trials], bool)
-    # Iterations until it is close and stays so; those that never are have none.
+    # Iterations until the estimate is close and stays close; infinite if it never is.
     far = errors >= CLOSE_DISTANCE
     until = np.array([np.inf if row[-1] else (np.flatnonzero(row)[-1] + 2 if row.any() else 1) for row in far])
     return {
@@ -102,7 +103,7 @@ def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
 
 
 def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
-    """All trials; writes e1.json, .csv, .pdf and .png into ``out``."""
+    """Runs all trials. Writes e1.json, .csv, .pdf and .png into ``out``."""
     jobs = [replace(job, index=index) for index in range(trials)]
     rows = run_trials("e1", trial, jobs, out, workers, console)
     curves: dict[str, list[Any]] = {"iteration": list(range(1, job.iterations + 1))}
@@ -124,17 +125,17 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
 
 
 def bounds(rows: Sequence[dict[str, Any]], heading_known: bool) -> Array:
-    """(N, 3, 3) Cramér-Rao bound of one scan at each trial's place; of k scans it is so many times smaller."""
-    found = np.array([row["bound"] for row in rows])
-    return bound.heading_known(found) if heading_known else found
+    """Cramér-Rao bound (N, 3, 3) of one scan at each trial's place; for k scans it is k times smaller."""
+    limits = np.array([row["bound"] for row in rows])
+    return bound.heading_known(limits) if heading_known else limits
 
 
 def draw(rows: Sequence[dict[str, Any]], names: Sequence[str], curves: dict[str, list[Any]]) -> Figure:
-    """Error against iteration, as in the paper's figure 3; beside it on a logarithmic axis, where all can be seen."""
+    """Error over iterations, as in the paper's figure 3, and on a logarithmic axis, which shows all estimators."""
     figure, panels = drawing.figure_of(2)
-    for axes, put in zip(panels, (drawing.band, drawing.quartiles), strict=True):
+    for axes, draw_curve in zip(panels, (drawing.band, drawing.quartiles), strict=True):
         for name in names:
-            put(axes, curves["iteration"], [row["error_m"][name] for row in rows], name)
+            draw_curve(axes, curves["iteration"], [row["error_m"][name] for row in rows], name)
         axes.set(xlabel="iteration (one scan)", ylabel="position error (m)", xlim=(1, curves["iteration"][-1]))
     for text, style in (("", "--"), (", heading known", ":")):
         limit = curves[f"bound{text} median m"]
@@ -147,7 +148,7 @@ def draw(rows: Sequence[dict[str, Any]], names: Sequence[str], curves: dict[str,
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
-    """As docs/experiments.md has it."""
+    """The Markdown table of docs/experiments.md."""
     heads = (
         "estimator", "error at the end, mean ± std (m)", "median (mm)", "over the bound's", "RMS (mm)",
         "over the bound's", "within 0.5 m", "in front of the objects", "error there (m)", "iterations to 0.2 m",

@@ -1,8 +1,8 @@
 """E2: small teleports across the map.
 
-The robot is carried 5 cm between two scans (0.75 m/s at 15 Hz) from one end of the corridor to the other, at a distance
-from the objects' wall that differs from trial to trial. Everybody knows the start. Nobody has odometry but those whose
-name says so: they are told of each teleport by dead reckoning that drifts as the simulator's does.
+The robot is teleported 5 cm between two scans (0.75 m/s at 15 Hz) from one end of the corridor to the other, at a
+distance from the objects' wall that differs between trials. All estimators know the start. Only those with "odometry"
+in their name have odometry: dead reckoning of the teleports, with the same drift as in the simulator.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ from presage.plotting import style as drawing
 from services.estimator.paper.perception import Descent
 from services.simulator.odometry import Drift, Odometer
 
-EXPERIMENT_ID = 2  # of the experiment, in its seeds
+EXPERIMENT_ID = 2  # part of the random seeds
 ESTIMATORS = (
     "paper", f"paper, {TEN_STEPS}", "precise", "particle-filter", "particle-filter, heading known",
     "amcl-defaults", "precise, odometry", "particle-filter, odometry", "amcl-defaults, odometry",
 )  # fmt: skip
-START_COVARIANCE = np.diag([0.01, 0.01, 0.01])  # covariance of what is known of the start: 10 cm, 6 degrees
-LOST_DISTANCE = 0.5  # m
+START_COVARIANCE = np.diag([0.01, 0.01, 0.01])  # m², m², rad²: 10 cm and 6 degrees
+LOST_DISTANCE = 0.5  # m; a larger error counts as lost
 BOUND_NAMES = ("one scan", "one scan, heading known", "all scans, odometry")
-MARGIN = 0.1  # m, between the robot and anything
+MARGIN = 0.1  # m, between the robot and any obstacle
 
 
 @dataclass(frozen=True)
 class Job:
-    """One crossing, the same scans to everybody."""
+    """One crossing, with the same scans for every estimator."""
 
     index: int
     seed: int
@@ -60,12 +60,15 @@ class Job:
 
 
 def bound_of(name: str) -> str:
-    """Which of `BOUND_NAMES` is this estimator's: those without odometry cannot tell how far they were carried."""
+    """Name of the bound that applies to an estimator: without odometry each scan counts alone."""
     return BOUND_NAMES[2] if uses_odometry(name) else BOUND_NAMES[knows_heading(name)]
 
 
 def path_of(scene: Scene, heading: float, step: float) -> Array:
-    """(N, 3) poses straight across the world along x, in steps of so many m, on a free line drawn at random."""
+    """Poses (N, 3) along a random free straight line across the world in direction x, every ``step`` m.
+
+    Raises UserError if no free line is found.
+    """
     x0, y0, x1, y1 = scene.world.bounds
     away = Robot().radius + MARGIN
     room = shapely.buffer(scene.world.free_space, -away)
@@ -77,7 +80,7 @@ def path_of(scene: Scene, heading: float, step: float) -> Array:
 
 
 def trial(job: Job) -> dict[str, Any]:
-    """Errors in m at each scan, by estimator."""
+    """Runs one crossing. Returns each estimator's error (m) at every scan, and the bounds."""
     scene = job.field.scene(job.seed, EXPERIMENT_ID, job.index)
     path = path_of(scene, job.field.heading, job.step)
     odometer, scans = Odometer(Drift(), np.random.default_rng((job.seed, EXPERIMENT_ID, job.index, 1))), []
@@ -85,10 +88,10 @@ def trial(job: Job) -> dict[str, Any]:
         if k:
             odometer.move(path[k - 1], path[k])
         scans.append(scene.observe(clean, k / scene.scanner.rate, odometer.pose.copy()))
-    found: dict[str, Any] = {"y": float(path[0, 1]), "error_m": {}, "lost": {}}
+    outcome: dict[str, Any] = {"y": float(path[0, 1]), "error_m": {}, "lost": {}}
     one = bound.single(scene, path)
     limits = one, bound.heading_known(one), bound.recursive(scene, path, Drift(), START_COVARIANCE)
-    found["bound_m"] = {
+    outcome["bound_m"] = {
         name: np.round(bound.position(each), 7).tolist() for name, each in zip(BOUND_NAMES, limits, strict=True)
     }
     for name in job.estimators:
@@ -97,13 +100,13 @@ def trial(job: Job) -> dict[str, Any]:
         with_odometry = scans if uses_odometry(name) else [replace(scan, odom=None) for scan in scans]
         poses = np.array([estimator.update(scan).pose for scan in with_odometry])
         error = np.hypot(*(poses - path)[:, :2].T)
-        found["error_m"][name] = np.round(error, 6).tolist()
-        found["lost"][name] = bool((error > LOST_DISTANCE).any())
-    return found
+        outcome["error_m"][name] = np.round(error, 6).tolist()
+        outcome["lost"][name] = bool((error > LOST_DISTANCE).any())
+    return outcome
 
 
 def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
-    """Numbers of one estimator over all crossings."""
+    """Statistics of one estimator over all crossings."""
     error = np.concatenate([each["error_m"][name] for each in trials])
     limit = np.concatenate([each["bound_m"][bound_of(name)] for each in trials])
     return {
@@ -120,7 +123,7 @@ def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
 
 
 def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
-    """All crossings; writes e2.json, .csv, .pdf and .png into ``out``."""
+    """Runs all crossings. Writes e2.json, .csv, .pdf and .png into ``out``."""
     jobs = [replace(job, index=index) for index in range(trials)]
     rows = run_trials("e2", trial, jobs, out, workers, console)
     scans = len(rows[0]["bound_m"][BOUND_NAMES[0]])
@@ -143,12 +146,12 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
 
 
 def _rms(rows: Sequence[Sequence[float]]) -> list[float]:
-    """Over trials (N, K), at each of K moments."""
+    """Root mean square over N trials at each of K times."""
     return [float(value) for value in np.sqrt(np.mean(np.square(rows), axis=0))]
 
 
 def draw(names: Sequence[str], curves: dict[str, list[Any]]) -> Figure:
-    """Error over time, root mean square over the crossings as the bounds are; without odometry, and with it."""
+    """RMS error and RMS bound of all crossings over time, without and with odometry."""
     figure, panels = drawing.figure_of(2)
     with_odometry = [name for name in names if uses_odometry(name)]
     groups = [name for name in names if name not in with_odometry], with_odometry
@@ -169,7 +172,7 @@ def draw(names: Sequence[str], curves: dict[str, list[Any]]) -> Figure:
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
-    """As docs/experiments.md has it."""
+    """The Markdown table of docs/experiments.md."""
     heads = (
         "estimator", "error, mean ± std (m)", "median (mm)", "RMS (mm)", "over its bound's", "the bound is that of",
         "max (mm)", "ever 0.5 m off",

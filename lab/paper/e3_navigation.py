@@ -1,8 +1,9 @@
 """E3: navigation.
 
-The real processes (router, simulator, estimator, controller) run in lockstep over zenoh: one scan, one belief, one
-command is one iteration, 1/15 s. The belief begins at the true start. There is no teleport: the base has its limits of
-speed and acceleration. A trial is done when the robot truly is within 0.8 m of the goal; nobody asks it to stop there.
+The real processes (router, simulator, estimator, controller) run in lockstep over zenoh. One iteration is one scan, one
+belief and one velocity command: 1/15 s. The belief starts at the true start. Unlike in the paper the robot is not
+teleported, but drives with limited speed and acceleration. A trial ends when the robot truly is within 0.8 m of the
+goal; it need not stop there.
 """
 
 from __future__ import annotations
@@ -38,41 +39,44 @@ from presage.plotting import style as drawing
 from presage.session.stack import Stack
 from services.estimator.paper.perception import Descent
 
-EXPERIMENT_ID = 3  # of the experiment, in its seeds
+EXPERIMENT_ID = 3  # part of the random seeds
 ESTIMATORS = (f"paper, {TEN_STEPS}", "precise", "particle-filter")
 
 
 @dataclass(frozen=True)
 class Job:
-    """One start and goal, to every estimator."""
+    """One start and goal, the same for every estimator."""
 
     index: int
     seed: int
-    apart: float = MIN_DISTANCE  # m, between start and goal at least
-    limit: int = 900  # iterations after which a trial is given up: one minute
-    free: bool = True  # only pairs with a free straight line between them
+    apart: float = MIN_DISTANCE  # m, minimum distance between start and goal
+    limit: int = 900  # maximum number of iterations: one minute
+    free: bool = True  # whether the straight line between start and goal must be free
     estimators: tuple[str, ...] = ESTIMATORS
     field: ExperimentWorld = ExperimentWorld()  # noqa: RUF009 - frozen
-    descent: Descent = PAPER_DESCENT  # of estimator `paper` alone
+    descent: Descent = PAPER_DESCENT  # parameters of estimator `paper`
 
 
 def arguments(name: str, descent: Descent) -> tuple[str, ...]:
-    """Of the estimator's command line, by its name in the figures."""
+    """Command-line arguments of the estimator service, for an estimator's name in the figures.
+
+    Raises UserError if the service does not offer this estimator.
+    """
     kind, _, how = name.partition(", ")
     if how not in ("", "odometry", TEN_STEPS):
-        raise UserError(f"estimator {name!r} is none that runs as a service: choose others for e3")
+        raise UserError(f"estimator {name!r} is not available as a service: choose others for e3 with --estimators")
     steps = ("--alpha", repr(descent.alpha), "--iterations", str(descent.iterations)) if name == "paper" else ()
     return ("--estimator", kind, *(("--prior", "odometry") if uses_odometry(name) else ()), *steps)
 
 
 def trial(job: Job) -> dict[str, Any]:
-    """One journey; by estimator what became of it, m and s."""
+    """Runs one journey with every estimator. Returns the journey and each estimator's results."""
     world = load_world(job.field.world)
     journey = draw_journey(
         world, np.random.default_rng((job.seed, EXPERIMENT_ID, job.index)), Robot(), job.apart, free=job.free
     )
-    found: dict[str, Any] = asdict(journey) | {"straight_m": journey.straight, "estimators": {}}
-    found["least_s"] = least_time(journey.straight, Robot())
+    outcome: dict[str, Any] = asdict(journey) | {"straight_m": journey.straight, "estimators": {}}
+    outcome["least_s"] = least_time(journey.straight, Robot())
     seed = (job.seed * 100_003 + job.index) % 2**31
     with session() as stack:
         for name in job.estimators:
@@ -80,8 +84,8 @@ def trial(job: Job) -> dict[str, Any]:
                 journey, job.field.heading, job.field.world, job.field.beams, seed, arguments(name, job.descent),
                 job.limit,
             )  # fmt: skip
-            found["estimators"][name] = _run(lockstep_run, stack)
-    return found
+            outcome["estimators"][name] = _run(lockstep_run, stack)
+    return outcome
 
 
 def _run(lockstep_run: LockstepRun, stack: Stack) -> dict[str, Any]:
@@ -89,7 +93,7 @@ def _run(lockstep_run: LockstepRun, stack: Stack) -> dict[str, Any]:
 
 
 def measure(trace: RunTrace, journey: Journey) -> dict[str, Any]:
-    """One run in numbers; what stands in lists has one entry an iteration, the first before any motion."""
+    """Results of one run. Lists have one entry per iteration, the first from before any motion."""
     path = trace.path()
     away = np.hypot(*(path[:, :2] - np.array(journey.goal)).T)
     error = np.hypot(*(trace.believed() - path)[:, :2].T)
@@ -110,7 +114,7 @@ def measure(trace: RunTrace, journey: Journey) -> dict[str, Any]:
 
 
 def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
-    """Numbers of one estimator over all trials; times and paths are of those that arrived."""
+    """Statistics of one estimator over all trials; times and paths only of trials that reached the goal."""
     every = [each["estimators"][name] for each in trials]
     there = [each for each in every if each["reached"]]
     error = np.concatenate([each["error_m"] for each in every])
@@ -138,7 +142,7 @@ def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
 
 
 def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
-    """All trials; writes e3.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
+    """Runs all trials. Writes e3.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
     for name in job.estimators:
         arguments(name, job.descent)
     jobs = [replace(job, index=index) for index in range(trials)]
@@ -174,13 +178,13 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
 
 
 def _rows(rows: Sequence[dict[str, Any]], name: str, quantity: str, names: Sequence[str]) -> Array:
-    """(N, K), as long as the longest of all estimators; a trial that has ended holds its last value."""
+    """One quantity of all trials (N, K), padded with the last value to the longest trial of all estimators."""
     longest = max(len(row["estimators"][each][quantity]) for row in rows for each in names)
     return drawing.held([row["estimators"][name][quantity] for row in rows], longest)
 
 
 def draw(rows: Sequence[dict[str, Any]], job: Job) -> Figure:
-    """Distance to the goal and error against iterations, as in the paper's figure 3; the paths below."""
+    """Distance to the goal and error over iterations, as in the paper's figure 3, and the paths below."""
     figure = drawing.blank(13.0, 7.2)
     grid = figure.add_gridspec(2, 2, height_ratios=(1.25, 1))
     left, right, below = (drawing.dress(figure.add_subplot(part)) for part in (grid[0, 0], grid[0, 1], grid[1, :]))
@@ -189,14 +193,16 @@ def draw(rows: Sequence[dict[str, Any]], job: Job) -> Figure:
         for axes, quantity in ((left, "distance_m"), (right, "error_m")):
             values = _rows(rows, name, quantity, job.estimators)
             drawing.band(axes, range(values.shape[1]), values, name, colour)
-            if name == "precise" and axes is left:  # wide, for another that drives as fast may lie upon it
+            if name == "precise" and axes is left:  # wide, because another estimator's line may cover it
                 axes.lines[-1].set(linewidth=3.2, zorder=1.5)
     left.axhline(ARRIVAL_DISTANCE, linestyle="--", color=drawing.BOUND, linewidth=1)
-    left.annotate(f"{ARRIVAL_DISTANCE:g} m: there", (1, ARRIVAL_DISTANCE), (4, 4), textcoords="offset points", fontsize=9)
+    left.annotate(
+        f"{ARRIVAL_DISTANCE:g} m: there", (1, ARRIVAL_DISTANCE), (4, 4), textcoords="offset points", fontsize=9
+    )
     left.set(xlabel="iteration (one scan, 1/15 s)", ylabel="distance to the goal (m)", ylim=(0, None))
     right.set(xlabel="iteration", ylabel="position error of the belief (m)")
     drawing.log_metres(right)
-    # As far as somebody arrives; those that never do stand still beyond.
+    # The axis ends with the last arrival; robots that never arrive stand still after it.
     every = [each for row in rows for each in row["estimators"].values()]
     last = max((each["iterations"] for each in every if each["reached"]), default=job.limit)
     for axes in (left, right):
@@ -214,7 +220,7 @@ def draw(rows: Sequence[dict[str, Any]], job: Job) -> Figure:
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
-    """As docs/experiments.md has it."""
+    """The Markdown table of docs/experiments.md."""
     heads = (
         "estimator", "reached", "trials with contact", "scans held back by the obstacle stop", "iterations, mean",
         "time (s), median", "time over least, median; max", "path over straight, mean", "error, mean ± std (m)",

@@ -1,7 +1,7 @@
 """Predicted against measured scans.
 
-The shipped weights, as they are. The paper's decoder states no precision: the paper sets Σ_o = 1, here 1 m² for every
-beam. The field states each beam's deviation m; with the scanner's noise σ it is (σ² + m²)^½.
+Uses the shipped weights. The paper's decoder predicts no precision: the paper sets Σ_o = 1, here 1 m² for every beam.
+The distance field predicts each beam's model error m; with the scanner's noise σ the deviation is (σ² + m²)^½.
 """
 
 from __future__ import annotations
@@ -29,20 +29,21 @@ from services.estimator.paper.decoder import use_one_core
 from services.estimator.paper.training import usable_ranges
 from services.estimator.precise.learning import weights as precise_weights
 
-EXPERIMENT_ID = 6  # of the experiment, in its seeds
-SAMPLE_SEED, TEST_SEED = 0, 1  # in the seeds
+EXPERIMENT_ID = 6  # part of the random seeds
+SAMPLE_SEED, TEST_SEED = 0, 1  # parts of the random seeds
 PAPER_SIGMA = 1.0  # m, the paper's Σ_o
-SIGMA_FACTORS = tuple(np.round(np.arange(0.25, 4.01, 0.25), 2).tolist())  # of the stated deviation
-GAUSSIAN = {1: 0.6827, 2: 0.9545, 3: 0.9973}  # share within so many deviations
-IMPRECISE_FACTOR = float(np.sqrt(2))  # times the scanner's noise: of such beams the model says that its own error m is the larger
-FRONT_MARGIN = 0.3  # m that the sample's robot keeps from the line of the objects
-FAR_RESIDUAL = 0.1  # m
+SIGMA_FACTORS = tuple(np.round(np.arange(0.25, 4.01, 0.25), 2).tolist())  # multiples of the predicted deviation
+GAUSSIAN = {1: 0.6827, 2: 0.9545, 3: 0.9973}  # share of a Gaussian within k deviations
+# A beam counts as unsure if its deviation exceeds the scanner's noise by this factor, that is if m > σ.
+IMPRECISE_FACTOR = float(np.sqrt(2))
+FRONT_MARGIN = 0.3  # m between the sample's robot and the line of the objects
+FAR_RESIDUAL = 0.1  # m; larger residuals are counted in the figure
 ESTIMATORS = ("paper", "precise")
 
 
 @dataclass(frozen=True)
 class Job:
-    """One scan to show, and scans to count beams of."""
+    """One sample scan for the figure, and ``scans`` test scans."""
 
     seed: int
     scans: int = 500
@@ -50,27 +51,27 @@ class Job:
 
 
 def trial(job: Job) -> dict[str, Any]:
-    """The sample as measured and as each expects it; shares of beams within the stated deviation's multiples."""
+    """The sample scan as measured and predicted; shares of test beams within multiples of the predicted deviation."""
     use_one_core()
     sample, test = (job.field.scene(job.seed, EXPERIMENT_ID, part) for part in (SAMPLE_SEED, TEST_SEED))
     pose = in_front(job.field, sample)
     noisy = sample.observe(sample.clean(pose[None])[0], 0.0).ranges
-    found: dict[str, Any] = {
+    outcome: dict[str, Any] = {
         "pose": pose.tolist(), "angle_rad": sample.scanner.angles().tolist(), "measured_m": noisy.tolist(), "models": {}
     }  # fmt: skip
     poses = test.poses(job.scans)
     clean = test.clean(poses)
     for name in ESTIMATORS:
-        own = poses.copy()
-        if name == "paper":  # knows but one heading
-            own[:, 2] = job.field.heading
-        ranges = test.clean(own) if name == "paper" else clean
+        test_poses = poses.copy()
+        if name == "paper":  # trained for one heading only
+            test_poses[:, 2] = job.field.heading
+        ranges = test.clean(test_poses) if name == "paper" else clean
         ranges = ranges + test.scanner.sigma * test.rng.standard_normal(ranges.shape)
-        expected, sigma = _expected(name, job.field, test, own)
+        expected, sigma = _expected(name, job.field, test, test_poses)
         error = np.abs(usable_ranges(test.scanner.limit(ranges), test.scanner.range_max) - expected)
         unsure = sigma > IMPRECISE_FACTOR * test.scanner.sigma
         one, deviation = _expected(name, job.field, sample, pose[None])
-        found["models"][name] = {
+        outcome["models"][name] = {
             "expected_m": one[0].tolist(), "sigma_m": deviation[0].tolist(), "beams": error.size,
             "within": _shares(error, sigma), "unsure_share": float(unsure.mean()),
             "unsure_within": _shares(error[unsure], sigma[unsure]),
@@ -78,7 +79,7 @@ def trial(job: Job) -> dict[str, Any]:
             "range_error_median_m": float(np.median(error)), "range_error_mean_m": float(error.mean()),
             "stated_sigma_median_m": float(np.median(sigma)), "stated_sigma_p99_m": float(np.quantile(sigma, 0.99)),
         }  # fmt: skip
-    return found
+    return outcome
 
 
 def _shares(error: Array, sigma: Array) -> dict[str, float]:
@@ -87,14 +88,14 @@ def _shares(error: Array, sigma: Array) -> dict[str, float]:
 
 
 def in_front(field: ExperimentWorld, scene: Scene) -> Array:
-    """(3,) at random between the bare wall and the objects; anywhere where there are none."""
+    """Random pose (3,) between the bare wall and the objects; anywhere if the world has no objects."""
     places = scene.world.sample_free(1000, scene.rng, ROBOT.radius)
     front = places[places[:, 1] < field.front() - FRONT_MARGIN]
     return np.array([*(front if len(front) else places)[0], field.heading])
 
 
 def _expected(name: str, field: ExperimentWorld, scene: Scene, poses: Array) -> tuple[Array, Array]:
-    """Ranges (N, B) m and the stated deviation of what is measured, m; from the shipped weights."""
+    """Ranges (N, B), m, predicted with the shipped weights, and the predicted deviations of the measurements, m."""
     if name == "paper":
         path = paper_weights.find(paper_weights.FOLDER, scene.world.name, "paper", scene.scanner.beams)
         ranges = paper_weights.load(path)[0].ranges(poses)
@@ -106,18 +107,18 @@ def _expected(name: str, field: ExperimentWorld, scene: Scene, poses: Array) -> 
 
 
 def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
-    """Writes prediction.json, .csv, .pdf and .png into ``out``."""
+    """Runs the experiment. Writes prediction.json, .csv, .pdf and .png into ``out``."""
     rows = run_trials("prediction", trial, [job], out, workers, console)
     row = rows[0]
     summary: dict[str, dict[str, Any]] = {}
-    for name, found in row["models"].items():
-        quantities = {key: value for key, value in found.items() if np.isscalar(value)}
-        kinds = [kind for kind, value in found.items() if isinstance(value, dict) and value]
-        shares = {f"{kind}_{k}_sigma": found[kind][str(k)] for kind in kinds for k in GAUSSIAN}
+    for name, model_row in row["models"].items():
+        quantities = {key: value for key, value in model_row.items() if np.isscalar(value)}
+        kinds = [kind for kind, value in model_row.items() if isinstance(value, dict) and value]
+        shares = {f"{kind}_{k}_sigma": model_row[kind][str(k)] for kind in kinds for k in GAUSSIAN}
         summary[name] = {"scans": job.scans, **quantities, **shares}
     curves = {"angle_rad": row["angle_rad"], "measured_m": row["measured_m"]}
-    for name, found in row["models"].items():
-        curves |= {f"{name} expected m": found["expected_m"], f"{name} sigma m": found["sigma_m"]}
+    for name, model_row in row["models"].items():
+        curves |= {f"{name} expected m": model_row["expected_m"], f"{name} sigma m": model_row["sigma_m"]}
     x, y, yaw = row["pose"]
     result = results.Result(
         "prediction", "Predicted against measured scan", job.seed, asdict(job), summary, curves, rows,
@@ -129,7 +130,7 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
 
 
 def draw(result: results.Result) -> Figure:
-    """The scan by both models, residuals below, calibration beside."""
+    """The sample scan with both models' predictions, residuals below, and calibration on the right."""
     row = result.trials[0]
     figure = drawing.blank(16, 6.2)
     grid = figure.add_gridspec(2, 3, height_ratios=(1.9, 1), width_ratios=(1, 1, 0.8))
@@ -138,8 +139,8 @@ def draw(result: results.Result) -> Figure:
     angle, measured = np.rad2deg(row["angle_rad"]), np.array(row["measured_m"])
     titles = {"paper": "paper: states no precision (Σ_o = 1)", "precise": "precise: states ± 2σ of every beam"}
     for name, top, bottom in zip(ESTIMATORS, tops, bottoms, strict=True):
-        found = row["models"][name]
-        expected, sigma = np.array(found["expected_m"]), np.array(found["sigma_m"])
+        model_row = row["models"][name]
+        expected, sigma = np.array(model_row["expected_m"]), np.array(model_row["sigma_m"])
         top.plot(angle, measured, ".", color=drawing.MEASURED, markersize=3.5, label="measured")
         top.plot(angle, expected, "-", color=drawing.PREDICTED, linewidth=1.1, label="expected")
         bottom.plot(angle, measured - expected, ".", color=drawing.MEASURED, markersize=3.5)
@@ -147,7 +148,9 @@ def draw(result: results.Result) -> Figure:
             _band(top, angle, expected, sigma)
             _band(bottom, angle, np.zeros_like(expected), sigma)
         share = float((np.abs(measured - expected) > FAR_RESIDUAL).mean())
-        bottom.text(0.99, 0.97, f"{share:.1%} of beams > {FAR_RESIDUAL} m off", transform=bottom.transAxes, ha="right", va="top")
+        bottom.text(
+            0.99, 0.97, f"{share:.1%} of beams > {FAR_RESIDUAL} m off", transform=bottom.transAxes, ha="right", va="top"
+        )
         bottom.axhline(0, color=drawing.PREDICTED, linewidth=1)
         bottom.set_yscale("symlog", linthresh=0.1, linscale=1.5)
         limit = 4 * max(1.0, *(np.abs(measured - np.array(m["expected_m"])).max() for m in row["models"].values()))
@@ -171,19 +174,21 @@ def _band(axes: Axes, angle: Array, middle: Array, sigma: Array) -> None:
     )  # fmt: skip
 
 
-def _calibration(axes: Axes, found: dict[str, Any], scans: int) -> None:
-    """Share of beams within k stated deviations, against the Gaussian's."""
+def _calibration(axes: Axes, model_row: dict[str, Any], scans: int) -> None:
+    """Plots the share of beams within k predicted deviations, and that of a Gaussian."""
     factors = np.array(SIGMA_FACTORS)
     axes.plot(factors, _gaussian(factors), "-", color=drawing.BOUND, label="Gaussian: a true statement")
-    unsure = f"{found['unsure_share']:.1%} of beams: m > σ"
+    unsure = f"{model_row['unsure_share']:.1%} of beams: m > σ"
     for key, colour, mark, label in (
         ("within", drawing.COLOURS["precise"], "o", "all beams, stated √(σ² + m²)"),
         ("unsure_within", drawing.GOAL, "^", f"{unsure}, stated √(σ² + m²)"),
         ("unsure_within_noise_alone", drawing.COLOURS["particle-filter"], "s", f"{unsure}, were it σ alone"),
     ):
-        if found[key]:
-            axes.plot(factors, [found[key][f"{k:g}"] for k in factors], mark, color=colour, markersize=5, label=label)
-    text = "\n".join(f"± {k}σ: {found['within'][str(k)]:.1%}  ({share:.1%})" for k, share in GAUSSIAN.items())
+        if model_row[key]:
+            axes.plot(
+                factors, [model_row[key][f"{k:g}"] for k in factors], mark, color=colour, markersize=5, label=label
+            )
+    text = "\n".join(f"± {k}σ: {model_row['within'][str(k)]:.1%}  ({share:.1%})" for k, share in GAUSSIAN.items())
     axes.text(0.98, 0.3, "all beams (Gaussian)\n" + text, transform=axes.transAxes, ha="right", fontsize=10)
     axes.set(xlabel="deviations k", ylabel="share of beams within ± kσ", ylim=(0, 1.03))
     axes.set_title(f"precise: is it true? {scans} test scans")
@@ -195,7 +200,7 @@ def _gaussian(factors: Array | Sequence[float]) -> Array:
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
-    """As docs/experiments.md has it."""
+    """The Markdown table of docs/experiments.md."""
     heads = ("", "range error, median (m)", "mean (m)", "stated σ, median (m)", *(f"within ± {k}σ" for k in GAUSSIAN))
     rows = [
         [

@@ -1,7 +1,8 @@
 """Error against the number of training samples.
 
-The paper's decoder gets the same number of gradient steps whatever the samples, so that data differs and not time. Both
-learn from noisy scans of the corridor, by exact rays: the paper's decoder at its one heading, the field at any.
+The paper's decoder gets the same number of gradient steps for every number of samples, so that only the amount of data
+differs. Both models learn from exact rays with noise in the corridor: the paper's decoder at one heading, the distance
+field at random headings.
 """
 
 from __future__ import annotations
@@ -28,56 +29,58 @@ from presage.plotting import style as drawing
 from services.estimator.paper.perception import Descent
 from services.estimator.shared.interface import Estimator
 
-EXPERIMENT_ID = 4  # of the experiment, in its seeds
+EXPERIMENT_ID = 4  # part of the random seeds
 SIZES = (100, 500, 1000, 2000, 5000, 13_000)
 ESTIMATORS = ("paper", "precise")
-SHARED_SEED, LEARNING_SEED = 0, 1  # in the seeds: what all sizes are judged on, and what each learns from
+SHARED_SEED, LEARNING_SEED = 0, 1  # parts of the random seeds: of the common test data, of training data
 
 
 @dataclass(frozen=True)
 class Job:
-    """One model from so many samples."""
+    """One model, trained on a number of samples."""
 
     seed: int
     estimator: str = "paper"
     samples: int = SIZES[-1]
     steps: int = learning.GRADIENT_STEPS  # of the paper's decoder
     places: int = 50
-    iterations: int = 50  # scans, of the paper's descent; precise gets one
-    held_out: int = 1000  # scans without noise
+    iterations: int = 50  # scans per place for the paper's estimator; precise gets one
+    held_out: int = 1000  # noise-free test scans
     field: ExperimentWorld = ExperimentWorld()  # noqa: RUF009 - frozen
     descent: Descent = PAPER_DESCENT
 
 
 def trial(job: Job) -> dict[str, Any]:
-    """Error of the ranges expected, and of the pose found with them."""
-    learner = job.field.scene(job.seed, EXPERIMENT_ID, LEARNING_SEED, ESTIMATORS.index(job.estimator), job.samples)
-    judge = job.field.scene(job.seed, EXPERIMENT_ID, SHARED_SEED)
+    """Trains a model. Returns the errors of its predicted ranges, and of the poses estimated with it."""
+    training_scene = job.field.scene(
+        job.seed, EXPERIMENT_ID, LEARNING_SEED, ESTIMATORS.index(job.estimator), job.samples
+    )
+    test_scene = job.field.scene(job.seed, EXPERIMENT_ID, SHARED_SEED)
     make: Callable[[], Estimator]
     if job.estimator == "paper":
-        decoder = learning.train_paper(learner, job.field.heading, job.samples, job.steps, job.seed)
+        decoder = learning.train_paper(training_scene, job.field.heading, job.samples, job.steps, job.seed)
         model, steps, seconds = decoder.model, learning.steps_of(decoder.card), decoder.card.training_s
         make, scans = (lambda: decoder.estimator(job.descent)), job.iterations
     else:
-        found = learning.learn_precise(learner, job.samples)
-        model, steps, seconds = found.model, None, found.learning_s  # type: ignore[assignment]
-        make, scans = (lambda: found.estimator(judge)), 1
-    held_out = learning.sample_scans(judge, job.held_out, job.field.heading, noise=False)
-    ranges = learning.range_errors(model, judge, held_out)
-    poses = judge.poses(job.places)
+        field = learning.learn_precise(training_scene, job.samples)
+        model, steps, seconds = field.model, None, field.learning_s  # type: ignore[assignment]
+        make, scans = (lambda: field.estimator(test_scene)), 1
+    held_out = learning.sample_scans(test_scene, job.held_out, job.field.heading, noise=False)
+    ranges = learning.range_errors(model, test_scene, held_out)
+    poses = test_scene.poses(job.places)
     poses[:, 2] = job.field.heading
     return {
         "estimator": job.estimator, "samples": job.samples, "gradient_steps": steps, "learning_s": seconds,
         "range_error_mean_m": float(np.nanmean(ranges)), "range_error_median_m": float(np.nanmedian(ranges)),
         "no_prediction_share": float(np.isnan(ranges).mean()),
-        "position_error_m": [round(_located(make(), judge, pose, scans), 6) for pose in poses],
+        "position_error_m": [round(_position_error(make(), test_scene, pose, scans), 6) for pose in poses],
         "same_scan_everywhere_m": float(np.abs(held_out.ranges - np.median(held_out.ranges, axis=0)).mean()),
-        "bound_median_m": bound.median(bound.single(judge, poses)),
+        "bound_median_m": bound.median(bound.single(test_scene, poses)),
     }  # fmt: skip
 
 
-def _located(estimator: Estimator, scene: Scene, pose: Array, scans: int) -> float:
-    """M, after so many scans of a robot that stands at ``pose`` (3,)."""
+def _position_error(estimator: Estimator, scene: Scene, pose: Array, scans: int) -> float:
+    """Position error in m after ``scans`` scans of a robot that stands at ``pose`` (3,)."""
     clean = scene.clean(pose[None])[0]
     for k in range(scans):
         posterior = estimator.update(scene.observe(clean, k / scene.scanner.rate))
@@ -85,7 +88,7 @@ def _located(estimator: Estimator, scene: Scene, pose: Array, scans: int) -> flo
 
 
 def summarise(row: dict[str, Any]) -> dict[str, Any]:
-    """Numbers of one trial."""
+    """Statistics of one trial."""
     errors = np.array(row["position_error_m"])
     return {
         **{name: value for name, value in row.items() if name != "position_error_m"},
@@ -98,7 +101,7 @@ def summarise(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def run(job: Job, out: Path, workers: int, console: Console, sizes: Sequence[int] = SIZES) -> results.Result:
-    """Every estimator from every number of samples; writes samples.json, .csv, .pdf and .png into ``out``."""
+    """Runs every estimator with every number of samples. Writes samples.json, .csv, .pdf and .png into ``out``."""
     jobs = [replace(job, estimator=name, samples=size) for name in ESTIMATORS for size in sizes]
     rows = run_trials("samples", trial, jobs, out, workers, console)
     summary = {f"{row['estimator']}, {row['samples']}": summarise(row) for row in rows}
@@ -126,7 +129,7 @@ def run(job: Job, out: Path, workers: int, console: Console, sizes: Sequence[int
 
 
 def draw(result: results.Result) -> Figure:
-    """Range error, and position error after it, against samples."""
+    """Range error and position error over the number of samples."""
     figure, (left, right) = drawing.figure_of(2)
     curves, places = result.curves, result.parameters["places"]
     for name, mark in zip(ESTIMATORS, "os", strict=True):
@@ -137,8 +140,8 @@ def draw(result: results.Result) -> Figure:
         errors = curves[f"{name} position_error_median_m"]
         right.plot(curves["samples"], errors, "-" + mark, color=colour, label=_how(name, result.parameters))
         offset = 10 if name == "paper" else -16  # points
-        for size, error, found in zip(curves["samples"], errors, curves[f"{name} found_within_0.2_m"], strict=True):
-            text = f"{found / places:.0%}"
+        for size, error, count in zip(curves["samples"], errors, curves[f"{name} found_within_0.2_m"], strict=True):
+            text = f"{count / places:.0%}"
             right.annotate(text, (size, error), (0, offset), textcoords="offset points", ha="center", fontsize=9)
     limit = next(iter(result.summary.values()))["bound_median_m"]
     right.axhline(limit, color=drawing.BOUND, linestyle=":", linewidth=1.4, label="Cramér-Rao bound of 1 scan, median")
@@ -159,7 +162,7 @@ def _how(name: str, parameters: dict[str, Any]) -> str:
 
 
 def _decades(axes: Axes, sizes: Sequence[int]) -> None:
-    """Logarithmic, with the sizes as ticks."""
+    """Makes both axes logarithmic, with the sizes as ticks."""
     drawing.log_metres(axes, "x")
     drawing.log_metres(axes)
     axes.set_xticks(list(sizes), [f"{size:,}".replace(",", " ") for size in sizes])
@@ -168,7 +171,7 @@ def _decades(axes: Axes, sizes: Sequence[int]) -> None:
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
-    """As docs/experiments.md has it."""
+    """The Markdown table of docs/experiments.md."""
     heads = (
         "estimator", "samples", "range error, mean (m)", "median (m)", "learning (CPU s)", "position error, median (m)",
         "mean (m)", "within 0.2 m",

@@ -1,9 +1,9 @@
 """The step sizes β and γ.
 
-Two loops over E3's journeys, both in the cores, without processes. **Displacement**: algorithm 1 to the letter
-(`teleports.py`), where the iterations are what the step sizes make of them: 12.5 is about a fifth of the distance
-closed an iteration, ln(12 / 0.8) / 12.5. **Velocity**: our controller and the simulator's physics with preset paper,
-where iterations are scans at 15 Hz and the robot's speed limit decides.
+Two loops over E3's journeys, both in one process. **Displacement**: the literal algorithm 1 (`teleports.py`), where the
+step sizes determine the number of iterations: the paper's 12.5 iterations mean that each one closes about a fifth of
+the distance, ln(12 / 0.8) / 12.5. **Velocity**: presage's controller and the simulator's physics with preset paper,
+where an iteration is a scan at 15 Hz and the robot's speed limit determines the number.
 """
 
 from __future__ import annotations
@@ -40,26 +40,26 @@ from services.estimator.paper.perception import Descent
 from services.estimator.paper.training import usable_ranges
 from services.estimator.shared.interface import Observation
 
-EXPERIMENT_ID = 5  # of the experiment, in its seeds; the journeys are E3's
+EXPERIMENT_ID = 5  # part of the random seeds; the journeys are those of E3
 PAPER_ITERATIONS = 12.5  # iterations, the paper's mean over 50 trials
-ALPHA = 2e-3  # m² along x, in the network's own coordinates: the largest with which the belief does not swing
+ALPHA = 2e-3  # m² along x, in the network's coordinates: the largest value without oscillation of the belief
 GAMMAS = (1e-3, 2e-3, 3e-3, 5e-3, 8e-3)  # m²
 BETAS = (0.3, 1.0, 3.0)
 SUMS = (1e-4, 3e-4, 1e-3)
 VELOCITY_GAMMAS, VELOCITY_BETAS = (0.05, 0.1, 0.3, 0.8), (0.03, 0.1, 0.3)
-VELOCITY_DIVISOR = 5  # of so many journeys one is driven with velocities as well: it takes a second per ten metres
+VELOCITY_DIVISOR = 5  # one journey in five is also driven with velocities, which takes a second per ten metres
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One column of the sweep. Of velocity only beta and gamma count, gamma without a unit."""
+    """One setting of the sweep. The velocity loop uses only beta and gamma, and gamma has no unit there."""
 
     loop: Literal["displacement", "velocity"]
     steps: Steps
 
     @property
     def name(self) -> str:
-        """In tables."""
+        """Name of the setting in tables and results."""
         steps = self.steps
         if self.loop == "velocity":
             return f"velocity, β {steps.beta:g}, γ {steps.gamma:g}"
@@ -73,17 +73,17 @@ class Job:
 
     index: int
     seed: int
-    limit: int = 150  # iterations of displacement
-    velocity_limit: int = 900  # iterations of velocity
+    limit: int = 150  # maximum number of iterations in the displacement loop
+    velocity_limit: int = 900  # maximum number of iterations in the velocity loop
     field: ExperimentWorld = ExperimentWorld()  # noqa: RUF009 - frozen
     setting: Setting = Setting("displacement", Steps())
 
 
 def settings() -> list[Setting]:
-    """All of the sweep."""
+    """All settings of the sweep."""
     every = [Steps(ALPHA, beta, gamma) for beta in BETAS for gamma in GAMMAS]
     every += [Steps(ALPHA, 1.0, gamma, "sum") for gamma in SUMS]
-    # In metres alpha is bounded by the short axis, along which the scan changes most.
+    # With equal step sizes along both axes, alpha is limited by the short axis, along which the scan changes most.
     every += [Steps(5e-4, 1.0, 1e-3, normalised=False), Steps(ALPHA, 1.0, 1e-3, "printed")]
     driven = [Steps(beta=0.0, gamma=gamma) for gamma in VELOCITY_GAMMAS]
     driven += [Steps(beta=beta, gamma=ActionParameters().gamma) for beta in VELOCITY_BETAS]
@@ -91,11 +91,11 @@ def settings() -> list[Setting]:
 
 
 def trial(job: Job) -> dict[str, Any]:
-    """Iterations, and time over the least where the robot drives."""
+    """Runs one journey. Returns its number of iterations, and in the velocity loop its time over the minimum."""
     world = job.field.scene(0).world
     journey = draw_journey(world, np.random.default_rng((job.seed, navigation.EXPERIMENT_ID, job.index)), Robot())
-    found = {"setting": job.setting.name, "straight_m": journey.straight}
-    return found | (_run_displacement if job.setting.loop == "displacement" else _run_velocity)(job, world, journey)
+    row = {"setting": job.setting.name, "straight_m": journey.straight}
+    return row | (_run_displacement if job.setting.loop == "displacement" else _run_velocity)(job, world, journey)
 
 
 @functools.lru_cache(maxsize=2)
@@ -121,7 +121,7 @@ def _run_displacement(job: Job, world: World, journey: Journey) -> dict[str, Any
 
 
 def _run_velocity(job: Job, world: World, journey: Journey) -> dict[str, Any]:
-    """As E3, but in one process and with these step sizes."""
+    """Runs the journey as in E3, but in one process and with the job's step sizes."""
     from services.simulator.simulation import Setup, Simulation  # noqa: PLC0415 - pybullet, for this alone
 
     scanner, steps = job.field.scene(0).scanner, job.setting.steps
@@ -139,13 +139,18 @@ def _run_velocity(job: Job, world: World, journey: Journey) -> dict[str, Any]:
             away, contacts = float(np.hypot(*(here - goal)[:2])), contacts + truth.contact
             if away <= ARRIVAL_DISTANCE or simulation.steps >= job.velocity_limit:
                 break
-            seen = Observation(scan.ranges.astype(float), scan.angles(), scan.range_max, goal=goal)
-            found = perception.update(seen)
-            errors.append(float(np.hypot(*(found.pose - here)[:2])))
+            observation = Observation(scan.ranges.astype(float), scan.angles(), scan.range_max, goal=goal)
+            posterior = perception.update(observation)
+            errors.append(float(np.hypot(*(posterior.pose - here)[:2])))
             belief = Belief(
-                stamp_ns=scan.stamp_ns, state=found.state, pose=Pose.of(found.pose), xi=found.xi.astype(np.float32),
-                curvature=found.curvature, free_energy=found.free_energy, accuracy=found.accuracy,
-            )  # fmt: skip
+                stamp_ns=scan.stamp_ns,
+                state=posterior.state,
+                pose=Pose.of(posterior.pose),
+                xi=posterior.xi.astype(np.float32),
+                curvature=posterior.curvature,
+                free_energy=posterior.free_energy,
+                accuracy=posterior.accuracy,
+            )
             navigator.on_scan(scan)
             simulation.command(scan.stamp_ns, navigator.step(belief)[0].twist)
             simulation.advance()
@@ -153,13 +158,17 @@ def _run_velocity(job: Job, world: World, journey: Journey) -> dict[str, Any]:
         simulation.close()
     over = simulation.stamp_ns * 1e-9 / least_time(journey.straight, Robot())
     return {
-        "reached": away <= ARRIVAL_DISTANCE, "iterations": simulation.steps, "time_over_least": over, "contacts": contacts,
-        "error_m": float(np.mean(errors)), "distance_m": [away],
-    }  # fmt: skip
+        "reached": away <= ARRIVAL_DISTANCE,
+        "iterations": simulation.steps,
+        "time_over_least": over,
+        "contacts": contacts,
+        "error_m": float(np.mean(errors)),
+        "distance_m": [away],
+    }
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Of one setting; iterations and times are of those that arrived."""
+    """Statistics of one setting; iterations and times only of journeys that reached the goal."""
     there = [row for row in rows if row["reached"]]
     over = [row["time_over_least"] for row in there if "time_over_least" in row]
     return {
@@ -173,7 +182,10 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
-    """Every setting over the first ``trials`` of E3's journeys; writes steps.json, .csv, .trials.jsonl, .pdf, .png."""
+    """Runs every setting over the first ``trials`` journeys of E3.
+
+    Writes steps.json, .csv, .trials.jsonl, .pdf and .png into ``out``.
+    """
     grid = settings()
     counts = [trials if each.loop == "displacement" else max(1, trials // VELOCITY_DIVISOR) for each in grid]
     jobs = [replace(job, index=k, setting=each) for each, count in zip(grid, counts, strict=True) for k in range(count)]
@@ -194,7 +206,10 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
     note = "no setting reached every goal"
     if nearest is not None:
         mean = summary[nearest.name]["iterations_mean"]
-        note = f"nearest to the paper's {PAPER_ITERATIONS:g} iterations, where every goal is reached: {nearest.name}: {mean:.1f}"
+        note = (
+            f"nearest to the paper's {PAPER_ITERATIONS:g} iterations, where every goal is reached: "
+            f"{nearest.name}: {mean:.1f}"
+        )
     result = results.Result(
         "steps", "Step sizes of action and goal", job.seed, {**asdict(job), "trials": trials, "alpha": ALPHA}, summary,
         curves, rows, [note],
@@ -204,7 +219,7 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
 
 
 def draw(grid: Sequence[Setting], summary: dict[str, dict[str, Any]]) -> Figure:
-    """Iterations against γ for each β with 12.5 marked; time over the least where the robot drives."""
+    """Iterations over γ for each β, with the paper's 12.5 marked, and time over the minimum in the velocity loop."""
     figure, (left, right) = drawing.figure_of(2)
     moved = [each for each in grid if each.loop == "displacement" and each.steps.normalised]
     for beta, colour in zip(BETAS, ("#56B4E9", "#0072B2", "#000000"), strict=True):
@@ -234,7 +249,7 @@ def draw(grid: Sequence[Setting], summary: dict[str, dict[str, Any]]) -> Figure:
 
 
 def _logarithmic(axes: Axes, *names: str) -> None:
-    """Where there is anything: an empty axis has no logarithm."""
+    """Makes the named axes logarithmic, unless the plot is empty."""
     for name in names if axes.collections else ():
         drawing.log_metres(axes, name)
         (axes.yaxis if name == "y" else axes.xaxis).set_minor_formatter(NullFormatter())
@@ -243,7 +258,7 @@ def _logarithmic(axes: Axes, *names: str) -> None:
 def _line(
     axes: Axes, own: Sequence[Setting], summary: dict[str, dict[str, Any]], by: str, what: str, label: str, colour: str
 ) -> None:
-    """Filled where every goal was reached, hollow where some were, absent where none was."""
+    """Plots one line; its marks are filled where every goal was reached, and hollow where only some were."""
     rows = [(getattr(each.steps, by), summary[each.name]) for each in own if summary[each.name]["reached"]]
     if not rows:
         return
@@ -254,7 +269,7 @@ def _line(
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
-    """As docs/experiments.md has it."""
+    """The Markdown table of docs/experiments.md."""
     heads = ("step sizes", "reached", "iterations, mean", "time over least, median", "error, mean (m)")
     rows = [
         [

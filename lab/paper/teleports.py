@@ -1,7 +1,7 @@
 """The paper's algorithm 1.
 
-No speed limit, no physics: an action is a displacement in m, as the thesis behind the paper has it. Only the body stays
-in free space: a displacement that would leave it ends before the wall, and the action begins anew there.
+Without speed limit and physics: an action is a displacement in m, as in the thesis behind the paper. The robot stays in
+free space, though: a displacement into a wall ends before the wall, and the action is reset to zero there.
 """
 
 from __future__ import annotations
@@ -20,43 +20,43 @@ from lab.experiments.journeys import ARRIVAL_DISTANCE, Journey
 from services.estimator.paper.decoder import PaperModel
 from services.estimator.paper.free_energy import gradient
 
-# Equation 4 sums the action over iterations. "step" takes the gradient alone as the displacement: the velocity that
-# dies away with the gradient, which the paper describes. "printed" has the printed signs of both equations.
+# "sum" sums the action over iterations, as equation 4 does. "step" takes the gradient alone as the displacement, so the
+# motion decays with the gradient, as the paper describes. "printed" uses the signs of both equations as printed.
 Form = Literal["step", "sum", "printed"]
 
 
 @dataclass(frozen=True)
 class Steps:
-    """Step sizes, m² each but beta; Sigma = 1 m².
+    """Step sizes; alpha and gamma in m², with Sigma = 1 m².
 
-    The paper's network, and so its gradients, are in coordinates in which the map is 2 x 2. Back in metres a step along
-    each axis is scaled by the square of the map's half size there: alpha and gamma are those of the longest axis, and
-    across an 18 m x 4.5 m corridor they are 16 times smaller.
+    The paper's network and its gradients use coordinates in which the map is 2 x 2. In metres, a step along an axis is
+    therefore scaled by the square of the map's half size along that axis. alpha and gamma apply to the longest axis;
+    across the 18 m x 4.5 m corridor the steps are 16 times smaller.
     """
 
-    alpha: float = 5e-4  # of perception
+    alpha: float = 5e-4  # m², of perception
     beta: float = 1.0  # weight of the goal
-    gamma: float = 5e-4  # of action
+    gamma: float = 5e-4  # m², of action
     form: Form = "step"
-    normalised: bool = True  # False: the same step sizes along both axes
+    normalised: bool = True  # whether steps scale with the map's size as above; otherwise they are equal on both axes
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One journey; entry k is before iteration k+1."""
+    """Result of a journey; entry k of the arrays is from before iteration k + 1."""
 
     distance: Array  # (K,) m, robot to goal
     error: Array  # (K,) m, belief to robot
-    stopped: int  # displacements that a wall cut short
+    stopped: int  # number of displacements that ended before a wall
 
     @property
     def reached(self) -> bool:
-        """Whether it came within `ARRIVAL_DISTANCE`."""
+        """Whether the robot came within `ARRIVAL_DISTANCE` of the goal."""
         return bool(self.distance[-1] <= ARRIVAL_DISTANCE)
 
     @property
     def iterations(self) -> int:
-        """Made."""
+        """Number of iterations."""
         return len(self.distance) - 1
 
 
@@ -64,7 +64,10 @@ def travel(
     journey: Journey, steps: Steps, model: PaperModel, look: Callable[[Array], Array], world: World, yaw: float,
     limit: int,
 ) -> Outcome:  # fmt: skip
-    """From the true start; ``look`` gives the usable ranges (B,) m seen from a pose (3,), with fresh noise."""
+    """Runs algorithm 1 with the belief starting at the true start, for at most ``limit`` iterations.
+
+    ``look`` returns usable ranges (B,), m, with fresh noise at a pose (3,).
+    """
     room = shapely.buffer(world.free_space, -Robot().radius)
     shapely.prepare(room)
     goal, robot = np.array(journey.goal), np.array(journey.start)
@@ -86,7 +89,7 @@ def travel(
 
 
 def _perceive(o: Array, belief: Array, g_goal: Array, model: PaperModel, steps: Steps, yaw: float) -> Array:
-    """(2,) the bracket of equation 3."""
+    """The bracket of equation 3, (2,)."""
     g, dg = model.predict(np.array([*belief, yaw]))
     if steps.form == "printed":
         return np.asarray((dg.T @ (o - g) + steps.beta * (dg.T @ (o - g_goal)))[:2])
@@ -94,7 +97,10 @@ def _perceive(o: Array, belief: Array, g_goal: Array, model: PaperModel, steps: 
 
 
 def _act(action: Array, o: Array, belief: Array, model: PaperModel, steps: Steps, yaw: float, metric: Array) -> Array:
-    """(2,) m, equation 4 at the belief just updated; the heading is fixed, so a displacement moves the belief 1:1."""
+    """The action (2,), m, of equation 4 at the updated belief.
+
+    The heading is fixed, so the derivative of the belief by the displacement is the identity.
+    """
     g, dg = model.predict(np.array([*belief, yaw]))
     xi = metric * (dg.T @ (o - g))[:2]
     if steps.form == "printed":
@@ -103,7 +109,10 @@ def _act(action: Array, o: Array, belief: Array, model: PaperModel, steps: Steps
 
 
 def displace(room: shapely.Geometry, place: Array, step: Array) -> tuple[Array, bool]:
-    """The place after a step (2,) m, or the last one on the way that lies in ``room``; whether it was cut short."""
+    """The place (2,) after a step (2,), m, or the last place on the line that lies in ``room``.
+
+    Also returns whether the step was shortened.
+    """
     if shapely.covers(room, shapely.LineString(np.array([place, place + step]))):
         return place + step, False
     low, high = 0.0, 1.0

@@ -22,47 +22,47 @@ from services.estimator.particle_filter.settings import Settings as ParticleSett
 from services.estimator.precise.learning.calibration import Drive
 from services.estimator.shared.interface import Estimator, Observation
 
-MAX_SEARCH_SCANS = 40  # scans that a search may take
-SCANS_BEFORE_KIDNAPPING = 10  # scans that a robot is tracked for before it is carried off
-START_COVARIANCE = np.diag([0.01, 0.01, 0.0025])  # covariance of the start that is given, m², m², rad²
-TRACKED_DISTANCE = 0.5  # m, within which a scan counts as tracked
-# A differential model cannot follow every base; AMCL_SETTINGS has an omnidirectional one for these.
+MAX_SEARCH_SCANS = 40
+SCANS_BEFORE_KIDNAPPING = 10  # scans for which the robot is tracked before it is kidnapped
+START_COVARIANCE = np.diag([0.01, 0.01, 0.0025])  # m², m², rad²; of a given start
+TRACKED_DISTANCE = 0.5  # m; a scan with a smaller error counts as tracked
+# AMCL's default motion model is differential and cannot follow every base, so its omnidirectional model is used.
 AMCL_SETTINGS = ParticleSettings(robot_model_type="omni")
 ODOMETRY, LASER, GLOBAL, KIDNAPPED = "odometry", "laser", "global", "kidnapped"
 
 
 @dataclass(frozen=True)
 class Job:
-    """One estimator on one stretch; plain values alone."""
+    """One estimator on one stretch of a drive; all values are plain, so that jobs can be compared and sent."""
 
     log: str
     map: str
-    mount: tuple[float, float, float] | None  # of the laser in base_link; None: as the log says
+    mount: tuple[float, float, float] | None  # pose of the laser in base_link; None for the log's own
     estimator: str  # precise, particle-filter or amcl-defaults
     task: str
-    first: int  # scan of the drive at which it begins
-    count: int = 0  # scans to go on for
-    to: int = 0  # kidnapped: the scan it is carried to
-    model: str = ""  # of precise: file of weights
+    first: int  # index of the first scan
+    count: int = 0  # number of scans
+    to: int = 0  # task kidnapped: index of the scan to which the robot is moved
+    model: str = ""  # weights file of estimator precise
     particles: tuple[tuple[str, float], ...] = ()  # settings of the particle filter, by name
     seed: int = 1
-    exchanged: bool = False  # the halves of the drive
+    exchanged: bool = False  # whether the second half of the drive is the training half
 
     @property
     def drive(self) -> Drive:
-        """All of it; the half that is learned comes first."""
+        """The whole drive, with the training half first."""
         return drive_at(self.log, self.mount, self.exchanged)
 
     @property
     def learned(self) -> int:
-        """Scans of `drive` that are learned from; the one with this number is the first of the other half."""
+        """Number of scans in the training half of `drive`, which is also the index of the first scan after it."""
         first, second = split(drive_at(self.log, self.mount))
         return len((second if self.exchanged else first).ranges)
 
 
 @functools.lru_cache(maxsize=2)
 def drive_at(log: str, mount: tuple[float, float, float] | None, exchanged: bool = False) -> Drive:
-    """The posed scans of a log, read once in each process; ``exchanged``: its second half first."""
+    """The scans of a log that have reference poses; cached per process. ``exchanged`` puts the second half first."""
     from presage.logs.log import Reading  # noqa: PLC0415
 
     if exchanged:
@@ -72,15 +72,15 @@ def drive_at(log: str, mount: tuple[float, float, float] | None, exchanged: bool
 
 
 def exchange_halves(drive: Drive) -> Drive:
-    """The second half, and then the first as if it had followed at the usual interval."""
+    """The drive with its halves exchanged; the first half follows the second after a usual scan interval."""
     early, late = split(drive)
-    follows = late.stamps[-1] + float(np.median(np.diff(drive.stamps))) - early.stamps[0]
-    turned = drive.part(np.roll(np.arange(len(drive.ranges)), -len(early.ranges)))
-    return replace(turned, stamps=np.concatenate([late.stamps, early.stamps + follows]))
+    offset = late.stamps[-1] + float(np.median(np.diff(drive.stamps))) - early.stamps[0]
+    exchanged = drive.part(np.roll(np.arange(len(drive.ranges)), -len(early.ranges)))
+    return replace(exchanged, stamps=np.concatenate([late.stamps, early.stamps + offset]))
 
 
 def trial(job: Job) -> dict[str, Any]:
-    """What was believed after every scan."""
+    """Runs the job's estimator over its stretch. Returns errors, states and times of every scan."""
     drive, estimator = job.drive, create_estimator(job)
     if job.task in (ODOMETRY, LASER):
         estimator.restart(drive.poses[job.first], START_COVARIANCE)
@@ -93,41 +93,43 @@ def trial(job: Job) -> dict[str, Any]:
         numbers = np.concatenate([np.arange(job.first, job.first + SCANS_BEFORE_KIDNAPPING), after])
     clock = drive.stamps[numbers]
     odom = None if drive.odom is None or job.task == LASER else drive.odom[numbers]
-    if job.task == KIDNAPPED:  # carried in no time, as far as the sensors tell
-        clock[SCANS_BEFORE_KIDNAPPING:] += drive.stamps[job.first + SCANS_BEFORE_KIDNAPPING] - clock[SCANS_BEFORE_KIDNAPPING]
+    if job.task == KIDNAPPED:  # to the sensors, the kidnapping takes no time
+        clock[SCANS_BEFORE_KIDNAPPING:] += (
+            drive.stamps[job.first + SCANS_BEFORE_KIDNAPPING] - clock[SCANS_BEFORE_KIDNAPPING]
+        )
         odom = None if odom is None else hide_kidnapping(odom, SCANS_BEFORE_KIDNAPPING)
     rows: dict[str, list[Any]] = {name: [] for name in ("stamp_s", "error_m", "yaw_error_rad", "state", "nees", "ms")}
     for i, k in enumerate(numbers):
-        told = None if odom is None else odom[i]
-        seen = Observation(drive.ranges[k], drive.angles, drive.range_max, float(clock[i]), told)
+        odom_pose = None if odom is None else odom[i]
+        observation = Observation(drive.ranges[k], drive.angles, drive.range_max, float(clock[i]), odom_pose)
         began = time.process_time()
-        posterior = estimator.update(seen)
+        posterior = estimator.update(observation)
         rows["ms"].append(round((time.process_time() - began) * 1e3, 2))
-        off = posterior.pose - drive.poses[k]
-        off[2] = se2.wrap(off[2])
+        error = posterior.pose - drive.poses[k]
+        error[2] = se2.wrap(error[2])
         rows["stamp_s"].append(round(float(clock[i]), 4))
-        rows["error_m"].append(round(float(np.hypot(off[0], off[1])), 5))
-        rows["yaw_error_rad"].append(round(abs(float(off[2])), 5))
+        rows["error_m"].append(round(float(np.hypot(error[0], error[1])), 5))
+        rows["yaw_error_rad"].append(round(abs(float(error[2])), 5))
         rows["state"].append(posterior.state)
-        rows["nees"].append(_nees(off, posterior.covariance))
+        rows["nees"].append(_nees(error, posterior.covariance))
     return {"estimator": job.estimator, "task": job.task, "first": job.first, "to": job.to, **rows}
 
 
-def _nees(off: Array, covariance: Array | None) -> float | None:
+def _nees(error: Array, covariance: Array | None) -> float | None:
     if covariance is None:
         return None
-    return round(min(float(off @ np.linalg.pinv(covariance, hermitian=True) @ off), 1e6), 3)
+    return round(min(float(error @ np.linalg.pinv(covariance, hermitian=True) @ error), 1e6), 3)
 
 
 def hide_kidnapping(odom: Array, carried: int) -> Array:
-    """Odometry (N, 3) of a robot that is lifted before its ``carried``-th scan: its wheels stand still meanwhile."""
+    """Odometry (N, 3) without the motion before scan ``carried``, as if the robot were lifted with its wheels still."""
     moved = odom.copy()
     moved[carried:] = se2.compose(odom[carried - 1], se2.between(odom[carried], odom[carried:]))
     return np.asarray(moved)
 
 
 def create_estimator(job: Job) -> Estimator:
-    """A new estimator that knows the place and nothing of where it is."""
+    """A new estimator for the job's map, without a start pose."""
     drive = job.drive
     if job.estimator == "precise":
         factory = _precise(job.map, job.model)
@@ -138,7 +140,7 @@ def create_estimator(job: Job) -> Estimator:
 
 
 def particle_settings(changed: tuple[tuple[str, float], ...]) -> ParticleSettings:
-    """The tuned set, or AMCL's own, with what a tuning on the first half has changed."""
+    """Settings of the particle filter: the tuned set, or AMCL's if "amcl_defaults" is 1, with the given changes."""
     kinds = {"max_beams": int, "keep_initial_pose": bool}
     values = {name: kinds[name](value) if name in kinds else value for name, value in changed}
     base = AMCL_SETTINGS if values.pop("amcl_defaults", 0.0) else ParticleSettings.tuned()

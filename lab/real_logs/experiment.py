@@ -1,7 +1,7 @@
 """`presage experiment real`.
 
-(a) tracking with odometry, (b) without, (c) from nothing, (d) carried off. The errors are against the log's reference
-poses, whose own error is among them.
+Tasks: (a) tracking with odometry, (b) tracking without, (c) global localisation, (d) kidnapping. Errors are relative to
+the log's reference poses and therefore include the errors of those poses.
 """
 
 from __future__ import annotations
@@ -48,34 +48,35 @@ TASKS = {
     ODOMETRY: "a: tracking with odometry", LASER: "b: tracking without", GLOBAL: "c: from nothing",
     KIDNAPPED: "d: carried off",
 }  # fmt: skip
-MIN_FREE_SHARE = 0.5  # share of the poses; a map may lack what the drive saw
-TRACKED_DISTANCE = TRACKED_DISTANCE  # m and
-TRACKED_YAW = float(np.deg2rad(10))  # rad from the reference: tracked; beyond, `tracking` is a wrong claim
-QUICK_SCANS = 120  # scans of (a) and (b), for a look
+MIN_FREE_SHARE = 0.5  # of the reference poses in free space; the map may lack places that the drive saw
+# Within this heading error (rad) and TRACKED_DISTANCE of the reference a scan counts as tracked. Otherwise state
+# `tracking` is a wrong claim.
+TRACKED_YAW = float(np.deg2rad(10))
+QUICK_SCANS = 120  # scans of (a) and (b) with --quick
 
 
 @dataclass(frozen=True)
 class Job:
-    """What to do."""
+    """Parameters of the experiment."""
 
     log: Path
     map: str
-    mount: tuple[float, float, float] | None = None  # of the laser in base_link; None: as the log says
-    every: int = 50  # scans between the starts of (c) and (d)
+    mount: tuple[float, float, float] | None = None  # pose of the laser in base_link; None for the log's own
+    every: int = 50  # number of scans between the starts of (c) and (d)
     quick: bool = False
     seed: int = 1
-    name: str = ""  # of the result, real-NAME
-    exchange: bool = False  # learn from the second half, localise the first
+    name: str = ""  # the result is named real-NAME
+    exchange: bool = False  # train on the second half, localise on the first
 
     @property
     def result(self) -> str:
-        """Of the files."""
+        """Name of the result and its files."""
         stem = re.sub(r"[^A-Za-z0-9_]", "_", self.log.stem) + "_exchanged" * self.exchange
         return f"real-{self.name or stem}"
 
 
 def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
-    """Learn, tune, localise; writes real-NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
+    """Trains, tunes and localises. Writes real-NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
     world = load_world(job.map)
     plain = Stretch(str(job.log), job.map, job.mount, "precise", ODOMETRY, 0, seed=job.seed, exchanged=job.exchange)
     drive = plain.drive
@@ -83,12 +84,16 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
     x, y, yaw = drive.mount
     console.print(
         f"{job.log.name}: {len(drive.ranges)} posed scans, the laser at {x:g} m, {y:g} m, {np.rad2deg(yaw):g} deg in "
-        f"base_link{'' if job.mount else ' (--mount)'}; {'first' if job.exchange else 'second'} half localised"
+        f"base_link{'' if job.mount else ' (change with --mount)'}; localising the "
+        f"{'first' if job.exchange else 'second'} half"
     )
-    _fits(world, drive.part(np.arange(half)), job.map)
+    _check_map(world, drive.part(np.arange(half)), job.map)
     if len(drive.ranges) < 4 * MAX_SEARCH_SCANS:
-        raise UserError(f"{job.log}: {len(drive.ranges)} posed scans; at least {4 * MAX_SEARCH_SCANS} are needed")
-    model, card, tuned = _prepared(job, plain, half, out, console)
+        raise UserError(
+            f"{job.log}: {len(drive.ranges)} posed scans; at least {4 * MAX_SEARCH_SCANS} are needed, that is scans "
+            "with a reference pose"
+        )
+    model, card, tuned = _train_and_tune(job, plain, half, out, console)
     plain = replace(plain, first=half, model=str(model))
     jobs = [
         replace(each, estimator=name, particles=_settings(tuned, each.task) if name == "particle-filter" else ())
@@ -105,7 +110,9 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
     result = results.Result(
         job.result, f"A real drive: {job.log.name}", job.seed,
         {**{k: str(v) if isinstance(v, Path) else v for k, v in asdict(job).items()}, "scans": len(drive.ranges),
-         "particle_filter": {**{name: dict(each) for name, each in _settings_by_task(tuned).items()}, "tried": tuned.tried},
+         "particle_filter": {
+             **{name: dict(each) for name, each in _settings_by_task(tuned).items()}, "tried": tuned.tried
+         },
          "calibration": asdict(card.calibration) if card.calibration else None},
         summary, curves_of(rows), rows, notes(job, card, tuned),
     )  # fmt: skip
@@ -113,25 +120,28 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
     return result
 
 
-def _fits(world: World, learned: Drive, name: str) -> None:
-    """Raises UserError where the drive cannot have been in that map."""
+def _check_map(world: World, learned: Drive, name: str) -> None:
+    """Raises UserError if most of the training half's poses are not in the map's free space."""
     free = float((world.clearance(learned.poses[:, :2]) > 0).mean())
     if free < MIN_FREE_SHARE:
         raise UserError(
-            f"only {free:.0%} of the reference poses of the half that is learned are in free space of {name}: "
+            f"only {free:.0%} of the reference poses of the training half are in free space of {name}: "
             "is it a map of this place, in the frame of these poses?"
         )
 
 
-def _prepared(
+def _train_and_tune(
     job: Job, stretch: Stretch, half: int, out: Path, console: Console
 ) -> tuple[Path, weights.FieldCard, Tuned]:
-    """The model of the half that is learned, and the particle filter's settings for it."""
+    """The model trained on the training half, and the settings of the particle filter tuned on it.
+
+    An interrupted run's model and settings are reused if the command and the commit are the same.
+    """
     world = load_world(job.map)
     path = out / f".{job.result}" / "model.safetensors"
     kept = path.with_name("tuned.json")
     key = json.dumps([commit(), asdict(job)], sort_keys=True, default=str)
-    with suppress(OSError, ValueError, KeyError, TypeError, UserError):  # of an interrupted run, or nothing
+    with suppress(OSError, ValueError, KeyError, TypeError, UserError):  # no usable files of an interrupted run
         before = json.loads(kept.read_text(encoding="utf-8"))
         if before["key"] == key:
             odometry, laser, finding = (tuple(before[what].items()) for what in ("odometry", "laser", "finding"))
@@ -168,37 +178,38 @@ def _settings_by_task(tuned: Tuned) -> dict[str, Settings]:
 
 
 def stretches(plain: Stretch, half: int, count: int, job: Job, *, odometry: bool) -> list[Stretch]:
-    """The trials of one estimator; what takes longest first."""
+    """The trials of one estimator, the longest first."""
     length = min(QUICK_SCANS, count - half) if job.quick else count - half
     whole = [replace(plain, task=task, count=length) for task in ((ODOMETRY, LASER) if odometry else (LASER,))]
     starts = list(range(half, count - MAX_SEARCH_SCANS, job.every * (4 if job.quick else 1)))
-    carried = [
+    kidnappings = [
         replace(plain, task=KIDNAPPED, first=first, to=to)
         for first in starts
-        if (to := half + (first - half + (count - half) // 2) % (count - half - MAX_SEARCH_SCANS)) > first + SCANS_BEFORE_KIDNAPPING
+        if (to := half + (first - half + (count - half) // 2) % (count - half - MAX_SEARCH_SCANS))
+        > first + SCANS_BEFORE_KIDNAPPING
         or to + MAX_SEARCH_SCANS <= first
     ]
-    return [*whole, *(replace(plain, task=GLOBAL, first=first) for first in starts), *carried]
+    return [*whole, *(replace(plain, task=GLOBAL, first=first) for first in starts), *kidnappings]
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Numbers of one estimator in one task."""
+    """Statistics of one estimator in one task."""
     after = [SCANS_BEFORE_KIDNAPPING if row["task"] == KIDNAPPED else 0 for row in rows]
     error, yaw, state, ms, nees = (
         np.array([value for row, skip in zip(rows, after, strict=True) for value in row[name][skip:]])
         for name in ("error_m", "yaw_error_rad", "state", "ms", "nees")
     )
-    good = (error < TRACKED_DISTANCE) & (yaw < TRACKED_YAW)
+    tracked_scans = (error < TRACKED_DISTANCE) & (yaw < TRACKED_YAW)
     claims = state == "tracking"
-    first = [_found(row, skip) for row, skip in zip(rows, after, strict=True)]
+    first = [_scans_until_found(row, skip) for row, skip in zip(rows, after, strict=True)]
     reached = [k for k in first if k is not None]
-    known = np.array([value for value in nees[good & claims] if value is not None], float)
+    known = np.array([value for value in nees[tracked_scans & claims] if value is not None], float)
     return {
         "trials": len(rows), "scans": len(error), "error_median_m": float(np.median(error)),
         "error_rms_m": float(np.sqrt(np.mean(error**2))), "error_95_m": float(np.quantile(error, 0.95)),
-        "tracked_error_rms_m": float(np.sqrt(np.mean(error[good] ** 2))) if good.any() else None,
-        "yaw_error_median_rad": float(np.median(yaw)), "tracked_share": float(good.mean()),
-        "claimed_share": float(claims.mean()), "wrong_claims_share": float((claims & ~good).mean()),
+        "tracked_error_rms_m": float(np.sqrt(np.mean(error[tracked_scans] ** 2))) if tracked_scans.any() else None,
+        "yaw_error_median_rad": float(np.median(yaw)), "tracked_share": float(tracked_scans.mean()),
+        "claimed_share": float(claims.mean()), "wrong_claims_share": float((claims & ~tracked_scans).mean()),
         "wrong_claim_longest_s": max(_longest_wrong(row, skip) for row, skip in zip(rows, after, strict=True)),
         "found": len(reached), "scans_until_found_median": float(np.median(reached)) if reached else None,
         "scans_until_found_mean": float(np.mean(reached)) if reached else None,
@@ -207,20 +218,20 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _good(row: dict[str, Any], skip: int) -> np.ndarray[Any, np.dtype[np.bool_]]:
+def _is_tracked(row: dict[str, Any], skip: int) -> np.ndarray[Any, np.dtype[np.bool_]]:
     error, yaw = np.array(row["error_m"][skip:]), np.array(row["yaw_error_rad"][skip:])
     return np.asarray((error < TRACKED_DISTANCE) & (yaw < TRACKED_YAW))
 
 
-def _found(row: dict[str, Any], skip: int) -> int | None:
-    """Scans until the estimator says `tracking` and is right."""
-    right = _good(row, skip) & (np.array(row["state"][skip:]) == "tracking")
+def _scans_until_found(row: dict[str, Any], skip: int) -> int | None:
+    """Number of scans until the state is `tracking` at the right place. Returns None if it never is."""
+    right = _is_tracked(row, skip) & (np.array(row["state"][skip:]) == "tracking")
     return int(np.argmax(right)) + 1 if right.any() else None
 
 
 def _longest_wrong(row: dict[str, Any], skip: int) -> float:
-    """S for which it said `tracking` without a break and was elsewhere."""
-    wrong = ~_good(row, skip) & (np.array(row["state"][skip:]) == "tracking")
+    """Longest uninterrupted time in s in which the state was `tracking` at a wrong place."""
+    wrong = ~_is_tracked(row, skip) & (np.array(row["state"][skip:]) == "tracking")
     longest, since = 0.0, None
     for stamp, is_wrong in zip(row["stamp_s"][skip:], wrong, strict=True):
         since = (stamp if since is None else since) if is_wrong else None
@@ -229,7 +240,7 @@ def _longest_wrong(row: dict[str, Any], skip: int) -> float:
 
 
 def curves_of(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
-    """Errors of (a) and (b), scan by scan."""
+    """CSV columns: errors of (a) and (b) at every scan."""
     curves: dict[str, list[Any]] = {}
     for row in rows:
         if row["task"] in (ODOMETRY, LASER):
@@ -239,15 +250,15 @@ def curves_of(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
 
 
 def notes(job: Job, card: weights.FieldCard, tuned: Tuned) -> list[str]:
-    """What the table does not say."""
+    """Notes below the table: definitions, tuned settings and calibration."""
     found, learned = card.calibration, "second" if job.exchange else "first"
     lines = [
         (
-            f"tracked: within {TRACKED_DISTANCE} m and 10 deg of the reference, whose own error is among the errors; found: says "
-            f"`tracking` there, within {MAX_SEARCH_SCANS} scans; wrong claim: says `tracking` elsewhere"
+            f"tracked: within {TRACKED_DISTANCE} m and 10 deg of the reference pose, whose error adds to the errors; "
+            f"found: state `tracking` there within {MAX_SEARCH_SCANS} scans; wrong claim: state `tracking` elsewhere"
         ),
         *(
-            f"particle filter, tuned on the {learned} half, {what}: {_listed(each)}"
+            f"particle filter, tuned on the {learned} half, {what}: {_format_settings(each)}"
             for what, each in (("a", tuned.odometry), ("b", tuned.laser), ("c and d", tuned.finding))
             if not job.quick
         ),
@@ -266,12 +277,12 @@ def notes(job: Job, card: weights.FieldCard, tuned: Tuned) -> list[str]:
     return lines
 
 
-def _listed(settings: Settings) -> str:
+def _format_settings(settings: Settings) -> str:
     return ", ".join(f"{name} {value:.3g}" for name, value in settings)
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
-    """As docs/experiments.md has it."""
+    """The Markdown table of docs/experiments.md."""
     heads = (
         "task, estimator", "median (mm)", "RMS (mm)", "95 % (mm)", "tracked", "wrong claims; longest (s)", "found",
         "scans until found", "NEES, median", "update, median; 95 % (CPU ms)",

@@ -13,11 +13,11 @@ from presage.learning.drive_figure import calibration_curve
 from presage.plotting import style as drawing
 from services.estimator.precise.learning.calibration import Calibration
 
-LEAST = 1e-3  # m that are drawn
+MIN_DRAWN_ERROR = 1e-3  # m; smaller errors are drawn at this value
 
 
-def draw(found: Calibration | None, rows: Sequence[dict[str, Any]], titles: dict[str, str]) -> Figure:
-    """Shares of scans by error, calibration, and errors over time with and without odometry."""
+def draw(calibration: Calibration | None, rows: Sequence[dict[str, Any]], titles: dict[str, str]) -> Figure:
+    """Cumulative distribution of the errors, calibration, and errors over time with and without odometry."""
     figure = drawing.blank(14, 9)
     panels = figure.subplots(2, 2, width_ratios=(1.6, 1))
     shares = drawing.dress(panels[0, 0])
@@ -25,7 +25,7 @@ def draw(found: Calibration | None, rows: Sequence[dict[str, Any]], titles: dict
         drawing.dress(axes)
         for row in (row for row in rows if row["task"] == task):
             colour, name = drawing.COLOURS[row["estimator"]], row["estimator"]
-            error = np.maximum(row["error_m"], LEAST)
+            error = np.maximum(row["error_m"], MIN_DRAWN_ERROR)
             stamps = np.array(row["stamp_s"]) - row["stamp_s"][0]
             axes.plot(stamps, error, linewidth=0.9, color=colour, label=name)
             share = np.arange(1, len(error) + 1) / len(error)
@@ -36,7 +36,7 @@ def draw(found: Calibration | None, rows: Sequence[dict[str, Any]], titles: dict
     drawing.log_metres(shares, "x")
     shares.set(xlabel="position error (m)", ylabel="share of scans with less", ylim=(0, 1), title="the half localised")
     shares.legend(frameon=False, fontsize=9)
-    if found is not None:
-        calibration_curve(drawing.dress(panels[0, 1]), found)
+    if calibration is not None:
+        calibration_curve(drawing.dress(panels[0, 1]), calibration)
     drawing.legend_below(figure, panels[1, 1])
     return figure

@@ -1,11 +1,13 @@
 """Tunes the particle filter on the training half.
 
-Odometry's noise is learned from the first half as it is for preset precise. Every other value is tried on stretches of
-the second quarter, in a map of the first quarter: like the half that is localised later, the second quarter sees rooms
-that the map lacks, which decides whether recovery helps or harms. For tracking the settings win that keep the most
-scans, then those with the least median error; for finding, those that find the most starts, from nothing and carried
-off, then those that need the fewest scans. Three sets, for tracking with odometry, without, and for finding, so that no
-task suffers from what another needs.
+The odometry noise is learned from the first half, as for preset precise. All other settings are tried on stretches of
+the second quarter, in a map of the first quarter. Like the half that is localised later, the second quarter sees rooms
+that the map lacks, and this decides whether recovery helps or harms.
+
+Three sets of settings are tuned separately, so that no task suffers from the needs of another: tracking with odometry,
+tracking without, and finding (global localisation and kidnapping). The best tracking settings keep the most scans, and
+among equals have the smallest median error. The best finding settings find the most starts, and among equals need the
+fewest scans.
 """
 
 from __future__ import annotations
@@ -45,35 +47,38 @@ TRACKING_CANDIDATES: dict[str, tuple[float, ...]] = {
     "jitter_heading": (0.005, 0.015),
     "alpha": (4.0, 16.0),
 }
-# amcl_defaults 1: nav2's values in place of the tuned set's where no other is listed; keep_initial_pose 0: recovery
-# after a start from a given pose; sigma_odometry 0: sigma_hit and max_beams with odometry too; alpha: all five, times
-# what the odometry says
+# amcl_defaults 1: nav2's values instead of the tuned set for all other settings. keep_initial_pose 0: allow recovery
+# after a start from a given pose. sigma_odometry 0: use sigma_hit and max_beams with odometry too. alpha: factor on all
+# five learned noise parameters.
 SEARCH_CANDIDATES: dict[str, tuple[float, ...]] = {
     "recovery_alpha_fast": (0.0, 0.1),
     "sigma_search": (0.2,),
     "jitter_position": (0.005, 0.05),
 }
-MAX_STRETCHES, MAX_STRETCH_SCANS = 3, 150  # of the second quarter: at most so many, of at most so many scans
-SEARCH_STARTS, SEARCH_SCANS = 4, 15  # places to find, and scans it may take from nothing
-CELL_SIZE = 0.05  # m, of the first quarter's map where the drive's own map has no cells
+MAX_STRETCHES, MAX_STRETCH_SCANS = 3, 150  # of the second quarter, for tracking
+SEARCH_STARTS, SEARCH_SCANS = 4, 15  # starts to find, and scans allowed for global localisation
+CELL_SIZE = 0.05  # m, of the first quarter's map if the drive's own map is not a grid
 Settings = tuple[tuple[str, float], ...]
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """Settings of the particle filter."""
+    """Tuned settings of the particle filter."""
 
-    odometry: Settings  # to track with odometry
-    laser: Settings  # to track without
-    finding: Settings
-    tried: list[
-        str
-    ]  # task, what was tried: share of scans kept, or of starts found; then median error (m), or mean scans
+    odometry: Settings  # for tracking with odometry
+    laser: Settings  # for tracking without
+    finding: Settings  # for global localisation and kidnapping
+    # A line per trial: task and setting, share of scans kept or starts found, median error (m) or mean number of scans.
+    tried: list[str]
 
 
 def starting_point(motion: MotionNoise) -> Settings:
-    """Of odometry, by the first half: variances of AMCL's omnidirectional model, per square metre and radian."""
-    along = float(np.sqrt(motion.path_by_path / 0.1))  # over steps of a decimetre, AMCL_SETTINGS's grow with the path itself
+    """Odometry noise of AMCL's omnidirectional model, from the noise learned on the first half.
+
+    alpha1 to alpha5 are variances per square metre and per square radian.
+    """
+    # AMCL's standard deviation grows with the path, the learned variance does; they are equal over a decimetre.
+    along = float(np.sqrt(motion.path_by_path / 0.1))
     return (
         ("alpha1", motion.path_by_turn), ("alpha2", motion.turn_by_path / 0.1), ("alpha3", along**2),
         ("alpha4", motion.turn_by_turn / 0.1), ("alpha5", along**2),
@@ -81,9 +86,10 @@ def starting_point(motion: MotionNoise) -> Settings:
 
 
 def tune(job: Job, half: int, start: Settings, folder: Path, report: Callable[[str, float], None]) -> Tuned:
-    """The best settings found; ``job``: log, map and mount; ``half``: scans of the first half.
+    """Tunes the settings by coordinate search. Writes the map of the first quarter into ``folder``.
 
-    The map of the first quarter is written into ``folder``.
+    ``job`` gives the log, the map and the mount; ``half`` is the number of scans in the first half, ``start`` the
+    settings to start from.
     """
     lines: list[str] = []
     total = 2 * sum(map(len, TRACKING_CANDIDATES.values())) + sum(map(len, SEARCH_CANDIDATES.values())) + 3
@@ -101,8 +107,8 @@ def tune(job: Job, half: int, start: Settings, folder: Path, report: Callable[[s
 
     def finding(settings: Settings) -> tuple[float, float]:
         rows = [trial(replace(job, task=GLOBAL, first=k, count=SEARCH_SCANS, particles=settings)) for k in starts]
-        carried = zip(starts, starts[len(starts) // 2 :] + starts[: len(starts) // 2], strict=True)
-        rows += [trial(replace(job, task=KIDNAPPED, first=k, to=to, particles=settings)) for k, to in carried]
+        kidnappings = zip(starts, starts[len(starts) // 2 :] + starts[: len(starts) // 2], strict=True)
+        rows += [trial(replace(job, task=KIDNAPPED, first=k, to=to, particles=settings)) for k, to in kidnappings]
         return _search_score(rows)
 
     def coordinate_search(
@@ -127,13 +133,13 @@ def tune(job: Job, half: int, start: Settings, folder: Path, report: Callable[[s
     odometry, laser = start, coordinate_search(LASER, start, TRACKING_CANDIDATES, partial(tracking, LASER))
     if job.drive.odom is not None:
         odometry = coordinate_search(ODOMETRY, start, TRACKING_CANDIDATES, partial(tracking, ODOMETRY))
-    # A robot that was carried off has to give up the pose that was given; nav2's few particles would not find it.
+    # A kidnapped robot must give up its given pose, and nav2's default number of particles is too small for a search.
     found = _with(_with(odometry, "keep_initial_pose", 0.0), "amcl_defaults", 0.0)
     return Tuned(odometry, laser, coordinate_search("finding", found, SEARCH_CANDIDATES, finding), lines)
 
 
 def _map_of_quarter(job: Job, quarter: int, folder: Path) -> Path:
-    """A ROS map of the first ``quarter`` scans, with cells like those of the job's map."""
+    """Writes a ROS map of the first ``quarter`` scans, with the cell size of the job's map. Returns its path."""
     grid = load_world(job.map).grid
     cell = grid.resolution if grid is not None else CELL_SIZE
     values, (x, y) = cells_of(job.drive.part(np.arange(quarter)), cell)
@@ -141,7 +147,7 @@ def _map_of_quarter(job: Job, quarter: int, folder: Path) -> Path:
 
 
 def _evenly_spaced(job: Job, first: int, last: int, count: int) -> list[int]:
-    """``count`` scans from ``first`` to ``last``, evenly spaced among those whose reference pose is free in the map."""
+    """Indices of ``count`` scans from ``first`` to ``last``, evenly spaced among those with a pose in free space."""
     free = np.flatnonzero(load_world(job.map).clearance(job.drive.poses[first : last + 1, :2]) > 0)
     numbers = first + (free if len(free) else np.arange(last + 1 - first))
     return [int(k) for k in numbers[np.linspace(0, len(numbers) - 1, count).astype(int)]]
@@ -155,14 +161,14 @@ def _with(settings: Settings, name: str, value: float) -> Settings:
 
 
 def _tracking_score(rows: list[dict[str, Any]]) -> tuple[float, float]:
-    """Share of scans tracked, and minus the median error (m) of those."""
+    """Share of scans tracked, and the negative median error (m) of those; larger is better."""
     off = np.array([value for row in rows for value in row["error_m"]])
     tracked = off < TRACKED_DISTANCE
     return round(float(tracked.mean()), 2), -float(np.median(off[tracked])) if tracked.any() else -np.inf
 
 
 def _search_score(rows: list[dict[str, Any]]) -> tuple[float, float]:
-    """Share of starts found, and minus the mean of the scans until then."""
+    """Share of starts found, and the negative mean number of scans until then; larger is better."""
     scans = []
     for row in rows:
         skip = SCANS_BEFORE_KIDNAPPING if row["task"] == KIDNAPPED else 0
