@@ -44,7 +44,7 @@ def goal(
     Examples: `presage goal 15 1.5 --wait`; `presage goal 15 1.5 --yaw 90`; `presage goal --cancel`.
     """
     from common.messages.definitions import Goal  # noqa: PLC0415
-    from presage.live.commands import give_goal  # noqa: PLC0415
+    from presage.live.commands import send_goal  # noqa: PLC0415
 
     if not cancel and (x is None or y is None):
         raise UserError("a goal is two numbers, X Y in m (or --cancel)")
@@ -59,7 +59,7 @@ def goal(
         yaw_tolerance=None if yaw is None else 0.1,
         cancel=cancel,
     )
-    raise typer.Exit(give_goal(link_of(connect, robot), request, console, wait=wait))
+    raise typer.Exit(send_goal(link_of(connect, robot), request, console, wait=wait))
 
 
 @app.command(context_settings=ALLOW_NEGATIVE_NUMBERS)
@@ -178,7 +178,7 @@ def doctor(
     Examples: `presage doctor`; `presage doctor --seconds 10 --json findings.json`; `presage doctor --world my.yaml`;
     `presage doctor --connect tcp/192.168.0.10:7447 --robot two`.
     """
-    from presage.diagnosis.doctor import examine  # noqa: PLC0415
+    from presage.diagnosis.doctor import run_doctor  # noqa: PLC0415
 
     link = link_of(connect, robot)
-    raise typer.Exit(examine(link, seconds, console, world=world, recordings=recordings, json_file=json_file))
+    raise typer.Exit(run_doctor(link, seconds, console, world=world, recordings=recordings, json_file=json_file))

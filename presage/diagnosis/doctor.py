@@ -14,37 +14,37 @@ from rich.table import Table
 from common.bus.bus import Link
 from common.runtime.protocol_check import build_config_reply
 from common.versions import PROTOCOL, versions
-from presage.diagnosis.bus_observation import Observed, listen
+from presage.diagnosis.bus_observation import BusObservation, observe_bus
 from presage.diagnosis.findings import Finding
-from presage.diagnosis.installation import look_at_installation
-from presage.diagnosis.machine import look_at_machine, look_for_stopped
-from presage.diagnosis.rules import judge
+from presage.diagnosis.installation import check_installation
+from presage.diagnosis.machine import check_machine, find_stopped_processes
+from presage.diagnosis.rules import evaluate
 from presage.terminal.output import check_file, write_json
 
 MARKS = {True: "[green]ok[/]", False: "[bold red]no[/]", None: "[yellow]-[/]"}
 
 
-def running(link: Link, seconds: float) -> Iterator[Finding]:
-    """What runs at the endpoint."""
-    seen = listen(link, seconds)
-    if isinstance(seen, Observed):
+def check_session(link: Link, seconds: float) -> Iterator[Finding]:
+    """Observes the session of ``link`` for ``seconds`` s and yields what is found."""
+    observation = observe_bus(link, seconds)
+    if isinstance(observation, BusObservation):
         where = ", ".join(link.connect)
         yield Finding("no_router", True, f"session at {where}", where)
-        for finding in judge(seen, build_config_reply("doctor", "{}")):
+        for finding in evaluate(observation, build_config_reply("doctor", "{}")):
             yield finding
             if finding.code == "missing" and not finding.ok:
-                yield from look_for_stopped(finding.where)
+                yield from find_stopped_processes(finding.where)
     else:
-        yield from seen
+        yield from observation
 
 
-def examine(
+def run_doctor(
     link: Link, seconds: float, console: Console, *, world: str, recordings: Path, json_file: Path | None = None
 ) -> int:
-    """Print the findings, and write them as JSON where asked; 0 when nothing is wrong."""
+    """Prints all findings, and writes them to ``json_file`` if given; returns 1 if there is a problem, else 0."""
     check_file(json_file, "--json")
-    with console.status("looking"):
-        findings = [*look_at_installation(world), *look_at_machine(recordings), *running(link, seconds)]
+    with console.status("checking"):
+        findings = [*check_installation(world), *check_machine(recordings), *check_session(link, seconds)]
     table = Table(show_header=False, box=None)
     for finding in findings:
         table.add_row(MARKS[finding.ok], *(escape(_printable(text)) for text in (finding.what, finding.advice)))
@@ -54,13 +54,18 @@ def examine(
     write_json(
         json_file,
         {
-            "findings": [asdict(finding) for finding in findings], "robot": link.robot, "connect": link.connect,
-            "seconds": seconds, "versions": versions(), "protocol": PROTOCOL, "arguments": sys.argv[1:],
+            "findings": [asdict(finding) for finding in findings],
+            "robot": link.robot,
+            "connect": link.connect,
+            "seconds": seconds,
+            "versions": versions(),
+            "protocol": PROTOCOL,
+            "arguments": sys.argv[1:],
         },
-    )  # fmt: skip
+    )
     return 1 if any(finding.ok is False for finding in findings) else 0
 
 
 def _printable(text: str) -> str:
-    """Words from the bus, which must not steer the terminal."""
+    """Text from the bus without control characters, which could change the state of the terminal."""
     return "".join(c if c.isprintable() else "?" for c in text)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Finding:
-    """What is so, where, and what to do about it."""
+    """One checked fact: whether it is a problem, where, and what to do about it."""
 
-    code: str  # of its kind, for programs
-    ok: bool | None  # None: worth knowing, no fault
+    code: str  # the kind of finding, for programs
+    ok: bool | None  # None for information that is not a problem
     what: str
     where: str = ""  # service and host, key, endpoint or path
     advice: str = ""

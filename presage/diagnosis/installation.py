@@ -11,7 +11,7 @@ from common.errors import UserError
 from common.geometry.world import known_worlds, load_world
 from presage.diagnosis.findings import Finding
 
-NEEDED = {
+PACKAGES_OF_SERVICES = {
     "simulator": ("pybullet",),
     "estimator": ("torch", "safetensors", "numba"),
     "controller": ("scipy",),
@@ -19,34 +19,34 @@ NEEDED = {
 }
 
 
-def look_at_installation(world: str) -> Iterator[Finding]:
-    """Python, packages, and the weights for ``world``; what other worlds have is worth knowing."""
+def check_installation(world: str) -> Iterator[Finding]:
+    """Checks Python, the packages of each service, and the weights for ``world``; lists those of other worlds."""
     python = platform.python_version()
-    fits = sys.version_info >= (3, 10)
-    advice = "" if fits else "3.10 or 3.11 is needed; `make install` picks one"
-    yield Finding("python", fits, f"Python {python}", sys.executable, advice)
-    for service, packages in NEEDED.items():
+    supported = sys.version_info >= (3, 10)
+    advice = "" if supported else "3.10 or 3.11 is needed; `make install` chooses one"
+    yield Finding("python", supported, f"Python {python}", sys.executable, advice)
+    for service, packages in PACKAGES_OF_SERVICES.items():
         missing = [name for name in packages if importlib.util.find_spec(name) is None]
-        what = f"{service}: {'misses ' + ', '.join(missing) if missing else 'installed'}"
+        what = f"{service}: {'missing packages ' + ', '.join(missing) if missing else 'installed'}"
         yield Finding("packages", not missing, what, service, f"pip install 'presage[{service}]'" if missing else "")
-    if all(importlib.util.find_spec(name) for name in NEEDED["estimator"]):
-        yield from _weights(world)
+    if all(importlib.util.find_spec(name) for name in PACKAGES_OF_SERVICES["estimator"]):
+        yield from _check_weights(world)
     else:
-        yield Finding("weights", None, "weights: not looked at, the estimator is not installed here")
+        yield Finding("weights", None, "weights: not checked, because the estimator is not installed here")
 
 
-def _weights(asked: str) -> Iterator[Finding]:
-    from services.estimator.precise.learning import weights as precise  # noqa: PLC0415 - only where its packages are
+def _check_weights(used_world: str) -> Iterator[Finding]:
+    from services.estimator.precise.learning import weights as precise  # noqa: PLC0415 - needs the estimator's packages
 
     where = str(precise.FOLDER)
     try:
-        precise.find(precise.FOLDER, load_world(asked), asked)
+        precise.find(precise.FOLDER, load_world(used_world), used_world)
     except UserError as error:
         what, _, advice = str(error).partition("; ")
-        yield Finding("weights", False, what, where, advice or precise.train_command(asked))
+        yield Finding("weights", False, what, where, advice or precise.train_command(used_world))
     for world in known_worlds():
         learned = precise.path_of(precise.FOLDER, world).exists()
-        there = sorted(path.stem for path in precise.FOLDER.glob(f"{world}-*.safetensors"))
-        text = ", ".join(there) or "none"
+        others = sorted(path.stem for path in precise.FOLDER.glob(f"{world}-*.safetensors"))
+        text = ", ".join(others) or "none"
         advice = "" if learned else precise.train_command(world)
         yield Finding("weights", True if learned else None, f"weights for {world}: {text}", where, advice)

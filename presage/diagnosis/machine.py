@@ -12,46 +12,49 @@ import psutil
 
 from presage.diagnosis.findings import Finding
 
-LEAST_FREE = 500e6  # bytes; a disk fuller than that is nearly full
-MEMORY_FILES = Path("/dev/shm")  # noqa: S108 - looked at, not used
+MIN_FREE_BYTES = 500e6
+SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - only tested for being writable
 
 
-def look_at_machine(recordings: Path) -> Iterator[Finding]:
-    """The folder of recordings must be writable and have room; caches should be."""
-    folder = _existing(recordings)
+def check_machine(recordings: Path) -> Iterator[Finding]:
+    """Checks that the folder of recordings is writable and its disk not nearly full, and that caches are writable."""
+    folder = _nearest_existing(recordings)
     if why := why_not_writable(folder):
-        advice = "choose another folder with --directory of the recorder, or make this one yours"
+        advice = "choose another folder with --directory of the recorder, or change the permissions of this one"
         yield Finding("not_writable", False, f"recordings cannot be written to {folder}: {why}", str(folder), advice)
     else:
-        yield Finding("not_writable", True, f"recordings: {folder} can be written to", str(folder))
+        yield Finding("not_writable", True, f"recordings: {folder} is writable", str(folder))
     free = shutil.disk_usage(folder).free
-    full = free < LEAST_FREE
+    full = free < MIN_FREE_BYTES
     advice = "remove old recordings, or record elsewhere: a recorder that cannot write ends" if full else ""
     yield Finding("disk", not full, f"disk of {folder}: {free / 1e6:.0f} MB free", str(folder), advice)
-    yield from _caches()
+    yield from _check_caches()
 
 
-def _caches() -> Iterator[Finding]:
+def _check_caches() -> Iterator[Finding]:
     cache = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[2] / "services" / "estimator")
-    if why := why_not_writable(_existing(cache)):
-        advice = "the estimator compiles its loops anew at each start; NUMBA_CACHE_DIR names another folder"
-        yield Finding("not_writable", None, f"compiled code cannot be kept in {cache}: {why}", str(cache), advice)
-    if MEMORY_FILES.is_dir() and (why := why_not_writable(MEMORY_FILES)):
-        advice = "experiments on several cores fail; the services do not use it"
-        yield Finding("not_writable", None, f"{MEMORY_FILES} cannot be used: {why}", str(MEMORY_FILES), advice)
+    if why := why_not_writable(_nearest_existing(cache)):
+        advice = "the estimator compiles its code again at each start; set NUMBA_CACHE_DIR to a writable folder"
+        yield Finding("not_writable", None, f"compiled code cannot be cached in {cache}: {why}", str(cache), advice)
+    if SHARED_MEMORY.is_dir() and (why := why_not_writable(SHARED_MEMORY)):
+        advice = "experiments on several cores fail; the services do not need it"
+        yield Finding("not_writable", None, f"{SHARED_MEMORY} cannot be used: {why}", str(SHARED_MEMORY), advice)
 
 
-def look_for_stopped(service: str) -> Iterator[Finding]:
-    """Processes of the service on this machine that are stopped: who comes to a session later does not hear of them."""
+def find_stopped_processes(service: str) -> Iterator[Finding]:
+    """Finds processes of the service on this machine that are stopped (SIGSTOP).
+
+    A session opened after the stop does not receive their liveliness tokens, so that they look missing on the bus.
+    """
     for process in psutil.process_iter(["cmdline", "status"]):
-        words = process.info["cmdline"] or []
-        if f"services.{service}" in words and process.info["status"] == psutil.STATUS_STOPPED:
+        arguments = process.info["cmdline"] or []
+        if f"services.{service}" in arguments and process.info["status"] == psutil.STATUS_STOPPED:
             what = f"{service}: process {process.pid} of this machine is stopped"
-            yield Finding("frozen", False, what, f"process {process.pid}", f"kill -CONT {process.pid} lets it go on")
+            yield Finding("frozen", False, what, f"process {process.pid}", f"kill -CONT {process.pid} resumes it")
 
 
 def why_not_writable(folder: Path) -> str:
-    """Why no file can be made in an existing folder; empty: one can. Leaves no trace."""
+    """Returns why no file can be created in an existing folder, or "" if one can; leaves no file behind."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             return ""
@@ -59,7 +62,7 @@ def why_not_writable(folder: Path) -> str:
         return error.strerror or str(error)
 
 
-def _existing(folder: Path) -> Path:
-    """The folder, or the nearest above it that is there."""
+def _nearest_existing(folder: Path) -> Path:
+    """The folder, or its nearest parent that exists."""
     folder = folder.absolute()
     return next((each for each in (folder, *folder.parents) if each.is_dir()), Path("/"))

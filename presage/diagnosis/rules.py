@@ -12,166 +12,173 @@ from common.messages.requests import ConfigReply
 from common.messages.topics import CMD_VEL, SCAN, TOPICS, TRUTH, expected_rate, topic_of
 from common.robot.scan_geometry import Sweep
 from common.runtime.protocol_check import describe_version_differences, same_protocol
-from presage.diagnosis.bus_observation import Observed
+from presage.diagnosis.bus_observation import BusObservation
 from presage.diagnosis.findings import Finding
-from presage.diagnosis.health_board import SLOW, SOURCE, STANDS_IN, replaced
-from presage.diagnosis.installation import NEEDED
+from presage.diagnosis.health_board import HEALTH_TIMEOUT_S, MIN_RATE_SHARE, REPLAY, SUBSTITUTES, is_replaced
+from presage.diagnosis.installation import PACKAGES_OF_SERVICES
 
-OPTIONAL = {"recorder": "needed only to record, with"}  # a healthy session can do without
-NO_PULSE = {SOURCE}  # alive, and publishes no health
-SILENT = 2.5  # s without a pulse, of which one comes each second
-CLOCKS = 0.5  # s between two hosts' clocks; the robot's own time-outs are as long
-DROPPED = 0.1  # of what came; more is falling behind
-LOOKS_ON = {"viewer"}  # a frame that it skips is lost to nobody
-
-
-def judge(seen: Observed, mine: ConfigReply) -> Iterator[Finding]:
-    """All findings about the services of one robot; ``mine`` is what this tool would say of itself."""
-    yield from _presence(seen)
-    yield from _doubled(seen)
-    yield from _versions(seen, mine)
-    yield from _clocks(seen)
-    yield from _rates(seen)
-    yield from _scanner(seen)
-    yield from _counts(seen)
+OPTIONAL_SERVICES = {"recorder": "needed only to record, with"}  # and the beginning of the advice
+SERVICES_WITHOUT_HEALTH = {REPLAY}
+MAX_CLOCK_DIFFERENCE_S = 0.5  # as long as the time-outs of the robot
+MAX_DROPPED_SHARE = 0.1  # of the received messages; a service that drops more cannot keep up
+MAY_SKIP_MESSAGES = {"viewer"}  # it shows only the newest messages
 
 
-def _presence(seen: Observed) -> Iterator[Finding]:
-    others = seen.robots - {seen.robot}
-    if not seen.alive and others:
-        what = f"nobody is {seen.robot!r}; there are {', '.join(sorted(others))}"
-        yield Finding("no_such_robot", False, what, seen.robot, "name the robot with --robot")
-    for service in NEEDED:
-        there, source = service in seen.alive, replaced(service, seen.alive)
-        what = f"{service} of {seen.robot!r}: {'alive' if there else 'not there'}"
-        advice = "" if there else f"{OPTIONAL.get(service, 'start it with')}: python -m services.{service}"
-        yield Finding("missing", there or (None if service in OPTIONAL or source else False), what, service, advice)
-    for service in sorted(seen.alive - NO_PULSE):
-        if service not in seen.pulses and seen.seconds >= SILENT:
+def evaluate(observation: BusObservation, own_config: ConfigReply) -> Iterator[Finding]:
+    """Yields all findings about the services of one robot; ``own_config`` holds the versions of this program."""
+    yield from _presence(observation)
+    yield from _duplicates(observation)
+    yield from _versions(observation, own_config)
+    yield from _clocks(observation)
+    yield from _rates(observation)
+    yield from _scanner(observation)
+    yield from _counts(observation)
+
+
+def _presence(observation: BusObservation) -> Iterator[Finding]:
+    others = observation.robots - {observation.robot}
+    if not observation.alive and others:
+        what = (
+            f"no service of robot {observation.robot!r} is running; there are services of {', '.join(sorted(others))}"
+        )
+        yield Finding("no_such_robot", False, what, observation.robot, "name the robot with --robot")
+    for service in PACKAGES_OF_SERVICES:
+        alive = service in observation.alive
+        not_required = service in OPTIONAL_SERVICES or is_replaced(service, observation.alive)
+        what = f"{service} of {observation.robot!r}: {'alive' if alive else 'not running'}"
+        advice = "" if alive else f"{OPTIONAL_SERVICES.get(service, 'start it with')}: python -m services.{service}"
+        yield Finding("missing", alive or (None if not_required else False), what, service, advice)
+    for service in sorted(observation.alive - SERVICES_WITHOUT_HEALTH):
+        if service not in observation.health and observation.seconds >= HEALTH_TIMEOUT_S:
             what = (
-                f"{service}: alive, but no pulse came within {seen.seconds:g} s: it is frozen, or in a step without end"
+                f"{service}: alive, but no health message came within {observation.seconds:g} s: the process is "
+                "stopped or in an endless step"
             )
-            yield Finding("frozen", False, what, _where(seen, service), "see its log; continue it or start it again")
+            yield Finding("frozen", False, what, _where(observation, service), "see its log; resume it or restart it")
 
 
-def _doubled(seen: Observed) -> Iterator[Finding]:
-    for service, replies in seen.replies.items():
+def _duplicates(observation: BusObservation) -> Iterator[Finding]:
+    for service, replies in observation.replies.items():
         if len(replies) > 1:
             youngest = min(replies, key=lambda reply: reply.uptime)
             hosts = ", ".join(f"{reply.host or 'unknown host'} for {reply.uptime:.0f} s" for reply in replies)
-            what = f"{service} of {seen.robot!r} runs {len(replies)} times: on {hosts}"
-            yield Finding("doubled", False, what, hosts, f"stop all but one; the last came on {youngest.host}")
-    for key, numbers in seen.sequences.items():
+            what = f"{service} of {observation.robot!r} runs {len(replies)} times: on {hosts}"
+            yield Finding("doubled", False, what, hosts, f"stop all but one; the last was started on {youngest.host}")
+    for key, numbers in observation.sequences.items():
         topic = topic_of(key)
-        if topic is not None and numbers.restarts + numbers.reordered > 1:  # one alone is a publisher that began anew
-            what = f"{key}: numbers go back and forth, more than one publishes there"
-            yield Finding("two_publishers", False, what, key, f"from a second {topic.publisher}, or a replay: stop one")
+        if topic is not None and numbers.restarts + numbers.reordered > 1:  # a single one is a restart of the publisher
+            what = f"{key}: the sequence numbers go back and forth, because there are several publishers"
+            advice = f"stop all publishers but one: probably a second {topic.publisher}, or a replay"
+            yield Finding("two_publishers", False, what, key, advice)
 
 
-def _versions(seen: Observed, mine: ConfigReply) -> Iterator[Finding]:
-    for service, replies in sorted(seen.replies.items()):
+def _versions(observation: BusObservation, own_config: ConfigReply) -> Iterator[Finding]:
+    for service, replies in sorted(observation.replies.items()):
         for reply in replies:
             where = f"{service} on {reply.host or 'an unknown host'}"
-            if not same_protocol(mine, reply):
-                what = f"{where}: protocol {reply.protocol}, {mine.protocol} here: they misread each other's messages"
+            if not same_protocol(own_config, reply):
+                what = f"{where}: protocol {reply.protocol}, but {own_config.protocol} here: messages will be misread"
                 yield Finding("protocol", False, what, where, "install the same version of presage everywhere")
-            if text := describe_version_differences(mine, reply):
+            if text := describe_version_differences(own_config, reply):
                 advice = "install the same versions everywhere: `make install`, or the same image"
                 yield Finding("versions", False, f"{where}: {text}", where, advice)
 
 
-def _clocks(seen: Observed) -> Iterator[Finding]:
-    for service, pulses in sorted(seen.pulses.items()):
-        # A pulse takes its time to come, never less than none: the quickest tells most.
-        apart = min(received - health.stamp_ns for received, health in pulses) * 1e-9
-        if abs(apart) > CLOCKS:
-            where = _where(seen, service)
-            what = f"{where}: its clock is {abs(apart):.1f} s {'behind' if apart > 0 else 'ahead of'} this machine's"
-            advice = f"set both by NTP; up to {CLOCKS:g} s is let pass, more spoils latencies and logs"
+def _clocks(observation: BusObservation) -> Iterator[Finding]:
+    for service, health in sorted(observation.health.items()):
+        # The difference contains the travel time of the message, which is positive: the smallest is the best estimate.
+        difference = min(received - message.stamp_ns for received, message in health) * 1e-9
+        if abs(difference) > MAX_CLOCK_DIFFERENCE_S:
+            where = _where(observation, service)
+            direction = "behind" if difference > 0 else "ahead of"
+            what = f"{where}: its clock is {abs(difference):.1f} s {direction} this machine's"
+            advice = (
+                f"synchronise both clocks with NTP; more than {MAX_CLOCK_DIFFERENCE_S:g} s spoils latencies and logs"
+            )
             yield Finding("clocks", False, what, where, advice)
 
 
-def _rates(seen: Observed) -> Iterator[Finding]:
-    foreign = STANDS_IN["simulator"] in seen.alive  # a real scanner has a rate of its own, and nobody knows the truth
-    period = seen.scan.scan_time if seen.scan is not None else 0.0
-    if foreign and not period and (scans := seen.arrivals[SCAN.key(seen.robot)]):
-        period = seen.seconds / scans  # drivers may leave it out
+def _rates(observation: BusObservation) -> Iterator[Finding]:
+    # A real robot's scanner may have any rate, and there is no ground truth.
+    real_robot = SUBSTITUTES["simulator"] in observation.alive
+    period = observation.scan.scan_time if observation.scan is not None else 0.0
+    if real_robot and not period and (scans := observation.arrivals[SCAN.key(observation.robot)]):
+        period = observation.seconds / scans  # some drivers do not fill in scan_time
     for topic in TOPICS:
-        if not topic.rate or topic.per_service or (foreign and topic is TRUTH):
+        if not topic.rate or topic.per_service or (real_robot and topic is TRUTH):
             continue
-        key = topic.key(seen.robot)
-        rate = seen.arrivals[key] / seen.seconds
-        meant = expected_rate(topic, period)
-        ok = rate > 0 and rate >= SLOW * meant
-        advice = f"from the {topic.publisher}: is it alive, paused, or are its inputs missing? see its log"
-        if topic is CMD_VEL and rate > 1.5 * meant:
-            ok, advice = False, "more than one driver? stop all controllers but one"
-        yield Finding("rate", ok, f"{topic.name}: {rate:.1f} of {meant:.3g} Hz", key, "" if ok else advice)
-    for key, why in sorted(seen.undecodable.items()):
-        advice = "another program or another version publishes there; `presage echo` shows what comes"
+        key = topic.key(observation.robot)
+        rate = observation.arrivals[key] / observation.seconds
+        expected = expected_rate(topic, period)
+        ok = rate > 0 and rate >= MIN_RATE_SHARE * expected
+        advice = f"published by the {topic.publisher}: is it alive, paused, or are its inputs missing? See its log"
+        if topic is CMD_VEL and rate > 1.5 * expected:
+            ok, advice = False, "there may be several controllers: stop all but one"
+        yield Finding("rate", ok, f"{topic.name}: {rate:.1f} of {expected:.3g} Hz", key, "" if ok else advice)
+    for key, why in sorted(observation.undecodable.items()):
+        advice = "another program or another version publishes there; `presage echo` shows the messages"
         yield Finding("undecodable", False, f"{key}: {why}", key, advice)
 
 
-def _scanner(seen: Observed) -> Iterator[Finding]:
-    """What it looks at, and whether that serves to drive."""
-    if (scan := seen.scan) is None:
+def _scanner(observation: BusObservation) -> Iterator[Finding]:
+    """Describes the scanner's beams and mount, and checks that they are usable for driving."""
+    if (scan := observation.scan) is None:
         return
     sweep, mount = Sweep.of(scan), scan.mount
     view = sweep.sector(mount.yaw)
-    first, apart, turned = np.rad2deg([sweep.first, sweep.increment, mount.yaw])
+    first, increment, yaw = np.rad2deg([sweep.first, sweep.increment, mount.yaw])
     what = (
-        f"scanner: {sweep.beams} beams from {first:.4g} deg on, {apart:.3g} deg apart, "
-        f"mounted at ({mount.x:g}, {mount.y:g}) m, {turned:.4g} deg"
-        f"{', clockwise, as upside down' if sweep.increment < 0 else ''}"
+        f"scanner: {sweep.beams} beams from {first:.4g} deg on, {increment:.3g} deg apart, "
+        f"mounted at ({mount.x:g}, {mount.y:g}) m, {yaw:.4g} deg"
+        f"{', clockwise as if upside down' if sweep.increment < 0 else ''}"
     )
-    where = SCAN.key(seen.robot)
+    where = SCAN.key(observation.robot)
     if sweep.spacing * (sweep.beams - 1) > np.deg2rad(360.1):
-        yield Finding("scanner", False, what, where, "its beams go round more than once: angle_increment is not that")
+        advice = "the beams cover more than one turn: angle_increment must be wrong"
+        yield Finding("scanner", False, what, where, advice)
     elif not sweep.increment or sweep.beams < 2:
-        yield Finding(
-            "scanner", False, what, where, "its beams have no directions: angle_increment is 0, or there is but one"
-        )
+        advice = "the beams have no directions: angle_increment is 0, or there is only one beam"
+        yield Finding("scanner", False, what, where, advice)
     elif abs(se2.wrap(-view.centre)) > view.half:
-        yield Finding(
-            "scanner", None, what, where, "it does not look ahead: turn `mount` if that is wrong (docs/scanners.md)"
-        )
+        advice = "no beam points ahead; correct the yaw of `mount` if that is wrong (docs/scanners.md)"
+        yield Finding("scanner", None, what, where, advice)
     else:
         yield Finding("scanner", True, what, where)
 
 
-def _counts(seen: Observed) -> Iterator[Finding]:
-    for service, pulses in sorted(seen.pulses.items()):
-        first, last = pulses[0][1], pulses[-1][1]
+def _counts(observation: BusObservation) -> Iterator[Finding]:
+    for service, health in sorted(observation.health.items()):
+        first, last = health[0][1], health[-1][1]
         if last.note:
-            unfit = _rose(first, last, "unfit_scans") > 0
+            unfit = _increase(first, last, "unfit_scans") > 0
             yield Finding(
-                "weights" if unfit else "note", False if unfit else None, f"{service} says: {last.note}", service
+                "weights" if unfit else "note", False if unfit else None, f"{service} reports: {last.note}", service
             )
-        if (failed := _rose(first, last, "failed")) > 0:
-            what = f"{service}: {failed} steps failed while we listened"
-            yield Finding("failed", False, what, service, "its log has the traceback")
+        if (failed := _increase(first, last, "failed")) > 0:
+            what = f"{service}: {failed} steps failed during the observation"
+            yield Finding("failed", False, what, service, "its log contains the traceback")
         before = {row.key: row for row in first.topics}
         for row in last.topics:
-            yield from _of_key(service, before.get(row.key, TopicHealth(key=row.key)), row)
+            yield from _counts_of_key(service, before.get(row.key, TopicHealth(key=row.key)), row)
 
 
-def _of_key(service: str, before: TopicHealth, row: TopicHealth) -> Iterator[Finding]:
+def _counts_of_key(service: str, before: TopicHealth, row: TopicHealth) -> Iterator[Finding]:
     received, dropped = row.received - before.received, row.dropped - before.dropped
     if (bad := row.undecodable - before.undecodable) > 0:
-        what = f"{service}: {bad} payloads on {row.key} could not be decoded while we listened"
-        advice = "another program or another version publishes there; its log says what is wrong with them"
+        what = f"{service}: {bad} payloads on {row.key} could not be decoded during the observation"
+        advice = f"another program or another version publishes there; see the log of the {service}"
         yield Finding("undecodable_rising", False, what, row.key, advice)
-    if dropped > 0 and service not in LOOKS_ON:
-        much = dropped > DROPPED * max(received, 1)
-        what = f"{service}: {dropped} of {received} messages on {row.key} not used while we listened"
-        advice = "it is too slow for what comes: a smaller --beams, another estimator, or a faster machine"
-        yield Finding("dropped_rising", False if much else None, what, row.key, advice if much else "")
+    if dropped > 0 and service not in MAY_SKIP_MESSAGES:
+        too_many = dropped > MAX_DROPPED_SHARE * max(received, 1)
+        what = f"{service}: {dropped} of {received} messages on {row.key} were dropped during the observation"
+        advice = "the service is too slow for its input: try a smaller --beams, another estimator, or a faster machine"
+        yield Finding("dropped_rising", False if too_many else None, what, row.key, advice if too_many else "")
 
 
-def _rose(first: Health, last: Health, name: str) -> int:
+def _increase(first: Health, last: Health, name: str) -> int:
     return last.counters.get(name, 0) - first.counters.get(name, 0)
 
 
-def _where(seen: Observed, service: str) -> str:
-    hosts = sorted({reply.host for reply in seen.replies.get(service, []) if reply.host})
+def _where(observation: BusObservation, service: str) -> str:
+    hosts = sorted({reply.host for reply in observation.replies.get(service, []) if reply.host})
     return f"{service} on {', '.join(hosts)}" if hosts else service

@@ -15,59 +15,64 @@ from common.bus.inbox import Inbox, Sample
 from common.messages.definitions import Health
 from common.messages.topics import topic_of
 from common.messages.wire import DecodeError
-from presage.diagnosis.health_board import WATCHED, Board, Rate, Row
+from presage.diagnosis.health_board import WATCHED, HealthBoard, Rate, Row
 from presage.live.bus_watch import session
 
-PERIOD = 0.5  # s between two looks
-PATIENCE = 5.0  # s for the router to say who is there; it answers at once unless the machine is busy
-LISTEN = (1.5, 4.0)  # s, at least and at most, for a single table
-COLOURS = {"alive": "green", "begins": "cyan", "silent": "red", "gone": "red", "missing": "bold red", "off": "dim"}
-LEFT = ("service", "state", "sends, Hz", "hears, Hz", "note")
-COLUMNS = (*LEFT[:2], "pulse", "up", *LEFT[2:4], "dropped", "broken", "failed", "latency", LEFT[4])
+REFRESH_PERIOD_S = 0.5
+LIVELINESS_TIMEOUT_S = 5.0  # for the router's list of tokens; it answers at once unless the machine is busy
+MIN_OBSERVATION_S, MAX_OBSERVATION_S = 1.5, 4.0  # for a single table
+COLOURS = {"alive": "green", "starting": "cyan", "silent": "red", "gone": "red", "missing": "bold red", "off": "dim"}
+COLUMNS = (
+    "service", "state", "last seen", "up", "publishes, Hz", "receives, Hz", "dropped", "undecodable", "failed",
+    "latency", "note",
+)  # fmt: skip
+LEFT_ALIGNED = {"service", "state", "publishes, Hz", "receives, Hz", "note"}
 
 
 def run_top(link: Link, robots: list[str], console: Console, *, once: bool) -> int:
-    """Until Ctrl-C, status 0; ``once`` (and where there is no terminal) one table, status 1 where somebody is missing.
+    """Shows the health of the robots' services until Ctrl-C and returns 0.
 
-    Raises UserError where no session answers.
+    With ``once``, or without a terminal, prints one table and returns 1 if a service needs attention. Raises UserError
+    if there is no session.
     """
-    boards = {robot: Board(robot, link.connect) for robot in robots}
+    boards = {robot: HealthBoard(robot, link.connect) for robot in robots}
     with session(link) as bus:
-        feed = Feed(bus, boards)
+        feed = BoardFeed(bus, boards)
         if once or not console.is_terminal:
             return _once(feed, console)
-        # Ctrl-C is how it ends.
         with suppress(KeyboardInterrupt), Live(console=console, auto_refresh=False, screen=True) as live:
             while True:
-                feed.run(PERIOD)
+                feed.run(REFRESH_PERIOD_S)
                 live.update(tables(boards, time.monotonic()), refresh=True)
     return 0
 
 
-def _once(feed: Feed, console: Console) -> int:
-    least, most = (time.monotonic() + seconds for seconds in LISTEN)
-    while (now := time.monotonic()) < least or (now < most and not feed.complete()):
+def _once(feed: BoardFeed, console: Console) -> int:
+    start = time.monotonic()
+    while (passed := time.monotonic() - start) < MIN_OBSERVATION_S or (
+        passed < MAX_OBSERVATION_S and not feed.complete()
+    ):
         feed.run(0.1)
     now = time.monotonic()
     console.print(tables(feed.boards, now))
-    return 0 if all(row.well for board in feed.boards.values() for row in board.rows(now)) else 1
+    return 0 if all(row.ok for board in feed.boards.values() for row in board.rows(now)) else 1
 
 
-class Feed:
-    """Moves what is on the bus to the boards."""
+class BoardFeed:
+    """Passes messages and liveliness tokens from the bus to the boards."""
 
-    def __init__(self, bus: Bus, boards: dict[str, Board]) -> None:
-        """From now on."""
+    def __init__(self, bus: Bus, boards: dict[str, HealthBoard]) -> None:
+        """Subscribes to the topics of all ``boards``."""
         self.bus, self.boards, self._inbox = bus, boards, Inbox()
         for robot in boards:
             for topic in WATCHED:
                 bus.subscribe(topic, self._inbox, keep_all=True, robot=robot)
 
     def run(self, seconds: float) -> None:
-        """Listen for so long."""
+        """Updates the boards for ``seconds`` s."""
         deadline = time.monotonic() + seconds
         for robot, board in self.boards.items():
-            board.see_alive(self.bus.alive(timeout=PATIENCE, robot=robot), time.monotonic())
+            board.update_alive(self.bus.alive(timeout=LIVELINESS_TIMEOUT_S, robot=robot), time.monotonic())
         while True:
             sample = self._inbox.get(max(0.0, deadline - time.monotonic()))
             if isinstance(sample, Sample):
@@ -76,8 +81,8 @@ class Feed:
                 return
 
     def complete(self) -> bool:
-        """Whether everybody who is there has been heard."""
-        return all(board.heard_of_all() for board in self.boards.values())
+        """Whether a health message of every live service has come."""
+        return all(board.all_reported() for board in self.boards.values())
 
     def _take(self, sample: Sample) -> None:
         topic, now = topic_of(sample.key), time.monotonic()
@@ -86,19 +91,20 @@ class Feed:
             with suppress(DecodeError):
                 message = topic.message.decode(sample.payload)
                 if isinstance(message, Health) and sample.key != topic.key(board.robot, message.service):
-                    return  # it speaks for another
-                board.hear(topic, message, sample.published_ns or sample.received_ns, now)
+                    return  # published on the key of another service
+                board.add_message(topic, message, sample.published_ns or sample.received_ns, now)
 
 
-def tables(boards: dict[str, Board], now: float) -> Group:
-    """One table a robot."""
+def tables(boards: dict[str, HealthBoard], now: float) -> Group:
+    """One table for each robot."""
     return Group(*(_table(board, now) for board in boards.values()))
 
 
-def _table(board: Board, now: float) -> Table:
+def _table(board: HealthBoard, now: float) -> Table:
     table = Table(title=f"robot {board.robot}", title_justify="left")
     for column in COLUMNS:
-        table.add_column(column, justify="left" if column in LEFT else "right", no_wrap=column not in LEFT)
+        left = column in LEFT_ALIGNED
+        table.add_column(column, justify="left" if left else "right", no_wrap=not left)
     for row in board.rows(now):
         table.add_row(*_cells(row), style="dim" if row.state == "off" else "")
     return table
@@ -106,22 +112,22 @@ def _table(board: Board, now: float) -> Table:
 
 def _cells(row: Row) -> list[Text]:
     counts = [(row.dropped, "yellow"), (row.undecodable, "yellow"), (row.failed, "red")]
-    there = row.uptime is not None
+    has_counts = row.uptime is not None
     return [
         _plain(row.name),
         Text({"off": "not running"}.get(row.state, row.state), COLOURS[row.state]),
         Text(f"{row.age:.1f} s" if row.age is not None else ""),
         Text(_duration(row.uptime) if row.uptime is not None else ""),
-        _rates(row.sends),
-        _rates(row.hears),
-        *(Text(f"{count}" if there else "", colour if count else "") for count, colour in counts),
+        _rates(row.published),
+        _rates(row.received),
+        *(Text(f"{count}" if has_counts else "", colour if count else "") for count, colour in counts),
         Text(f"{row.latency_ms:.1f} ms" if row.latency_ms is not None else ""),
         _plain(row.note),
     ]
 
 
 def _plain(text: str) -> Text:
-    """Words from the bus, which must not steer the terminal."""
+    """Text from the bus without control characters, which could change the state of the terminal."""
     return Text("".join(c if c.isprintable() else "?" for c in text))
 
 

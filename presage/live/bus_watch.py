@@ -21,14 +21,14 @@ class Watch:
     """Subscribes to topics and keeps the newest message of each."""
 
     def __init__(self, bus: Bus, *topics: Topic) -> None:
-        """From now on."""
+        """Subscribes to ``topics``; messages published before are not received."""
         self.bus, self.inbox = bus, Inbox()
         self.latest: dict[str, Stamped] = {}
         for topic in topics:
             bus.subscribe(topic, self.inbox, keep_all=True)
 
     def next(self, timeout: float) -> Stamped | None:
-        """The next valid message, or None within ``timeout`` s."""
+        """Returns the next valid message, or None if none comes within ``timeout`` s."""
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
             sample = self.inbox.get(left)
@@ -40,7 +40,7 @@ class Watch:
         return None
 
     def until(self, kind: type[M], condition: Callable[[M], bool], timeout: float) -> M | None:
-        """The first message of a kind that meets the condition, or None within ``timeout`` s."""
+        """Returns the next message of type ``kind`` that meets the condition, or None if none comes in ``timeout`` s."""
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
             message = self.next(left)
@@ -51,11 +51,11 @@ class Watch:
 
 @contextmanager
 def session(link: Link, timeout: float = 3.0) -> Iterator[Bus]:
-    """A bus that has reached somebody; raises UserError where nobody is there."""
+    """Opens the bus of a running session; raises UserError if no router answers within ``timeout`` s."""
     with open_bus(link, patience=timeout) as bus:
         if link.connect and not wait_until(bus.linked, timeout):
             raise UserError(
                 f"nothing answers at {', '.join(link.connect)}: start a session with `presage up`, "
-                "or say where it is with --connect"
+                "or give the endpoint of a running one with --connect"
             )
         yield bus

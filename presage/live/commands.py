@@ -22,86 +22,102 @@ from presage.live.bus_watch import Watch, session
 
 
 def topic_named(name: str) -> Topic:
-    """The row of that name; raises UserError with those there are."""
+    """The row of the table of topics with this name; raises UserError if there is none."""
     for topic in TOPICS:
         if topic.name == name:
             return topic
     raise UserError(f"no topic {name!r}: choose one of {', '.join(t.name for t in TOPICS)}")
 
 
-def give_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
-    """Send the robot somewhere (or cancel); 0 when accepted, or with ``wait`` when reached."""
+def send_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
+    """Sends or cancels a goal; returns 0 if it is accepted (with ``wait``: reached), else 1."""
     with session(link) as bus:
         watch = Watch(bus, STATUS)
         if not bus.wait_matching(GOAL, 3.0):
-            raise UserError("nobody listens for goals: is the controller running?")
+            raise UserError("no controller receives goals: is it running?")
         status = watch.until(Status, lambda _: True, 3.0)
         if status is None:
-            raise UserError("the controller says nothing: does it get beliefs? `presage doctor` looks")
+            raise UserError(
+                "the controller publishes no status: does it receive beliefs? `presage doctor` finds the cause"
+            )
         bus.put(GOAL, goal.model_copy(update={"stamp_ns": status.stamp_ns}).encode())
         if goal.cancel:
             done = watch.until(Status, lambda s: s.state == "idle", 3.0)
-            console.print("cancelled; the robot stands" if done else "sent, but not confirmed")
+            console.print("cancelled; the robot stops" if done else "sent, but not confirmed by the controller")
             return 0 if done else 1
         if (status := watch.until(Status, lambda s: s.goal_seq == goal.seq, 3.0)) is None:
-            raise UserError("the controller did not take the goal within 3 s")
+            raise UserError("the controller did not acknowledge the goal within 3 s")
         if status.state == "blocked":
             raise UserError(status.reason)
         console.print(f"going to ({goal.pose.x:g}, {goal.pose.y:g})")
         return _follow(watch, goal, console) if wait else 0
 
 
-BLOCKED_FOR = 30.0  # s of stamps; who stands in the way goes on sooner, and the robot with them
-QUIET, EXCHANGED_IN = 3.0, 30.0  # s without a status until that is said, and until it is over
-NEARER = 0.3  # m; what is less is no progress
+# Measured with the stamps of the messages. A person in the way usually moves on sooner.
+BLOCKED_TIMEOUT_S = 30.0
+# Without statuses from the controller: time until a note is printed, and until the command gives up.
+STATUS_WARNING_S, STATUS_TIMEOUT_S = 3.0, 30.0
+MIN_PROGRESS_M = 0.3  # a smaller decrease of the distance to the goal does not end a blockage
 
 
 def _follow(watch: Watch, goal: Goal, console: Console) -> int:
-    least, blocked_ns, before_ns = np.inf, 0, None  # m to go at least; how long it has been blocked since
+    """Waits until the goal is reached (returns 0), or refused or blocked for too long (returns 1)."""
+    least_distance, blocked_ns, previous_ns = np.inf, 0, None
     with console.status("navigating") as line:
-        while (status := _heard(watch, console)) is not None:
+        while (status := _next_status(watch, console)) is not None:
             if status.goal_seq != goal.seq:
-                raise UserError("another goal took its place" if status.goal else "the goal was cancelled")
-            away = f"{status.distance:.2f} m to go" if status.distance is not None else ""
-            line.update(f"{status.state} {away} {status.reason}")
-            if status.distance is not None and status.distance < least - NEARER:
-                least, blocked_ns = status.distance, 0
-            if before_ns is not None and status.state == "blocked":
-                blocked_ns += max(0, status.stamp_ns - before_ns)
-            before_ns = status.stamp_ns
-            if status.state == "reached" or status.refused or blocked_ns > BLOCKED_FOR * 1e9:
+                raise UserError("the goal was replaced by another" if status.goal else "the goal was cancelled")
+            to_go = f"{status.distance:.2f} m to go" if status.distance is not None else ""
+            line.update(f"{status.state} {to_go} {status.reason}")
+            if status.distance is not None and status.distance < least_distance - MIN_PROGRESS_M:
+                least_distance, blocked_ns = status.distance, 0
+            if previous_ns is not None and status.state == "blocked":
+                blocked_ns += max(0, status.stamp_ns - previous_ns)
+            previous_ns = status.stamp_ns
+            if status.state == "reached" or status.refused or blocked_ns > BLOCKED_TIMEOUT_S * 1e9:
                 console.print(f"{status.state}: {status.reason}")
                 return 0 if status.state == "reached" else 1
-    raise UserError(f"the controller fell silent for {EXCHANGED_IN:g} s")
+    raise UserError(f"the controller has published no status for {STATUS_TIMEOUT_S:g} s")
 
 
-def _heard(watch: Watch, console: Console) -> Status | None:
-    """The next status, though a service is exchanged meanwhile: without beliefs the controller says nothing."""
-    if (status := watch.until(Status, lambda _: True, QUIET)) is None:
-        console.print(f"the controller says nothing; the goal waits for it, {EXCHANGED_IN:g} s at most")
-        status = watch.until(Status, lambda _: True, EXCHANGED_IN - QUIET)
+def _next_status(watch: Watch, console: Console) -> Status | None:
+    """Returns the next status, or None after a timeout.
+
+    The timeout is long enough to restart the estimator meanwhile: without beliefs the controller publishes no status.
+    """
+    if (status := watch.until(Status, lambda _: True, STATUS_WARNING_S)) is None:
+        console.print(f"the controller publishes no status; waiting up to {STATUS_TIMEOUT_S:g} s for it")
+        status = watch.until(Status, lambda _: True, STATUS_TIMEOUT_S - STATUS_WARNING_S)
     return status
 
 
 def teleport(link: Link, pose: Pose, console: Console) -> None:
-    """Carry the robot off; raises UserError with the reason where it is refused."""
+    """Moves the simulated robot; raises UserError with the reason if the simulator refuses."""
     with session(link) as bus:
         reply = bus.ask(TELEPORT, PoseRequest(pose=pose), Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
-    console.print(f"carried to ({pose.x:g}, {pose.y:g}), {np.rad2deg(pose.yaw):g} deg; nobody told the estimator")
+    console.print(
+        f"moved to ({pose.x:g}, {pose.y:g}), {np.rad2deg(pose.yaw):g} deg; the estimator is not informed",
+        soft_wrap=True,
+    )
 
 
 def list_topics(robot: str, console: Console) -> None:
-    """The table."""
+    """Prints the tables of topics and queryables."""
     table = Table(title="topics", title_justify="left")
     for column in ("key", "message", "Hz", "publisher", "receivers keep", "recorded", "about"):
         table.add_column(column, no_wrap=column == "key")
     for topic in TOPICS:
         table.add_row(
-            topic.key(robot, "SERVICE"), topic.message.__name__, f"{topic.rate:g}" if topic.rate else "-",
-            topic.publisher, topic.queue, "yes" if topic.recorded else "no", topic.about,
-        )  # fmt: skip
+            topic.key(robot, "SERVICE"),
+            topic.message.__name__,
+            f"{topic.rate:g}" if topic.rate else "-",
+            topic.publisher,
+            topic.queue,
+            "yes" if topic.recorded else "no",
+            topic.about,
+        )
     console.print(table)
     table = Table(title="queryables", title_justify="left")
     for column in ("key", "request", "reply", "server", "about"):
@@ -113,7 +129,7 @@ def list_topics(robot: str, console: Console) -> None:
 
 
 def measure_rates(link: Link, topics: tuple[Topic, ...], seconds: float) -> dict[str, list[int]]:
-    """Arrival times (ns, wall) by key over ``seconds`` s."""
+    """Receives ``topics`` for ``seconds`` s; returns the arrival times (ns of wall time) by key."""
     with session(link) as bus:
         inbox, times = Inbox(), defaultdict(list)
         for topic in topics:
@@ -127,9 +143,9 @@ def measure_rates(link: Link, topics: tuple[Topic, ...], seconds: float) -> dict
 
 
 def show_rates(link: Link, name: str | None, seconds: float, console: Console) -> int:
-    """Rates of one topic or all, against the table's; 1 when nothing came."""
+    """Prints measured and nominal rates of one topic, or of all if ``name`` is None; returns 1 if nothing came."""
     topics = (topic_named(name),) if name else TOPICS
-    with console.status(f"listening for {seconds:g} s"):
+    with console.status(f"measuring for {seconds:g} s"):
         times = measure_rates(link, topics, seconds)
     table = Table()
     for column in ("key", "messages", "Hz", "nominal", "period ms: median", "longest"):
@@ -150,11 +166,11 @@ def show_rates(link: Link, name: str | None, seconds: float, console: Console) -
 
 
 def plain(message: Message, *, full: bool) -> dict[str, Any]:
-    """A message as JSON-able values; long arrays by their ends unless ``full``."""
+    """A message as values that JSON can hold; long arrays are shortened to both ends unless ``full``."""
 
     def convert(value: Any) -> Any:
         if isinstance(value, np.ndarray):
-            # Significant digits: a covariance is in millionths, a range in metres.
+            # Significant digits instead of decimals, because covariances are of the order of 1e-6.
             numbers = [float(f"{v:.6g}") if np.isfinite(v) else str(v) for v in value.astype(float).ravel().tolist()]
             if full or len(numbers) <= 9:
                 return numbers
@@ -168,18 +184,23 @@ def plain(message: Message, *, full: bool) -> dict[str, Any]:
 
 
 def echo(link: Link, name: str, count: int, console: Console, *, full: bool) -> int:
-    """Print messages of a topic as they come, one JSON line each; 1 when none came within 5 s."""
-    topic, seen = topic_named(name), 0
+    """Prints ``count`` messages of a topic (0: until Ctrl-C), one JSON line each; returns 0.
+
+    Raises UserError if no first message comes within 5 s.
+    """
+    topic, printed = topic_named(name), 0
     with session(link) as bus:
         inbox = Inbox()
         bus.subscribe(topic, inbox, keep_all=True)
-        while not count or seen < count:
+        while not count or printed < count:
             sample = inbox.get(5.0)
             if not isinstance(sample, Sample):
-                if seen == 0:
-                    raise UserError(f"nothing on {topic.key(link.robot)} within 5 s: is the {topic.publisher} running?")
+                if printed == 0:
+                    raise UserError(
+                        f"no message on {topic.key(link.robot)} within 5 s: is the {topic.publisher} running?"
+                    )
                 continue
-            seen += 1
+            printed += 1
             try:
                 line = json.dumps(plain(topic.message.decode(sample.payload), full=full))
             except DecodeError as error:
@@ -189,9 +210,9 @@ def echo(link: Link, name: str, count: int, console: Console, *, full: bool) -> 
 
 
 def localise(link: Link, pose: Pose | None, console: Console) -> None:
-    """Restart the estimator's belief; raises UserError with the reason where it is refused."""
+    """Resets the estimator's belief; raises UserError with the reason if the estimator refuses."""
     with session(link) as bus:
         reply = bus.ask(LOCALISE, LocaliseRequest(pose=pose), Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")
-    console.print("localising anew " + (f"from ({pose.x:g}, {pose.y:g})" if pose else "from its initial pose"))
+    console.print("localising again " + (f"from ({pose.x:g}, {pose.y:g})" if pose else "from the initial pose"))

@@ -164,6 +164,6 @@ def test_tools_on_a_running_session(process, bus, link):
     assert status == (1 if faults else 0)
     for there in ("simulator", "estimator", "controller"):
         assert f"{there} of '{link.robot}': alive" in text
-    assert f"recorder of '{link.robot}': not there" in text
+    assert f"recorder of '{link.robot}': not running" in text
     assert "python -m services.recorder" in text
     assert link.robot in run("topics", "--robot", link.robot)[1]

@@ -113,7 +113,7 @@ def test_a_sick_session(process, bus, sick, tmp_path):
     assert fault(found, "protocol", f"protocol {PROTOCOL + 1}")["where"] == "estimator on far"
     assert fault(found, "versions", "presage")["where"] == "estimator on near"
     assert "ahead of" in fault(found, "clocks", "estimator on far, near: its clock is 60.0 s")["what"]
-    assert fault(found, "frozen", "no pulse came")["where"] == "viewer"
+    assert fault(found, "frozen", "no health message came")["where"] == "viewer"
     assert "python -m services.controller" in fault(found, "missing", "controller")["advice"]
     fault(found, "rate", "scan: ")
     fault(found, "rate", "cmd_vel: 0.0 of 15 Hz")
@@ -121,7 +121,7 @@ def test_a_sick_session(process, bus, sick, tmp_path):
     fault(found, "undecodable_rising", "estimator: ")
     fault(found, "dropped_rising", "estimator: ")
     fault(found, "failed", "simulator: ")
-    fault(found, "weights", "estimator says: no weights of this world")
+    fault(found, "weights", "estimator reports: no weights of this world")
     assert "Traceback" not in running.output
     assert "install the same version of presage" in " ".join(running.output.split())
 
