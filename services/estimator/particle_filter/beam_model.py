@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import World
 
-HEADINGS = 360  # of the table; between them ranges are interpolated
+HEADINGS = 360  # of the table; ranges are interpolated between them
 MAX_CELLS = 20_000_000
 _erf = np.vectorize(math.erf, otypes=[float])
 
 
 @dataclass(frozen=True)
 class BeamModel:
-    """Mixture of hit, short, max and random measurements; weights sum to 1 by construction."""
+    """Mixture of hit, short, max and random measurements; the weights z are normalised to sum to 1."""
 
     z_hit: float
     z_short: float
@@ -34,20 +34,22 @@ class BeamModel:
     lambda_short: float  # 1/m
 
     def log_density(self, ranges: Array, expected: Array, range_max: float) -> Array:
-        """(N, B) ln p of ranges (B,) m where ``expected`` (N, B) m; no return (+inf) is a mass, not a density.
+        """Log density (N, B) of ranges (B,) m, given the ranges ``expected`` (N, B) m at each pose.
 
-        -inf says nothing: 0 for every pose.
-        Hit and short are normalised over what can be measured, [0, range_max] and [0, expected], as in the book; a
-        beam expected to meet nothing is a maximum reading instead of a hit, and cannot be short.
+        For a beam without return (+inf) it is the log of a probability instead. A beam that was not measured (-inf or
+        NaN) has 0 for every pose.
+
+        Hit and short are normalised over the ranges that can be measured, [0, range_max] and [0, expected], as in the
+        book. Where no return is expected, there is no short component, and a maximum reading takes the place of a hit.
         """
         total = self.z_hit + self.z_short + self.z_max + self.z_rand
         far = expected >= range_max
         mean = np.minimum(expected, range_max)
-        silent = np.isneginf(ranges) | np.isnan(ranges)
-        missed = silent | (ranges >= range_max)
+        not_measured = np.isneginf(ranges) | np.isnan(ranges)
+        missed = not_measured | (ranges >= range_max)
         z = np.where(missed, 0.0, np.maximum(ranges, 0.0))
         root = math.sqrt(2) * self.sigma_hit
-        # The part of the Gaussian that lies in [0, range_max]; nearly always 1, so erf is asked for few.
+        # The part of the Gaussian within [0, range_max]: nearly always 1, so erf is computed only near the limits.
         edge = (mean < 5 * self.sigma_hit) | (mean > range_max - 5 * self.sigma_hit)
         inside = np.ones_like(mean)
         inside[edge] = 0.5 * (_erf((range_max - mean[edge]) / root) + _erf(mean[edge] / root))
@@ -58,14 +60,14 @@ class BeamModel:
         measured = np.where(far, random, self.z_hit * hit + self.z_short * short + random)
         nothing = np.where(far, self.z_hit + self.z_short + self.z_max, self.z_max)
         log = np.log(np.maximum(np.where(missed, nothing, measured) / total, 1e-300))
-        return np.asarray(np.where(silent, 0.0, log))
+        return np.asarray(np.where(not_measured, 0.0, log))
 
 
 class RangeTable:
-    """Ranges to the walls from cells of a grid, all around; a cell is cast when a particle first comes there."""
+    """Ranges in all directions from the cells of a grid, cast when a cell is first needed."""
 
     def __init__(self, world: World, resolution: float = 0.05) -> None:
-        """``resolution`` m of a cell; UserError for too many cells."""
+        """``resolution`` is the size of a cell in m. Raises UserError if there are too many cells."""
         x0, y0, x1, y1 = world.bounds
         self.world, self.resolution, self.origin = world, resolution, np.array([x0, y0])
         nx, ny = int(np.ceil((x1 - x0) / resolution)), int(np.ceil((y1 - y0) / resolution))
@@ -77,7 +79,10 @@ class RangeTable:
         self._angles: Array = 2 * np.pi / HEADINGS * np.arange(HEADINGS, dtype=float)
 
     def ranges(self, poses: Array, angles: Array) -> Array:
-        """(N, B) m, about, from scanner poses (N, 3) in map along ``angles`` (B,): as from the cell's middle."""
+        """Approximate ranges (N, B) in m from scanner poses (N, 3) in map along ``angles`` (B,).
+
+        They are those from the middle of each pose's cell.
+        """
         ij = np.clip(np.floor((poses[:, :2] - self.origin) / self.resolution).astype(int), 0, self._limit)
         cells = ij[:, 0] * (self._limit[1] + 1) + ij[:, 1]
         self._cast(np.unique(cells[self._row[cells] < 0]))
@@ -85,7 +90,7 @@ class RangeTable:
         low = np.floor(at).astype(int)
         rows, part = self._row[cells][:, None], at - low
         a, b = self._ranges[rows, low % HEADINGS], self._ranges[rows, (low + 1) % HEADINGS]
-        # Across a silhouette the nearer heading is asked: between near and far there is nothing.
+        # At a silhouette the nearer heading is used, because interpolated ranges would end in free space.
         with np.errstate(invalid="ignore"):
             smooth = np.abs(a - b) < 0.1 * np.minimum(a, b)
             return np.asarray(np.where(smooth, a + part * (b - a), np.where(part < 0.5, a, b)), float)
@@ -98,6 +103,6 @@ class RangeTable:
         self._row[cells] = len(self._ranges) + np.arange(len(cells), dtype=np.int32)
         if self.world.grid is None:
             found = self.world.ray_distances(middles, self._angles)
-        else:  # compiled: several times as fast among cells, and here they are thousands
+        else:  # the compiled ray caster is several times faster in a grid
             found = RayCaster(self.world).expect(middles, self._angles).ranges
         self._ranges = np.concatenate([self._ranges, found.astype(np.float32)])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
-from services.estimator.particle_filter.resampling import HEADING_BINS, OFFSET, bins
+from services.estimator.particle_filter.resampling import BIN_OFFSET, HEADING_BINS, bins
 from services.estimator.shared.interface import Hypothesis
 
 if TYPE_CHECKING:
@@ -16,22 +16,25 @@ if TYPE_CHECKING:
 
     from common.geometry.se2 import Array
 
-NEGLIGIBLE = 1e-3  # this part of the weight, carried by the lightest particles, joins no cluster
-MOST = 8  # clusters reported
-# Half of the 26 neighbours in x, y, heading, (13, 3, 1): each pair once.
+NEGLIGIBLE_WEIGHT = 1e-3  # the lightest particles, with this share of the total weight, are left out
+MAX_CLUSTERS = 8  # reported
+# Half of the 26 neighbours in x, y, heading, (13, 3, 1), so that each pair occurs once.
 NEIGHBOURS = np.array([n for n in product((-1, 0, 1), repeat=3) if n > (0, 0, 0)])[..., None]
 
 
 def labels(poses: Array) -> npt.NDArray[np.int64]:
-    """(N,) cluster of each pose (N, 3): bins that touch, corners and headings across pi included."""
+    """Cluster index (N,) of each pose (N, 3).
+
+    Poses in bins that touch, also at corners or with headings across pi, are in one cluster.
+    """
     occupied, of_pose = np.unique(bins(poses), return_inverse=True)
     xy, yaw = np.divmod(occupied, HEADING_BINS)
-    beside = (xy + NEIGHBOURS[:, 0] * 2 * OFFSET + NEIGHBOURS[:, 1]) * HEADING_BINS
+    beside = (xy + NEIGHBOURS[:, 0] * 2 * BIN_OFFSET + NEIGHBOURS[:, 1]) * HEADING_BINS
     beside = beside + (yaw + NEIGHBOURS[:, 2]) % HEADING_BINS
     at = np.minimum(np.searchsorted(occupied, beside), len(occupied) - 1)
     offset, a = np.nonzero(occupied[at] == beside)
     b = at[offset, a]
-    # Every bin takes the least label around it, and the label's own label, until none changes.
+    # Every bin takes the least label among its neighbours, and then that label's own label, until none changes.
     label = np.arange(len(occupied))
     while True:
         before = label.copy()
@@ -43,7 +46,7 @@ def labels(poses: Array) -> npt.NDArray[np.int64]:
 
 
 def moments(poses: Array, weights: Array) -> tuple[Array, Array]:
-    """Mean (3,) and covariance (3, 3) of poses (N, 3) under weights (N,); headings by their mean direction."""
+    """Mean (3,) and covariance (3, 3) of poses (N, 3) with weights (N,); headings are averaged on the circle."""
     w = weights / weights.sum()
     yaw = np.arctan2(w @ np.sin(poses[:, 2]), w @ np.cos(poses[:, 2]))
     mean = np.array([w @ poses[:, 0], w @ poses[:, 1], yaw])
@@ -53,13 +56,13 @@ def moments(poses: Array, weights: Array) -> tuple[Array, Array]:
 
 
 def hypotheses(poses: Array, weights: Array) -> tuple[Hypothesis, ...]:
-    """The heaviest clusters of weighted poses, at most 8, heaviest first; their weights sum to 1."""
+    """The heaviest clusters of weighted poses, at most `MAX_CLUSTERS`, heaviest first; their weights sum to 1."""
     order = np.argsort(weights, kind="stable")
-    kept = order[np.searchsorted(np.cumsum(weights[order]), NEGLIGIBLE * weights.sum()) :]
+    kept = order[np.searchsorted(np.cumsum(weights[order]), NEGLIGIBLE_WEIGHT * weights.sum()) :]
     poses, weights = poses[kept], weights[kept]
     names, of_pose = np.unique(labels(poses), return_inverse=True)
     mass = np.bincount(of_pose, weights, len(names))
-    heaviest = np.argsort(-mass, kind="stable")[:MOST]
+    heaviest = np.argsort(-mass, kind="stable")[:MAX_CLUSTERS]
     total = float(mass[heaviest].sum())
     found = []
     for name in heaviest:

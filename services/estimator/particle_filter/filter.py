@@ -20,21 +20,21 @@ if TYPE_CHECKING:
     from common.geometry.world import World
     from services.estimator.shared.interface import Hypothesis
 
-NOMINAL_DT = 1 / 15  # s, between scans where no stamps tell; the jitter's unit
-LONGEST_DT = 1.0  # s, a random walk over a longer gap would be everywhere: that is recovery's business
+NOMINAL_PERIOD_S = 1 / 15  # between scans without stamps; the settings state the random walk per such period
+MAX_PERIOD_S = 1.0  # for the motion model; after longer gaps recovery must find the robot
 INITIAL_COVARIANCE = np.diag([0.25, 0.25, (np.pi / 12) ** 2])  # nav2's initial_cov
-COMMAND_NOISE = 0.5  # of the recent speed: the base lags behind its command
-COMMAND_MEMORY = 0.5  # s, for which a past command may still be acted upon
-TIGHT = 0.3  # m, position standard deviation of a cluster that is one place
-SURE = 0.95  # of the weight
-PLACES = 20_000  # sampled over free space in advance: to find them scan by scan takes longer than to filter
-LOST = 0.65  # short- over long-term fit below which the pose is not believed
-SEARCHES = 3  # that end in one place and no good fit, before the poor fit is taken for the world's doing
-FOUND = 0.85  # the same, above which it is again
+COMMAND_NOISE = 0.5  # as a share of the recently commanded speed, because the base lags behind its command
+COMMAND_MEMORY_S = 0.5  # for which a past command may still have effect
+MAX_CLUSTER_DEVIATION_M = 0.3  # position standard deviation of a cluster that counts as one place
+TRACKING_WEIGHT = 0.95  # least weight of the best cluster in state tracking
+SAMPLED_PLACES = 20_000  # in free space, sampled in advance because sampling takes longer than an update
+LOST_FIT_RATIO = 0.65  # ratio of short- to long-term fit below which the pose is not believed
+FOUND_FIT_RATIO = 0.85  # ratio above which it is believed again
+MAX_SEARCHES = 3  # that end at one place with a poor fit, before the fit is attributed to a change of the world
 
 
 class ParticleFilter:
-    """Monte Carlo localisation with KLD-adaptive particles and augmented recovery; deterministic by seed."""
+    """Monte Carlo localisation with KLD-adaptive sampling and augmented recovery; deterministic for a given seed."""
 
     name = "particle-filter"
 
@@ -47,11 +47,11 @@ class ParticleFilter:
         heading: float | None = None,
         sensor: Sensor | None = None,
     ) -> None:
-        """Spread over free space of ``world``; ``mount`` (3,) is laser in base_link, m, m, rad.
+        """Starts from an unknown pose in ``world``; ``mount`` (3,) is the laser in base_link, m, m, rad.
 
-        ``heading`` rad: known and frozen, as the paper's robot has it; none: estimated. ``sensor``: one of this world
-        and these settings, for several filters; none: one of its own.
-        Raises UserError where the world is too large for the settings' resolution.
+        ``heading`` rad is a known and constant heading, as in the paper; by default the heading is estimated.
+        ``sensor`` may be shared by several filters with the same world and settings; by default a new one is built.
+        Raises UserError if the world is too large for the settings' resolution.
         """
         self.world, self.settings = world, settings or Settings()
         self.mount, self.heading = np.array(mount, float), heading
@@ -61,10 +61,13 @@ class ParticleFilter:
         self.restart()
 
     def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:
-        """Begin anew: Gaussian about ``pose`` (3,) with ``covariance`` (3, 3), nav2's by default, or uniform."""
+        """Starts from a Gaussian at ``pose`` (3,) with ``covariance`` (3, 3), or from an unknown pose.
+
+        The default covariance is nav2's.
+        """
         s = self.settings
         if pose is None:
-            self._places = self.world.sample_free(max(s.max_particles, PLACES), self._rng)
+            self._places = self.world.sample_free(max(s.max_particles, SAMPLED_PLACES), self._rng)
             self.particles = self._anywhere(s.max_particles, self._places[: s.max_particles])
         else:
             count = min(s.max_particles, max(s.min_particles, 2000))
@@ -77,21 +80,22 @@ class ParticleFilter:
         self._state: State = "localising"
         self._was_found, self._searches = False, 0
         self._scans = 0
-        # A pose that was given is kept: nothing is searched, and no particles are drawn elsewhere.
+        # A pose that was given is kept: there is no search, and no particles are drawn elsewhere.
         self._recovers = s.recovery_alpha_fast > 0 and (pose is None or not s.keep_initial_pose)
         self._searching = pose is None and self.sensor.widest > s.sigma_hit
         self._sigma = self.sensor.widest if self._searching else s.sigma_hit
         self._last: Observation | None = None
-        self._speed = np.zeros(2)  # m/s, rad/s recently commanded
+        self._speed = np.zeros(2)  # m/s and rad/s, recently commanded
 
     def update(self, observation: Observation) -> Posterior:
-        """The posterior after one more scan."""
+        """Returns the posterior after one more scan."""
         self._predict(observation)
         self._anneal()
         s, sigma, beams = self.settings, self._sigma, self.settings.max_beams
         share = s.search_share if self._searching else 0.0
         if s.sigma_odometry and observation.odom is not None and sigma <= 1.01 * s.sigma_hit:
-            sigma, beams, share = s.sigma_odometry, None, s.odometry_share  # the particles are few and close together
+            # All beams can be used, because the particles are few and close together.
+            sigma, beams, share = s.sigma_odometry, None, s.odometry_share
         log_weights = self.sensor.weigh(se2.compose(self.particles, self.mount), observation, sigma, beams)
         log_weights += np.log(np.maximum(self.weights, 1e-300))
         self.weights = resampling.tempered(log_weights, share)
@@ -103,29 +107,29 @@ class ParticleFilter:
         return posterior
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
-        """See Estimator: exact rays in its map; sigma is that of a hit while it tracks."""
+        """Predicts scans (see Estimator) by exact rays in the map; sigma is that of a hit while tracking."""
         ranges = RayCaster(self.world).expect(se2.compose(poses, self.mount), angles).ranges
         return Predicted(ranges, np.full(ranges.shape, self.settings.sigma_hit))
 
     def _anywhere(self, count: int, places: Array | None = None) -> Array:
-        """(count, 3) poses uniform over free space, at ``places`` (count, 2) or at ones sampled in advance."""
+        """Poses (count, 3), uniform over free space: at ``places`` (count, 2), or at places sampled in advance."""
         if places is None:
             places = self._places[self._rng.integers(len(self._places), size=count)]
         return np.column_stack([places, self._rng.uniform(-np.pi, np.pi, count)])
 
     def _predict(self, now: Observation) -> None:
-        """Move the particles by odometry, else by the last command, else at random."""
+        """Moves the particles by odometry if there is any, else by the last command, else at random."""
         last, s = self._last, self.settings
         if last is None:
             return
-        dt = NOMINAL_DT
+        period = NOMINAL_PERIOD_S
         if now.stamp is not None and last.stamp is not None and now.stamp >= last.stamp:
-            dt = min(now.stamp - last.stamp, LONGEST_DT)
+            period = min(now.stamp - last.stamp, MAX_PERIOD_S)
         alphas = (s.alpha1, s.alpha2, s.alpha3, s.alpha4, s.alpha5)
         model = motion.omni if s.robot_model_type == "omni" else motion.differential
-        walk = np.array([s.jitter_position, s.jitter_heading]) * dt / NOMINAL_DT
-        # While searching a particle stands for its surroundings: it must be able to come nearer. How far its neighbours
-        # are does not depend on the time between scans.
+        walk = np.array([s.jitter_position, s.jitter_heading]) * period / NOMINAL_PERIOD_S
+        # During a search a particle represents its surroundings, so it must be able to move within them. The distance
+        # to its neighbours does not depend on the time between scans.
         search = self._searching * (self._sigma - s.sigma_hit) / max(self.sensor.widest - s.sigma_hit, 1e-9)
         position, heading = np.maximum(
             (s.floor_position, s.floor_heading), (search * s.jitter_position, search * s.jitter_heading)
@@ -135,13 +139,13 @@ class ParticleFilter:
             moved = model(moved, se2.between(last.odom, now.odom), alphas, self._rng)
         elif now.command is not None:
             speed = np.array([np.hypot(now.command[0], now.command[1]), abs(now.command[2])])
-            self._speed = np.maximum(speed, self._speed * np.exp(-dt / COMMAND_MEMORY))
-            moved = se2.compose(moved, motion.arc(now.command, dt))
-            position, heading = np.hypot((position, heading), COMMAND_NOISE * dt * self._speed)
+            self._speed = np.maximum(speed, self._speed * np.exp(-period / COMMAND_MEMORY_S))
+            moved = se2.compose(moved, motion.arc(now.command, period))
+            position, heading = np.hypot((position, heading), COMMAND_NOISE * period * self._speed)
         else:
             walks = self._rng.random(len(moved)) < s.walk_share
             position, heading = (
-                np.where(walks, far, near) for far, near in zip(walk, (position, heading), strict=True)
+                np.where(walks, wide, narrow) for wide, narrow in zip(walk, (position, heading), strict=True)
             )
         self.particles = motion.jitter(moved, position, heading, self._rng)
         self.particles[:, 2] = se2.wrap(self.particles[:, 2])
@@ -152,8 +156,8 @@ class ParticleFilter:
             self.particles[:, 2] = self.heading
 
     def _anneal(self) -> None:
-        """Sigma of a hit follows the spread of the particles; a search that found nothing begins again."""
-        if self._recovers and self._state == "lost" and not self._searching and self._health.ratio < LOST:
+        """Adapts sigma of a hit to the spread of the particles; starts a new search if the filter is lost."""
+        if self._recovers and self._state == "lost" and not self._searching and self._health.ratio < LOST_FIT_RATIO:
             self._searching, self._sigma = True, self.sensor.widest
             self._searches += 1
             return
@@ -163,11 +167,14 @@ class ParticleFilter:
         self._searching &= self._sigma > self.settings.sigma_hit
 
     def _judge(self, found: tuple[Hypothesis, ...]) -> State:
-        tight = [h.covariance is not None and np.sqrt(np.trace(h.covariance[:2, :2])) < TIGHT for h in found]
+        tight = [
+            h.covariance is not None and np.sqrt(np.trace(h.covariance[:2, :2])) < MAX_CLUSTER_DEVIATION_M
+            for h in found
+        ]
         sharp = not self._searching or self._sigma < 1.5 * self.settings.sigma_hit
-        settled = found[0].weight > SURE and tight[0] and sharp
-        if self._was_found and self._health.ratio < (FOUND if self._state == "lost" else LOST):
-            if self._searches <= SEARCHES or not settled or not self._recovers:
+        settled = found[0].weight > TRACKING_WEIGHT and tight[0] and sharp
+        if self._was_found and self._health.ratio < (FOUND_FIT_RATIO if self._state == "lost" else LOST_FIT_RATIO):
+            if self._searches <= MAX_SEARCHES or not settled or not self._recovers:
                 return "lost"
             self._health.accept()
             self._recovery.accept()
@@ -178,7 +185,10 @@ class ParticleFilter:
                 self._health.converged()
                 self._recovery.converged()
             return "tracking"
-        if found[0].weight <= SURE and sum(h.weight for h, t in zip(found, tight, strict=True) if t) > SURE:
+        if (
+            found[0].weight <= TRACKING_WEIGHT
+            and sum(h.weight for h, t in zip(found, tight, strict=True) if t) > TRACKING_WEIGHT
+        ):
             return "ambiguous"
         return "localising"
 
@@ -192,31 +202,31 @@ class ParticleFilter:
             state=self._state,
             hypotheses=found,
             accuracy=explanation.accuracy,
-            complexity=0.0,  # particles have no density to compare with the prior's
+            complexity=0.0,  # not defined, because particles have no density to compare with that of the prior
             xi=explanation.xi,
             curvature=explanation.curvature,
             predicted=self.world.ray_distances(se2.compose(pose, self.mount), observation.angles)[0],
         )
 
     def _resample(self) -> None:
-        """As many particles as the belief needs, a share of them anywhere when scans have stopped to fit."""
+        """Draws as many particles as the belief needs; a share at random places if scans no longer fit."""
         s, rng = self.settings, self._rng
         share = self._recovery.random_share if self._recovers else 0.0
         at = resampling.bins(self.particles)
-        trial = self._most_needed(len(np.unique(at)), share)
+        trial = self._upper_bound(len(np.unique(at)), share)
         drawn = at[rng.permutation(resampling.low_variance(self.weights, trial, rng))]
-        strangers = self._anywhere(int(rng.binomial(trial, share))) if share > 0 else np.zeros((0, 3))
-        if len(strangers):
-            drawn[rng.permutation(trial)[: len(strangers)]] = resampling.bins(strangers)
+        random_poses = self._anywhere(int(rng.binomial(trial, share))) if share > 0 else np.zeros((0, 3))
+        if len(random_poses):
+            drawn[rng.permutation(trial)[: len(random_poses)]] = resampling.bins(random_poses)
         count = resampling.adaptive_count(drawn, s.pf_err, s.pf_z, s.min_particles, s.max_particles)
-        strangers = strangers[: int(rng.binomial(count, share))]
-        chosen = resampling.low_variance(self.weights, count - len(strangers), rng)
-        self.particles = np.concatenate([self.particles[chosen], strangers])
+        random_poses = random_poses[: int(rng.binomial(count, share))]
+        chosen = resampling.low_variance(self.weights, count - len(random_poses), rng)
+        self.particles = np.concatenate([self.particles[chosen], random_poses])
         self.weights = np.full(count, 1 / count)
         self._freeze_heading()
 
-    def _most_needed(self, occupied: int, share: float) -> int:
-        """Particles that suffice in any case: no draw meets more bins than are occupied, and one a stranger."""
+    def _upper_bound(self, occupied: int, share: float) -> int:
+        """Number of particles that always suffices: draws occupy at most the present bins and one per random pose."""
         s, count = self.settings, self.settings.min_particles
         while count < s.max_particles:
             needed = resampling.kld_bound(occupied + np.ceil(1.5 * share * count), s.pf_err, s.pf_z)

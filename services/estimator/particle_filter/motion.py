@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 
     Alphas = tuple[float, float, float, float, float]
 
-TURN_IN_PLACE = 0.01  # m, below it the direction of travel is noise
+MIN_PATH_M = 0.01  # for shorter steps the direction of travel is noise
 
 
 def omni(poses: Array, step: Array, alphas: Alphas, rng: np.random.Generator) -> Array:
-    """Poses (N, 3) after the odometry moved by ``step`` (3,) in base_link: nav2's OmniMotionModel.
+    """Moves poses (N, 3) by an odometry ``step`` (3,) in base_link with noise: nav2's OmniMotionModel.
 
-    Variances, with path p and turn t: along alpha3 p² + alpha1 t², sideways alpha1 t² + alpha5 p², turn
-    alpha4 t² + alpha2 p².
+    With path p and turn t the variances are alpha3 p² + alpha1 t² along the path, alpha1 t² + alpha5 p² sideways, and
+    alpha4 t² + alpha2 p² in heading.
     """
     a1, a2, a3, a4, a5 = alphas
     path, turn = float(np.hypot(step[0], step[1])), float(step[2])
@@ -35,17 +35,17 @@ def omni(poses: Array, step: Array, alphas: Alphas, rng: np.random.Generator) ->
 
 
 def differential(poses: Array, step: Array, alphas: Alphas, rng: np.random.Generator) -> Array:
-    """Poses (N, 3) after the odometry moved by ``step`` (3,) in base_link: nav2's DifferentialMotionModel.
+    """Moves poses (N, 3) by an odometry ``step`` (3,) in base_link with noise: nav2's DifferentialMotionModel.
 
-    A step is a turn, a straight path, a turn. Below a centimetre nav2 takes the path as forward; here a scan's step
-    is often shorter than that, so it keeps its sign.
+    A step is a turn, a straight path and another turn. nav2 takes every path shorter than a centimetre as forward. Here
+    steps are often that short, so the path keeps its sign.
     """
     a1, a2, a3, a4, _ = alphas
     path, first = float(np.hypot(step[0], step[1])), float(np.arctan2(step[1], step[0]))
-    if path < TURN_IN_PLACE:
+    if path < MIN_PATH_M:
         path, first = float(step[0]), 0.0
     second = float(se2.wrap(step[2] - first))
-    # Driving backwards is no turn by pi.
+    # A turn by about pi means driving backwards, and gets the noise of a small turn.
     noisy1, noisy2 = (min(abs(turn), abs(float(se2.wrap(turn - np.pi)))) for turn in (first, second))
     deviation = np.sqrt(
         [
@@ -62,15 +62,18 @@ def differential(poses: Array, step: Array, alphas: Alphas, rng: np.random.Gener
 
 
 def arc(command: Array, dt: float) -> Array:
-    """(3,) motion in base_link by a velocity command (3,) m/s, m/s, rad/s held for ``dt`` s."""
+    """Motion (3,) in base_link caused by a constant velocity ``command`` (3,), m/s, m/s, rad/s, in ``dt`` s."""
     vx, vy, w = (float(v) for v in command)
     turn = w * dt
-    # sin(t)/t and (1 - cos t)/t, by numpy's sinc that knows their limit at 0.
+    # sin(t)/t and (1 - cos t)/t, from numpy's sinc, which has the right limits at 0.
     straight, bent = float(np.sinc(turn / np.pi)), turn / 2 * float(np.sinc(turn / (2 * np.pi))) ** 2
     return np.array([dt * (vx * straight - vy * bent), dt * (vx * bent + vy * straight), turn])
 
 
 def jitter(poses: Array, position: Array | float, heading: Array | float, rng: np.random.Generator) -> Array:
-    """Poses (N, 3) moved by Gaussian noise: deviation ``position`` m in x and y, ``heading`` rad; one, or (N,)."""
+    """Adds Gaussian noise to poses (N, 3).
+
+    The standard deviations are ``position`` m in x and in y, and ``heading`` rad, for all poses or for each (N,).
+    """
     spread = np.broadcast_arrays(position, position, heading)
     return np.asarray(poses + np.stack(spread, axis=-1) * rng.standard_normal((len(poses), 3)))

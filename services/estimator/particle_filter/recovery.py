@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-# Most particles stay where the belief is: people that block half the beams must not cost a pose that is right.
-MOST_RANDOM = 0.4
+# Most particles always stay at the belief, so that people who block half of the beams do not make the filter lose it.
+MAX_RANDOM_SHARE = 0.4
 
 
 @dataclass
 class Recovery:
-    """Short- and long-term average of how well the particles explain the scans.
+    """Short- and long-term averages of how well the estimate explains the scans.
 
-    AMCL averages the particles' likelihoods. A product over many beams jumps by e^20 from one good scan to the next,
-    and changes with sigma; what is averaged here is the fit of a beam at the estimate, see `Explanation.fit`.
+    AMCL averages the particles' likelihoods. These are products over many beams, which vary by e^20 between good scans
+    and change with sigma. So here the fit of a single beam at the estimate is averaged, see `Explanation.fit`.
     """
 
     alpha_slow: float
@@ -22,26 +22,26 @@ class Recovery:
     fast: float = 0.0
 
     def add(self, fit: float) -> None:
-        """Take in how well one scan fitted, > 0."""
+        """Updates the averages with the fit of one scan, greater than 0."""
         if self.slow == 0.0:
             self.slow = self.fast = fit
         self.slow += self.alpha_slow * (fit - self.slow)
         self.fast += self.alpha_fast * (fit - self.fast)
 
     def converged(self) -> None:
-        """The long-term average forgets the search, whose poor fits would hide a later kidnapping."""
+        """Removes the poor fits of a search from the long-term average, where they would hide a later kidnapping."""
         self.slow = max(self.slow, self.fast)
 
     def accept(self) -> None:
-        """Scans fit as well as they will: it is the world that changed."""
+        """Accepts the present fit as normal, because the world has changed."""
         self.slow = self.fast
 
     @property
     def ratio(self) -> float:
-        """Short- over long-term average; 1 before the first scan."""
+        """Ratio of the short-term to the long-term average; 1 before the first scan."""
         return self.fast / self.slow if self.slow > 0 else 1.0
 
     @property
     def random_share(self) -> float:
-        """Share of particles to draw at random over free space."""
-        return min(MOST_RANDOM, max(0.0, 1.0 - self.ratio))
+        """Share of particles to draw at random from free space."""
+        return min(MAX_RANDOM_SHARE, max(0.0, 1.0 - self.ratio))

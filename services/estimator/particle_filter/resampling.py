@@ -12,16 +12,17 @@ if TYPE_CHECKING:
 
     Indices = npt.NDArray[np.int64]
 
-BIN = (0.5, 0.5, np.pi / 18)  # m, m, rad: nav2's kd-tree cells
+BIN_SIZE = (0.5, 0.5, np.pi / 18)  # m, m, rad, as the cells of nav2's kd-tree
 HEADING_BINS = 36
-OFFSET = 1 << 20  # so many bins either side of the origin: 500 km
+BIN_OFFSET = 1 << 20  # number of bins to either side of the origin: 500 km
 
 
 def tempered(log_weights: Array, share: float) -> Array:
-    """(N,) weights exp(beta log_weights), normalised: beta = 1, or so small that ``share`` of them count.
+    """Normalised weights exp(beta log_weights) (N,), with the largest beta <= 1 that keeps enough effective particles.
 
-    What counts is the effective sample size 1 / sum of squares (Del Moral, Doucet, Jasra 2012). While particles are
-    sparse, the right place may have none near enough to beat a lucky one in a place that looks alike.
+    The effective sample size, 1 / sum of squared weights, is at least ``share`` of the particles (Del Moral, Doucet,
+    Jasra 2012). This is needed while particles are sparse: the nearest particle to the true pose may then fit worse
+    than one that is, by chance, well placed in a similar room.
     """
     log = log_weights - log_weights.max()
 
@@ -39,39 +40,40 @@ def tempered(log_weights: Array, share: float) -> Array:
 
 
 def low_variance(weights: Array, count: int, rng: np.random.Generator) -> Indices:
-    """(count,) indices, each i about count * weights[i] times, never off by one or more; weights (N,) sum to 1."""
+    """Draws indices (count,): each index i floor or ceil of count * weights[i] times; weights (N,) sum to 1."""
     comb = (rng.random() + np.arange(count)) / count
     cumulative = np.cumsum(weights)
-    # Rounding may leave the sum below 1: the last particle with weight takes what is left.
+    # Rounding may leave the sum below 1; the last particle with weight gets the rest.
     last = int(np.flatnonzero(weights)[-1])
     return np.minimum(np.searchsorted(cumulative / cumulative[-1], comb, side="right"), last).astype(np.int64)
 
 
 def bins(poses: Array) -> Indices:
-    """(N,) numbers of the 0.5 m x 0.5 m x 10 deg bins that poses (N, 3) fall into."""
-    x = np.floor(poses[:, 0] / BIN[0]).astype(np.int64) + OFFSET
-    y = np.floor(poses[:, 1] / BIN[1]).astype(np.int64) + OFFSET
-    yaw = np.floor(poses[:, 2] / BIN[2]).astype(np.int64) % HEADING_BINS
-    return np.asarray((x * (2 * OFFSET) + y) * HEADING_BINS + yaw)
+    """Numbers (N,) of the 0.5 m x 0.5 m x 10 deg bins of poses (N, 3)."""
+    x = np.floor(poses[:, 0] / BIN_SIZE[0]).astype(np.int64) + BIN_OFFSET
+    y = np.floor(poses[:, 1] / BIN_SIZE[1]).astype(np.int64) + BIN_OFFSET
+    yaw = np.floor(poses[:, 2] / BIN_SIZE[2]).astype(np.int64) % HEADING_BINS
+    return np.asarray((x * (2 * BIN_OFFSET) + y) * HEADING_BINS + yaw)
 
 
 def kld_bound(occupied: npt.ArrayLike, err: float, z: float) -> Array:
-    """Particles so that the sampled belief is within ``err`` nats of the true one, for k ``occupied`` bins.
+    """Number of particles with which a belief in k ``occupied`` bins is sampled to within ``err`` nats.
 
-    (k - 1) / (2 err) (1 - 2 / (9 (k - 1)) + sqrt(2 / (9 (k - 1))) z)^3, z the standard normal's quantile of the
-    confidence wanted. One bin needs one particle: nav2 takes the maximum there, which only costs time.
+    It is (k - 1) / (2 err) (1 - 2 / (9 (k - 1)) + sqrt(2 / (9 (k - 1))) z)^3, with z the quantile of the standard
+    normal for the desired confidence. One bin needs one particle; nav2 takes the maximum number there, which only costs
+    time.
     """
     k = np.asarray(occupied, float)
     c = 2 / (9 * np.maximum(k - 1, 1e-9))
     return np.where(k > 1, np.ceil((k - 1) / (2 * err) * (1 - c + np.sqrt(c) * z) ** 3), 1.0)
 
 
-def adaptive_count(drawn_bins: Indices, err: float, z: float, least: int, most: int) -> int:
-    """How many of draws in random order, whose bins are ``drawn_bins`` (M,), suffice; between least and most."""
+def adaptive_count(drawn_bins: Indices, err: float, z: float, min_count: int, max_count: int) -> int:
+    """Number of particles that suffice, given the bins (M,) of draws in random order; from min_count to max_count."""
     first = np.zeros(len(drawn_bins), bool)
     first[np.unique(drawn_bins, return_index=True)[1]] = True
     enough = np.arange(1, len(first) + 1) >= kld_bound(np.cumsum(first), err, z)
-    enough[: least - 1] = False  # the first draws meet few bins, that does not make them enough
-    # Where all of them do not suffice, what their bins ask for.
+    enough[: min_count - 1] = False  # the first few draws always occupy few bins
+    # If all draws together do not suffice, use the bound for their bins.
     needed = np.argmax(enough) + 1 if enough.any() else kld_bound(first.sum(), err, z)
-    return int(np.clip(needed, least, most))
+    return int(np.clip(needed, min_count, max_count))

@@ -18,25 +18,25 @@ if TYPE_CHECKING:
     from services.estimator.particle_filter.settings import Settings
     from services.estimator.shared.interface import Observation
 
-SIGMA_PER_SPREAD = 1.5  # a hit is as blurred as the particles are sparse
-SLOWEST = 0.85  # sigma shrinks by no more than this a scan: one scan must not decide a search
-STEP = np.array([0.01, 0.01, 0.002])  # m, m, rad of the numeric gradient
+SIGMA_PER_SPREAD = 1.5  # sigma of a hit, relative to the spread of the particles
+MIN_SIGMA_FACTOR = 0.85  # by which sigma may shrink per scan, so that one scan cannot decide a search
+GRADIENT_STEP = np.array([0.01, 0.01, 0.002])  # m, m, rad
 
 
 class Explanation(NamedTuple):
-    """What a pose makes of a scan."""
+    """How well a pose explains a scan."""
 
     accuracy: float  # nats, -ln p(o | pose)
     xi: Array  # (3,) minus its gradient
     curvature: Array  # (3, 3) Gauss-Newton Hessian
-    fit: float  # mean likelihood of a beam over that of an exact one, in (0, 1]: about the share that is explained
+    fit: float  # mean likelihood of a beam relative to an exact one, in (0, 1]: about the share of beams explained
 
 
 class Sensor:
-    """How likely scans are at poses, under the settings' laser model."""
+    """The laser model that the settings select, in one world."""
 
     def __init__(self, world: World, settings: Settings) -> None:
-        """Build the distance field of ``world``, and the table of ranges where the beam model wants it."""
+        """Builds the distance field of ``world``, and the table of ranges if the settings select the beam model."""
         s = self.settings = settings
         self.field = LikelihoodField(DistanceField(world, s.resolution, s.laser_likelihood_max_dist), s.z_hit, s.z_rand)
         self.widest = max(s.sigma_hit, s.sigma_search)
@@ -44,14 +44,14 @@ class Sensor:
         self._beam = BeamModel(s.z_hit, s.z_short, s.z_max, s.z_rand, s.sigma_hit, s.lambda_short)
 
     def sigma(self, spread: float, before: float) -> float:
-        """Standard deviation of a hit in m for particles ``spread`` m about their median, after one of ``before`` m."""
+        """Standard deviation of a hit in m, for particles spread by ``spread`` m; it was ``before`` at the last scan."""
         wanted = float(np.clip(SIGMA_PER_SPREAD * spread, self.settings.sigma_hit, self.widest))
-        return max(wanted, SLOWEST * before) if before > self.settings.sigma_hit else wanted
+        return max(wanted, MIN_SIGMA_FACTOR * before) if before > self.settings.sigma_hit else wanted
 
     def weigh(self, poses: Array, observation: Observation, sigma: float, beams: int | None) -> Array:
-        """(N,) log weights of scanner poses (N, 3) in map, by at most ``beams`` beams, or all.
+        """Log weights (N,) of scanner poses (N, 3) in map, from at most ``beams`` beams, or all if None.
 
-        ``sigma`` m of a hit, but the beam model keeps its own.
+        ``sigma`` is the standard deviation of a hit in m; the beam model uses its own instead.
         """
         used, ranges, angles = self._beams(observation, beams)
         kind = self.settings.laser_model_type
@@ -65,19 +65,19 @@ class Sensor:
         return self.field.log_product(ends, sigma, observation.range_max)
 
     def explain(self, pose: Array, mount: Array, observation: Observation) -> Explanation:
-        """The scan, all its beams, seen from base_link ``pose`` (3,) in map by the product likelihood field.
+        """Evaluates all beams of a scan at base_link ``pose`` (3,) in map, by the product likelihood field.
 
-        Sigma is that of tracking; derivatives of the distances are central differences.
+        Uses the sigma of tracking. Derivatives of the distances are central differences.
         """
         _, ranges, angles = self._beams(observation, None)
         sigma = self.settings.sigma_hit
-        offsets = np.diag(STEP)
+        offsets = np.diag(GRADIENT_STEP)
         poses = se2.compose(np.concatenate([pose[None], pose + offsets, pose - offsets]), mount)
         ends = self.field.ends(poses, ranges, angles).astype(float)
-        d, slope = ends[0], (ends[1:4] - ends[4:]) / (2 * STEP[:, None])
+        d, slope = ends[0], (ends[1:4] - ends[4:]) / (2 * GRADIENT_STEP[:, None])
         p = self.field.densities(np.append(d, 0.0), sigma, observation.range_max).astype(float)
         p, exact = p[:-1], p[-1]
-        # Beams that the surface explains pull; the others are z_rand's.
+        # Only beams that a surface explains contribute to the gradient.
         pull = (1 - self.field.z_rand / observation.range_max / p) / sigma**2
         return Explanation(
             accuracy=float(-np.log(p).sum()),
@@ -86,12 +86,12 @@ class Sensor:
             fit=float(p.mean() / exact) if len(p) else 1.0,
         )
 
-    def _beams(self, observation: Observation, most: int | None) -> tuple[npt.NDArray[np.int_], Array, Array]:
-        """Indices of at most ``most`` beams, evenly spaced, and ranges and angles of those that ended somewhere."""
+    def _beams(self, observation: Observation, max_beams: int | None) -> tuple[npt.NDArray[np.int_], Array, Array]:
+        """Indices of at most ``max_beams`` beams, evenly spaced, and ranges and angles of those that returned."""
         count = len(observation.ranges)
         used = np.arange(count)
-        if most is not None and most < count:
-            used = np.round(np.linspace(0, count - 1, most)).astype(int)
+        if max_beams is not None and max_beams < count:
+            used = np.round(np.linspace(0, count - 1, max_beams)).astype(int)
         ranges = observation.ranges[used]
-        ended = np.isfinite(ranges) & (ranges < observation.range_max)
-        return used, ranges[ended], observation.angles[used][ended]
+        returned = np.isfinite(ranges) & (ranges < observation.range_max)
+        return used, ranges[returned], observation.angles[used][returned]

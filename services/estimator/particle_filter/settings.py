@@ -13,21 +13,22 @@ MotionModel = Literal["omni", "differential"]
 
 @dataclass(frozen=True)
 class Settings:
-    """As nav2_amcl 1.x documents them; those without a name there come last.
+    """Parameters of the particle filter.
 
-    nav2 filters a scan only after the robot has moved by update_min_d or update_min_a. Here every scan is filtered
-    (both are 0 in either set): there may be no odometry that could tell of a motion.
+    The first ones have the names and meanings of nav2_amcl 1.x; those that it does not have come last. nav2 processes a
+    scan only after the robot has moved by update_min_d or update_min_a. Here every scan is processed, as with both set
+    to 0, because there may be no odometry from which to tell that the robot moved.
     """
 
-    alpha1: float = 0.2  # turning noise by turning
-    alpha2: float = 0.2  # turning noise by path
-    alpha3: float = 0.2  # path noise by path
-    alpha4: float = 0.2  # path noise by turning
-    alpha5: float = 0.2  # sideways noise by path, omni only
+    alpha1: float = 0.2  # noise of turning, caused by turning
+    alpha2: float = 0.2  # noise of turning, caused by the path
+    alpha3: float = 0.2  # noise of the path, caused by the path
+    alpha4: float = 0.2  # noise of the path, caused by turning
+    alpha5: float = 0.2  # noise sideways, caused by the path; omni only
     robot_model_type: MotionModel = "differential"
     laser_model_type: LaserModel = "likelihood_field"
-    max_beams: int | None = 60  # evenly spaced over the scan; None: all
-    laser_likelihood_max_dist: float = 2.0  # m, distances beyond count as this
+    max_beams: int | None = 60  # evenly spaced over the scan; None for all
+    laser_likelihood_max_dist: float = 2.0  # m, at which distances saturate
     z_hit: float = 0.5
     z_short: float = 0.05
     z_max: float = 0.05
@@ -36,41 +37,44 @@ class Settings:
     lambda_short: float = 0.1  # 1/m
     min_particles: int = 500
     max_particles: int = 2000
-    pf_err: float = 0.05  # Kullback-Leibler distance allowed to the sampled belief
-    pf_z: float = 0.99  # quantile of the standard normal; nav2 hands this number to the formula as it is
-    recovery_alpha_slow: float = 0.0  # 0: no random particles
+    pf_err: float = 0.05  # largest Kullback-Leibler divergence of the sampled belief from the true one
+    pf_z: float = 0.99  # quantile of the standard normal, inserted into the formula directly, as in nav2
+    recovery_alpha_slow: float = 0.0  # 0 disables random particles
     recovery_alpha_fast: float = 0.0
-    keep_initial_pose: bool = True  # a pose that was given is never given up for a search: no recovery
+    keep_initial_pose: bool = True  # never search elsewhere after a pose was given: disables recovery
     resample_interval: int = 1  # scans
+    # Parameters that nav2_amcl does not have:
     resolution: float = 0.05  # m, cells of the likelihood field and of the beam model's table
-    sigma_search: float = 0.0  # m, replaces sigma_hit while the particles are spread; 0: never
-    sigma_odometry: float = 0.0  # m, with all beams, replaces sigma_hit once found while there is odometry; 0: never
-    search_share: float = 0.0  # of the particles keep weight while sigma is wide, by tempering; 0: none need to
-    odometry_share: float = 0.0  # the same while sigma_odometry holds: a single particle would have no covariance
-    jitter_position: float = 0.05  # m in 1/15 s, random walk where neither odometry nor command is known
-    jitter_heading: float = 0.05  # rad in 1/15 s
-    walk_share: float = 1.0  # of the particles take that walk, the others stay: a robot that stands is found exactly
-    floor_position: float = 0.0  # m a scan, added to every motion: copies of one particle part again
-    floor_heading: float = 0.0  # rad a scan
+    sigma_search: float = 0.0  # m, replaces sigma_hit while the particles are spread; 0 disables it
+    sigma_odometry: float = 0.0  # m, replaces sigma_hit, with all beams, while tracking with odometry; 0 disables it
+    search_share: float = 0.0  # least effective share of particles during a search, by tempering; 0 disables it
+    odometry_share: float = 0.0  # the same while sigma_odometry is used: one particle would have no covariance
+    jitter_position: float = 0.05  # m per 1/15 s, random walk if there is neither odometry nor a command
+    jitter_heading: float = 0.05  # rad per 1/15 s
+    walk_share: float = 1.0  # share of particles in that walk; the others stay, for a robot that stands still
+    floor_position: float = 0.0  # m per scan, added to every motion so that copies of one particle separate
+    floor_heading: float = 0.0  # rad per scan
 
     def __post_init__(self) -> None:
-        """Raises UserError on what cannot be filtered with."""
+        """Raises UserError for values with which the filter cannot work."""
         numbers = [f.name for f in fields(self) if f.type in ("float", "int", "int | None")]
         negative = [name for name in numbers if (value := getattr(self, name)) is not None and not value >= 0]
         positive = ("sigma_hit", "lambda_short", "pf_err", "resolution", "min_particles", "resample_interval")
         if negative or any(getattr(self, name) == 0 for name in positive) or self.max_beams == 0:
             named = negative or [name for name in (*positive, "max_beams") if getattr(self, name) == 0]
             raise UserError(
-                f"particle filter: {', '.join(named)} must be greater than 0 (noise and weights: not below)"
+                f"particle filter: {', '.join(named)} must be greater than 0 (noise and weights may also be 0)"
             )
         if self.max_particles < self.min_particles:
             raise UserError(f"particle filter: max_particles {self.max_particles} < min_particles {self.min_particles}")
         if self.z_hit == 0 or self.z_rand == 0:
-            raise UserError("particle filter: z_hit and z_rand must be greater than 0, or one beam decides alone")
+            raise UserError(
+                "particle filter: z_hit and z_rand must be greater than 0, because otherwise a single beam would decide"
+            )
 
     @classmethod
     def tuned(cls) -> Settings:
-        """What finds and holds a pose by laser alone: the best AMCL is known to do, and more particles to search."""
+        """Settings with which the filter localises and tracks by laser alone, with more particles for the search."""
         return cls(
             robot_model_type="omni",
             laser_model_type="likelihood_field_prob",
