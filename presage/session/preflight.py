@@ -28,7 +28,7 @@ def check_services(
     load_settings(ControllerSettings, list(controller)).check()
     if simulator is not None:
         settings = load_settings(SimulatorSettings, list(simulator))
-        settings.the_scanner()
+        settings.build_scanner()
         radius, start = settings.build_robot().radius, settings.start_pose()
         pose = loaded_world.start_pose(radius) if start is None else np.array(start)
         if (why := loaded_world.why_no_room(pose, radius)) is not None:

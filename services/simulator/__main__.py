@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def make(settings: SimulatorSettings) -> Service:
-    """Imports pybullet here, so that --help answers at once."""
+    """Create the service. Imports pybullet only now, so that --help is fast."""
     from services.simulator.service import SimulatorService  # noqa: PLC0415
 
     return SimulatorService(settings)

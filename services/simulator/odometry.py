@@ -1,7 +1,7 @@
 """Dead reckoning with drift (Thrun et al. 2005, chapter 5.4).
 
-There the variances are quadratic in one step's motion; here they grow with the distance travelled, so that the drift
-over a metre does not depend on how often the wheels are read.
+In the book the variances are quadratic in the motion of one step. Here they grow with the distance travelled, so that
+the drift per metre does not depend on how often the wheels are read.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from common.geometry.se2 import Array
 
 @dataclass(frozen=True)
 class Drift:
-    """Variance gained by motion."""
+    """Variance added per unit of motion."""
 
     turn_by_turn: float = 1e-3  # alpha 1, rad²/rad
     turn_by_path: float = 5e-4  # alpha 2, rad²/m
@@ -25,22 +25,21 @@ class Drift:
 
 
 class Odometer:
-    """The pose in odom, from true motion and noise."""
+    """Pose and covariance in odom, from the true motion and noise. Starts at the origin with zero covariance."""
 
     def __init__(self, drift: Drift, rng: np.random.Generator) -> None:
-        """At the origin of odom, certain."""
         self.drift, self._rng = drift, rng
         self.pose, self.covariance = np.zeros(3), np.zeros((3, 3))
 
     def move(self, before: Array, after: Array) -> None:
-        """The robot went from one true pose (3,) to another."""
+        """Add the motion between two true poses (3,), with noise."""
         step = se2.between(before, after)
         path, turn = float(np.hypot(step[0], step[1])), abs(float(step[2]))
         drift = self.drift
-        along = drift.path_by_path * path + drift.path_by_turn * turn
-        around = drift.turn_by_turn * turn + drift.turn_by_path * path
-        spread = np.array([along, along, around])
-        noisy = step + np.sqrt(spread) * self._rng.standard_normal(3)
+        path_variance = drift.path_by_path * path + drift.path_by_turn * turn
+        turn_variance = drift.turn_by_turn * turn + drift.turn_by_path * path
+        variance = np.array([path_variance, path_variance, turn_variance])
+        noisy = step + np.sqrt(variance) * self._rng.standard_normal(3)
         by_pose, by_step = se2.compose_jacobians(self.pose, noisy)
-        self.covariance = by_pose @ self.covariance @ by_pose.T + by_step @ np.diag(spread) @ by_step.T
+        self.covariance = by_pose @ self.covariance @ by_pose.T + by_step @ np.diag(variance) @ by_step.T
         self.pose = se2.compose(self.pose, noisy)

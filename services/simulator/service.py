@@ -46,12 +46,16 @@ from services.simulator.odometry import Drift
 from services.simulator.settings import SimulatorSettings
 from services.simulator.simulation import Setup, Simulation
 
-MAX_SAMPLE = 4_000_000  # ranges an answer, 16 MB
-LATE = 1.0  # s behind real time, beyond which it is not caught up
+MAX_SAMPLE_RANGES = 4_000_000  # in one reply, 16 MB
+MAX_LAG_S = 1.0  # farther behind real time, the lost time is not caught up
 
 
 class SimulatorService(Service):
-    """The world as a process."""
+    """Runs a `Simulation` on the bus: publishes its measurements at the chosen pace, and answers requests.
+
+    A scan is published, then time stands still until the next step. When that comes depends on the setting `pace`: at
+    the time of the next scan (realtime), at once (fast), or when a command with the scan's stamp arrives (lockstep).
+    """
 
     name: ClassVar[str] = "simulator"
     single: ClassVar[bool] = True
@@ -60,88 +64,98 @@ class SimulatorService(Service):
     queries: ClassVar[tuple[Query, ...]] = (TELEPORT, RESET, PAUSE, RESUME, STEP, SPEED, OBSTACLE, SAMPLE, WORLD)
 
     def __init__(self, settings: SimulatorSettings) -> None:
-        """The world is built in `open`."""
         super().__init__(settings)
         self.options = settings
         self.paused = False
         self.speed = 1.0  # simulated time over wall time, in pace realtime
-        self._sent: tuple[Stamped, Stamped, Stamped] | None = None  # the observation of now, once published
-        self._next = 0.0  # wall time of the next step, or in lockstep of the next complaint
-        self._alive: set[str] = set()
-        self._wait_for = settings.waited_for()
+        # The measurements at the present simulated time. None before the first ones, and after a reset.
+        self._published: tuple[Stamped, Stamped, Stamped] | None = None
+        self._next_at = 0.0  # time.monotonic() of the next step; in lockstep, of publishing the same scan again
+        self._alive: set[str] = set()  # services, updated from zenoh's thread
+        self._required_services = settings.required_services()  # emptied when time begins
 
     @property
     def lockstep(self) -> bool:
-        """Whether each scan waits for its command."""
+        """Whether time advances only when a command answers the scan."""
         return self.options.pace == "lockstep"
 
     @property
-    def _period(self) -> float:
-        """S of wall time between scans."""
+    def _period_s(self) -> float:
+        """Wall time between scans."""
         return self.simulation.period_ns * 1e-9 / self.speed
 
     def open(self) -> None:
-        """Build world and robot; begin once those waited for are there."""
+        """Build the world and the robot. Time begins when the required services are running."""
         options = self.options
         drift = Drift(options.turn_by_turn, options.turn_by_path, options.path_by_path, options.path_by_turn)
         robot = options.build_robot()
         self.log.info("loading the world", world=options.world)
-        scanner = options.the_scanner()
+        scanner = options.build_scanner()
         self.setup = Setup(
-            load_world(options.world), scanner, robot, options.start_pose(), options.seed, drift,
-            options.obstacle_stop, options.people, options.people_speed,
-        )  # fmt: skip
-        self._begin()
+            world=load_world(options.world),
+            scanner=scanner,
+            robot=robot,
+            start=options.start_pose(),
+            seed=options.seed,
+            drift=drift,
+            obstacle_stop=options.obstacle_stop,
+            people=options.people,
+            people_speed=options.people_speed,
+        )
+        self._create_simulation()
         if not options.obstacle_stop:
-            self.log.warning("the obstacle stop is off, for fault injection: nothing keeps the robot from contact")
-        self._next = time.monotonic()
-        if self._wait_for:
-            self._say_how_time_goes()
+            self.log.warning("the obstacle stop is off, for fault injection: the robot will not brake before obstacles")
+        self._next_at = time.monotonic()
+        if self._required_services:
+            self._update_note()
             self.log.info(self.note)
-            self.loop.bus.watch_alive(self._changed)
+            self.loop.bus.watch_alive(self._on_liveliness)
 
-    def _begin(self) -> None:
+    def _create_simulation(self) -> None:
         self.simulation = Simulation(self.setup)
-        self._set_hurry()
+        self._update_clock_factor()
 
-    def _set_hurry(self) -> None:
-        """As fast as it goes: as long as a command is obeyed at all."""
+    def _update_clock_factor(self) -> None:
+        """Makes the command timeout longer if simulated time runs faster than the controller's clock.
+
+        At pace fast, the timeout is as long as the age up to which commands are accepted.
+        """
         robot = self.setup.robot
         fast = robot.command_age / robot.command_timeout
-        self.simulation.hurry = fast if self.options.pace == "fast" else max(1.0, self.speed)
+        self.simulation.clock_factor = fast if self.options.pace == "fast" else max(1.0, self.speed)
 
-    def _changed(self, service: str, there: bool) -> None:  # noqa: FBT001 - zenoh's thread; the set alone is shared
-        if there:
+    def _on_liveliness(self, service: str, alive: bool) -> None:  # noqa: FBT001 - zenoh calls it, in its own thread
+        if alive:
             self._alive.add(service)
         else:
             self._alive.discard(service)
 
     def close(self) -> None:
-        """Give the physics back."""
+        """End the simulation."""
         self.simulation.close()
 
     def due(self) -> float | None:
-        """Until the next step, or in lockstep until the scan is sent again."""
+        """Seconds until the next step; in lockstep, until the scan is published again."""
         if self.paused:
             return None
-        if self._wait_for:
-            return 0.0 if self._wait_for <= self._alive else 0.05
-        return 0.0 if self.options.pace == "fast" else self._next - time.monotonic()
+        if self._required_services:
+            return 0.0 if self._required_services <= self._alive else 0.05
+        return 0.0 if self.options.pace == "fast" else self._next_at - time.monotonic()
 
     def on_timer(self) -> None:
-        """Step, by the pace asked for."""
-        if self._wait_for:
-            self._wait_for = set()
-            self._say_how_time_goes()
-            self._next = time.monotonic()
-        if self._sent is None:
+        """Publish the first scan, or the next one; in lockstep the same scan again."""
+        if self._required_services:
+            self._required_services = set()
+            self._update_note()
+            self._next_at = time.monotonic()
+        if self._published is None:
             self._observe()
         elif self.lockstep:
-            stamp, wait = self.simulation.stamp_ns, self.options.lockstep_deadline
             self.log.warning(
-                "lockstep: no command answered the scan, it is sent again; are estimator and controller running?",
-                stamp_ns=stamp, waited_s=wait,
-            )  # fmt: skip
+                "lockstep: no command answered the scan, so it is sent again; are estimator and controller running?",
+                stamp_ns=self.simulation.stamp_ns,
+                waited_s=self.options.lockstep_deadline,
+            )
             self.counters["scans_sent_again"] += 1
             self._publish()
         else:
@@ -149,42 +163,43 @@ class SimulatorService(Service):
             self._observe()
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
-        """A command; in lockstep the one that answers the scan of now lets time go on."""
+        """Take a command. In lockstep, time advances if it answers the present scan."""
         if not isinstance(message, CmdVel):
             return
         if self.lockstep and message.stamp_ns != self.simulation.stamp_ns:
             self.counters["stale_commands"] += 1
             return
-        if self.paused and self.simulation.answered:  # a controller that waits in vain lets the robot stand: not now
+        if self.paused and self.simulation.answered:
+            # While paused, the controller gets no beliefs and commands a stop. It must not replace the last command.
             self.counters["stale_commands"] += 1
             return
         if not self.simulation.command(message.stamp_ns, message.twist):
             self.counters["stale_commands"] += 1
             return
-        if self.lockstep and not self.paused and self._sent is not None:
+        if self.lockstep and not self.paused and self._published is not None:
             self.simulation.advance()
             self._observe()
 
     def _observe(self) -> None:
-        self._sent = self.simulation.observe()
+        self._published = self.simulation.observe()
         self._publish()
 
     def _publish(self) -> None:
-        """Truth and odometry first: who acts on the scan finds them there."""
-        assert self._sent is not None  # noqa: S101 - just set
-        for topic, message in zip((ODOM, TRUTH, SCAN), self._sent, strict=True):
+        """Publishes odometry and truth before the scan, so that they are there when a service receives the scan."""
+        assert self._published is not None  # noqa: S101 - set by all callers
+        for topic, message in zip((ODOM, TRUTH, SCAN), self._published, strict=True):
             self.publish(topic, message)
         now = time.monotonic()
         if self.lockstep:
-            self._next = now + self.options.lockstep_deadline
+            self._next_at = now + self.options.lockstep_deadline
         else:
-            self._next += self._period
-            if now - self._next > LATE:
+            self._next_at += self._period_s
+            if now - self._next_at > MAX_LAG_S:
                 self.counters["late"] += 1
-                self._next = now
+                self._next_at = now
 
     def on_request(self, query: Query, request: Request) -> Reply:
-        """Do what is asked, or say why not."""
+        """Carry out a request. Raises UserError if that is not possible."""
         if query is WORLD:
             simulation = self.simulation
             return WorldReply(world=simulation.world, scanner=self.setup.scanner, robot=self.setup.robot)
@@ -197,7 +212,7 @@ class SimulatorService(Service):
         if isinstance(request, PoseRequest):
             self.simulation.teleport(request.pose.array())
         elif isinstance(request, ObstacleRequest):
-            self.simulation.change(request.action, request.name, request.obstacle)
+            self.simulation.change_obstacle(request.action, request.name, request.obstacle)
         elif isinstance(request, ResetRequest):
             self._reset(request.seed)
         elif query is PAUSE or query is RESUME:
@@ -209,54 +224,55 @@ class SimulatorService(Service):
 
     def _pause(self, *, paused: bool) -> None:
         self.paused = paused
-        self._say_how_time_goes()
-        # In lockstep the answer may have come during the pause: the scan is sent again at once.
-        self._next = time.monotonic()
+        self._update_note()
+        # In lockstep, a command that came during the pause did not advance time. Publish the scan again at once, so that
+        # it is answered again.
+        self._next_at = time.monotonic()
 
-    def _say_how_time_goes(self) -> None:
-        """The note in health."""
-        waits = f"waits for {', '.join(sorted(self._wait_for))}" if self._wait_for else ""
+    def _update_note(self) -> None:
+        """Sets the note shown in health: whether and how fast time runs."""
+        waits = f"waits for {', '.join(sorted(self._required_services))}" if self._required_services else ""
         speed = f"runs at {self.speed:g} x real time" if self.speed != 1 else ""
         self.note = "paused" if self.paused else waits or speed
 
     def _step(self) -> Reply:
-        """While paused, one scan further; in lockstep, as ever, not before the scan of now has its command."""
+        """Advances by one scan while paused. In lockstep the present scan must have its command first."""
         if not self.paused:
             return Reply(ok=False, reason="time runs: pause first, then step")
-        if self._wait_for:
-            return Reply(ok=False, reason=f"time has not begun: waits for {', '.join(sorted(self._wait_for))}")
-        self._next = time.monotonic()
-        if self._sent is not None and self.lockstep and not self.simulation.answered:
+        if self._required_services:
+            return Reply(ok=False, reason=f"time has not begun: waits for {', '.join(sorted(self._required_services))}")
+        self._next_at = time.monotonic()
+        if self._published is not None and self.lockstep and not self.simulation.answered:
             self._publish()
             return Reply(ok=False, reason="no command has answered this scan yet; it is sent again: ask once more")
-        if self._sent is not None:
+        if self._published is not None:
             self.simulation.advance()
         self._observe()
         return Reply()
 
     def _set_speed(self, factor: float) -> Reply:
-        """Times real time, from now on."""
+        """Sets the speed relative to real time."""
         if self.options.pace != "realtime":
             why = "each scan waits for its command" if self.lockstep else "it goes as fast as it can"
             return Reply(ok=False, reason=f"the pace is {self.options.pace}: {why}; a speed needs --pace realtime")
         self.speed = factor
-        self._set_hurry()
-        self._next = min(self._next, time.monotonic() + self._period)  # the next scan may have been far off
-        self._say_how_time_goes()
+        self._update_clock_factor()
+        self._next_at = min(self._next_at, time.monotonic() + self._period_s)  # a slow pace may have put it far ahead
+        self._update_note()
         self.log.info("speed", factor=factor)
         return Reply()
 
     def _reset(self, seed: int | None) -> None:
         self.setup = replace(self.setup, seed=self.setup.seed if seed is None else seed)
         self.simulation.close()
-        self._begin()
-        self._sent, self._next = None, time.monotonic()
+        self._create_simulation()
+        self._published, self._next_at = None, time.monotonic()
 
     def _sample(self, request: SampleRequest) -> SampleReply:
         scanner = self.setup.scanner.with_beams(request.beams)
-        if len(request.poses) * scanner.beams > MAX_SAMPLE:
+        if len(request.poses) * scanner.beams > MAX_SAMPLE_RANGES:
             raise UserError(
-                f"{len(request.poses)} poses x {scanner.beams} beams are more than {MAX_SAMPLE}: ask in parts"
+                f"{len(request.poses)} poses x {scanner.beams} beams are more than {MAX_SAMPLE_RANGES}: ask in parts"
             )
         ranges = self.simulation.sample(request.poses, request.beams, request.seed if request.noise else None)
         return SampleReply(scanner=scanner, ranges=np.asarray(ranges, np.float32).ravel())

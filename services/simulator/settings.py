@@ -21,57 +21,76 @@ class SimulatorSettings(RobotSettings):
       python -m services.simulator --world maze --drive differential
       python -m services.simulator --world my.yaml --start 2,1,90    x m, y m, yaw deg
       python -m services.simulator --beams 622 --pace lockstep --seed 7
-      python -m services.simulator --world office --people 10        who walk about
+      python -m services.simulator --world office --people 10        with ten walking people
       python -m services.simulator --scanner rplidar-a1 --mount=-0.1,0,180 --upside-down
-      python -m services.simulator --radius 0.105 --max-speed 0.22 --mount=-0.032,0     a TurtleBot 3's body
-      python -m services.simulator --scanner my-laser.yaml           docs/scanners.md shows such a file
+      python -m services.simulator --radius 0.105 --max-speed 0.22 --mount=-0.032,0     the body of a TurtleBot 3
+      python -m services.simulator --scanner my-laser.yaml           docs/scanners.md describes such files
 
     """
 
     service: ClassVar[str] = "simulator"
 
-    world: Annotated[str, Field(description="shipped world, world file or ROS map.yaml")] = "corridor"
+    world: Annotated[str, Field(description="a shipped world, a world file or a ROS map.yaml")] = "corridor"
     scanner: Annotated[str, Field(description=f"one of {', '.join(SCANNERS)}, or a file")] = "tim571"
-    beams: Annotated[int | None, Field(ge=2, le=MAX_BEAMS, description="instead of the scanner's own number")] = None
-    noise: Annotated[float | None, Field(ge=0, le=1, description="instead of the scanner's own sigma, m")] = None
+    beams: Annotated[
+        int | None, Field(ge=2, le=MAX_BEAMS, description="number of beams; defaults to the scanner's")
+    ] = None
+    noise: Annotated[
+        float | None, Field(ge=0, le=1, description="sigma of the range noise, m; defaults to the scanner's")
+    ] = None
     mount: Annotated[
-        str, Field(pattern=POSE_TEXT, description="x,y[,yaw_deg] of the laser in base_link; none: the scanner's own")
+        str,
+        Field(
+            pattern=POSE_TEXT,
+            description="x,y[,yaw_deg] of the laser in base_link; if empty, that of the scanner model",
+        ),
     ] = ""
-    upside_down: Annotated[bool | None, Field(description="the laser hangs with a roll of 180 deg")] = None
-    start: Annotated[str, Field(pattern=POSE_TEXT, description="x,y[,yaw_deg]; none: the world's own")] = ""
-    seed: Annotated[int, Field(ge=0, description="of all noise")] = 0
+    upside_down: Annotated[bool | None, Field(description="the laser is mounted with a roll of 180 deg")] = None
+    start: Annotated[
+        str,
+        Field(
+            pattern=POSE_TEXT, description="x,y[,yaw_deg] at which the robot starts; if empty, the start of the world"
+        ),
+    ] = ""
+    seed: Annotated[int, Field(ge=0, description="random seed of all noise and of people's motion")] = 0
     pace: Annotated[
         Literal["realtime", "fast", "lockstep"],
         Field(
-            description="realtime; fast: as fast as it goes; lockstep: each scan waits for the command that answers it"
+            description="realtime; fast: as fast as possible; lockstep: the next scan waits for the command that "
+            "answers the last one"
         ),
     ] = "realtime"
-    lockstep_deadline: Annotated[float, Field(gt=0, description="s until a scan nobody answered is sent again")] = 5.0
+    lockstep_deadline: Annotated[
+        float, Field(gt=0, description="lockstep: a scan that no command answers within this time is sent again, s")
+    ] = 5.0
     wait_for: Annotated[
         str | None,
-        Field(description="services waited for before the first scan; lockstep: estimator,controller unless told"),
+        Field(
+            description="services that must be running before the first scan; defaults to estimator,controller in "
+            "lockstep, otherwise to none"
+        ),
     ] = None
-    people: Annotated[int, Field(ge=0, le=100, description="how many walk about; the map does not know them")] = 0
-    people_speed: Annotated[float, Field(ge=0, le=3, description="of their walk, m/s")] = 1.0
+    people: Annotated[int, Field(ge=0, le=100, description="number of walking people, who are not in the map")] = 0
+    people_speed: Annotated[float, Field(ge=0, le=3, description="walking speed of the people, m/s")] = 1.0
     obstacle_stop: Annotated[
-        bool, Field(description="brake before what the scan shows; off only for fault injection")
+        bool, Field(description="brake before obstacles in the scan; turn off only for fault injection")
     ] = True
     turn_by_turn: Annotated[float, Field(ge=0, description="odometry alpha 1, rad²/rad")] = 1e-3
     turn_by_path: Annotated[float, Field(ge=0, description="odometry alpha 2, rad²/m")] = 5e-4
     path_by_path: Annotated[float, Field(ge=0, description="odometry alpha 3, m²/m")] = 1e-3
     path_by_turn: Annotated[float, Field(ge=0, description="odometry alpha 4, m²/rad")] = 1e-4
 
-    def the_scanner(self) -> Scanner:
-        """The scanner asked for; raises UserError for an unknown one."""
+    def build_scanner(self) -> Scanner:
+        """Scanner according to the settings. Raises UserError if it is unknown."""
         return chosen_scanner(self.scanner, self.beams, self.noise, self.mount, upside_down=self.upside_down)
 
-    def waited_for(self) -> set[str]:
-        """Services without which time does not begin."""
+    def required_services(self) -> set[str]:
+        """Names of the services that must be running before the first scan."""
         text = self.wait_for if self.wait_for is not None else "estimator,controller" * (self.pace == "lockstep")
         return {name.strip() for name in text.split(",") if name.strip()}
 
     def start_pose(self) -> tuple[float, float, float] | None:
-        """X m, y m, yaw rad, or None."""
+        """Start in m, m and rad. None if the world's start is to be used."""
         if not self.start:
             return None
         x, y, yaw = map(float, pose_of_text(self.start, "--start"))

@@ -18,22 +18,22 @@ from common.robot.base import Robot
 from common.robot.scanner import Scanner
 from common.runtime import safety
 from services.simulator.odometry import Drift, Odometer
-from services.simulator.physics import SUBSTEP, Physics
+from services.simulator.physics import SUBSTEP_S, Physics
 
 if TYPE_CHECKING:
     from services.simulator.people import People
 
-BLOCK = 200  # poses of a sample at once
+SAMPLE_BLOCK_POSES = 200  # poses whose scans are simulated together
 
 
 @dataclass(frozen=True)
 class Setup:
-    """Everything a run depends on."""
+    """Everything that a run depends on, besides the commands."""
 
     world: World
     scanner: Scanner
     robot: Robot = field(default_factory=Robot)
-    start: tuple[float, float, float] | None = None  # x m, y m, yaw rad; None: the world's own
+    start: tuple[float, float, float] | None = None  # x m, y m, yaw rad; defaults to the world's start
     seed: int = 0
     drift: Drift = field(default_factory=Drift)
     obstacle_stop: bool = True  # off only for fault injection
@@ -42,24 +42,24 @@ class Setup:
 
 
 class Simulation:
-    """Same setup and commands, same bytes."""
+    """The simulated robot. The same setup and commands give the same bytes."""
 
     def __init__(self, setup: Setup) -> None:
-        """At time 0; raises UserError where the robot would stand in a wall, or the people have no room."""
-        self.setup, self.world = setup, _named(setup.world)
+        """Begin at time 0. Raises UserError if the robot would stand in a wall, or the people have no room."""
+        self.setup, self.world = setup, _name_obstacles(setup.world)
         robot, scanner = setup.robot, setup.scanner
         pose = np.array(setup.start) if setup.start is not None else self.world.start_pose(robot.radius)
-        if (why := self.why_not(pose)) is not None:
+        if (why := self.placement_error(pose)) is not None:
             raise UserError(f"start {why}")
-        # Streams of their own: people change no noise.
+        # Separate random streams, so that people do not change the noise.
         scan_seed, odom_seed, people_seed = np.random.SeedSequence(setup.seed).spawn(3)
         self.people: People | None = None
         if setup.people:
-            # scipy takes half a second to import; a world without people does without.
+            # scipy takes half a second to import, and a world without people does not need it.
             from services.simulator.people import People  # noqa: PLC0415
 
-            walking = np.random.default_rng(people_seed)
-            self.people = People(self.world, setup.people, setup.people_speed, walking, pose[:2], robot.radius)
+            people_rng = np.random.default_rng(people_seed)
+            self.people = People(self.world, setup.people, setup.people_speed, people_rng, pose[:2], robot.radius)
         self.physics = Physics(self.world, robot, pose)
         for obstacle in self.world.obstacles:
             self.physics.add(obstacle.name, obstacle)
@@ -67,96 +67,103 @@ class Simulation:
             self.physics.add_people(self.people.places, self.people.radius)
         self._noise = np.random.default_rng(scan_seed)
         self.odometer = Odometer(setup.drift, np.random.default_rng(odom_seed))
-        self.substeps = max(1, round(1 / (scanner.rate * SUBSTEP)))
+        self.substeps = max(1, round(1 / (scanner.rate * SUBSTEP_S)))
         self.steps = 0
-        self._velocity = np.zeros(3)  # what the wheels are told, after ramp
-        self._command: tuple[int, Array] | None = None  # stamp and twist
-        self._heard = 0  # steps when the last newer command came
-        self.hurry = 1.0  # how much faster than a controller's clock time runs here: it may take that much longer
+        self._velocity = np.zeros(3)  # set at the wheels, within the acceleration limits
+        self._command: tuple[int, Array] | None = None  # stamp and velocity of the latest command
+        self._last_command_step = 0  # value of `steps` when a command with a new stamp last arrived
+        # How much faster than a controller's clock time may pass here; the command timeout is longer by this factor.
+        self.clock_factor = 1.0
         self._contact = self._stopped = False
-        self._points = np.zeros((0, 2))
+        self._scan_points = np.zeros((0, 2))  # m in base_link
 
     def close(self) -> None:
-        """Give the physics back."""
+        """Disconnect from pybullet."""
         self.physics.close()
 
     @property
     def period_ns(self) -> int:
-        """Between scans."""
-        return round(self.substeps * SUBSTEP * 1e9)
+        """Time between scans."""
+        return round(self.substeps * SUBSTEP_S * 1e9)
 
     @property
     def stamp_ns(self) -> int:
-        """Simulation time."""
+        """Simulated time."""
         return self.steps * self.period_ns
 
     @property
     def answered(self) -> bool:
-        """Whether the command that answers the scan of now has come."""
+        """Whether the present scan's command has arrived."""
         return self._command is not None and self._command[0] == self.stamp_ns
 
     def command(self, stamp_ns: int, twist: Twist) -> bool:
-        """Take a command; False where it answers a scan too old, one before the last one's, or one that never was."""
-        age, before = self.stamp_ns - stamp_ns, -1 if self._command is None else self._command[0]
-        if age < 0 or age > self.setup.robot.command_age * 1e9 or stamp_ns < before:
+        """Take a command. Returns False if its stamp is in the future, too old, or older than the latest command's."""
+        age_ns, latest_ns = self.stamp_ns - stamp_ns, -1 if self._command is None else self._command[0]
+        if age_ns < 0 or age_ns > self.setup.robot.command_age * 1e9 or stamp_ns < latest_ns:
             return False
-        if stamp_ns > before:  # one said again keeps nothing going
-            self._heard = self.steps
+        if stamp_ns > latest_ns:  # a repeated command does not restart the timeout
+            self._last_command_step = self.steps
         self._command = (stamp_ns, safety.clip_twist(twist.array(), self.setup.robot))
         return True
 
     def advance(self) -> None:
-        """One scan period."""
-        silent = (self.steps - self._heard) * self.period_ns * 1e-9 >= self.setup.robot.command_timeout * self.hurry
-        wanted = np.zeros(3) if silent else self._wanted()
+        """Simulate one scan period."""
+        silence_s = (self.steps - self._last_command_step) * self.period_ns * 1e-9
+        timed_out = silence_s >= self.setup.robot.command_timeout * self.clock_factor
+        target = np.zeros(3) if timed_out else self._target_velocity()
         before = self.physics.pose()
-        self._walk(before)
+        self._move_people(before)
         self._contact = False
         for _ in range(self.substeps):
-            self._velocity = safety.ramp(self._velocity, wanted, self.setup.robot, SUBSTEP, hard=silent)
+            self._velocity = safety.ramp(self._velocity, target, self.setup.robot, SUBSTEP_S, hard=timed_out)
             self._contact |= self.physics.drive(self._velocity)
         self.odometer.move(before, self.physics.pose())
         self.steps += 1
 
-    def _walk(self, pose: Array) -> None:
-        """The people's step; the robot is at ``pose`` (3,)."""
+    def _move_people(self, pose: Array) -> None:
+        """Moves the people by one scan period; the robot is at ``pose`` (3,)."""
         if self.people is not None:
             velocity = se2.rotate(float(pose[2]), self.physics.twist()[:2])
             self.people.step(self.period_ns * 1e-9, pose[:2], velocity)
             self.physics.move_people(self.people.places)
 
-    def _wanted(self) -> Array:
-        """The velocity to aim at: the command while it is fresh, no faster than what the last scan shows allows."""
+    def _target_velocity(self) -> Array:
+        """Velocity (3,) for the next period: the latest command while it is fresh, limited by the obstacle stop."""
         self._stopped = False
         if self._command is None or self.stamp_ns - self._command[0] > self.setup.robot.command_age * 1e9:
             return np.zeros(3)
         if not self.setup.obstacle_stop:
             return self._command[1]
-        # Each period ends in a velocity from which braking is clear: that way out is taken where no other is left.
-        wanted, self._stopped = safety.limit_velocity(
-            self._command[1], self._points, self.setup.robot, self._velocity, self.period_ns * 1e-9
+        # Each period ends with a velocity from which the robot can brake without contact. If nothing else is left, it
+        # does so.
+        target, self._stopped = safety.limit_velocity(
+            self._command[1], self._scan_points, self.setup.robot, self._velocity, self.period_ns * 1e-9
         )
-        return wanted
+        return target
 
     def observe(self) -> tuple[Odom, Truth, Scan]:
-        """What is measured now; draws the scanner's noise."""
+        """Measurements at the present time. Each call draws new noise for the scan."""
         pose, twist, scanner = self.physics.pose(), self.physics.twist(), self.setup.scanner
-        exact = self._see(pose[None])[0]
+        exact = self._cast_rays(pose[None])[0]
         ranges = scanner.limit(scanner.noisy(exact, self._noise))
-        moving = Twist(vx=float(twist[0]), vy=float(twist[1]), wz=float(twist[2]))
+        velocity = Twist(vx=float(twist[0]), vy=float(twist[1]), wz=float(twist[2]))
         odometer = self.odometer
         odom = Odom(
-            stamp_ns=self.stamp_ns, pose=Pose.of(odometer.pose), twist=moving, covariance=odometer.covariance.copy()
+            stamp_ns=self.stamp_ns, pose=Pose.of(odometer.pose), twist=velocity, covariance=odometer.covariance.copy()
         )
         truth = Truth(
-            stamp_ns=self.stamp_ns, pose=Pose.of(pose), twist=moving, contact=self._contact, stopped=self._stopped,
+            stamp_ns=self.stamp_ns,
+            pose=Pose.of(pose),
+            twist=velocity,
+            contact=self._contact,
+            stopped=self._stopped,
             people=np.zeros((0, 2), np.float32) if self.people is None else self.people.places.astype(np.float32),
-        )  # fmt: skip
-        scan = self._scan(ranges)
-        self._points = safety.scan_points(scan)
+        )
+        scan = self._scan_message(ranges)
+        self._scan_points = safety.scan_points(scan)
         return odom, truth, scan
 
-    def _scan(self, ranges: Array) -> Scan:
+    def _scan_message(self, ranges: Array) -> Scan:
         scanner = self.setup.scanner
         return Scan(
             stamp_ns=self.stamp_ns,
@@ -171,56 +178,65 @@ class Simulation:
             sigma_relative=scanner.sigma_relative,
         )
 
-    def _see(self, poses: Array, scanner: Scanner | None = None, *, people: bool = True) -> Array:
-        """(N, B) m without noise or limits from base_link poses (N, 3)."""
+    def _cast_rays(self, poses: Array, scanner: Scanner | None = None, *, people: bool = True) -> Array:
+        """Ranges (N, B) m from base_link poses (N, 3), without noise and range limits."""
         scanner = scanner or self.setup.scanner
         lasers = se2.compose(poses, np.array(scanner.mount))
-        # A little beyond the limit, so that noise decides about a return at the limit.
+        # Slightly beyond the maximum range, so that near it the noise decides whether there is a return.
         reach = scanner.range_max + 6 * float(scanner.deviation(np.array(scanner.range_max))) + 1e-6
         return self.physics.ranges(lasers, scanner.angles(), reach, people=people)
 
     def sample(self, poses: Array, beams: int | None, noise_seed: int | None) -> Array:
-        """(N, B) m seen from poses (N, 3), with noise of a seed or none; the robot and its noise do not notice.
+        """Ranges (N, B) m that the scanner would measure from poses (N, 3), for training.
 
-        The world alone, for what learns it: no people.
+        ``noise_seed`` of None means no noise. People are left out. The run itself, with its noise, is not affected.
+        Raises UserError if a pose is inside a wall.
         """
         scanner = self.setup.scanner.with_beams(beams)
         lasers = se2.compose(poses, np.array(scanner.mount))
-        for what, where in (("", poses), (" with the laser", lasers)):
-            inside = self.world.clearance(where[:, :2]) <= 0
+        for suffix, positions in (("", poses), (" with the laser", lasers)):
+            inside = self.world.clearance(positions[:, :2]) <= 0
             if inside.any():
                 x, y, _ = poses[int(np.argmax(inside))]
                 raise UserError(
-                    f"{inside.sum()} of {len(poses)} poses are{what} inside a wall or outside,"
+                    f"{inside.sum()} of {len(poses)} poses are{suffix} inside a wall or outside,"
                     f" such as ({x:.2f}, {y:.2f})"
                 )
-        rows = [self._see(poses[i : i + BLOCK], scanner, people=False) for i in range(0, len(poses), BLOCK)]
-        ranges = np.concatenate(rows) if rows else np.zeros((0, scanner.beams))
+        blocks = [
+            self._cast_rays(poses[start : start + SAMPLE_BLOCK_POSES], scanner, people=False)
+            for start in range(0, len(poses), SAMPLE_BLOCK_POSES)
+        ]
+        ranges = np.concatenate(blocks) if blocks else np.zeros((0, scanner.beams))
         if noise_seed is not None:
             ranges = scanner.noisy(ranges, np.random.default_rng(noise_seed))
         return scanner.limit(ranges)
 
-    def why_not(self, pose: Array) -> str | None:
-        """Why the robot cannot stand at a pose (3,), or None."""
+    def placement_error(self, pose: Array) -> str | None:
+        """Why the robot cannot stand at a pose (3,). None if it can."""
         return self.world.why_no_room(pose, self.setup.robot.radius)
 
     def teleport(self, pose: Array) -> None:
-        """Carry the robot off, standing; odometry does not notice, and people make room. Raises UserError in a wall."""
-        if (why := self.why_not(pose)) is not None:
+        """Put the robot at a pose (3,), at rest. Odometry does not change, and people make room.
+
+        Raises UserError if the robot cannot stand there.
+        """
+        if (why := self.placement_error(pose)) is not None:
             raise UserError(why)
         self._make_room(pose)
         self.physics.place(pose)
         self._velocity, self._command = np.zeros(3), None
-        # What stands around the new place, for a command that comes before the next scan; no noise is drawn.
-        self._points = safety.scan_points(self._scan(self.setup.scanner.limit(self._see(pose[None])[0])))
+        # Obstacles around the new pose, for a command that arrives before the next scan. Draws no noise.
+        self._scan_points = safety.scan_points(
+            self._scan_message(self.setup.scanner.limit(self._cast_rays(pose[None])[0]))
+        )
 
     def _make_room(self, pose: Array, world: World | None = None) -> None:
         if self.people is not None:
             self.people.make_room(pose[:2], world)
             self.physics.move_people(self.people.places)
 
-    def change(self, action: str, name: str, obstacle: Obstacle | None) -> None:
-        """Add, move or remove furniture; raises UserError with the reason where it cannot be."""
+    def change_obstacle(self, action: str, name: str, obstacle: Obstacle | None) -> None:
+        """Add, move or remove a piece of furniture. Raises UserError if that is not possible."""
         known = {o.name: o for o in self.world.obstacles}
         if (name in known) == (action == "add"):
             there = ", ".join(known) or "none"
@@ -231,12 +247,12 @@ class Simulation:
             if obstacle is None:
                 raise UserError(f"{action} needs the obstacle's shape")
             self._check_place(obstacle)
-        kept = [o for o in self.world.obstacles if o.name != name]
+        obstacles = [o for o in self.world.obstacles if o.name != name]
         if action != "remove" and obstacle is not None:
             obstacle = obstacle.model_copy(update={"name": name})
-            kept.append(obstacle)
-        # Built anew, for a copy would keep the old world's cached geometry; first, for it may refuse.
-        world = self.world.with_obstacles(kept)
+            obstacles.append(obstacle)
+        # A new world, because a copy would keep cached geometry. It is built first, because that may raise an error.
+        world = self.world.with_obstacles(obstacles)
         self._make_room(self.physics.pose(), world)
         if action != "add":
             self.physics.remove(name)
@@ -252,11 +268,11 @@ class Simulation:
             raise UserError("the obstacle would stand on the robot")
 
 
-def _named(world: World) -> World:
-    """Every obstacle with a name, so that it can be moved."""
+def _name_obstacles(world: World) -> World:
+    """The world with a name for every obstacle, by which it can be moved and removed."""
     taken = [o.name for o in world.obstacles if o.name]
-    if twice := sorted({name for name in taken if taken.count(name) > 1}):
-        raise UserError(f"world {world.name!r}: two obstacles are named {twice[0]!r}; give each a name of its own")
+    if duplicates := sorted({name for name in taken if taken.count(name) > 1}):
+        raise UserError(f"world {world.name!r}: two obstacles are named {duplicates[0]!r}; give each a name of its own")
     if "boundary" in taken:
         raise UserError(
             f"world {world.name!r}: an obstacle is named 'boundary', as the walls are; give it another name"

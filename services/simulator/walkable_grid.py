@@ -1,7 +1,7 @@
 """Grid of places where a person can walk, for their paths.
 
-Ways are shortest over that graph (Dijkstra, from scipy), then pulled tight: a point is left out where the straight
-line past it is clear as well.
+Paths are shortest over the grid's graph (Dijkstra's algorithm, from scipy), then shortened: a point is left out if the
+straight line past it is clear as well.
 """
 
 from __future__ import annotations
@@ -14,44 +14,47 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from common.geometry.se2 import Array
 from common.geometry.world import World
 
-CELL = 0.2  # m between two points of the grid; wider where the world would have more than MOST
-MOST = 100_000  # points
-SPARE = 0.05  # m to walls, beside the body
-FAR = 2.0  # m, the least walk worth setting out for, where there is one
-ROOMY = 25  # points, 1 m²: a smaller pocket is no place to begin in
-AHEAD = 40  # points of a way that one look takes in
-NEIGHBOURS = 24  # points looked at for the first step onto the grid
-NOBODY = np.zeros((0, 3))
+CELL_M = 0.2  # between two points of the grid; more in worlds that would have too many points
+MAX_POINTS = 100_000
+WALL_MARGIN_M = 0.05  # to walls, beside the body
+MIN_WALK_M = 2.0  # a destination is at least this far away, if there is one
+MIN_COMPONENT_NODES = 25  # 1 m²; a person does not start in a smaller part of the grid
+MAX_SHORTCUT_NODES = 40  # nodes that one step of the shortening may leave out
+MAX_START_CANDIDATES = 24  # nearest nodes that are tried as the first one of a path
+NO_DISCS = np.zeros((0, 3))
 
 
-class Floor:
-    """The graph of one world for one radius."""
+class WalkableGrid:
+    """Graph of the places in one world where a person of one radius fits."""
 
     def __init__(self, world: World, radius: float) -> None:
-        """No error where nothing is free: there are no ``nodes`` then."""
-        self.room = shapely.buffer(world.free_space, -(radius + SPARE))
-        self._near = shapely.buffer(self.room, 1e-6)  # who walks along its edge is in, whatever the last digit says
+        """``nodes`` is empty if there is no room for a person of ``radius`` m anywhere."""
+        self.room = shapely.buffer(world.free_space, -(radius + WALL_MARGIN_M))
+        self._room_with_tolerance = shapely.buffer(self.room, 1e-6)  # paths along the edge of `room` must be inside
         shapely.prepare(self.room)
-        shapely.prepare(self._near)
+        shapely.prepare(self._room_with_tolerance)
         x0, y0, x1, y1 = world.bounds
-        cell = max(CELL, float(np.sqrt((x1 - x0) * (y1 - y0) / MOST)))
+        cell = max(CELL_M, float(np.sqrt((x1 - x0) * (y1 - y0) / MAX_POINTS)))
         x, y = np.meshgrid(np.arange(x0 + cell / 2, x1, cell), np.arange(y0 + cell / 2, y1, cell), indexing="ij")
         points = np.column_stack([x.ravel(), y.ravel()])
         inside = shapely.covers(self.room, shapely.points(points))
         self.nodes: Array = points[inside]  # (N, 2) m
-        number = np.where(inside, np.cumsum(inside) - 1, -1).reshape(x.shape)
-        self.graph = self._joined(number)
-        label = connected_components(self.graph, directed=False)[1]
-        self.roomy = np.flatnonzero(np.bincount(label)[label] >= ROOMY)  # nodes to begin at
+        index = np.where(inside, np.cumsum(inside) - 1, -1).reshape(x.shape)
+        self.graph = self._connect(index)
+        component = connected_components(self.graph, directed=False)[1]
+        self.start_nodes = np.flatnonzero(np.bincount(component)[component] >= MIN_COMPONENT_NODES)
 
-    def _joined(self, number: Array) -> csr_matrix:
-        """Each node (its number at its place in the grid, or -1) with those of its eight neighbours it sees."""
-        wide, high = number.shape
+    def _connect(self, index: Array) -> csr_matrix:
+        """Graph of each node with those of its eight neighbours to which a straight line is clear.
+
+        ``index`` (columns, rows) contains each node's index at its place in the grid, and -1 elsewhere.
+        """
+        wide, high = index.shape
         pairs = [
-            np.column_stack([number[:-1].ravel(), number[1:].ravel()]),
-            np.column_stack([number[:, :-1].ravel(), number[:, 1:].ravel()]),
-            np.column_stack([number[: wide - 1, : high - 1].ravel(), number[1:, 1:].ravel()]),
-            np.column_stack([number[: wide - 1, 1:].ravel(), number[1:, : high - 1].ravel()]),
+            np.column_stack([index[:-1].ravel(), index[1:].ravel()]),
+            np.column_stack([index[:, :-1].ravel(), index[:, 1:].ravel()]),
+            np.column_stack([index[: wide - 1, : high - 1].ravel(), index[1:, 1:].ravel()]),
+            np.column_stack([index[: wide - 1, 1:].ravel(), index[1:, : high - 1].ravel()]),
         ]
         pair = np.concatenate(pairs)
         pair = pair[(pair >= 0).all(axis=1)]
@@ -60,67 +63,69 @@ class Floor:
         both = np.concatenate([a, b]), np.concatenate([b, a])
         return csr_matrix((np.tile(length, 2), both), shape=(len(self.nodes), len(self.nodes)))
 
-    def holds(self, place: Array) -> bool:
-        """Whether a way can begin at ``place`` (2,) m."""
-        return self._first(place, self.nodes, NOBODY) is not None
+    def can_start(self, place: Array) -> bool:
+        """Whether a path can begin at ``place`` (2,) m."""
+        return self._first_node(place, self.nodes, NO_DISCS) is not None
 
-    def way(self, place: Array, rng: np.random.Generator, blocked: Array = NOBODY) -> Array | None:
-        """(W, 2) m, W >= 2, from ``place`` (2,) m to a random node in reach; None where there is no way.
+    def random_path(self, place: Array, rng: np.random.Generator, blocked: Array = NO_DISCS) -> Array | None:
+        """Path (W, 2) m, W >= 2, from ``place`` (2,) m to a random node that can be reached. None if there is no path.
 
-        It comes no nearer to the centres of ``blocked`` (M, 3: x, y, radius m) than their radii, or than it begins.
+        The path stays out of the discs ``blocked`` (M, 3: x, y, radius, in m). If it begins inside a disc, it comes no
+        closer to its centre.
         """
         nodes, graph = self.nodes, self.graph
         if len(blocked):
-            apart = np.hypot(nodes[:, None, 0] - blocked[:, 0], nodes[:, None, 1] - blocked[:, 1])
-            free = np.flatnonzero((apart >= blocked[:, 2] + SPARE).all(axis=1))
+            distance = np.hypot(nodes[:, None, 0] - blocked[:, 0], nodes[:, None, 1] - blocked[:, 1])
+            free = np.flatnonzero((distance >= blocked[:, 2] + WALL_MARGIN_M).all(axis=1))
             nodes, graph = nodes[free], graph[free][:, free]
-        first = self._first(place, nodes, blocked)
+        first = self._first_node(place, nodes, blocked)
         if first is None:
             return None
-        reach, before = dijkstra(graph, indices=first, return_predecessors=True)
-        some = np.flatnonzero(np.isfinite(reach))
-        far = some[reach[some] >= FAR]
-        back = [int(rng.choice(far if len(far) else some))]
-        while back[-1] != first:
-            back.append(int(before[back[-1]]))
-        return self._tight(place, nodes[back[::-1]], blocked)
+        length, predecessor = dijkstra(graph, indices=first, return_predecessors=True)
+        reachable = np.flatnonzero(np.isfinite(length))
+        far = reachable[length[reachable] >= MIN_WALK_M]
+        reversed_path = [int(rng.choice(far if len(far) else reachable))]
+        while reversed_path[-1] != first:
+            reversed_path.append(int(predecessor[reversed_path[-1]]))
+        return self._shorten(place, nodes[reversed_path[::-1]], blocked)
 
-    def _first(self, place: Array, nodes: Array, blocked: Array) -> int | None:
-        """The nearest node that is seen from ``place``."""
+    def _first_node(self, place: Array, nodes: Array, blocked: Array) -> int | None:
+        """Index of the nearest node to which a straight line from ``place`` is clear. None if there is none."""
         distance = np.hypot(*(nodes - place).T)
-        near = np.argsort(distance, kind="stable")[:NEIGHBOURS]
-        seen = near[self._clear(place, nodes[near], blocked)]
-        return int(seen[0]) if len(seen) else None
+        near = np.argsort(distance, kind="stable")[:MAX_START_CANDIDATES]
+        visible = near[self._clear_lines(place, nodes[near], blocked)]
+        return int(visible[0]) if len(visible) else None
 
-    def _tight(self, place: Array, path: Array, blocked: Array) -> Array:
-        """``place`` and those points of ``path`` (P, 2) m that are needed."""
-        way, at = [place], 0
+    def _shorten(self, place: Array, path: Array, blocked: Array) -> Array:
+        """``place``, followed by those points of ``path`` (P, 2) m that are needed."""
+        shortened, at = [place], 0
         while at < len(path):
-            seen = np.flatnonzero(self._clear(way[-1], path[at : at + AHEAD], blocked))
-            at += int(seen[-1]) if len(seen) else 0  # the next one is seen but for the last digit
-            way.append(path[at])
+            visible = np.flatnonzero(self._clear_lines(shortened[-1], path[at : at + MAX_SHORTCUT_NODES], blocked))
+            at += int(visible[-1]) if len(visible) else 0  # the next node is always visible, but for rounding errors
+            shortened.append(path[at])
             at += 1
-        return np.array(way)
+        return np.array(shortened)
 
-    def _clear(self, start: Array, ends: Array, blocked: Array) -> Array:
-        """(E,) whether the straight lines from ``start`` (2,) to ``ends`` (E, 2) keep to the room and off others."""
+    def _clear_lines(self, start: Array, ends: Array, blocked: Array) -> Array:
+        """Whether lines from ``start`` (2,) to ``ends`` (E, 2) stay in the room and out of the discs; (E,) bool."""
         lines = np.stack([np.broadcast_to(start, ends.shape), ends], axis=1)
         length = np.hypot(*(ends - start).T)
-        # A line without length is no line to shapely.
-        here = bool(shapely.covers(self._near, shapely.Point(start)))
-        clear = np.where(length > 1e-9, shapely.covers(self._near, shapely.linestrings(lines)), here)
+        # shapely does not accept lines of length zero.
+        start_inside = bool(shapely.covers(self._room_with_tolerance, shapely.Point(start)))
+        inside = shapely.covers(self._room_with_tolerance, shapely.linestrings(lines))
+        clear = np.where(length > 1e-9, inside, start_inside)
         if len(blocked):
             centres = blocked[:, :2]
-            nearest = np.stack([to_segment(centres, start, end) for end in ends])  # (E, M)
-            least = np.minimum(blocked[:, 2], np.hypot(*(centres - start).T))
-            clear &= (nearest >= least - 1e-9).all(axis=1)
+            nearest = np.stack([distance_to_segment(centres, start, end) for end in ends])  # (E, M)
+            min_distance = np.minimum(blocked[:, 2], np.hypot(*(centres - start).T))
+            clear &= (nearest >= min_distance - 1e-9).all(axis=1)
         return clear
 
 
-def to_segment(points: Array, a: Array, b: Array) -> Array:
-    """(N,) m from points (N, 2) to the straight piece from ``a`` (2,) to ``b`` (2,)."""
+def distance_to_segment(points: Array, a: Array, b: Array) -> Array:
+    """Distance (N,) m from points (N, 2) to the line segment from ``a`` (2,) to ``b`` (2,)."""
     along = b - a
     square = float(along @ along)
-    share = np.clip((points - a) @ along / square, 0.0, 1.0) if square > 0 else np.zeros(len(points))
-    off = points - a - share[:, None] * along
-    return np.hypot(off[:, 0], off[:, 1])
+    fraction = np.clip((points - a) @ along / square, 0.0, 1.0) if square > 0 else np.zeros(len(points))
+    offset = points - a - fraction[:, None] * along
+    return np.hypot(offset[:, 0], offset[:, 1])

@@ -32,7 +32,7 @@ def simulation(world):
 
 
 def test_rays_agree_to_a_millimetre_but_for_edges(world, simulation, monkeypatch):
-    monkeypatch.setattr(physics, "WALLS_A_BODY", 200)  # so that one map is several bodies
+    monkeypatch.setattr(physics, "MAX_WALLS_PER_BODY", 200)  # so that one map is several bodies
     rng = np.random.default_rng(0)
     poses = np.column_stack([world.sample_free(40, rng, 0.27), rng.uniform(-np.pi, np.pi, 40)])
     lasers = se2.compose(poses, np.array(SCANNER.mount))
@@ -47,7 +47,7 @@ def test_rays_agree_to_a_millimetre_but_for_edges(world, simulation, monkeypatch
 
 
 def test_the_robot_is_stopped_by_cells(world, simulation):
-    wall = int(np.argmax(simulation._see(simulation.physics.pose()[None], SCANNER, people=False)[0] < 2.5))
+    wall = int(np.argmax(simulation._cast_rays(simulation.physics.pose()[None], SCANNER, people=False)[0] < 2.5))
     heading = float(SCANNER.angles()[wall])
     turned = np.array([*simulation.physics.pose()[:2], heading])
     simulation.physics.place(turned)
@@ -72,14 +72,14 @@ def test_nobody_is_put_into_walls_or_what_is_unknown(world, simulation):
 
 def test_furniture_comes_and_goes_on_a_map(world, simulation):
     here = simulation.physics.pose()
-    before = simulation._see(here[None], people=False)[0]
+    before = simulation._cast_rays(here[None], people=False)[0]
     place = here[:2] + 0.6 * np.array([np.cos(here[2]), np.sin(here[2])])
-    simulation.change("add", "crate", Obstacle(circle={"center": tuple(place.tolist()), "radius": 0.1}))
+    simulation.change_obstacle("add", "crate", Obstacle(circle={"center": tuple(place.tolist()), "radius": 0.1}))
     assert simulation.world.grid is world.grid
     ahead = len(before) // 2
-    assert simulation._see(here[None], people=False)[0][ahead] == pytest.approx(
+    assert simulation._cast_rays(here[None], people=False)[0][ahead] == pytest.approx(
         0.3, abs=1e-3
     )  # the laser is 0.2 m ahead
     assert simulation.world.clearance(place)[0] < 0
-    simulation.change("remove", "crate", None)
-    assert np.array_equal(simulation._see(here[None], people=False)[0], before)
+    simulation.change_obstacle("remove", "crate", None)
+    assert np.array_equal(simulation._cast_rays(here[None], people=False)[0], before)

@@ -13,8 +13,15 @@ from hypothesis import strategies as st
 from common.errors import UserError
 from common.geometry.world import Obstacle, World, load_world
 from common.robot.base import Robot
-from services.simulator.people import APART, KEEP, LOOK, RADIUS, SIDE, People
-from services.simulator.walkable_grid import Floor
+from services.simulator.people import (
+    LOOK_AHEAD_M,
+    MIN_START_DISTANCE_M,
+    PERSON_GAP_M,
+    PERSON_RADIUS_M,
+    ROBOT_GAP_M,
+    People,
+)
+from services.simulator.walkable_grid import WalkableGrid
 
 PERIOD = 1 / 15  # s
 ROBOT = Robot().radius
@@ -64,11 +71,11 @@ def test_nobody_is_ever_in_a_wall_or_in_another_or_in_the_robot(name, seed, spee
     world = shipped(name)
     robot = world.sample_free(1, np.random.default_rng(seed), ROBOT)[0]
     people = crowd(world, 8, seed, speed, robot)
-    assert np.hypot(*(people.places - robot).T).min() >= APART
+    assert np.hypot(*(people.places - robot).T).min() >= MIN_START_DISTANCE_M
     places = walk(people, 20, robot)
-    assert world.clearance(places.reshape(-1, 2)).min() >= RADIUS
-    assert apart(places).min() >= 2 * RADIUS + KEEP - 1e-9
-    assert np.hypot(*(places.reshape(-1, 2) - robot).T).min() >= RADIUS + ROBOT + SIDE - 1e-9
+    assert world.clearance(places.reshape(-1, 2)).min() >= PERSON_RADIUS_M
+    assert apart(places).min() >= 2 * PERSON_RADIUS_M + PERSON_GAP_M - 1e-9
+    assert np.hypot(*(places.reshape(-1, 2) - robot).T).min() >= PERSON_RADIUS_M + ROBOT + ROBOT_GAP_M - 1e-9
     steps = np.hypot(*np.moveaxis(np.diff(places, axis=0), -1, 0))
     assert steps.max() <= speed * PERIOD + 1e-9
 
@@ -111,7 +118,7 @@ def test_two_who_meet_where_nobody_can_pass_turn_back():
     places = walk(crowd(ALLEY, 2, seed=0, robot=robot), 300, robot)
     order = np.sign(places[:, 0, 0] - places[:, 1, 0])
     assert (order == order[0]).all()
-    assert apart(places).min() == pytest.approx(2 * RADIUS + KEEP, abs=PERIOD)  # they did meet
+    assert apart(places).min() == pytest.approx(2 * PERSON_RADIUS_M + PERSON_GAP_M, abs=PERIOD)  # they did meet
     moving = np.hypot(*np.moveaxis(np.diff(places, axis=0), -1, 0)) > 1e-9
     assert max(longest_stand(one) for one in moving.T) < 20.0
 
@@ -119,8 +126,8 @@ def test_two_who_meet_where_nobody_can_pass_turn_back():
 def test_who_walks_up_to_a_standing_robot_stops_half_a_metre_before_it_and_goes_elsewhere():
     robot = np.array([8.0, 0.45])
     places = walk(crowd(ALLEY, 1, seed=3, robot=robot), 300, robot)[:, 0]
-    gap = np.abs(places[:, 0] - 8.0) - RADIUS - ROBOT
-    assert gap.min() == pytest.approx(LOOK + SIDE, abs=PERIOD + 0.02)
+    gap = np.abs(places[:, 0] - 8.0) - PERSON_RADIUS_M - ROBOT
+    assert gap.min() == pytest.approx(LOOK_AHEAD_M + ROBOT_GAP_M, abs=PERIOD + 0.02)
     stands = np.hypot(*np.diff(places, axis=0).T) < 1e-9
     assert 1.0 < longest_stand(~stands) < 20.0
     assert (gap[:-1][stands] < 0.6).all()
@@ -139,7 +146,7 @@ def test_nobody_steps_before_a_robot_that_cannot_brake_any_more():
 
     It would brake for them: what it runs over here is left out from then on.
     """
-    world, rng, brakes = shipped("office"), np.random.default_rng(0), RADIUS + ROBOT + 0.65
+    world, rng, brakes = shipped("office"), np.random.default_rng(0), PERSON_RADIUS_M + ROBOT + 0.65
     met = 0
     for seed in range(6):
         people = crowd(world, 10, seed, robot=(1.0, 4.0))
@@ -149,8 +156,8 @@ def test_nobody_steps_before_a_robot_that_cannot_brake_any_more():
             people.step(PERIOD, robot, np.array([1.0, 0.0]))
             (was_along, was_aside), (along, aside) = (before - robot).T, (people.places - robot).T
             close = (along > 0) & (along < brakes)
-            in_way = close & (np.abs(aside) < RADIUS + ROBOT)
-            came_in = in_way & (np.abs(was_aside) >= RADIUS + ROBOT)
+            in_way = close & (np.abs(aside) < PERSON_RADIUS_M + ROBOT)
+            came_in = in_way & (np.abs(was_aside) >= PERSON_RADIUS_M + ROBOT)
             came_near = in_way & (np.hypot(along, aside) < np.hypot(was_along, was_aside) - 1e-9)
             assert not (came_in | came_near).any(), (seed, step)
             met += int(close.sum())
@@ -162,16 +169,16 @@ def test_who_is_in_the_way_of_furniture_or_of_the_robot_put_down_is_placed_anew_
     walk(people, 5, CORNER)
     before = people.places.copy()
     people.make_room(before[2])
-    assert np.hypot(*(people.places[2] - before[2])) >= APART
+    assert np.hypot(*(people.places[2] - before[2])) >= MIN_START_DISTANCE_M
     assert np.array_equal(np.delete(people.places, 2, 0), np.delete(before, 2, 0))
 
     before = people.places.copy()
     box = Obstacle.model_validate({"name": "box", "box": {"center": tuple(before[4]), "size": (0.6, 0.6)}})
     world = World(name="hall", boundary=HALL.boundary, obstacles=[box])
     people.make_room(CORNER, world)
-    assert world.clearance(people.places).min() >= RADIUS
+    assert world.clearance(people.places).min() >= PERSON_RADIUS_M
     assert not np.array_equal(people.places[4], before[4])
-    assert world.clearance(walk(people, 60, CORNER).reshape(-1, 2)).min() >= RADIUS
+    assert world.clearance(walk(people, 60, CORNER).reshape(-1, 2)).min() >= PERSON_RADIUS_M
 
 
 def test_where_there_is_no_room_nothing_changes_and_the_error_says_so():
@@ -187,26 +194,26 @@ def test_where_there_is_no_room_nothing_changes_and_the_error_says_so():
 
 
 def test_a_world_without_a_place_for_a_person_has_an_empty_floor():
-    floor = Floor(World(name="slit", boundary=[(0, 0), (9, 0), (9, 0.5), (0, 0.5)]), RADIUS)
-    assert len(floor.nodes) == len(floor.roomy) == 0
-    assert not floor.holds(np.array([4.0, 0.25]))
+    grid = WalkableGrid(World(name="slit", boundary=[(0, 0), (9, 0), (9, 0.5), (0, 0.5)]), PERSON_RADIUS_M)
+    assert len(grid.nodes) == len(grid.start_nodes) == 0
+    assert not grid.can_start(np.array([4.0, 0.25]))
 
 
 def test_ways_keep_off_what_is_blocked_and_off_walls():
     world, rng = shipped("maze"), np.random.default_rng(0)
-    floor = Floor(world, RADIUS)
+    grid = WalkableGrid(world, PERSON_RADIUS_M)
     blocked = np.array([[2.5, 3.5, 0.6], [7.5, 5.5, 0.6], [9.0, 2.5, 0.6]])
     count = 0
-    for node in rng.permutation(floor.roomy)[:60]:
-        place = floor.nodes[node]
+    for node in rng.permutation(grid.start_nodes)[:60]:
+        place = grid.nodes[node]
         gaps = np.hypot(*(blocked[:, :2] - place).T)
-        way = floor.way(place, rng, blocked)
+        way = grid.random_path(place, rng, blocked)
         if way is None:
             continue
         count += 1
         assert np.array_equal(way[0], place)
         fine = np.concatenate([np.linspace(a, b, 50) for a, b in itertools.pairwise(way)])
-        assert world.clearance(fine).min() >= RADIUS + 0.04
+        assert world.clearance(fine).min() >= PERSON_RADIUS_M + 0.04
         nearest = np.hypot(fine[:, None, 0] - blocked[:, 0], fine[:, None, 1] - blocked[:, 1]).min(axis=0)
         assert (nearest >= np.minimum(blocked[:, 2], gaps) - 0.03).all()
     assert count > 40

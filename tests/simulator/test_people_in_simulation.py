@@ -12,7 +12,7 @@ from common.geometry.world import Circle, Obstacle, World, load_world
 from common.messages.definitions import Twist
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
-from services.simulator.people import RADIUS
+from services.simulator.people import PERSON_RADIUS_M
 from services.simulator.simulation import Setup, Simulation
 
 SCANNER = SCANNERS["tim571"].with_beams(271)
@@ -56,7 +56,7 @@ def test_rays_hit_people_where_they_are(make):
     hits = 0
     for _, truth, scan in run(simulation, 12, Twist(vx=0.3, wz=0.2))[::5]:
         solid = [
-            Obstacle(name=f"person-{i}", circle=Circle(center=(float(x), float(y)), radius=RADIUS))
+            Obstacle(name=f"person-{i}", circle=Circle(center=(float(x), float(y)), radius=PERSON_RADIUS_M))
             for i, (x, y) in enumerate(truth.people)
         ]
         office = simulation.world
@@ -106,7 +106,7 @@ def test_a_sample_never_sees_people_and_the_world_does_not_list_them(make):
 def test_who_walks_up_to_a_standing_robot_does_not_touch_it(make):
     simulation = make(ALLEY, people=2, start=(8.0, 0.45, 0.0), seed=3)
     truths = [truth for _, truth, _ in run(simulation, 45)]
-    nearest = min(map(distance, truths)) - RADIUS - Robot().radius
+    nearest = min(map(distance, truths)) - PERSON_RADIUS_M - Robot().radius
     assert 0.4 < nearest < 0.6
     assert not any(truth.contact for truth in truths)
     assert truths[-1].pose.array() == pytest.approx([8.0, 0.45, 0.0], abs=1e-4)
@@ -116,10 +116,10 @@ def test_a_robot_driven_into_a_standing_person_touches_them_and_stops_there(make
     simulation = make(ALLEY, people=1, start=(0.5, 0.45, 0.0), people_speed=0.0, obstacle_stop=False)
     truths = [truth for _, truth, _ in run(simulation, 16, Twist(vx=1.0))]
     assert any(truth.contact for truth in truths)
-    assert distance(truths[-1]) == pytest.approx(RADIUS + Robot().radius, abs=0.02)
+    assert distance(truths[-1]) == pytest.approx(PERSON_RADIUS_M + Robot().radius, abs=0.02)
     assert not truths[0].contact
     first = next(truth for truth in truths if truth.contact)
-    assert distance(first) == pytest.approx(RADIUS + Robot().radius, abs=0.02)
+    assert distance(first) == pytest.approx(PERSON_RADIUS_M + Robot().radius, abs=0.02)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -130,7 +130,7 @@ def test_the_obstacle_stop_keeps_a_robot_from_people_who_stand_in_its_way(make, 
     for place in simulation.people.places.copy():
         before = place - [2.2, 0.25 * (seed - 1)]  # head on, and grazing
         pose = np.array([*before, 0.0])
-        if simulation.why_not(pose) or np.hypot(*(simulation.people.places - before).T).min() < 0.9:
+        if simulation.placement_error(pose) or np.hypot(*(simulation.people.places - before).T).min() < 0.9:
             continue
         simulation.teleport(pose)
         truths = [truth for _, truth, _ in run(simulation, 3.5, Twist(vx=1.0))]
@@ -163,12 +163,12 @@ def test_a_teleport_onto_a_person_moves_them_and_is_seen_at_once(make):
     simulation = make(seed=2)
     run(simulation, 3)
     target = simulation.people.places[0].copy()
-    clear = simulation.why_not(np.array([*target, 0.0])) is None
+    clear = simulation.placement_error(np.array([*target, 0.0])) is None
     assert clear
     simulation.teleport(np.array([*target, 0.0]))
     assert np.hypot(*(simulation.people.places[0] - target)) >= 1.5
     truth = simulation.observe()[1]
-    assert distance(truth) > RADIUS + Robot().radius
+    assert distance(truth) > PERSON_RADIUS_M + Robot().radius
     assert not any(truth.contact for _, truth, _ in run(simulation, 3))
 
 
@@ -176,8 +176,8 @@ def test_furniture_put_onto_a_person_moves_them_and_later_ways_go_round_it(make)
     simulation = make(HALL, people=3, start=(1.0, 1.0, 0.0), seed=2)
     run(simulation, 2)
     place = simulation.people.places[1]
-    simulation.change(
+    simulation.change_obstacle(
         "add", "box", Obstacle.model_validate({"box": {"center": tuple(map(float, place)), "size": (1, 1)}})
     )
     for _, truth, _ in run(simulation, 15):
-        assert simulation.world.clearance(truth.people).min() >= RADIUS - 1e-6
+        assert simulation.world.clearance(truth.people).min() >= PERSON_RADIUS_M - 1e-6

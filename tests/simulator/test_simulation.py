@@ -231,12 +231,12 @@ def test_furniture_comes_moves_and_goes(make):
         return float(simulation.sample(np.array([[2.0, 3.0, 0.0]]), None, None)[0][135])
 
     assert ahead() == pytest.approx(5.8, abs=1e-3)
-    simulation.change("add", "box", box)
+    simulation.change_obstacle("add", "box", box)
     assert ahead() == pytest.approx(2.3, abs=1e-3)
     assert [o.name for o in simulation.world.obstacles] == ["box"]
-    simulation.change("move", "box", further)
+    simulation.change_obstacle("move", "box", further)
     assert ahead() == pytest.approx(3.3, abs=1e-3)
-    simulation.change("remove", "box", None)
+    simulation.change_obstacle("remove", "box", None)
     assert ahead() == pytest.approx(5.8, abs=1e-3)
     assert simulation.world.obstacles == []
 
@@ -255,7 +255,7 @@ def test_furniture_that_cannot_be_is_refused(make, action, name, center, why):
     shape = Obstacle.model_validate({"circle": {"center": center, "radius": 0.3}})
     simulation = make()
     with pytest.raises(UserError, match=why):
-        simulation.change(action, name, shape)
+        simulation.change_obstacle(action, name, shape)
     assert simulation.world.obstacles == []
 
 

@@ -102,7 +102,7 @@ def test_a_box_just_put_in_the_way_may_move_until_it_has_stood_for_a_second():
 
     def move(simulation):
         if simulation.steps == 30:
-            simulation.change("move", "box", near)
+            simulation.change_obstacle("move", "box", near)
 
     _, said, _ = drive(world, Robot(), (1.5, 1.5, 0.0), (8.5, 1.5), 60, known=hall, change=move)
     nearby = [status.reason.split(",")[0] for status in said[30:]]
@@ -121,7 +121,7 @@ def test_a_door_that_was_shut_is_said_and_once_it_opens_it_goes_on():
 
     def change(simulation):
         if simulation.steps == 300:
-            simulation.change("remove", "door", None)
+            simulation.change_obstacle("remove", "door", None)
 
     poses, said, contacts = drive(shut, Robot(), (2.0, 2.5, 0.0), (8.0, 2.5), known=known, change=change)
     blocked = [status for status in said[:300] if status.state == "blocked"]
