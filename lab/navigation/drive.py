@@ -25,7 +25,7 @@ from common.messages.definitions import Goal, Pose, Truth
 from common.robot.base import Robot
 from lab.experiments.lockstep import RunTrace
 from lab.navigation.shortest_path import Trip, least_trip, length
-from services.simulator.people import RADIUS as PERSON_RADIUS
+from services.simulator.people import PERSON_RADIUS_M as PERSON_RADIUS
 
 MIN_MOVING_SPEED = 0.01  # m/s
 TOLERANCE = float(Goal(stamp_ns=0, pose=Pose(x=0, y=0)).tolerance)  # m

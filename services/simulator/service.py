@@ -225,8 +225,8 @@ class SimulatorService(Service):
     def _pause(self, *, paused: bool) -> None:
         self.paused = paused
         self._update_note()
-        # In lockstep, a command that came during the pause did not advance time. Publish the scan again at once, so that
-        # it is answered again.
+        # In lockstep, a command that came during the pause did not advance time. Publish the scan again at once, so
+        # that it is answered again.
         self._next_at = time.monotonic()
 
     def _update_note(self) -> None:
