@@ -17,17 +17,17 @@ from rich.table import Table
 from common.errors import UserError
 from common.versions import commit, versions
 from lab.fault_injection.faults import FAULTS, Fault
-from lab.fault_injection.hosts import INSIDE, Network, enter_own_namespaces, why_no_hosts
-from lab.fault_injection.measure import AGAIN_WITHIN, STOP_WITHIN, Outcome, measure
+from lab.fault_injection.hosts import NAMESPACE_VARIABLE, Network, enter_own_namespaces, missing_for_namespaces
+from lab.fault_injection.measure import MAX_RECOVERY_TIME_S, MAX_STOP_TIME_S, FaultOutcome, measure
 from lab.fault_injection.system import System
 from presage.terminal.output import check_file, write_json
 
 
-def chosen(names: Sequence[str]) -> list[Fault]:
-    """Rows whose names match, such as ``killed*``; raises UserError where none does."""
+def select_faults(names: Sequence[str]) -> list[Fault]:
+    """The faults whose names match a pattern such as ``killed*``; all by default. Raises UserError if none matches."""
     rows = [fault for fault in FAULTS if not names or any(fnmatch(fault.name, name) for name in names)]
     if not rows:
-        raise UserError(f"no fault is called {', '.join(names)}; there are: {', '.join(f.name for f in FAULTS)}")
+        raise UserError(f"no fault is called {', '.join(names)}: choose from {', '.join(f.name for f in FAULTS)}")
     return rows
 
 
@@ -41,13 +41,16 @@ def bench_chaos(
     quiet: bool = True,
     in_markdown: bool = False,
 ) -> int:
-    """Print the table; 0 where everything is as expected."""
-    faults = chosen(names)
+    """Inject the faults, print the table and write it to ``json_file`` if given.
+
+    Returns exit status 0 if the system reacted to every fault as expected, otherwise 1.
+    """
+    faults = select_faults(names)
     check_file(json_file, "--json")
-    missing = "asked for" if one_host else why_no_hosts()
-    if not missing and not os.environ.get(INSIDE):
+    missing = "--one-host was given" if one_host else missing_for_namespaces()
+    if not missing and not os.environ.get(NAMESPACE_VARIABLE):
         enter_own_namespaces(["-m", "presage", *sys.argv[1:]])
-    outcomes: list[Outcome] = []
+    outcomes: list[FaultOutcome] = []
     skipped: dict[str, str] = {}
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PRESAGE_")}
     with ExitStack() as stack:
@@ -56,16 +59,18 @@ def bench_chaos(
         with console.status("starting the system"):
             system = stack.enter_context(System(folder, network, clean, quiet=quiet))
         for fault in faults:
-            why = (f"one host alone: {missing}" if fault.hosts and missing else "") or fault.why_not()
-            if why:
-                skipped[fault.name] = why
-                console.print(f"[yellow]not tried[/] {fault.name}: {why}", highlight=False)
+            unavailable = (
+                f"needs several hosts: {missing}" if fault.needs_hosts and missing else ""
+            ) or fault.unavailable_reason()
+            if unavailable:
+                skipped[fault.name] = unavailable
+                console.print(f"[yellow]not tried[/] {fault.name}: {unavailable}", highlight=False)
                 continue
             for number in range(repeats):
                 with console.status(f"{fault.name} ({number + 1} of {repeats}): {fault.about}"):
                     outcomes.append(measure(system, fault))
-                said = outcomes[-1].why
-                console.print(f"{'[red]no[/]' if said else '[green]ok[/]'} {fault.name} {said}", highlight=False)
+                problem = outcomes[-1].why
+                console.print(f"{'[red]no[/]' if problem else '[green]ok[/]'} {fault.name} {problem}", highlight=False)
     if in_markdown:
         print(markdown(outcomes))
     else:
@@ -73,7 +78,7 @@ def bench_chaos(
     data = {
         "command": "presage bench chaos", "arguments": {"faults": list(names), "repeats": repeats},
         "hosts": not missing, "rows": [outcome.row() for outcome in outcomes], "skipped": skipped,
-        "limits": {"stopped_s": STOP_WITHIN, "again_s": AGAIN_WITHIN},
+        "limits": {"stopped_s": MAX_STOP_TIME_S, "again_s": MAX_RECOVERY_TIME_S},
         "versions": versions(), "commit": commit(), "machine": platform.processor() or platform.machine(),
     }  # fmt: skip
     write_json(json_file, data)
@@ -83,13 +88,13 @@ def bench_chaos(
 HEAD = ("fault", "detected", "robot stands", "new process", "at work again", "least speed meanwhile", "as expected")
 
 
-def rows_of(outcomes: Sequence[Outcome]) -> list[tuple[str, ...]]:
-    """The worst of each fault's repeats."""
-    found = []
+def rows_of(outcomes: Sequence[FaultOutcome]) -> list[tuple[str, ...]]:
+    """Rows of the table: for each fault the worst of its repeats."""
+    table_rows = []
     for name in dict.fromkeys(outcome.fault for outcome in outcomes):
         rows = [outcome for outcome in outcomes if outcome.fault == name]
 
-        def worst(what: str, rows: Sequence[Outcome] = rows) -> str:
+        def worst(what: str, rows: Sequence[FaultOutcome] = rows) -> str:
             known = [value for row in rows if (value := getattr(row, what)) is not None]
             return f"{max(known):.2f} s" if known else ""
 
@@ -97,19 +102,19 @@ def rows_of(outcomes: Sequence[Outcome]) -> list[tuple[str, ...]]:
         good = sum(not row.why for row in rows)
         speed = f"{min(slow):.2f} m/s" if slow else ""
         times = [worst(what) for what in ("detected_s", "stopped_s", "start_s", "again_s")]
-        found.append((name, *times, speed, f"{good} of {len(rows)}"))
-    return found
+        table_rows.append((name, *times, speed, f"{good} of {len(rows)}"))
+    return table_rows
 
 
-def table(outcomes: Sequence[Outcome]) -> Table:
-    """For a terminal."""
-    shown = Table(*HEAD)
+def table(outcomes: Sequence[FaultOutcome]) -> Table:
+    """The table for a terminal."""
+    terminal_table = Table(*HEAD)
     for row in rows_of(outcomes):
-        shown.add_row(*row)
-    return shown
+        terminal_table.add_row(*row)
+    return terminal_table
 
 
-def markdown(outcomes: Sequence[Outcome]) -> str:
-    """For a page."""
+def markdown(outcomes: Sequence[FaultOutcome]) -> str:
+    """The table as Markdown."""
     lines = [HEAD, ("---",) * len(HEAD), *rows_of(outcomes)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)

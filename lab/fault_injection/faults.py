@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,99 +13,122 @@ from common.errors import UserError
 from lab.fault_injection.hosts import run
 from lab.fault_injection.system import System
 
-LEASE = 3.0  # s after which a silent session is given up (common/bus/bus.py)
-FAKETIME = ("/usr/lib/*/faketime/libfaketimeMT.so.1", "/usr/lib64/faketime/libfaketimeMT.so.1")
-TINY = "2m"  # of a full disk
+SESSION_LEASE_S = 3.0  # zenoh closes a silent session after this time (common/bus/bus.py)
+FAKETIME_PATTERNS = ("/usr/lib/*/faketime/libfaketimeMT.so.1", "/usr/lib64/faketime/libfaketimeMT.so.1")
+FULL_DISK_SIZE = "2m"  # for mount: 2 MiB
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One row."""
+    """One fault: how to inject and end it, and what should happen."""
 
     name: str
     about: str
     begin: Callable[[System], None]
-    end: Callable[[System], None]  # returns when the part has returned
-    expect: Literal["stops", "goes on", "survives"]  # survives: whether it drives meanwhile is the network's affair
-    lasts: float = 1.0  # s, or until the robot stands where that takes longer
-    services: tuple[str, ...] = ()  # whose return is looked for
-    base: bool = False  # the robot itself is what fails: nothing is seen of it meanwhile
-    again: bool = False  # its process is a new one afterwards
-    hosts: bool = False  # needs more than one
-    why_not: Callable[[], str] = lambda: ""  # what else is missing here
+    end: Callable[[System], None]  # returns once the affected services are back
+    # "stops": the robot must stop. "goes on": it must keep driving. "survives": it may do either, depending on the
+    # network, but must drive afterwards.
+    expect: Literal["stops", "goes on", "survives"]
+    duration: float = 1.0  # s; longer if the robot takes longer to stop
+    services: tuple[str, ...] = ()  # the affected services, whose recovery is measured
+    stops_simulator: bool = False  # whether the simulator is affected, so that the robot cannot be observed
+    restarts_process: bool = False  # whether a new process replaces the affected one
+    needs_hosts: bool = False  # whether it needs several hosts
+    unavailable_reason: Callable[[], str] = lambda: ""  # why it cannot be injected here; empty if it can
 
 
 def killed(*names: str, stops: bool = True) -> Fault:
-    """SIGKILL, and started again."""
+    """Services killed with SIGKILL and restarted."""
     return Fault(
-        f"killed: {' + '.join(names)}", "SIGKILL; started again once the robot stands" if stops else "SIGKILL",
+        f"killed: {' + '.join(names)}",
+        "SIGKILL; started again once the robot stands" if stops else "SIGKILL",
         lambda system: system.kill(*names),
         lambda system: system.restart(*names),
-        "stops" if stops else "goes on", services=names, base="simulator" in names, again=names != ("router",),
-    )  # fmt: skip
+        "stops" if stops else "goes on",
+        services=names,
+        stops_simulator="simulator" in names,
+        restarts_process=names != ("router",),
+    )
 
 
-def frozen(name: str, lasts: float, *, stops: bool = True) -> Fault:
-    """SIGSTOP and SIGCONT."""
+def frozen(name: str, duration: float, *, stops: bool = True) -> Fault:
+    """A service stopped with SIGSTOP and continued with SIGCONT."""
     return Fault(
-        f"frozen {lasts:g} s: {name}", "SIGSTOP, then SIGCONT",
+        f"frozen {duration:g} s: {name}",
+        "SIGSTOP, then SIGCONT",
         lambda system: system.signal(name, signal.SIGSTOP),
         lambda system: system.signal(name, signal.SIGCONT),
-        "stops" if stops else "goes on", lasts, (name,), base=name == "simulator",
-    )  # fmt: skip
+        "stops" if stops else "goes on",
+        duration,
+        (name,),
+        stops_simulator=name == "simulator",
+    )
 
 
-def cut(seconds: float) -> Fault:
-    """The robot's host loses its link."""
+def network_cut(seconds: float) -> Fault:
+    """The link of the robot's host cut for a time."""
 
     def begin(system: System) -> None:
-        assert system.network is not None  # noqa: S101 - the row needs hosts
+        assert system.network is not None  # noqa: S101 - guaranteed by needs_hosts
         system.network.cut("robot")
 
-    return Fault(f"network cut {seconds:g} s", "the robot's host loses its link", begin, _mend, "stops", seconds,
-                 hosts=True)  # fmt: skip
+    return Fault(
+        f"network cut {seconds:g} s",
+        "the robot's host loses its link",
+        begin,
+        _restore_link,
+        "stops",
+        seconds,
+        needs_hosts=True,
+    )
 
 
-def _mend(system: System) -> None:
+def _restore_link(system: System) -> None:
     assert system.network is not None  # noqa: S101
-    system.network.mend("robot")
+    system.network.restore("robot")
 
 
-def _worsen(system: System) -> None:
+def _degrade_link(system: System) -> None:
     assert system.network is not None  # noqa: S101
-    system.network.worsen("robot", delay_ms=50, jitter_ms=20, loss=0.1)
+    system.network.degrade("robot", delay_ms=50, jitter_ms=20, loss=0.1)
 
 
-def _skew(system: System) -> None:
-    """The estimator's host has another time."""
+def _set_clock_ahead(system: System) -> None:
+    # The restarted estimator runs with a clock that is a minute ahead.
     system.kill("estimator")
     system.extra["estimator"] = {"LD_PRELOAD": _faketime(), "FAKETIME": "+60s", "DONT_FAKE_MONOTONIC": "1"}
 
 
-def _unskew(system: System) -> None:
+def _reset_clock(system: System) -> None:
     system.restart("estimator")
 
 
 def _faketime() -> str:
-    for pattern in FAKETIME:
+    for pattern in FAKETIME_PATTERNS:
         root, rest = Path("/"), pattern.lstrip("/")
         for path in root.glob(rest):
             return str(path)
     return ""
 
 
-def _second(service: str) -> Fault:
-    """Another instance, by mistake."""
+def second_instance(service: str) -> Fault:
+    """A second instance of a service, as if started by mistake."""
 
     def begin(system: System) -> None:
         system.start_module(f"second {service}", service, *system.arguments[service])
 
-    return Fault(f"a second {service}", "started by mistake: it is named, and stands by", begin,
-                 lambda system: system.kill(f"second {service}"), "goes on", 6.0)  # fmt: skip
+    return Fault(
+        f"a second {service}",
+        "started by mistake: it reports the duplicate and stands by",
+        begin,
+        lambda system: system.kill(f"second {service}"),
+        "goes on",
+        6.0,
+    )
 
 
-def _helper(what: str, *args: str) -> tuple[Callable[[System], None], Callable[[System], None]]:
-    """A troublemaker of lab.fault_injection.misbehaving_peers, at the router's host."""
+def _misbehaving_peer(what: str, *args: str) -> tuple[Callable[[System], None], Callable[[System], None]]:
+    """Functions that start and end a process of lab.fault_injection.misbehaving_peers on the router's host."""
 
     def begin(system: System) -> None:
         system.start_python(what, f"from lab.fault_injection.misbehaving_peers import main; main({[what, *args]!r})")
@@ -121,16 +143,16 @@ def _helper(what: str, *args: str) -> tuple[Callable[[System], None], Callable[[
     return begin, end
 
 
-def _fill(system: System) -> None:
-    """A second recorder, on a disk that is full before long."""
+def _start_recorder_on_full_disk(system: System) -> None:
+    """Start a second recorder on a disk that soon is full."""
     disk = system.folder / "full"
     disk.mkdir(exist_ok=True)
-    run("mount", "-t", "tmpfs", "-o", f"size={TINY}", "tmpfs", str(disk))
+    run("mount", "-t", "tmpfs", "-o", f"size={FULL_DISK_SIZE}", "tmpfs", str(disk))
     (disk / "others").write_bytes(bytes(1_900_000))
     system.start_module("recorder on a full disk", "recorder", "--directory", str(disk))
 
 
-def _empty(system: System) -> None:
+def _free_disk(system: System) -> None:
     if "recorder on a full disk" in system.processes:
         system.kill("recorder on a full disk")
     disk = system.folder / "full"
@@ -140,18 +162,16 @@ def _empty(system: System) -> None:
     run("umount", str(disk))
 
 
-def _no_faketime() -> str:
+def _missing_faketime() -> str:
     return "" if _faketime() else "libfaketime is not installed (package faketime)"
 
 
-def _linux() -> str:
-    return "" if sys.platform == "linux" else "Linux alone"
-
-
-REPEATS, SLOW, NOISE = _helper("repeater"), _helper("slow subscriber"), _helper("malformed", "100000")
+REPEATER = _misbehaving_peer("repeater")
+SLOW_SUBSCRIBER = _misbehaving_peer("slow subscriber")
+NOISE = _misbehaving_peer("malformed", "100000")
 
 FAULTS: tuple[Fault, ...] = (
-    Fault("nothing", "to compare with", lambda _: None, lambda _: None, "goes on", 8.0),
+    Fault("nothing", "no fault, for comparison", lambda _: None, lambda _: None, "goes on", 8.0),
     killed("estimator"),
     killed("controller"),
     killed("simulator"),
@@ -162,24 +182,54 @@ FAULTS: tuple[Fault, ...] = (
     killed("simulator", "estimator"),
     killed("router", "controller"),
     frozen("estimator", 1.0),
-    frozen("estimator", LEASE + 2),
+    frozen("estimator", SESSION_LEASE_S + 2),
     frozen("controller", 1.0),
-    frozen("controller", LEASE + 2),
-    frozen("simulator", LEASE + 2),
-    frozen("recorder", LEASE + 2, stops=False),
-    frozen("viewer", LEASE + 2, stops=False),
-    cut(1.0),
-    cut(5.0),
-    cut(30.0),
-    Fault("bad network", "10 % of the packets lost, 100 ms there and back, jitter 20 ms, at the robot's host",
-          _worsen, _mend, "survives", 20.0, hosts=True),
-    Fault("clock a minute ahead", "of the estimator's host; killed, and started again with it", _skew, _unskew, "stops",
-          services=("estimator",), again=True, why_not=_no_faketime),
-    Fault("duplicates, late", "every scan, belief and command once more at once, and once more a second later",
-          *REPEATS, "goes on", 6.0),
-    _second("estimator"),
-    _second("controller"),
-    Fault("full disk", "of a recorder; what it wrote before can be read", _fill, _empty, "goes on", 8.0, hosts=True),
-    Fault("slow subscriber", "takes 0.2 s over every message of every topic", *SLOW, "goes on", 8.0),
-    Fault("malformed", "100 000 payloads of noise, as fast as they go, over all topics", *NOISE, "survives", 8.0),
-)  # fmt: skip
+    frozen("controller", SESSION_LEASE_S + 2),
+    frozen("simulator", SESSION_LEASE_S + 2),
+    frozen("recorder", SESSION_LEASE_S + 2, stops=False),
+    frozen("viewer", SESSION_LEASE_S + 2, stops=False),
+    network_cut(1.0),
+    network_cut(5.0),
+    network_cut(30.0),
+    Fault(
+        "bad network",
+        "at the robot's host: 10 % packet loss, 100 ms round trip, 20 ms jitter",
+        _degrade_link,
+        _restore_link,
+        "survives",
+        20.0,
+        needs_hosts=True,
+    ),
+    Fault(
+        "clock a minute ahead",
+        "the estimator is killed and restarted with a wrong clock",
+        _set_clock_ahead,
+        _reset_clock,
+        "stops",
+        services=("estimator",),
+        restarts_process=True,
+        unavailable_reason=_missing_faketime,
+    ),
+    Fault(
+        "duplicates, late",
+        "every scan, belief and command is repeated at once and again a second later",
+        *REPEATER,
+        "goes on",
+        6.0,
+    ),
+    second_instance("estimator"),
+    second_instance("controller"),
+    Fault(
+        "full disk",
+        "a recorder's disk is full; what it wrote before remains readable",
+        _start_recorder_on_full_disk,
+        _free_disk,
+        "goes on",
+        8.0,
+        needs_hosts=True,
+    ),
+    Fault(
+        "slow subscriber", "a subscriber to all topics takes 0.2 s for each message", *SLOW_SUBSCRIBER, "goes on", 8.0
+    ),
+    Fault("malformed", "100 000 random payloads on all topics, as fast as possible", *NOISE, "survives", 8.0),
+)

@@ -1,7 +1,7 @@
 """Hosts as network namespaces.
 
-Everything lives in a namespace of this process and of its children: nothing on the machine changes, and nothing is left
-when they end, however they end.
+All changes are made in namespaces of this process and its children. The rest of the machine is not affected, and
+nothing is left when the processes end, however they end.
 """
 
 from __future__ import annotations
@@ -20,36 +20,36 @@ from common.bus.bus import wait_until
 from common.errors import UserError
 from common.processes import end_with_parent
 
-INSIDE = "PRESAGE_CHAOS_INSIDE"  # set in a process that has its own namespaces
+NAMESPACE_VARIABLE = "PRESAGE_CHAOS_INSIDE"  # set in a process that has its own namespaces
 SWITCH = "switch0"
-NETWORK = "10.77.0"  # nobody else is in these namespaces
+NETWORK = "10.77.0"  # cannot collide with other networks, because the namespaces are private
 
 
-def why_no_hosts() -> str:
-    """Empty where this machine lets us have network namespaces of our own; else what is missing."""
+def missing_for_namespaces() -> str:
+    """Why this process cannot create network namespaces; empty if it can."""
     for tool, package in (("unshare", "util-linux"), ("nsenter", "util-linux"), ("ip", "iproute2")):
         if shutil.which(tool) is None:
             return f"{tool} is not installed (package {package})"
-    tried = subprocess.run([*_unshare(), "true"], capture_output=True, text=True, check=False)  # noqa: S603 - our own words
-    return "" if tried.returncode == 0 else f"no namespaces of our own: {tried.stderr.strip()}"
+    attempt = subprocess.run([*_unshare(), "true"], capture_output=True, text=True, check=False)  # noqa: S603 - fixed commands
+    return "" if attempt.returncode == 0 else f"network namespaces are not permitted: {attempt.stderr.strip()}"
 
 
 def _unshare() -> list[str]:
-    mine = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
-    return ["unshare", *mine, "--net", "--mount", "--propagation", "private"]
+    user_namespace = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
+    return ["unshare", *user_namespace, "--net", "--mount", "--propagation", "private"]
 
 
 def enter_own_namespaces(arguments: list[str]) -> None:
-    """Begin this command anew, with ``arguments`` of Python, in namespaces of its own; returns once it is there."""
-    if os.environ.get(INSIDE):
+    """Replaces this process by Python with ``arguments`` in new namespaces. Returns if it already has its own."""
+    if os.environ.get(NAMESPACE_VARIABLE):
         return
-    os.environ[INSIDE] = "1"
-    os.execvp("unshare", [*_unshare(), sys.executable, *arguments])  # noqa: S606, S607 - found by why_no_hosts
+    os.environ[NAMESPACE_VARIABLE] = "1"
+    os.execvp("unshare", [*_unshare(), sys.executable, *arguments])  # noqa: S606, S607 - found by missing_for_namespaces
 
 
 def run(*command: str) -> str:
-    """What a tool of the system says; raises UserError with its own words where it fails."""
-    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own words
+    """Runs a system tool. Returns its output; raises UserError with its error message if it fails."""
+    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - fixed commands
     if done.returncode:
         raise UserError(f"{' '.join(command)}: {done.stderr.strip() or done.returncode}")
     return done.stdout
@@ -57,26 +57,26 @@ def run(*command: str) -> str:
 
 @dataclass
 class Host:
-    """One namespace, held by a process."""
+    """A network namespace, kept open by a process."""
 
     name: str
     address: str
     holder: subprocess.Popen[bytes]
-    relay: subprocess.Popen[bytes] | None = None  # stands between it and the switch while its link is bad
+    relay: subprocess.Popen[bytes] | None = None  # between the host and the switch while its link is degraded
 
     @property
     def entering(self) -> list[str]:
-        """What a command begins with that runs there."""
+        """Prefix that makes a command run on this host."""
         return ["nsenter", f"--net=/proc/{self.holder.pid}/ns/net", "--"]
 
 
 class Network:
-    """The switch, here, and hosts on it; a context manager. This process is a host as well."""
+    """A switch and the hosts connected to it; a context manager. This process's namespace is a host as well."""
 
     here = f"{NETWORK}.1"
 
     def __init__(self) -> None:
-        """Not before `enter_own_namespaces`."""
+        """Call `enter_own_namespaces` first."""
         self.hosts: dict[str, Host] = {}
 
     def __enter__(self) -> Self:
@@ -94,11 +94,11 @@ class Network:
         run("ip", "link", "delete", SWITCH)
 
     def add(self, name: str) -> Host:
-        """A new host, linked to all others."""
+        """Create a host that is connected to all others."""
         holder = _child("unshare", "--net", "sleep", "infinity")
         mine = Path("/proc/self/ns/net").stat().st_ino
         if not wait_until(lambda: Path(f"/proc/{holder.pid}/ns/net").stat().st_ino != mine, 10):
-            raise UserError(f"no network namespace for {name}")
+            raise UserError(f"could not create a network namespace for host {name} within 10 s")
         host = Host(name, f"{NETWORK}.{len(self.hosts) + 2}", holder)
         self.hosts[name] = host
         run(*host.entering, "ip", "link", "set", "lo", "up")
@@ -106,24 +106,24 @@ class Network:
         return host
 
     def cut(self, name: str) -> None:
-        """Nothing passes any more; nobody is told."""
+        """Cut the host's link; packets are lost without notice."""
         run("ip", "link", "set", port_of(name), "down")
 
-    def mend(self, name: str) -> None:
-        """As at first."""
+    def restore(self, name: str) -> None:
+        """Restore the host's link to its original state."""
         host = self.hosts[name]
         if host.relay is None:
             run("ip", "link", "set", port_of(name), "up")
             return
-        host.relay.kill()  # its two ends go with it
+        host.relay.kill()  # its two network devices disappear with it
         host.relay.wait()
         host.relay = None
         self._wire(host)
 
-    def worsen(self, name: str, *, delay_ms: float, jitter_ms: float, loss: float) -> None:
-        """Every packet to and from the host that much later, or lost; ``loss`` is a share of 1.
+    def degrade(self, name: str, *, delay_ms: float, jitter_ms: float, loss: float) -> None:
+        """Delay the packets to and from the host, and lose a share ``loss`` (0 to 1) of them.
 
-        A process of ours passes the packets on: not every kernel has netem.
+        A relay process passes the packets on, because not every kernel has netem.
         """
         host = self.hosts[name]
         run("ip", "link", "delete", port_of(name))
@@ -137,7 +137,7 @@ class Network:
             return all(path.name in listed for path in there)
 
         if not wait_until(ready, 10):
-            raise UserError("the bad link did not come up: is /dev/net/tun there?")
+            raise UserError("the relay created no network devices within 10 s: does /dev/net/tun exist?")
         run("ip", "link", "set", port_of(name), "master", SWITCH, "up")
         run("ip", "link", "set", "far0", "netns", str(host.holder.pid), "name", "eth0")
         self._address(host)
@@ -150,20 +150,20 @@ class Network:
 
     def _address(self, host: Host) -> None:
         number = host.address.rsplit(".", 1)[-1]
-        # One hardware address whatever the link is made of: nobody has to ask anew who has the address.
+        # The hardware address stays the same when the link is replaced, so that other hosts' ARP entries stay valid.
         run(*host.entering, "ip", "link", "set", "eth0", "address", f"02:00:00:00:00:{int(number):02x}")
         run(*host.entering, "ip", "addr", "add", f"{host.address}/24", "dev", "eth0")
         run(*host.entering, "ip", "link", "set", "eth0", "up")
 
 
 def port_of(name: str) -> str:
-    """The switch's end of a host's link."""
+    """Network device at the switch's end of a host's link."""
     return f"to-{name}"[:15]
 
 
 def _child(*command: str) -> subprocess.Popen[bytes]:
     parent = os.getpid()
-    return subprocess.Popen(  # noqa: S603 - our own words
+    return subprocess.Popen(  # noqa: S603 - fixed commands
         command, stdin=subprocess.DEVNULL, start_new_session=True,
         preexec_fn=lambda: end_with_parent(parent, signal.SIGKILL),  # noqa: PLW1509 - one call, before any thread of the child
     )  # fmt: skip

@@ -17,21 +17,31 @@ from rich.table import Table
 
 from common.errors import UserError
 from common.versions import commit, versions
-from lab.fault_injection.hosts import INSIDE, Network, enter_own_namespaces, port_of, run, why_no_hosts
+from lab.fault_injection.hosts import (
+    NAMESPACE_VARIABLE,
+    Network,
+    enter_own_namespaces,
+    missing_for_namespaces,
+    port_of,
+    run,
+)
 from lab.fault_injection.system import System
 from lab.fault_injection.timeline import Row
 from presage.terminal.output import check_file, write_json
 
-WARM_UP = 3.0  # s
-ABOUT = {"robot": "simulator, controller", "brain": "estimator"}
+WARM_UP_S = 3.0
+SERVICES_ON_HOST = {"robot": "simulator, controller", "brain": "estimator"}
 
 
 def bench_hosts(seconds: float, beams: int, json_file: Path | None, console: Console) -> int:
-    """Print bytes by link and delays at the robot; raises UserError where there can be no hosts."""
+    """Run the benchmark, print traffic and delays and write them to ``json_file`` if given. Returns exit status 0.
+
+    Raises UserError if this machine permits no network namespaces.
+    """
     check_file(json_file, "--json")
-    if why := why_no_hosts():
-        raise UserError(f"several hosts on this machine need network namespaces of our own: {why}")
-    if not os.environ.get(INSIDE):
+    if missing := missing_for_namespaces():
+        raise UserError(f"several hosts on one machine need network namespaces: {missing}")
+    if not os.environ.get(NAMESPACE_VARIABLE):
         enter_own_namespaces(["-m", "presage", *sys.argv[1:]])
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PRESAGE_")}
     with ExitStack() as stack:
@@ -40,42 +50,42 @@ def bench_hosts(seconds: float, beams: int, json_file: Path | None, console: Con
         with console.status("starting the system"):
             system = stack.enter_context(System(folder, network, clean, beams=beams))
         with console.status("driving"):
-            system.drive()
-            time.sleep(WARM_UP)
-            before, began = {name: carried(name) for name in network.hosts}, time.monotonic()
+            system.drive_fast()
+            time.sleep(WARM_UP_S)
+            before, began = {name: traffic(name) for name in network.hosts}, time.monotonic()
             while time.monotonic() < began + seconds:
-                system.drive()
+                system.drive_fast()
                 time.sleep(1.0)
             took = time.monotonic() - began
             links = {
-                name: {way: (carried(name)[way] - count) / took for way, count in before[name].items()}
+                name: {way: (traffic(name)[way] - count) / took for way, count in before[name].items()}
                 for name in network.hosts
             }
             rows = [row for row in system.timeline.rows if row["t"] >= began]
-    late = {what: delays(rows, what) for what in ("belief", "cmd_vel")}
+    delays_by_topic = {what: delays(rows, what) for what in ("belief", "cmd_vel")}
     table = Table("link of", "with", "out kB/s", "in kB/s", title=f"{beams} beams at 15 Hz, {took:.0f} s")
     for name, link in links.items():
-        table.add_row(name, ABOUT[name], f"{link['out'] / 1e3:.0f}", f"{link['in'] / 1e3:.0f}")
+        table.add_row(name, SERVICES_ON_HOST[name], f"{link['out'] / 1e3:.0f}", f"{link['in'] / 1e3:.0f}")
     console.print(table)
-    for what, each in late.items():
+    for what, each in delays_by_topic.items():
         console.print(f"scan to {what}, at the robot: {each['median_ms']:.1f} ms median, {each['p99_ms']:.1f} ms p99")
     data: dict[str, Any] = {
         "command": "presage bench hosts", "arguments": {"seconds": seconds, "beams": beams},
-        "links_bytes_per_s": links, "delays": late, "versions": versions(), "commit": commit(),
+        "links_bytes_per_s": links, "delays": delays_by_topic, "versions": versions(), "commit": commit(),
     }  # fmt: skip
     write_json(json_file, data)
     return 0
 
 
-def carried(host: str) -> dict[str, int]:
-    """Bytes that left the host and came to it, so far; headers included. Seen from the switch."""
+def traffic(host: str) -> dict[str, int]:
+    """Bytes sent and received by the host so far, with headers, as counted by the switch."""
     (device,) = json.loads(run("ip", "-s", "-j", "link", "show", port_of(host)))
     counts = device["stats64"]
     return {"out": counts["rx"]["bytes"], "in": counts["tx"]["bytes"]}
 
 
 def delays(rows: list[Row], what: str) -> dict[str, float]:
-    """Ms from a scan's coming to the coming of what answers it; both at the robot's host."""
+    """Statistics of the time in ms from a scan to the message that answers it, both received at the robot's host."""
     scans = {row["stamp"]: row["t"] for row in rows if row["what"] == "scan"}
     found = [row["t"] - scans[row["stamp"]] for row in rows if row["what"] == what and row["stamp"] in scans]
     if not found:

@@ -9,121 +9,128 @@ from typing import Any
 from common.errors import UserError
 from lab.fault_injection.faults import Fault
 from lab.fault_injection.system import System
-from lab.fault_injection.timeline import Row, Timeline, back, gone, moving, standing, truth, worried
+from lab.fault_injection.timeline import Row, Timeline, is_back, is_gone, is_lost, is_moving, is_standing, is_truth
 
-STOP_WITHIN = 0.5  # s, standing after losing any part of the loop
-AGAIN_WITHIN = 3.0  # s, at work after the part's return
-GOES_ON = 0.2  # m/s: it slows for corners, too (row `nothing`)
-BRAKES = 0.97  # of the speed it had
-PATIENCE = 40.0  # s
-AFTERWARDS = 1.0  # s that are still looked at
+MAX_STOP_TIME_S = 0.5  # from the fault until the robot stands
+MAX_RECOVERY_TIME_S = 3.0  # from a service's return until the robot drives again
+MIN_SPEED = 0.2  # m/s, of a robot that keeps driving; it slows down for corners even without a fault
+BRAKING_RATIO = 0.97  # of the speed before the fault; below it the robot counts as braking
+EVENT_TIMEOUT_S = 40.0
+OBSERVATION_TIME_S = 1.0  # after recovery
 
 
 @dataclass
-class Outcome:
-    """One row of the table. Times in s; None: does not apply, or never."""
+class FaultOutcome:
+    """Result of one fault. Times are in s, and None if they do not apply or the event never happened."""
 
     fault: str
     about: str
     expect: str
-    detected_s: float | None = None  # from the fault: a token gone, the controller says so, or the robot brakes
+    detected_s: float | None = None  # from the fault until a token disappears, the status is `lost` or the robot brakes
     stopped_s: float | None = None  # from the fault until the robot stands
-    start_s: float | None = None  # of a killed part: its new process, until it says that it is there
-    again_s: float | None = None  # from the part's return until the robot is under way again, or the part works
-    least_speed: float | None = None  # m/s meanwhile, where the robot is to go on
+    start_s: float | None = None  # from the restart of a killed service until its liveliness token appears
+    again_s: float | None = None  # from a service's return until the robot drives, or the service works, again
+    least_speed: float | None = None  # m/s, during a fault in which the robot should keep driving
     contact: bool = False
-    why: str = ""  # what is not as it should be; empty: as expected
+    why: str = ""  # deviations from the expectation; empty if there are none
 
     def row(self) -> dict[str, Any]:
-        """Plain."""
+        """The result as a row of the JSON file."""
         return asdict(self)
 
 
-def measure(system: System, fault: Fault) -> Outcome:
-    """Raises UserError where the system cannot be brought to work before, or after."""
-    outcome, timeline = Outcome(fault.name, fault.about, fault.expect), system.timeline
-    before = system.drive()
+def measure(system: System, fault: Fault) -> FaultOutcome:
+    """Injects a fault while the robot drives at full speed. Returns the result.
+
+    Raises UserError if the system does not work before the fault, or a service does not return after it.
+    """
+    outcome, timeline = FaultOutcome(fault.name, fault.about, fault.expect), system.timeline
+    before = system.drive_fast()
     timeline.forget(time.monotonic() - 30)
-    began = time.monotonic()
+    injected = time.monotonic()
     fault.begin(system)
     try:
-        if fault.expect == "stops" and not fault.base:
-            stand = _seen(timeline, began, standing, PATIENCE)
-            outcome.stopped_s = None if stand is None else stand["t"] - began
-        time.sleep(max(0.0, began + fault.lasts - time.monotonic()))
+        if fault.expect == "stops" and not fault.stops_simulator:
+            stand = _wait_for(timeline, injected, is_standing, EVENT_TIMEOUT_S)
+            outcome.stopped_s = None if stand is None else stand["t"] - injected
+        time.sleep(max(0.0, injected + fault.duration - time.monotonic()))
     finally:
         ending = time.monotonic()
         fault.end(system)
     returned = time.monotonic()
-    if fault.again:
+    if fault.restarts_process:
         outcome.start_s = returned - ending
-    _look_again(system, fault, returned, outcome)
-    time.sleep(AFTERWARDS)
-    _look_back(timeline, began, before["speed"], fault, outcome)
+    _measure_recovery(system, fault, returned, outcome)
+    time.sleep(OBSERVATION_TIME_S)
+    _evaluate(timeline, injected, before["speed"], fault, outcome)
     outcome.why = judge(outcome, fault)
     return outcome
 
 
-def _look_again(system: System, fault: Fault, returned: float, outcome: Outcome) -> None:
-    """When the robot goes on, or the part does."""
+def _measure_recovery(system: System, fault: Fault, returned: float, outcome: FaultOutcome) -> None:
+    """Measure when the robot drives again, or when the affected services work again."""
     timeline = system.timeline
     if fault.expect == "goes on":
-        works = [_seen(timeline, returned, _pulse(name), PATIENCE) for name in fault.services if name != "router"]
+        works = [
+            _wait_for(timeline, returned, _is_working(name), EVENT_TIMEOUT_S)
+            for name in fault.services
+            if name != "router"
+        ]
         if works and None not in works:
             outcome.again_s = max(row["t"] for row in works if row is not None) - returned
         return
     if fault.expect == "survives":
-        system.aim()  # it may have come to its goal meanwhile
-    row = _seen(timeline, returned, moving, PATIENCE)
+        system.set_far_goal()  # it may have reached its goal during the fault
+    row = _wait_for(timeline, returned, is_moving, EVENT_TIMEOUT_S)
     outcome.again_s = None if row is None else row["t"] - returned
 
 
-def _pulse(service: str) -> Any:
-    return lambda row: (row["what"] == "health" and row["service"] == service) or back(service)(row)
+def _is_working(service: str) -> Any:
+    return lambda row: (row["what"] == "health" and row["service"] == service) or is_back(service)(row)
 
 
-def _seen(timeline: Timeline, since: float, wanted: Any, timeout: float) -> Row | None:
+def _wait_for(timeline: Timeline, since: float, wanted: Any, timeout: float) -> Row | None:
     try:
         return timeline.wait(since, wanted, timeout, "")
     except UserError:
         return None
 
 
-def _look_back(timeline: Timeline, began: float, speed: float, fault: Fault, outcome: Outcome) -> None:
-    """What is read from the rows once all is over."""
+def _evaluate(timeline: Timeline, injected: float, speed: float, fault: Fault, outcome: FaultOutcome) -> None:
+    """Derive detection, contact and lowest speed from the recorded events."""
 
-    def sign(row: Row) -> bool:
-        if any(gone(name)(row) for name in fault.services) or worried(row):
+    def is_detection(row: Row) -> bool:
+        if any(is_gone(name)(row) for name in fault.services) or is_lost(row):
             return True
         if row["what"] == "line" and any(word in row["line"] for word in ("standing by", "No space left", "full")):
             return True
-        return fault.expect == "stops" and truth(row) and row["speed"] < BRAKES * speed
+        return fault.expect == "stops" and is_truth(row) and row["speed"] < BRAKING_RATIO * speed
 
-    first = timeline.first(began, sign)
-    outcome.detected_s = None if first is None else first["t"] - began
-    outcome.contact = timeline.first(began, lambda r: truth(r) and r["contact"]) is not None
+    first = timeline.first(injected, is_detection)
+    outcome.detected_s = None if first is None else first["t"] - injected
+    outcome.contact = timeline.first(injected, lambda r: is_truth(r) and r["contact"]) is not None
     if fault.expect == "goes on":
-        reached = timeline.first(began, lambda r: r["what"] == "status" and (r["distance"] or 9.0) < 1.5)
+        reached = timeline.first(injected, lambda r: r["what"] == "status" and (r["distance"] or 9.0) < 1.5)
         until = float("inf") if reached is None else reached["t"]
-        speeds = [row["speed"] for row in timeline.rows if truth(row) and began <= row["t"] < until]
+        speeds = [row["speed"] for row in timeline.rows if is_truth(row) and injected <= row["t"] < until]
         outcome.least_speed = min(speeds) if speeds else None
 
 
-def judge(outcome: Outcome, fault: Fault) -> str:
-    """What is not as the fault's row expects; empty: nothing."""
+def judge(outcome: FaultOutcome, fault: Fault) -> str:
+    """Deviations from what the fault expects, separated by semicolons; empty if there are none."""
     wrong = []
     if outcome.contact:
         wrong.append("contact")
-    if fault.expect == "stops" and not fault.base:
+    if fault.expect == "stops" and not fault.stops_simulator:
         if outcome.stopped_s is None:
             wrong.append("never stood")
-        elif outcome.stopped_s > STOP_WITHIN:
-            wrong.append(f"stood after more than {STOP_WITHIN:g} s")
-    if fault.expect == "goes on" and (outcome.least_speed is None or outcome.least_speed < GOES_ON):
+        elif outcome.stopped_s > MAX_STOP_TIME_S:
+            wrong.append(f"stood after more than {MAX_STOP_TIME_S:g} s")
+    if fault.expect == "goes on" and (outcome.least_speed is None or outcome.least_speed < MIN_SPEED):
         wrong.append("the robot did not go on")
     if fault.expect != "goes on" or outcome.again_s is not None:
         if outcome.again_s is None:
             wrong.append("never at work again")
-        elif outcome.again_s > AGAIN_WITHIN:
-            wrong.append(f"at work only after more than {AGAIN_WITHIN:g} s")
+        elif outcome.again_s > MAX_RECOVERY_TIME_S:
+            wrong.append(f"at work only after more than {MAX_RECOVERY_TIME_S:g} s")
     return "; ".join(wrong)

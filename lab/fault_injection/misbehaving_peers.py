@@ -13,13 +13,13 @@ from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.messages.topics import BELIEF, CMD_VEL, SCAN, TOPICS
 
-LATE = 1.0  # s
-SLOW = 0.2  # s over each message
+REPEAT_DELAY_S = 1.0
+PROCESSING_TIME_S = 0.2  # per message
 
 
-def main(words: list[str]) -> None:
-    """Do one of them until killed."""
-    what, *rest = words
+def main(arguments: list[str]) -> None:
+    """Run one kind of misbehaviour until killed: "repeater", "slow subscriber", or "malformed" with a count."""
+    what, *rest = arguments
     robot, connect = os.environ["PRESAGE_ROBOT"], os.environ["PRESAGE_CONNECT"]
     listen = os.environ.get("PRESAGE_LISTEN") or "tcp/127.0.0.1:0"
     with open_bus(Link(robot=robot, connect=(connect,), listen=(listen,), insecure=True)) as bus:
@@ -30,11 +30,11 @@ def main(words: list[str]) -> None:
         elif what == "malformed":
             send_noise(bus, int(rest[0]))
         else:
-            raise UserError(f"no trouble is called {what!r}")
+            raise UserError(f"unknown misbehaviour {what!r}")
 
 
 def repeat(bus: Bus) -> None:
-    """What is heard, again at once and again late; its own messages not."""
+    """Repeat every received message at once and again after a delay, except its own repetitions."""
     inbox, late = Inbox(), []
     for topic in (SCAN, BELIEF, CMD_VEL):
         bus.subscribe(topic, inbox, keep_all=True)
@@ -43,18 +43,18 @@ def repeat(bus: Bus) -> None:
         now = time.monotonic()
         if isinstance(sample, Sample) and sample.source != bus.zid:
             bus.put(sample.topic, sample.payload)
-            late.append((now + LATE, sample))
+            late.append((now + REPEAT_DELAY_S, sample))
         while late and late[0][0] <= now:
             _, old = late.pop(0)
             bus.put(old.topic, old.payload)
 
 
 def listen_slowly(bus: Bus) -> None:
-    """As somebody else's subscriber might, which computes in zenoh's own thread."""
+    """Subscribe to all topics and block zenoh's callback thread for each message, as a badly written peer might."""
 
     class Slow(Inbox):
         def put(self, entry: object, *, newest_only: bool = False) -> None:  # noqa: ARG002
-            time.sleep(SLOW)
+            time.sleep(PROCESSING_TIME_S)
 
     slow = Slow()
     for topic in TOPICS:
@@ -63,7 +63,7 @@ def listen_slowly(bus: Bus) -> None:
 
 
 def send_noise(bus: Bus, count: int) -> None:
-    """Payloads that are no messages, on every topic in turn."""
+    """Send ``count`` random payloads, on all topics in turn."""
     rng = np.random.default_rng(0)
     payloads = [rng.bytes(int(size)) for size in rng.integers(0, 600, 997)]
     for topic in TOPICS:

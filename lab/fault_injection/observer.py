@@ -1,6 +1,6 @@
 """Prints bus traffic at the robot's host as JSON lines.
 
-The clock is the machine's monotonic one, which all processes share: intervals between processes can be told.
+Times are of the machine's monotonic clock, which all processes share, so that intervals between processes are exact.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from common.messages.definitions import Belief, CmdVel, Health, Scan, Status, Tr
 from common.messages.topics import BELIEF, CMD_VEL, HEALTH, SCAN, STATUS, TRUTH
 from common.messages.wire import DecodeError, Message
 
-SEEN = (TRUTH, STATUS, BELIEF, CMD_VEL, HEALTH, SCAN)
+OBSERVED_TOPICS = (TRUTH, STATUS, BELIEF, CMD_VEL, HEALTH, SCAN)
 
 
-def told(message: Message) -> dict[str, Any]:
-    """What matters of a message."""
+def describe(message: Message) -> dict[str, Any]:
+    """The fields of a message that the benchmark evaluates."""
     if isinstance(message, Truth):
         speed = float(np.hypot(message.twist.vx, message.twist.vy))
         place = [message.pose.x, message.pose.y]
@@ -56,29 +56,29 @@ def told(message: Message) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Until told to end."""
+    """Print events until the process is ended."""
     connect, robot = os.environ["PRESAGE_CONNECT"], os.environ["PRESAGE_ROBOT"]
     listen = os.environ.get("PRESAGE_LISTEN") or "tcp/127.0.0.1:0"
     inbox = Inbox()
 
-    alone = threading.Lock()  # zenoh's threads say things too
+    lock = threading.Lock()  # events also come from zenoh's threads
 
-    def say(**row: Any) -> None:
-        with alone:
+    def emit(**row: Any) -> None:
+        with lock:
             print(json.dumps({"t": time.monotonic(), **row}), flush=True)
 
     with open_bus(Link(robot=robot, connect=(connect,), listen=(listen,), lossless=False, insecure=True)) as bus:
-        bus.watch_alive(lambda service, there: say(what="alive", service=service, there=there))
-        for topic in SEEN:
+        bus.watch_alive(lambda service, there: emit(what="alive", service=service, there=there))
+        for topic in OBSERVED_TOPICS:
             bus.subscribe(topic, inbox, keep_all=True)
-        say(what="ready")
+        emit(what="ready")
         while True:
             sample = inbox.get(60)
             if isinstance(sample, Sample):
                 try:
-                    say(**told(sample.topic.message.decode(sample.payload)), source=sample.source)
+                    emit(**describe(sample.topic.message.decode(sample.payload)), source=sample.source)
                 except DecodeError:
-                    say(what="undecodable", key=sample.key)
+                    emit(what="undecodable", key=sample.key)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """A slow or lossy link.
 
-Two network devices of its own, and every frame of one goes to the other: s later, or never. Frames may overtake one
-another, as with netem.
+The relay creates two network devices and passes every frame from one to the other after a delay, or loses it. Frames
+may overtake one another, as with netem.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ import sys
 import time
 
 TUNSETIFF, IFF_TAP, IFF_NO_PI = 0x400454CA, 0x0002, 0x1000  # linux/if_tun.h
-LARGEST = 65_536  # bytes of a frame
+MAX_FRAME_BYTES = 65_536
 
 
 def device(name: str) -> int:
-    """File descriptor of a new network device."""
+    """Creates a network device. Returns its file descriptor."""
     file = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
     fcntl.ioctl(file, TUNSETIFF, struct.pack("16sH", name.encode(), IFF_TAP | IFF_NO_PI))
     return file
 
 
 def relay(near: int, far: int, delay: float, jitter: float, loss: float) -> None:
-    """Until killed."""
-    chance, other = random.Random(0), {near: far, far: near}
+    """Passes frames between two devices until killed; delay and jitter in s, loss as a share of 1."""
+    rng, other = random.Random(0), {near: far, far: near}
     waiting: list[tuple[float, int, int, bytes]] = []
     number = 0
     while True:
@@ -37,15 +37,15 @@ def relay(near: int, far: int, delay: float, jitter: float, loss: float) -> None
             _, _, target, frame = heapq.heappop(waiting)
             try:
                 os.write(target, frame)
-            except OSError:  # not up yet, or full: lost, as on a wire
+            except OSError:  # the device is not up yet or its queue is full: the frame is lost
                 continue
         until = waiting[0][0] - now if waiting else None
         for source in select.select([near, far], [], [], until)[0]:
-            frame = os.read(source, LARGEST)
-            if chance.random() < loss:
+            frame = os.read(source, MAX_FRAME_BYTES)
+            if rng.random() < loss:
                 continue
             number += 1
-            due = time.monotonic() + max(0.0, delay + chance.uniform(-jitter, jitter))
+            due = time.monotonic() + max(0.0, delay + rng.uniform(-jitter, jitter))
             heapq.heappush(waiting, (due, number, other[source], frame))
 
 

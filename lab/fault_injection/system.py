@@ -18,23 +18,24 @@ from common.errors import UserError
 from common.messages.definitions import Goal, Pose
 from common.messages.topics import GOAL
 from lab.fault_injection.hosts import Network
-from lab.fault_injection.timeline import Row, Timeline, back
+from lab.fault_injection.timeline import Row, Timeline, is_back
 from presage.session.ports import free_port
 from presage.session.stack import Stack
 
 ROBOT = "chaos"
 WORLD = "corridor"
-ENDS = ((2.5, 1.5), (15.5, 1.5))  # m, goals in turn
-FAST = 0.9  # m/s, of the robot when a fault comes
-ROOM = 5.0  # m it still has to go then
-PATIENCE = 60.0  # s
-WHERE = {"simulator": "robot", "controller": "robot", "observer": "robot", "estimator": "brain"}  # others: here
+GOALS = ((2.5, 1.5), (15.5, 1.5))  # m; the robot drives back and forth between them
+FAULT_SPEED = 0.9  # m/s, minimum speed when a fault is injected
+MIN_DISTANCE_TO_GOAL = 5.0  # m, when a fault is injected
+TIMEOUT_S = 60.0
+# Host of each process; the others run in this process's namespace.
+HOST_OF = {"simulator": "robot", "controller": "robot", "observer": "robot", "estimator": "brain"}
 
 
 class System(Stack):
-    """All services, three hosts where there is a network, else this one; a context manager."""
+    """All services, on three hosts if a network is given, otherwise on one; a context manager."""
 
-    orphan_signal = signal.SIGKILL  # one that is frozen would not end by SIGTERM
+    orphan_signal = signal.SIGKILL  # a frozen process ignores SIGTERM
 
     def __init__(
         self,
@@ -45,12 +46,12 @@ class System(Stack):
         quiet: bool = True,
         beams: int = 271,
     ) -> None:
-        """Recordings and logs go into ``folder``."""
+        """Recordings and logs are written into ``folder``."""
         super().__init__(ROBOT, free_port(), quiet=quiet, environment=environment)
         self.folder, self.network, self.beams = folder, network, beams
         self.timeline = Timeline()
-        self.goal = 0  # how many were set
-        self.extra: dict[str, dict[str, str]] = {}  # of one process's environment
+        self.goal = 0  # number of goals sent so far
+        self.extra: dict[str, dict[str, str]] = {}  # additional environment variables by process
         self.arguments = {
             "simulator": ["--world", WORLD, "--beams", str(beams)],
             "estimator": ["--world", WORLD],
@@ -59,29 +60,29 @@ class System(Stack):
             "viewer": ["--port", "0", "--recordings", str(folder / "recordings")],
         }
         if network is not None:
-            for name in sorted({*WHERE.values()}):
+            for name in sorted({*HOST_OF.values()}):
                 network.add(name)
 
     @property
     def endpoint(self) -> str:
-        """The router's, as all hosts see it."""
+        """The router's endpoint, as seen from all hosts."""
         return f"tcp/{'127.0.0.1' if self.network is None else self.network.here}:{self.port}"
 
     def router_endpoints(self) -> str:
-        """For the other hosts, too."""
+        """Endpoints on which the router listens: loopback, and the address for the other hosts."""
         return self.endpoint if self.network is None else f"tcp/127.0.0.1:{self.port},{self.endpoint}"
 
     def command(self, name: str, args: list[str]) -> list[str]:
-        """On its host."""
-        entering = [] if self.network is None or name not in WHERE else self.network.hosts[WHERE[name]].entering
+        """The command line that starts a process on its host."""
+        entering = [] if self.network is None or name not in HOST_OF else self.network.hosts[HOST_OF[name]].entering
         return [*entering, sys.executable, *args]
 
     def child_environment(self, name: str) -> Mapping[str, str]:
-        """Services listen where the other hosts reach them."""
+        """Environment variables of a process; with several hosts it listens on its host's address."""
         more = {"PRESAGE_INSECURE": "1", **self.extra.get(name, {})}
         if self.network is None or name == "router":
             return more
-        host = self.network.hosts[WHERE[name]].address if name in WHERE else self.network.here
+        host = self.network.hosts[HOST_OF[name]].address if name in HOST_OF else self.network.here
         return {"PRESAGE_LISTEN": f"tcp/{host}:0", **more}
 
     def __enter__(self) -> Self:
@@ -92,7 +93,7 @@ class System(Stack):
         for service in self.arguments:
             self.begin(service)
         for service in self.arguments:
-            self.timeline.wait(0, back(service), PATIENCE, f"start of the {service}")
+            self.timeline.wait(0, is_back(service), TIMEOUT_S, f"start of the {service}")
         return self
 
     def __exit__(
@@ -106,75 +107,78 @@ class System(Stack):
     # ---- processes
 
     def begin(self, service: str) -> None:
-        """Start a service with its own arguments; one that ended before is forgotten."""
+        """Start a service with its arguments."""
         if service == "router":
             self.start_router()
         else:
             self.start(service, *self.arguments[service])
 
     def start_module(self, name: str, service: str, *args: str) -> None:
-        """One more instance of a service, under a name of its own."""
+        """Start one more instance of a service under another name."""
         self._spawn(name, ["-m", f"services.{service}", *args])
 
     def signal(self, name: str, number: int) -> None:
-        """To a process that still runs."""
+        """Send a signal to a process if it still runs."""
         process = self.processes.get(name)
         if process is not None and process.child.poll() is None:
             process.child.send_signal(number)
 
     def kill(self, *names: str) -> None:
-        """Without a word; they are gone when this returns."""
+        """Kill processes with SIGKILL and wait until they have ended."""
         for name in names:
             self.processes[name].child.kill()
         for name in names:
             self.stop(name)
 
     def restart(self, *names: str) -> None:
-        """Start again what was killed; returns when all say that they are there."""
+        """Restart killed services and wait until their liveliness tokens appear."""
         since = time.monotonic()
         for name in names:
             self.begin(name)
         for name in names:
             if name != "router":
-                self.timeline.wait(since, back(name), PATIENCE, f"return of the {name}")
+                self.timeline.wait(since, is_back(name), TIMEOUT_S, f"return of the {name}")
 
     # ---- the robot
 
-    def drive(self) -> Row:
-        """Until the robot goes fast, with room before it: the row that says so. Goals are its two ends in turn."""
-        deadline, since = time.monotonic() + 2 * PATIENCE, time.monotonic()
+    def drive_fast(self) -> Row:
+        """Drive until the robot is fast and far from its goal. Returns the event that shows it.
+
+        Raises UserError if that does not happen in time.
+        """
+        deadline, since = time.monotonic() + 2 * TIMEOUT_S, time.monotonic()
         while time.monotonic() < deadline:
             status = self._latest("status")
             if status is None or status["state"] in {"idle", "reached"} or self.goal == 0:
                 since = time.monotonic()
-                self.aim()
-            row = self.timeline.wait(since, lambda r: r["what"] == "status", PATIENCE, "a word of the controller")
+                self.set_far_goal()
+            row = self.timeline.wait(since, lambda r: r["what"] == "status", TIMEOUT_S, "a status of the controller")
             since = row["t"] + 1e-6
             distance, speed = row["distance"], self._latest("truth")
             if row["state"] == "navigating" and row["goal_seq"] == self.goal and distance and speed is not None:
-                if speed["speed"] >= FAST and distance > ROOM:
+                if speed["speed"] >= FAULT_SPEED and distance > MIN_DISTANCE_TO_GOAL:
                     return speed
-                if speed["speed"] >= FAST:
-                    self.aim()  # too near: the other end
-        raise UserError(f"the robot did not get going: {self._latest('status')}")
+                if speed["speed"] >= FAULT_SPEED:
+                    self.set_far_goal()  # too close to the goal: turn around
+        raise UserError(f"the robot did not reach {FAULT_SPEED:g} m/s; the last status: {self._latest('status')}")
 
-    def aim(self) -> None:
-        """The end that is farther from where the robot is."""
+    def set_far_goal(self) -> None:
+        """Send the goal that is farther from the robot."""
         here = self._latest("truth")
         x = here["place"][0] if here is not None else 0.0
-        goal = max(ENDS, key=lambda end: abs(end[0] - x))
+        goal = max(GOALS, key=lambda end: abs(end[0] - x))
         self.goal += 1
-        if not self.bus.wait_matching(GOAL, PATIENCE):
-            raise UserError("nobody hears a goal")
+        if not self.bus.wait_matching(GOAL, TIMEOUT_S):
+            raise UserError(f"no controller subscribed to goals within {TIMEOUT_S:g} s")
         self.bus.put(GOAL, Goal(stamp_ns=0, seq=self.goal, pose=Pose(x=goal[0], y=goal[1])).encode())
 
     def _latest(self, what: str) -> Row | None:
         return next((row for row in reversed(self.timeline.rows) if row["what"] == what), None)
 
     def on_output(self, name: str, line: str) -> None:
-        """Lines of the observer are what it saw; other lines may tell of a fault."""
+        """Add a process's output line to the timeline: the observer's lines as events, others as text."""
         row: Row = {"t": time.monotonic(), "what": "line", "name": name, "line": line}
         if name == "observer":
-            with suppress(json.JSONDecodeError):  # zenoh's own lines may come between
+            with suppress(json.JSONDecodeError):  # zenoh may print lines of its own
                 row = json.loads(line)
         self.timeline.add(row)

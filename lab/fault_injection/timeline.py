@@ -10,33 +10,36 @@ from typing import Any
 from common.errors import UserError
 
 Row = dict[str, Any]
-STANDING = 0.01  # m/s
-MOVING = 0.05  # m/s
+MAX_STANDING_SPEED = 0.01  # m/s
+MIN_MOVING_SPEED = 0.05  # m/s
 
 
 class Timeline:
-    """Rows as they come from the observer; filled by one thread, read by another."""
+    """Events from the observer in the order of arrival; one thread adds them, another reads them."""
 
     def __init__(self) -> None:
-        """Empty."""
+        """Start without events."""
         self.rows: list[Row] = []
-        self._lock = threading.RLock()  # entered by itself: Ctrl-C in Condition's __enter__ would leave it locked
+        self._lock = threading.RLock()  # entered directly, because Ctrl-C in Condition.__enter__ would leave it locked
         self._changed = threading.Condition(self._lock)
 
     def add(self, row: Row) -> None:
-        """A row came."""
+        """Append an event and wake up waiting threads."""
         with self._lock:
             self.rows.append(row)
             self._changed.notify_all()
 
     def first(self, since: float, wanted: Callable[[Row], bool], until: float = float("inf")) -> Row | None:
-        """The first row from ``since`` s on that is wanted."""
+        """The first event at or after ``since`` (s) and before ``until`` for which ``wanted`` is true, if any."""
         with self._lock:
             rows = list(self.rows)
         return next((row for row in rows if since <= row["t"] < until and wanted(row)), None)
 
     def wait(self, since: float, wanted: Callable[[Row], bool], timeout: float, what: str) -> Row:
-        """The first such row, as soon as it is there; raises UserError naming ``what`` did not happen."""
+        """Waits for the first event at or after ``since`` (s) for which ``wanted`` is true, and returns it.
+
+        Raises UserError that ``what`` did not happen if there is none within ``timeout`` s.
+        """
         deadline = time.monotonic() + timeout
         at = 0
         while True:
@@ -48,39 +51,39 @@ class Timeline:
                 if not self._changed.wait(max(0.0, min(0.5, deadline - time.monotonic()))) and (
                     time.monotonic() >= deadline
                 ):
-                    raise UserError(f"{what}: not within {timeout:g} s")
+                    raise UserError(f"{what}: did not happen within {timeout:g} s")
 
     def forget(self, before: float) -> None:
-        """Rows older than ``before`` s, which nobody will ask for."""
+        """Remove events before the time ``before`` (s)."""
         with self._lock:
             self.rows = [row for row in self.rows if row["t"] >= before]
 
 
-def truth(row: Row) -> bool:
-    """Of the robot itself."""
+def is_truth(row: Row) -> bool:
+    """Whether the event is the robot's true state."""
     return bool(row["what"] == "truth")
 
 
-def standing(row: Row) -> bool:
-    """The robot stands."""
-    return truth(row) and row["speed"] < STANDING
+def is_standing(row: Row) -> bool:
+    """Whether the event shows that the robot stands."""
+    return is_truth(row) and row["speed"] < MAX_STANDING_SPEED
 
 
-def moving(row: Row) -> bool:
-    """It moves."""
-    return truth(row) and row["speed"] > MOVING
+def is_moving(row: Row) -> bool:
+    """Whether the event shows that the robot moves."""
+    return is_truth(row) and row["speed"] > MIN_MOVING_SPEED
 
 
-def gone(service: str) -> Callable[[Row], bool]:
-    """The service's liveliness token is gone."""
+def is_gone(service: str) -> Callable[[Row], bool]:
+    """Returns a predicate: whether an event shows that the service's liveliness token disappeared."""
     return lambda row: row["what"] == "alive" and row["service"] == service and not row["there"]
 
 
-def back(service: str) -> Callable[[Row], bool]:
-    """It is there."""
+def is_back(service: str) -> Callable[[Row], bool]:
+    """Returns a predicate: whether an event shows that the service's liveliness token appeared."""
     return lambda row: row["what"] == "alive" and row["service"] == service and bool(row["there"])
 
 
-def worried(row: Row) -> bool:
-    """The controller says that it lost its belief."""
+def is_lost(row: Row) -> bool:
+    """Whether the event is a controller status `lost`."""
     return bool(row["what"] == "status" and row["state"] == "lost")

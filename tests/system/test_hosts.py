@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from lab.fault_injection.hosts import why_no_hosts
+from lab.fault_injection.hosts import missing_for_namespaces
 from services.recorder.reader import read_recording
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_the_three_hosts_of_the_page_drive_the_robot_to_its_goal(process, tmp_path):
-    if why := why_no_hosts():
+    if why := missing_for_namespaces():
         print(f"\n==== NO NETWORK NAMESPACES HERE ({why}): several hosts were NOT tested ====", file=sys.__stderr__)
         pytest.skip(f"several hosts were NOT tested: {why}")
     script = ROOT / "tests" / "system" / "three_hosts.py"
