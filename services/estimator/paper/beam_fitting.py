@@ -1,8 +1,9 @@
 """Resamples another scanner's scan to the beams of the training, or refuses it.
 
-Each of the model's beams takes the range between the two beams of the scan on either side of it, linearly. That holds
-where the scan looks wherever the model does, with beams at most `COARSEST` times as far apart, from the same place on
-the robot; a scanner turned or hung upside down is no hindrance, for only directions in base_link count.
+The range of each of the model's beams is interpolated linearly between the two nearest beams of the scan. This is
+possible if the scan covers the model's field of view, with beams at most `MAX_SPACING_RATIO` times as far apart, from
+the same position on the robot. A scanner may be rotated or mounted upside down, because only directions in base_link
+matter.
 """
 
 from __future__ import annotations
@@ -20,53 +21,53 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.robot.scanner import Scanner
 
-TOLERANCE = 1e-4  # rad and m; nearer is the same
-ROUND = 360.1  # deg, from the first beam to the last; some drivers measure the first direction twice
-COARSEST = 4.0  # times the model's spacing
+TOLERANCE = 1e-4  # rad and m; smaller differences are ignored
+MAX_FIELD_OF_VIEW_DEG = 360.1  # from the first beam to the last; some drivers measure the first direction twice
+MAX_SPACING_RATIO = 4.0  # of the scan's beams, relative to the model's
 
 
 @dataclass(frozen=True)
 class Fit:
-    """From B beams of a scan to the M of a model and back."""
+    """Converts between the B beams of a scan and the M beams of a model."""
 
-    own: Array  # (M,) rad, the model's beams from the middle of its view, ascending
-    order: npt.NDArray[np.intp]  # (M,) which of its beams these are
-    low: npt.NDArray[np.intp]  # (M,) beam of the scan before each, and
-    high: npt.NDArray[np.intp]  # (M,) after
-    share: Array  # (M,) of the second
-    middle: float  # rad, of the model's view, in the scan's laser frame
-    same: bool  # beam for beam: nothing is computed
+    model_angles: Array  # (M,) rad, the model's beams relative to the centre of its view, ascending
+    order: npt.NDArray[np.intp]  # (M,) indices of these beams in the model
+    before: npt.NDArray[np.intp]  # (M,) the scan's beam before each of them
+    after: npt.NDArray[np.intp]  # (M,) the scan's beam after each of them
+    share: Array  # (M,) weight of the beam after it
+    view_centre: float  # rad, centre of the model's view in the scan's laser frame
+    same: bool  # the beams are identical, so that nothing is interpolated
 
     def ranges(self, ranges: Array) -> Array:
-        """(M,) m the model's beams measure, of finite ranges (B,) m."""
+        """Ranges (M,) in m along the model's beams, from the scan's finite ranges (B,) m."""
         if self.same:
             return ranges
-        found = np.empty(len(self.own))
-        found[self.order] = (1 - self.share) * ranges[self.low] + self.share * ranges[self.high]
+        found = np.empty(len(self.model_angles))
+        found[self.order] = (1 - self.share) * ranges[self.before] + self.share * ranges[self.after]
         return found
 
-    def of_all(self, beams: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-        """(M,) which of the model's beams are made of none but these (B,) of the scan's."""
+    def valid_beams(self, valid: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """Whether each of the model's beams (M,) is computed from ``valid`` beams of the scan (B,) only."""
         if self.same:
-            return beams
-        found = np.empty(len(self.own), bool)
-        found[self.order] = (beams[self.low] | (self.share >= 1)) & (beams[self.high] | (self.share <= 0))
+            return valid
+        found = np.empty(len(self.model_angles), bool)
+        found[self.order] = (valid[self.before] | (self.share >= 1)) & (valid[self.after] | (self.share <= 0))
         return found
 
     def predicted(self, ranges: Array, angles: Array) -> Array:
-        """(N, B) m expected along the scan's beams at ``angles`` (B,) rad, of the model's (N, M); +inf outside."""
-        off = wrap(angles - self.middle)
+        """Ranges (N, B) in m along the scan's beams at ``angles`` (B,) rad, from the model's (N, M); +inf outside."""
+        off = wrap(angles - self.view_centre)
         ascending = np.atleast_2d(ranges)[:, self.order]
-        inside = (off >= self.own[0] - TOLERANCE) & (off <= self.own[-1] + TOLERANCE)
+        inside = (off >= self.model_angles[0] - TOLERANCE) & (off <= self.model_angles[-1] + TOLERANCE)
         found = np.full((len(ascending), len(off)), np.inf)
-        found[:, inside] = [np.interp(off[inside], self.own, row) for row in ascending]
+        found[:, inside] = [np.interp(off[inside], self.model_angles, row) for row in ascending]
         return found
 
 
 def fit(scanner: Scanner, angles: Array, mount: Array, remedy: str) -> Fit:
-    """How scans at ``angles`` (B,) rad of a laser mounted at ``mount`` (3,) serve a model of ``scanner``.
+    """Returns the conversion of scans at ``angles`` (B,) rad, of a laser at ``mount`` (3,), for a model of ``scanner``.
 
-    Raises UserError where they do not, saying why; ``remedy`` is the command that helps.
+    Raises UserError with the reason if the scans do not suit the model; ``remedy`` is the command that trains another.
     """
 
     def refuse(why: str) -> UserError:
@@ -77,29 +78,32 @@ def fit(scanner: Scanner, angles: Array, mount: Array, remedy: str) -> Fit:
     if off > TOLERANCE:
         here, there = (f"({x:g}, {y:g}) m" for x, y in (mount[:2], scanner.mount[:2]))
         raise refuse(f"its laser is mounted at {here}, theirs at {there}")
-    if (round_deg := float(np.rad2deg(np.ptp(angles)))) > ROUND:
+    if (round_deg := float(np.rad2deg(np.ptp(angles)))) > MAX_FIELD_OF_VIEW_DEG:
         raise refuse(f"its beams go round more than once, {round_deg:.0f} deg from the first to the last")
     turned = float(mount[2]) - scanner.mount[2]
-    middle = scanner.angle_min + scanner.angle_increment * (scanner.beams - 1) / 2
-    own = scanner.angles() - middle
-    seen = wrap(angles + turned - middle)
-    same = len(angles) == scanner.beams and float(np.abs(wrap(seen - own)).max()) < TOLERANCE
-    order, by_angle = np.argsort(own), np.argsort(seen)
-    # Once more on either side, for views that go all round.
-    around = np.concatenate([seen[by_angle] - 2 * np.pi, seen[by_angle], seen[by_angle] + 2 * np.pi])
+    centre = scanner.angle_min + scanner.angle_increment * (scanner.beams - 1) / 2
+    model_angles = scanner.angles() - centre
+    scan_angles = wrap(angles + turned - centre)
+    same = len(angles) == scanner.beams and float(np.abs(wrap(scan_angles - model_angles)).max()) < TOLERANCE
+    order, by_angle = np.argsort(model_angles), np.argsort(scan_angles)
+    # Repeated by a full turn to either side, for scanners that look all round.
+    around = np.concatenate(
+        [scan_angles[by_angle] - 2 * np.pi, scan_angles[by_angle], scan_angles[by_angle] + 2 * np.pi]
+    )
     index = np.tile(by_angle, 3)
-    asc = own[order]
-    after = np.searchsorted(around, asc - TOLERANCE)
+    ascending = model_angles[order]
+    after = np.searchsorted(around, ascending - TOLERANCE)
     before = np.maximum(after - 1, 0)
-    at = np.abs(around[after] - asc) <= TOLERANCE
-    gap = np.where(at, 0.0, around[after] - around[before])
-    most = COARSEST * abs(scanner.angle_increment)
-    if (gap > most).any() and not same:
-        spacing = float(np.median(np.diff(np.sort(seen))))
-        if spacing > most:
-            apart = f"its beams are {np.rad2deg(spacing):.2f} deg apart, theirs {np.rad2deg(most / COARSEST):.2f}"
-            raise refuse(f"{apart}, and {COARSEST:g} times as far is the most")
-        blind = np.rad2deg(float(wrap(asc[np.argmax(gap)] + middle + scanner.mount[2])))
+    exact = np.abs(around[after] - ascending) <= TOLERANCE
+    gap = np.where(exact, 0.0, around[after] - around[before])
+    max_gap = MAX_SPACING_RATIO * abs(scanner.angle_increment)
+    if (gap > max_gap).any() and not same:
+        spacing = float(np.median(np.diff(np.sort(scan_angles))))
+        if spacing > max_gap:
+            model_spacing = np.rad2deg(max_gap / MAX_SPACING_RATIO)
+            apart = f"its beams are {np.rad2deg(spacing):.2f} deg apart, theirs {model_spacing:.2f}"
+            raise refuse(f"{apart}, and {MAX_SPACING_RATIO:g} times as far is the most")
+        blind = np.rad2deg(float(wrap(ascending[np.argmax(gap)] + centre + scanner.mount[2])))
         raise refuse(f"it does not look towards {blind:.0f} deg of base_link, as they do")
-    share = np.where(at, 1.0, (asc - around[before]) / np.maximum(gap, 1e-12))
-    return Fit(asc, order, index[before], index[after], share, middle - turned, same)
+    share = np.where(exact, 1.0, (ascending - around[before]) / np.maximum(gap, 1e-12))
+    return Fit(ascending, order, index[before], index[after], share, centre - turned, same)

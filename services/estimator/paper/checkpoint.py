@@ -17,14 +17,14 @@ import safetensors.torch
 from common.errors import UserError
 from services.estimator.paper.training import Data, Trainer
 
-DAMAGED = (zipfile.BadZipFile, zlib.error, safetensors.SafetensorError)
+DAMAGED_FILE_ERRORS = (zipfile.BadZipFile, zlib.error, safetensors.SafetensorError)
 
 
 class Checkpoint:
-    """A folder that exists while a training is unfinished; ``recipe`` must match for it to be taken up again."""
+    """State of an unfinished training in a folder, from which a training with the same ``recipe`` can resume."""
 
     def __init__(self, folder: Path, recipe: dict[str, Any]) -> None:
-        """What was left for another recipe is thrown away; ``discarded`` says whether there was any."""
+        """Removes the state of a training with another recipe; ``discarded`` tells whether there was any."""
         self.folder, self.recipe = folder, json.loads(json.dumps(recipe))
         self.discarded = False
         if folder.exists() and self._read("recipe.json") != self.recipe:
@@ -34,7 +34,7 @@ class Checkpoint:
         self._write("recipe.json", self.recipe)
 
     def samples(self, name: str) -> Data | None:
-        """Samples that were kept, or None; raises UserError where they cannot be read."""
+        """Returns the stored samples, or None if there are none. Raises UserError if they cannot be read."""
         path = self.folder / f"{name}.npz"
         if not path.exists():
             return None
@@ -45,25 +45,25 @@ class Checkpoint:
             return Data(poses, ranges)
 
     def keep_samples(self, name: str, data: Data) -> None:
-        """Keep samples for a later run."""
+        """Stores samples for a later run."""
         partial = self.folder / f"{name}.partial.npz"
         np.savez(partial, poses=data.poses, ranges=data.ranges.astype(np.float32))
         partial.replace(self.folder / f"{name}.npz")
 
     def save(self, trainer: Trainer) -> None:
-        """Keep where training stands; the last complete state survives an interruption."""
+        """Stores the state of the training atomically."""
         state = trainer.state()
         tensors = {f"decoder.{name}": tensor.contiguous() for name, tensor in state["decoder"].items()}
         for index, slots in state["optimiser"]["state"].items():
             tensors |= {f"adam.{index}.{name}": tensor.contiguous() for name, tensor in slots.items()}
-        # One file, so that weights and progress cannot disagree.
+        # Weights and progress are in one file, so that they are always consistent.
         meta = {"progress": json.dumps(state["progress"])}
         partial = self.folder / "state.partial"
         safetensors.torch.save_file(tensors, partial, metadata=meta)
         partial.replace(self.folder / "state.safetensors")
 
     def restore(self, trainer: Trainer) -> bool:
-        """Carry on from what was saved; False where nothing was. Raises UserError where it cannot be read."""
+        """Restores the stored state; returns False if there is none. Raises UserError if it cannot be read."""
         path = self.folder / "state.safetensors"
         if not path.exists():
             return False
@@ -87,17 +87,26 @@ class Checkpoint:
 
     @contextmanager
     def _reading(self, path: Path) -> Iterator[None]:
-        """Whatever is wrong with a file, in one line."""
+        """Converts every error that a damaged file can cause to a UserError."""
         try:
             yield
-        except (OSError, EOFError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, *DAMAGED) as error:
+        except (
+            OSError,
+            EOFError,
+            LookupError,
+            ValueError,
+            TypeError,
+            AttributeError,
+            RuntimeError,
+            *DAMAGED_FILE_ERRORS,
+        ) as error:
             raise UserError(
-                f"{path}: the unfinished training cannot be taken up ({' '.join(str(error).split())[:200]}); "
+                f"{path}: the unfinished training cannot be resumed ({' '.join(str(error).split())[:200]}); "
                 f"remove {self.folder} and train from the start"
             ) from None
 
     def finish(self) -> None:
-        """The weights are written: nothing is left to take up."""
+        """Removes the folder, once the weights are written."""
         shutil.rmtree(self.folder)
 
     def _read(self, name: str) -> Any:

@@ -22,78 +22,95 @@ if TYPE_CHECKING:
     from services.estimator.paper.decoder import PaperModel
     from services.estimator.paper.weights import ModelCard
 
-HEADING_TOLERANCE = 1e-3  # rad, between a pose's and the model's
+HEADING_TOLERANCE_RAD = 1e-3  # between a pose and the model
 
 
 class PaperPerception:
-    """The paper's estimator; the heading is the one of its training, there is no covariance."""
+    """The paper's estimator of x and y, for the one heading of its training, without covariance."""
 
     name = "paper"
 
     def __init__(
         self, model: PaperModel, card: ModelCard, descent: Descent, pose: Array | None = None, fit: Fit | None = None
     ) -> None:
-        """``pose`` (3,) to begin with; none: the map's centre. ``fit``: of another scanner's scans; none: its own."""
+        """``pose`` (3,) is the initial pose, by default the centre of the map.
+
+        ``fit`` converts scans of another scanner; by default scans have the beams of the training.
+        """
         self.card, self.model = card, model
         self.fit = fit or own_fit(card.scanner, card.scanner.angles(), np.array(card.scanner.mount), "")
         self._first = pose
         self.estimator = PaperEstimator(
-            model, card.test_l1_mean, card.world.bounds, self._initial(pose), descent,
-            model.norm.metric, known=pose is not None,
-        )  # fmt: skip
+            model,
+            card.test_l1_mean,
+            card.world.bounds,
+            self._initial(pose),
+            descent,
+            model.norm.metric,
+            known=pose is not None,
+        )
 
     def _initial(self, pose: Array | None) -> Array:
         x, y = self.card.world.center() if pose is None else pose[:2]
         return np.array([x, y, self.card.heading])
 
     def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:  # noqa: ARG002
-        """Begin anew at ``pose``, or where it began first; the heading and a covariance are not used."""
+        """Starts at ``pose`` or, by default, at the first initial pose; its heading and the covariance are not used."""
         self.estimator.restart(self._initial(self._first if pose is None else pose), known=pose is not None)
 
     def update(self, observation: Observation) -> Posterior:
-        """Descend on one scan."""
+        """Returns the posterior after descending on one scan."""
         return alone(self.updating(observation))
 
     def updating(self, observation: Observation) -> Conversation[Posterior]:
-        """The same as a conversation: see `asking`."""
+        """`update` as a generator; see `services.estimator.shared.asking`."""
         ranges = self.fit.ranges(usable_ranges(observation.ranges, observation.range_max))
-        says = self.fit.of_all(observation.ranges > -np.inf)
-        estimate = yield from self.estimator.updating(ranges, observation.goal, says)
+        measured = self.fit.valid_beams(observation.ranges > -np.inf)
+        estimate = yield from self.estimator.updating(ranges, observation.goal, measured)
         found = estimate.gradient
+        predicted = estimate.predicted
+        if not self.fit.same:
+            predicted = self.fit.predicted(predicted, observation.angles)[0]
         return Posterior(
-            estimate.state,
-            (Hypothesis(estimate.pose, None, 1.0),),
-            found.accuracy,
-            found.attraction,
-            found.xi,
-            found.curvature,
-            estimate.predicted if self.fit.same else self.fit.predicted(estimate.predicted, observation.angles)[0],
+            state=estimate.state,
+            hypotheses=(Hypothesis(estimate.pose, None, 1.0),),
+            accuracy=found.accuracy,
+            complexity=found.attraction,
+            xi=found.xi,
+            curvature=found.curvature,
+            predicted=predicted,
         )
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
-        """See Estimator: the decoder knows one heading; +inf where it has no beams. Sigma is its mean error."""
+        """Predicts scans (see Estimator), at the decoder's heading only; +inf where it has no beams.
+
+        Sigma is the decoder's mean error on test scans.
+        """
         off = np.abs(se2.wrap(poses[:, 2] - self.card.heading))
-        if (off > HEADING_TOLERANCE).any():
+        if (off > HEADING_TOLERANCE_RAD).any():
             raise UserError(
                 f"preset paper predicts at its one heading, {np.rad2deg(self.card.heading):.1f} deg, "
                 f"and was asked for {np.rad2deg(poses[off.argmax(), 2]):.1f} deg"
             )
-        # Far outside the map single precision has no number.
+        # Far outside the map the result is not finite in single precision.
         ranges = np.nan_to_num(self.fit.predicted(self.model.ranges(poses), angles), nan=np.inf, posinf=np.inf)
         return Predicted(ranges, np.full(ranges.shape, self.card.test_l1_mean))
 
 
 class PaperScans:
-    """The paper's decoder as a generative model: one heading, the beams of its training, no derivative by yaw."""
+    """The paper's decoder as a GenerativeModel.
 
-    ripple = 0.0  # not known
+    It predicts at one heading, only the beams of its training, and without derivative by yaw.
+    """
+
+    ripple = 0.0  # unknown
 
     def __init__(self, model: PaperModel, scanner: Scanner, heading: float, scale: float) -> None:
-        """``scale`` m is the stated error of every beam: this decoder has one precision for all."""
+        """``scale`` m is the stated error of every beam, since the decoder has the same precision for all."""
         self.model, self.scanner, self.heading, self.scale = model, scanner, heading, scale
 
     def expect(self, lasers: Array, angles: Array) -> Expected:
-        """See GenerativeModel; raises UserError for other beams than those of the training."""
+        """Predicts scans (see GenerativeModel). Raises UserError for other beams than those of the training."""
         scanner = self.scanner
         own = scanner.angles()
         index = np.abs(own[None, :] - se2.wrap(angles)[:, None]).argmin(axis=1)

@@ -17,37 +17,37 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Gradient:
-    """F at a belief, and where it falls."""
+    """Parts of F at a belief, and their gradients."""
 
     accuracy: float  # nats, -ln N(o; g, Sigma_o)
-    attraction: float  # nats, beta-weighted misfit between what is expected here and at the goal
+    attraction: float  # nats, beta-weighted difference between the scans expected here and at the goal
     xi: Array  # (3,) dg' Sigma_o^-1 (o - g), minus the gradient of accuracy
     xi_goal: Array  # (3,) minus the gradient of attraction
     curvature: Array  # (3, 3) dg' Sigma_o^-1 dg, Gauss-Newton Hessian of accuracy
 
     @property
     def descent(self) -> Array:
-        """(3,) minus the gradient of F: the direction of equation 3 with the signs of descent."""
+        """Minus the gradient of F (3,): the direction of equation 3 with the signs of descent."""
         return self.xi + self.xi_goal
 
 
 def accuracy(o: Array, g: Array, precision: Array) -> float:
-    """-ln N(o; g, diag(1 / precision)) in nats, the whole density with its constant."""
+    """-ln N(o; g, diag(1 / precision)) in nats, including the constant."""
     return float(0.5 * np.sum(precision * (o - g) ** 2 - np.log(precision / (2 * np.pi))))
 
 
 def attraction(g: Array, g_goal: Array, precision: Array, beta: float) -> float:
-    """beta/2 (g_goal - g)' Sigma^-1 (g_goal - g) in nats: how unlike the preferred scan the expected one is."""
+    """beta/2 (g_goal - g)' Sigma^-1 (g_goal - g) in nats, the distance of the expected scan from the preferred one."""
     return float(0.5 * beta * np.sum(precision * (g_goal - g) ** 2))
 
 
 def gradient(
     o: Array, g: Array, dg: Array, precision: Array, g_goal: Array | None = None, beta: float = 0.0
 ) -> Gradient:
-    """Equation 3 of the paper, both terms, with the signs that descend F.
+    """Both terms of equation 3 of the paper, with the signs that descend F.
 
-    As printed the goal term is + beta dg' Sigma^-1 (o - g_goal), which to first order is beta H (x - x_goal): away
-    from the goal. Minus the gradient of `attraction` is + beta dg' Sigma^-1 (g_goal - g).
+    The goal term as printed is + beta dg' Sigma^-1 (o - g_goal). To first order this is beta H (x - x_goal), which
+    points away from the goal. Minus the gradient of `attraction` is + beta dg' Sigma^-1 (g_goal - g).
     """
     weighted = dg.T * precision
     pull = weighted @ (g_goal - g) * beta if g_goal is not None else np.zeros(3)

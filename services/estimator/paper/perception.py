@@ -23,20 +23,22 @@ State = Literal["localising", "tracking", "lost"]
 
 @dataclass(frozen=True)
 class Descent:
-    """The paper's parameters. Sigma_o = 1 m² on every beam, as there."""
+    """The paper's parameters; Sigma_o is 1 m² for every beam, as in the paper."""
 
-    alpha: float = 2e-3  # m², step size along the map's longest axis; twice that and the belief swings near walls
-    beta: float = 0.0  # weight of the goal's attraction in perception; 0 leaves the goal to the controller
-    iterations: int = 10  # gradient steps a scan; the paper makes 1, but its robot stands between two steps
-    max_step: float = 0.5  # m, a longer step of one scan is shortened
+    alpha: float = (
+        2e-3  # m², step size along the map's longest axis; with twice the value the belief oscillates near walls
+    )
+    beta: float = 0.0  # weight of the goal's attraction in perception; with 0 only the controller uses the goal
+    iterations: int = 10  # gradient steps per scan; the paper makes 1, but its robot stands still between two steps
+    max_step: float = 0.5  # m, longer steps are shortened
     settled_step: float = 0.03  # m, mean step below which the belief counts as settled
-    settled_misfit: float = 2.0  # times the model's own error on test scans
+    settled_misfit: float = 2.0  # relative to the model's error on test scans, below which the scan fits
     window: int = 10  # scans over which step and misfit are averaged
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What one scan made of the belief."""
+    """The belief after one scan."""
 
     pose: Array  # (3,) base_link in map
     predicted: Array  # (B,) m, g at the pose
@@ -46,7 +48,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Decode:
-    """The question preset `paper` asks (see `asking`): what is expected at a pose, and its derivative."""
+    """`GenerativeModel.predict` as a question (see `services.estimator.shared.asking`)."""
 
     model: GenerativeModel
     pose: Array  # (3,)
@@ -54,60 +56,64 @@ class Decode:
 
     @property
     def alike(self) -> Hashable:
-        """One network."""
+        """Questions to one network can be answered together."""
         return id(self.model)
 
     def answer(self) -> tuple[Array, Array]:
-        """Now."""
+        """Returns the ranges and their derivative."""
         return self.model.predict(self.pose)
 
     def answer_all(self, questions: Sequence[Decode]) -> list[tuple[Array, Array]]:
-        """All poses through the network at once."""
+        """Evaluates the network at all poses at once."""
         ranges, jacobians = self.model.predict_all(np.array([question.pose for question in questions]))
         return list(zip(ranges, jacobians, strict=True))
 
     def in_pieces(self, beams: int) -> Pieces[tuple[Array, Array]]:  # noqa: ARG002
-        """There is but one."""
+        """Answers at once, because one pose cannot be divided."""
         yield from ()
         return self.answer()
 
 
 @dataclass
 class PaperEstimator:
-    """Belief about (x, y); the heading is known and frozen, there is no covariance and no prior in time."""
+    """Belief about (x, y), with a known constant heading, without covariance and without a motion model."""
 
     model: GenerativeModel
     model_error: float  # m, mean absolute error of the model's beams on test scans
-    bounds: tuple[float, float, float, float]  # m, the belief stays within x0, y0, x1, y1
+    bounds: tuple[float, float, float, float]  # m, x0, y0, x1, y1 of the map, within which the belief stays
     pose: Array  # (3,) initial belief
     settings: Descent = field(default_factory=Descent)
-    metric: Array = field(default_factory=lambda: np.ones(2))  # (2,) of alpha by axis, see Normalisation.metric
-    known: bool = False  # the initial belief is where the robot is, so it tracks from the first scan on
+    metric: Array = field(
+        default_factory=lambda: np.ones(2)
+    )  # (2,) factor on alpha for each axis, see Normalisation.metric
+    known: bool = False  # the initial belief is the true pose, so the state is tracking from the first scan on
 
     def __post_init__(self) -> None:
-        """Nothing is known of the first steps."""
+        """Clears the averages of step and misfit."""
         self._steps: list[float] = []
         self._misfits: list[float] = []
         self._was_tracking = self.known
 
     def restart(self, pose: Array, *, known: bool = False) -> None:
-        """Believe ``pose`` (3,): told that it is there, or to localise from there."""
+        """Starts at ``pose`` (3,), which is the true pose if ``known``, else only a start for localisation."""
         self.pose, self.known = np.array(pose, float), known
         self.__post_init__()
 
-    def update(self, ranges: Array, goal: Array | None = None, says: Mask | None = None) -> Estimate:
-        """Descend F for a scan of usable ranges (B,) m; ``goal`` (3,) attracts the belief where beta > 0.
+    def update(self, ranges: Array, goal: Array | None = None, measured: Mask | None = None) -> Estimate:
+        """Descends F for a scan of usable ranges (B,) m; ``goal`` (3,) attracts the belief if beta > 0.
 
-        Beams that are not among ``says`` (B,) say nothing: F is that of the others.
+        ``measured`` (B,) tells which beams to use; by default all.
         """
-        return alone(self.updating(ranges, goal, says))
+        return alone(self.updating(ranges, goal, measured))
 
-    def updating(self, ranges: Array, goal: Array | None = None, says: Mask | None = None) -> Conversation[Estimate]:
-        """The same as a conversation: see `asking`."""
-        used = slice(None) if says is None or says.all() else says
+    def updating(
+        self, ranges: Array, goal: Array | None = None, measured: Mask | None = None
+    ) -> Conversation[Estimate]:
+        """`update` as a generator; see `services.estimator.shared.asking`."""
+        used = slice(None) if measured is None or measured.all() else measured
         ranges = ranges[used]
         precision = np.ones(len(ranges))
-        before = self.pose
+        previous = self.pose
         metric = np.append(self.metric, 1.0)
         g_goal = None
         if goal is not None and self.settings.beta > 0:
@@ -121,9 +127,9 @@ class PaperEstimator:
             self.pose = self._inside(self.pose + step * min(1.0, self.settings.max_step / max(length, 1e-12)))
         g, dg = yield Decode(self.model, self.pose)
         final = gradient(ranges, g[used], dg[used], precision, g_goal, self.settings.beta)
-        # A scan that says nothing fits no worse, and no better, than the one before.
+        # A scan without any measured beam keeps the misfit of the one before.
         misfit = float(np.mean(np.abs(ranges - g[used]))) if len(ranges) else (self._misfits or [np.inf])[-1]
-        state = self._judge(float(np.hypot(*(self.pose - before)[:2])), misfit)
+        state = self._judge(float(np.hypot(*(self.pose - previous)[:2])), misfit)
         return Estimate(self.pose.copy(), g, final, state)
 
     def _inside(self, pose: Array) -> Array:
@@ -131,14 +137,14 @@ class PaperEstimator:
         return np.array([np.clip(pose[0], x0, x1), np.clip(pose[1], y0, y1), pose[2]])
 
     def _judge(self, step: float, misfit: float) -> State:
-        """Tracking once steps are short and the scan fits as well as the model can; lost when it no longer does."""
+        """Tracking once steps are short and the misfit is near the model's error; lost when it no longer is."""
         window = self.settings.window
         self._steps = [*self._steps, step][-window:]
         self._misfits = [*self._misfits, misfit][-window:]
         fits = float(np.mean(self._misfits)) < self.settings.settled_misfit * self.model_error
         settled = len(self._steps) == window and float(np.mean(self._steps)) < self.settings.settled_step
         if self._was_tracking:
-            # Twice the misfit that was needed to begin: no flicker at the border.
+            # Twice the misfit that is allowed at the beginning, so that the state does not flicker at the limit.
             self._was_tracking = float(np.mean(self._misfits)) < 2 * self.settings.settled_misfit * self.model_error
             return "tracking" if self._was_tracking else "lost"
         self._was_tracking = settled and fits

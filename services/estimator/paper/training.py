@@ -17,28 +17,31 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Recipe:
-    """What training depends on, besides the samples."""
+    """Parameters of training."""
 
     epochs: int = 60
     batch: int = 500
-    learning_rate: float = 2e-3  # at first; falls to zero on a half cosine
+    learning_rate: float = 2e-3  # at first; decreases to zero along half a cosine
     seed: int = 0
 
 
 @dataclass
 class Progress:
-    """Where training stands; enough to go on from."""
+    """Progress of a training, from which it can resume."""
 
     epoch: int = 0
-    train_l1: list[float] = field(default_factory=list)  # m, mean over beams, one an epoch
+    train_l1: list[float] = field(default_factory=list)  # m, mean over beams, one per epoch
     test_l1: list[float] = field(default_factory=list)  # m
 
 
 class Trainer:
-    """Trains a decoder epoch by epoch; `state` and `restore` carry an interrupted run on, to the same weights."""
+    """Trains a decoder epoch by epoch.
+
+    With `state` and `restore` an interrupted run can resume, and ends with the same weights.
+    """
 
     def __init__(self, shape: Shape, norm: Normalisation, recipe: Recipe, train: Data, test: Data) -> None:
-        """``train`` and ``test`` are posed scans; same seed and samples, same weights on one machine."""
+        """The same seed and samples give the same weights on one machine."""
         torch.manual_seed(recipe.seed)
         self.recipe, self.norm = recipe, norm
         self.decoder = Decoder(shape)
@@ -47,7 +50,7 @@ class Trainer:
         self._train, self._test = train.tensors(norm), test.tensors(norm)
 
     def run(self, report: Callable[[Progress], None] = lambda _: None) -> PaperModel:
-        """Train what is left of the recipe; ``report`` is called after each epoch."""
+        """Trains the remaining epochs of the recipe; ``report`` is called after each epoch."""
         while self.progress.epoch < self.recipe.epochs:
             self._epoch()
             report(self.progress)
@@ -56,7 +59,7 @@ class Trainer:
     def _epoch(self) -> None:
         recipe, epoch = self.recipe, self.progress.epoch
         positions, ranges = self._train
-        # The order depends on seed and epoch alone, so that a resumed run sees the batches it would have seen.
+        # The order depends only on seed and epoch, so that a resumed run has the same batches.
         order = torch.randperm(len(positions), generator=torch.Generator().manual_seed(recipe.seed * 100_003 + epoch))
         batches = torch.split(order, recipe.batch)
         total = 0.0
@@ -85,7 +88,7 @@ class Trainer:
         return total / ranges.numel() * self.norm.range_scale
 
     def state(self) -> dict[str, Any]:
-        """Everything `restore` needs; tensors and plain numbers only."""
+        """Returns the state for `restore`, as tensors and plain numbers."""
         return {
             "decoder": self.decoder.state_dict(),
             "optimiser": self.optimiser.state_dict(),
@@ -93,7 +96,7 @@ class Trainer:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on where `state` was taken."""
+        """Continues from a state returned by `state`."""
         self.decoder.load_state_dict(state["decoder"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.progress = Progress(**state["progress"])
@@ -101,16 +104,16 @@ class Trainer:
 
 @dataclass(frozen=True)
 class Data:
-    """Posed scans: poses (N, 3) of base_link in map, ranges (N, B) m."""
+    """Scans with known poses: poses (N, 3) of base_link in map, ranges (N, B) m."""
 
     poses: Array
     ranges: Array
 
     def tensors(self, norm: Normalisation) -> tuple[torch.Tensor, torch.Tensor]:
-        """Normalised positions and ranges."""
+        """Returns normalised positions (N, 2) and ranges (N, B)."""
         return norm.position(self.poses), torch.as_tensor(self.ranges / norm.range_scale, dtype=torch.float32)
 
 
 def usable_ranges(ranges: Array, range_max: float) -> Array:
-    """The paper's network knows no infinity: no return counts as ``range_max`` m, what says nothing (-inf) as 0."""
+    """Replaces ranges that are not finite, for the network: no return by ``range_max`` m, not measured (-inf) by 0."""
     return np.clip(np.where(np.isposinf(ranges), range_max, np.nan_to_num(ranges)), 0.0, range_max)

@@ -19,14 +19,14 @@ FOLDER = Path(__file__).resolve().parents[3] / "models"
 
 
 class ModelCard(BaseModel):
-    """Where a model comes from and how well it does."""
+    """Model card of a decoder: how it was made, and its errors on test scans."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 
     preset: str
     world: World
     scanner: Scanner
-    heading: float  # rad, the frozen heading of the robot
+    heading: float  # rad, constant heading of the robot
     samples: int
     epochs: int
     batch: int
@@ -40,30 +40,30 @@ class ModelCard(BaseModel):
     test_samples: int
     test_l1_mean: Annotated[float, Field(description="m, mean over beams and test samples")]
     test_l1_median: Annotated[float, Field(description="m, median over beams and test samples")]
-    curve_train_l1: list[float]  # m, one an epoch
+    curve_train_l1: list[float]  # m, one per epoch
     curve_test_l1: list[float]  # m
     training_s: float  # wall time
     commit: str
     command: str
     versions: dict[str, str]
-    weights_sha256: str = ""  # of the file beside the card, hexadecimal; empty in older cards
+    weights_sha256: str = ""  # SHA-256 of the weights file, hexadecimal; empty in older cards
 
     def shape(self) -> Shape:
-        """Of the network."""
+        """Size of the network."""
         return Shape(self.scanner.beams, self.hidden, self.channels)
 
     def normalisation(self) -> Normalisation:
-        """Of its inputs and outputs."""
+        """Normalisation of the network's inputs and outputs."""
         return Normalisation(self.center, self.half_size, self.range_scale)
 
 
 def path_of(folder: Path, world: str, preset: str, beams: int) -> Path:
-    """Where the weights for a world, preset and number of beams lie."""
+    """The weights file for a world, preset and number of beams in ``folder``."""
     return folder / f"{world}-{preset}-{beams}.safetensors"
 
 
 def available(folder: Path, world: str, preset: str) -> dict[int, Path]:
-    """Beam count to weights, of those that lie in ``folder``."""
+    """The weights files in ``folder``, by number of beams."""
     found = {}
     for path in folder.glob(f"{world}-{preset}-*.safetensors"):
         beams = path.stem.rsplit("-", 1)[-1]
@@ -73,14 +73,14 @@ def available(folder: Path, world: str, preset: str) -> dict[int, Path]:
 
 
 def train_command(world: str, preset: str, scanner: str = "tim571", beams: int | None = None) -> str:
-    """What a user types to make missing weights."""
+    """The command that trains missing weights."""
     return f"presage train --world {world} --preset {preset} --scanner {scanner}" + (
         f" --beams {beams}" if beams else ""
     )
 
 
 def save(path: Path, decoder: Decoder, card: ModelCard) -> None:
-    """Weights in half precision and the card beside them; whole files or none."""
+    """Writes the weights, in half precision, and their card atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     tensors = {name: tensor.detach().half().contiguous() for name, tensor in decoder.state_dict().items()}
     partial = path.with_suffix(".partial")
@@ -94,7 +94,7 @@ def save(path: Path, decoder: Decoder, card: ModelCard) -> None:
 
 
 def load(path: Path) -> tuple[PaperModel, ModelCard]:
-    """A trained model; raises UserError where a file is missing or is not what it should be."""
+    """Returns a trained model and its card. Raises UserError if a file is missing, damaged or inconsistent."""
     try:
         card = ModelCard.model_validate_json(path.with_suffix(".json").read_text(encoding="utf-8"))
         data = path.read_bytes()
@@ -109,24 +109,26 @@ def load(path: Path) -> tuple[PaperModel, ModelCard]:
         where = ".".join(map(str, first["loc"]))
         raise UserError(f"model card {path.with_suffix('.json')}: {where}: {first['msg']}") from None
     except (safetensors.SafetensorError, RuntimeError, ValueError) as error:
-        raise UserError(f"weights {path}: not this network's ({' '.join(str(error).split())[:200]})") from None
+        raise UserError(
+            f"weights {path}: this is not a file of weights of this network ({' '.join(str(error).split())[:200]})"
+        ) from None
     return PaperModel(decoder, card.normalisation()), card
 
 
 def find(folder: Path, world: str, preset: str, beams: int) -> Path:
-    """The weights for a scan of so many beams; raises UserError with the command that makes them."""
+    """The weights file for scans of ``beams`` beams. Raises UserError, with the command that trains it, if missing."""
     known = available(folder, world, preset)
     if beams not in known:
-        have = f"there are some for {', '.join(map(str, known))} beams" if known else f"none lie in {folder}"
+        found = f"there are weights for {', '.join(map(str, known))} beams" if known else f"there are none in {folder}"
         raise UserError(
-            f"no weights of preset {preset} for world {world!r} and {beams} beams ({have}); "
-            f"make them with: {train_command(world, preset, beams=beams)}"
+            f"no weights of preset {preset} for world {world!r} and {beams} beams ({found}); "
+            f"train them with: {train_command(world, preset, beams=beams)}"
         )
     return known[beams]
 
 
 def nearest(folder: Path, world: str, preset: str, beams: int) -> Path:
-    """The weights for the number of beams nearest to that; raises UserError where there are none at all."""
+    """The weights file for the number of beams nearest to ``beams``. Raises UserError if there is none at all."""
     known = available(folder, world, preset)
     if not known:
         return find(folder, world, preset, beams)

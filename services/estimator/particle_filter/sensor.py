@@ -44,7 +44,7 @@ class Sensor:
         self._beam = BeamModel(s.z_hit, s.z_short, s.z_max, s.z_rand, s.sigma_hit, s.lambda_short)
 
     def sigma(self, spread: float, before: float) -> float:
-        """Standard deviation of a hit in m, for particles spread by ``spread`` m; it was ``before`` at the last scan."""
+        """Standard deviation of a hit in m for particles spread by ``spread`` m; it was ``before`` at the last scan."""
         wanted = float(np.clip(SIGMA_PER_SPREAD * spread, self.settings.sigma_hit, self.widest))
         return max(wanted, MIN_SIGMA_FACTOR * before) if before > self.settings.sigma_hit else wanted
 

@@ -67,10 +67,10 @@ def test_between_beams_it_is_linear_and_round_the_back_too():
 def test_a_beam_is_made_of_both_its_neighbours():
     model = SCANNERS["rplidar-a1"]
     scanner = model.model_copy(update={"first": model.angle_min + 0.25 * model.angle_increment})
-    says = np.ones(360, bool)
-    says[7] = False
-    assert np.flatnonzero(~fitted(scanner, model).of_all(says)).tolist() == [7, 8]
-    assert np.flatnonzero(~fitted(model, model).of_all(says)).tolist() == [7]
+    valid = np.ones(360, bool)
+    valid[7] = False
+    assert np.flatnonzero(~fitted(scanner, model).valid_beams(valid)).tolist() == [7, 8]
+    assert np.flatnonzero(~fitted(model, model).valid_beams(valid)).tolist() == [7]
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ def test_a_damaged_state_is_one_line(folder, keep):
 
 
 def damaged(path, read):
-    with pytest.raises(UserError, match="cannot be taken up") as error:
+    with pytest.raises(UserError, match="cannot be resumed") as error:
         read()
     assert str(path) in str(error.value)
     assert f"remove {path.parent} and train from the start" in str(error.value)

@@ -68,12 +68,12 @@ def test_the_goal_draws_the_belief_only_where_beta_says_so():
 def test_beams_that_say_nothing_are_as_if_they_were_not_there():
     rng, truth = np.random.default_rng(6), (3.0, 1.5)
     plain, masked, blind = (estimator((3.15, 1.4), alpha=2e-3, iterations=1) for _ in range(3))
-    says = rng.random(len(scan(truth, rng))) < 0.7
+    measured = rng.random(len(scan(truth, rng))) < 0.7
     for _ in range(60):
         o = scan(truth, rng)
-        plain.update(np.where(says, o, 0.0))
-        found = masked.update(np.where(says, o, 0.0), says=says)
-        stays = blind.update(o * 0, says=np.zeros(len(o), bool))
+        plain.update(np.where(measured, o, 0.0))
+        found = masked.update(np.where(measured, o, 0.0), measured=measured)
+        stays = blind.update(o * 0, measured=np.zeros(len(o), bool))
     assert found.state == "tracking"
     assert np.hypot(*(found.pose[:2] - truth)) < 0.01 < np.hypot(*(plain.pose[:2] - truth))
     assert stays.pose.tolist() == [3.15, 1.4, HEADING]

@@ -48,7 +48,7 @@ def test_available_and_find(tmp_path):
     assert weights.find(tmp_path, "room", "paper", 64) == path
     with pytest.raises(UserError, match="presage train --world room --preset paper --scanner tim571 --beams 99"):
         weights.find(tmp_path, "room", "paper", 99)
-    with pytest.raises(UserError, match="none lie in"):
+    with pytest.raises(UserError, match="there are none in"):
         weights.find(tmp_path / "empty", "room", "paper", 64)
 
 
