@@ -1,4 +1,4 @@
-"""What tests share: processes that are always ended, a router of their own, keys of their own."""
+"""Fixtures for all tests: child processes that are always ended, and a router and keys of their own."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ import pytest
 
 from common.bus.bus import Link, open_bus, wait_until
 from common.bus.inbox import Sample
-from tests.fork_server import Child, ForkServer, die_with
+from tests.fork_server import Child, ForkServer, end_with_parent
 
 ROOT = Path(__file__).resolve().parent.parent
-PATIENCE = 30.0  # s, deadline of a wait for what takes well under a second on an idle machine
+WAIT_TIMEOUT_S = 30.0  # for events that take well under a second on an idle machine
 numbers = itertools.count(1)
-fork_servers: list[ForkServer] = []  # one, once it is needed, for each of xdist's workers
+fork_servers: list[ForkServer] = []  # at most one in each of xdist's workers, started when it is needed
 
-# No database: nothing is written into the checkout. In CI the examples are the same every time.
-# `pytest --hypothesis-profile thorough` looks longer than every run can.
+# Without a database, so that nothing is written into the checkout. In CI the examples are the same every time.
+# `pytest --hypothesis-profile thorough` tries more examples than a normal run has time for.
 EXAMPLES = 50
 hypothesis.settings.register_profile("local", deadline=None, database=None, max_examples=EXAMPLES)
 hypothesis.settings.register_profile(
@@ -36,21 +36,21 @@ hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "local")
 
 
 def pytest_collection_modifyitems(items):
-    """Fast tests first: those that drive processes come last and carry the mark."""
+    """Runs fast tests first. Tests in tests/system, which start processes, come last and get the marker `system`."""
     for item in items:
         if (ROOT / "tests" / "system") in item.path.parents:
             item.add_marker(pytest.mark.system)
-    # Of these the engine's first: they take longest, and wait for it rather than for a core.
+    # Among the system tests, those that need Docker come first: they take longest, but little processor time.
     items.sort(key=lambda item: ("system" in item.keywords, item.get_closest_marker("docker") is None))
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _nothing_left_behind():
-    """No test run leaves a process behind; asked for first, so torn down last, in each of xdist's workers."""
+    """Fails if a test run leaves a process behind. Set up first and so torn down last, in each of xdist's workers."""
     yield
     while fork_servers:
         fork_servers.pop().close()
-    # Python's own resource tracker, once a pool was spawned, ends with us.
+    # Python's resource tracker, which runs once a process pool was used, ends with this process.
     left = [c for c in psutil.Process().children(recursive=True) if "resource_tracker" not in " ".join(c.cmdline())]
     for child in left:
         print(f"\nleft behind: {child}", file=sys.stderr)
@@ -78,32 +78,32 @@ def accepts(port: int) -> bool:
 
 @pytest.fixture
 def free_port():
-    """Calls give TCP ports of loopback that are free now."""
+    """A function that returns a free TCP port of loopback."""
     return free_tcp_port
 
 
-def taken(inbox, kind):
-    """The messages of a kind that wait, out of the inbox one by one."""
+def received_messages(inbox, kind):
+    """Takes the waiting messages out of the inbox; yields those of class ``kind``."""
     while isinstance(sample := inbox.get(0), Sample):
         message = sample.topic.message.decode(sample.payload)
         if isinstance(message, kind):
             yield message
 
 
-def next_of(inbox, kind, condition, timeout=60.0):
-    """The first message of a kind that meets a condition."""
-    found = []
+def wait_for_message(inbox, kind, condition, timeout=60.0):
+    """Waits for the first message of class ``kind`` that meets a condition, and returns it."""
+    matches = []
 
-    def look():
-        found.extend(itertools.islice(filter(condition, taken(inbox, kind)), 1))
-        return bool(found)
+    def check():
+        matches.extend(itertools.islice(filter(condition, received_messages(inbox, kind)), 1))
+        return bool(matches)
 
-    assert wait_until(look, timeout), f"no {kind.__name__} as wanted within {timeout:g} s"
-    return found[0]
+    assert wait_until(check, timeout), f"no matching {kind.__name__} within {timeout:g} s"
+    return matches[0]
 
 
 class Running:
-    """A child process and the file with all it said."""
+    """A child process and the file with its output."""
 
     def __init__(self, name: str, child: Child | subprocess.Popen, log: Path) -> None:
         self.name, self.child, self.log = name, child, log
@@ -116,13 +116,13 @@ class Running:
     def running(self) -> bool:
         return self.child.poll() is None
 
-    def wait_for(self, text: str, timeout: float = PATIENCE) -> None:
-        """Until it has said ``text``."""
+    def wait_for(self, text: str, timeout: float = WAIT_TIMEOUT_S) -> None:
+        """Waits until the output contains ``text``."""
         wait_until(lambda: text in self.output or not self.running, timeout)
-        assert text in self.output, f"{self.name} did not say {text!r}:\n{self.output}"
+        assert text in self.output, f"{self.name} did not print {text!r}:\n{self.output}"
 
-    def wait(self, timeout: float = PATIENCE) -> int:
-        """Its status, once it ends by itself."""
+    def wait(self, timeout: float = WAIT_TIMEOUT_S) -> int:
+        """Waits until the process ends by itself. Returns its exit status."""
         try:
             return self.child.wait(timeout)
         except subprocess.TimeoutExpired:
@@ -132,7 +132,7 @@ class Running:
         self.child.send_signal(number)
 
     def stop(self, number: int = signal.SIGTERM, timeout: float = 10.0) -> tuple[int, float]:
-        """Ask it to end: its status, and the seconds it took."""
+        """Sends a signal and waits for the end. Returns the exit status and the duration in s."""
         began = time.monotonic()
         self.send(number)
         return self.wait(timeout), time.monotonic() - began
@@ -143,18 +143,18 @@ class Running:
 
 
 class Processes:
-    """Starts children; `close` ends them all and says which had to be killed."""
+    """Starts child processes; `close` ends them all and fails if one had to be killed."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.started = folder, []
 
     def start(self, name: str | Path, *args: str, env: dict[str, str] | None = None, fresh: bool = False) -> Running:
-        """``simulator`` is services.simulator; a dotted name is a module, a path a script.
+        """Starts a process: a plain name such as ``simulator`` is a service, a dotted name a module, a path a script.
 
-        ``fresh``: by an interpreter that begins anew, not by the fork server.
+        With ``fresh`` in a new interpreter instead of the fork server.
         """
         what = [str(name)] if isinstance(name, Path) else ["-m", name if "." in name else f"services.{name}"]
-        # The checkout's modules, though the child runs in a folder of its own.
+        # The child imports the checkout's modules although it runs in another folder.
         path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
         clean = {k: v for k, v in os.environ.items() if not k.startswith("PRESAGE_")}
         environment = {**clean, "PYTHONUNBUFFERED": "1", "PYTHONPATH": path, **(env or {})}
@@ -168,19 +168,19 @@ class Processes:
             if not fork_servers:
                 fork_servers.append(ForkServer())
             return fork_servers[0].start(what, environment, log, self.folder)
-        parent = os.getpid()  # pytest-timeout ends the process without a teardown
+        parent = os.getpid()  # pytest-timeout ends this process without a teardown
         with log.open("wb") as file:
             return subprocess.Popen(
                 [sys.executable, *what], env=environment, cwd=self.folder, stdin=subprocess.DEVNULL, stdout=file,
-                stderr=subprocess.STDOUT, preexec_fn=lambda: die_with(parent),  # noqa: PLW1509 - as in the server
+                stderr=subprocess.STDOUT, preexec_fn=lambda: end_with_parent(parent),  # noqa: PLW1509 - as in the server
             )  # fmt: skip
 
     def start_router(self) -> tuple[Running, int]:
-        """A router that listens, and its port; another port where somebody was quicker."""
+        """Starts a router. Returns it and its port; tries another port if a process has just taken the first one."""
         for _ in range(5):
             port = free_tcp_port()
             running = self.start("common.router", "--listen", f"tcp/127.0.0.1:{port}")
-            wait_until(lambda r=running, p=port: not r.running or accepts(p), PATIENCE)
+            wait_until(lambda r=running, p=port: not r.running or accepts(p), WAIT_TIMEOUT_S)
             if running.running:
                 return running, port
         raise AssertionError(f"no router started:\n{running.output}")
@@ -193,16 +193,16 @@ class Processes:
                 process.send(signal.SIGTERM)
         for process in self.started:
             try:
-                process.child.wait(PATIENCE)
+                process.child.wait(WAIT_TIMEOUT_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 killed.append(process)
-        assert not killed, "\n".join(f"{p.name} had to be killed; it said:\n{p.output}" for p in killed)
+        assert not killed, "\n".join(f"{p.name} had to be killed; its output:\n{p.output}" for p in killed)
 
 
 @pytest.fixture(scope="module")
 def router(tmp_path_factory):
-    """Port of a router process."""
+    """Port of a router process, one for each test module."""
     processes = Processes(tmp_path_factory.mktemp("router"))
     try:
         yield processes.start_router()[1]
@@ -212,21 +212,21 @@ def router(tmp_path_factory):
 
 @pytest.fixture
 def link(router):
-    """A session's settings: this module's router, a robot name no other test has."""
+    """Settings of a session: this module's router, and a robot name that no other test uses."""
     return Link(robot=f"test{next(numbers)}", connect=(f"tcp/127.0.0.1:{router}",))
 
 
 @pytest.fixture
 def bus(link):
-    """An open session that has found the router."""
+    """An open session that is connected to the router."""
     with open_bus(link) as session:
-        assert wait_until(session.linked, PATIENCE)
+        assert wait_until(session.linked, WAIT_TIMEOUT_S)
         yield session
 
 
 @pytest.fixture
 def process(tmp_path, link):
-    """Calls start processes that talk to this test's robot over its router; all are ended after the test."""
+    """A function that starts processes of this test's robot, connected to its router. They end after the test."""
     processes = Processes(tmp_path)
 
     def start(name, *args, env=None, fresh=False):
@@ -241,9 +241,9 @@ def process(tmp_path, link):
 
 @pytest.fixture
 def processes(tmp_path):
-    """The same without a router: for tests of routers, and of what fails before it talks."""
-    made = Processes(tmp_path)
+    """Starts processes without a router, for tests of routers and of processes that fail before they connect."""
+    started = Processes(tmp_path)
     try:
-        yield made
+        yield started
     finally:
-        made.close()
+        started.close()

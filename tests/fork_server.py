@@ -1,7 +1,7 @@
-"""Processes without the cost of their imports: a server that has imported what the services use forks one a start.
+"""Starts processes quickly: a server has imported the third-party packages already and forks for every start.
 
-What runs is the same module in a process of its own, by `runpy` as `python -m` does; hundreds of starts, each 0.6 s of
-others' packages, are much of what the tests would cost. What needs a new interpreter is started with ``fresh=True``.
+The child runs the module with `runpy`, as `python -m` does. Otherwise each of hundreds of starts would take 0.6 s for
+imports, much of the tests' time. Tests that need a new interpreter use ``fresh=True``.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ import threading
 import time
 from pathlib import Path
 
-PRELOADED = (
+PRELOADED_MODULES = (
     "common.router", "presage.cli.main", "services.controller.service", "services.estimator.service",
     "services.recorder.service", "services.simulator.service", "services.viewer.service",
 )  # fmt: skip
-OURS = {"common", "presage", "services", "worlds", "models"}
+PROJECT_PACKAGES = {"common", "presage", "services", "worlds", "models"}
 LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 
 
-def die_with(parent: int) -> None:
-    """End when the process ``parent`` does, however it does."""
+def end_with_parent(parent: int) -> None:
+    """Ends this process when the process ``parent`` ends, however it ends."""
     if LIBC is not None:
         LIBC.prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
         if os.getppid() != parent:
@@ -37,7 +37,7 @@ def die_with(parent: int) -> None:
 
 
 class Child:
-    """As much of subprocess.Popen as tests use."""
+    """A forked process, with those methods of subprocess.Popen that tests use."""
 
     def __init__(self, pid: int) -> None:
         self.pid, self.returncode = pid, None
@@ -65,7 +65,7 @@ class Child:
 
 
 class ForkServer:
-    """The server's process, as the tests' process sees it."""
+    """Client of the fork server in the process that runs the tests."""
 
     def __init__(self) -> None:
         command = [sys.executable, __file__]
@@ -74,7 +74,7 @@ class ForkServer:
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
             env={**os.environ, "PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1"},
-            preexec_fn=lambda: die_with(parent),  # noqa: PLW1509 - no lock, no allocation in it
+            preexec_fn=lambda: end_with_parent(parent),  # noqa: PLW1509 - no lock, no allocation in it
         )  # fmt: skip
         self._lock = threading.Lock()
         self._started = threading.Semaphore(0)
@@ -83,7 +83,7 @@ class ForkServer:
         threading.Thread(target=self._listen, daemon=True).start()
 
     def start(self, what: list[str], environment: dict[str, str], log: Path, cwd: Path) -> Child:
-        log.touch()  # whoever started it may look at once
+        log.touch()  # so that the caller can read it at once
         with self._lock:
             request = {"what": what, "environment": environment, "log": str(log), "cwd": str(cwd)}
             self.process.stdin.write(json.dumps(request) + "\n")
@@ -106,23 +106,25 @@ class ForkServer:
                 self._started.release()
             else:
                 self._children.pop(int(numbers[0])).end(int(numbers[1]))
-        self._started.release()  # it has ended: nobody is to wait
+        self._started.release()  # the server has ended, so wake up a waiting caller
 
 
 def serve() -> dict | None:
-    """Fork for each line of standard input; returns in the children, with what to run, and at the end, with None."""
+    """Forks for each request on standard input. Returns the request in the children, None in the server at the end."""
     reports = os.dup(1)
-    os.dup2(2, 1)  # what imports print is no report
-    sys.path[0] = str(Path(__file__).parent.parent)  # not tests/, with its folders of the same names
-    for name in PRELOADED:
+    os.dup2(2, 1)  # keep output of imports out of the reports
+    sys.path[0] = str(Path(__file__).parent.parent)  # instead of tests/, which has folders of the same names
+    for name in PRELOADED_MODULES:
         importlib.import_module(name)
-    for name in [name for name in sys.modules if name.partition(".")[0] in OURS]:
-        del sys.modules[name]  # what they import from others stays; they themselves begin anew in each process
+    for name in [name for name in sys.modules if name.partition(".")[0] in PROJECT_PACKAGES]:
+        del sys.modules[
+            name
+        ]  # third-party packages stay imported; the project's modules are imported again in each child
     died, wake = os.pipe()
     os.set_blocking(wake, False)
     signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
     signal.signal(signal.SIGCHLD, lambda *_: None)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the tests' own affair
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the tests' process
     pending, me = b"", os.getpid()
     while True:
         ready, _, _ = select.select([0, died], [], [])
@@ -136,14 +138,14 @@ def serve() -> dict | None:
             *lines, pending = (pending + read).split(b"\n")
             for line in lines:
                 if (pid := os.fork()) == 0:
-                    _forget(me, (reports, died, wake))
+                    _leave_server(me, (reports, died, wake))
                     return json.loads(line)
                 os.write(reports, f"started {pid}\n".encode())
 
 
-def _forget(server: int, descriptors: tuple[int, ...]) -> None:
-    """In a child: be no server."""
-    die_with(server)
+def _leave_server(server: int, descriptors: tuple[int, ...]) -> None:
+    """Restores normal signal handling in a child and closes the server's descriptors."""
+    end_with_parent(server)
     signal.set_wakeup_fd(-1)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -159,8 +161,8 @@ def _reap() -> tuple[int, int] | None:
     return (pid, os.waitstatus_to_exitcode(status)) if pid else None
 
 
-def become(request: dict) -> None:
-    """The module or script that is asked for, as if the interpreter had just begun with it."""
+def run_request(request: dict) -> None:
+    """Runs the requested module or script as if the interpreter had been started with it."""
     log = os.open(request["log"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     nothing = os.open(os.devnull, os.O_RDONLY)
     for target, source in ((0, nothing), (1, log), (2, log)):
@@ -186,5 +188,5 @@ def become(request: dict) -> None:
 
 
 if __name__ == "__main__":
-    if (asked := serve()) is not None:
-        become(asked)
+    if (request := serve()) is not None:
+        run_request(request)

@@ -85,8 +85,8 @@ def _why(trace: RunTrace, outcome: str, left: float) -> str:
     if outcome == "reached":
         return ""
     last = trace.statuses[max(trace.statuses)] if trace.statuses else None
-    said = f"; at last {last.state}: {last.reason}" if last is not None else ""
-    return trace.failure or f"{left:.2f} m from the goal after {_seconds(trace):.1f} s{said}"
+    last_status = f"; at last {last.state}: {last.reason}" if last is not None else ""
+    return trace.failure or f"{left:.2f} m from the goal after {_seconds(trace):.1f} s{last_status}"
 
 
 def _contacts(trace: RunTrace) -> dict[str, Any]:

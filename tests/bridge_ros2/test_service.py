@@ -20,7 +20,7 @@ from common.messages.requests import LocaliseRequest, Reply
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, LOCALISE, ODOM, SCAN
 from tests.bridge_ros2 import independent as other
 from tests.bridge_ros2.made import belief
-from tests.conftest import PATIENCE, Processes
+from tests.conftest import WAIT_TIMEOUT_S, Processes
 from tests.system.ros2_robot import BEGIN, Ros, transform, transforms
 
 LASER, ODOMETRY = "sensor_msgs::msg::dds_::LaserScan_", "nav_msgs::msg::dds_::Odometry_"
@@ -87,7 +87,7 @@ class Beside:
             found.extend(each for each in self.kept if isinstance(each, kind) and condition(each))
             return bool(found)
 
-        assert wait_until(look, PATIENCE), f"no such {kind.__name__}"
+        assert wait_until(look, WAIT_TIMEOUT_S), f"no such {kind.__name__}"
         return found[-1]
 
     def counts(self, counter, at_least):
@@ -110,8 +110,8 @@ def beside(tmp_path_factory, router):
             args = ("--ros-connect", f"tcp/127.0.0.1:{router}", "--publish-map", "--world", "maze")
             bridge = processes.start("bridge_ros2", *args, env=environment)
             bridge.wait_for("ready")
-            assert bus.wait_matching(BELIEF, PATIENCE)
-            assert bus.wait_matching(CMD_VEL, PATIENCE)
+            assert bus.wait_matching(BELIEF, WAIT_TIMEOUT_S)
+            assert bus.wait_matching(CMD_VEL, WAIT_TIMEOUT_S)
             last = time.monotonic()
 
             def heard():  # the first ones may come before the bridge's subscription is known
@@ -122,7 +122,7 @@ def beside(tmp_path_factory, router):
                     found.put["scan"](laser(found.stamp))
                 return all(found.inbox.received[topic.key("rover")] > 0 for topic in (SCAN, ODOM))
 
-            assert wait_until(heard, PATIENCE), bridge.output
+            assert wait_until(heard, WAIT_TIMEOUT_S), bridge.output
             yield found
             assert bridge.stop()[0] == 0
     finally:
@@ -136,7 +136,7 @@ def test_a_scan_comes_with_the_odometry_of_its_moment(beside):
         seen.append(beside.sweep())
         return seen[-1][0].pose.x == pytest.approx(2.025)
 
-    assert wait_until(carried_on, PATIENCE), seen
+    assert wait_until(carried_on, WAIT_TIMEOUT_S), seen
     _, scan = seen[-1]
     np.testing.assert_array_equal(scan.ranges, np.array([1, 2, 3, 0, 5], np.float32))
     assert scan.mount.x == pytest.approx(0.3)
@@ -149,7 +149,7 @@ def test_the_belief_is_said_only_while_it_tracks(beside):
     assert not beside.heard["amcl_pose"]
     assert not beside.heard["tf"]
     beside.believe("tracking")
-    assert wait_until(lambda: bool(beside.heard["amcl_pose"] and beside.heard["tf"]), PATIENCE)
+    assert wait_until(lambda: bool(beside.heard["amcl_pose"] and beside.heard["tf"]), WAIT_TIMEOUT_S)
     pose, (said,) = beside.heard["amcl_pose"][-1], beside.heard["tf"][-1].transforms
     assert pose.pose.covariance[35] == 0.09
     assert (said.header.frame_id, said.child_frame_id) == ("map", "odom")
@@ -170,9 +170,9 @@ def test_commands_pass_and_are_followed_by_a_stop(beside):
             beside.bus.put(CMD_VEL, CmdVel(stamp_ns=beside.stamp, twist=Twist(vx=0.2)).encode())
         return bool(heard)
 
-    assert wait_until(driven, PATIENCE)
+    assert wait_until(driven, WAIT_TIMEOUT_S)
     assert heard[0].linear.x == pytest.approx(0.2)
-    assert wait_until(lambda: heard[-1].linear.x == 0, PATIENCE)
+    assert wait_until(lambda: heard[-1].linear.x == 0, WAIT_TIMEOUT_S)
     beside.bus.put(CMD_VEL, CmdVel(stamp_ns=beside.stamp - 10**9, twist=Twist(vx=0.2)).encode())
     beside.counts("stale_commands", 1)
     assert heard[-1].linear.x == 0
@@ -181,7 +181,7 @@ def test_commands_pass_and_are_followed_by_a_stop(beside):
 def test_rvizs_two_buttons(beside):
     beside.put["initialpose"](posed(4, 2, covariance=True))
     calls = []
-    assert wait_until(lambda: (call := beside.calls.get(0)) is not None and not calls.append(call), PATIENCE)
+    assert wait_until(lambda: (call := beside.calls.get(0)) is not None and not calls.append(call), WAIT_TIMEOUT_S)
     request = LocaliseRequest.decode(calls[0].payload)
     assert (request.pose.x, request.pose.y) == (4, 2)
     calls[0].reply(Reply().encode())
@@ -204,7 +204,7 @@ def test_the_map_is_there_for_who_comes_later(beside):
             history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
         )  # fmt: skip
         try:
-            assert wait_until(lambda: bool(heard), PATIENCE)
+            assert wait_until(lambda: bool(heard), WAIT_TIMEOUT_S)
             return heard, bool(again)
         finally:
             late.undeclare()
@@ -243,7 +243,7 @@ def test_it_says_what_it_waits_for_and_what_is_wrong(processes, router):
                 put(laser(BEGIN, "lidar"))
             return "tf does not connect lidar with base_link" in bridge.output
 
-        assert wait_until(complains_about_tf, PATIENCE), bridge.output
+        assert wait_until(complains_about_tf, WAIT_TIMEOUT_S), bridge.output
     theirs.kill()
     bridge.wait_for("it is gone")
     assert nowhere.stop()[0] == bridge.stop()[0] == 0

@@ -15,7 +15,7 @@ from common.log_capture import Line, parse_line
 from common.messages.definitions import Goal, Pose
 from common.messages.topics import GOAL
 from presage.session.stack import _log_text
-from tests.conftest import PATIENCE, ROOT
+from tests.conftest import ROOT, WAIT_TIMEOUT_S
 
 HEAD = ["time", "level", "service", "robot", "event"]
 
@@ -50,8 +50,8 @@ def test_everybody_s_line_is_one_object():
 def test_a_service_s_failed_step_and_zenoh_s_own_lines_are_objects(process, bus):
     small = Path(__file__).with_name("small_service.py")
     running = process(small, "--log-json", env={"RUST_LOG": "info"})
-    assert wait_until(lambda: "small" in bus.alive(), PATIENCE), running.output
-    assert bus.wait_matching(GOAL, PATIENCE)
+    assert wait_until(lambda: "small" in bus.alive(), WAIT_TIMEOUT_S), running.output
+    assert bus.wait_matching(GOAL, WAIT_TIMEOUT_S)
     bus.put(GOAL, Goal(stamp_ns=0, pose=Pose(x=-1.0, y=0.0)).encode())
     running.wait_for("step failed")
     assert running.stop()[0] == 0

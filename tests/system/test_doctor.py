@@ -22,7 +22,7 @@ from common.messages.definitions import Health, Scan, TopicHealth
 from common.messages.topics import CONFIG, HEALTH, ODOM, SCAN
 from common.runtime.protocol_check import build_config_reply
 from common.versions import PROTOCOL
-from tests.conftest import PATIENCE, ROOT
+from tests.conftest import ROOT, WAIT_TIMEOUT_S
 
 
 class Participant:
@@ -37,7 +37,7 @@ class Participant:
 
     def run(self) -> None:
         with open_bus(self.link) as bus:
-            wait_until(bus.linked, PATIENCE)
+            wait_until(bus.linked, WAIT_TIMEOUT_S)
             calls, number = Inbox(), 0
             bus.serve(CONFIG, calls, self.name)
             bus.declare_alive(self.name)
@@ -67,7 +67,7 @@ class Participant:
 
     def stop(self) -> None:
         self.stopping.set()
-        self.thread.join(PATIENCE)
+        self.thread.join(WAIT_TIMEOUT_S)
 
 
 def doctor(process, folder: Path, *args: str):
@@ -96,14 +96,14 @@ def sick(link):
         Participant(link, "viewer", frozen=True),
     ]
     for each in made:
-        assert each.ready.wait(PATIENCE)
+        assert each.ready.wait(WAIT_TIMEOUT_S)
     yield made
     for each in made:
         each.stop()
 
 
 def test_a_sick_session(process, bus, sick, tmp_path):
-    assert wait_until(lambda: {"viewer", "estimator", "simulator"} <= bus.alive(), PATIENCE)
+    assert wait_until(lambda: {"viewer", "estimator", "simulator"} <= bus.alive(), WAIT_TIMEOUT_S)
     running = doctor(process, tmp_path, "--seconds", "4")
     assert running.wait(90) == 1, running.output
     found = read(tmp_path)
@@ -128,7 +128,7 @@ def test_a_sick_session(process, bus, sick, tmp_path):
 
 def test_a_stopped_process_is_told_from_one_that_is_not_there(process, bus, tmp_path):
     controller = process("controller", fresh=True)  # found by its command line
-    assert wait_until(lambda: "controller" in bus.alive(), PATIENCE), controller.output
+    assert wait_until(lambda: "controller" in bus.alive(), WAIT_TIMEOUT_S), controller.output
     controller.send(signal.SIGSTOP)
     running = doctor(process, tmp_path)
     assert running.wait(90) == 1, running.output

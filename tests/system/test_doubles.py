@@ -11,7 +11,7 @@ from common.bus.bus import open_bus, wait_until
 from common.bus.inbox import Inbox
 from common.messages.definitions import CmdVel, Goal, Health, Pose, Status, Truth, Twist
 from common.messages.topics import CMD_VEL, GOAL, HEALTH, STATUS, TRUTH
-from tests.conftest import next_of, taken
+from tests.conftest import received_messages, wait_for_message
 
 PATIENCE = 60.0
 
@@ -47,7 +47,7 @@ def test_the_second_controller_stands_by_and_takes_the_goal_over(process, bus, h
     truths, commands, states = heard(TRUTH), heard(CMD_VEL), heard(STATUS)
     assert bus.wait_matching(GOAL, PATIENCE)
     bus.put(GOAL, Goal(stamp_ns=0, seq=7, pose=Pose(x=16.5, y=1.5)).encode())
-    next_of(truths, Truth, lambda t: speed(t) > 0.5)
+    wait_for_message(truths, Truth, lambda t: speed(t) > 0.5)
     drivers = set()
     while (sample := commands.get(0)) is not None:
         drivers.add(sample.source)
@@ -55,18 +55,18 @@ def test_the_second_controller_stands_by_and_takes_the_goal_over(process, bus, h
 
     # Frozen, it loses the lead; the other goes on to the same goal.
     first.send(signal.SIGSTOP)
-    next_of(truths, Truth, lambda t: speed(t) < 1e-3)
+    wait_for_message(truths, Truth, lambda t: speed(t) < 1e-3)
     second.wait_for("taking over", PATIENCE)
     second.wait_for("resuming the goal of the previous controller instance", PATIENCE)
-    next_of(states, Status, lambda s: s.goal_seq == 7 and s.state == "navigating")
-    next_of(truths, Truth, lambda t: speed(t) > 0.3)
+    wait_for_message(states, Status, lambda s: s.goal_seq == 7 and s.state == "navigating")
+    wait_for_message(truths, Truth, lambda t: speed(t) > 0.3)
 
     # Back again, the older one leads; never are both heard.
     first.send(signal.SIGCONT)
     assert second.wait(PATIENCE) == 2
     assert "was started before this one and is active, so this one ends" in second.output
     assert wait_until(lambda: list(bus.alive_instances().get("controller", [])) != [], PATIENCE)
-    next_of(states, Status, lambda s: s.state == "reached", 120)
+    wait_for_message(states, Status, lambda s: s.state == "reached", 120)
     assert first.running
 
 
@@ -76,7 +76,7 @@ def test_the_one_that_leads_is_obeyed_and_another_source_is_counted_and_named(pr
     assert bus.wait_matching(CMD_VEL, PATIENCE), simulator.output
 
     def command(driver, **twist):
-        now = next_of(truths, Truth, lambda _: True).stamp_ns
+        now = wait_for_message(truths, Truth, lambda _: True).stamp_ns
         driver.put(CMD_VEL, CmdVel(stamp_ns=now, twist=Twist(**twist)).encode())
 
     with open_bus(link) as leader:
@@ -85,15 +85,15 @@ def test_the_one_that_leads_is_obeyed_and_another_source_is_counted_and_named(pr
         for _ in range(10):
             command(leader, wz=0.5)
         assert wait_until(lambda: "controller" in bus.alive(), PATIENCE)
-        before = next_of(health, Health, lambda h: h.service == "simulator").counters.get("other_sources", 0)
+        before = wait_for_message(health, Health, lambda h: h.service == "simulator").counters.get("other_sources", 0)
 
         def counted() -> bool:
             command(leader, wz=0.5)
             command(bus, vx=1.0)  # of several a busy simulator sees the newest
-            return any(h.counters.get("other_sources", 0) >= before + 20 for h in taken(health, Health))
+            return any(h.counters.get("other_sources", 0) >= before + 20 for h in received_messages(health, Health))
 
         assert wait_until(counted, PATIENCE)
-        truth = next_of(truths, Truth, lambda _: True)
+        truth = wait_for_message(truths, Truth, lambda _: True)
         assert speed(truth) < 1e-3
         assert bus.zid in simulator.output
     assert wait_until(lambda: "controller" not in bus.alive(), PATIENCE)
@@ -101,6 +101,6 @@ def test_the_one_that_leads_is_obeyed_and_another_source_is_counted_and_named(pr
 
     def driven() -> bool:
         command(bus, vx=0.5)
-        return speed(next_of(truths, Truth, lambda _: True)) > 0.1
+        return speed(wait_for_message(truths, Truth, lambda _: True)) > 0.1
 
     assert wait_until(driven, PATIENCE)

@@ -13,7 +13,7 @@ from common.bus.inbox import Inbox
 from common.messages.definitions import Belief, Goal, Health, Pose, Scan
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, PREDICTION, SCAN, STATUS, TRUTH
 from services.recorder.reader import read_recording
-from tests.conftest import next_of
+from tests.conftest import wait_for_message
 from tests.recorder import sessions as made
 from tests.viewer.client import Page
 
@@ -39,11 +39,11 @@ def run_in_lockstep(process, bus, folder, name):
     assert wait_until(lambda: {"recorder", "controller", "estimator", "simulator"} <= bus.alive(), 60)
     bus.put(GOAL, Goal(stamp_ns=0, pose=Pose(x=15.5, y=1.5)).encode())
     goal_key = GOAL.key(bus.robot)
-    next_of(
+    wait_for_message(
         inbox, Health, lambda h: h.service == "controller" and any(t.key == goal_key and t.received for t in h.topics)
     )
     bus.declare_alive(driver)
-    next_of(inbox, Scan, lambda scan: scan.seq >= SCANS)
+    wait_for_message(inbox, Scan, lambda scan: scan.seq >= SCANS)
     for running in reversed(started):
         assert running.stop()[0] == 0, running.output
     raw = read_recording(folder / f"{name}.mcap").raw
@@ -70,7 +70,7 @@ def test_recorded_scans_give_the_recorded_beliefs(process, bus, tmp_path):
     for scan, belief in zip(recorded["scan"], recorded["belief"], strict=True):
         bus.put(SCAN, scan)
         stamp = Scan.decode(scan).stamp_ns
-        again = next_of(inbox, Belief, lambda b, s=stamp: b.stamp_ns == s)
+        again = wait_for_message(inbox, Belief, lambda b, s=stamp: b.stamp_ns == s)
         assert again == Belief.decode(belief)
 
 

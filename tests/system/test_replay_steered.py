@@ -26,7 +26,7 @@ from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, PLAYER, SCAN
 from common.robot.scanner import SCANNERS
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.replaying.replay import ReplayOptions, replay
-from tests.conftest import PATIENCE, ROOT
+from tests.conftest import ROOT, WAIT_TIMEOUT_S
 
 SECOND = 10**9
 
@@ -64,26 +64,26 @@ def terminal(tmp_path, link):
 
 
 def state(bus):
-    return bus.ask(PLAYER, PlayerRequest(action="status"), PlayerReply, timeout=PATIENCE)
+    return bus.ask(PLAYER, PlayerRequest(action="status"), PlayerReply, timeout=WAIT_TIMEOUT_S)
 
 
 def test_keys_steer_it_and_the_terminal_is_as_before(terminal, bus, tmp_path):
     child, ours, as_before = terminal
-    assert wait_until(lambda: b"q quit" in (tmp_path / "said").read_bytes(), PATIENCE)
-    assert wait_until(lambda: not as_before(), PATIENCE)
+    assert wait_until(lambda: b"q quit" in (tmp_path / "said").read_bytes(), WAIT_TIMEOUT_S)
+    assert wait_until(lambda: not as_before(), WAIT_TIMEOUT_S)
     os.write(ours, b" ")
-    assert wait_until(lambda: state(bus).paused, PATIENCE)
+    assert wait_until(lambda: state(bus).paused, WAIT_TIMEOUT_S)
     here = state(bus).position_s
     os.write(ours, b"l")
-    assert wait_until(lambda: state(bus).position_s == pytest.approx(here + 5), PATIENCE)
+    assert wait_until(lambda: state(bus).position_s == pytest.approx(here + 5), WAIT_TIMEOUT_S)
     os.write(ours, b"\x1b[D")
-    assert wait_until(lambda: state(bus).position_s == pytest.approx(here), PATIENCE)
+    assert wait_until(lambda: state(bus).position_s == pytest.approx(here), WAIT_TIMEOUT_S)
     os.write(ours, b".")
-    assert wait_until(lambda: state(bus).position_s == pytest.approx(np.ceil(here)), PATIENCE)
+    assert wait_until(lambda: state(bus).position_s == pytest.approx(np.ceil(here)), WAIT_TIMEOUT_S)
     os.write(ours, b"\x1b[A")
-    assert wait_until(lambda: state(bus).rate == 2.0, PATIENCE)
+    assert wait_until(lambda: state(bus).rate == 2.0, WAIT_TIMEOUT_S)
     os.write(ours, b" q")
-    assert child.wait(PATIENCE) == 0
+    assert child.wait(WAIT_TIMEOUT_S) == 0
     assert as_before()
     assert b"replayed presage/" in (tmp_path / "said").read_bytes()
 
@@ -91,10 +91,10 @@ def test_keys_steer_it_and_the_terminal_is_as_before(terminal, bus, tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_cleanly(terminal, bus, tmp_path, number):
     child, _, as_before = terminal
-    assert wait_until(lambda: not as_before(), PATIENCE)
+    assert wait_until(lambda: not as_before(), WAIT_TIMEOUT_S)
     assert state(bus).duration_s == 3599.0
     child.send_signal(number)
-    assert child.wait(PATIENCE) == 130
+    assert child.wait(WAIT_TIMEOUT_S) == 130
     assert as_before()
     assert "Traceback" not in (tmp_path / "said").read_text()
 
@@ -121,7 +121,7 @@ def test_services_take_a_time_that_goes_back_for_a_session_begun_anew(process, b
     for topic in (BELIEF, CMD_VEL, HEALTH):
         bus.subscribe(topic, inbox, keep_all=True)
     assert wait_until(lambda: {"estimator", "controller"} <= bus.alive(), 60), [s.output for s in services]
-    assert bus.wait_matching(GOAL, PATIENCE)
+    assert bus.wait_matching(GOAL, WAIT_TIMEOUT_S)
     bus.put(GOAL, Goal(stamp_ns=0, pose=Pose(x=15.5, y=1.5)).encode())
     stop, beliefs, commands, failed = threading.Event(), [], [], {}
     choice = ReplayOptions(rate=0.5, loop=True)
@@ -142,7 +142,7 @@ def test_services_take_a_time_that_goes_back_for_a_session_begun_anew(process, b
         assert wait_until(jumps, 60), [s.output for s in services]
     finally:
         stop.set()
-        thread.join(PATIENCE)
+        thread.join(WAIT_TIMEOUT_S)
     assert not any(failed.values()), [s.output for s in services]
     errors = [np.hypot(*(b.pose.array() - truth[b.stamp_ns])[:2]) for b in beliefs]
     assert np.max(errors) < 0.05

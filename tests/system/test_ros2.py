@@ -12,7 +12,7 @@ from common.geometry import se2
 from common.messages.definitions import Goal, Pose
 from common.messages.topics import GOAL
 from tests.bridge_ros2.independent import encode, header, quaternion, vector
-from tests.conftest import PATIENCE, Processes
+from tests.conftest import WAIT_TIMEOUT_S, Processes
 from tests.system.ros2_robot import Ros
 
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -26,7 +26,7 @@ def said(robot):
 
 
 def until(robot, condition, what, *others):
-    if not wait_until(lambda: bool(now := said(robot)) and condition(now), PATIENCE):
+    if not wait_until(lambda: bool(now := said(robot)) and condition(now), WAIT_TIMEOUT_S):
         pytest.fail(f"{what}: {said(robot)}\n" + "\n".join(each.output[-3000:] for each in (robot, *others)))
 
 
@@ -77,7 +77,7 @@ def test_over_rmw_zenoh_a_robot_is_localised_drives_to_rvizs_goal_and_stands_whe
     until(robot, lambda now: now["pose"] and now["transforms"] > 3, "no pose and transform", bridge)
     with Ros(port, "rmw_zenoh", "jazzy") as rviz:
         put = rviz.publisher("goal_pose", GOAL_POSE)
-        assert wait_until(lambda: bool(rviz.kept[-1].matching_status.matching), PATIENCE)
+        assert wait_until(lambda: bool(rviz.kept[-1].matching_status.matching), WAIT_TIMEOUT_S)
         put(goal_message(4.2, 1.5))
         until(robot, arrived, "no way", bridge)
         put(goal_message(12.0, 1.5))
@@ -98,7 +98,7 @@ def test_over_zenoh_bridge_ros2dds_commands_that_end_are_followed_by_a_stop(mind
     bridge = start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{port}", "--flavor", "ros2dds", "--stamped")
     robot = start("tests.system.ros2_robot", "--port", str(port), "--flavor", "ros2dds", "--stamped")
     until(robot, lambda now: now["pose"] and now["transforms"] > 3, "no pose and transform", bridge)
-    assert bus.wait_matching(GOAL, PATIENCE)
+    assert bus.wait_matching(GOAL, WAIT_TIMEOUT_S)
     bus.put(GOAL, Goal(stamp_ns=0, pose=Pose(x=12.0, y=1.5)).encode())
     until(robot, lambda now: now["speed"] > 0.3, "it does not go", bridge)
     controller.kill()

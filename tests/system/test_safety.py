@@ -14,7 +14,7 @@ from common.geometry.world import Box, Obstacle
 from common.messages.definitions import Belief, CmdVel, Goal, Pose, Status, Truth, Twist
 from common.messages.requests import ObstacleRequest, Reply
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, OBSTACLE, STATUS, TRUTH
-from tests.conftest import next_of
+from tests.conftest import wait_for_message
 
 PATIENCE = 60.0
 DRIVER = "driver"  # ours: the simulator waits for it
@@ -38,7 +38,7 @@ def drive(bus, truths, answer):
     """Truths until the robot stands before the box, or touches it; ``answer(truth)`` lets the simulation go on."""
     seen, placed = [], False
     while len(seen) < 600:
-        truth = next_of(truths, Truth, lambda _: True)
+        truth = wait_for_message(truths, Truth, lambda _: True)
         seen.append(truth)
         if not placed and speed(truth) > FAST:
             block(bus, truth)  # the simulation waits meanwhile
@@ -87,7 +87,7 @@ def test_without_the_base_s_stop_the_controller_alone_prevents_contact(process, 
     assert bus.wait_matching(GOAL, PATIENCE)
     assert bus.wait_matching(BELIEF, PATIENCE)
     bus.put(GOAL, Goal(stamp_ns=0, seq=1, pose=Pose(x=15.5, y=1.5)).encode())
-    next_of(statuses, Status, lambda status: status.goal_seq == 1)
+    wait_for_message(statuses, Status, lambda status: status.goal_seq == 1)
     bus.declare_alive(DRIVER)
 
     def know(truth):
@@ -99,7 +99,7 @@ def test_without_the_base_s_stop_the_controller_alone_prevents_contact(process, 
     seen = drive(bus, truths, know)
     assert max(map(speed, seen)) > FAST
     assert not any(truth.contact for truth in seen)
-    said = next_of(statuses, Status, lambda status: status.stamp_ns == seen[-2].stamp_ns)
+    said = wait_for_message(statuses, Status, lambda status: status.stamp_ns == seen[-2].stamp_ns)
     assert said.reason.startswith("waiting: something")
     for running in (simulator, controller):
         assert running.stop()[0] == 0, running.output

@@ -14,7 +14,7 @@ from common.messages.definitions import Scan
 from common.messages.topics import SCAN, TOPICS, TRUTH
 from common.runtime.heartbeat import read_beats
 from services.recorder.files.writer import RecordingWriter
-from tests.conftest import next_of
+from tests.conftest import wait_for_message
 
 SCANS = 4
 PATIENCE = 30.0
@@ -53,7 +53,7 @@ def test_a_recording_takes_the_simulator_s_place(bus, process, recording, tmp_pa
     )  # fmt: skip
     for _ in range(2):  # again and again
         for number in range(SCANS):
-            assert next_of(scans, Scan, lambda message: True).seq == number, running.output
+            assert wait_for_message(scans, Scan, lambda message: True).seq == number, running.output
     healthy = lambda: fault_of("replay", read_beats(tmp_path, "replay"), [bus.robot], time.monotonic()) == ""  # noqa: E731
     assert wait_until(healthy, PATIENCE), read_beats(tmp_path, "replay")
     assert running.stop()[0] == 0

@@ -21,7 +21,7 @@ from common.messages.definitions import CmdVel, Goal, Health, Pose, Truth, Twist
 from common.messages.requests import PoseRequest, Reply, Request, WorldReply
 from common.messages.topics import CMD_VEL, GOAL, HEALTH, SCAN, TELEPORT, TRUTH, WORLD
 from presage.session import credentials as secure
-from tests.conftest import PATIENCE, Processes, accepts, free_tcp_port, next_of
+from tests.conftest import WAIT_TIMEOUT_S, Processes, accepts, free_tcp_port, wait_for_message
 
 INTRUDER = Path(__file__).with_name("intruder.py")
 HERE = "presage/robot"
@@ -44,7 +44,7 @@ class Guarded:
             running = self.processes.start(
                 "common.router", "--listen", f"tcp/127.0.0.1:{taken}", "--security", str(self.keys)
             )
-            wait_until(lambda r=running, p=taken: not r.running or accepts(p), PATIENCE)
+            wait_until(lambda r=running, p=taken: not r.running or accepts(p), WAIT_TIMEOUT_S)
             if running.running:
                 return running, taken
         raise AssertionError(running.output)
@@ -52,8 +52,8 @@ class Guarded:
     @contextmanager
     def session(self, name, **more):
         link = Link(connect=(f"tcp/127.0.0.1:{self.port}",), security=credentials(self.keys, (name,)), **more)
-        with open_bus(link, patience=PATIENCE) as bus:
-            assert wait_until(bus.linked, PATIENCE)
+        with open_bus(link, patience=WAIT_TIMEOUT_S) as bus:
+            assert wait_until(bus.linked, WAIT_TIMEOUT_S)
             yield bus
 
     def settings(self, name, keys=None):
@@ -155,7 +155,7 @@ def test_another_name_s_certificate_with_ones_own_password_has_no_rights(guarded
 def stamps_until_own(controller, heard):
     """Stamps of the commands that arrive, until one of the controller itself, stamped 7, is there."""
     own = CmdVel(stamp_ns=7, twist=Twist(vx=0.0, vy=0.0, wz=0.0)).encode()
-    assert controller.wait_matching(CMD_VEL, PATIENCE)
+    assert controller.wait_matching(CMD_VEL, WAIT_TIMEOUT_S)
     controller.put(CMD_VEL, own)
     stamps = []
 
@@ -164,7 +164,7 @@ def stamps_until_own(controller, heard):
             stamps.append(CmdVel.decode(sample.payload).stamp_ns)
         return 7 in stamps
 
-    assert wait_until(look, PATIENCE)
+    assert wait_until(look, WAIT_TIMEOUT_S)
     return stamps
 
 
@@ -201,9 +201,9 @@ def test_an_estimator_does_not_speak_for_the_scanner(guarded):
     with guarded.session("estimator") as victim, guarded.session("simulator") as scanner:
         victim.subscribe(SCAN, heard, keep_all=True)
         assert "done" in guarded.intrude(guarded.settings("estimator"), ["put", f"{HERE}/scan", "00"])
-        assert scanner.wait_matching(SCAN, PATIENCE)
+        assert scanner.wait_matching(SCAN, WAIT_TIMEOUT_S)
         scanner.put(SCAN, b"mine")
-        assert wait_until(lambda: len(heard) > 0, PATIENCE)
+        assert wait_until(lambda: len(heard) > 0, WAIT_TIMEOUT_S)
         assert heard.get(0).payload == b"mine"
     guarded.router.wait_for("who=estimator why=put")
 
@@ -219,10 +219,10 @@ def test_nobody_s_certificate_passes_for_a_router_s(guarded, name, answered):
     fake = guarded.processes.start(INTRUDER, json.dumps(settings), json.dumps(["serve", f"{HERE}/world", reply]))
     fake.wait_for("serving")
     link = Link(connect=(f"tcp/127.0.0.1:{port}",), security=credentials(guarded.keys, ("operator",)))
-    with open_bus(link, patience=PATIENCE) as bus:
-        assert wait_until(bus.linked, PATIENCE)
+    with open_bus(link, patience=WAIT_TIMEOUT_S) as bus:
+        assert wait_until(bus.linked, WAIT_TIMEOUT_S)
         if answered:
-            assert bus.ask(WORLD, Request(), WorldReply, PATIENCE).reason == "I am the world"
+            assert bus.ask(WORLD, Request(), WorldReply, WAIT_TIMEOUT_S).reason == "I am the world"
         else:
             with pytest.raises(UserError, match="no service answers"):
                 bus.ask(WORLD, Request(), WorldReply, 2.0)
@@ -235,7 +235,7 @@ def test_a_session_just_opened_knows_at_once_who_is_there(guarded):
         for name in SERVICES[:4]:
             stack.enter_context(guarded.session(name)).declare_alive(name)
         watching = stack.enter_context(guarded.session("observer"))
-        assert wait_until(lambda: watching.alive() == set(SERVICES[:4]), PATIENCE)
+        assert wait_until(lambda: watching.alive() == set(SERVICES[:4]), WAIT_TIMEOUT_S)
         for _ in range(20):
             with guarded.session("observer") as newcomer:
                 assert newcomer.alive() == set(SERVICES[:4])
@@ -269,7 +269,7 @@ def clients_without_certificate(port, count):
         while not ended.is_set():
             with (
                 suppress(OSError),
-                socket.create_connection(("127.0.0.1", port), PATIENCE) as plain,
+                socket.create_connection(("127.0.0.1", port), WAIT_TIMEOUT_S) as plain,
                 tls.wrap_socket(plain) as refused,
             ):
                 refused.recv(1)
@@ -279,7 +279,7 @@ def clients_without_certificate(port, count):
     for thread in threads:
         thread.start()
     try:
-        assert wait_until(lambda: all(failed), PATIENCE)
+        assert wait_until(lambda: all(failed), WAIT_TIMEOUT_S)
         yield
     finally:
         ended.set()
@@ -326,16 +326,16 @@ def test_the_whole_loop_and_an_old_command_played_again(guarded):
         goal = guarded.processes.start("presage.__main__", "goal", "4.5", "1.5", "--wait", env=environment)
         assert goal.wait(120) == 0, goal.output
         assert "reached" in goal.output
-        old = next_of(commands, CmdVel, lambda c: np.hypot(c.twist.vx, c.twist.vy) > 0.3)
+        old = wait_for_message(commands, CmdVel, lambda c: np.hypot(c.twist.vx, c.twist.vy) > 0.3)
         for topic in (TRUTH, HEALTH):
             bus.subscribe(topic, inbox, keep_all=True)
-        there = next_of(inbox, Truth, lambda _: True)
+        there = wait_for_message(inbox, Truth, lambda _: True)
         # While the controller leads nobody else is heard; after it, what is old is refused.
         for counter in ("other_sources", "stale_commands"):
-            before = next_of(inbox, Health, lambda h: h.service == "simulator").counters.get(counter, 0)
+            before = wait_for_message(inbox, Health, lambda h: h.service == "simulator").counters.get(counter, 0)
             played = guarded.intrude(guarded.settings("controller"), ["put", f"{HERE}/cmd_vel", old.encode().hex()])
             assert "done" in played
-            next_of(
+            wait_for_message(
                 inbox, Health,
                 lambda h, c=counter, b=before: h.service == "simulator" and h.counters.get(c, 0) > b,
             )  # fmt: skip
@@ -343,7 +343,7 @@ def test_the_whole_loop_and_an_old_command_played_again(guarded):
                 controller = started[SERVICES.index("controller")]
                 assert controller.stop()[0] == 0, controller.output
                 assert wait_until(lambda: "controller" not in bus.alive(), 20)
-        after = next_of(inbox, Truth, lambda _: True)  # of the pulses that told, or later
+        after = wait_for_message(inbox, Truth, lambda _: True)  # of the pulses that told, or later
     assert np.hypot(after.pose.x - 4.5, after.pose.y - 1.5) < 0.3
     assert np.hypot(after.pose.x - there.pose.x, after.pose.y - there.pose.y) < 0.05
     statuses = {process.name: process.stop()[0] for process in reversed(started) if process.running}

@@ -12,7 +12,7 @@ from common.bus.inbox import Inbox
 from common.messages.definitions import Belief, Scan
 from common.messages.topics import BELIEF, SCAN
 from services.recorder.reader import read_recording
-from tests.conftest import ROOT, next_of
+from tests.conftest import ROOT, wait_for_message
 from tests.estimator.models import change_weights
 
 SCANS = 15  # a second
@@ -39,7 +39,7 @@ def record(process, bus, folder, *estimator):
         process("simulator", "--beams", "622", "--pace", "lockstep", "--wait-for", "estimator,controller,recorder"),
     ]
     assert wait_until(lambda: bus.alive() >= SERVICES, 60)
-    next_of(scans, Scan, lambda scan: scan.seq >= SCANS)
+    wait_for_message(scans, Scan, lambda scan: scan.seq >= SCANS)
     active = folder / "session.mcap.active"
     assert wait_until(lambda: b"model/world.yaml" in active.read_bytes(), 30), started[0].output
     for running in reversed(started):
@@ -70,7 +70,7 @@ def rerun(process, bus, config, folder, scans):
     found = []
     for scan in scans:
         bus.put(SCAN, scan.encode())
-        found.append(next_of(beliefs, Belief, lambda belief, s=scan: belief.stamp_ns == s.stamp_ns))
+        found.append(wait_for_message(beliefs, Belief, lambda belief, s=scan: belief.stamp_ns == s.stamp_ns))
     assert running.stop()[0] == 0
     return found
 

@@ -10,7 +10,7 @@ import pytest
 from common.bus.bus import wait_until
 from common.geometry.cell_distance import signed_distance
 from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN
-from tests.conftest import PATIENCE, Processes, accepts, free_tcp_port
+from tests.conftest import WAIT_TIMEOUT_S, Processes, accepts, free_tcp_port
 from tests.viewer.stub_server import MAPPED
 
 browser_tools = pytest.importorskip("tests.viewer.browser", reason="NO PLAYWRIGHT: the page is not tested")
@@ -58,7 +58,7 @@ def stub(tmp_path_factory):
     processes, port = Processes(tmp_path_factory.mktemp("stub")), free_tcp_port()
     processes.start("tests.viewer.stub_server", "--port", str(port))
     try:
-        assert wait_until(lambda: accepts(port), PATIENCE)
+        assert wait_until(lambda: accepts(port), WAIT_TIMEOUT_S)
         yield f"http://127.0.0.1:{port}"
     finally:
         processes.close()
@@ -275,7 +275,7 @@ def test_after_the_mouse_the_space_key_is_the_maps(look):
 def test_the_page_comes_back_by_itself(browser, processes):
     port = str(free_tcp_port())
     first = processes.start("tests.viewer.stub_server", "--port", port)
-    assert wait_until(lambda: accepts(int(port)), PATIENCE)
+    assert wait_until(lambda: accepts(int(port)), WAIT_TIMEOUT_S)
     seen = browser_tools.visit(browser, f"http://127.0.0.1:{port}/planning/")
     seen.wait("store.arrivals.length > 5 && store.prior")
     first.stop(signal.SIGKILL)

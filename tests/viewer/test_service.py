@@ -22,7 +22,7 @@ from common.messages.topics import HEALTH, PAUSE, PREFERENCE, SCAN, TOPICS, TRUT
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
 from services.viewer.state.robot_view import SHOWN_TOPICS
-from tests.conftest import PATIENCE, taken
+from tests.conftest import WAIT_TIMEOUT_S, received_messages
 from tests.viewer.client import Page, page_of
 from tests.viewer.messages import RANGES, at, preference
 
@@ -41,7 +41,7 @@ def viewer(process):
 def fetch(url, **headers):
     """Status, headers and text of a page."""
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=PATIENCE) as answer:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=WAIT_TIMEOUT_S) as answer:
             return answer.status, answer.headers, answer.read().decode()
     except urllib.error.HTTPError as error:
         with error:
@@ -53,13 +53,13 @@ class Pretence:
 
     def __init__(self, bus):
         self.bus = bus
-        assert all(bus.wait_matching(topic, PATIENCE) for topic in SHOWN_TOPICS if topic is not HEALTH)
+        assert all(bus.wait_matching(topic, WAIT_TIMEOUT_S) for topic in SHOWN_TOPICS if topic is not HEALTH)
 
     def say(self, stamp_s, **how):
         for topic, message in at(stamp_s, **how).items():
             self.bus.put(topic, message.encode())
 
-    def keep_saying(self, page, wanted, begin=1.0, timeout=PATIENCE):
+    def keep_saying(self, page, wanted, begin=1.0, timeout=WAIT_TIMEOUT_S):
         """A stamp after another until a frame is as wanted."""
         deadline, stamp = time.monotonic() + timeout, begin
         while time.monotonic() < deadline:
@@ -245,7 +245,7 @@ class Servant:
         for query in queries:
             bus.serve(query, self.inbox)
 
-    def answer(self, name, timeout=PATIENCE):
+    def answer(self, name, timeout=WAIT_TIMEOUT_S):
         """Answer what comes until a query of that name was."""
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
@@ -300,7 +300,7 @@ def test_hostile_messages_are_answered_and_do_nothing(viewer, bus):
             page.socket.send("x" * 200_000)
             for _ in range(100):
                 page.next()
-    raw = socket.create_connection(("127.0.0.1", int(where.rstrip("/").rsplit(":", 1)[1])), PATIENCE)
+    raw = socket.create_connection(("127.0.0.1", int(where.rstrip("/").rsplit(":", 1)[1])), WAIT_TIMEOUT_S)
     with raw:
         raw.sendall(b"GET /ws HTTP/1.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Key: \xff\r\n\r\n")
         raw.shutdown(socket.SHUT_WR)
@@ -313,10 +313,10 @@ def test_hostile_messages_are_answered_and_do_nothing(viewer, bus):
     def counted():
         return any(
             health.service == "viewer" and health.counters.get("malformed", 0) == len(HOSTILE)
-            for health in taken(inbox, Health)
+            for health in received_messages(inbox, Health)
         )
 
-    assert wait_until(counted, PATIENCE)
+    assert wait_until(counted, WAIT_TIMEOUT_S)
     assert running.running
     assert "Traceback" not in running.output
 

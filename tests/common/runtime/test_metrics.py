@@ -21,7 +21,7 @@ from common.messages.definitions import Belief, Health, Pose, Scan, Status, Topi
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, SCAN, STATUS
 from common.runtime.metrics import METRICS, ServiceMetrics, table
 from common.runtime.metrics_server import split_address
-from tests.conftest import PATIENCE, ROOT
+from tests.conftest import ROOT, WAIT_TIMEOUT_S
 
 SMALL = Path(__file__).parents[1] / "small_service.py"
 SAMPLES = {row.sample: row for row in METRICS}
@@ -69,14 +69,14 @@ def test_a_service_s_numbers_are_those_of_what_happened(bus, process):
     running = process(SMALL, "--metrics", "0")
     address = address_of(running)
     assert address.startswith("http://127.0.0.1:")
-    assert wait_until(lambda: "small" in bus.alive(), PATIENCE), running.output
+    assert wait_until(lambda: "small" in bus.alive(), WAIT_TIMEOUT_S), running.output
     commands = Inbox()
     bus.subscribe(CMD_VEL, commands, keep_all=True)
-    assert bus.wait_matching(SCAN, PATIENCE)
-    assert bus.wait_matching(HEALTH, PATIENCE, key=HEALTH.key(bus.robot, "intruder"))
+    assert bus.wait_matching(SCAN, WAIT_TIMEOUT_S)
+    assert bus.wait_matching(HEALTH, WAIT_TIMEOUT_S, key=HEALTH.key(bus.robot, "intruder"))
     for number in range(5):
         bus.put(SCAN, scan(number))
-        assert wait_until(lambda n=number: commands.received.total() == n + 1, PATIENCE)
+        assert wait_until(lambda n=number: commands.received.total() == n + 1, WAIT_TIMEOUT_S)
     bus.put(HEALTH, b"\xc1", key=HEALTH.key(bus.robot, "intruder"))
     found = {}
 
@@ -86,7 +86,7 @@ def test_a_service_s_numbers_are_those_of_what_happened(bus, process):
         rate = value(found, "presage_message_rate_hertz", topic="health/small")
         return bad == 1 and bool(rate)
 
-    assert wait_until(settled, PATIENCE), found
+    assert wait_until(settled, WAIT_TIMEOUT_S), found
     whose = {"robot": bus.robot, "service": "small"}
     assert value(found, "presage_messages_received_total", **whose, topic="scan") == 5
     assert value(found, "presage_messages_published_total", **whose, topic="cmd_vel") == 5
@@ -125,8 +125,8 @@ def test_the_router_has_some_too(processes, free_port):
     running = processes.start("common.router", "--listen", endpoint, "--metrics", "127.0.0.1:0")
     address = address_of(running)
     with open_bus(Link(connect=(endpoint,))) as bus:
-        assert wait_until(bus.linked, PATIENCE)
-        assert wait_until(lambda: value(read(scrape(address)), "presage_router_sessions") == 1, PATIENCE)
+        assert wait_until(bus.linked, WAIT_TIMEOUT_S)
+        assert wait_until(lambda: value(read(scrape(address)), "presage_router_sessions") == 1, WAIT_TIMEOUT_S)
     assert value(read(scrape(address)), "presage_build_info", service="router") == 1
     assert running.stop()[0] == 0
 

@@ -25,7 +25,7 @@ from common.runtime.protocol_check import (
     started_later,
 )
 from common.versions import PROTOCOL
-from tests.conftest import PATIENCE, next_of
+from tests.conftest import WAIT_TIMEOUT_S, wait_for_message
 
 SMALL = Path(__file__).parents[1] / "small_service.py"
 FOREIGN = Path(__file__).parents[1] / "foreign_service.py"
@@ -38,10 +38,10 @@ def said(name="x", protocol=PROTOCOL, uptime=0.0, **versions) -> ConfigReply:
 
 def started_long_ago(small, bus):
     """Nobody doubts that who comes now came later."""
-    assert wait_until(lambda: "small" in bus.alive(), PATIENCE), small.output
+    assert wait_until(lambda: "small" in bus.alive(), WAIT_TIMEOUT_S), small.output
     pulses = Inbox()
     bus.subscribe(HEALTH, pulses, keep_all=True)
-    next_of(pulses, Health, lambda h: h.uptime > 1.5 * SIMULTANEOUS_START_S)
+    wait_for_message(pulses, Health, lambda h: h.uptime > 1.5 * SIMULTANEOUS_START_S)
 
 
 def test_a_newcomer_of_another_protocol_ends_and_says_why_in_one_line(process, bus):
@@ -101,12 +101,12 @@ def test_who_comes_while_the_other_is_too_busy_to_answer_ends_once_it_does(proce
 
 def test_who_is_there_names_a_newcomer_that_does_not_look_and_goes_on(process, bus, link):
     small = process(SMALL)
-    assert wait_until(lambda: "small" in bus.alive(), PATIENCE), small.output
+    assert wait_until(lambda: "small" in bus.alive(), WAIT_TIMEOUT_S), small.output
     calls = Inbox()
     with open_bus(link) as newcomer:
         newcomer.serve(CONFIG, calls, "careless")
         newcomer.declare_alive("careless")
-        call = calls.get(PATIENCE)
+        call = calls.get(WAIT_TIMEOUT_S)
         assert isinstance(call, Call)
         call.reply(said("careless", OTHER).encode())
         small.wait_for(f"protocol {OTHER} in the careless")
@@ -116,12 +116,12 @@ def test_who_is_there_names_a_newcomer_that_does_not_look_and_goes_on(process, b
 
 def test_another_version_is_one_warning(process, bus):
     foreign = process(FOREIGN, env={"FOREIGN_PRESAGE": "9.9"})
-    assert wait_until(lambda: "foreign" in bus.alive(), PATIENCE), foreign.output
+    assert wait_until(lambda: "foreign" in bus.alive(), WAIT_TIMEOUT_S), foreign.output
     small = process(SMALL)
     small.wait_for("other versions in the foreign")
     small.wait_for("ready")
     inbox = Inbox()
-    assert bus.ask_each(CONFIG, Request(), inbox).wait(PATIENCE)  # both have turned since
+    assert bus.ask_each(CONFIG, Request(), inbox).wait(WAIT_TIMEOUT_S)  # both have turned since
     replies = {answer.reply().service: answer.reply() for answer in iter(lambda: inbox.get(0), None)}
     assert replies["foreign"].versions["presage"] == "9.9"
     assert replies["small"].protocol == PROTOCOL
@@ -175,10 +175,10 @@ def test_the_bus_asks_each_of_two_of_one_name(link, bus):
             for call in calls:
                 if call is not None:
                     call.reply(build_config_reply("twice", "{}").encode())
-            assert done.wait(PATIENCE)
+            assert done.wait(WAIT_TIMEOUT_S)
             return None not in calls
 
-        assert wait_until(asked, PATIENCE)
+        assert wait_until(asked, WAIT_TIMEOUT_S)
         assert len({answer.session for answer in iter(lambda: answers.get(0), None)}) == 2
     with pytest.raises(UserError, match="no service answers"):
         bus.ask(CONFIG, Request(), ConfigReply, timeout=0.1, service="nobody")

@@ -24,7 +24,7 @@ from presage.logs.scan_files import Scans, read_scans
 from presage.replay.localize import COLUMNS, LocalizeOptions, choice_of, chosen, localize
 from presage.replay.rerun import RerunOptions, rerun_command
 from services.estimator.precise.learning.weights import FOLDER
-from tests.conftest import PATIENCE
+from tests.conftest import WAIT_TIMEOUT_S
 from tests.recorder.sessions import write
 
 SCANNER = SCANNERS["tim571"].with_beams(200)
@@ -278,7 +278,9 @@ def test_ctrl_c_ends_with_a_table_and_status_130(tmp_path, processes):
     out = tmp_path / "poses.csv"
     arguments = ["localize", str(tmp_path / "long.npz"), "--world", "corridor", "--fresh", "--out", str(out)]
     running = processes.start("presage.__main__", *arguments)
-    wait_until(lambda: not running.running or (out.exists() and len(out.read_text().splitlines()) > 3), 4 * PATIENCE)
+    wait_until(
+        lambda: not running.running or (out.exists() and len(out.read_text().splitlines()) > 3), 4 * WAIT_TIMEOUT_S
+    )
     assert running.stop(signal.SIGINT)[0] == 130
     lines = running.output.splitlines()
     assert "reading long.npz" in lines
