@@ -11,16 +11,16 @@ if TYPE_CHECKING:
     from services.bridge_ros2.graph import Graph
     from services.bridge_ros2.settings import BridgeRos2Settings
 
-SCAN_TIMEOUT_S = 3.0  # s without a scan, then it is said why
+SCAN_TIMEOUT_S = 3.0  # after this time without a scan, the health note explains why
 
 
 def diagnose(
     options: BridgeRos2Settings, graph: Graph, problem: str, *, linked: bool, quiet: float, heard: bool, reckoned: bool
 ) -> str:
-    """Empty where all is well.
+    """Explains what is wrong in one line. Returns an empty string if nothing is.
 
-    ``problem``: why the last scan could not be used; ``quiet``: s since the last that could, if one was ``heard``;
-    ``reckoned``: it came with odometry of its moment.
+    ``problem``: why the last scan could not be used. ``quiet``: seconds since the last usable scan, or since the start.
+    ``heard``: whether there was a usable scan. ``reckoned``: whether the last scan had odometry for its stamp.
     """
     topic = options.topic(options.scan_topic)
     if not linked:
@@ -36,7 +36,7 @@ def diagnose(
 
 
 def _with_scans(options: BridgeRos2Settings, graph: Graph, *, reckoned: bool) -> str:
-    """What else may be wrong while scans come."""
+    """Explains what else is wrong while scans arrive, or returns an empty string."""
     if wrong := _no_odometry(options, graph):
         return wrong
     if options.tf == "map-odom" and not reckoned:
@@ -44,9 +44,9 @@ def _with_scans(options: BridgeRos2Settings, graph: Graph, *, reckoned: bool) ->
         return (
             f"no odometry of the scans' moments {where}, so no transform from map to odom: --odom-topic, --tf map-base"
         )
-    chart = options.topic(options.map_topic)
-    if options.publish_map and (other := graph.publishers(chart)):
-        return f"{chart}: {other} publishes a map there as well: leave out --publish-map, or --map-topic"
+    map_topic = options.topic(options.map_topic)
+    if options.publish_map and (other := graph.publishers(map_topic)):
+        return f"{map_topic}: {other} publishes a map there as well: leave out --publish-map, or --map-topic"
     command = options.topic(options.cmd_topic)
     wanted = graph.expected_twist_type(command) if options.commands else ""
     if wanted and (wanted == TWIST_STAMPED) != options.stamped:
@@ -55,7 +55,10 @@ def _with_scans(options: BridgeRos2Settings, graph: Graph, *, reckoned: bool) ->
 
 
 def _no_odometry(options: BridgeRos2Settings, graph: Graph) -> str:
-    """Of a topic that was asked for by name and is not there, though others of its type are; tf may do, but unasked."""
+    """Explains that the odometry topic set by the user does not exist while others of its type do.
+
+    Returns an empty string if the topic was not set explicitly, because then odometry from tf is fine.
+    """
     if "odom_topic" not in options.model_fields_set or not options.odom_topic:
         return ""
     topic = options.topic(options.odom_topic)
@@ -66,7 +69,7 @@ def _no_odometry(options: BridgeRos2Settings, graph: Graph) -> str:
 
 
 def _no_endpoint_reason(options: BridgeRos2Settings, graph: Graph) -> str:
-    """Where nobody of our flavour and domain is seen: who is there instead, or what to look at."""
+    """Explains why no endpoints of the configured flavour and domain exist: others do, or what to check."""
     other_endpoints = graph.other_endpoints()
     domains = sorted(
         {each.domain for each in other_endpoints if each.flavor == "rmw_zenoh" and each.domain is not None}

@@ -10,24 +10,29 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.messages.ros_messages import IDENTITY, Transform, read_pose, stamp_of
 
-HISTORY_S = 10.0  # s of odometry
-CLOCK_RESET_S = (
-    1.0  # s; no network delays by more, so the clock was set back; by less, and it is soon past the old time
-)
-MAX_EXTRAPOLATION_S = 0.2  # s by which the newest odometry is carried on
-MAX_CHAIN_FRAMES = 32  # frames from the scanner to the base
+HISTORY_S = 10.0  # length of the stored odometry
+# A step of the stamps back by at least this much is no network delay: the clock was set back. After a smaller step the
+# clock soon passes the old time again.
+CLOCK_RESET_S = 1.0
+MAX_EXTRAPOLATION_S = 0.2  # beyond the newest odometry
+MAX_CHAIN_FRAMES = 32  # from a frame to the root of the tree
 
 
 class LatestTransforms:
-    """The newest transform of every child frame. Fixed joints are all that is asked for, so time does not matter."""
+    """The newest transform of every child frame.
+
+    It is only used for fixed joints, so stamps do not matter.
+    """
 
     def __init__(self) -> None:
-        """Nothing is known."""
         self._parents: dict[str, tuple[str, Transform]] = {}
 
     def add(self, message: Any) -> list[tuple[str, str, int, Transform]]:
-        """Parent, child, stamp and transform of each in a tf2_msgs/TFMessage, kept; what is none is left out."""
-        heard = []
+        """Stores the transforms of a tf2_msgs/TFMessage. Skips invalid ones.
+
+        Returns parent, child, stamp in ns and transform of each.
+        """
+        added = []
         for each in message.transforms[:10_000]:
             parent, child = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
             try:
@@ -36,23 +41,23 @@ class LatestTransforms:
                 continue
             if child in self._parents or len(self._parents) < 10_000:
                 self._parents[child] = (parent, transform)
-            heard.append((parent, child, stamp_of(each.header), transform))
-        return heard
+            added.append((parent, child, stamp_of(each.header), transform))
+        return added
 
     def find(self, child: str, base: str) -> Transform | None:
-        """The pose of ``child`` in ``base``, over frames they have in common; None where they are not connected."""
-        up, down = self._chain(child), self._chain(base)
-        for frame, transform in up.items():
-            if frame in down:
-                return down[frame].inverse().then(transform)
+        """The pose of ``child`` in ``base``. Returns None if tf does not connect them."""
+        of_child, of_base = self._chain(child), self._chain(base)
+        for frame, transform in of_child.items():
+            if frame in of_base:
+                return of_base[frame].inverse().then(transform)
         return None
 
     def names(self) -> list[str]:
-        """All frames there are."""
+        """Names of all known frames."""
         return sorted(self._parents.keys() | {parent for parent, _ in self._parents.values()})
 
     def _chain(self, frame: str) -> dict[str, Transform]:
-        """The frame's pose in itself, its parent, and so on."""
+        """The frame's pose in itself, in its parent and in each further ancestor, by the ancestor's name."""
         chain, pose = {frame: IDENTITY}, IDENTITY
         while frame in self._parents and len(chain) < MAX_CHAIN_FRAMES:
             frame, transform = self._parents[frame]
@@ -65,7 +70,7 @@ class LatestTransforms:
 
 @dataclass(frozen=True)
 class DeadReckoning:
-    """Dead reckoning at a moment."""
+    """Dead reckoning at a stamp."""
 
     stamp_ns: int
     pose: Array  # (3,) base_link in odom
@@ -74,39 +79,38 @@ class DeadReckoning:
 
 
 class OdometryBuffer:
-    """Odometry of the last seconds, at any moment between."""
+    """Odometry of the last seconds, which can be interpolated at any stamp."""
 
     def __init__(self) -> None:
-        """None has come."""
-        self._kept: deque[DeadReckoning] = deque()
+        self._entries: deque[DeadReckoning] = deque()
 
-    def add(self, dead: DeadReckoning) -> None:
-        """What comes out of order is left out; where the clock was set back (a simulation anew), all before."""
-        if self._kept and dead.stamp_ns <= (newest := self._kept[-1].stamp_ns):
-            if newest - dead.stamp_ns < CLOCK_RESET_S * 1e9:
+    def add(self, entry: DeadReckoning) -> None:
+        """Adds the newest odometry. Skips late entries; removes all before if the clock was set back."""
+        if self._entries and entry.stamp_ns <= (newest := self._entries[-1].stamp_ns):
+            if newest - entry.stamp_ns < CLOCK_RESET_S * 1e9:
                 return
-            self._kept.clear()
-        self._kept.append(dead)
-        while dead.stamp_ns - self._kept[0].stamp_ns > HISTORY_S * 1e9:
-            self._kept.popleft()
+            self._entries.clear()
+        self._entries.append(entry)
+        while entry.stamp_ns - self._entries[0].stamp_ns > HISTORY_S * 1e9:
+            self._entries.popleft()
 
     def at(self, stamp_ns: int) -> DeadReckoning | None:
-        """Between two, on the way; after the newest, carried on with its velocity for `MAX_EXTRAPOLATION_S` s; None elsewhere."""
+        """Odometry at a stamp, interpolated, or extrapolated by at most `MAX_EXTRAPOLATION_S`. Otherwise None."""
         after = None
-        for dead in reversed(self._kept):
-            if dead.stamp_ns <= stamp_ns:
-                return self._between(dead, after, stamp_ns)
-            after = dead
+        for entry in reversed(self._entries):
+            if entry.stamp_ns <= stamp_ns:
+                return self._between(entry, after, stamp_ns)
+            after = entry
         return None
 
     @staticmethod
     def _between(before: DeadReckoning, after: DeadReckoning | None, stamp_ns: int) -> DeadReckoning | None:
-        passed = (stamp_ns - before.stamp_ns) * 1e-9
+        elapsed = (stamp_ns - before.stamp_ns) * 1e-9
         if after is None:
-            moved, known = before.twist * passed, passed <= MAX_EXTRAPOLATION_S
+            moved, valid = before.twist * elapsed, elapsed <= MAX_EXTRAPOLATION_S
         else:
             span = (after.stamp_ns - before.stamp_ns) * 1e-9
-            moved, known = se2.between(before.pose, after.pose) * (passed / span), span <= 1.0
-        if not known:
+            moved, valid = se2.between(before.pose, after.pose) * (elapsed / span), span <= 1.0
+        if not valid:
             return None
         return DeadReckoning(stamp_ns, se2.compose(before.pose, moved), before.twist, before.covariance)

@@ -16,20 +16,20 @@ from common.messages.ros_messages import Mount, Transform, read_pose, stamp_of
 from common.robot.ranges import normalise_driver_ranges
 from services.bridge_ros2.frames import DeadReckoning
 
-PLANE = [0, 1, 5]  # x, y, yaw among the six of a pose's covariance
+PLANE = [0, 1, 5]  # indices of x, y, yaw in the 6 x 6 covariance of a ROS pose
 
 
 def scan_of(message: Any, mount: Mount, stamp_ns: int) -> Scan:
-    """A sensor_msgs/LaserScan with beams that turn to the left; raises ValueError where it makes no sense.
+    """Converts a sensor_msgs/LaserScan to a Scan with counter-clockwise beams. Raises ValueError if it is invalid.
 
-    A scanner upside down, or one that turns to the right, gives its beams in the other order. Of ranges
-    `common.robot.ranges` has the rule.
+    The beams of a scanner that is mounted upside down or turns clockwise are reversed. Ranges are converted by
+    `common.robot.ranges`.
     """
     beams = len(message.ranges)
     first, step = float(message.angle_min), float(message.angle_increment)
     if not 2 <= beams <= MAX_BEAMS:
         raise ValueError(f"a scan of {beams} beams, not 2 to {MAX_BEAMS}")
-    if step == 0:  # some drivers leave it out
+    if step == 0:  # some drivers do not set it
         step = (float(message.angle_max) - first) / (beams - 1)
     nearest, farthest = float(message.range_min), float(message.range_max)
     if not np.isfinite([first, step, nearest, farthest]).all() or step == 0 or farthest <= max(nearest, 0.0):
@@ -52,9 +52,9 @@ def scan_of(message: Any, mount: Mount, stamp_ns: int) -> Scan:
 
 
 def dead_reckoning_of(message: Any, child_in_base: Transform | None) -> DeadReckoning:
-    """A nav_msgs/Odometry; ``child_in_base`` where its child frame is not the base itself. Raises ValueError.
+    """Converts a nav_msgs/Odometry to the pose and velocity of the base. Raises ValueError if it is invalid.
 
-    The velocity is the child frame's, which is the base's but for where the child frame is turned or off the centre.
+    ``child_in_base`` is the pose of the message's child frame in the base, or None if the child frame is the base.
     """
     pose = read_pose(message.pose.pose.position, message.pose.pose.orientation).planar()
     linear, angular = message.twist.twist.linear, message.twist.twist.angular
@@ -73,21 +73,24 @@ def dead_reckoning_of(message: Any, child_in_base: Transform | None) -> DeadReck
 
 
 def _covariance(six: Any) -> Array:
-    """(3, 3) of x, y, yaw; zeros, as ROS says unknown, where a number is none."""
+    """Covariance (3, 3) of x, y, yaw. Zeros, which mean unknown in ROS, if a value is not finite."""
     found = np.asarray(six, float).reshape(6, 6)[np.ix_(PLANE, PLANE)]
     return found if np.isfinite(found).all() else np.zeros((3, 3))
 
 
-def odom_of(dead: DeadReckoning) -> Odom:
-    """Our message."""
-    vx, vy, wz = (float(v) for v in dead.twist)
+def odom_of(odometry: DeadReckoning) -> Odom:
+    """Converts dead reckoning to an Odom message."""
+    vx, vy, wz = (float(v) for v in odometry.twist)
     return Odom(
-        stamp_ns=dead.stamp_ns, pose=Pose.of(dead.pose), twist=Twist(vx=vx, vy=vy, wz=wz), covariance=dead.covariance
+        stamp_ns=odometry.stamp_ns,
+        pose=Pose.of(odometry.pose),
+        twist=Twist(vx=vx, vy=vy, wz=wz),
+        covariance=odometry.covariance,
     )
 
 
 def pose_of(message: Any, frame: str) -> Pose:
-    """The pose of a PoseStamped or PoseWithCovarianceStamped in ``frame``; raises ValueError for another frame."""
+    """Pose of a PoseStamped or PoseWithCovarianceStamped. Raises ValueError if it is not in ``frame``."""
     frame_id = message.header.frame_id.strip("/")
     if frame_id not in ("", frame):
         raise ValueError(f"it is in the frame {frame_id!r}, not {frame!r}: in rviz set the fixed frame to {frame}")

@@ -1,9 +1,11 @@
 """Keys of ROS 2 topics in rmw_zenoh and zenoh-bridge-ros2dds.
 
-rmw_zenoh_cpp (github.com/ros2/rmw_zenoh: docs/design.md, liveliness_utils.cpp, attachment_helpers.cpp): data on
- ``<domain>/<topic>/<type>/<hash>``; for each node, publisher and subscription a liveliness token, from which every
-other node knows the graph; with each message an attachment of 33 bytes (Jazzy's from 0.2.4 on, all others). Humble has
-no hashes of types. zenoh-bridge-ros2dds: data on the topic's plain name, no attachment, tokens of its own.
+rmw_zenoh_cpp (github.com/ros2/rmw_zenoh: docs/design.md, liveliness_utils.cpp, attachment_helpers.cpp) publishes data
+on ``<domain>/<topic>/<type>/<hash>``. Each node, publisher and subscription declares a liveliness token, from which the
+other nodes know the graph. Each message has an attachment of 33 bytes (in Jazzy from 0.2.4 on). Humble has no type
+hashes.
+
+zenoh-bridge-ros2dds publishes data on the topic's plain name, without attachments, and has its own tokens.
 """
 
 from __future__ import annotations
@@ -20,105 +22,106 @@ from services.bridge_ros2.ros_types import NO_HASH, dds_name, ros_name, type_has
 Flavor = Literal["rmw_zenoh", "ros2dds"]
 Kind = Literal["NN", "MP", "MS"]  # node, publisher, subscription
 NAME = r"(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*"
-DEPTH = 42  # of a history, where none is said (qos.cpp)
-# Everybody's tokens, whatever flavour and domain: where messages do not come, it is said who is there instead. Those of
-# zenoh-bridge-ros2dds; those of rmw_zenoh, and of that bridge before 1.0.
+DEFAULT_DEPTH = 42  # rmw_zenoh's default history depth (qos.cpp)
+# Tokens of every flavour and domain, to explain which nodes exist if no messages arrive: first those of
+# zenoh-bridge-ros2dds, then those of rmw_zenoh and of zenoh-bridge-ros2dds before 1.0.
 TOKENS = ("@/*/@ros2_lv/**", "@ros2_lv/**")
-ATTACHMENT = struct.Struct("<qqB16s")  # sequence number, ns of wall time, length, gid
+ATTACHMENT = struct.Struct("<qqB16s")  # sequence number, wall time in ns, length of the gid, gid
+# The attachment of the first versions for Jazzy, with named fields.
 LEGACY = re.compile(rb"\x0fsequence_number(.{8})\x10source_timestamp(.{8})\x0asource_gid\x10(.{16})", re.DOTALL)
 
 
 @dataclass(frozen=True)
 class Qos:
-    """Quality of service, as far as it is more than a word here."""
+    """Quality of service: the policies that the bridge uses."""
 
     reliable: bool = True
-    transient_local: bool = False  # the last ``depth`` messages are kept for those who come later
+    transient_local: bool = False  # late subscribers get the last ``depth`` messages
     depth: int = 10
 
     def text(self) -> str:
-        """As tokens have it: numbers of rmw/types.h, nothing where it is what rmw_zenoh takes unless told."""
+        """Encodes the policies as in tokens: numbers of rmw/types.h, or nothing for rmw_zenoh's defaults."""
         reliability, durability = "" if self.reliable else "2", "1" if self.transient_local else ""
-        return f"{reliability}:{durability}:,{'' if self.depth == DEPTH else self.depth}:,:,:,,"
+        return f"{reliability}:{durability}:,{'' if self.depth == DEFAULT_DEPTH else self.depth}:,:,:,,"
 
 
 SENSOR = Qos(reliable=False, depth=5)
 LATEST = Qos(depth=1)
 TF = Qos(depth=100)
 TF_STATIC = Qos(transient_local=True, depth=100)
-KEPT = Qos(transient_local=True, depth=1)
+LATCHED = Qos(transient_local=True, depth=1)
 
 
 def full_name(topic: str, namespace: str) -> str:
-    """A topic's absolute name: a relative one is put into the namespace."""
+    """A topic's absolute name. A relative name is resolved in the namespace."""
     return topic if topic.startswith("/") else f"{clean_namespace(namespace).rstrip('/')}/{topic}"
 
 
 def clean_namespace(namespace: str) -> str:
-    """With one slash before it and none after; the empty one is ``/``."""
+    """The namespace with one leading slash and no trailing one. The empty namespace is ``/``."""
     return "/" + namespace.strip("/")
 
 
 @dataclass(frozen=True)
 class Names:
-    """Keys of one domain as one flavour has them."""
+    """Zenoh keys of one flavour and ROS domain."""
 
     flavor: Flavor = "rmw_zenoh"
     domain: int = 0
-    hashes: bool = True  # False: Humble
+    hashes: bool = True  # types have hashes; False for Humble
 
     def hash_of(self, kind: str) -> str:
-        """What stands in the place of a type's hash."""
+        """The type's hash, or Humble's placeholder for it."""
         return type_hash(kind) if self.hashes else NO_HASH
 
     def publish(self, topic: str, kind: str) -> str:
-        """Where messages of type ``kind`` are put."""
+        """Key on which messages of type ``kind`` are published."""
         stem = topic.strip("/")
         if self.flavor == "ros2dds":
             return stem
         return f"{self.domain}/{stem}/{dds_name(kind)}/{self.hash_of(kind)}"
 
     def subscribe(self, topic: str, kind: str) -> str:
-        """Where they are heard: with any hash, so that one of another definition is noticed."""
+        """Key expression to subscribe to. It matches any hash, so that another definition of the type is noticed."""
         stem = topic.strip("/")
         return stem if self.flavor == "ros2dds" else f"{self.domain}/{stem}/{dds_name(kind)}/*"
 
     def check_type_hash(self, key: str, kind: str) -> None:
-        """Raises ValueError where what came on ``key`` says that it is of another definition than known here."""
-        told = key.rsplit("/", 1)[-1]
-        if self.flavor == "rmw_zenoh" and told not in (type_hash(kind), NO_HASH):
-            raise ValueError(f"its {kind} has the type hash {told}, not {type_hash(kind)}: another definition")
+        """Raises ValueError if the type hash in a received ``key`` belongs to another definition of the type."""
+        received = key.rsplit("/", 1)[-1]
+        if self.flavor == "rmw_zenoh" and received not in (type_hash(kind), NO_HASH):
+            raise ValueError(f"its {kind} has the type hash {received}, not {type_hash(kind)}: another definition")
 
-    def ours(self, endpoint: Endpoint) -> bool:
-        """Whether somebody's endpoint is called as we call ours, so that messages can meet."""
+    def matches(self, endpoint: Endpoint) -> bool:
+        """Whether an endpoint has this flavour and domain, so that it can exchange messages with the bridge."""
         return endpoint.flavor == self.flavor and endpoint.domain in (None, self.domain)
 
     def caches(self, topic: str) -> tuple[str, ...]:
-        """Where zenoh-bridge-ros2dds is asked for messages kept for those who come later."""
+        """Keys on which zenoh-bridge-ros2dds answers queries for the latched messages of a topic."""
         stem = topic.strip("/")
         return f"@/*/@ros2_pub_cache/{stem}", f"@ros2_pub_cache/*/{stem}"
 
 
 def mangle(name: str) -> str:
-    """As one chunk of a key."""
+    """Encodes a name as one chunk of a key."""
     return name.replace("/", "%")
 
 
 @dataclass(frozen=True)
 class Node:
-    """One of rmw_zenoh's nodes, which is us."""
+    """The bridge as a node of rmw_zenoh."""
 
     names: Names
-    zid: str  # of the session
+    zid: str  # the zenoh session's id
     namespace: str
     name: str
 
     def token(self) -> str:
-        """Its liveliness token."""
+        """The node's liveliness token."""
         return self._token("NN", 0)
 
     def endpoint_token(self, kind: Kind, number: int, topic: str, message: str, qos: Qos) -> str:
-        """The token of its publisher or subscription with that ``number``, unique among them."""
+        """Token of a publisher or subscription. ``number`` must be unique in the node."""
         rest = (mangle(topic), dds_name(message), self.names.hash_of(message), qos.text())
         return "/".join([self._token(kind, number), *rest])
 
@@ -128,17 +131,23 @@ class Node:
 
 
 def publisher_gid(token: str) -> bytes:
-    """16 bytes by which ROS knows the publisher with that token: its XXH3 of 128 bits, the lower half first."""
+    """The 16-byte gid of the publisher with this token: its 128-bit XXH3 hash, the lower half first."""
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(16, "little")
 
 
 def attachment(sequence: int, stamp_ns: int, gid: bytes) -> bytes:
-    """What rmw_zenoh wants with a message; it drops one without, and one it cannot read ends its process."""
+    """The attachment that rmw_zenoh needs with each message.
+
+    rmw_zenoh drops a message without it, and crashes on an attachment that it cannot read.
+    """
     return ATTACHMENT.pack(sequence, stamp_ns, len(gid), gid)
 
 
 def read_attachment(data: bytes) -> tuple[int, int, bytes] | None:
-    """Sequence number, ns of wall time, gid; also of Jazzy's first versions, which named them. None: it is none."""
+    """Sequence number, wall time in ns and gid of an attachment. Returns None if it is invalid.
+
+    Also reads the format of the first versions for Jazzy, with named fields.
+    """
     if match := LEGACY.fullmatch(data):
         return (*struct.unpack("<qq", match[1] + match[2]), match[3])
     if len(data) != ATTACHMENT.size or data[16] != 16:
@@ -149,19 +158,19 @@ def read_attachment(data: bytes) -> tuple[int, int, bytes] | None:
 
 @dataclass(frozen=True)
 class Endpoint:
-    """Somebody's publisher or subscription."""
+    """A publisher or subscription of another node."""
 
     publishes: bool
     topic: str  # absolute
-    kind: str  # a/msg/B
+    kind: str  # message type, as package/msg/Name
     hash: str = ""
-    node: str = ""  # absolute; zenoh-bridge-ros2dds does not say
+    node: str = ""  # absolute name; unknown for zenoh-bridge-ros2dds
     flavor: Flavor = "rmw_zenoh"
-    domain: int | None = None  # zenoh-bridge-ros2dds does not say
+    domain: int | None = None  # unknown for zenoh-bridge-ros2dds
 
 
 def read_token(key: str) -> Endpoint | None:
-    """What a token of either flavour says of a publisher or subscription; None of all else."""
+    """Parses the token of a publisher or subscription, of either flavour. Returns None for any other key."""
     parts = key.split("/")
     if parts[0] == "@ros2_lv" and len(parts) >= 13 and parts[5] in ("MP", "MS"):
         namespace, name, topic, kind, digest = (part.replace("%", "/") for part in parts[7:12])

@@ -12,75 +12,80 @@ from services.bridge_ros2.frames import DeadReckoning, LatestTransforms, Odometr
 
 
 class NoMountError(ValueError):
-    """Where the scanner sits is not in tf, or not yet."""
+    """tf does not, or not yet, contain the scanner's mount."""
 
 
 class MountAndOdometry:
-    """Of one robot."""
+    """The scanner's mount and the odometry of one robot, from topics and from tf."""
 
     def __init__(self, base: str, odom: str, mount: Mount | None = None) -> None:
-        """``base`` and ``odom``: names of the frames; ``mount``: of the scanner, else tf says it."""
+        """``base`` and ``odom`` are names of frames. ``mount`` is the scanner's; defaults to the one in tf."""
         self.base, self.odom = base.strip("/"), odom.strip("/")
         self.frames = LatestTransforms()
-        self._told = mount
-        self._found = mount  # the last one used
+        self._configured_mount = mount
+        self._mount = mount  # the last one used
         self._by_topic, self._by_tf = OdometryBuffer(), OdometryBuffer()
-        self._last: DeadReckoning | None = None  # by tf
-        self.unconnected_frame = (
-            ""  # odometry's child frame where tf does not connect it with the base, whose it is taken for
-        )
+        self._last: DeadReckoning | None = None  # from tf
+        # Child frame of the odometry if tf does not connect it with the base. It is then taken for the base.
+        self.unconnected_frame = ""
 
     def mount(self) -> Mount | None:
-        """The scanner's, once it is known."""
-        return self._found
+        """The scanner's mount, or None as long as it is unknown."""
+        return self._mount
 
     def mount_for(self, frame: str) -> Mount:
-        """Of a scanner whose scans name ``frame``; raises NoMountError, or ValueError where it is inclined."""
-        if self._told is not None:
-            return self._told
+        """The scanner's mount, for scans in ``frame``.
+
+        Raises NoMountError if tf does not contain it, or ValueError if the scanner is inclined.
+        """
+        if self._configured_mount is not None:
+            return self._configured_mount
         frame = frame.strip("/")
         transform = self.frames.find(frame, self.base)
         if transform is None:
-            there = ", ".join(self.frames.names()[:12]) or "none"
+            known = ", ".join(self.frames.names()[:12]) or "none"
             raise NoMountError(
-                f"tf does not connect {frame or 'their empty frame'} with {self.base} (--base-frame); frames: {there}; "
+                f"tf does not connect {frame or 'their empty frame'} with {self.base} (--base-frame); frames: {known}; "
                 "--mount x,y[,yaw_deg] says it without tf"
             )
-        self._found = mount_of(transform)
-        return self._found
+        self._mount = mount_of(transform)
+        return self._mount
 
     def child_in_base(self, child: str) -> Transform | None:
-        """Of an odometry's child frame; None where it is the base, or tf does not know better: then `unconnected_frame`."""
+        """Pose of the odometry's child frame in the base.
+
+        Returns None if the child frame is the base, or if tf does not connect them, which sets `unconnected_frame`.
+        """
         child = child.strip("/")
         found = None if child in ("", self.base) else self.frames.find(child, self.base)
         self.unconnected_frame = "" if found is not None or child == self.base else child
         return found
 
-    def add_odometry(self, dead: DeadReckoning) -> None:
-        """By topic."""
-        self._by_topic.add(dead)
+    def add_odometry(self, odometry: DeadReckoning) -> None:
+        """Adds odometry from the topic."""
+        self._by_topic.add(odometry)
 
     def add_tf(self, message: Any) -> None:
-        """Fixed joints, and the base's odometry if it is there."""
+        """Adds a tf message: fixed joints, and odometry if it contains the odom frame."""
         for parent, child, stamp_ns, transform in self.frames.add(message):
             if parent != self.odom:
                 continue
             base = self.frames.find(self.base, child)
             if base is not None:
-                self._reckon(stamp_ns, transform.then(base))
+                self._add_tf_odometry(stamp_ns, transform.then(base))
 
-    def _reckon(self, stamp_ns: int, base_in_odom: Transform) -> None:
-        """The velocity, which tf does not say, is that since the last."""
+    def _add_tf_odometry(self, stamp_ns: int, base_in_odom: Transform) -> None:
+        """Adds odometry from tf, with the mean velocity since the last one, because tf has no velocities."""
         pose, twist, last = base_in_odom.planar(), np.zeros(3), self._last
-        if last is not None and 0 < (passed := (stamp_ns - last.stamp_ns) * 1e-9) < 1:
-            twist = se2.between(last.pose, pose) / passed
+        if last is not None and 0 < (elapsed := (stamp_ns - last.stamp_ns) * 1e-9) < 1:
+            twist = se2.between(last.pose, pose) / elapsed
         self._last = DeadReckoning(stamp_ns, pose, twist, np.zeros((3, 3)))
         self._by_tf.add(self._last)
 
     def at(self, stamp_ns: int) -> DeadReckoning | None:
-        """Dead reckoning for the estimator: by topic, else by tf."""
+        """Odometry for the estimator: from the topic, or else from tf."""
         return self._by_topic.at(stamp_ns) or self._by_tf.at(stamp_ns)
 
     def at_by_tf(self, stamp_ns: int) -> DeadReckoning | None:
-        """What the transform from map to odom has to fit: tf's own odometry, else the topic's."""
+        """Odometry that the transform from map to odom must match: from tf, or else from the topic."""
         return self._by_tf.at(stamp_ns) or self._by_topic.at(stamp_ns)

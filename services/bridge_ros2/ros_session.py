@@ -1,6 +1,6 @@
 """The session on the ROS side.
 
-It imports zenoh itself: neither keys nor rules are the bus's there.
+Uses zenoh directly, because keys and access rules differ from those of the bus.
 """
 
 from __future__ import annotations
@@ -24,27 +24,28 @@ from services.bridge_ros2.ros_types import encode
 if TYPE_CHECKING:
     from services.bridge_ros2.graph import Graph
 
-HEARTBEAT_PERIOD_S = 0.5  # s, of kept topics; rmw_zenoh's
-LEASE_MS = 3000  # ms until one who is silent counts as gone
+HEARTBEAT_PERIOD_S = 0.5  # of latched topics, as in rmw_zenoh
+LEASE_MS = 3000  # a silent peer counts as gone after this
 
 
 def open_ros_session(endpoint: str, config: Path | None = None) -> zenoh.Session | None:
-    """None where nobody answers; raises UserError where the endpoint or the file is none.
+    """Opens a zenoh session on the ROS side. Returns None if no router answers.
 
-    A client: rmw_zenoh's nodes listen on their own host alone, and a router does not pass on between peers.
+    Raises UserError if the endpoint or the configuration file is invalid. The session is a client, because nodes of
+    rmw_zenoh only listen on their own host, and a router does not forward between peers.
     """
     try:
-        chosen = zenoh.Config.from_file(str(config)) if config else zenoh.Config()
+        zenoh_config = zenoh.Config.from_file(str(config)) if config else zenoh.Config()
         for key, value in ({} if config else _settings(endpoint)).items():
-            chosen.insert_json5(key, json.dumps(value))
-        return zenoh.open(chosen)
+            zenoh_config.insert_json5(key, json.dumps(value))
+        return zenoh.open(zenoh_config)
     except zenoh.ZError as error:
         text = str(error)
         if "Unable to connect" in text:
             return None
-        # Zenoh appends its own source line, and wraps some messages in the name of a Rust enum.
+        # zenoh appends its own source line, and wraps some messages in the name of a Rust enum.
         why = " ".join(text.split(" at /", maxsplit=1)[0].split()).removeprefix('Json5Err(Message { msg: "')
-        advice = "--ros-config: a zenoh configuration" if config else "--ros-connect is written like tcp/ROBOT:7447"
+        advice = "--ros-config needs a zenoh configuration" if config else "write --ros-connect like tcp/ROBOT:7447"
         raise UserError(f"no session with {config or endpoint}: {why}; {advice}") from None
 
 
@@ -52,7 +53,7 @@ def _settings(endpoint: str) -> dict[str, Any]:
     return {
         "mode": "client",
         "connect/endpoints": [each.strip() for each in endpoint.split(",") if each.strip()],
-        "connect/timeout_ms": 500,  # it is tried again; the loop goes on between
+        "connect/timeout_ms": 500,  # short, because it blocks the service loop, which tries again later
         "connect/exit_on_failure": True,
         "scouting/multicast/enabled": False,
         "transport/shared_memory/enabled": False,
@@ -62,15 +63,15 @@ def _settings(endpoint: str) -> dict[str, Any]:
 
 @dataclass
 class RosPublisher:
-    """One of our publishers."""
+    """A publisher on the ROS side."""
 
-    kind: str
+    kind: str  # message type
     publisher: Any
-    gid: bytes  # empty: no attachment
+    gid: bytes  # for the attachment; empty if the flavour has none
     sequence: itertools.count[int]
 
     def put(self, message: Any, kind: str | None = None) -> None:
-        """Send a message."""
+        """Sends a message. ``kind`` defaults to the publisher's type."""
         payload = encode(kind or self.kind, message)
         if not self.gid:
             self.publisher.put(payload)
@@ -79,10 +80,10 @@ class RosPublisher:
 
 
 class RosSession:
-    """What was declared on it; the graph and the inbox are filled by zenoh's threads."""
+    """The bridge's node in the ROS graph. zenoh's threads fill the graph and the inbox."""
 
     def __init__(self, session: zenoh.Session, names: Names, namespace: str, name: str, graph: Graph) -> None:
-        """Say that the node is there, and hear who else is."""
+        """Declares the node, and subscribes to the tokens of other nodes."""
         self._session, self._names, self._graph = session, names, graph
         self._declared: list[Any] = []
         self._numbers = itertools.count(1)
@@ -91,80 +92,87 @@ class RosSession:
             self._node = Node(names, str(session.zid()), namespace, name)
             self._token(self._node.token())
         for key in TOKENS:
-            self._declared.append(session.liveliness().declare_subscriber(key, self._seen, history=True))
+            self._declared.append(session.liveliness().declare_subscriber(key, self._on_token, history=True))
 
-    def _seen(self, sample: zenoh.Sample) -> None:
+    def _on_token(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
-        if self._node is None or f"/{self._node.zid}/" not in key:  # not ourselves
+        if self._node is None or f"/{self._node.zid}/" not in key:  # skips the bridge's own tokens
             self._graph.change(key, there=sample.kind == zenoh.SampleKind.PUT)
 
     def _token(self, key: str) -> None:
         self._declared.append(self._session.liveliness().declare_token(key))
 
     def subscribe(self, row: Topic, topic: str, kind: str, qos: Qos, inbox: Inbox) -> None:
-        """Move what comes on a ROS topic to ``inbox`` under ``row``, with what was kept for latecomers."""
+        """Subscribes to a ROS topic. Its messages, latched ones included, go to ``inbox`` as samples of ``row``."""
 
-        def move(sample: zenoh.Sample) -> None:
-            attached = sample.attachment
-            read = read_attachment(attached.to_bytes()) if attached is not None else None
-            published = read[1] if read is not None else 0
-            entry = Sample(row, str(sample.key_expr), sample.payload.to_bytes(), published, time.time_ns())
+        def on_sample(sample: zenoh.Sample) -> None:
+            data = sample.attachment
+            fields = read_attachment(data.to_bytes()) if data is not None else None
+            published_ns = fields[1] if fields is not None else 0
+            entry = Sample(row, str(sample.key_expr), sample.payload.to_bytes(), published_ns, time.time_ns())
             inbox.put(entry, newest_only=row.queue == "newest")
 
         key = self._names.subscribe(topic, kind)
-        more: dict[str, Any] = {}
+        options: dict[str, Any] = {}
         if qos.transient_local:
-            more = {
+            options = {
                 "history": zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=qos.depth),
                 "recovery": zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
                 "subscriber_detection": True,
             }
-        self._declared.append(zenoh.ext.declare_advanced_subscriber(self._session, key, move, **more))
+        self._declared.append(zenoh.ext.declare_advanced_subscriber(self._session, key, on_sample, **options))
         if self._node is not None:
             self._token(self._node.endpoint_token("MS", next(self._numbers), topic, kind, qos))
 
     def fetch(self, row: Topic, topic: str, inbox: Inbox) -> None:
-        """Ask zenoh-bridge-ros2dds, which keeps them otherwise, for messages of a kept topic; does not wait."""
+        """Queries zenoh-bridge-ros2dds for the messages of a latched topic, without waiting for the reply.
+
+        Does nothing with rmw_zenoh, where `subscribe` receives them.
+        """
         if self._node is not None:
             return
 
-        def move(reply: zenoh.Reply) -> None:
+        def on_reply(reply: zenoh.Reply) -> None:
             if (sample := reply.ok) is not None:
                 inbox.put(Sample(row, topic.strip("/"), sample.payload.to_bytes(), 0, time.time_ns()))
 
         for key in self._names.caches(topic):
             self._session.get(
-                key, zenoh.handlers.Callback(move), target=zenoh.QueryTarget.ALL, timeout=1.0,
-                consolidation=zenoh.ConsolidationMode.NONE, accept_replies=zenoh.ReplyKeyExpr.ANY,
-            )  # fmt: skip
+                key,
+                zenoh.handlers.Callback(on_reply),
+                target=zenoh.QueryTarget.ALL,
+                timeout=1.0,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                accept_replies=zenoh.ReplyKeyExpr.ANY,
+            )
 
     def publisher(self, topic: str, kind: str, qos: Qos) -> RosPublisher:
-        """A publisher, known to the graph."""
-        more: dict[str, Any] = {}
+        """Declares a publisher, with its token in the ROS graph."""
+        options: dict[str, Any] = {}
         if qos.transient_local:
-            more = {
+            options = {
                 "cache": zenoh.ext.CacheConfig(qos.depth),
                 "publisher_detection": True,
                 "sample_miss_detection": zenoh.ext.MissDetectionConfig(
                     heartbeat=None, sporadic_heartbeat=HEARTBEAT_PERIOD_S
                 ),
             }
-        made = zenoh.ext.declare_advanced_publisher(
-            self._session, self._names.publish(topic, kind), congestion_control=zenoh.CongestionControl.DROP, **more
+        publisher = zenoh.ext.declare_advanced_publisher(
+            self._session, self._names.publish(topic, kind), congestion_control=zenoh.CongestionControl.DROP, **options
         )
-        self._declared.append(made)
+        self._declared.append(publisher)
         gid = b""
         if self._node is not None:
             token = self._node.endpoint_token("MP", next(self._numbers), topic, kind, qos)
             self._token(token)
             gid = publisher_gid(token)
-        return RosPublisher(kind, made, gid, itertools.count(1))
+        return RosPublisher(kind, publisher, gid, itertools.count(1))
 
     def linked(self) -> bool:
-        """Whether the router is reached."""
+        """Whether the session is connected to a router or peer."""
         info = self._session.info
         return bool(list(info.routers_zid()) or list(info.peers_zid()))
 
     def close(self) -> None:
-        """Take everything back."""
+        """Closes the session and all its declarations."""
         self._session.close()  # type: ignore[no-untyped-call]

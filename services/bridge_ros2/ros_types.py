@@ -23,51 +23,51 @@ USED: Final = (
     LASER_SCAN, ODOMETRY, TF_MESSAGE, TWIST, TWIST_STAMPED, POSE_STAMPED, POSE_WITH_COVARIANCE, POSE_ARRAY,
     OCCUPANCY_GRID,
 )  # fmt: skip
-NO_HASH: Final = "TypeHashNotSupported"  # what Humble, which knows no hashes, writes in their place
+NO_HASH: Final = "TypeHashNotSupported"  # placeholder of Humble, which has no type hashes
 
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 
 class CdrError(ValueError):
-    """Bytes that are not the message they should be."""
+    """Bytes that are not a valid CDR message of the expected type."""
 
 
 @cache
 def type_hash(name: str) -> str:
-    """RIHS01 of a type (REP-2016), as rmw_zenoh has it in its keys from Iron on."""
+    """RIHS01 hash of a type (REP-2016), which rmw_zenoh has in its keys from Iron on."""
     return str(_STORE.hash_rihs01(name))
 
 
 def dds_name(name: str) -> str:
-    """``a/msg/B`` as DDS and rmw_zenoh call it: ``a::msg::dds_::B_``."""
+    """Name of the type ``a/msg/B`` in DDS and rmw_zenoh: ``a::msg::dds_::B_``."""
     package, kind, short = name.split("/")
     return f"{package}::{kind}::dds_::{short}_"
 
 
 def ros_name(dds: str) -> str:
-    """The other way round; what is no such name stays as it is."""
+    """Inverse of `dds_name`. Any other name is returned unchanged."""
     parts = dds.split("::")
     return "/".join([*parts[:-2], parts[-1].removesuffix("_")]) if parts[-2:-1] == ["dds_"] else dds
 
 
 def make(name: str, **fields: Any) -> Any:
-    """A message; every field has to be given."""
+    """Creates a message. Every field must be given."""
     return _STORE.types[name](**fields)
 
 
 def encode(name: str, message: Any) -> bytes:
-    """CDR, little-endian, with its four bytes of encapsulation."""
+    """Encodes a message as little-endian CDR, with the four bytes of its encapsulation header."""
     return bytes(_STORE.serialize_cdr(message, name))
 
 
 def decode(name: str, payload: bytes) -> Any:
-    """The message; raises CdrError where the bytes are none."""
+    """Decodes a message. Raises CdrError if the bytes are invalid."""
     if len(payload) < 4 or payload[0] != 0 or payload[1] not in (0, 1):
-        raise CdrError(f"{name}: {len(payload)} bytes that do not begin as plain CDR does")
+        raise CdrError(f"{name}: {len(payload)} bytes without the header of plain CDR")
     try:
         return _STORE.deserialize_cdr(payload, name)
-    except Exception as error:  # noqa: BLE001 - the library raises whatever the bytes lead it into
-        raise CdrError(f"{name}: {len(payload)} bytes that are none ({type(error).__name__})") from None
+    except Exception as error:  # noqa: BLE001 - the library raises any error on invalid bytes
+        raise CdrError(f"{name}: {len(payload)} bytes that cannot be decoded ({type(error).__name__})") from None
 
 
 def header(stamp_ns: int, frame: str) -> Any:

@@ -20,7 +20,7 @@ from services.bridge_ros2.command_gate import CommandGate
 from services.bridge_ros2.diagnostics import SCAN_TIMEOUT_S, diagnose
 from services.bridge_ros2.from_ros import dead_reckoning_of, odom_of, pose_of, scan_of
 from services.bridge_ros2.graph import Graph
-from services.bridge_ros2.keys import KEPT, LATEST, SENSOR, TF, TF_STATIC, Qos
+from services.bridge_ros2.keys import LATCHED, LATEST, SENSOR, TF, TF_STATIC, Qos
 from services.bridge_ros2.odometry import MountAndOdometry, NoMountError
 from services.bridge_ros2.ros_session import RosPublisher, RosSession, open_ros_session
 from services.bridge_ros2.ros_types import (
@@ -38,13 +38,13 @@ from services.bridge_ros2.ros_types import (
 )  # fmt: skip
 from services.bridge_ros2.settings import BridgeRos2Settings
 
-MAP_PERIOD_S = 10.0  # s between two messages of the map, for who has missed it; SLAM's nodes say theirs as often
-CHECK_PERIOD_S = 1.0  # s between two looks at how things stand, and between two tries to reach the router
-YAW_TOLERANCE = 0.25  # rad, of rviz's goals, as nav2 has it
+MAP_PERIOD_S = 10.0  # the map is repeated for subscribers that missed it, as SLAM nodes do
+CHECK_PERIOD_S = 1.0  # between checks of the health, and between attempts to reach the router
+YAW_TOLERANCE_RAD = 0.25  # of goals from rviz, as in nav2
 
 
 class BridgeRos2Service(Service):
-    """A robot in ROS as a process of ours."""
+    """Connects presage with a robot in ROS 2."""
 
     name: ClassVar[str] = "bridge_ros2"
     single: ClassVar[bool] = True
@@ -52,30 +52,30 @@ class BridgeRos2Service(Service):
     inputs: ClassVar[tuple[Topic, ...]] = (BELIEF, CMD_VEL)
 
     def __init__(self, settings: BridgeRos2Settings) -> None:
-        """Nothing is reached yet."""
         super().__init__(settings)
         self.options = settings
         self.graph = Graph(settings.names())
-        self.motion = MountAndOdometry(settings.base_frame, settings.odom_frame, settings.the_mount())
+        self.motion = MountAndOdometry(settings.base_frame, settings.odom_frame, settings.build_mount())
         self.gate = CommandGate(settings.build_robot(), obstacle_stop=settings.obstacle_stop)
-        self.blind = settings.build_self_filter()
+        self.self_filter = settings.build_self_filter()
         self.note = f"waits for the zenoh router at {settings.ros_connect}"
         self._ros: RosSession | None = None
-        self._out: dict[str, RosPublisher] = {}
-        self._rows: dict[str, tuple[str, Callable[[Any], None]]] = {}  # by name of our row: type, what is done
-        self._look_at = 0.0
+        self._publishers: dict[str, RosPublisher] = {}  # by the option's topic name
+        # Subscribed ROS topics by the name of their row: message type and handler.
+        self._handlers: dict[str, tuple[str, Callable[[Any], None]]] = {}
+        self._check_at = 0.0
         self._scan_at: float | None = None  # when the last scan was passed on
         self._began = time.monotonic()
-        self._clock: tuple[int, float] | None = None  # the robot's, and ours, when its last scan came
-        self._waiting_said = False
-        self._unplaced_said = False
+        self._clock: tuple[int, float] | None = None  # the last scan's stamp, and its monotonic reception time
+        self._warned_waiting = False
+        self._warned_unconnected_frame = False
         self._reckoned = False  # the last scan came with odometry
-        self._map: Any = None  # the message
-        self._map_at = 0.0  # when it is due
-        self._problem = ""  # why the last message could not be used
+        self._map: Any = None  # the map message
+        self._map_at = 0.0  # when the map is published next
+        self._problem = ""  # why the last scan could not be used
 
     def open(self) -> None:
-        """Declared before anybody asks: the first message on a key just declared may be lost."""
+        """Checks the settings and declares publishers, because the first messages after a declaration may be lost."""
         self.options.check()
         if self.options.publish_map:
             self._map = to_ros.map_message(rasterise(load_world(self.options.world)), self.options.map_frame)
@@ -83,111 +83,117 @@ class BridgeRos2Service(Service):
             self.loop.bus.publisher(topic, self.name)
 
     def close(self) -> None:
-        """A robot under way is stopped."""
+        """Stops a moving robot and closes the session on the ROS side."""
         self._drive(self.gate.stop_for_silence(time.monotonic()))
         if self._ros is not None:
             self._ros.close()
 
     def _connect(self) -> None:
-        """Reach the robot's router, or try again a second later."""
+        """Tries to reach the robot's router. If it answers, declares subscriptions and publishers."""
         options = self.options
         session = open_ros_session(options.ros_connect, options.ros_config)
         if session is None:
-            if not self._waiting_said:
+            if not self._warned_waiting:
                 self.log.warning(self.note)
-            self._waiting_said = True
+            self._warned_waiting = True
             return
         ros = self._ros = RosSession(session, options.names(), options.namespace, options.node, self.graph)
         self._began = time.monotonic()
-        heard: list[tuple[str, str, Qos, Callable[[Any], None]]] = [
+        subscribed: list[tuple[str, str, Qos, Callable[[Any], None]]] = [
             (options.tf_topic + "_static", TF_MESSAGE, TF_STATIC, self._on_tf),
             (options.tf_topic, TF_MESSAGE, TF, self._on_tf),
             (options.odom_topic, ODOMETRY, Qos(), self._on_odometry),
             (options.scan_topic, LASER_SCAN, SENSOR, self._on_scan),
             (options.initial_pose_topic, POSE_WITH_COVARIANCE, Qos(), self._on_initial_pose),
         ]
-        said = [
-            (options.pose_topic, POSE_WITH_COVARIANCE, KEPT),
+        published = [
+            (options.pose_topic, POSE_WITH_COVARIANCE, LATCHED),
             (options.hypotheses_topic, POSE_ARRAY, SENSOR),
             (options.tf_topic if options.tf != "none" else "", TF_MESSAGE, TF),
         ]
         if self._map is not None:
-            said.append((options.map_topic, OCCUPANCY_GRID, KEPT))
+            published.append((options.map_topic, OCCUPANCY_GRID, LATCHED))
         if options.commands:
-            heard.append((options.goal_topic, POSE_STAMPED, Qos(), self._on_goal))
-            said.append((options.cmd_topic, TWIST_STAMPED if options.stamped else TWIST, LATEST))
-        self._out = {name: ros.publisher(options.topic(name), kind, qos) for name, kind, qos in said if name}
-        for name, kind, qos, hear in heard:
+            subscribed.append((options.goal_topic, POSE_STAMPED, Qos(), self._on_goal))
+            published.append((options.cmd_topic, TWIST_STAMPED if options.stamped else TWIST, LATEST))
+        self._publishers = {
+            name: ros.publisher(options.topic(name), kind, qos) for name, kind, qos in published if name
+        }
+        for name, kind, qos, handler in subscribed:
             if name:
                 row = _row(name, newest=name == options.scan_topic)
-                self._rows[row.name] = (kind, hear)
+                self._handlers[row.name] = (kind, handler)
                 ros.subscribe(row, options.topic(name), kind, qos, self.loop.inbox)
         self.note = f"no scan on {options.topic(options.scan_topic)} yet"
-        self.log.info("reached the robot's side", endpoint=options.ros_connect, flavor=options.flavor)
+        self.log.info("connected to the robot's router", endpoint=options.ros_connect, flavor=options.flavor)
 
     def due(self) -> float | None:
-        """Until the next look, or until a robot whose commands have ended is stopped."""
+        """Seconds until the next check, or until a robot without commands is stopped."""
         now = time.monotonic()
         stop = self.gate.due(now) if self.gate.moving else self.gate.repeat_due(now)
-        look = self._look_at - now
-        return look if stop is None else min(look, stop)
+        check = self._check_at - now
+        return check if stop is None else min(check, stop)
 
     def on_timer(self) -> None:
-        """Stop the robot; look how things stand."""
+        """Stops a robot without commands, and checks the health periodically."""
         now = time.monotonic()
         if self.gate.moving and self.gate.due(now) <= 0:
             self.counters["stops_for_silence"] += 1
             self.log.warning("stop: commands have ended", silent_s=round(self.gate.timeout, 2))
             self._drive(self.gate.stop_for_silence(now))
         self._drive(self.gate.repeat_stop(now))
-        if now >= self._look_at:
-            self._look_at = now + CHECK_PERIOD_S
-            self._look(now)
+        if now >= self._check_at:
+            self._check_at = now + CHECK_PERIOD_S
+            self._check(now)
 
-    def _look(self, now: float) -> None:
-        """Say in health, and once in the log, what is missing."""
+    def _check(self, now: float) -> None:
+        """Connects if necessary, publishes the map, and reports problems in the health note and once in the log."""
         if self._ros is None:
             self._connect()
-            self._look_at = time.monotonic() + CHECK_PERIOD_S
+            self._check_at = time.monotonic() + CHECK_PERIOD_S
         before = self.note
         if self._ros is not None:
-            self._say_map(now)
+            self._publish_map(now)
             static = self.options.topic(self.options.tf_topic + "_static")
             if self.motion.mount() is None:
                 self._ros.fetch(_row(self.options.tf_topic + "_static"), static, self.loop.inbox)
             since = self._scan_at if self._scan_at is not None else self._began
             self.note = diagnose(
-                self.options, self.graph, self._problem,
-                linked=self._ros.linked(), quiet=now - since, heard=self._scan_at is not None,
+                self.options,
+                self.graph,
+                self._problem,
+                linked=self._ros.linked(),
+                quiet=now - since,
+                heard=self._scan_at is not None,
                 reckoned=self._reckoned,
-            )  # fmt: skip
-            self._say_unplaced(now)
+            )
+            self._warn_about_unconnected_frame(now)
         if self.note and self.note != before:
             self.log.warning(self.note)
         elif before and not self.note:
-            self.log.info("scans come", mount=self.motion.mount())
+            self.log.info("receiving scans", mount=self.motion.mount())
 
-    def _say_unplaced(self, now: float) -> None:
-        """Once: odometry is about a frame that tf does not know, though it had the time to come."""
+    def _warn_about_unconnected_frame(self, now: float) -> None:
+        """Logs once if tf does not contain the odometry's child frame, some time after the start."""
         child, base = self.motion.unconnected_frame, self.motion.base
-        if child and not self._unplaced_said and now - self._began > SCAN_TIMEOUT_S:
-            self._unplaced_said = True
+        if child and not self._warned_unconnected_frame and now - self._began > SCAN_TIMEOUT_S:
+            self._warned_unconnected_frame = True
             self.log.warning(
-                "odometry is about a frame that tf does not connect with the base: taken for the base's",
+                "tf does not connect the child frame of the odometry with the base: it is taken for the base",
                 frame=child,
                 base=base,
             )
 
     def on_sample(self, sample: Sample) -> None:
-        """Ours as ever; one of ROS is decoded, and handed to what is done with its topic."""
-        if sample.topic.name not in self._rows:
+        """Decodes a sample from ROS and calls its handler. Samples from the bus are handled by the base class."""
+        if sample.topic.name not in self._handlers:
             super().on_sample(sample)
             return
-        kind, hear = self._rows[sample.topic.name]
+        kind, handler = self._handlers[sample.topic.name]
         try:
             self.options.names().check_type_hash(sample.key, kind)
-            hear(decode(kind, sample.payload))
-        except NoMountError as error:  # tf may still be on its way: after a while it is said
+            handler(decode(kind, sample.payload))
+        except NoMountError as error:  # tf may still arrive; the health note reports it only after a while
             self._problem = str(error)
             self.counters["scans_without_mount"] += 1
         except (CdrError, ValueError, OverflowError) as error:
@@ -199,12 +205,12 @@ class BridgeRos2Service(Service):
 
     def _on_odometry(self, message: Any) -> None:
         child = self.motion.child_in_base(message.child_frame_id)
-        dead = dead_reckoning_of(message, child)
-        self.motion.add_odometry(dead)
-        self.gate.add_velocity(dead.twist, time.monotonic())
+        odometry = dead_reckoning_of(message, child)
+        self.motion.add_odometry(odometry)
+        self.gate.add_velocity(odometry.twist, time.monotonic())
 
     def _on_scan(self, message: Any) -> None:
-        """The scan, after the odometry of its moment."""
+        """Publishes the odometry at the scan's stamp and then the scan."""
         now = time.monotonic()
         stamp_ns = stamp_of(message.header)
         if stamp_ns <= 0:
@@ -213,90 +219,90 @@ class BridgeRos2Service(Service):
         mount = self.motion.mount_for(message.header.frame_id)
         scan = scan_of(message, mount, stamp_ns)
         self._clock = (stamp_ns, now)
-        dead = self.motion.at(stamp_ns)
-        self._reckoned = dead is not None
-        if dead is not None:
-            self.publish(ODOM, odom_of(dead))
+        odometry = self.motion.at(stamp_ns)
+        self._reckoned = odometry is not None
+        if odometry is not None:
+            self.publish(ODOM, odom_of(odometry))
         else:
             self.counters["scans_without_odometry"] += 1
-        self.gate.add_scan(self.blind.mask_for_planning(scan), now)
-        self.publish(SCAN, self.blind.mask_for_bus(scan))
+        self.gate.add_scan(self.self_filter.mask_for_planning(scan), now)
+        self.publish(SCAN, self.self_filter.mask_for_bus(scan))
         self._scan_at, self._problem = now, ""
 
     def _on_initial_pose(self, message: Any) -> None:
         pose = pose_of(message, self.options.map_frame)
-        self.log.info("told where the robot is", x=pose.x, y=pose.y, yaw=pose.yaw)
+        self.log.info("initial pose from ROS", x=pose.x, y=pose.y, yaw=pose.yaw)
         self.request(LOCALISE, LocaliseRequest(pose=pose))
 
     def _on_goal(self, message: Any) -> None:
         pose = pose_of(message, self.options.map_frame)
-        self.log.info("goal", x=pose.x, y=pose.y, yaw=pose.yaw)
+        self.log.info("goal from ROS", x=pose.x, y=pose.y, yaw=pose.yaw)
         stamp_ns = self._clock[0] if self._clock else 0
-        self.publish(GOAL, Goal(stamp_ns=stamp_ns, pose=pose, yaw_tolerance=YAW_TOLERANCE))
+        self.publish(GOAL, Goal(stamp_ns=stamp_ns, pose=pose, yaw_tolerance=YAW_TOLERANCE_RAD))
 
     def on_reply(self, query: Query, number: int, reply: Reply) -> None:  # noqa: ARG002
-        """What became of rviz's pose."""
+        """Logs if the estimator did not accept the initial pose."""
         if not reply.ok:
-            self.log.warning("the estimator was not told where the robot is", why=reply.reason)
+            self.log.warning("the estimator did not accept the initial pose", why=reply.reason)
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
-        """A belief or a command, for ROS."""
+        """Publishes a belief or a command to ROS."""
         if isinstance(message, Belief):
-            self._say(message)
+            self._publish_belief(message)
         elif isinstance(message, CmdVel) and self.options.commands:
             refused = self.gate.refused
             self._drive(self.gate.command(message, time.monotonic()))
             if self.gate.refused > refused:
                 self.counters["stale_commands"] += 1
 
-    def _say(self, belief: Belief) -> None:
-        """Pose, transform and hypotheses."""
+    def _publish_belief(self, belief: Belief) -> None:
+        """Publishes hypotheses and, while the robot is tracked, pose and transform."""
         options = self.options
-        if (cloud := self._out.get(options.hypotheses_topic)) is not None:
-            cloud.put(to_ros.hypotheses_message(belief, options.map_frame))
+        if (hypotheses := self._publishers.get(options.hypotheses_topic)) is not None:
+            hypotheses.put(to_ros.hypotheses_message(belief, options.map_frame))
         if not to_ros.is_publishable(belief):
             self.counters["beliefs_not_said"] += 1
             return
-        if (pose := self._out.get(options.pose_topic)) is not None:
+        if (pose := self._publishers.get(options.pose_topic)) is not None:
             message = to_ros.pose_message(belief, options.map_frame)
             if message is not None:
                 pose.put(message)
-        if (tf := self._out.get(options.tf_topic)) is not None:
-            self._say_transform(belief, tf)
+        if (tf := self._publishers.get(options.tf_topic)) is not None:
+            self._publish_transform(belief, tf)
 
-    def _say_transform(self, belief: Belief, tf: RosPublisher) -> None:
-        options, odometry, child = self.options, None, self.options.base_frame
+    def _publish_transform(self, belief: Belief, tf: RosPublisher) -> None:
+        options, odometry_pose, child = self.options, None, self.options.base_frame
         if options.tf == "map-odom":
-            dead = self.motion.at_by_tf(belief.stamp_ns)
-            if dead is None:
+            odometry = self.motion.at_by_tf(belief.stamp_ns)
+            if odometry is None:
                 self.counters["transforms_without_odometry"] += 1
                 return
-            odometry, child = dead.pose, options.odom_frame
-        ahead = belief.stamp_ns + round(options.transform_tolerance * 1e9)
-        pose = to_ros.correction(belief.pose, odometry)
-        tf.put(to_ros.transform_message(pose, ahead, options.map_frame, child))
+            odometry_pose, child = odometry.pose, options.odom_frame
+        stamp_ns = belief.stamp_ns + round(options.transform_tolerance * 1e9)
+        pose = to_ros.correction(belief.pose, odometry_pose)
+        tf.put(to_ros.transform_message(pose, stamp_ns, options.map_frame, child))
 
-    def _say_map(self, now: float) -> None:
-        """Kept for those who come later, as map_server's; and again, for those whom that does not reach."""
+    def _publish_map(self, now: float) -> None:
+        """Publishes the map if it is due. It is latched, as map_server's, and repeated in case that fails."""
         if self._map is not None and now >= self._map_at:
             self._map_at = now + MAP_PERIOD_S
-            self._out[self.options.map_topic].put(self._map)
+            self._publishers[self.options.map_topic].put(self._map)
 
     def _drive(self, twist: Array | None) -> None:
-        """Send a velocity, dated by the robot's clock."""
-        publisher = self._out.get(self.options.cmd_topic)
+        """Publishes a velocity, stamped with the robot's clock. Does nothing if ``twist`` is None."""
+        publisher = self._publishers.get(self.options.cmd_topic)
         if twist is None or publisher is None:
             return
-        stamp = None
+        stamp_ns = None
         if self.options.stamped:
-            there, here = self._clock or (time.time_ns(), time.monotonic())
-            stamp = there + round((time.monotonic() - here) * 1e9)
-        kind, message = to_ros.twist_message(twist, stamp, self.options.base_frame)
+            scan_stamp_ns, received_at = self._clock or (time.time_ns(), time.monotonic())
+            stamp_ns = scan_stamp_ns + round((time.monotonic() - received_at) * 1e9)
+        kind, message = to_ros.twist_message(twist, stamp_ns, self.options.base_frame)
         publisher.put(message, kind)
 
 
 def _row(name: str, *, newest: bool = False) -> Topic:
-    """A topic of ROS as the inbox has it."""
+    """A ROS topic as a row of the table of topics, for the inbox."""
     return Topic(
         f"ros {name}", Stamped, "ros", 0, "newest" if newest else "all", recorded=False, multiple_publishers=True
     )

@@ -20,20 +20,20 @@ FRAME = r"^[A-Za-z0-9_./-]{1,64}$"
 
 
 class BridgeRos2Settings(SeenRobotSettings):
-    """Bridge to ROS 2: a robot, or Gazebo, in the simulator's place; presage in AMCL's. Needs no ROS here.
+    """Bridge to ROS 2: a robot, or Gazebo, replaces the simulator, and presage replaces AMCL. ROS is not needed here.
 
     On the robot: RMW_IMPLEMENTATION=rmw_zenoh_cpp and `ros2 run rmw_zenoh_cpp rmw_zenohd`, or zenoh-bridge-ros2dds.
 
     Examples:
-      python -m services.bridge_ros2 --ros-connect tcp/ROBOT:7447         its scans, odometry and tf, and it drives
-      python -m services.bridge_ros2 --ros-connect tcp/ROBOT:7447 --no-commands      nav2 drives: localise it, no more
-      python -m services.bridge_ros2 --ros-connect tcp/ROBOT:7447 --flavor ros2dds   through zenoh-bridge-ros2dds
+      python -m services.bridge_ros2 --ros-connect tcp/ROBOT:7447         localise and drive the robot
+      python -m services.bridge_ros2 --ros-connect tcp/ROBOT:7447 --no-commands      only localise; nav2 drives
+      python -m services.bridge_ros2 --ros-connect tcp/ROBOT:7447 --flavor ros2dds   with zenoh-bridge-ros2dds
       python -m services.bridge_ros2 --distro humble --cmd-topic cmd_vel --drive differential
       python -m services.bridge_ros2 --namespace robot1 --scan-topic scan --stamped
       python -m services.bridge_ros2 --publish-map --world my.yaml        rviz and nav2 without a map_server
-      python -m services.bridge_ros2 --mount 0.1,0,180 --upside-down      where tf does not say how the laser sits
+      python -m services.bridge_ros2 --mount 0.1,0,180 --upside-down      if tf does not contain the laser's mount
 
-    More, with TurtleBot, TIAGo, rviz and nav2: docs/ros2.md.
+    For TurtleBot, TIAGo, rviz and nav2, see docs/ros2.md.
 
     """
 
@@ -58,87 +58,114 @@ class BridgeRos2Settings(SeenRobotSettings):
         Field(pattern=ENDPOINTS, description="tcp/HOST:PORT of the robot's zenoh router, or of zenoh-bridge-ros2dds"),
     ] = "tcp/127.0.0.1:7447"
     ros_config: Annotated[
-        Path | None, Field(description="zenoh configuration of that session (TLS, say), a JSON5 file; none: our own")
+        Path | None,
+        Field(
+            description="JSON5 file with a zenoh configuration for that session, e.g. for TLS; replaces --ros-connect"
+        ),
     ] = None
     flavor: Annotated[
-        Literal["rmw_zenoh", "ros2dds"], Field(description="rmw_zenoh; ros2dds: zenoh-bridge-ros2dds")
+        Literal["rmw_zenoh", "ros2dds"],
+        Field(description="what connects the robot's nodes to zenoh: rmw_zenoh, or ros2dds for zenoh-bridge-ros2dds"),
     ] = "rmw_zenoh"
     distro: Annotated[
         Literal["humble", "jazzy"],
-        Field(description="humble: types have no hashes; jazzy: as Iron, Kilted and later (rmw_zenoh alone minds)"),
+        Field(
+            description="ROS distribution: humble (types without hashes), or jazzy (also for Iron, Kilted and later); "
+            "only matters for rmw_zenoh"
+        ),
     ] = "jazzy"
     domain: Annotated[int, Field(ge=0, le=232, description="ROS_DOMAIN_ID")] = 0
     namespace: Annotated[
-        str, Field(pattern=rf"^$|^{NAME}/?$", description="before relative topic names, such as robot1")
+        str, Field(pattern=rf"^$|^{NAME}/?$", description="namespace of relative topic names, such as robot1")
     ] = ""
     node: Annotated[
-        str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="our name in the ROS graph; letters, digits, _")
+        str,
+        Field(
+            pattern=r"^[A-Za-z_][A-Za-z0-9_]*$",
+            description="name of the bridge's node in the ROS graph, of letters, digits and _",
+        ),
     ] = "presage"
 
-    scan_topic: Annotated[
-        str, Field(pattern=rf"^{NAME}$", description="name of the topic with sensor_msgs/LaserScan")
-    ] = "scan"
+    scan_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="topic with scans (sensor_msgs/LaserScan)")] = (
+        "scan"
+    )
     odom_topic: Annotated[
-        str, Field(pattern=TOPIC, description="name of that with nav_msgs/Odometry; empty: odometry from tf")
+        str,
+        Field(pattern=TOPIC, description="topic with odometry (nav_msgs/Odometry); empty to use odometry from tf"),
     ] = "odom"
     tf_topic: Annotated[
-        str, Field(pattern=rf"^{NAME}$", description="name of that with tf2_msgs/TFMessage, and of it with _static")
+        str,
+        Field(
+            pattern=rf"^{NAME}$",
+            description="topic with transforms (tf2_msgs/TFMessage); fixed ones are on this name with _static",
+        ),
     ] = "tf"
-    cmd_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="name of the topic for velocity commands")] = (
-        "cmd_vel"
-    )
-    stamped: Annotated[bool, Field(description="commands as TwistStamped, else Twist")] = False
+    cmd_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="topic for velocity commands")] = "cmd_vel"
+    stamped: Annotated[bool, Field(description="send commands as TwistStamped instead of Twist")] = False
     pose_topic: Annotated[
-        str, Field(pattern=TOPIC, description="PoseWithCovarianceStamped of the belief; empty: none")
+        str,
+        Field(pattern=TOPIC, description="topic for the pose (PoseWithCovarianceStamped); empty to publish none"),
     ] = "amcl_pose"
-    hypotheses_topic: Annotated[str, Field(pattern=TOPIC, description="PoseArray of all possible places")] = (
-        "pose_hypotheses"
-    )
-    initial_pose_topic: Annotated[str, Field(pattern=TOPIC, description="rviz's 2D Pose Estimate")] = "initialpose"
-    goal_topic: Annotated[str, Field(pattern=TOPIC, description="rviz's 2D Goal Pose")] = "goal_pose"
+    hypotheses_topic: Annotated[
+        str, Field(pattern=TOPIC, description="topic for all hypotheses (PoseArray); empty to publish none")
+    ] = "pose_hypotheses"
+    initial_pose_topic: Annotated[
+        str, Field(pattern=TOPIC, description="topic with initial poses (rviz's 2D Pose Estimate); empty for none")
+    ] = "initialpose"
+    goal_topic: Annotated[
+        str, Field(pattern=TOPIC, description="topic with goals (rviz's 2D Goal Pose); empty for none")
+    ] = "goal_pose"
     commands: Annotated[
-        bool, Field(description="pass velocity commands and goals on; --no-commands: others drive, such as nav2")
+        bool,
+        Field(description="pass velocity commands and goals on; use --no-commands if nav2 or another program drives"),
     ] = True
 
     publish_map: Annotated[
-        bool, Field(description="publish the world as OccupancyGrid, in map_server's place; not where one runs")
+        bool, Field(description="publish the world as OccupancyGrid; only if no map_server is running")
     ] = False
-    map_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="of --publish-map")] = "map"
+    map_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="topic for the map, with --publish-map")] = "map"
     world: Annotated[
-        str, Field(description="of --publish-map: shipped world, world file or ROS map.yaml, that of the estimator")
+        str,
+        Field(
+            description="world to publish with --publish-map: a shipped world, a world file or a ROS map.yaml; "
+            "the same as the estimator's"
+        ),
     ] = "corridor"
 
-    map_frame: Annotated[str, Field(pattern=FRAME, description="the world")] = "map"
-    odom_frame: Annotated[str, Field(pattern=FRAME, description="of dead reckoning")] = "odom"
-    base_frame: Annotated[str, Field(pattern=FRAME, description="of the robot's centre")] = "base_link"
+    map_frame: Annotated[str, Field(pattern=FRAME, description="frame of the map")] = "map"
+    odom_frame: Annotated[str, Field(pattern=FRAME, description="frame of the odometry")] = "odom"
+    base_frame: Annotated[str, Field(pattern=FRAME, description="frame of the robot's centre")] = "base_link"
     tf: Annotated[
         Literal["map-odom", "map-base", "none"],
-        Field(description="map-odom: as AMCL; map-base: of a robot without odometry; none: somebody else says it"),
+        Field(
+            description="transform to publish: map-odom, as AMCL; map-base for a robot without odometry; "
+            "none if another node publishes it"
+        ),
     ] = "map-odom"
     transform_tolerance: Annotated[
-        float, Field(ge=0, le=60, description="s by which that transform is dated ahead, as AMCL's")
+        float, Field(ge=0, le=60, description="time in s by which that transform is stamped ahead, as in AMCL")
     ] = 1.0
     mount: Annotated[
         str,
         Field(
             pattern=POSE_TEXT,
-            description="x,y[,yaw_deg] (m, m, degrees) of the laser in the base frame; none: tf says",
+            description="x,y[,yaw_deg] (m, m, degrees): pose of the laser in the base frame; defaults to the one in tf",
         ),
     ] = ""
-    upside_down: Annotated[bool, Field(description="with --mount: its z axis points down")] = False
+    upside_down: Annotated[bool, Field(description="with --mount: the laser's z axis points down")] = False
 
-    obstacle_stop: Annotated[bool, Field(description="slow commands down before what the scan shows")] = True
+    obstacle_stop: Annotated[bool, Field(description="slow down and stop before obstacles in the scan")] = True
 
     def names(self) -> Names:
-        """How topics are called on zenoh."""
+        """Zenoh keys of the configured flavour and domain."""
         return Names(self.flavor, self.domain, hashes=self.distro != "humble")
 
     def check(self) -> None:
-        """Raises UserError where two of these settings do not go together."""
+        """Raises UserError if settings contradict each other, or if a file is missing."""
         frames = {"--map-frame": self.map_frame, "--odom-frame": self.odom_frame, "--base-frame": self.base_frame}
         if len(set(frames.values())) < len(frames):
-            said = ", ".join(f"{option} {name}" for option, name in frames.items())
-            raise UserError(f"{said}: these are three frames, each needs a name of its own")
+            options = ", ".join(f"{option} {name}" for option, name in frames.items())
+            raise UserError(f"{options}: these are three frames, each needs a name of its own")
         if self.ros_config is not None and not self.ros_config.is_file():
             raise UserError(f"--ros-config {self.ros_config}: there is no such file")
         if self.scan_topic == self.odom_topic:
@@ -148,11 +175,11 @@ class BridgeRos2Settings(SeenRobotSettings):
         """A topic's absolute name."""
         return full_name(name, self.namespace)
 
-    def the_mount(self) -> Mount | None:
-        """How the laser sits, where it was said."""
+    def build_mount(self) -> Mount | None:
+        """The configured mount of the laser. Returns None if tf should be used."""
         if not self.mount:
             if self.upside_down:
-                raise UserError("--upside-down goes with --mount x,y[,yaw_deg]: without it, tf says how the laser sits")
+                raise UserError("--upside-down needs --mount x,y[,yaw_deg]: without it the mount is taken from tf")
             return None
         x, y, yaw = map(float, pose_of_text(self.mount, "--mount"))
         return Mount((x, y, yaw), self.upside_down)

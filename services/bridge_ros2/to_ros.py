@@ -23,14 +23,14 @@ from services.bridge_ros2.ros_types import (
 
 
 def is_publishable(belief: Belief) -> bool:
-    """Whether ROS is told where the robot is: only while it is tracked, not of a belief lost or in two minds."""
+    """Whether the pose of a belief is published to ROS: only while the robot is tracked, not if lost or ambiguous."""
     return belief.state == "tracking"
 
 
 def pose_message(belief: Belief, frame: str) -> Any | None:
-    """PoseWithCovarianceStamped at the scan's stamp; None of an estimator that states no covariance.
+    """PoseWithCovarianceStamped at the scan's stamp. Returns None if the belief has no covariance.
 
-    Of the 6 x 6 covariance the rows and columns of x, y and yaw are the belief's, all others 0, as AMCL has it.
+    In the 6 x 6 covariance, the rows and columns of x, y and yaw are those of the belief. All others are 0, as in AMCL.
     """
     if belief.covariance is None:
         return None
@@ -41,42 +41,52 @@ def pose_message(belief: Belief, frame: str) -> Any | None:
 
 
 def hypotheses_message(belief: Belief, frame: str) -> Any:
-    """PoseArray of all places the belief holds possible, the best first."""
+    """PoseArray of the belief's hypotheses, the best first."""
     poses = [each.pose for each in belief.hypotheses] or [belief.pose]
     return make(POSE_ARRAY, header=header(belief.stamp_ns, frame), poses=[_pose(each) for each in poses])
 
 
 def correction(belief: Pose, odometry: Array | None) -> Array:
-    """(3,) of odom in map, so that odometry (3,) of the same moment leads to the belief; without it, of base_link."""
+    """Pose (3,) of odom in map, such that odometry (3,) of the same stamp leads to the belief.
+
+    Without odometry, the pose of base_link in map.
+    """
     return belief.array() if odometry is None else se2.compose(belief.array(), se2.inverse(odometry))
 
 
 def transform_message(pose: Array, stamp_ns: int, parent: str, child: str) -> Any:
     """TFMessage of one transform."""
     transform = make(
-        "geometry_msgs/msg/Transform", translation=_vector(float(pose[0]), float(pose[1])),
+        "geometry_msgs/msg/Transform",
+        translation=_vector(float(pose[0]), float(pose[1])),
         rotation=_quaternion(float(pose[2])),
-    )  # fmt: skip
+    )
     stamped = make(
-        "geometry_msgs/msg/TransformStamped", header=header(stamp_ns, parent), child_frame_id=child,
+        "geometry_msgs/msg/TransformStamped",
+        header=header(stamp_ns, parent),
+        child_frame_id=child,
         transform=transform,
-    )  # fmt: skip
+    )
     return make("tf2_msgs/msg/TFMessage", transforms=[stamped])
 
 
 def map_message(grid: OccupancyGrid, frame: str) -> Any:
-    """OccupancyGrid as nav2's map_server says it, but for the stamp, which is 0: a map holds at any time."""
+    """OccupancyGrid as published by nav2's map_server, except for the stamp, which is 0."""
     x, y, yaw = grid.origin
     info = make(
-        "nav_msgs/msg/MapMetaData", map_load_time=header(0, frame).stamp, resolution=grid.resolution,
-        width=grid.width, height=grid.height, origin=_pose(Pose(x=x, y=y, yaw=yaw)),
-    )  # fmt: skip
-    cells = grid.values.ravel().view(np.int8)  # 255 without a sign is -1, unknown
+        "nav_msgs/msg/MapMetaData",
+        map_load_time=header(0, frame).stamp,
+        resolution=grid.resolution,
+        width=grid.width,
+        height=grid.height,
+        origin=_pose(Pose(x=x, y=y, yaw=yaw)),
+    )
+    cells = grid.values.ravel().view(np.int8)  # the unsigned 255 becomes -1, which means unknown
     return make(OCCUPANCY_GRID, header=header(0, frame), info=info, data=cells)
 
 
 def twist_message(twist: Array, stamp_ns: int | None, frame: str) -> tuple[str, Any]:
-    """Type and message of a velocity (3,) in base_link: TwistStamped, or without a stamp Twist."""
+    """Type and message of a velocity (3,) in base_link: TwistStamped, or Twist if ``stamp_ns`` is None."""
     vx, vy, wz = (float(v) for v in twist)
     plain = make(TWIST, linear=_vector(vx, vy), angular=_vector(0.0, 0.0, wz))
     if stamp_ns is None:

@@ -8,7 +8,7 @@ import pytest
 from zenoh import KeyExpr
 
 from services.bridge_ros2.keys import (
-    KEPT,
+    LATCHED,
     SENSOR,
     TOKENS,
     Endpoint,
@@ -61,7 +61,7 @@ def test_tokens_are_those_of_others():
 
 
 def test_quality_of_service_says_what_is_not_usual():
-    assert (SENSOR.text(), KEPT.text(), Qos().text()) == ("2::,5:,:,:,,", ":1:,1:,:,:,,", "::,10:,:,:,,")
+    assert (SENSOR.text(), LATCHED.text(), Qos().text()) == ("2::,5:,:,:,,", ":1:,1:,:,:,,", "::,10:,:,:,,")
 
 
 def test_tokens_are_read():

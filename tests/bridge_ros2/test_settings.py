@@ -14,7 +14,7 @@ from services.bridge_ros2.settings import BridgeRos2Settings
     ("said", "pose"), [("0.1,-2", (0.1, -2, 0)), ("0.1,0,180", (0.1, 0, np.pi)), ("-1,0,-90", None)]
 )
 def test_a_mount_with_or_without_its_yaw(said, pose):
-    mount = load_settings(BridgeRos2Settings, ["--mount", said]).the_mount()
+    mount = load_settings(BridgeRos2Settings, ["--mount", said]).build_mount()
     np.testing.assert_allclose(mount.pose, pose or (-1, 0, -np.pi / 2))
 
 
