@@ -107,13 +107,13 @@ def localize(job: LocalizeOptions, console: Console) -> list[dict[str, Any]]:
         world = job.choice.world
         check_start(job.choice, load_world(world) if isinstance(world, str) else world)
     laser, kind = job.frame == "laser", kind_of(job.file)
-    with working(f"preparing {job.choice.estimator} for {job.choice.asked}", console):
+    with working(f"preparing {job.choice.estimator} for {job.choice.world_argument}", console):
         make = prepare(replace(job.choice, initial_pose=None))
     with working(f"reading {job.file.name}", console):
         # An .npz's poses are the laser's where that is asked for; of every other file it is known where the laser sits.
         itself = laser and kind == "npz"
         read = read_scans(job.file, np.zeros(3) if itself else None, job.reading)
-    read.say_notes(console)
+    read.print_notes(console)
     scans = chosen(job, read)
     start, count = _start(job, scans), len(scans.ranges)
     estimator = make(scans.geometry)
@@ -220,7 +220,7 @@ def _output(job: LocalizeOptions, count: int) -> Iterator[Callable[[dict[str, An
 
 def _write_json(job: LocalizeOptions, out: Path, rows: list[dict[str, Any]], *, complete: bool) -> None:
     meta = {
-        "file": str(job.file), "world": job.choice.asked, "estimator": job.choice.estimator,
+        "file": str(job.file), "world": job.choice.world_argument, "estimator": job.choice.estimator,
         "model": job.choice.model, "frame": job.frame, "mode": job.mode, "fresh": job.fresh,
         "start": job.start, "end": job.end, "every": job.every, "complete": complete,
         "seed": job.choice.seed, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
-# Before numpy is there: products as small as these gain nothing from a second thread, which spins while it waits.
+# Must be set before numpy is imported. The matrices are so small that a second thread would only spin while it waits.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from common.runtime.service import main
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def make(settings: EstimatorSettings) -> Service:
-    """Torch is imported here, so that --help answers at once."""
+    """Builds the service; imports torch only here, so that --help is fast."""
     if settings.robots:
         from services.estimator.multi_robot_service import FleetService  # noqa: PLC0415
 

@@ -29,61 +29,62 @@ from services.estimator.precise.settings import Settings
 from services.estimator.shared.generative_models import GenerativeModel, RayCaster, map_error
 from services.estimator.shared.interface import Estimator
 
-SIGMA = 0.02  # m, the noise of a scanner that states none
-SAME_MOUNT = 1e-3  # m and rad
-LEAST_SIGMA = 1e-3  # m, of one that states less: no surface is known better
-MAP_LEVER = 5.0  # m, typical distance of walls: an error of the map there turns the pose by error / distance
+DEFAULT_SIGMA_M = 0.02  # noise of a scanner whose scans state none
+MOUNT_TOLERANCE = 1e-3  # m and rad
+MIN_SIGMA_M = 1e-3  # used if scans state less, because no surface is known more exactly
+TYPICAL_WALL_DISTANCE_M = 5.0  # an error of the map at this distance rotates the pose by error / distance
 Name = Literal["precise", "paper", "particle-filter", "amcl-defaults"]
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What a user chooses."""
+    """The user's choice of an estimator, its model and its parameters."""
 
-    world: str | World = "corridor"  # a shipped one, a file, or the world itself
+    world: str | World = "corridor"  # name of a shipped world, path of a file, or the world itself
     estimator: Name = "precise"
-    model: str = "learned"  # of precise: learned, exact, or a file of weights
-    models: Path | None = None  # folder of weights; none: the shipped ones
-    sigma: float | None = None  # m, the scanner's noise; None: as the scan states it, or SIGMA
+    model: str = "learned"  # for precise: learned, exact, or a file of weights
+    models: Path | None = None  # folder of weights; None for the shipped ones
+    sigma: float | None = None  # m, the scanner's noise; None: as the scans state it, or DEFAULT_SIGMA_M
     seed: int = 0
-    initial_pose: Array | None = None  # (3,); none: nothing is known (paper: the map's centre)
-    descent: Descent = Descent()  # noqa: RUF009 - frozen; of paper
+    initial_pose: Array | None = None  # (3,); None if unknown (paper: the centre of the map)
+    descent: Descent = Descent()  # noqa: RUF009 - frozen; for paper
 
     @property
-    def asked(self) -> str:
-        """The world as the user names it."""
+    def world_argument(self) -> str:
+        """The world as it would be given on the command line."""
         if isinstance(self.world, str):
             return self.world
-        return self.world.name if self.world.name in known_worlds() else f"{self.world.name}.yaml"  # it was recorded
+        return self.world.name if self.world.name in known_worlds() else f"{self.world.name}.yaml"  # from a recording
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Of the scans to come."""
+    """Beams, mount and noise of a scanner's scans."""
 
     angles: Array  # (B,) rad in laser
     mount: Array  # (3,) laser in base_link
     range_max: float  # m
-    sigma: float = 0.0  # m, the scanner's noise, and
-    sigma_relative: float = 0.0  # its part that grows with the range; both 0: not stated
+    sigma: float = 0.0  # m, the scanner's noise
+    sigma_relative: float = 0.0  # its part that grows with the range, as a share; both 0 if not stated
     mount_assumed: bool = False  # neither the file nor the user states the mount
 
     @classmethod
     def of(cls, scanner: Scanner) -> Geometry:
-        """Of the scans of a scanner."""
+        """The geometry of a scanner's scans."""
         return cls(
             scanner.angles(), np.array(scanner.mount), scanner.range_max, scanner.sigma, scanner.sigma_relative
         )  # fmt: skip
 
     @classmethod
     def of_scan(cls, scan: Scan) -> Geometry:
-        """Of scans like this one."""
+        """The geometry of a scan message."""
         return cls(scan.angles(), scan.mount.array(), scan.range_max, scan.sigma, scan.sigma_relative)
 
     def same(self, other: Geometry, *, bound_to_beams: bool) -> bool:
-        """Whether an estimator made for one takes the other; one that is ``bound_to_beams`` only with the same angles.
+        """Whether an estimator made for this geometry can process scans of the other one.
 
-        Scanners whose motor sets the pace give a few beams more or less each time round.
+        One that is ``bound_to_beams`` needs the same angles. Others do not: with some scanners the number of beams
+        varies a little from turn to turn.
         """
         noise = (self.sigma, self.sigma_relative) == (other.sigma, other.sigma_relative)
         if not noise or not np.allclose(self.mount, other.mount, atol=1e-4):
@@ -93,23 +94,26 @@ class Geometry:
         return len(self.angles) == len(other.angles) and np.allclose(self.angles, other.angles, atol=1e-4)
 
     def upside_down(self) -> Geometry:
-        """With a roll of 180 deg: seen from above the beams run the other way round."""
+        """The geometry of the scanner mounted upside down (a roll of 180 deg), which reverses the order of beams."""
         return replace(self, angles=-self.angles)
 
     def likelihood(self, sigma: float | None = None) -> Likelihood:
-        """With the noise ``sigma`` m asked for, or what the scans state, or `SIGMA`."""
+        """The likelihood with noise ``sigma`` m, by default the noise that the scans state, or `DEFAULT_SIGMA_M`."""
         if sigma is not None:
             return Likelihood(sigma)
         if not self.sigma and not self.sigma_relative:
-            return Likelihood(SIGMA)
-        return Likelihood(max(self.sigma, LEAST_SIGMA), relative=self.sigma_relative)
+            return Likelihood(DEFAULT_SIGMA_M)
+        return Likelihood(max(self.sigma, MIN_SIGMA_M), relative=self.sigma_relative)
 
 
 Factory = Callable[[Geometry], Estimator]
 
 
 def prepare(choice: Choice) -> Factory:
-    """Load what is needed, so that errors come now; the factory makes the estimator for the first scan's geometry."""
+    """Loads the world and the weights, and returns a factory of estimators for the geometry of the first scan.
+
+    Raises UserError now, and not at the first scan, if something is missing or wrong.
+    """
     if choice.estimator not in get_args(Name):
         raise UserError(f"no estimator {choice.estimator!r}: choose one of {', '.join(get_args(Name))}")
     world = choice.world if isinstance(choice.world, World) else load_world(choice.world)
@@ -119,13 +123,13 @@ def prepare(choice: Choice) -> Factory:
     if choice.estimator == "precise":
         return _precise(choice, world)
     tuned = choice.estimator == "particle-filter"
-    RayCaster(world).expect(np.zeros((1, 3)), np.zeros(1))  # compiled now, no request waits for it
-    sensor = functools.cache(functools.partial(Sensor, world))  # one field, however many filters are made
+    RayCaster(world).expect(np.zeros((1, 3)), np.zeros(1))  # compile now, so that no request has to wait
+    sensor = functools.cache(functools.partial(Sensor, world))  # all filters share one field
 
     def make(geometry: Geometry) -> Estimator:
         settings = ParticleSettings.tuned() if tuned else ParticleSettings()
         if tuned:
-            settings = replace(settings, robot_model_type="omni")  # covers a differential base as well
+            settings = replace(settings, robot_model_type="omni")  # this model also covers a differential base
         made = ParticleFilter(world, settings, (*map(float, geometry.mount),), choice.seed, sensor=sensor(settings))  # type: ignore[arg-type]
         made.name = choice.estimator
         if choice.initial_pose is not None:
@@ -140,8 +144,8 @@ def _precise(choice: Choice, world: World) -> Factory:
     calibration = card.calibration if card else None
     settings = calibration.settings() if calibration else Settings(inflation=card.inflation if card else 1.0)
     if not calibration and (error := map_error(world)):
-        # Neighbouring cells err alike: their error averages out neither over beams nor over scans.
-        settings = replace(settings, floor_position=error, floor_heading=error / MAP_LEVER)
+        # Errors of neighbouring cells are correlated, so they average out neither over beams nor over scans.
+        settings = replace(settings, floor_position=error, floor_heading=error / TYPICAL_WALL_DISTANCE_M)
     seeds, bounds = Seeds.at(model, places), (card.world if card else world).bounds
     _compile(model, seeds, Likelihood())
 
@@ -161,7 +165,7 @@ def _precise(choice: Choice, world: World) -> Factory:
 
 
 def generative_model(choice: Choice, world: World) -> tuple[GenerativeModel, Array, weights.FieldCard | None]:
-    """The model of that name, places (S, 2) m a laser may be at, and the card of what was learned."""
+    """Returns the model, places (S, 2) m where the laser can be, and the card of a learned model, else None."""
     if choice.model == "exact":
         places = world.sample_free(max(4000, int(60 * world.free_area)), np.random.default_rng(0), 0.05)
         return RayCaster(world), thin_places(places, SEED_SPACING_M), None
@@ -169,19 +173,21 @@ def generative_model(choice: Choice, world: World) -> tuple[GenerativeModel, Arr
 
 
 def field_path(choice: Choice, world: World) -> Path:
-    """Where the learned field lies; raises UserError where there is none."""
+    """The weights file of the learned field. Raises UserError if there is none."""
     if choice.model == "learned":
-        return weights.find(choice.models or weights.FOLDER, world, choice.asked)
+        return weights.find(choice.models or weights.FOLDER, world, choice.world_argument)
     if (path := Path(choice.model)).suffix != ".safetensors":
         raise UserError(f"no model {choice.model!r}: give learned, exact, or a file of weights (.safetensors)")
     if not path.exists():
-        made = weights.train_command(choice.asked, path.parent)
-        raise UserError(f"--model {path}: there is no such file; {made} makes one, --model exact needs none")
+        command = weights.train_command(choice.world_argument, path.parent)
+        raise UserError(
+            f"--model {path}: there is no such file. Train it with: {command}; or use --model exact, which needs none"
+        )
     return path
 
 
 def check(choice: Choice, world: World) -> None:
-    """Raises UserError where `prepare` would for want of a model; nothing is compiled, so it is quick."""
+    """Raises UserError if `prepare` would, because a model is missing; it is fast, because it compiles nothing."""
     check_start(choice, world)
     if choice.estimator == "precise" and choice.model != "exact":
         weights.load(field_path(choice, world))
@@ -190,7 +196,7 @@ def check(choice: Choice, world: World) -> None:
 
 
 def check_start(choice: Choice, world: World) -> None:
-    """Raises UserError where the initial pose is off the map; a wall there may have been moved."""
+    """Raises UserError if the initial pose is off the map; it may be inside a wall, which may have been moved."""
     if choice.initial_pose is None:
         return
     x0, y0, x1, y1 = world.bounds
@@ -202,76 +208,77 @@ def check_start(choice: Choice, world: World) -> None:
 
 
 def check_mount(geometry: Geometry, trained: Scanner) -> None:
-    """Raises UserError where the mount is only assumed, and the weights were ``trained`` with another.
+    """Raises UserError if the mount is only assumed, and the weights were ``trained`` with another mount.
 
-    A distance field predicts scans of a laser mounted anywhere, so a mount that is stated may differ.
+    A mount that is stated may differ, because a distance field predicts scans for any mount.
     """
     off = geometry.mount - np.array(trained.mount)
     off[2] = se2.wrap(off[2])
-    if geometry.mount_assumed and np.abs(off).max() > SAME_MOUNT:
-        (here, there) = (f"{x:g},{y:g},{np.rad2deg(yaw):g}" for x, y, yaw in (geometry.mount, trained.mount))
+    if geometry.mount_assumed and np.abs(off).max() > MOUNT_TOLERANCE:
+        assumed, stated = (f"{x:g},{y:g},{np.rad2deg(yaw):g}" for x, y, yaw in (geometry.mount, trained.mount))
         raise UserError(
-            f"the scans do not state where the laser sits in base_link: {here} was assumed, but the weights were "
-            f"trained with {there}; give --mount x,y[,yaw_deg] (for an imported recording, import its log again with "
+            f"the scans do not state where the laser sits in base_link: {assumed} was assumed, but the weights were "
+            f"trained with {stated}; give --mount x,y[,yaw_deg] (for an imported recording, import its log again with "
             "--mount)"
         )
 
 
 def _compile(model: GenerativeModel, seeds: Seeds, likelihood: Likelihood) -> None:
-    """Once through every compiled loop, so that no scan waits for it."""
+    """Calls every compiled loop once, so that no scan has to wait for compilation."""
     angles = np.linspace(-1, 1, 16)
     view = View(model, likelihood, np.zeros(3), angles, np.ones(16), 25.0)
     polish(view, seeds.rank(view, 2), iterations=1)
 
 
 def _paper(choice: Choice, world: World) -> Factory:
-    # Torch takes a second to import; the other estimators do without.
+    # Imported only here, because torch takes a second to import and the other estimators do not need it.
     from services.estimator.paper import weights as paper_weights  # noqa: PLC0415
     from services.estimator.paper.beam_fitting import fit  # noqa: PLC0415
     from services.estimator.paper.decoder import use_one_core  # noqa: PLC0415
     from services.estimator.paper.estimator import PaperPerception  # noqa: PLC0415
 
     use_one_core()
-    folder, known, remedy = _paper_weights(choice, world)
-    without = remedy.rpartition(" --scanner")[0]
-    for path in known.values():  # a broken file is found now, and torch is warm for the first scan
+    folder, files, remedy = _paper_weights(choice, world)
+    train_command = remedy.rpartition(" --scanner")[0]
+    for path in files.values():  # find damaged files now, and warm up torch for the first scan
         model, card = paper_weights.load(path)
         if not weights.same_walls(card.world, world):
             raise UserError(
-                f"{path} was trained in another world of the same name {world.name!r}: its walls differ. Give your "
-                f"world a name of its own and train for it: {remedy}"
+                f"{path} was trained in another world of the same name {world.name!r}: its walls differ. Rename your "
+                f"world and train for it: {remedy}"
             )
         model.predict(np.array([*card.world.center(), card.heading]))
-    load = functools.cache(paper_weights.load)  # one network, however many estimators are made
+    load = functools.cache(paper_weights.load)  # all estimators share one network
 
     def make(geometry: Geometry) -> Estimator:
         model, card = load(paper_weights.nearest(folder, world.name, "paper", len(geometry.angles)))
         check_mount(geometry, card.scanner)
-        found = fit(card.scanner, geometry.angles, geometry.mount, f"{without} {_options(geometry)}")
-        return PaperPerception(model, card, choice.descent, choice.initial_pose, found)
+        converted = fit(card.scanner, geometry.angles, geometry.mount, f"{train_command} {_train_options(geometry)}")
+        return PaperPerception(model, card, choice.descent, choice.initial_pose, converted)
 
     return make
 
 
 def _paper_weights(choice: Choice, world: World) -> tuple[Path, dict[int, Path], str]:
-    """Folder, files by number of beams, and the command that makes them; raises UserError where there are none."""
+    """Returns the folder, its files by number of beams, and the command that trains them.
+
+    Raises UserError if there are none.
+    """
     from services.estimator.paper import weights as paper_weights  # noqa: PLC0415 - torch, as above
 
     folder = choice.models or paper_weights.FOLDER
-    known, remedy = (
-        paper_weights.available(folder, world.name, "paper"),
-        paper_weights.train_command(choice.asked, "paper"),
-    )
-    if not known:
+    files = paper_weights.available(folder, world.name, "paper")
+    remedy = paper_weights.train_command(choice.world_argument, "paper")
+    if not files:
         raise UserError(
-            f"no weights of preset paper for world {world.name!r} in {folder}; make them with: {remedy}; "
-            "preset precise does without, where told: --estimator precise --model exact"
+            f"no weights of preset paper for world {world.name!r} in {folder}; train them with: {remedy}; "
+            "or use --estimator precise --model exact, which needs no weights"
         )
-    return folder, known, remedy
+    return folder, files, remedy
 
 
-def _options(geometry: Geometry) -> str:
-    """Of `presage train`, for the scanner that gave these scans."""
+def _train_options(geometry: Geometry) -> str:
+    """Options of `presage train` for the scanner of these scans."""
     beams, (x, y, yaw) = len(geometry.angles), geometry.mount
     known = (
         name
@@ -282,5 +289,5 @@ def _options(geometry: Geometry) -> str:
 
 
 def default_geometry(beams: int | None = None) -> Geometry:
-    """Of the shipped scanner."""
+    """The geometry of the default scanner, with ``beams`` beams if given."""
     return Geometry.of(SCANNERS["tim571"].with_beams(beams))

@@ -18,18 +18,18 @@ from services.estimator.precise.learning import weights as precise_weights
 
 @dataclass(frozen=True)
 class ModelInUse:
-    """Described when it was loaded, for the files may be others later."""
+    """The model of an estimator, described when it is loaded, because its files may change later."""
 
     estimator: str
     world: World  # the estimator's map
-    path: Path | None = None  # of the weights; None: nothing was learned
-    file: str = ""  # the name that `--models FOLDER` looks for
-    card: str = ""  # JSON, as it stands in its file
+    path: Path | None = None  # of the weights; None if the model was not learned
+    file: str = ""  # name of the file that `--models FOLDER` expects
+    card: str = ""  # JSON text of the model card
     size: int = 0  # bytes of the weights
     sha256: str = ""  # of the weights
 
     def reply(self, *, weights: bool) -> ModelReply:
-        """The answer, with the weights or without; raises UserError where they are others by now."""
+        """Returns the reply, with or without the weights. Raises UserError if the weights file has changed since."""
         data = b""
         if weights and self.path is not None:
             data = _read(self.path)
@@ -47,17 +47,20 @@ class ModelInUse:
 
 
 def model_in_use(choice: Choice, beams: int | None) -> ModelInUse:
-    """The model of that choice, for scans of so many beams (None: no scan has come); raises UserError where unknown."""
+    """Describes the model of a choice, for scans of ``beams`` beams, or None before the first scan.
+
+    Raises UserError if the model is unknown.
+    """
     world = choice.world if isinstance(choice.world, World) else load_world(choice.world)
     if choice.estimator == "precise" and choice.model != "exact":
         path = field_path(choice, world)
-        if choice.model != "learned":  # a file of any name, whose own world is the map
+        if choice.model != "learned":  # any file; its map is the world in its card
             world = World.model_validate(json.loads(_card(path))["world"])
         return _learned(choice.estimator, world, path, precise_weights.path_of(Path(), world.name).name)
     if choice.estimator == "paper":
         if beams is None:
             raise UserError("no scan has come yet: how many beams, and so which weights, is not known")
-        # Torch takes a second to import; the other estimators do without.
+        # Imported only here, because torch takes a second to import and the other estimators do not need it.
         from services.estimator.paper import weights as paper_weights  # noqa: PLC0415
 
         path = paper_weights.nearest(choice.models or paper_weights.FOLDER, world.name, "paper", beams)

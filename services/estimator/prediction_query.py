@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from services.estimator.shared.interface import Estimator
 
 MAX_POSES = 1000
-MAX_RANGES = 1_000_000  # perception waits meanwhile: about half a second
+MAX_RANGES = 1_000_000  # take about half a second, during which no scan is processed
 
 
 def answer(estimator: Estimator, request: PredictRequest, angles: Array, range_max: float) -> PredictReply:
-    """Predictions for the scanner with beams at ``angles`` (B,) rad; +inf beyond ``range_max`` m.
+    """Predicts scans of a scanner with beams at ``angles`` (B,) rad; ranges beyond ``range_max`` m become +inf.
 
-    Raises UserError where the request is too large, or the model cannot answer it.
+    Raises UserError if the request is too large, or the model cannot predict the poses.
     """
     chosen = angles[evenly(len(angles), request.beams)]
     count = len(request.poses)
@@ -42,9 +42,9 @@ def answer(estimator: Estimator, request: PredictRequest, angles: Array, range_m
 
 
 def evenly(count: int, wanted: int | None) -> np.ndarray[tuple[int, ...], np.dtype[np.intp]]:
-    """(wanted,) indices of ``count`` beams, evenly spaced, first and last among them; None: all of them.
+    """Indices (wanted,) out of ``count`` beams, evenly spaced, including the first and the last; None for all.
 
-    Raises UserError where there are not so many.
+    Raises UserError if there are fewer beams.
     """
     if wanted is None:
         return np.arange(count)

@@ -35,7 +35,7 @@ from services.estimator.shared.interface import Estimator, Observation, Posterio
 
 
 def choice_of(settings: EstimatorSettings) -> Choice:
-    """The estimator asked for."""
+    """The estimator that the settings select."""
     return Choice(
         settings.world, settings.estimator, settings.model, settings.models, settings.sigma, settings.seed,
         initial_pose=pose_of_text(settings.initial_pose, "--initial-pose") if settings.initial_pose else None,
@@ -44,16 +44,16 @@ def choice_of(settings: EstimatorSettings) -> Choice:
 
 
 class Models:
-    """What is loaded once, for however many robots."""
+    """World and weights, loaded once for all robots of a process."""
 
     def __init__(self, settings: EstimatorSettings) -> None:
-        """Raises UserError where a world has no weights."""
+        """Raises UserError if there are no weights for the world."""
         self.choice = choice_of(settings)
         self.factory: Factory = prepare(self.choice)
         self._described: dict[int | None, ModelInUse | str] = {}
 
     def in_use(self, beams: int | None) -> ModelInUse | str:
-        """What was loaded for scans of so many beams, before somebody writes other files; or why it is not known."""
+        """Describes the model for scans of ``beams`` beams, as first loaded; if unknown, returns the reason as text."""
         if beams not in self._described:
             try:
                 self._described[beams] = model_in_use(self.choice, beams)
@@ -63,7 +63,7 @@ class Models:
 
 
 class EstimatorService(Service):
-    """Perception as a process."""
+    """Publishes a belief and a prediction for each scan."""
 
     name: ClassVar[str] = "estimator"
     single: ClassVar[bool] = True
@@ -72,7 +72,10 @@ class EstimatorService(Service):
     queries: ClassVar[tuple[Query, ...]] = (LOCALISE, MODEL, PREDICT)
 
     def __init__(self, settings: EstimatorSettings, models: Models | None = None) -> None:
-        """Models are loaded in `open`, or are ``models`` of several robots; the estimator is made at the first scan."""
+        """``models`` are given if several robots share them, else they are loaded in `open`.
+
+        The estimator is built at the first scan, for its geometry.
+        """
         super().__init__(settings)
         self.options = settings
         more = {"odometry": (ODOM,), "command": (CMD_VEL,)}.get(settings.prior, ())
@@ -80,15 +83,15 @@ class EstimatorService(Service):
         self.models = models
         self.geometry: Geometry | None = None
         self.estimator: Estimator | None = None
-        self.model: ModelInUse | str = "no scan has come yet"  # or why it is not known
+        self.model: ModelInUse | str = "no scan has come yet"  # or the reason why it is unknown
         self.goal: Goal | None = None
         self.odom: Odom | None = None
         self.command: CmdVel | None = None
-        self.waiting: Scan | None = None  # for the odometry of its stamp
+        self.waiting: Scan | None = None  # a scan that waits for the odometry of its stamp
         self.last: tuple[int, Belief, Prediction] | None = None
 
     def open(self) -> None:
-        """Fail now, not at the first scan, where a world has no weights."""
+        """Loads the models, so that missing weights are an error now and not at the first scan."""
         options = self.options
         if self.models is None:
             self.log.info("loading the world", world=options.world)
@@ -97,7 +100,7 @@ class EstimatorService(Service):
         self.log.info("estimator", name=options.estimator, world=options.world, prior=options.prior)
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
-        """A scan makes a belief; goal, odometry and command are remembered."""
+        """Processes a scan; stores goal, odometry and command for the scans after it."""
         if isinstance(message, Goal):
             self.goal = None if message.cancel else message
         elif isinstance(message, CmdVel):
@@ -105,21 +108,21 @@ class EstimatorService(Service):
         elif isinstance(message, Odom):
             self.odom = message
             if self.waiting is not None and message.stamp_ns >= self.waiting.stamp_ns:
-                self._take_waiting()
+                self._perceive_waiting()
         elif isinstance(message, Scan):
-            self._take_waiting()  # its odometry has not come in time
+            self._perceive_waiting()  # its odometry has not come in time
             if self.options.prior == "odometry" and (self.odom is None or self.odom.stamp_ns < message.stamp_ns):
                 self.waiting = message
             else:
                 self._perceive(message)
 
-    def _take_waiting(self) -> None:
+    def _perceive_waiting(self) -> None:
         scan, self.waiting = self.waiting, None
         if scan is not None:
             self._perceive(scan)
 
     def on_request(self, query: Query, request: Request) -> Reply:
-        """Localise anew, predict scans, or say what the estimator was made of."""
+        """Answers a request to localise again, to predict scans, or to describe the model."""
         if isinstance(request, ModelRequest):
             if isinstance(self.model, str):
                 return ModelReply(ok=False, reason=self.model)
@@ -135,7 +138,7 @@ class EstimatorService(Service):
 
     def _perceive(self, scan: Scan) -> None:
         if self.last is not None and self.last[0] == scan.stamp_ns:
-            _, belief, prediction = self.last  # a scan sent again is answered again, not used again
+            _, belief, prediction = self.last  # a repeated scan gets the same answer again
         else:
             estimator = self._estimator_for(scan)
             if estimator is not None:
@@ -144,11 +147,11 @@ class EstimatorService(Service):
         self._answer(belief, prediction)
 
     def infer(self, scan: Scan, estimator: Estimator, observation: Observation) -> None:
-        """Update, and `conclude`: at once."""
+        """Updates the estimator, and calls `conclude`; overridden where several robots share the time."""
         self.conclude(scan, estimator.update(observation), estimator.name)
 
     def conclude(self, scan: Scan, posterior: Posterior, estimator: str) -> None:
-        """Say what came of a scan."""
+        """Publishes the belief and the prediction after a scan."""
         belief, prediction = _belief(scan, posterior, estimator), _prediction(scan, posterior)
         self.last = (scan.stamp_ns, belief, prediction)
         self._answer(belief, prediction)
@@ -158,7 +161,10 @@ class EstimatorService(Service):
         self.publish(BELIEF, belief)
 
     def _estimator_for(self, scan: Scan) -> Estimator | None:
-        """The one at hand, or a new one for another scanner; None, and it is said, where there is no model for it."""
+        """Returns the estimator, a new one if the scanner has changed.
+
+        If there is no model for the scanner, logs the reason, puts it into the health note, and returns None.
+        """
         assert self.models is not None  # noqa: S101 - set in open
         geometry = Geometry.of_scan(scan)
         try:
@@ -166,9 +172,9 @@ class EstimatorService(Service):
             if self.geometry is None or not self.geometry.same(geometry, bound_to_beams=paper):
                 made = self.models.factory(geometry)
                 if self.geometry is not None:
-                    self.log.warning("another scanner, or mounted elsewhere: localisation begins anew")
+                    self.log.warning("the scanner or its mount has changed: localisation starts again")
                 self.estimator, self.geometry = made, geometry
-                if paper:  # whose weights were chosen by the beams just now
+                if paper:  # its weights depend on the number of beams
                     self.model = self.models.in_use(len(geometry.angles))
         except UserError as error:
             self.counters["unfit_scans"] += 1

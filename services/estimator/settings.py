@@ -16,16 +16,16 @@ _PATTERN = r"[A-Za-z0-9_.*?-]{1,64}"
 
 
 class EstimatorSettings(ServiceSettings):
-    """Estimator: from each scan a belief about the pose, and the scan it expected.
+    """Estimator: publishes for each scan a belief about the pose, and the scan it expected.
 
     Examples:
       python -m services.estimator                                    preset precise in the corridor
-      python -m services.estimator --estimator particle-filter        another one, on the same topics
-      python -m services.estimator --world office --model exact       rays cast in the world itself, nothing learned
-      python -m services.estimator --world my.yaml --models trained   your world, your weights
+      python -m services.estimator --estimator particle-filter        another estimator, on the same topics
+      python -m services.estimator --world office --model exact       cast rays in the world itself, without learning
+      python -m services.estimator --world my.yaml --models trained   your world, with weights from folder trained
       python -m services.estimator --initial-pose 3,1.5,90            start from a known pose (m, m, deg)
       python -m services.estimator --robots robot-1,robot-2           one process for several robots
-      python -m services.estimator --robots 'robot-*' --max-robots 20 for each that appears, 20 at most
+      python -m services.estimator --robots 'robot-*' --max-robots 20 one process for every such robot, at most 20
       PRESAGE_ESTIMATOR=paper python -m services.estimator --print-config
 
     """
@@ -37,41 +37,54 @@ class EstimatorSettings(ServiceSettings):
         str,
         Field(
             pattern=rf"^$|^{_PATTERN}(,{_PATTERN})*$",
-            description="names or patterns (* and ?), comma-separated: robots that this process serves; none: --robot",
+            description="robots that this process serves: names or patterns (* and ?), comma-separated; "
+            "empty for the one of --robot",
         ),
     ] = ""
-    max_robots: Annotated[int, Field(ge=1, le=1000, description="that one process serves")] = 100
+    max_robots: Annotated[int, Field(ge=1, le=1000, description="most robots that one process serves")] = 100
     forget: Annotated[
-        float, Field(gt=0, le=1e6, description="s without scan or simulator, after which one of several is forgotten")
+        float,
+        Field(gt=0, le=1e6, description="s without scan or simulator after which one of several robots is dropped"),
     ] = 60.0
 
-    world: Annotated[str, Field(description="shipped world, world file or ROS map.yaml the model was trained for")] = (
-        "corridor"
-    )
+    world: Annotated[
+        str, Field(description="shipped world, world file or ROS map.yaml for which the model was trained")
+    ] = "corridor"
     estimator: Annotated[
         Literal["precise", "paper", "particle-filter", "amcl-defaults"],
-        Field(description="precise; paper: Burghardt & Lanillos 2021; particle-filter: AMCL's design, tuned or not"),
+        Field(
+            description="precise; paper: Burghardt & Lanillos 2021; particle-filter: tuned AMCL; amcl-defaults: untuned"
+        ),
     ] = "precise"
-    model: Annotated[str, Field(description="of precise: learned, exact, or a file of weights")] = "learned"
-    models: Annotated[Path | None, Field(description="folder of weights; none: the shipped ones")] = None
+    model: Annotated[str, Field(description="model of precise: learned, exact, or a file of weights")] = "learned"
+    models: Annotated[Path | None, Field(description="folder of weights; defaults to the shipped ones")] = None
     prior: Annotated[
         Literal["motion", "odometry", "command"],
         Field(
-            description="what tells of motion between scans; motion: the last scans alone; "
-            "command: runs are not repeatable to the byte, for it races with the scan"
+            description="source of the motion between scans; motion: only the last scans; command: results are not "
+            "repeatable to the byte, because commands and scans arrive in varying order"
         ),
     ] = "motion"
     sigma: Annotated[
-        float | None, Field(gt=0, lt=10, description="m, the scanner's noise; none: as the scan says, else 0.02")
+        float | None, Field(gt=0, lt=10, description="m, noise of the scanner; defaults to what scans state, else 0.02")
     ] = None
-    seed: Annotated[int, Field(ge=0, le=2**31, description="of particles")] = 0
+    seed: Annotated[int, Field(ge=0, le=2**31, description="random seed")] = 0
     initial_pose: Annotated[
-        str, Field(pattern=POSE_TEXT, description="x,y[,yaw_deg]; none: nothing is known (paper: the map's centre)")
+        str,
+        Field(
+            pattern=POSE_TEXT,
+            description="initial pose x,y[,yaw_deg]; empty if unknown (paper then starts at the map's centre)",
+        ),
     ] = ""
     alpha: Annotated[
         float, Field(gt=0, lt=1, description="paper: step size of perception along the longest axis, m²")
     ] = 2e-3
     beta: Annotated[
-        float, Field(ge=0, lt=10, description="paper: the goal's attraction in perception (eq. 3); 0: unbiased belief")
+        float,
+        Field(
+            ge=0, lt=10, description="paper: attraction of the goal in perception (eq. 3); 0 leaves the belief unbiased"
+        ),
     ] = 0.0
-    iterations: Annotated[int, Field(ge=1, le=1000, description="paper: gradient steps a scan; the paper: 1")] = 10
+    iterations: Annotated[
+        int, Field(ge=1, le=1000, description="paper: gradient steps per scan; 1 in the publication")
+    ] = 10
