@@ -44,11 +44,16 @@ def scan_of(message: Any, mount: Mount, stamp_ns: int) -> Scan:
         first, step, ranges = first + step * (beams - 1), -step, ranges[::-1]
     period = float(message.scan_time)
     return Scan(
-        stamp_ns=stamp_ns, angle_min=float(se2.wrap(first)), angle_increment=step,
-        range_min=max(nearest, 0.0), range_max=farthest, ranges=normalise_driver_ranges(ranges, nearest, farthest),
-        mount=Pose.of(mount.pose), scan_time=period if 0 < period < 3600 else 0.0,
+        stamp_ns=stamp_ns,
+        angle_min=float(se2.wrap(first)),
+        angle_increment=step,
+        range_min=max(nearest, 0.0),
+        range_max=farthest,
+        ranges=normalise_driver_ranges(ranges, nearest, farthest),
+        mount=Pose.of(mount.pose),
+        scan_time=period if 0 < period < 3600 else 0.0,
         frame_id=(message.header.frame_id or "laser")[:64],
-    )  # fmt: skip
+    )
 
 
 def dead_reckoning_of(message: Any, child_in_base: Transform | None) -> DeadReckoning:

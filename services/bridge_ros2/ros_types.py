@@ -20,9 +20,16 @@ POSE_WITH_COVARIANCE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 POSE_ARRAY: Final = "geometry_msgs/msg/PoseArray"
 OCCUPANCY_GRID: Final = "nav_msgs/msg/OccupancyGrid"
 USED: Final = (
-    LASER_SCAN, ODOMETRY, TF_MESSAGE, TWIST, TWIST_STAMPED, POSE_STAMPED, POSE_WITH_COVARIANCE, POSE_ARRAY,
+    LASER_SCAN,
+    ODOMETRY,
+    TF_MESSAGE,
+    TWIST,
+    TWIST_STAMPED,
+    POSE_STAMPED,
+    POSE_WITH_COVARIANCE,
+    POSE_ARRAY,
     OCCUPANCY_GRID,
-)  # fmt: skip
+)
 NO_HASH: Final = "TypeHashNotSupported"  # placeholder of Humble, which has no type hashes
 
 _STORE = get_typestore(Stores.ROS2_HUMBLE)

@@ -35,7 +35,7 @@ from services.bridge_ros2.ros_types import (
     TWIST_STAMPED,
     CdrError,
     decode,
-)  # fmt: skip
+)
 from services.bridge_ros2.settings import BridgeRos2Settings
 
 MAP_PERIOD_S = 10.0  # the map is repeated for subscribers that missed it, as SLAM nodes do

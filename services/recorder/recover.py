@@ -28,13 +28,20 @@ TORN_SUFFIX = ".torn"  # appended to the name of an unfinished source file after
 # Parsers of all records that may precede a file's end. Each record is parsed completely, to detect a damaged length or
 # opcode.
 PARSERS: dict[int, Callable[[ReadDataStream], object]] = {
-    Opcode.HEADER: Header.read, Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read, Opcode.CHUNK: Chunk.read,
-    Opcode.MESSAGE_INDEX: kinds.MessageIndex.read, Opcode.CHUNK_INDEX: kinds.ChunkIndex.read,
-    Opcode.ATTACHMENT: Attachment.read, Opcode.ATTACHMENT_INDEX: kinds.AttachmentIndex.read,
-    Opcode.STATISTICS: kinds.Statistics.read, Opcode.METADATA: Metadata.read,
-    Opcode.METADATA_INDEX: kinds.MetadataIndex.read, Opcode.SUMMARY_OFFSET: kinds.SummaryOffset.read,
+    Opcode.HEADER: Header.read,
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.CHUNK: Chunk.read,
+    Opcode.MESSAGE_INDEX: kinds.MessageIndex.read,
+    Opcode.CHUNK_INDEX: kinds.ChunkIndex.read,
+    Opcode.ATTACHMENT: Attachment.read,
+    Opcode.ATTACHMENT_INDEX: kinds.AttachmentIndex.read,
+    Opcode.STATISTICS: kinds.Statistics.read,
+    Opcode.METADATA: Metadata.read,
+    Opcode.METADATA_INDEX: kinds.MetadataIndex.read,
+    Opcode.SUMMARY_OFFSET: kinds.SummaryOffset.read,
     Opcode.DATA_END: DataEnd.read,
-}  # fmt: skip
+}
 # Where reading may resume after damage: the prefix of a chunk, an attachment or metadata shorter than 2^40 bytes.
 LANDMARK = re.compile(rb"[\x06\x09\x0c](?=.{5}\x00\x00\x00)", re.DOTALL)
 

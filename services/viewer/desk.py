@@ -124,9 +124,7 @@ class Desk:
     async def _open(self, visitor: Visitor, name: str) -> ActionResult:
         context, robot = self.context, self.context.playback.robot
         try:
-            await self._in_thread(
-                context.playback.open, name, lambda: "replay" in context.roster.services(robot)
-            )  # fmt: skip
+            await self._in_thread(context.playback.open, name, lambda: "replay" in context.roster.services(robot))
         finally:  # the recording that was open before is closed even if this one cannot be opened
             self.worlds.pop(robot, None)
             self._world_texts.pop(robot, None)
@@ -207,9 +205,7 @@ class Desk:
         if not services & {"simulator", "replay"}:
             return
         try:
-            reply = await self._in_thread(
-                self.context.control.query, robot, WORLD, Request(), WorldReply
-            )  # fmt: skip
+            reply = await self._in_thread(self.context.control.query, robot, WORLD, Request(), WorldReply)
         except UserError:
             return  # the next query may succeed
         if reply == self.worlds.get(robot):
