@@ -53,7 +53,7 @@ def map_command(job: MapOptions, console: Console, progress: Console) -> Path:
         raise UserError(f"{there} is there already: --out another name, or remove it")
     make_folder(job.out.parent, "--out")
     scans = read_scans(job.log, reading=job.reading)
-    scans.say_notes(progress)
+    scans.print_notes(progress)
     if scans.stamps is None:  # a map needs none
         scans = replace(scans, stamps=np.arange(len(scans.ranges), dtype=np.float64))
     drive = drive_of(scans, job.log)

@@ -48,7 +48,7 @@ class TrainDriveOptions:
 def train_from_drive(job: TrainDriveOptions, console: Console) -> Path:
     """The weights' path; raises UserError in one line."""
     scans = read_scans(job.log, reading=job.reading)
-    scans.say_notes(console)
+    scans.print_notes(console)
     drive = drive_of(scans, job.log)
     drive, _ = split(drive, job.share)
     if len(drive.ranges) < MIN_SCANS:

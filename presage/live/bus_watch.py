@@ -40,7 +40,7 @@ class Watch:
         return None
 
     def until(self, kind: type[M], condition: Callable[[M], bool], timeout: float) -> M | None:
-        """Returns the next message of type ``kind`` that meets the condition, or None if none comes in ``timeout`` s."""
+        """Returns the next message of type ``kind`` that meets the condition, or None after ``timeout`` s."""
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
             message = self.next(left)

@@ -18,64 +18,76 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.robot.ranges import normalise_driver_ranges
-from presage.logs.carmen_lines import WORD, LaserLine, is_laser, laser_line, pose_line
+from presage.logs.carmen_lines import LINE_TYPE, LaserLine, is_laser, laser_line, pose_line
 from presage.logs.log import Log, LoggedScan, Reading
 from presage.logs.poses import Track
-from presage.logs.resampling import resampled
+from presage.logs.resampling import resample
 
-LONGEST = 1 << 22  # characters of a line; no log has such
-SAME = np.array([0.01, 0.01, np.deg2rad(0.5)])  # m, m, rad: a laser that moves less against the robot is bolted to it
-BROKEN = (EOFError, OSError, lzma.LZMAError, zlib.error)  # what a cut or damaged .gz, .bz2, .xz raises
+MAX_LINE_CHARACTERS = 1 << 22  # far more than the lines of real logs; limits the memory for other files
+# Tolerance in m, m, rad: if the mount computed from all scans varies less, the laser is fixed to the robot and the
+# logged poses are odometry; else they were corrected.
+MOUNT_TOLERANCE = np.array([0.01, 0.01, np.deg2rad(0.5)])
+DECOMPRESSION_ERRORS = (EOFError, OSError, lzma.LZMAError, zlib.error)  # for a cut or damaged .gz, .bz2 or .xz
 
-# Degrees from the first beam to the last, where a line only says how many there are. 180 and 360 lack the last of 181
-# and 361.
-SPANS = {
+# Angles of the first and last beam in degrees, by number of beams, for lines that only state the number. 180 and 360
+# are scans of 181 and 361 beams without the last.
+SPANS_DEG = {
     101: (-50, 50), 180: (-90, 89), 181: (-90, 90), 201: (-50, 50), 360: (-90, 89.5), 361: (-90, 90), 401: (-50, 50),
     541: (-135, 135), 1081: (-135, 135),
 }  # fmt: skip
-LMS_FAR = 80.0  # m; SICK's LMS says 81.83 m and more for "nothing", or 8.183 in its mode of millimetres
-LMS_NEAR, CODES = 8.18, (8.18, 8.192)  # m
-LMS_STATED = ((8.18, 8.2), (LMS_FAR, 82.0))  # m: what headers state of such a laser: its limit, or its highest code
-LOOKED_AT = 100  # scans, for that
-FRONT = ("FLASER", "ROBOTLASER1", "RAWLASER1")  # CARMEN's PARAMs are of these two; of LASER3 and up there are none
+# A SICK LMS reports "no return" as a code of 81.83 m and more, or in its millimetre mode as 8.183 m and more. All in m.
+LMS_FAR_RANGE_MAX, LMS_NEAR_RANGE_MAX = 80.0, 8.18
+LMS_NEAR_CODES = (8.18, 8.192)
+# What headers state as maximum range of such a laser: its limit, or its highest code, in the near and the far mode.
+LMS_STATED_RANGES = ((8.18, 8.2), (LMS_FAR_RANGE_MAX, 82.0))
+SURVEYED_SCANS = 100  # scans of each laser from which the maximum range and the clock are determined
+# CARMEN's parameters describe a front and a rear laser; there are none of LASER3 and up.
+FRONT = ("FLASER", "ROBOTLASER1", "RAWLASER1")
 REAR = ("RLASER", "ROBOTLASER2", "RAWLASER2")
 POSE_LINES = ("ODOM", "TRUEPOS")
 
 
 @dataclass
 class _Survey:
-    """What a first pass finds."""
+    """What the first pass over the file finds."""
 
     params: dict[str, str] = field(default_factory=dict)
     lasers: Counter[str] = field(default_factory=Counter)  # lines by name
-    firsts: dict[str, list[LaserLine]] = field(default_factory=dict)  # the first of each laser
-    mounts: dict[str, tuple[Array, Array]] = field(default_factory=dict)  # least and largest laser in base_link
-    odom: tuple[Track, Track] = field(default_factory=lambda: (Track(), Track()))  # by ipc and by logger
-    true: tuple[Track, Track] = field(default_factory=lambda: (Track(), Track()))
+    firsts: dict[str, list[LaserLine]] = field(default_factory=dict)  # the first lines of each laser
+    mounts: dict[str, tuple[Array, Array]] = field(default_factory=dict)  # minimum and maximum of laser in base_link
+    odom: tuple[Track, Track] = field(default_factory=lambda: (Track(), Track()))  # by ipc stamp, by logger stamp
+    true: tuple[Track, Track] = field(default_factory=lambda: (Track(), Track()))  # likewise
 
 
 def open_carmen(path: Path, reading: Reading) -> Log:
-    """Raises UserError saying what is wrong."""
+    """Opens a CARMEN log; raises UserError if it has no usable scans or an option does not fit it."""
     survey = _survey(path)
     if not survey.lasers:
-        raise UserError(f"{path}: a CARMEN log without a scan (FLASER, ROBOTLASER1, RAWLASER1 lines)")
-    name = _choose(path, survey.lasers, reading.scan_topic)
+        raise UserError(f"{path}: a CARMEN log without a scan (no FLASER, ROBOTLASER1, RAWLASER1 lines)")
+    name = _choose_laser(path, survey.lasers, reading.scan_topic)
     if reading.odom_topic and (reading.odom_topic != "ODOM" or not len(survey.odom[0])):
         there = "ODOM lines" if len(survey.odom[0]) else "no ODOM lines"
         raise UserError(
-            f"{path}: --odom-topic {reading.odom_topic}: of a CARMEN log it can only be ODOM, and this one has {there}"
+            f"{path}: --odom-topic {reading.odom_topic}: for a CARMEN log it can only be ODOM, and this one has {there}"
         )
     if not survey.firsts.get(name):
-        raise UserError(f"{path}: every {name} line is garbled")
+        raise UserError(f"{path}: every {name} line is malformed")
     notes: list[str] = []
     first = survey.firsts[name][0]
     angles, range_max = _angles(path, name, first, reading, notes), _range_max(survey, name, reading, notes)
     clock = _clock(survey.firsts[name], reading, notes)
     mount, corrected, assumed = _mount(survey, name, reading, notes)
     log = Log(
-        path, f"CARMEN log ({name})", angles, mount, range_max, survey.lasers[name], lambda: iter(()), notes=notes,
+        path,
+        f"CARMEN log ({name})",
+        angles,
+        mount,
+        range_max,
+        survey.lasers[name],
+        lambda: iter(()),
+        notes=notes,
         mount_assumed=assumed,
-    )  # fmt: skip
+    )
     odom = survey.odom[clock] if first.robot is None or reading.odom_topic == "ODOM" else None
     true = survey.true[clock] if len(survey.true[clock]) and reading.reference is not False else None
     if odom is None or len(odom):
@@ -85,77 +97,84 @@ def open_carmen(path: Path, reading: Reading) -> Log:
     elif reading.reference and corrected:
         log.reference = f"{name}'s corrected pose"
     elif reading.reference:
-        notes.append(f"no reference: {name}'s poses are its odometry, and there are no TRUEPOS lines")
-    # With --angles a header does not count, and nothing says where the beams of another header would be.
+        notes.append(f"no reference: the poses of {name} are odometry, and there are no TRUEPOS lines")
+    # Without known angles in the headers (--angles replaces them), other scans cannot be resampled.
     fixed = reading.angles is not None or first.beams is None
-    log.read = lambda: _sweeps(log, first, clock, odom, true, name, fixed=fixed)
+    log.read = lambda: _read_scans(log, first, clock, odom, true, name, fixed=fixed)
     return log
 
 
-def _choose(path: Path, there: Counter[str], wanted: str) -> str:
-    if wanted and wanted not in there:
-        raise UserError(f"{path}: no {wanted} lines in it; it has {', '.join(sorted(there))}: choose with --scan-topic")
-    return wanted or next((name for name in FRONT if name in there), min(there))
+def _choose_laser(path: Path, lasers: Counter[str], wanted: str) -> str:
+    if wanted and wanted not in lasers:
+        raise UserError(
+            f"{path}: no {wanted} lines in it; it has {', '.join(sorted(lasers))}: choose one with --scan-topic"
+        )
+    return wanted or next((name for name in FRONT if name in lasers), min(lasers))
 
 
 def _angles(path: Path, name: str, first: LaserLine, reading: Reading, notes: list[str]) -> Array:
-    """(B,) rad, by --angles, the line's header, or what a scanner of so many beams usually is."""
-    count, said = len(first.ranges), first.beams
+    """Beam angles (B,) rad, from --angles, the line's header, or the usual scanner with this number of beams."""
+    count, header = len(first.ranges), first.beams
     if reading.angles is not None:
         return np.linspace(*reading.angles, count)
-    if said is not None:
-        return said.angles()
-    if count not in SPANS:
+    if header is not None:
+        return header.angles()
+    if count not in SPANS_DEG:
         raise UserError(
-            f"{path}: {name} does not say where its {count} beams look: say it, such as --angles -90,90 (first, last)"
+            f"{path}: {name} does not state the angles of its {count} beams: give the first and the last one, such as "
+            "--angles -90,90"
         )
-    first_deg, last_deg = SPANS[count]
-    notes.append(f"{count} beams are taken to look from {first_deg:g} to {last_deg:g} deg (--angles)")
+    first_deg, last_deg = SPANS_DEG[count]
+    notes.append(f"assumed: the {count} beams cover {first_deg:g} to {last_deg:g} deg (change with --angles)")
     return np.deg2rad(np.linspace(first_deg, last_deg, count))
 
 
 def _range_max(survey: _Survey, name: str, reading: Reading, notes: list[str]) -> float:
-    """From which on a range is no return, m: by --range-max, the line's header, PARAM, or as an LMS has it."""
+    """Range from which on there is no return, m: from --range-max, the line's header, a PARAM line, or of an LMS."""
     lines = survey.firsts[name]
     if reading.range_max is not None:
         return reading.range_max
-    codes = CODES[0] <= max(float(np.max(line.ranges)) for line in lines) <= CODES[1]
-    if (said := lines[0].beams) is not None:
-        near, far = (low <= said.range_max <= high for low, high in LMS_STATED)
+    longest = max(float(np.max(line.ranges)) for line in lines)
+    near_codes = LMS_NEAR_CODES[0] <= longest <= LMS_NEAR_CODES[1]
+    if (header := lines[0].beams) is not None:
+        near, far = (low <= header.range_max <= high for low, high in LMS_STATED_RANGES)
         if not near and not far:
-            return said.range_max
-        range_max, stated = LMS_NEAR if near or codes else LMS_FAR, said.range_max
+            return header.range_max
+        range_max, stated = LMS_NEAR_RANGE_MAX if near or near_codes else LMS_FAR_RANGE_MAX, header.range_max
     else:
         param = survey.params.get(f"robot_{_side(name)}_laser_max", "")
         try:
             stated = float(param)
         except ValueError:
             stated = 0.0
-        range_max = LMS_NEAR if codes else stated if 0 < stated < np.inf else LMS_FAR
+        range_max = LMS_NEAR_RANGE_MAX if near_codes else stated if 0 < stated < np.inf else LMS_FAR_RANGE_MAX
     if range_max != stated:
-        notes.append(f"ranges from {range_max:g} m on are taken for no return (--range-max)")
+        notes.append(f"assumed: ranges from {range_max:g} m on mean no return (change with --range-max)")
     return range_max
 
 
 def _clock(lines: list[LaserLine], reading: Reading, notes: list[str]) -> int:
-    """0: ipc's times, 1: the logger's, which also serve where ipc's stand still."""
+    """Which stamps to use: 0 for those of ipc, 1 for those of the logger; the latter also if ipc's do not advance."""
     if reading.clock == "logger":
         return 1
     if len(lines) > 1 and lines[0].ipc == lines[-1].ipc:
-        notes.append("the ipc timestamps stand still: the logger's are taken")
+        notes.append("the ipc timestamps do not advance: the timestamps of the logger are used")
         return 1
     return 0
 
 
 def _mount(survey: _Survey, name: str, reading: Reading, notes: list[str]) -> tuple[Array, bool, bool]:
-    """(3,) laser in base_link, whether its poses are corrected (do not stay with the odometry), and whether assumed."""
-    least, largest = survey.mounts.get(name, (np.zeros(3), np.full(3, np.inf)))
-    bolted = bool((largest - least <= 2 * SAME).all())
-    corrected = name in survey.mounts and not bolted
+    """Returns the laser in base_link (3,), whether the laser's poses were corrected, and whether the mount is assumed.
+
+    The poses were corrected by a mapping program if their offset from the odometry is not constant.
+    """
+    low, high = survey.mounts.get(name, (np.zeros(3), np.full(3, np.inf)))
+    fixed = bool((high - low <= 2 * MOUNT_TOLERANCE).all())
+    corrected = name in survey.mounts and not fixed
     if reading.mount is not None:
         return reading.mount, corrected, False
-    if bolted:
-        return (least + largest) / 2, corrected, False
+    if fixed:
+        return (low + high) / 2, corrected, False
     side = _side(name)
     names = [f"robot_{side}laser_{part}" for part in ("offset", "side_offset", "angular_offset")]
     try:
@@ -164,19 +183,20 @@ def _mount(survey: _Survey, name: str, reading: Reading, notes: list[str]) -> tu
         mount = np.zeros(3)
     if side == "rear":
         mount[2] += np.pi
-    words = ",".join(f"{number:g}" for number in (*mount[:2], np.rad2deg(mount[2])))
-    notes.append(f"the laser is taken to sit at {words} in base_link (--mount says where it does)")
+    text = ",".join(f"{number:g}" for number in (*mount[:2], np.rad2deg(mount[2])))
+    notes.append(f"assumed: the laser is mounted at {text} in base_link (change with --mount)")
     return mount, corrected, not survey.params.keys() & set(names)
 
 
 def _side(name: str) -> str:
-    """Front or rear, as PARAMs call it; empty of any other laser."""
+    """The laser's side in names of parameters: front or rear, or "" for another laser."""
     return "front" if name in FRONT else "rear" if name in REAR else ""
 
 
 def _survey(path: Path) -> _Survey:
+    """Reads the whole file once for parameters, poses, and the first scans of each laser."""
     survey = _Survey()
-    for words in _lines(path):
+    for words in _read_words(path):
         try:
             if words[0] == "PARAM" and len(words) > 2:
                 survey.params[words[1]] = words[2]
@@ -187,7 +207,7 @@ def _survey(path: Path) -> _Survey:
             elif is_laser(words[0]):
                 survey.lasers[words[0]] += 1
                 _note_laser(survey, words)
-        except (ValueError, IndexError):  # counted where scans are read
+        except (ValueError, IndexError):  # malformed lines are counted when the scans are read
             continue
     return survey
 
@@ -195,25 +215,25 @@ def _survey(path: Path) -> _Survey:
 def _note_laser(survey: _Survey, words: list[str]) -> None:
     name = words[0]
     firsts = survey.firsts.setdefault(name, [])
-    looked_at = len(firsts) < LOOKED_AT
-    line = laser_line(words, ranges=looked_at)
-    if looked_at:
+    keep = len(firsts) < SURVEYED_SCANS
+    line = laser_line(words, ranges=keep)
+    if keep:
         firsts.append(line)
     if line.laser is not None and line.robot is not None:
         mount = se2.between(line.robot, line.laser)
-        least, largest = survey.mounts.get(name, (mount, mount))
-        turned = least[2] + se2.wrap(mount[2] - least[2])  # a scanner that looks back is near pi and -pi
-        mount = np.array([*mount[:2], turned])
-        survey.mounts[name] = np.minimum(least, mount), np.maximum(largest, mount)
+        low, high = survey.mounts.get(name, (mount, mount))
+        unwrapped_yaw = low[2] + se2.wrap(mount[2] - low[2])  # the yaw of a rear scanner is near both pi and -pi
+        mount = np.array([*mount[:2], unwrapped_yaw])
+        survey.mounts[name] = np.minimum(low, mount), np.maximum(high, mount)
 
 
-def _sweeps(
+def _read_scans(
     log: Log, first: LaserLine, clock: int, odom: Track | None, true: Track | None, name: str, *, fixed: bool
 ) -> Iterator[LoggedScan]:
-    fitted = 0
-    for words in _lines(log.path):
+    resampled_scans = 0
+    for words in _read_words(log.path):
         if words[0] != name:
-            if not WORD.match(words[0]):
+            if not LINE_TYPE.match(words[0]):
                 log.left_out["garbled lines"] += 1
             elif words[0] in POSE_LINES and not _is_pose(words):
                 log.left_out_beside[f"garbled {words[0]} lines"] += 1
@@ -224,11 +244,11 @@ def _sweeps(
             log.left_out["garbled lines"] += 1
             continue
         own = normalise_driver_ranges(line.ranges, 0.0, log.range_max)
-        ranges = _at_beams_of(first, line, own, log.angles, fixed=fixed)
+        ranges = _resample(first, line, own, log.angles, fixed=fixed)
         if ranges is None:
             log.left_out["scans of other beams"] += 1
             continue
-        fitted += ranges is not own
+        resampled_scans += ranges is not own
         stamp = round((line.ipc, line.logger)[clock] * 1e9)
         reference = None
         if true is not None:
@@ -236,19 +256,19 @@ def _sweeps(
         elif log.reference and line.laser is not None:
             reference = se2.compose(line.laser, se2.inverse(log.mount))
         yield LoggedScan(stamp, ranges, line.robot if odom is None else odom.at(stamp), reference)
-    log.note_fitted(fitted)
+    log.note_resampled(resampled_scans)
 
 
-def _at_beams_of(first: LaserLine, line: LaserLine, ranges: Array, angles: Array, *, fixed: bool) -> Array | None:
-    """The line's ``ranges`` at the first line's ``angles``: an interlaced LMS turns its beams by 0.25 deg each scan.
+def _resample(first: LaserLine, line: LaserLine, ranges: Array, angles: Array, *, fixed: bool) -> Array | None:
+    """The line's ``ranges`` at the first line's ``angles``; an interlaced LMS shifts its beams by 0.25 deg each scan.
 
-    Returns None where the line cannot be brought to them; with ``fixed`` only a line of the same beams can.
+    Returns None if the scan cannot be resampled; with ``fixed``, if its beams are not those of the first line.
     """
     if line.beams == first.beams and len(ranges) == len(angles):
         return ranges
     if fixed or line.beams is None or first.beams is None or line.beams.range_max != first.beams.range_max:
         return None
-    return resampled(ranges, line.beams.angles(), angles)
+    return resample(ranges, line.beams.angles(), angles)
 
 
 def _is_pose(words: list[str]) -> bool:
@@ -259,22 +279,22 @@ def _is_pose(words: list[str]) -> bool:
     return True
 
 
-def _lines(path: Path) -> Iterator[list[str]]:
-    """The words of each line that has any, less comments; UserError where the file cannot be read to its end."""
+def _read_words(path: Path) -> Iterator[list[str]]:
+    """Yields the words of each line, without comments; raises UserError if the file cannot be read to its end."""
     try:
-        with path.open("rb") as raw, unpacked(raw) as stream:
-            while line := stream.readline(LONGEST):
+        with path.open("rb") as raw, decompressed(raw) as stream:
+            while line := stream.readline(MAX_LINE_CHARACTERS):
                 words = line.decode("ascii", "replace").split()
                 if words and not words[0].startswith("#"):
                     yield words
-    except BROKEN as error:
+    except DECOMPRESSION_ERRORS as error:
         raise UserError(
-            f"{path}: cut short or damaged ({error}); copy or download it again, or unpack what is intact and use that"
+            f"{path}: cut short or damaged ({error}); copy or download it again, or unpack the intact part and use that"
         ) from None
 
 
-def unpacked(raw: BinaryIO) -> BinaryIO:
-    """What is inside a .gz, .bz2 or .xz, told by its first bytes; else the file itself."""
+def decompressed(raw: BinaryIO) -> BinaryIO:
+    """A stream of the decompressed .gz, .bz2 or .xz file, recognised from its first bytes; else ``raw`` itself."""
     magic = raw.read(6)
     raw.seek(0)
     if magic.startswith(b"\x1f\x8b"):

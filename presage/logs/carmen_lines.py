@@ -20,71 +20,74 @@ import numpy as np
 from common.geometry.se2 import Array
 from common.limits import MAX_BEAMS
 
-OLD = re.compile(r"(FLASER|RLASER|LASER\d)$")
-ROBOT, RAW = re.compile(r"ROBOTLASER\d$"), re.compile(r"RAWLASER\d$")
-WORD = re.compile(r"[A-Z][A-Z0-9_]*$")
-HEADER = 8  # words of ROBOTLASER1 and RAWLASER1 before the readings, the number of them included
+OLD_LASER = re.compile(r"(FLASER|RLASER|LASER\d)$")
+ROBOT_LASER, RAW_LASER = re.compile(r"ROBOTLASER\d$"), re.compile(r"RAWLASER\d$")
+LINE_TYPE = re.compile(r"[A-Z][A-Z0-9_]*$")
+COUNT_INDEX = 8  # of the word with the number of readings, in ROBOTLASER1 and RAWLASER1
 
 
 @dataclass(frozen=True)
-class Beams:
-    """What a header says."""
+class BeamHeader:
+    """The beams of a scan as stated in the header."""
 
-    start: float  # rad
-    step: float  # rad
+    start: float  # rad, angle of the first beam
+    step: float  # rad, between beams
     count: int
     range_max: float  # m
 
     def angles(self) -> Array:
-        """(count,) rad."""
+        """Angles of the beams (count,) rad."""
         return self.start + self.step * np.arange(self.count, dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class LaserLine:
-    """One scan."""
+    """A line with a scan."""
 
     ranges: Array  # (B,) m
-    beams: Beams | None  # None: an old line, which does not say
-    laser: Array | None  # (3,) its pose in odom, or corrected
+    beams: BeamHeader | None  # None for the old types of lines, which do not state it
+    laser: Array | None  # (3,) pose of the laser, in odom or corrected by a mapping program
     robot: Array | None  # (3,) base_link in odom
-    ipc: float  # s, when the message was made
-    logger: float  # s, when it was logged
+    ipc: float  # s, time when the message was made
+    logger: float  # s, time when it was logged
 
 
 def is_laser(word: str) -> bool:
-    """Whether lines of that name hold scans."""
-    return any(pattern.match(word) for pattern in (OLD, ROBOT, RAW))
+    """Whether lines of that type contain scans."""
+    return any(pattern.match(word) for pattern in (OLD_LASER, ROBOT_LASER, RAW_LASER))
 
 
 def laser_line(words: list[str], *, ranges: bool = True) -> LaserLine:
-    """Of the words of a line; raises ValueError where it is garbled. Without ``ranges`` these are not looked at."""
-    if OLD.match(words[0]):
-        seen, tail = _readings(words, 1, wanted=ranges)
+    """Parses the words of a line with a scan; raises ValueError if it is malformed.
+
+    Without ``ranges``, the ranges are not parsed, which saves time.
+    """
+    if OLD_LASER.match(words[0]):
+        readings, tail = _readings(words, 1, wanted=ranges)
         ipc, logger = _times(tail[6:])
-        return LaserLine(seen, None, _pose(tail), _pose(tail[3:]), ipc, logger)
-    seen, tail = _readings(words, HEADER, wanted=ranges)
-    count = _count(words[HEADER])
+        return LaserLine(readings, None, _pose(tail), _pose(tail[3:]), ipc, logger)
+    readings, tail = _readings(words, COUNT_INDEX, wanted=ranges)
+    count = _count(words[COUNT_INDEX])
     _, start, fov, step, range_max = (float(word) for word in words[1:6])
     step = step if step > 0 else fov / max(1, count - 1)
     if not (abs(start) <= 2 * np.pi and 0 < step * (count - 1) <= 2 * np.pi + step and 0 < range_max < np.inf):
         raise ValueError("an impossible header")
-    beams = Beams(start, step, count, range_max)
-    remissions = len(tail) != 13 or RAW.match(words[0]) is not None
+    beams = BeamHeader(start, step, count, range_max)
+    remissions = len(tail) != 13 or RAW_LASER.match(words[0]) is not None
     if remissions:
         tail = tail[1 + _count(tail[0]) :]
-    if RAW.match(words[0]):
-        return LaserLine(seen, beams, None, None, *_times(tail))
-    return LaserLine(seen, beams, _pose(tail), _pose(tail[3:]), *_times(tail[11 if remissions else 10 :]))
+    if RAW_LASER.match(words[0]):
+        return LaserLine(readings, beams, None, None, *_times(tail))
+    return LaserLine(readings, beams, _pose(tail), _pose(tail[3:]), *_times(tail[11 if remissions else 10 :]))
 
 
 def pose_line(words: list[str]) -> tuple[Array, float, float]:
-    """Of ODOM and TRUEPOS: the pose (3,), and the times ipc and logger, s. Raises ValueError where it is garbled."""
+    """Parses an ODOM or TRUEPOS line: the pose (3,), and the ipc and logger times, s; raises ValueError."""
     return _pose(words[1:]), *_times(words[7:])
 
 
 def _readings(words: list[str], at: int, *, wanted: bool) -> tuple[Array, list[str]]:
-    """(B,) m, and the words behind them."""
+    """Returns the ranges (B,) m, empty unless ``wanted``, and the words after them."""
     count = _count(words[at])
     if len(words) < at + 1 + count or count < 3:
         raise ValueError("readings are missing")
@@ -107,9 +110,9 @@ def _pose(words: list[str]) -> Array:
 
 
 def _times(words: list[str]) -> tuple[float, float]:
-    """Ipc and logger; logs without the last have its place filled with the first."""
+    """Returns the ipc and logger times, s; without a logger time, the ipc time stands for both."""
     if len(words) not in (2, 3):
-        raise ValueError(f"{len(words)} words where the times should be")
+        raise ValueError(f"{len(words)} words instead of the times")
     ipc, logger = float(words[0]), float(words[-1]) if len(words) == 3 else float(words[0])
     if not (0 <= ipc < 1e10 and 0 <= logger < 1e10):
         raise ValueError("an impossible time")

@@ -12,12 +12,12 @@ from common.geometry.se2 import Array
 from common.messages.ros_messages import IDENTITY, Mount, Transform, mount_of
 from presage.logs.poses import Track
 
-MOVED = 0.01  # m and rad, by which what is bolted on does not move
+FIXED_TOLERANCE = 0.01  # m and rad; a frame that changes more moves against its parent
 
 
 @dataclass(eq=False)
 class Edge:
-    """A frame in its parent."""
+    """A frame in its parent over time."""
 
     parent: str
     first: Transform
@@ -25,13 +25,13 @@ class Edge:
     moves: bool = False
 
     def add(self, stamp_ns: int, transform: Transform) -> None:
-        """One more, at a time."""
-        self.moves = self.moves or transform.apart(self.first) > MOVED
+        """Adds a transform at a time."""
+        self.moves = self.moves or transform.apart(self.first) > FIXED_TOLERANCE
         self.track.add(stamp_ns, transform.planar())
 
 
 class FrameHistory:
-    """Edges by child, as tf and tf_static have them, over the whole log."""
+    """The transforms of tf and tf_static over the whole log."""
 
     def __init__(self) -> None:
         self._edges: dict[str, Edge] = {}
@@ -40,7 +40,7 @@ class FrameHistory:
         return frame in self._edges or any(edge.parent == frame for edge in self._edges.values())
 
     def add(self, parent: str, child: str, stamp_ns: int, transform: Transform) -> None:
-        """One transform, at a time."""
+        """Adds the transform of ``child`` in ``parent`` at a time; a new parent replaces the earlier one."""
         parent, child = parent.lstrip("/"), child.lstrip("/")
         if child == parent:
             return
@@ -50,7 +50,7 @@ class FrameHistory:
         edge.add(stamp_ns, transform)
 
     def chain(self, parent: str, child: str) -> list[Edge] | None:
-        """From ``parent`` down to ``child``; None where the one does not hang on the other."""
+        """The edges from ``parent`` down to ``child``; None if ``child`` is not a descendant of ``parent``."""
         found: list[Edge] = []
         while child != parent:
             edge = self._edges.get(child)
@@ -61,7 +61,7 @@ class FrameHistory:
         return found
 
     def at(self, chain: list[Edge], stamp_ns: int) -> Array | None:
-        """(3,) the last frame of a chain in its first, on the floor; None where one of them is not known then."""
+        """Planar pose (3,) of the last frame of a chain in its first; None if a transform is unknown at that time."""
         pose = np.zeros(3)
         for edge in chain:
             step = edge.track.at(stamp_ns) if edge.moves else edge.first.planar()
@@ -71,19 +71,21 @@ class FrameHistory:
         return np.asarray(pose)
 
     def mount(self, base: str, laser: str) -> Mount | None:
-        """The laser's in the base; None where tf does not say.
+        """The laser in the base frame; None if tf does not connect them.
 
-        Raises UserError where it moves, or does not lie level.
+        Raises UserError if the laser moves against the base or is not level.
         """
         chain = self.chain(base, laser)
         if chain is None:
             return None
         if any(edge.moves for edge in chain):
-            raise UserError(f"{laser} moves against {base}: a scanner must be fixed to it; name another --base-frame")
+            raise UserError(
+                f"{laser} moves against {base}, but must be fixed to it: choose another frame with --base-frame"
+            )
         transform = IDENTITY
         for edge in chain:
             transform = transform.then(edge.first)
         try:
             return mount_of(transform)
         except ValueError as error:
-            raise UserError(f"{laser} on {base}: {error} (--mount says otherwise)") from None
+            raise UserError(f"{laser} on {base}: {error}; give the mount with --mount if this is wrong") from None

@@ -14,22 +14,23 @@ from common.geometry.se2 import Array
 
 @dataclass(frozen=True)
 class Reading:
-    """What the user says about a log; None and empty: as the log itself has it."""
+    """The user's options for reading a log. A field that is None or empty defaults to what the log states."""
 
     mount: Array | None = None  # (3,) laser in base_link
-    scan_topic: str = ""  # of CARMEN: the line, such as RLASER
+    scan_topic: str = ""  # for CARMEN logs the type of line, such as RLASER
     odom_topic: str = ""
     base_frame: str = ""
-    upside_down: bool | None = None  # the scanner hangs so; None: as tf says, else not
-    reference: bool | None = None  # False: none; True: also poses that only claim to be corrected (CARMEN)
+    upside_down: bool | None = None  # defaults to what tf states, otherwise False
+    # False reads no reference poses; True also reads poses of CARMEN scans that differ from the odometry.
+    reference: bool | None = None
     reference_topic: str = ""
-    angles: tuple[float, float] | None = None  # rad, first and last beam, where a line does not say
+    angles: tuple[float, float] | None = None  # rad, first and last beam, for lines that do not state them
     range_max: float | None = None  # m
-    clock: Literal["sensor", "logger"] = "sensor"  # whose stamps
+    clock: Literal["sensor", "logger"] = "sensor"  # which stamps are used
 
     @property
-    def plain(self) -> bool:
-        """Whether nothing was said."""
+    def is_default(self) -> bool:
+        """Whether the user gave no option."""
         return self.mount is None and self == Reading()
 
 
@@ -37,34 +38,37 @@ class Reading:
 class LoggedScan:
     """One scan of a log."""
 
-    stamp_ns: int | None  # None: the log has no times
-    ranges: Array  # (B,) m, as `common.robot.ranges.normalise_driver_ranges` has them
+    stamp_ns: int | None  # None if the log has no stamps
+    ranges: Array  # (B,) m, in the convention of `common.robot.ranges.normalise_driver_ranges`
     odom: Array | None = None  # (3,) base_link in odom at the stamp
     reference: Array | None = None  # (3,) base_link in map
 
 
 @dataclass
 class Log:
-    """A log that was opened: what is known before its scans are read."""
+    """An opened log: everything that is known before its scans are read."""
 
     path: Path
-    format: str  # for people
+    format: str  # description of the format, for messages
     angles: Array  # (B,) rad in laser
     mount: Array  # (3,) laser in base_link
     range_max: float  # m
-    scans: int  # that are in it, the unusable included
-    read: Callable[[], Iterator[LoggedScan]]  # from the beginning; UserError where the file is damaged
+    scans: int  # number of scans in the file, including unusable ones
+    read: Callable[[], Iterator[LoggedScan]]  # reads from the beginning; raises UserError if the file is damaged
     range_min: float = 0.0  # m
     mount_assumed: bool = False  # neither the log nor the user states the mount
-    odometry: str = ""  # where it comes from; empty: there is none
-    reference: str = ""  # what it is; empty: there is none
+    odometry: str = ""  # source of the odometry; empty if there is none
+    reference: str = ""  # source of the reference poses; empty if there are none
     initial_pose: Array | None = None  # (3,) in map
-    notes: list[str] = field(default_factory=list)  # what was taken for granted
-    left_out: Counter[str] = field(default_factory=Counter)  # of the last pass, scans: what, and how often
-    left_out_beside: Counter[str] = field(default_factory=Counter)  # the same, of what is no scan
+    notes: list[str] = field(default_factory=list)  # assumptions that were made
+    left_out: Counter[str] = field(default_factory=Counter)  # scans left out in the last pass, by reason
+    left_out_beside: Counter[str] = field(default_factory=Counter)  # other lines or messages left out, by reason
 
     def sweeps(self) -> Iterator[LoggedScan]:
-        """Scans with growing stamps; the others are counted. UserError where hardly any can be used."""
+        """Yields the scans with increasing stamps and counts the others in `left_out`.
+
+        Raises UserError at the end if more scans were left out than used.
+        """
         self.left_out.clear()
         self.left_out_beside.clear()
         last, used = None, 0
@@ -74,16 +78,15 @@ class Log:
                 continue
             last, used = sweep.stamp_ns, used + 1
             yield sweep
-        lost = self.left_out.total()
-        if lost > used:
-            raise UserError(f"{self.path}: too little of use: {used} scans; {self.lost()}")
+        if self.left_out.total() > used:
+            raise UserError(f"{self.path}: too few usable scans: {used}; left out: {self.describe_left_out()}")
 
-    def note_fitted(self, count: int) -> None:
-        """Adds the note, once, that ``count`` scans were brought to the first scan's angles."""
-        note = f"{count} scans of other beams are brought to the angles of the first"
+    def note_resampled(self, count: int) -> None:
+        """Adds the note, once, that ``count`` scans were resampled at the angles of the first scan."""
+        note = f"{count} scans with other beam angles are resampled at the angles of the first scan"
         if count and note not in self.notes:
             self.notes.append(note)
 
-    def lost(self) -> str:
-        """What was left out, in words; empty: nothing."""
+    def describe_left_out(self) -> str:
+        """What was left out and how often, for messages; empty if nothing was."""
         return ", ".join(f"{what}: {count}" for what, count in (self.left_out + self.left_out_beside).items())

@@ -10,11 +10,11 @@ import numpy.typing as npt
 from common.geometry import se2
 from common.geometry.se2 import Array
 
-GAP_NS = 1_000_000_000  # further apart than this two poses say nothing of what lies between
+MAX_GAP_NS = 1_000_000_000  # between two poses; over a longer gap there is no interpolation
 
 
 class Track:
-    """Poses as they come, in any order: 32 bytes each, and what stays the same costs nothing."""
+    """Poses over time, added in any order; 32 bytes each, and a pose that does not change is stored only twice."""
 
     def __init__(self) -> None:
         self._stamps, self._rows = array("q"), array("d")
@@ -24,37 +24,37 @@ class Track:
         return len(self._stamps)
 
     def add(self, stamp_ns: int, pose: Array) -> None:
-        """``pose`` (3,) at a time; one that is not finite is none."""
+        """Adds ``pose`` (3,) at a time; ignores a pose that is not finite."""
         if not np.isfinite(pose).all():
             return
         row = array("d", pose.tolist())
         self._sorted = None
-        stands = len(self) > 1 and self._rows[-6:-3] == self._rows[-3:] == row
-        if stands and self._stamps[-2] <= self._stamps[-1] <= stamp_ns <= self._stamps[-2] + GAP_NS:
+        unchanged = len(self) > 1 and self._rows[-6:-3] == self._rows[-3:] == row
+        if unchanged and self._stamps[-2] <= self._stamps[-1] <= stamp_ns <= self._stamps[-2] + MAX_GAP_NS:
             self._stamps[-1] = stamp_ns
             return
         self._stamps.append(stamp_ns)
         self._rows.extend(row)
 
     def at(self, stamp_ns: int) -> Array | None:
-        """(3,) there: along the straight line between the pose before and the one behind, and by the shorter turn.
+        """Pose (3,) at a time, linearly interpolated in position and heading (by the shorter turn).
 
-        None before the first, after the last, and where those two are more than a second apart.
+        Returns None before the first pose, after the last, and between two poses more than a second apart.
         """
-        stamps, rows = self._in_order()
+        stamps, rows = self._sort()
         if not len(stamps):
             return None
-        behind = int(np.searchsorted(stamps, stamp_ns))
-        if behind < len(stamps) and stamps[behind] == stamp_ns:
-            return np.array(rows[behind])
-        if behind in (0, len(stamps)) or stamps[behind] - stamps[behind - 1] > GAP_NS:
+        after = int(np.searchsorted(stamps, stamp_ns))
+        if after < len(stamps) and stamps[after] == stamp_ns:
+            return np.array(rows[after])
+        if after in (0, len(stamps)) or stamps[after] - stamps[after - 1] > MAX_GAP_NS:
             return None
-        a, b = rows[behind - 1], rows[behind]
-        share = (stamp_ns - stamps[behind - 1]) / (stamps[behind] - stamps[behind - 1])
+        a, b = rows[after - 1], rows[after]
+        share = (stamp_ns - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
         yaw = se2.wrap(a[2] + share * se2.wrap(b[2] - a[2]))
         return np.array([*(a[:2] + share * (b[:2] - a[:2])), yaw])
 
-    def _in_order(self) -> tuple[npt.NDArray[np.int64], Array]:
+    def _sort(self) -> tuple[npt.NDArray[np.int64], Array]:
         if self._sorted is None:
             stamps, rows = np.array(self._stamps, np.int64), np.array(self._rows).reshape(-1, 3)
             order = np.argsort(stamps, kind="stable")

@@ -7,34 +7,36 @@ import numpy as np
 from common.geometry.se2 import Array, wrap
 from common.robot.ranges import NOT_MEASURED, surfaces
 
-SAME = 1e-4  # rad, by which a beam may be off and is the same
-COARSEST = 4.0  # times the first scan's spacing, as in services/estimator/paper/beam_fitting.py
-ONE_SURFACE = 0.1  # of the nearer range, by which two neighbours differ at most
+ANGLE_TOLERANCE = 1e-4  # rad, below which two beams have the same angle
+MAX_SPACING_RATIO = 4.0  # of the scan to the wanted angles, as in services/estimator/paper/beam_fitting.py
+# Two neighbouring beams hit the same surface if their ranges differ by less than this share of the smaller one.
+SAME_SURFACE_SHARE = 0.1
 
 
-def resampled(ranges: Array, angles: Array, wanted: Array) -> Array | None:
-    """Ranges (B,) m at ``wanted`` (B,) rad, from a scan (S,) m at ``angles`` (S,) rad, ascending; see `ranges`.
+def resample(ranges: Array, angles: Array, wanted: Array) -> Array | None:
+    """Ranges (B,) m at the angles ``wanted`` (B,) rad, from a scan (S,) m at ``angles`` (S,) rad, ascending.
 
-    Between two beams on one surface linearly, else as the nearer of the two says; where none is within the scan's own
-    spacing: not measured. None of a scan that cannot stand for it: too coarse, or it looks at less than half of that.
+    Interpolates linearly between two beams on the same surface, otherwise takes the nearer beam. Angles without a beam
+    within the spacing of the scan are NOT_MEASURED. Returns the scan itself if the angles are the same, and None if the
+    scan is too coarse or covers less than half of the wanted angles.
     """
-    if len(angles) == len(wanted) and float(np.abs(wrap(angles - wanted)).max()) < SAME:
+    if len(angles) == len(wanted) and float(np.abs(wrap(angles - wanted)).max()) < ANGLE_TOLERANCE:
         return ranges
     spacing = float(np.median(np.diff(angles)))
-    if spacing > COARSEST * float(np.median(np.diff(wanted))):
+    if spacing > MAX_SPACING_RATIO * float(np.median(np.diff(wanted))):
         return None
-    order = np.argsort(around := wrap(angles))
-    # Once more on either side, for views that go all round.
-    ring = np.concatenate([around[order] - 2 * np.pi, around[order], around[order] + 2 * np.pi])
+    order = np.argsort(wrapped := wrap(angles))
+    # Copies one turn before and after give every wanted angle a neighbour on both sides.
+    ring = np.concatenate([wrapped[order] - 2 * np.pi, wrapped[order], wrapped[order] + 2 * np.pi])
     values = np.tile(ranges[order], 3)
-    at = wrap(wanted)
-    after = np.searchsorted(ring, at)
-    a, b = values[after - 1], values[after]
+    targets = wrap(wanted)
+    after = np.searchsorted(ring, targets)
+    left, right = values[after - 1], values[after]
     gap = ring[after] - ring[after - 1]
-    share = (at - ring[after - 1]) / np.maximum(gap, 1e-12)
-    found = np.where(share < 0.5, a, b)
-    one = surfaces(a) & surfaces(b) & (gap < 2 * spacing)
-    one[one] = np.abs(a[one] - b[one]) < ONE_SURFACE * np.minimum(a[one], b[one])
-    found[one] = a[one] + share[one] * (b[one] - a[one])
-    seen = np.minimum(share, 1 - share) * gap <= spacing
-    return np.where(seen, found, NOT_MEASURED) if 2 * seen.sum() >= len(wanted) else None
+    share = (targets - ring[after - 1]) / np.maximum(gap, 1e-12)
+    result = np.where(share < 0.5, left, right)
+    same = surfaces(left) & surfaces(right) & (gap < 2 * spacing)
+    same[same] = np.abs(left[same] - right[same]) < SAME_SURFACE_SHARE * np.minimum(left[same], right[same])
+    result[same] = left[same] + share[same] * (right[same] - left[same])
+    covered = np.minimum(share, 1 - share) * gap <= spacing
+    return np.where(covered, result, NOT_MEASURED) if 2 * covered.sum() >= len(wanted) else None

@@ -16,29 +16,29 @@ from presage.logs.frame_history import FrameHistory
 from presage.logs.log import Reading
 from presage.logs.poses import Track
 
-Lookup = Callable[[int], Array | None]  # of a stamp in ns; (3,) or None
+Lookup = Callable[[int], Array | None]  # pose (3,) at a stamp in ns, or None
 
 BASES = ("base_link", "base_footprint")  # REP-105
-MAP, ODOM = "map", "odom"
+MAP, ODOM = "map", "odom"  # REP-105
 
 
-def nothing(_: int) -> Array | None:
-    """Where there are no poses."""
+def no_poses(_: int) -> Array | None:
+    """A lookup without poses."""
     return None
 
 
 class Poses:
-    """Everything but the scans: 32 bytes a pose in memory."""
+    """All poses and transforms of a bag, in memory; 32 bytes for each pose."""
 
     def __init__(self, *, by_logger: bool) -> None:
-        """``by_logger``: times are those of logging, not those in the headers."""
+        """With ``by_logger``, uses the times of logging instead of the stamps in the headers."""
         self.frames = FrameHistory()
         self._by_logger = by_logger
         self._tracks: dict[str, Track] = {}  # by topic
         self._bases: dict[str, str] = {}  # child_frame_id of Odometry, by topic
 
-    def take(self, topic: str, logged_ns: int, message: Any) -> None:
-        """A TFMessage, or any message with a header and a pose; what is no pose is left out."""
+    def add(self, topic: str, logged_ns: int, message: Any) -> None:
+        """Adds a TFMessage, or any message with a header and a pose; ignores invalid poses."""
         if hasattr(message, "transforms"):
             for each in message.transforms:
                 with contextlib.suppress(ValueError):
@@ -57,38 +57,41 @@ class Poses:
         return logged_ns if self._by_logger else stamp_of(message.header)
 
     def base(self, laser: str, odom: list[Connection], wanted: str) -> str:
-        """The frame of the robot: as asked for, odometry's child frame, or one of REP-105's on which the laser sits."""
+        """The frame of the robot.
+
+        ``wanted`` if given; else the first of the odometry's child frame and those of REP-105 that tf connects to the
+        laser.
+        """
         of_odom = [self._bases[c.topic] for c in odom if self._bases.get(c.topic)]
         candidates = [*of_odom, *BASES]
         return wanted or next((c for c in candidates if self.frames.chain(c, laser) is not None), candidates[0])
 
     def odometry(self, connections: list[Connection], base: str, notes: list[str]) -> tuple[str, Lookup]:
-        """What it is, empty where there is none, and the base in odom at a time."""
+        """Returns the source of the odometry ("" if there is none) and a lookup of base in odom."""
         for topic in {c.topic for c in connections} & self._tracks.keys():
-            # Odometry of another frame of the robot is that of the base, seen from there.
             offset = self._offset(topic, base, notes)
-            return f"{topic}, interpolated", self._of(self._tracks[topic], offset)
+            return f"{topic}, interpolated", self._lookup(self._tracks[topic], offset)
         chain = self.frames.chain(ODOM, base)
         if not chain:
-            return "", nothing
+            return "", no_poses
         return f"tf {ODOM} -> {base}, interpolated", lambda stamp: self.frames.at(chain, stamp)
 
     def reference(
         self, connections: list[Connection], base: str, reading: Reading, notes: list[str]
     ) -> tuple[str, Lookup]:
-        """What it is, empty where there is none, and the base in map at a time."""
+        """Returns the source of the reference poses ("" if there are none) and a lookup of base in map."""
         if reading.reference is False:
-            return "", nothing
+            return "", no_poses
         for topic in {c.topic for c in connections} & self._tracks.keys():
             offset = self._offset(topic, base, notes)
-            return f"the log's {topic}", self._of(self._tracks[topic], offset)
+            return f"the log's {topic}", self._lookup(self._tracks[topic], offset)
         chain = self.frames.chain(MAP, base)
-        # A map -> odom that never moves is nobody's localisation.
+        # A transform map -> odom that never changes was not published by a localisation.
         if not chain or not (chain[0].moves or reading.reference):
-            return "", nothing
+            return "", no_poses
         return f"the log's own localisation (tf {MAP} -> {base})", lambda stamp: self.frames.at(chain, stamp)
 
-    def _of(self, track: Track, offset: Array) -> Lookup:
+    def _lookup(self, track: Track, offset: Array) -> Lookup:
         def look(stamp: int) -> Array | None:
             pose = track.at(stamp)
             return None if pose is None else np.asarray(se2.compose(pose, offset))
@@ -96,21 +99,21 @@ class Poses:
         return look
 
     def _offset(self, topic: str, base: str, notes: list[str]) -> Array:
-        """(3,) the base in the frame whose poses a topic has; where tf does not say, they are taken for the base's."""
+        """The base (3,) in the frame whose poses the topic has; zero with a note if tf does not connect the two."""
         child = self._bases.get(topic, "")
-        offset = self._fixed(child, base) if child not in ("", base) else np.zeros(3)
+        offset = self._fixed_transform(child, base) if child not in ("", base) else np.zeros(3)
         if offset is None:
             notes.append(
-                f"{topic} has poses of {child}, and tf does not say where that sits on {base}: they are taken for "
-                f"{base}'s (--base-frame)"
+                f"{topic} has poses of {child}, and tf does not connect {child} and {base}: assumed to be poses of "
+                f"{base} (change with --base-frame)"
             )
         return np.zeros(3) if offset is None else offset
 
-    def _fixed(self, frame: str, base: str) -> Array | None:
-        """(3,) the base in another frame bolted to it; None where tf does not say."""
-        for parent, child, turn in ((frame, base, False), (base, frame, True)):
+    def _fixed_transform(self, frame: str, base: str) -> Array | None:
+        """The base (3,) in another frame that is fixed to it; None if tf does not connect them so."""
+        for parent, child, invert in ((frame, base, False), (base, frame, True)):
             chain = self.frames.chain(parent, child)
             if chain and not any(edge.moves for edge in chain):
                 pose = self.frames.at(chain, 0)
-                return None if pose is None else se2.inverse(pose) if turn else pose
+                return None if pose is None else se2.inverse(pose) if invert else pose
         return None

@@ -12,26 +12,26 @@ from matplotlib.transforms import Affine2D
 from common.geometry.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from common.geometry.world import World
 
-NOT_KNOWN = "#E4E4E4"
-THICKNESS = 0.12  # m of a wall, as drawn
+UNKNOWN_COLOUR = "#E4E4E4"
+WALL_THICKNESS_M = 0.12  # as drawn
 
 
 def draw_walls(axes: Axes, world: World, wall: str) -> None:
-    """Below everything else, in m: a ROS map, or a boundary with some thickness in the colour ``wall``."""
+    """Draws a ROS map, or the boundary of a world as walls of the colour ``wall``, below everything else; axes in m."""
     if world.grid is not None:
         draw_cells(axes, world.grid, wall)
         return
-    outside = shapely.Polygon(world.boundary).buffer(THICKNESS, join_style="mitre")
+    outside = shapely.Polygon(world.boundary).buffer(WALL_THICKNESS_M, join_style="mitre")
     axes.add_patch(Polygon(shapely.get_coordinates(outside.exterior), facecolor=wall, edgecolor="none", zorder=0.1))
     axes.add_patch(Polygon(world.boundary, closed=True, facecolor="white", edgecolor="none", zorder=0.2))
 
 
 def draw_cells(axes: Axes, grid: OccupancyGrid, wall: str) -> None:
-    """Below everything else, in m: occupied cells in the colour ``wall``, unknown ones grey, free ones white."""
+    """Draws occupied cells in the colour ``wall``, unknown grey and free white, below everything else; axes in m."""
     kinds = np.select([grid.values == OCCUPIED, grid.values == UNKNOWN], [1, 2], 0)
     place = Affine2D().scale(grid.resolution).rotate(grid.origin[2]).translate(*grid.origin[:2])
     image = axes.imshow(
-        kinds, cmap=ListedColormap(["white", wall, NOT_KNOWN]), vmin=0, vmax=2, origin="lower", aspect="equal",
+        kinds, cmap=ListedColormap(["white", wall, UNKNOWN_COLOUR]), vmin=0, vmax=2, origin="lower", aspect="equal",
         interpolation="nearest", extent=(0, grid.width, 0, grid.height), zorder=0.2,
     )  # fmt: skip
     image.set_transform(place + axes.transData)

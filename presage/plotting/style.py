@@ -16,33 +16,33 @@ from common.geometry.se2 import Array
 from common.geometry.world import World
 from presage.plotting.maps import draw_cells
 
-# Okabe and Ito; the same in every figure. Green is the paper's for the distance to the goal.
+# Palette of Okabe and Ito, the same in every figure. Green is the colour of the distance to the goal in the paper.
 COLOURS = {
     "paper": "#E69F00", "paper, 10 steps a scan": "#E69F00", "precise": "#0072B2", "particle-filter": "#D55E00",
     "amcl-defaults": "#CC79A7", "particle-filter, heading known": "#000000", "precise, odometry": "#56B4E9",
     "particle-filter, odometry": "#999999", "amcl-defaults, odometry": "#CC79A7",
 }  # fmt: skip
-DASHED = ("paper, 10 steps a scan",)  # those that share a colour with another
+DASHED = ("paper, 10 steps a scan",)  # estimators that share a colour with another
 MEASURED, PREDICTED, GOAL, BOUND = "#0072B2", "#D55E00", "#009E73", "#444444"
-SMALLEST = 1e-4  # m, the least a logarithmic axis shows
+MIN_LOG_VALUE = 1e-4  # m, lower limit of bands on logarithmic axes
 
 
 def figure_of(columns: int = 1, rows: int = 1, *, width: float = 7.0, height: float = 4.2) -> tuple[Figure, list[Axes]]:
-    """An empty figure of so many panels, each ``width`` x ``height`` inches; the panels, row by row."""
-    figure = blank(width * columns, height * rows)
+    """Returns a figure with empty panels of ``width`` x ``height`` inches each, and the panels row by row."""
+    figure = empty_figure(width * columns, height * rows)
     axes = figure.subplots(rows, columns, squeeze=False)
-    return figure, [dress(each) for each in axes.ravel()]
+    return figure, [style_axes(each) for each in axes.ravel()]
 
 
-def blank(width: float, height: float) -> Figure:
-    """No panel yet; inches."""
+def empty_figure(width: float, height: float) -> Figure:
+    """A figure without panels; the size is in inches."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
-def dress(axes: Axes) -> Axes:
-    """Light grid, no box."""
+def style_axes(axes: Axes) -> Axes:
+    """Gives the axes a light grid and no frame; returns them."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(visible=True, which="major", color="#DDDDDD", linewidth=0.6)
     axes.set_axisbelow(True)
@@ -52,20 +52,20 @@ def dress(axes: Axes) -> Axes:
 def band(
     axes: Axes, x: Sequence[float] | Array, rows: Sequence[Sequence[float]] | Array, name: str, colour: str = ""
 ) -> None:
-    """Mean over trials (N, K) with a band of one standard deviation; on a log axis it ends where it would be <= 0."""
+    """Draws the mean over trials (N, K) with a band of one standard deviation, which stays positive for log axes."""
     values = np.asarray(rows, float)
     mean, std = values.mean(axis=0), values.std(axis=0)
-    _band(axes, x, mean, (np.maximum(mean - std, SMALLEST), mean + std), name, colour)
+    _band(axes, x, mean, (np.maximum(mean - std, MIN_LOG_VALUE), mean + std), name, colour)
 
 
 def quartiles(axes: Axes, x: Sequence[float] | Array, rows: Sequence[Sequence[float]] | Array, name: str) -> None:
-    """Median over trials (N, K) with a band from the first to the third quartile: for a logarithmic axis."""
+    """Draws the median over trials (N, K) with a band from the first to the third quartile, for logarithmic axes."""
     low, middle, high = np.quantile(np.asarray(rows, float), (0.25, 0.5, 0.75), axis=0)
     _band(axes, x, middle, (low, high), name)
 
 
 def line(axes: Axes, x: Sequence[float], y: Sequence[float], name: str, colour: str = "") -> None:
-    """As this estimator's always is."""
+    """Draws a line in the colour and style of the estimator ``name``."""
     colour = colour or COLOURS.get(name, GOAL)
     axes.plot(x, y, "--" if name in DASHED else "-", color=colour, linewidth=1.6, label=name)
 
@@ -78,13 +78,13 @@ def _band(
     axes.fill_between(x, *edges, color=colour, alpha=0.18, linewidth=0)
 
 
-def held(rows: Sequence[Sequence[float]], length: int) -> Array:
-    """(N, ``length``) of rows that end earlier: they hold their last value."""
+def pad_with_last(rows: Sequence[Sequence[float]], length: int) -> Array:
+    """Array (N, ``length``) of rows of different lengths, each continued with its last value."""
     return np.array([[*row, *[row[-1]] * (length - len(row))] for row in rows])
 
 
 def world_map(axes: Axes, world: World) -> None:
-    """Walls and furniture, m."""
+    """Draws the walls and furniture of a world; axes in m."""
     if world.grid is not None:
         draw_cells(axes, world.grid, "black")
     else:
@@ -97,7 +97,7 @@ def world_map(axes: Axes, world: World) -> None:
 
 
 def legend_below(figure: Figure, *panels: Axes) -> None:
-    """One legend for all panels, where it hides nothing."""
+    """Adds one legend for all panels below the figure."""
     named = {label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     figure.legend(
         named.values(), named.keys(), loc="outside lower center", ncols=min(len(named), 5), fontsize=9, frameon=False
@@ -105,7 +105,7 @@ def legend_below(figure: Figure, *panels: Axes) -> None:
 
 
 def log_metres(axes: Axes, axis: str = "y") -> None:
-    """A logarithmic axis that says 0.01, not 10^-2."""
+    """Makes an axis logarithmic with labels such as 0.01 instead of 10^-2."""
     axes.set(**{f"{axis}scale": "log"})
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     (axes.yaxis if axis == "y" else axes.xaxis).set_major_formatter(plain)

@@ -13,7 +13,7 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import load_world
 from presage.logs.log import Reading
-from presage.logs.opening import PEEK, kind_of, open_log
+from presage.logs.opening import HEAD_BYTES, kind_of, open_log
 from tests.presage.logs.drives import ANGLES, BEAMS, MOUNT, SCANS, STAMPS, carmen, odom, ranges, truth, words
 
 FOV = {"angles": (ANGLES[0], ANGLES[-1])}  # FLASER's 91 beams are no usual number
@@ -70,7 +70,7 @@ def test_compressed_and_longer_than_its_head(tmp_path, pack):
     rng = np.random.default_rng(0)
     lines = [f"FLASER 361 {words(row)} 0 0 0 0 0 0 {k} h {k}" for k, row in enumerate(rng.uniform(1, 9, (150, 361)))]
     file = write(tmp_path, lines, pack)
-    assert file.stat().st_size > 2 * PEEK
+    assert file.stat().st_size > 2 * HEAD_BYTES
     assert kind_of(file) == "carmen"
     assert len(read(file)[1]) == 150
     whole = file.read_bytes()
@@ -115,7 +115,7 @@ def test_where_so_many_beams_look(tmp_path, beams, first, last):
     log, _ = read(write(tmp_path, [line.format(1.0), line.format(2.0)]))
     np.testing.assert_allclose(np.rad2deg(log.angles[[0, -1]]), [first, last])
     assert any("--angles" in note for note in log.notes)
-    with pytest.raises(UserError, match="where its 100 beams look"):
+    with pytest.raises(UserError, match="the angles of its 100 beams"):
         read(write(tmp_path, [f"FLASER 100 {words(np.full(100, 2.0))} 0 0 0 0 0 0 1.0 host 0.1"]))
 
 
@@ -164,7 +164,7 @@ def test_garbled_poses_are_counted_and_cost_no_scan(tmp_path):
     lines.insert(7, "TRUEPOS nan 0 0 0 0 0 1 h 1")
     log, scans = read(write(tmp_path, lines))
     assert len(scans) == SCANS
-    assert log.lost() == "garbled ODOM lines: 2, garbled TRUEPOS lines: 1"
+    assert log.describe_left_out() == "garbled ODOM lines: 2, garbled TRUEPOS lines: 1"
     assert not log.left_out
 
 
@@ -219,18 +219,19 @@ def test_an_interlaced_scanner_is_brought_to_the_first_beams(tmp_path):
     file = write(tmp_path, lines)
     log, sweeps = read(file)
     assert not log.left_out
-    assert "6 scans of other beams are brought to the angles of the first" in log.notes
+    assert "6 scans with other beam angles are resampled at the angles of the first scan" in log.notes
     off = np.abs([sweep.ranges for sweep in sweeps] - ranges())[1::2, 1:-1]
     assert np.quantile(off, 0.9) < 0.05  # at edges a ray half a spacing aside sees another surface
     upside_down = read(file, upside_down=True)
-    assert upside_down[0].notes == ["the scanner hangs upside down: its beams are turned over", log.notes[-1]]
+    note = "the scanner is mounted upside down: the order of its beams is reversed"
+    assert upside_down[0].notes == [note, log.notes[-1]]
     np.testing.assert_array_equal(upside_down[1][1].ranges, sweeps[1].ranges[::-1])
     assert read(file, angles=(ANGLES[0], ANGLES[-1]))[0].left_out == {"scans of other beams": 6}
 
 
 def test_hardly_anything_of_use(tmp_path):
     lines = [line[:80] if line.startswith("ROBOT") and k > 8 else line for k, line in enumerate(carmen())]
-    with pytest.raises(UserError, match="too little of use: 3 scans; garbled lines: 9"):
+    with pytest.raises(UserError, match="too few usable scans: 3; left out: garbled lines: 9"):
         read(write(tmp_path, lines))
     with pytest.raises(UserError, match="without a scan"):
         read(write(tmp_path, ["ODOM 0 0 0 0 0 0 1 h 1"]))
@@ -243,4 +244,4 @@ def test_clocks(tmp_path):
     still = [f"FLASER 181 {words(np.full(181, 2.0))} 0 0 0 0 0 0 0 nohost {k}" for k in range(5)]
     log, sweeps = read(write(tmp_path, still))
     assert [sweep.stamp_ns for sweep in sweeps] == [k * 10**9 for k in range(5)]
-    assert any("stand still" in note for note in log.notes)
+    assert any("do not advance" in note for note in log.notes)

@@ -113,7 +113,9 @@ def test_localises_from_its_reference_on(tmp_path):
     out, _ = imported(make(tmp_path, "ros1"), world="corridor")
     for file, world in ((out, ""), (tmp_path / "drive.bag", "corridor")):
         choice = choice_of(file, world, "precise", "exact", None, 0.02, 0, "")
-        job = LocalizeOptions.of(file, choice, "track", "base_link", Reading(), fresh=False, odometry=True, out=tmp_path / "p.json")
+        job = LocalizeOptions.of(
+            file, choice, "track", "base_link", Reading(), fresh=False, odometry=True, out=tmp_path / "p.json"
+        )
         rows = localize(job, CONSOLE)
         found = np.array([[row["x"], row["y"]] for row in rows])
         assert np.hypot(*(found - truth(STAMPS)[:, :2]).T).max() < 0.02
@@ -155,9 +157,9 @@ def test_reference_poses_that_are_not_known_throughout(tmp_path):
     ("changes", "why"),
     [
         ({"angles": ANGLES**3 / 4}, "not evenly spaced"),
-        ({"angles": np.rad2deg(ANGLES)}, "more than once round: are they degrees"),
+        ({"angles": np.rad2deg(ANGLES)}, "more than one turn: are they in degrees"),
         ({"stamps": STAMPS * 1e-9 - 2e9}, "below 0 s"),
-        ({"stamps": np.zeros(SCANS)}, "1 scans; scans twice: 11"),
+        ({"stamps": np.zeros(SCANS)}, "too few usable scans: 1; left out: scans twice: 11"),
     ],
 )
 def test_what_no_recording_can_be_made_of_leaves_no_file(tmp_path, changes, why):
@@ -169,7 +171,7 @@ def test_what_no_recording_can_be_made_of_leaves_no_file(tmp_path, changes, why)
 def test_names_that_cannot_be(tmp_path):
     file = npz(tmp_path)
     (tmp_path / "there.mcap").write_bytes(b"")
-    for out, why in (("out.bag", "NAME.mcap"), ("there.mcap", "is there already; choose another name with --out")):
+    for out, why in (("out.bag", "must end with .mcap"), ("there.mcap", "exists already; choose another name")):
         with pytest.raises(UserError, match=why):
             imported(file, out)
     with pytest.raises(UserError, match="no world"):
@@ -211,9 +213,11 @@ def test_an_rplidar_that_looks_all_round(tmp_path):
 
     out, facts = imported(write_bag(tmp_path, Bag("ros1", each=turn, localised=True)), world="corridor")
     assert (facts["scans"], facts["left_out"]) == (SCANS, {})
-    assert any("brought to the angles of the first" in note for note in facts["notes"])
+    assert any("resampled at the angles of the first" in note for note in facts["notes"])
     assert read_recording(out).scanner().beams == 360
     choice = choice_of(out, "", "precise", "exact", None, 0.02, 0, "")
-    job = LocalizeOptions.of(out, choice, "track", "base_link", Reading(), fresh=False, odometry=True, out=tmp_path / "p.json")
+    job = LocalizeOptions.of(
+        out, choice, "track", "base_link", Reading(), fresh=False, odometry=True, out=tmp_path / "p.json"
+    )
     found = np.array([[row["x"], row["y"]] for row in localize(job, CONSOLE)])
     assert np.hypot(*(found - truth(STAMPS)[:, :2]).T).max() < 0.02

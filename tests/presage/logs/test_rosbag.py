@@ -12,7 +12,7 @@ from common.geometry import se2
 from common.geometry.world import load_world
 from presage.logs.log import Reading
 from presage.logs.opening import open_log
-from presage.logs.resampling import resampled
+from presage.logs.resampling import resample
 from tests.presage.logs.drives import ANGLES, BEAMS, MOUNT, SCANS, STAMPS, Bag, believed, odom, ranges, truth, write_bag
 
 
@@ -105,7 +105,7 @@ def test_odometry_from_tf_where_there_is_no_topic(tmp_path):
 def test_odometry_of_a_frame_that_tf_does_not_know_is_said_once(tmp_path):
     log, scans = read(write_bag(tmp_path, Bag(child="wheels")))
     (note,) = log.notes
-    assert note.startswith("/odom has poses of wheels, and tf does not say where that sits on base_link")
+    assert note.startswith("/odom has poses of wheels, and tf does not connect wheels and base_link")
     close([scan.odom for scan in scans], odom(STAMPS))
     with pytest.raises(UserError, match="--odom-topic /odm: no topic of that name and type; it has /odom"):
         read(tmp_path / "drive", odom_topic="/odm")
@@ -113,7 +113,7 @@ def test_odometry_of_a_frame_that_tf_does_not_know_is_said_once(tmp_path):
 
 def test_without_tf_the_mount_must_be_said(tmp_path):
     path = write_bag(tmp_path, Bag(tf=False))
-    with pytest.raises(UserError, match="tf does not say where laser sits on base_link: say it with --mount"):
+    with pytest.raises(UserError, match="tf does not state where laser is mounted on base_link: give it with --mount"):
         read(path)
     np.testing.assert_array_equal(read(path, mount=MOUNT)[0].mount, MOUNT)
 
@@ -137,7 +137,7 @@ def test_the_loggers_clock(tmp_path):
 
 def test_no_scan_in_it(tmp_path):
     path = write_bag(tmp_path, Bag(scan={"ranges": np.zeros(0, np.float32)}))
-    with pytest.raises(UserError, match="/scan has no scan of three beams"):
+    with pytest.raises(UserError, match="/scan has no scan with at least three beams"):
         read(path)
 
 
@@ -156,7 +156,7 @@ def test_a_scanner_whose_beams_come_and_go(tmp_path):
     log, scans = read(write_bag(tmp_path, Bag(each=turn)))
     assert len(scans) == SCANS
     assert not log.left_out
-    assert any("scans of other beams are brought to the angles of the first" in note for note in log.notes)
+    assert any("scans with other beam angles are resampled at the angles of the first" in note for note in log.notes)
     for stamp, scan in zip(STAMPS, scans, strict=True):
         wanted = exact.ray_distances(se2.compose(truth(stamp), MOUNT)[None], log.angles)[0]
         off = np.abs(scan.ranges - wanted)
@@ -191,7 +191,7 @@ def test_a_round_room_looks_the_same_from_other_beams(beams, share, first):
     """All round, from any first direction on; never a range that neither neighbour has."""
     angles = first + 2 * np.pi / beams * np.arange(beams)
     wanted = -np.pi + 2 * np.pi / 90 * np.arange(90)
-    found = resampled(np.where(np.arange(beams) / beams < share, 2.0, 7.0), angles, wanted)
+    found = resample(np.where(np.arange(beams) / beams < share, 2.0, 7.0), angles, wanted)
     if beams < 90 / 4:
         assert found is None
     else:

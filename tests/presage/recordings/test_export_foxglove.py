@@ -104,7 +104,9 @@ def test_a_recording_of_every_topic_is_exported_whole(tmp_path):
     recording = read_recording(path)
     assert set(recording.topics().values()) == set(TOPICS)
     for form in ("foxglove", "csv", "tum"):
-        run_export(ExportOptions(path, form, tmp_path / form), None, console := Console(record=True, file=io.StringIO()))
+        run_export(
+            ExportOptions(path, form, tmp_path / form), None, console := Console(record=True, file=io.StringIO())
+        )
         assert "left out" not in console.export_text()
 
 
