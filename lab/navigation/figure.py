@@ -40,13 +40,13 @@ def draw(by_group: Mapping[str, Rows], worlds: Mapping[str, str], title: str) ->
         max(_height(world_of_group[group]) for group in list(world_of_group)[row * columns :][:columns])
         for row in range(rows_of_maps)
     ]
-    figure = drawing.blank(6.6 * columns, 6.2 * sum(heights) + 0.5 * rows_of_maps + 3.4)
+    figure = drawing.empty_figure(6.6 * columns, 6.2 * sum(heights) + 0.5 * rows_of_maps + 3.4)
     figure.suptitle(title, fontsize=11)
     grid = figure.add_gridspec(rows_of_maps + 1, 2 * columns, height_ratios=[*(6.2 * h + 0.5 for h in heights), 2.6])
     for number, (group, rows) in enumerate(by_group.items()):
         row, column = divmod(number, columns)
         _map(
-            drawing.dress(figure.add_subplot(grid[row, 2 * column : 2 * column + 2])),
+            drawing.style_axes(figure.add_subplot(grid[row, 2 * column : 2 * column + 2])),
             world_of_group[group],
             group,
             rows,
@@ -58,7 +58,7 @@ def draw(by_group: Mapping[str, Rows], worlds: Mapping[str, str], title: str) ->
         (left, "path_over_shortest", "path over the shortest way with clearance"),
         (right, "time_over_least", "time over the least time"),
     ):
-        _distribution(drawing.dress(axes), by_group, quantity, label)
+        _distribution(drawing.style_axes(axes), by_group, quantity, label)
     drawing.legend_below(figure, left)
     return figure
 

@@ -185,13 +185,13 @@ def run(job: Job, out: Path, workers: int, console: Console, worlds: Sequence[st
 def draw(rows: Sequence[dict[str, Any]], summary: dict[str, dict[str, Any]]) -> Figure:
     """One row per world: a map with the final beliefs of the paper's estimator, and bars with shares of places."""
     worlds = list(dict.fromkeys(row["world"] for row in rows))
-    figure = drawing.blank(14, 3.5 * len(worlds))
+    figure = drawing.empty_figure(14, 3.5 * len(worlds))
     panels = figure.subplots(len(worlds), 2, squeeze=False, width_ratios=(1.15, 1))
     for name, (left, right) in zip(worlds, panels, strict=True):
         own = {row["estimator"]: row for row in rows if row["world"] == name}
         _map(left, world_of(name), own["paper"]["places"])
         left.set_title(TITLES[name])
-        _bars(drawing.dress(right), {each: summary[f"{name}, {each}"] for each in own})
+        _bars(drawing.style_axes(right), {each: summary[f"{name}, {each}"] for each in own})
     panels[0][1].set_title(f"belief within {CLOSE_DISTANCE} m of the truth | claims at the end")
     drawing.legend_below(figure, *panels[0])
     return figure

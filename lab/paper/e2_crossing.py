@@ -166,7 +166,7 @@ def draw(names: Sequence[str], curves: dict[str, list[Any]]) -> Figure:
         axes.set(xlabel="time (s)", ylabel="position error, RMS of all crossings (m)", title=title)
     low, high = zip(*(axes.get_ylim() for axes in panels), strict=True)
     for axes in panels:
-        axes.set(ylim=(max(min(low), drawing.SMALLEST), max(high)))
+        axes.set(ylim=(max(min(low), drawing.MIN_LOG_VALUE), max(high)))
     drawing.legend_below(figure, *panels)
     return figure
 

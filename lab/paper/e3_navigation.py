@@ -180,14 +180,14 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
 def _rows(rows: Sequence[dict[str, Any]], name: str, quantity: str, names: Sequence[str]) -> Array:
     """One quantity of all trials (N, K), padded with the last value to the longest trial of all estimators."""
     longest = max(len(row["estimators"][each][quantity]) for row in rows for each in names)
-    return drawing.held([row["estimators"][name][quantity] for row in rows], longest)
+    return drawing.pad_with_last([row["estimators"][name][quantity] for row in rows], longest)
 
 
 def draw(rows: Sequence[dict[str, Any]], job: Job) -> Figure:
     """Distance to the goal and error over iterations, as in the paper's figure 3, and the paths below."""
-    figure = drawing.blank(13.0, 7.2)
+    figure = drawing.empty_figure(13.0, 7.2)
     grid = figure.add_gridspec(2, 2, height_ratios=(1.25, 1))
-    left, right, below = (drawing.dress(figure.add_subplot(part)) for part in (grid[0, 0], grid[0, 1], grid[1, :]))
+    left, right, below = (drawing.style_axes(figure.add_subplot(part)) for part in (grid[0, 0], grid[0, 1], grid[1, :]))
     for name in job.estimators:
         colour = drawing.GOAL if name == "precise" else drawing.COLOURS[name]
         for axes, quantity in ((left, "distance_m"), (right, "error_m")):

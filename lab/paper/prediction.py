@@ -132,10 +132,10 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
 def draw(result: results.Result) -> Figure:
     """The sample scan with both models' predictions, residuals below, and calibration on the right."""
     row = result.trials[0]
-    figure = drawing.blank(16, 6.2)
+    figure = drawing.empty_figure(16, 6.2)
     grid = figure.add_gridspec(2, 3, height_ratios=(1.9, 1), width_ratios=(1, 1, 0.8))
-    tops = [drawing.dress(figure.add_subplot(grid[0, k])) for k in range(2)]
-    bottoms = [drawing.dress(figure.add_subplot(grid[1, k], sharex=tops[k])) for k in range(2)]
+    tops = [drawing.style_axes(figure.add_subplot(grid[0, k])) for k in range(2)]
+    bottoms = [drawing.style_axes(figure.add_subplot(grid[1, k], sharex=tops[k])) for k in range(2)]
     angle, measured = np.rad2deg(row["angle_rad"]), np.array(row["measured_m"])
     titles = {"paper": "paper: states no precision (Σ_o = 1)", "precise": "precise: states ± 2σ of every beam"}
     for name, top, bottom in zip(ESTIMATORS, tops, bottoms, strict=True):
@@ -162,7 +162,7 @@ def draw(result: results.Result) -> Figure:
     bottoms[0].set_ylabel("measured − expected (m)")
     tops[1].sharey(tops[0])
     tops[1].legend(fontsize=9, frameon=False, loc="upper right")
-    _calibration(drawing.dress(figure.add_subplot(grid[:, 2])), row["models"]["precise"], result.parameters["scans"])
+    _calibration(drawing.style_axes(figure.add_subplot(grid[:, 2])), row["models"]["precise"], result.parameters["scans"])
     figure.suptitle("; ".join(result.notes[:1]), fontsize=10)
     return figure
 

@@ -18,11 +18,11 @@ MIN_DRAWN_ERROR = 1e-3  # m; smaller errors are drawn at this value
 
 def draw(calibration: Calibration | None, rows: Sequence[dict[str, Any]], titles: dict[str, str]) -> Figure:
     """Cumulative distribution of the errors, calibration, and errors over time with and without odometry."""
-    figure = drawing.blank(14, 9)
+    figure = drawing.empty_figure(14, 9)
     panels = figure.subplots(2, 2, width_ratios=(1.6, 1))
-    shares = drawing.dress(panels[0, 0])
+    shares = drawing.style_axes(panels[0, 0])
     for axes, task, style in zip(panels[1], (ODOMETRY, LASER), ("-", "--"), strict=True):
-        drawing.dress(axes)
+        drawing.style_axes(axes)
         for row in (row for row in rows if row["task"] == task):
             colour, name = drawing.COLOURS[row["estimator"]], row["estimator"]
             error = np.maximum(row["error_m"], MIN_DRAWN_ERROR)
@@ -37,6 +37,6 @@ def draw(calibration: Calibration | None, rows: Sequence[dict[str, Any]], titles
     shares.set(xlabel="position error (m)", ylabel="share of scans with less", ylim=(0, 1), title="the half localised")
     shares.legend(frameon=False, fontsize=9)
     if calibration is not None:
-        calibration_curve(drawing.dress(panels[0, 1]), calibration)
+        calibration_curve(drawing.style_axes(panels[0, 1]), calibration)
     drawing.legend_below(figure, panels[1, 1])
     return figure
