@@ -34,7 +34,7 @@ class ModelInUse:
         if weights and self.path is not None:
             data = _read(self.path)
             if hashlib.sha256(data).hexdigest() != self.sha256:
-                raise UserError(f"{self.path} was changed since the estimator loaded it: start the estimator anew")
+                raise UserError(f"{self.path} was changed since the estimator loaded it: restart the estimator")
         return ModelReply(
             estimator=self.estimator,
             world=self.world,

@@ -28,7 +28,7 @@ HEADING = np.pi / 2
 
 
 def change_weights(path: Path) -> bytes:
-    """Other numbers in a file of weights, with the card's digest adapted; the bytes of the new file."""
+    """Changes the numbers in a file of weights, adapts the digest in its card, and returns the new bytes."""
     data = safetensors.numpy.save(
         {name: (tensor * 1.02).astype(tensor.dtype) for name, tensor in safetensors.numpy.load_file(path).items()}
     )
@@ -39,7 +39,7 @@ def change_weights(path: Path) -> bytes:
 
 
 class ExactModel:
-    """The ray caster as a generative model; its derivative by central differences."""
+    """The ray caster as a generative model, with derivatives by central differences."""
 
     def __init__(self, world: World, step: float = 1e-4) -> None:
         self.world, self.step = world, step
@@ -54,7 +54,7 @@ class ExactModel:
 
 
 def posed_scans(count: int, seed: int, world: World = ROOM) -> Data:
-    """Scans from random places at the one heading."""
+    """Scans from random places at one heading."""
     places = world.sample_free(count, np.random.default_rng(seed), 0.3)
     poses = np.column_stack([places, np.full(count, HEADING)])
     return Data(poses, ExactModel(world).ranges(poses))

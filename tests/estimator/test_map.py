@@ -1,4 +1,4 @@
-"""Estimators on a ROS map: compiled rays and their derivatives, the likelihood field, a place found from one scan."""
+"""Estimators on a ROS map: compiled rays and their derivatives, the likelihood field, global localisation."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_compiled_rays_are_those_of_the_world(seed):
         )  # fmt: skip
         with np.errstate(invalid="ignore"):
             slope = (ahead.ranges - back.ranges) / (2 * small)
-        # Beams that change their cell, and those so flat that the derivative is held, have none to compare with.
+        # Excludes beams that change their cell, and beams so flat that their derivative is limited.
         same = np.isclose(ahead.jacobian, back.jacobian, atol=1e-3).all(axis=-1) & np.isfinite(slope)
         flat = np.abs(expected.jacobian).max(axis=-1) > 40
         fine = same & ~flat & (np.abs(slope) < 1e3)
@@ -76,7 +76,7 @@ def test_the_robot_finds_itself_on_a_map(hall):
 
 
 def test_stated_deviation_covers_the_error_of_the_cells():
-    """A slanted room, mapped in cells of 5 cm: its walls are off by up to a cell, the same at every scan."""
+    """A slanted room mapped with cells of 5 cm: the error of its walls, up to a cell, is the same at every scan."""
     corners = se2.rotate(0.3, np.array([(0.0, 0), (7, 0), (7, 5), (4, 5), (4, 3.5), (0, 3.5)]))
     room = World(name="room", boundary=corners.tolist())
     edges = np.roll(corners, -1, axis=0) - corners
@@ -100,4 +100,4 @@ def test_stated_deviation_covers_the_error_of_the_cells():
         off = found.pose - pose
         off[2] = se2.wrap(off[2])
         misfits.append(off @ np.linalg.solve(found.covariance, off))
-    assert np.mean(misfits) < 6  # three degrees of freedom; scanner noise alone would make it hundreds
+    assert np.mean(misfits) < 6  # three degrees of freedom; with scanner noise alone it would be hundreds

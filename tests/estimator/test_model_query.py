@@ -1,4 +1,4 @@
-"""What the estimator says it was made of, and that a folder made of the answer makes it again."""
+"""Query `model`: the description of the model, and that the same estimator can be built from the reply."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def ask(service, *, with_weights=True):
 
 
 def extracted(reply, folder):
-    """The answer as files, the way a recording hands them out."""
+    """Writes the reply to files, as a recording does."""
     folder.mkdir()
     (folder / reply.file).write_bytes(reply.weights.tobytes())
     (folder / reply.file).with_suffix(".json").write_text(reply.card)
@@ -33,7 +33,7 @@ def extracted(reply, folder):
 
 @pytest.fixture
 def shipped(tmp_path):
-    """The shipped weights in a folder of our own, which a test may harm."""
+    """A copy of the shipped weights, which a test may damage."""
     return Path(shutil.copytree(weights.FOLDER, tmp_path / "mine", ignore=shutil.ignore_patterns("*.png")))
 
 
@@ -50,7 +50,7 @@ def beliefs(service):
     [({"estimator": "precise"}, "corridor-precise"), ({"estimator": "paper"}, "corridor-paper-622")],
 )
 def test_the_answer_makes_the_very_same_estimator(settings, file, shipped, tmp_path):
-    # Weights that nobody ships: whoever falls back on the shipped ones is found out.
+    # These weights differ from the shipped ones, so that use of the shipped ones by mistake is noticed.
     data = change_weights(shipped / f"{file}.safetensors")
     service = opened(models=shipped, **settings)
     first = beliefs(service)
@@ -65,7 +65,7 @@ def test_the_answer_makes_the_very_same_estimator(settings, file, shipped, tmp_p
     again = opened(models=folder, world=str(folder / "world.yaml"), **settings)
     assert beliefs(again) == first
     assert ask(again) == reply
-    assert beliefs(opened(**settings)) != first  # the difference is one that shows
+    assert beliefs(opened(**settings)) != first  # the difference is visible
 
 
 def test_weights_come_only_when_asked_for(shipped):
@@ -116,7 +116,7 @@ def test_weights_changed_on_disk_are_not_passed_off_as_those_in_use(shipped):
     with pytest.raises(UserError, match=f"{path} was changed since the estimator loaded it"):
         ask(service)
     assert ask(service, with_weights=False).sha256 == before.sha256
-    service.on_message(SCAN, a_scan(1, TRUTH))  # the first scan does not look again
+    service.on_message(SCAN, a_scan(1, TRUTH))  # the first scan does not read the files again
     assert ask(service, with_weights=False).sha256 == before.sha256
     path.unlink()
     with pytest.raises(UserError, match="cannot be read"):

@@ -1,4 +1,4 @@
-"""The particle filter as a whole: found from nothing, tracked, kidnapped, and the same twice."""
+"""The particle filter as a whole: global localisation, tracking, kidnapping, repeatability."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def errors(posterior: Posterior, pose) -> tuple[float, float]:
 
 
 def drive(steps: int) -> np.ndarray:
-    """(steps, 3) poses at 15 Hz on a curve through the room's south, up to 1 m/s, turning up to 1 rad/s."""
+    """Poses (steps, 3) at 15 Hz on a curve through the south of the room, at up to 1 m/s and 1 rad/s."""
     t = np.arange(steps) / 15
     return np.column_stack([3 + 2.2 * np.sin(0.45 * t), 1.4 + 0.4 * np.sin(0.9 * t), se2.wrap(np.sin(t) * 1.0)])
 
@@ -62,7 +62,7 @@ def test_found_from_nothing_known_and_the_posterior_is_whole():
     assert sum(h.weight for h in posterior.hypotheses) == pytest.approx(1.0)
     assert np.linalg.eigvalsh(posterior.covariance).min() > 0
     assert np.allclose(posterior.predicted, ROOM.ray_distances(se2.compose(posterior.pose, SCANNER.mount), ANGLES)[0])
-    assert posterior.free_energy == posterior.accuracy < 0  # densities of a few beams a decimetre wide
+    assert posterior.free_energy == posterior.accuracy < 0  # the density of narrow beams exceeds 1/m
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_found_from_nothing_known_and_the_posterior_is_whole():
 )
 def test_a_moving_robot_is_tracked(known, limit):
     rng, path = np.random.default_rng(1), drive(150)
-    # Odometry in a frame of its own; commands between two poses.
+    # Odometry has its own frame; commands are those between two poses.
     odom = se2.compose(np.array([5.0, -2.0, 1.0]), path)
     twist = se2.between(path[:-1], path[1:]) * 15
     given = {
@@ -117,7 +117,7 @@ def test_kidnapped_is_noticed_and_recovered():
 
 
 def test_without_recovery_a_kidnapped_filter_stays_lost():
-    """The strangers are what finds it: the test above would pass for another reason otherwise."""
+    """Shows that the random particles find the robot in the test above."""
     settings = dataclasses.replace(SMALL, recovery_alpha_slow=0.0, recovery_alpha_fast=0.0, keep_initial_pose=False)
     rng, first, second = np.random.default_rng(5), np.array([1.0, 1.0, 0.3]), np.array([5.0, 1.2, 2.0])
     found = make(5, settings)
@@ -130,7 +130,7 @@ def test_without_recovery_a_kidnapped_filter_stays_lost():
 
 
 def test_initial_pose_is_kept_in_an_unmapped_room():
-    """Scans that fit nowhere must not make the filter search: odometry still says where the robot is."""
+    """With odometry, scans that fit nowhere must not start a search."""
     unmapped = World(name="unmapped", boundary=[(0, 0), (6, 0), (6, 2.4), (0, 2.4)])
     odom, path = np.random.default_rng(12), drive(60)
     found = make(12)
@@ -144,7 +144,7 @@ def test_initial_pose_is_kept_in_an_unmapped_room():
 
 @pytest.mark.parametrize("period", [1 / 15, 1.0])
 def test_scanner_rate_does_not_spread_the_particles(period):
-    """A robot that stands, with odometry that says so, stays where it is however slowly scans come."""
+    """The belief about a standing robot with odometry does not move, however low the scan rate."""
     rng, truth = np.random.default_rng(13), np.array([3.0, 1.5, 0.4])
     found = make(13)
     found.restart(truth, CERTAIN)
@@ -154,7 +154,7 @@ def test_scanner_rate_does_not_spread_the_particles(period):
 
 
 def test_two_identical_places_are_both_kept():
-    """A bare rectangle looks the same turned by pi."""
+    """An empty rectangle looks the same when turned by pi."""
     bare = World(name="bare", boundary=[(0, 0), (6, 0), (6, 4), (0, 4)])
     rng, truth = np.random.default_rng(6), np.array([2.0, 1.2, 0.5])
     found = make(6, dataclasses.replace(SMALL, min_particles=2000), bare)
@@ -204,7 +204,7 @@ def test_xi_is_minus_the_gradient_of_accuracy():
         high, low = (found.sensor.explain(pose + s * step, found.mount, observation)[0] for s in (1, -1))
         assert xi[axis] == pytest.approx(-(high - low) / (2 * h), rel=0.05, abs=5)
     assert np.linalg.eigvalsh(curvature).min() > 0
-    assert np.linalg.norm(xi) > 50  # or the comparison says nothing
+    assert np.linalg.norm(xi) > 50  # else the comparison would prove nothing
 
 
 def test_scans_that_say_nothing_change_nothing_but_the_spread():

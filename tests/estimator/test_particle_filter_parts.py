@@ -1,4 +1,4 @@
-"""The particle filter's parts against what the book says of them: densities, motion, resampling, clusters."""
+"""The particle filter's parts compared with the textbook: densities, motion, resampling, clusters."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_the_distance_field_is_exact_at_nodes_and_close_between():
     points = rng.uniform((-1, -1), (7, 5), (4000, 2))
     exact = np.clip(ROOM.clearance(points), -2, 2)
     found = field(points[:, 0], points[:, 1])
-    assert np.abs(found - exact).max() < 0.03  # a medial axis or a corner within a cell
+    assert np.abs(found - exact).max() < 0.03  # largest where a cell contains a medial axis or a corner
     assert np.median(np.abs(found - exact)) < 1e-4
     x, y = (field.origin[k] + 0.05 * rng.integers(5, field.shape[k] - 5, 500) for k in (0, 1))
     nodes = np.clip(ROOM.clearance(np.column_stack([x, y])), -2, 2)
@@ -37,7 +37,7 @@ def test_the_distance_field_is_exact_at_nodes_and_close_between():
 
 
 def test_surfaces_are_where_they_are_seen_and_far_away_is_saturated():
-    """No pull into the walls: the distance vanishes on the boundary of free space, to a tenth of a millimetre."""
+    """The distance is 0 on the boundary of free space, to 0.1 mm, so that no pose is drawn into the walls."""
     field = DistanceField(HALL, 0.07)
     along = np.linspace(0.5, 9.5, 50)
     assert np.abs(field(np.zeros(50), along)).max() < 1e-4
@@ -56,12 +56,12 @@ def test_a_world_too_large_for_the_field_is_refused():
 
 @pytest.mark.parametrize("sigma", [0.05, 0.1, 0.5])
 def test_likelihood_field_of_a_beam_is_a_density(sigma):
-    """A beam that meets a wall squarely, over every range it may report; the wall is the only surface about."""
+    """Integrates over all ranges of a beam perpendicular to a wall, without other surfaces nearby."""
     field = LikelihoodField(DistanceField(HALL, 0.05), 0.95, 0.05)
     z, pose = np.linspace(0, 25, 25001), np.array([[5.0, 5.0, 0.0]])
     ends = np.concatenate([field.ends(pose, np.array([r]), np.zeros(1))[0] for r in z[::10]])
     density = field.densities(ends, sigma, 25.0)
-    # Beyond max_dist the Gaussian's tail is held at its value there: 4 sigma for the widest.
+    # Beyond max_dist the Gaussian has its value at max_dist, which is 4 sigma for the largest sigma.
     assert np.sum(density) * 0.01 == pytest.approx(1.0, abs=6e-3)
 
 
@@ -120,10 +120,10 @@ def test_omni_moments_are_the_analytic_ones():
 @pytest.mark.parametrize("sign", [1, -1], ids=["forward", "backward"])
 @pytest.mark.parametrize("path", [0.5, 0.004], ids=["far", "short"])
 def test_differential_moments_are_the_analytic_ones(sign, path):
-    """Along a straight line, either way: path variance alpha3 p², turn variance 2 alpha2 p², no false turn by pi."""
+    """On a straight line: path variance alpha3 p², turn variance 2 alpha2 p²; driving backwards is no turn by pi."""
     rng, n = np.random.default_rng(3), 200_000
     moved = motion.differential(np.zeros((n, 3)), np.array([sign * path, 0.0, 0.0]), ALPHAS, rng)
-    shrunk = np.exp(-0.5 * ALPHAS[1] * path**2)  # E cos of the first turn
+    shrunk = np.exp(-0.5 * ALPHAS[1] * path**2)  # expectation of the cosine of the first turn
     deviation = path * np.sqrt(ALPHAS[2])
     assert moved[:, 0].mean() == pytest.approx(sign * path * shrunk, abs=4 * deviation / np.sqrt(n))
     assert np.std(moved[:, 0]) == pytest.approx(deviation, rel=0.02)
@@ -228,7 +228,7 @@ def test_settings_are_amcls_and_refuse_nonsense():
 
 
 def test_surfaces_hidden_inside_obstacles_count_for_nothing():
-    """Two boxes that overlap: the edge of one inside the other is no surface."""
+    """Of two boxes that overlap, the edge of one inside the other is no surface."""
     boxes = [{"box": {"center": (c, 5), "size": (2, 2)}} for c in (4.5, 5.5)]
     world = World(name="pair", boundary=HALL.boundary, obstacles=boxes)
     assert DistanceField(world)(np.array([5.5]), np.array([5.0]))[0] == pytest.approx(-1.0, abs=1e-3)

@@ -1,4 +1,4 @@
-"""The scans the estimator expects from poses it is asked about: against exact rays, and for impossible requests."""
+"""Query `predict`: predicted scans compared with exact rays, and requests that are refused."""
 
 from __future__ import annotations
 
@@ -21,8 +21,14 @@ from services.estimator import prediction_query as predicting
 from services.estimator.shared.interface import Predicted
 from tests.estimator.test_service import SCANNER, TRUTH, a_scan, opened
 
-HEADING = np.pi / 2  # the paper's
-FAR = [[-500.0, 3.0, 0.0], [1e4, -1e4, 1e4], [6.8, 3.95, 1.0], [0.0, 0.0, 0.0], [18.0, 4.5, 3.0]]  # and in walls
+HEADING = np.pi / 2  # of the paper's decoder
+FAR = [
+    [-500.0, 3.0, 0.0],
+    [1e4, -1e4, 1e4],
+    [6.8, 3.95, 1.0],
+    [0.0, 0.0, 0.0],
+    [18.0, 4.5, 3.0],
+]  # far outside the map, and inside walls
 
 
 def ready(**settings):
@@ -42,7 +48,7 @@ def paper():
 
 
 def predicted(service, poses, beams=None):
-    """Angles (B,), ranges (N, B), sigma (N, B)."""
+    """Returns angles (B,), ranges (N, B) and sigma (N, B)."""
     reply = service.on_request(PREDICT, PredictRequest(poses=np.asarray(poses, float), beams=beams))
     assert reply.ok, reply.reason
     shape = (len(poses), len(reply.angles))
@@ -68,7 +74,9 @@ def test_the_learned_field_predicts_exact_rays_and_knows_how_well(name):
     assert np.median(error) < 0.001
     assert (error > 0.05).mean() < 0.02
     assert (sigma >= 0.02).all()
-    assert (error < 3 * np.sqrt(np.maximum(sigma**2 - 0.02**2, 1e-6))).mean() > 0.95  # of the model's own part
+    assert (
+        error < 3 * np.sqrt(np.maximum(sigma**2 - 0.02**2, 1e-6))
+    ).mean() > 0.95  # within three deviations of the model alone
     assert error[sigma > 0.05].mean() > 10 * error[sigma < 0.03].mean()
 
 
@@ -92,7 +100,7 @@ def test_the_paper_s_decoder_predicts_at_its_heading(paper):
     world = load_world("corridor")
     poses = anywhere(world, 50, heading=HEADING)
     angles, ranges, sigma = predicted(paper, poses, 61)
-    assert np.median(np.abs(ranges - exact(world, poses, angles))) < 0.2  # of its card: 0.05 m
+    assert np.median(np.abs(ranges - exact(world, poses, angles))) < 0.2  # the card states 0.05 m
     assert (sigma == np.float32(paper.estimator.card.test_l1_mean)).all()
     own = paper.estimator.model.predict(poses[7])[0]
     assert predicted(paper, poses[7:8])[1][0] == pytest.approx(own, rel=1e-4, abs=1e-4)
@@ -102,7 +110,7 @@ def test_the_paper_refuses_other_headings_and_says_which(paper):
     poses = np.array([[5.0, 1.5, HEADING], [5.0, 1.5, 0.0]])
     with pytest.raises(UserError, match=r"at its one heading, 90\.0 deg, and was asked for 0\.0 deg"):
         paper.on_request(PREDICT, PredictRequest(poses=poses, beams=10))
-    predicted(paper, [[5.0, 1.5, HEADING + 4 * np.pi]], 10)  # the same one
+    predicted(paper, [[5.0, 1.5, HEADING + 4 * np.pi]], 10)  # the same heading
 
 
 def test_beams_are_some_of_the_scanner_s_first_and_last_among_them(precise):
@@ -163,7 +171,7 @@ def test_a_prediction_changes_no_belief():
 
 
 class Answering:
-    """A service's loop without a bus: bytes in, bytes or a refusal out."""
+    """A service's loop without a bus: takes a request as bytes, and returns the reply as bytes or the refusal."""
 
     def __init__(self, service):
         self.loop = Loop(service, SimpleNamespace(robot="robot"), Inbox())

@@ -1,4 +1,4 @@
-"""Any scanner on any side of the robot: a field learned with it in a second, places found, tracked, honestly stated."""
+"""Scanners of many kinds and mounts: a field is learned with each, with which the robot is found and tracked."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ MOUNTED = {
 }
 EVERY = {**SCANNERS, **MOUNTED}
 PLACES = 6
-TRACKED = 40  # scans
-LEARNED = 100_000  # beams to learn from
+TRACKED = 40  # number of scans
+LEARNED = 100_000  # number of beams to learn from
 
 
 @cache
@@ -47,7 +47,7 @@ def precise(model: FieldModel, scanner: Scanner) -> PreciseEstimator:
 
 
 def biases(made: PreciseEstimator, scene: Scene, poses: np.ndarray) -> np.ndarray:
-    """(N,) m², squared position error that the model alone leaves: scans without noise, descended from the truth."""
+    """Squared position error (N,) in m² caused by the model alone: scans without noise, descent from the true pose."""
     scanner, found = scene.scanner, []
     for pose, clean in zip(poses, scanner.limit(scene.clean(poses)), strict=True):
         view = View(made.model, made.likelihood, made.mount, scanner.angles(), clean, scanner.range_max)
@@ -57,13 +57,13 @@ def biases(made: PreciseEstimator, scene: Scene, poses: np.ndarray) -> np.ndarra
 
 
 def check(made: PreciseEstimator, scene: Scene, posteriors: list, poses: np.ndarray) -> None:
-    """Mean squared error by the Cramer-Rao bound's, and NEES, each within 3.3 deviations of such a mean (99.9 %)."""
+    """Mean squared error relative to the Cramer-Rao bound, and NEES, are each within 3.3 deviations (99.9 %)."""
     off = np.array([posterior.pose for posterior in posteriors]) - poses
     off[:, 2] = se2.wrap(off[:, 2])
     expected = np.square(bound.position(bound.single(scene, poses))) + biases(made, scene, poses)
     ratio = float(np.mean(np.square(off[:, :2]).sum(axis=1) / expected))
     nees = np.mean([o @ np.linalg.solve(p.covariance, o) for o, p in zip(off, posteriors, strict=True)])
-    # An efficient estimator's squares are chi squared: their variance is 2 at most.
+    # For an efficient estimator the squares are chi squared distributed, with a variance of at most 2.
     assert ratio < 1 + 3.3 * np.sqrt(2 / len(off))
     assert nees < 3 + 3.3 * np.sqrt(6 / len(off))
 
@@ -83,7 +83,7 @@ def test_it_is_found_from_nothing_and_tracked_at_the_bound(name):
     for pose, clean in zip(poses, scene.clean(poses), strict=True):
         made.restart()
         posterior = made.update(scene.observe(clean, 0.0))
-        # Half a circle may see a corner that looks like another: then it keeps both.
+        # A scanner that sees half a circle may confuse two corners; then both hypotheses are kept.
         assert any(is_at(hypothesis.pose, pose) for hypothesis in posterior.hypotheses if hypothesis.weight > 0.05)
         if posterior.state != "ambiguous":
             found.append((posterior, pose))
@@ -97,7 +97,7 @@ def test_it_is_found_from_nothing_and_tracked_at_the_bound(name):
 
 
 def test_a_field_learned_with_one_scanner_serves_another_as_well():
-    """Learned with 270 deg, 20 mm and beams a third of a degree apart; used with half a circle, 5 mm and a degree."""
+    """Learned with 270 deg, 20 mm noise and a beam per 1/3 deg; used with 180 deg, 5 mm noise and a beam per degree."""
     scanner = SCANNERS["lms200"]
     made = precise(learned("tim571"), scanner)
     scene = Scene(ROOM, scanner, np.random.default_rng(2))
@@ -117,7 +117,9 @@ def test_the_particle_filter_takes_any_scanner(name):
         for k in range(10):
             posterior = made.update(scene.observe(clean, k / scanner.rate))
         off = (posterior.pose - pose)[:2]
-        assert off @ np.linalg.solve(posterior.covariance[:2, :2], off) < 13.8  # chi squared of 2, 99.9 %
+        assert (
+            off @ np.linalg.solve(posterior.covariance[:2, :2], off) < 13.8
+        )  # chi squared with 2 degrees of freedom, 99.9 %
         assert np.hypot(*off) < 0.03
 
 

@@ -1,4 +1,4 @@
-"""The estimator's shell without a bus: what it answers to which scan."""
+"""The estimator service without a bus: its reactions to scans, goals, odometry and requests."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TRUTH = np.array([5.0, 1.5, 2.0])
 
 
 class Heard(EstimatorService):
-    """Keeps what it would publish."""
+    """Stores messages instead of publishing them."""
 
     def __init__(self, settings):
         super().__init__(settings)
@@ -133,7 +133,7 @@ def test_precise_takes_any_scanner(precise):
 
 
 def test_beams_may_come_and_go(precise):
-    """A scanner whose motor sets the pace: 622 beams, then 621, over the same view."""
+    """A scanner whose number of beams varies with its motor: 622 beams, then 621, over the same view."""
     precise.on_message(SCAN, a_scan(1, TRUTH))
     made = precise.estimator
     other = SCANNERS["tim571"].with_beams(621)
@@ -158,13 +158,13 @@ def test_a_scan_the_paper_was_not_trained_for_is_refused_with_the_command_that_h
     paper.on_message(SCAN, a_scan(1, **changes))
     assert paper.sent == []
     assert "presage train --world corridor --preset paper" in paper.note
-    paper.on_message(SCAN, a_scan(2))  # and it goes on
+    paper.on_message(SCAN, a_scan(2))  # the service continues
     assert len(paper.sent) == 2
     assert paper.note == ""
 
 
 def test_localise_anew(paper):
-    assert not paper.on_request(LOCALISE, LocaliseRequest()).ok  # nothing to restart yet
+    assert not paper.on_request(LOCALISE, LocaliseRequest()).ok  # there is no estimator to restart yet
     paper.on_message(SCAN, a_scan(1))
     assert paper.on_request(LOCALISE, LocaliseRequest(pose=Pose(x=4.0, y=1.0))).ok
     assert paper.estimator.estimator.pose[:2].tolist() == [4.0, 1.0]
@@ -192,8 +192,8 @@ def test_with_odometry_a_scan_waits_for_the_odometry_of_its_stamp(precise):
     assert len(precise.sent) == 2
     precise.on_message(ODOM, an_odom(2))
     assert [m.stamp_ns for m in precise.sent] == [1, 1, 2, 2]
-    precise.on_message(SCAN, a_scan(3, TRUTH))  # its odometry never comes:
-    precise.on_message(SCAN, a_scan(4, TRUTH))  # the next scan does not wait for ever
+    precise.on_message(SCAN, a_scan(3, TRUTH))  # its odometry never comes, so
+    precise.on_message(SCAN, a_scan(4, TRUTH))  # it is processed when the next scan comes
     assert precise.sent[-1].stamp_ns == 3
     assert precise.counters["scans_without_odometry"] == 1
 

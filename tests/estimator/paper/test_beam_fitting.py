@@ -1,4 +1,4 @@
-"""A scan brought to a model's beams: exactly where it can be, within the rule elsewhere, refused beyond it."""
+"""Conversion of scans to a model's beams: exact where possible, interpolated, or refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An interrupted training on disk: taken up by the same recipe, thrown away aloud by another, damage in one line."""
+"""Checkpoints of a training: resumed with the same recipe, discarded with another, damage is one line of error."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def trainer() -> Trainer:
 
 @pytest.fixture
 def folder(tmp_path):
-    """What an interrupted training left."""
+    """The folder of an interrupted training."""
     checkpoint = Checkpoint(tmp_path / "unfinished", RECIPE)
     assert not checkpoint.discarded
     checkpoint.keep_samples("train", DATA)

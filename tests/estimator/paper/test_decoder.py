@@ -35,19 +35,19 @@ def test_jacobian_agrees_with_finite_differences(x, y):
     pose = np.array([x, y, np.pi / 2])
     ranges, jacobian = model.predict(pose)
     assert np.allclose(ranges, model.ranges(pose[None])[0])
-    h = 1e-7  # between two ReLU kinks but for one pose in many thousands
+    h = 1e-7  # so small that nearly no pose is at the kink of a ReLU
     for axis in range(2):
         step = h * np.eye(3)[axis]
         numeric = (model.ranges((pose + step)[None]) - model.ranges((pose - step)[None]))[0] / (2 * h)
         assert np.median(np.abs(jacobian[:, axis] - numeric)) < 1e-6
         assert np.mean(np.abs(jacobian[:, axis] - numeric) < 1e-5) > 0.9
-    assert not jacobian[:, 2].any()  # the heading is frozen
+    assert not jacobian[:, 2].any()  # the heading is constant
 
 
 def test_learning_lowers_the_error_on_scans_not_trained_on():
     one = Trainer(Shape(64, 64, 8), normalisation(), Recipe(epochs=40, batch=50, learning_rate=5e-3), TRAIN, TEST)
     one.run()
-    flat = np.abs(TEST.ranges - np.median(TRAIN.ranges, axis=0)).mean()  # what a constant can do
+    flat = np.abs(TEST.ranges - np.median(TRAIN.ranges, axis=0)).mean()  # error of a constant prediction
     assert one.progress.test_l1[-1] < 0.8 * flat
     assert one.progress.test_l1[-1] < one.progress.test_l1[0]
 

@@ -1,4 +1,4 @@
-"""Value and derivative by hand against torch's own."""
+"""Values and derivatives compared with torch's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""F and its descent directions against finite differences, and the paper's printed signs against both."""
+"""F and its descent directions compared with finite differences and with the signs printed in the paper."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_a_short_step_along_the_descent_lowers_f(seed, beta):
 @given(seeds)
 def test_curvature_is_the_gauss_newton_hessian(seed):
     g, dg, o, precision, belief, _ = scene(seed)
-    found = gradient(g(belief), g(belief), dg(belief), precision)  # where the misfit is 0 it is the whole Hessian
+    found = gradient(g(belief), g(belief), dg(belief), precision)  # without misfit the Gauss-Newton Hessian is exact
     h = 1e-4
     for i in range(3):
         for j in range(3):
@@ -70,7 +70,7 @@ def test_curvature_is_the_gauss_newton_hessian(seed):
 
 
 def test_accuracy_is_a_density():
-    """exp(-accuracy) integrates to one over what may be measured: no gain, no 1/N."""
+    """exp(-accuracy) integrates to one over all measurements: there is no gain and no factor 1/N."""
     for precision in (0.25, 1.0, 2500.0):
         sigma = precision**-0.5
         o = np.linspace(-12 * sigma, 12 * sigma, 20001)
@@ -80,7 +80,7 @@ def test_accuracy_is_a_density():
 
 @given(seeds)
 def test_the_printed_goal_term_points_away_from_the_goal(seed):
-    """Equation 3 as printed adds beta dg' Pi (o - g_goal); near the goal, belief at the truth, that is uphill."""
+    """The goal term as printed, beta dg' Pi (o - g_goal), ascends F near the goal if the belief is the true pose."""
     g, dg, _, precision, belief, _ = scene(seed)
     goal = belief + 1e-3 * np.random.default_rng(seed).normal(size=3)
     o = g(belief)

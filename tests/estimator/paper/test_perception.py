@@ -37,7 +37,7 @@ def test_carried_off_is_lost():
     for _ in range(30):
         state = found.update(scan((3.0, 1.5), rng)).state
     assert state == "tracking"
-    found.settings = Descent(alpha=1e-9)  # it cannot follow
+    found.settings = Descent(alpha=1e-9)  # too slow to follow
     states = [found.update(scan((5.0, 0.8), rng)).state for _ in range(20)]
     assert "lost" in states
 

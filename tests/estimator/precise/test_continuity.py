@@ -1,4 +1,4 @@
-"""What was seen a moment ago holds the place where the model knows nothing, and only while nobody carries the robot."""
+"""Recent scans hold the pose where the model knows nothing, but not after a kidnapping."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ HALL = World(
         {"box": {"center": (14.6, 2.6), "size": (0.5, 1.2)}},
     ],
 )
-LEARNED = 8.0  # m: of HALL the part west of it
+LEARNED = 8.0  # m: the part of HALL with smaller x was learned
 STEP = np.diag([0.2, 0.2, 0.3]) ** 2
 
 
 @dataclass(frozen=True)
 class HalfLearned:
-    """The hall as a field learned in its western half knows it."""
+    """A model of the hall that was learned only in its western half."""
 
     world: World = HALL
     ripple: float = 0.0
@@ -56,7 +56,7 @@ class HalfLearned:
 
 
 def scan(scene, pose):
-    """Points (K, 2) m in the laser."""
+    """End points (K, 2) of a scan, m in the laser frame."""
     seen = scene.observe(scene.clean(np.array(pose)[None])[0], 0.0)
     return View(RayCaster(HALL), Likelihood(), np.zeros(3), seen.angles, seen.ranges, seen.range_max).points
 
@@ -108,7 +108,7 @@ def test_too_few_points_tell_nothing():
 @given(yaw=st.floats(-3, 3), x=st.floats(-5, 5))
 @settings(max_examples=15, deadline=None)
 def test_what_it_says_does_not_depend_on_the_frame(yaw, x):
-    """The same scans, anywhere in the map: the same place among them, its covariance turned with it."""
+    """The same scans elsewhere in the map give the same relative pose, with the covariance rotated."""
     scene = Scene.of(ROOM, 361, 7)
     poses = [np.array([2.5 + 0.3 * k, 1.5, 0.1 * k]) for k in range(5)]
     points = [scan(scene, pose) for pose in poses]
@@ -146,7 +146,7 @@ def test_a_place_must_be_proven_and_not_be_contradicted():
         )
     assert made.match(option, here, scan(scene, here), 0.0) is not None
     made.begin_scan(1.0)
-    assert made.match(option, here, scan(scene, here), 0.0) is None  # it may have gone a metre
+    assert made.match(option, here, scan(scene, here), 0.0) is None  # the robot may have moved by a metre
     made.begin_scan(0.1)
     held = [made.match(option, here, scan(scene, here), 0.9) is not None for _ in range(30)]
     assert held[0]

@@ -1,4 +1,4 @@
-"""Preset precise as a whole: finds, tracks, fuses, doubts, notices; on exact rays, and on the shipped fields."""
+"""Preset precise as a whole, with exact rays and with the shipped fields."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_one_scan_finds_the_place_and_twenty_are_worth_more():
     assert one.found == one.of == 40
     rms = [np.sqrt(np.mean(np.square(np.array(o.errors)[:, :2]).sum(1))) for o in (one, many)]
     limit = [np.sqrt(np.mean(np.square(o.bounds))) for o in (one, many)]
-    assert 0.7 * limit[0] < rms[0] < 1.4 * limit[0]  # below the bound would be an error of the test
+    assert 0.7 * limit[0] < rms[0] < 1.4 * limit[0]  # less would be an error of the test
     assert rms[1] < 1.6 * limit[1]
 
 
@@ -90,7 +90,7 @@ def test_it_tracks_and_is_never_lost(odometry):
 
 
 def test_carried_off_it_is_found_again_by_the_next_scan():
-    made, scene = estimator(load_world("maze"))  # no two places alike, as there are in the empty room
+    made, scene = estimator(load_world("maze"))  # unlike the empty room, it has no two similar places
     outcome = tasks.kidnapped(made, scene, 15, iter)
     assert outcome["kidnapped, 1 scan"].found == 15
     assert outcome["kidnapped, 3 scans"].wrong == 0
@@ -111,7 +111,7 @@ def test_two_rooms_alike_are_both_kept_until_a_scan_tells():
 
 
 def test_in_a_corridor_without_features_the_covariance_says_so():
-    """Two walls 60 m long, a scanner that sees 25 m: nothing is known along them, much across."""
+    """With two walls of 60 m and a scanner of 25 m the position is unknown along the walls, and well known across."""
     hall = World(name="hall", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)])
     made, scene = estimator(hall, 90)
     pose = np.array([30.0, 0.9, 0.1])
@@ -126,7 +126,7 @@ def test_in_a_corridor_without_features_the_covariance_says_so():
 
 @pytest.mark.parametrize("learned", [False, True])
 def test_driving_along_such_a_corridor_it_does_not_pretend_to_know_how_far(learned):
-    """Neither odometry nor features: the error along the walls is within what is stated, and it grows."""
+    """Without odometry and features the error along the walls grows, but remains within the stated covariance."""
     hall = World(name="hall", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)])
     made, scene = estimator(hall, 360)
     if learned:
@@ -138,7 +138,7 @@ def test_driving_along_such_a_corridor_it_does_not_pretend_to_know_how_far(learn
         posterior = feed(made, scene, pose + np.array([0.8 / 15 * k, 0, 0]), 1, k)[0]
     error = off(posterior, pose + np.array([0.8 / 15 * 74, 0, 0]))
     stated = np.sqrt(np.diag(posterior.covariance))
-    # A learned wall's ripples are told from features, but not to the last (docs/precise.md, limits).
+    # Not all ripples of a learned wall can be distinguished from features (docs/precise.md, limits).
     assert abs(error[0]) < (5 if learned else 3) * stated[0]
     assert stated[0] > (0.5 if learned else 1)
     assert abs(error[1]) < 0.02
@@ -188,7 +188,7 @@ def test_the_same_scans_give_the_same_beliefs():
 
 @pytest.mark.parametrize("world", ["corridor", "maze", "office"])
 def test_shipped_fields_find_the_robot_anywhere(world):
-    """Poses, seeds and noise that nothing was tuned on: 20 of 20, a few millimetres."""
+    """Finds 20 of 20 poses to a few millimetres; nothing was tuned on these poses and this noise."""
     scene = Scene.of(load_world(world), 622, 4242)
     scanner = scene.scanner
     made = prepare(Choice(world))(Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max))
@@ -203,7 +203,7 @@ def test_shipped_fields_find_the_robot_anywhere(world):
 
 
 def odd_scan(kind, clean, rng):
-    """A scan of a place, or one that no place gives."""
+    """A scan of one of `KINDS`; only an ordinary one is possible in the world."""
     count = len(clean)
     return {
         "ordinary": clean,
@@ -221,7 +221,7 @@ KINDS = ("ordinary", "no return", "says nothing", "random", "a ring", "scaled", 
 
 @pytest.fixture(scope="module")
 def in_a_hall():
-    """Two walls 60 m long: nothing is known along them."""
+    """An estimator between two walls of 60 m, along which the position is unknown."""
     made, scene = estimator(World(name="hall", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)]), 60)
     made.bounds = scene.world.bounds
     return made, scene
@@ -231,7 +231,7 @@ def in_a_hall():
 @example(["random"] * 20, 25, 1.0)
 @settings(max_examples=8, deadline=None)
 def test_the_belief_stays_in_the_map_whatever_the_scans_are(in_a_hall, kinds, seed, period):
-    """And a hypothesis moves at most 10 m, which is 20 steps of a descent, beyond what motion allows."""
+    """Also checks that a hypothesis moves at most 20 steps of a descent, 10 m, beyond what motion allows."""
     made, scene = in_a_hall
     rng = np.random.default_rng(seed)
     pose = np.array([rng.uniform(5, 55), rng.uniform(0.5, 1.5), rng.uniform(-3, 3)])
@@ -248,6 +248,6 @@ def test_the_belief_stays_in_the_map_whatever_the_scans_are(in_a_hall, kinds, se
             assert 0 <= each.pose[1] <= 2
             assert np.diag(each.covariance)[:2].max() < 2 * 60**2
         for mode in made.modes:
-            if mode.age:  # not found by a search just now
+            if mode.age:  # not found by a search at this scan
                 moved = np.abs(mode.pose[:2] - before).max(axis=1).min()
                 assert moved <= 20 * 0.5 + 3 * made.settings.motion.speed * period

@@ -1,4 +1,4 @@
-"""The likelihood is a density, its gradient is the gradient, the descent descends, fusion is Bayes' rule."""
+"""Likelihood and its gradient, descent, fusion by Bayes' rule, motion priors, hypotheses, ranking of seeds."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_the_slope_of_a_beam_is_that_of_its_energy(relative):
 
 
 def smooth_beams(ranges, pose, step):
-    """(B,) beams whose density has a derivative at ``pose``, and none of its steps within ``step``.
+    """Whether each beam's density (B,) is smooth within ``step`` of ``pose``.
 
     The caster limits the derivative of a beam that grazes a surface, so that it is not that of the range. A beam may
     jump to another surface, and the density has a step where the range measured is the one expected.
@@ -151,7 +151,7 @@ def test_fusing_is_bayes_rule_for_gaussians(seed):
     a, b = rng.normal(0, 0.1, (2, 3, 3))
     P, H = a @ a.T + 0.01 * np.eye(3), np.linalg.inv(b @ b.T + 0.01 * np.eye(3))
     prior, seen = rng.normal(0, 0.2, (2, 3))
-    mode = seen + rng.normal(0, 0.05, 3)  # any point will do to expand a parabola
+    mode = seen + rng.normal(0, 0.05, 3)  # the parabola may be expanded at any point
     found = fuse(Candidate("x", prior, P, 0.5), mode, H @ (seen - mode), H)
     information = np.linalg.inv(P) + H
     assert found.mean == pytest.approx(np.linalg.solve(information, np.linalg.inv(P) @ prior + H @ seen), abs=1e-6)

@@ -1,4 +1,4 @@
-"""Generative models: ranges against exact rays, derivatives against finite differences."""
+"""Generative models: ranges compared with exact rays, derivatives with finite differences."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_field_predicts_what_exact_rays_do():
     assert np.quantile(error, 0.98) < 2e-3
     unsure = (found.dip < 0.03) | (found.edge < 0.75) | (found.facing < 0.3)
     assert error[~unsure].max() < 5e-3
-    assert error[unsure].max() > 0.1  # where it errs, the classes know
+    assert error[unsure].max() > 0.1  # large errors occur only in these classes
 
 
 def _differences(model, pose, angles, step):

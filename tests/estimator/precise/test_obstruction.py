@@ -1,4 +1,4 @@
-"""People around the scanner: what they hide is no reason to doubt, and being elsewhere still is."""
+"""People around the scanner: beams that they block do not contradict the pose, a wrong pose does."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RNG = np.random.default_rng(5)
 
 
 def crowd(clean, share, first=0):
-    """Ranges (B,) of which ``share``, side by side from beam ``first``, ends at somebody a metre away or less."""
+    """Ranges (B,) of which ``share``, from beam ``first`` on, is blocked at a distance of at most a metre."""
     ranges = clean.copy()
     hidden = (first + np.arange(int(share * len(clean)))) % len(clean)
     ranges[hidden] = np.minimum(ranges[hidden], RNG.uniform(0.5, 1.0, len(hidden)))

@@ -1,4 +1,4 @@
-"""Two identical rooms: both are kept while no scan tells, and the corridor decides, without odometry."""
+"""Two identical rooms: both hypotheses are kept until the corridor is seen, without odometry."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def begun(model, seed):
 
 
 def drive(start, *corners, speed=0.8):
-    """(N, 3) poses, one a scan, with the heading of the start."""
+    """Poses (N, 3), one per scan, with the heading of the start."""
     points = np.array([start[:2], *corners])
     legs = [np.linspace(a, b, int(np.hypot(*(b - a)) / speed * RATE)) for a, b in pairwise(points)]
     places = np.concatenate(legs)
     return np.column_stack([places, np.full(len(places), start[2])])
 
 
-# The two fields, each with errors of its own, differ by up to about 24 nats (40 places); evidence counts a twentieth.
+# The errors of the field differ between the rooms by up to about 24 nats (40 places); evidence counts a twentieth.
 @pytest.mark.parametrize(("model", "most"), [("learned", 0.85), ("exact", 0.55)])
 @pytest.mark.parametrize("room", [0, 1])
 @pytest.mark.parametrize("yaw", [0.0, 2.0])
@@ -54,4 +54,4 @@ def test_both_rooms_are_kept_until_the_corridor_tells(model, most, room, yaw):
     assert states[-1] == "tracking"
     assert max(off[-15:]) < 0.01
     sure = np.array(states) == "tracking"
-    assert (np.array(off)[sure] < 0.05).all()  # what is claimed is true, all the way
+    assert (np.array(off)[sure] < 0.05).all()  # the state is never tracking at a wrong pose

@@ -1,4 +1,4 @@
-"""What is learned of real scans beside the field: shares, noise, motion, precision; what nobody looked into."""
+"""Calibration on real scans: shares of outliers, noise, motion, precision, and cells that were never seen."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ def test_the_noise_is_told_from_scans_alone():
 def test_motion_is_learned_from_the_drive(drive):
     found = learn_motion(drive.stamps, drive.poses, drive.odom)
     assert found.period == pytest.approx(0.25)
-    assert 0.3 < found.speed < 0.8  # m/s: it drives at 0.4 to 0.5
+    assert 0.3 < found.speed < 0.8  # m/s; the robot drives at 0.4 to 0.5 m/s
     without = learn_motion(drive.stamps, drive.poses, None)
     assert without.path_by_path != found.path_by_path
 
 
 def test_what_beams_go_through_is_no_surface():
-    """A person who stood there for a tenth of the scans leaves nothing behind."""
+    """A person seen in a tenth of the scans leaves no surface in the field."""
     poses = np.array([[3.0, 3.0, yaw] for yaw in np.linspace(-np.pi, np.pi, 100)])
     ranges = BEFORE.ray_distances(poses, ANGLES)
     rng = np.random.default_rng(0)
@@ -73,8 +73,8 @@ def test_what_beams_go_through_is_no_surface():
 
 
 def test_nothing_is_expected_where_nobody_looked():
-    """Beams into the part that no scan has seen are neither explained nor contradicted by what comes back."""
-    poses = np.array([[2.0, 4.0, yaw] for yaw in np.linspace(2.8, 3.5, 100)])  # never towards the right
+    """The range of a beam into cells that were never seen is neither evidence for a pose nor against it."""
+    poses = np.array([[2.0, 4.0, yaw] for yaw in np.linspace(2.8, 3.5, 100)])  # never facing right
     ranges = BEFORE.ray_distances(poses, ANGLES)
     beams = Beams.of(poses, np.zeros(3), ANGLES, ranges)
     seen = seen_cells(beams)
@@ -93,7 +93,7 @@ def test_nothing_is_expected_where_nobody_looked():
 
 
 def test_the_stated_precision_is_honest(learned):
-    """Poses found in scans held out, against references that are 2 cm off: NEES in a band, floors of that size."""
+    """NEES of poses found in held-out scans, with floors of the size of the references' error, 2 cm."""
     found = learned.calibration
     assert found.scans == 16
     assert 1.2 < found.nees_median < 3.6
@@ -105,7 +105,7 @@ def test_the_stated_precision_is_honest(learned):
 
 
 def test_it_localises_the_second_half_among_moved_furniture(drive, learned):
-    """With and without odometry from a known start, and from nothing."""
+    """With and without odometry from a known pose, and from an unknown pose."""
     settings = learned.calibration.settings()
     made = PreciseEstimator(
         learned.model, Seeds.at(learned.model, learned.places), drive.mount, learned.calibration.likelihood, settings
