@@ -1,4 +1,4 @@
-"""ROS 2's messages by Foxglove's implementation of CDR, not the bridge's; definitions are the published ones."""
+"""ROS 2 messages encoded by Foxglove's CDR library, independent of the bridge, from the published definitions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 
 @cache
 def _definition(name: str) -> str:
-    """The .msg text with all it names; its hash is compared with the published one in test_ros_types.py."""
+    """The .msg text with all referenced types. test_ros_types.py compares its hash with the published one."""
     return get_typestore(Stores.ROS2_JAZZY).generate_msgdef(name, ros_version=2)[0]
 
 
@@ -23,12 +23,12 @@ def _codec(name: str):
 
 
 def encode(name: str, message: dict) -> bytes:
-    """CDR of a message given as dictionaries."""
+    """Encodes a message given as dictionaries to CDR."""
     return bytes(_codec(name)[0](message))
 
 
 def decode(name: str, payload: bytes):
-    """The message, as attributes."""
+    """Decodes CDR to a message with attributes."""
     return _codec(name)[1](payload)
 
 

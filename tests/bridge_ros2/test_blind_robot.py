@@ -1,4 +1,4 @@
-"""Who takes scans hands them on as he was told: cut out for himself, too close to say for the bus."""
+"""Bridge and controller mask beams that hit the robot: NaN for their own use, not measured on the bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which commands reach the base, and when it is told to stop."""
+"""Which commands are passed on, and when the robot is stopped."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def test_a_fresh_command_passes_and_an_old_one_does_not():
     gate = driving()
     np.testing.assert_array_equal(gate.command(command(1000), 0.01), [0.5, 0, 0])
     gate.add_scan(scan(1066), 0.066)
-    assert gate.command(command(400), 0.07) is None  # before the last one's, and too old
-    assert gate.command(command(2000), 0.07) is None  # of a scan that never was
+    assert gate.command(command(400), 0.07) is None  # before the last command's stamp, and too old
+    assert gate.command(command(2000), 0.07) is None  # newer than the newest scan
     assert gate.refused == 2
     assert gate.command(command(1066), 0.07) is not None
     gate.add_scan(scan(1700), 0.7)
@@ -94,7 +94,7 @@ def test_a_slow_scanner_has_longer():
 
 def test_a_robot_that_stands_is_told_for_a_while_and_then_left_to_others():
     gate = driving()
-    assert gate.command(command(1000, vx=0.0), 0.0) is None  # it has not been driven
+    assert gate.command(command(1000, vx=0.0), 0.0) is None  # the robot has not moved
     gate.add_scan(scan(1066), 0.066)
     gate.command(command(1066), 0.07)
     told = []
@@ -114,7 +114,7 @@ def test_no_faster_than_the_robot_and_not_into_what_the_scan_shows():
     np.testing.assert_allclose(gate.command(command(1000, vx=5.0, wz=9.0), 0.0), [0.3, 0, 2.0])
     near = CommandGate(Robot())
     near.add_scan(scan(1000, ahead=0.33), 0.0)
-    assert near.command(command(1000, vx=1.0), 0.0) is None  # nothing is said to a robot that stands
+    assert near.command(command(1000, vx=1.0), 0.0) is None  # no stop is sent to a standing robot
     assert near.stopped
     blind = CommandGate(Robot(), obstacle_stop=False)
     blind.add_scan(scan(1000, ahead=0.33), 0.0)

@@ -26,7 +26,7 @@ def turned(roll=0.0, pitch=0.0, yaw=0.0):
 
 
 def tf(*each):
-    """Of (parent, child, (x, y, z), rotation, stamp)."""
+    """A tf message of transforms given as (parent, child, (x, y, z), rotation, stamp)."""
     transforms = [
         {
             "header": other.header(stamp, parent), "child_frame_id": child,
@@ -82,7 +82,7 @@ def test_nonsense_in_tf_is_left_out():
     motion = MountAndOdometry("base_link", "odom")
     motion.add_tf(tf(
         ("base_link", "a", (np.nan, 0, 0), turned(), 0), ("base_link", "b", (0, 0, 0), other.quaternion(w=0.0), 0),
-        ("x", "y", (0, 0, 0), turned(), 0), ("y", "x", (0, 0, 0), turned(), 0),  # a ring
+        ("x", "y", (0, 0, 0), turned(), 0), ("y", "x", (0, 0, 0), turned(), 0),  # a cycle
     ))  # fmt: skip
     for frame in ("a", "b", "x"):
         with pytest.raises(ValueError, match="does not connect"):
@@ -101,20 +101,20 @@ def test_odometry_between_two_and_a_little_beyond():
     middle = odometer.at(SECOND // 4)
     np.testing.assert_allclose(middle.pose, [0.5, 0, np.pi / 4])
     beyond = odometer.at(SECOND // 2 + SECOND // 10)
-    np.testing.assert_allclose(beyond.pose, [1, 0.1, np.pi / 2 + 0.05])  # forward is along y by now
+    np.testing.assert_allclose(beyond.pose, [1, 0.1, np.pi / 2 + 0.05])  # forward is along y here
     assert odometer.at(SECOND) is None  # too far beyond
     assert odometer.at(-1) is None
-    odometer.add(dead(SECOND // 4, [9, 9, 9]))  # late: left out
+    odometer.add(dead(SECOND // 4, [9, 9, 9]))  # late: skipped
     np.testing.assert_allclose(odometer.at(SECOND // 4).pose, middle.pose)
     odometer.add(dead(60 * SECOND, [2, 0, 0]))
-    assert odometer.at(0) is None  # long ago
-    odometer.add(dead(0, [3, 0, 0]))  # a simulation anew
+    assert odometer.at(0) is None  # too old
+    odometer.add(dead(0, [3, 0, 0]))  # the simulation was restarted
     np.testing.assert_allclose(odometer.at(0).pose, [3, 0, 0])
 
 
 @pytest.mark.parametrize("ran", [1.5, 5.0, 9.9, 3600.0])
 def test_odometry_goes_on_after_the_clock_is_set_back(ran):
-    """However long the simulation ran before it began anew: a few seconds just as an hour."""
+    """Independent of how long the simulation ran before its restart."""
     odometer, motion = OdometryBuffer(), MountAndOdometry("base_link", "odom")
     for k in range(int(min(ran, 12) * 20)):
         stamp = round((ran - min(ran, 12)) * SECOND) + k * SECOND // 20
@@ -125,11 +125,11 @@ def test_odometry_goes_on_after_the_clock_is_set_back(ran):
         motion.add_tf(tf(("odom", "base_link", (0.1 * k, 0, 0), turned(), k * SECOND // 20)))
     for found in (odometer.at(SECOND // 8), motion.at(SECOND // 8)):
         np.testing.assert_allclose(found.pose, [0.25, 0, 0], atol=1e-9)
-    assert abs(odometer.at(SECOND // 5).pose[0] - 0.4) < 1e-9  # nothing of before is in it
+    assert abs(odometer.at(SECOND // 5).pose[0] - 0.4) < 1e-9  # the odometry before the restart has no influence
 
 
 def test_odometry_by_tf_with_its_velocity():
-    """The base is 0.5 m ahead of the frame that odometry is about."""
+    """The base is 0.5 m ahead of the child frame of the odometry."""
     motion = MountAndOdometry("base_link", "odom")
     motion.add_tf(tf(("wheels", "base_link", (0.5, 0, 0), turned(), 0)))
     for k in range(3):
@@ -138,5 +138,5 @@ def test_odometry_by_tf_with_its_velocity():
     np.testing.assert_allclose(found.pose, se2.compose([0.2, 0, 0.4], [0.5, 0, 0]))
     assert found.twist[2] == pytest.approx(2.0)
     motion.add_odometry(dead(2 * SECOND // 10, [7, 7, 0]))
-    assert motion.at(2 * SECOND // 10).pose[0] == 7  # the topic goes before it for the estimator
-    assert motion.at_by_tf(2 * SECOND // 10).pose[0] == found.pose[0]  # but what is said in tf has to fit tf
+    assert motion.at(2 * SECOND // 10).pose[0] == 7  # for the estimator, the topic has priority
+    assert motion.at_by_tf(2 * SECOND // 10).pose[0] == found.pose[0]  # but the published transform has to match tf

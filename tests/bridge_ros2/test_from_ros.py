@@ -1,4 +1,4 @@
-"""ROS's messages as ours."""
+"""Conversion of ROS messages to presage messages."""
 
 from __future__ import annotations
 

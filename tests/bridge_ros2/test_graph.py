@@ -1,4 +1,4 @@
-"""What is said where messages do not come."""
+"""Explanations why messages do not arrive."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_the_kind_of_command_that_the_robot_listens_for():
     graph.change(token("MS", "/cmd_vel", TWIST_STAMPED), there=True)
     assert graph.expected_twist_type("/cmd_vel") == TWIST_STAMPED
     graph.change(token("MS", "/cmd_vel", TWIST, 2), there=True)
-    assert graph.expected_twist_type("/cmd_vel") == ""  # either will do
+    assert graph.expected_twist_type("/cmd_vel") == ""  # both types have a subscriber
 
 
 def test_a_complaint_names_the_option_that_mends_it():
@@ -68,7 +68,7 @@ def test_a_complaint_names_the_option_that_mends_it():
     assert "nothing of ROS is heard at tcp/rover:7447" in nothing
     assert "RMW_IMPLEMENTATION=rmw_zenoh_cpp" in nothing
     assert "does zenoh-bridge-ros2dds run there" in said(graph, quiet=4.0, flavor="ros2dds")
-    assert said(graph, quiet=1.0, heard=False) == "no scan on /scan yet"  # not at once
+    assert said(graph, quiet=1.0, heard=False) == "no scan on /scan yet"  # only after the timeout
     assert "on /r1/scan for 3 s" in said(graph, quiet=4.0, namespace="r1")
     assert said(graph, "too odd", quiet=4.0) == "scans on /scan cannot be used: too odd"
     assert "on /odom or in tf" in said(graph, reckoned=False)
@@ -76,7 +76,7 @@ def test_a_complaint_names_the_option_that_mends_it():
     assert said(graph, odom_topic="odm") == "no odometry on /odm: nav_msgs/msg/Odometry is on /odom: --odom-topic"
     assert said(graph, odom_topic="odom") == ""
     graph.change(token("MP", "/odom", ODOMETRY, 9), there=False)
-    assert said(graph, odom_topic="odm") == ""  # nothing to choose from: tf does
+    assert said(graph, odom_topic="odm") == ""  # no other odometry topic exists, so tf is used
     assert said(graph, reckoned=False, tf="map-base") == ""
     graph.change(token("MS", "/cmd_vel", TWIST_STAMPED), there=True)
     assert said(graph) == "/cmd_vel: the robot listens for geometry_msgs/msg/TwistStamped: --stamped"
@@ -87,7 +87,7 @@ DDS_SCAN = "@/a1/@ros2_lv/MP/scan/sensor_msgs§msg§LaserScan/:::"
 
 
 def silent(*tokens, **options):
-    """What is said of a scan that has not come for 4 s."""
+    """The explanation for a scan that has not arrived for 4 s."""
     settings = BridgeRos2Settings(**options)
     graph = Graph(settings.names())
     for each in tokens:
@@ -101,15 +101,15 @@ def test_the_other_flavor_and_another_domain_are_named():
     assert "in ROS domain 0, but in 5: --domain 5" in silent(far)
     assert silent(far, flavor="ros2dds").endswith("--flavor rmw_zenoh --domain 5")
     assert silent(token("MP", "/scan", LASER_SCAN), flavor="ros2dds").endswith("--flavor rmw_zenoh")
-    # Somebody's rviz is there, but the scanner is not.
+    # rviz is there, but the scanner is not.
     assert "--flavor ros2dds" in silent(DDS_SCAN, token("MS", "/scan", LASER_SCAN))
     assert "--domain 5" in silent(far, token("MP", "/odom", ODOMETRY))
     assert "nothing arrives" in silent(far, token("MP", "/scan", LASER_SCAN))
-    assert "nothing arrives" in silent(DDS_SCAN, flavor="ros2dds", domain=3)  # it does not say of which domain
+    assert "nothing arrives" in silent(DDS_SCAN, flavor="ros2dds", domain=3)  # its tokens do not contain the domain
 
 
 def test_a_distro_that_does_not_fit_is_named_though_scans_come():
-    """Humble's robot is heard by any hash, but drops what is sent with one without a word."""
+    """Scans of a Humble robot arrive with any hash, but the robot silently drops messages that have one."""
     humble = Node(Names(hashes=False), "ab", "", "driver")
     jazzy = token("MP", "/scan", LASER_SCAN)
 
@@ -127,7 +127,7 @@ def test_a_distro_that_does_not_fit_is_named_though_scans_come():
     assert "--distro humble" in said(listens, distro="jazzy")
     assert "--distro jazzy" in said(jazzy, distro="humble")
     assert said(scans, distro="humble") == said(jazzy, distro="jazzy") == ""
-    # Several are there: whoever has the scanner decides.
+    # With several nodes, the one that publishes scans decides.
     rviz = token("MS", "/amcl_pose", ODOMETRY, 3)
     assert said(scans, rviz, distro="humble") == ""
     assert "--distro humble" in said(scans, rviz, distro="jazzy")

@@ -54,7 +54,7 @@ def posed(x, y, frame="map", *, covariance=False):
 
 
 class Beside:
-    """What the bridge joins, in the test's hands."""
+    """Both sides of the bridge: presage's bus and a node in ROS."""
 
     def __init__(self, bus, node) -> None:
         self.bus, self.node, self.stamp = bus, node, BEGIN
@@ -67,18 +67,18 @@ class Beside:
             node.subscribe(name, kind, self.heard[name].append)
         kinds = {"tf_static": TF, "scan": LASER, "odom": ODOMETRY, "initialpose": POSED, "goal_pose": GOAL_POSE}
         self.put = {name: node.publisher(name, kind) for name, kind in kinds.items()}
-        # Said before the bridge is there.
+        # Published before the bridge starts.
         self.put["tf_static"](transforms(transform("base_link", "laser", 0.3, 0, 0, other.quaternion(), 0)))
 
     def sweep(self):
-        """A scan that comes 50 ms after odometry, at 0.5 m/s; what the bridge made of both."""
+        """Publishes odometry and, 50 ms later by its stamp, a scan. Returns the bridge's Odom and Scan."""
         self.stamp += 10**8
         self.put["odom"](odometry(self.stamp - 5 * 10**7, 2.0))
         self.put["scan"](laser(self.stamp))
         return tuple(self.next(kind, lambda each: each.stamp_ns == self.stamp) for kind in (Odom, Scan))
 
     def next(self, kind, condition=lambda _: True):
-        """Each topic comes in order, but not one after another: what is not wanted yet is kept."""
+        """The next message of a type that meets a condition. Keeps the others, because topics arrive interleaved."""
         found = []
 
         def look():
@@ -100,7 +100,7 @@ class Beside:
 
 @pytest.fixture(scope="module")
 def beside(tmp_path_factory, router):
-    """One router for both sides, which may be."""
+    """A bridge between both sides, which here share one router."""
     processes = Processes(tmp_path_factory.mktemp("beside"))
     try:
         link = Link(robot="rover", connect=(f"tcp/127.0.0.1:{router}",))
@@ -114,7 +114,7 @@ def beside(tmp_path_factory, router):
             assert bus.wait_matching(CMD_VEL, WAIT_TIMEOUT_S)
             last = time.monotonic()
 
-            def heard():  # the first ones may come before the bridge's subscription is known
+            def heard():  # the first messages may be sent before the bridge's subscription is known
                 nonlocal last
                 if time.monotonic() - last > 0.2:
                     last, found.stamp = time.monotonic(), found.stamp + 10**8
@@ -132,7 +132,7 @@ def beside(tmp_path_factory, router):
 def test_a_scan_comes_with_the_odometry_of_its_moment(beside):
     seen = []
 
-    def carried_on():  # by 50 ms; where odometry comes after the scan of its time, it is the one before that is
+    def carried_on():  # extrapolated by 50 ms; the scan may arrive before the odometry of its period
         seen.append(beside.sweep())
         return seen[-1][0].pose.x == pytest.approx(2.025)
 
@@ -145,7 +145,7 @@ def test_a_scan_comes_with_the_odometry_of_its_moment(beside):
 def test_the_belief_is_said_only_while_it_tracks(beside):
     for number, state in enumerate(("localising", "ambiguous", "lost"), 1):
         beside.believe(state)
-        beside.counts("beliefs_not_said", number)  # one by one: of several a busy bridge takes the newest
+        beside.counts("beliefs_not_said", number)  # one by one, because a busy bridge only takes the newest of several
     assert not beside.heard["amcl_pose"]
     assert not beside.heard["tf"]
     beside.believe("tracking")
@@ -157,13 +157,13 @@ def test_the_belief_is_said_only_while_it_tracks(beside):
     odom_in_map = [at.x, at.y, 2 * np.arctan2(turn.z, turn.w)]
     np.testing.assert_allclose(se2.compose(odom_in_map, [2.025, 0, 0]), [3.0, -1.5, 0.5], atol=1e-9)
     stamps = [each.stamp.sec * 10**9 + each.stamp.nanosec for each in (pose.header, said.header)]
-    assert stamps == [beside.stamp, beside.stamp + 10**9]  # the second with AMCL's tolerance
+    assert stamps == [beside.stamp, beside.stamp + 10**9]  # the transform is stamped ahead, as in AMCL
 
 
 def test_commands_pass_and_are_followed_by_a_stop(beside):
     heard, last = beside.heard["cmd_vel"], [0.0]
 
-    def driven():  # on a busy machine a command may come too late for its scan: the next
+    def driven():  # on a busy machine a command may be too late for its scan, so try again
         if not heard and time.monotonic() - last[0] > 0.5:
             last[0] = time.monotonic()
             beside.sweep()
@@ -185,18 +185,18 @@ def test_rvizs_two_buttons(beside):
     request = LocaliseRequest.decode(calls[0].payload)
     assert (request.pose.x, request.pose.y) == (4, 2)
     calls[0].reply(Reply().encode())
-    beside.put["goal_pose"](posed(9, 9, "odom"))  # in the wrong frame: not taken
+    beside.put["goal_pose"](posed(9, 9, "odom"))  # in the wrong frame: rejected
     beside.put["goal_pose"](posed(5, 1))
     goal = beside.next(Goal)
     assert (goal.pose.x, goal.pose.y, goal.seq) == (5, 1, 0)
 
 
 def test_the_map_is_there_for_who_comes_later(beside):
-    """As rmw_zenoh's transient-local subscriptions ask for it: history of an advanced subscriber, at once."""
+    """A late subscriber requests the history, as rmw_zenoh does for transient-local topics, and gets it at once."""
     key = "0/map/nav_msgs::msg::dds_::OccupancyGrid_/*"
 
     def ask():
-        """What comes first to who wants history; whether it was said again just then, to anybody."""
+        """The first map with history requested, and whether the bridge happened to repeat the map at that time."""
         heard, again = [], []
         plain = beside.node.session.declare_subscriber(key, again.append)
         late = zenoh.ext.declare_advanced_subscriber(
@@ -211,7 +211,7 @@ def test_the_map_is_there_for_who_comes_later(beside):
             plain.undeclare()
 
     heard, again = ask()
-    if again:  # the next time is far off
+    if again:  # the next repetition is far off
         heard, again = ask()
     assert not again
     sample = heard[0]
@@ -228,7 +228,9 @@ def test_the_map_is_there_for_who_comes_later(beside):
 def test_it_says_what_it_waits_for_and_what_is_wrong(processes, router):
     ours = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{router}", "PRESAGE_ROBOT": "lost"}
     theirs, port = processes.start_router()
-    nowhere = processes.start("bridge_ros2", "--ros-connect", "tcp/127.0.0.1:1", env=ours)  # nobody ever listens there
+    nowhere = processes.start(
+        "bridge_ros2", "--ros-connect", "tcp/127.0.0.1:1", env=ours
+    )  # nothing listens on this port
     wrong = {**ours, "PRESAGE_ROBOT": "wrong"}
     bridge = processes.start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{port}", env=wrong)
     with Ros(port, "rmw_zenoh", "jazzy") as node:

@@ -1,4 +1,4 @@
-"""A made-up session whose numbers can be worked out by hand, written with the project's own writer."""
+"""A synthetic session whose statistics can be computed by hand, written with RecordingWriter."""
 
 from __future__ import annotations
 
@@ -44,22 +44,22 @@ BEGAN_NS = 1_700_000_000_000_000_000
 SCANS = 100
 LOCALISED = 20  # index of the first belief in state tracking
 MOVED = 30  # index of the scan after which the goal comes and the robot leaves
-SPEED = 0.1  # m a scan
+SPEED = 0.1  # m per scan
 GOAL_MESSAGE = Goal(stamp_ns=0, pose=Pose(x=8, y=1), tolerance=0.15)  # as `presage goal` sends it, without a stamp
 
 
 def true_x(i: int) -> float:
-    """m; stands at 1 until `MOVED`, then drives along y = 1."""
+    """True x in m: 1 until scan `MOVED`, then increasing along y = 1."""
     return 1.0 + SPEED * max(0, i - MOVED)
 
 
 def error(i: int) -> float:
-    """m; falls from 2 by 0.1 a scan until localised, then 0.05 standing, 0.2 on the way."""
+    """Error in m: falls from 2 by 0.1 per scan until localised, then 0.05 standing and 0.2 driving."""
     return 2.0 - 0.1 * i if i < LOCALISED else 0.05 if i <= MOVED else 0.2
 
 
 def events() -> list[tuple[Topic, str, Stamped, int]]:
-    """Topic, publishing service, message and reception time."""
+    """Topic, publishing service, message and reception time in ns of each message."""
     rng = np.random.default_rng(1)
     found: list[tuple[Topic, str, Stamped, int]] = []
     for i in range(SCANS):
@@ -100,7 +100,7 @@ def events() -> list[tuple[Topic, str, Stamped, int]]:
             status = Status(stamp_ns=stamp, state=state, goal=GOAL_MESSAGE.pose, distance=away)
             found.append((STATUS, "controller", status, at + 6_000_000))
     for service, dropped in (("estimator", 3), ("controller", 4)):
-        for count in (1, dropped):  # counters grow; the last counts
+        for count in (1, dropped):  # counters grow; the last message is the valid one
             rows = [TopicHealth(key=SCAN.key("robot"), received=100, dropped=count)]
             health = Health(stamp_ns=1, service=service, uptime=1.0, topics=rows)
             found.append((HEALTH, service, health, BEGAN_NS + SCANS * PERIOD_NS))

@@ -1,4 +1,4 @@
-"""A damaged or hostile file: what is whole in it is kept, what is lost is counted, and memory stays bounded."""
+"""Damaged or hostile files: intact chunks are kept, losses are counted, and memory stays bounded."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from services.recorder.recover import recover
 from services.recorder.settings import RecorderSettings
 
 CHUNKS = 6
-EACH = 4  # messages in a chunk, of two channels in turn
+EACH = 4  # messages per chunk, alternating between two channels
 KINDS = st.sampled_from(["zstd", "lz4", "none"])
 
 
@@ -67,7 +67,7 @@ def flipped(folder, path, bit):
 
 
 def chunks_lost(path):
-    """How many chunks are missing; the others must be as they were sent."""
+    """Number of missing chunks. Asserts that the others are unchanged."""
     got = [(raw.key, raw.payload) for raw in read_recording(path).payloads()]
     kept = [SENT[n : n + EACH] for n in range(0, len(SENT), EACH) if SENT[n] in got]
     assert got == list(itertools.chain(*kept))
@@ -111,7 +111,7 @@ def test_info_of_a_damaged_index_suggests_recover(tmp_path):
 
 
 def by_mcap_alone(path, *, closed):
-    """A recording with declarations only where a channel is first used; where its second chunk begins."""
+    """A recording that declares each channel only once. Returns the offset of its second chunk."""
     with path.open("wb") as stream:
         writer = Writer(stream, compression=COMPRESSION["none"])
         writer.start(PROFILE)
@@ -177,7 +177,7 @@ def test_a_chunk_that_unpacks_to_gigabytes(tmp_path, compression, stated):
 
 
 class FullDisk:
-    """A file that takes so many bytes, and then no more."""
+    """A file that raises an error after a number of bytes, like a full disk."""
 
     def __init__(self, stream, room):
         self.stream, self.room = stream, room

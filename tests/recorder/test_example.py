@@ -1,4 +1,4 @@
-"""The reader of docs/recording.md, as a stranger runs it."""
+"""The example reader of docs/recording.md, run outside of the project."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recorder that begins and ends when told: each file is whole, says what the session is, and counts its own."""
+"""Recording on request: each file is complete, describes the session, and has its own counters."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def tell(bus):
 
 
 def send(bus, numbers):
-    """Odometry with those numbers; the payloads."""
+    """Publishes odometry with these sequence numbers. Returns the payloads."""
     assert bus.wait_matching(ODOM, 20)
     sent = []
     for number in numbers:
@@ -53,7 +53,7 @@ def send(bus, numbers):
 
 
 def settle(bus, count):
-    """Until the recorder has received so many of them in all: a request may overtake what was put before it."""
+    """Waits until the recorder has received this many messages. A request may overtake messages sent before it."""
     pulses, own, key = Inbox(), HEALTH.key(bus.robot, "recorder"), ODOM.key(bus.robot)
     bus.subscribe(HEALTH, pulses, keep_all=True)
 
@@ -66,7 +66,7 @@ def settle(bus, count):
 
 
 def odometry_in(path, bus):
-    """Payloads and the counters of that key; the file is whole and its counters agree with it."""
+    """Odometry payloads and their counters. Asserts that the file is complete and all counters match."""
     recording = read_recording(path)
     assert recording.complete
     counters = from_metadata(recording.metadata["counters"])
@@ -83,7 +83,10 @@ def test_idle_it_writes_nothing_until_told_and_then_one_file_each_time(recorder,
     send(bus, range(5))
     settle(bus, 5)
     files, sent, total = [], [], 5
-    for first, count in ((5, 20), (100, 30)):  # what comes in between is in no file, and missed by none
+    for first, count in (
+        (5, 20),
+        (100, 30),
+    ):  # messages between the recordings are in no file and do not count as missing
         begun = tell("start")
         assert (begun.ok, begun.recording) == (True, True)
         sent.append(send(bus, range(first, first + count)))
@@ -116,7 +119,7 @@ def test_what_cannot_be_is_refused_with_the_reason(recorder, bus, tell, tmp_path
     assert refused.recording
     assert "run.mcap" in refused.reason
     assert tell("stop").ok
-    assert tell("start").file.endswith("run-2.mcap")  # the name asked for is taken
+    assert tell("start").file.endswith("run-2.mcap")  # the configured name is taken
     assert tell("stop").ok
     assert sorted(path.name for path in (tmp_path / "logs").iterdir()) == ["run-2.mcap", "run.mcap"]
 
@@ -152,7 +155,7 @@ def test_one_that_records_from_the_start_can_be_stopped_and_started(recorder, bu
     assert tell("start").file.endswith("run-2.mcap")
     second = send(bus, range(10, 15))
     assert wait_until(lambda: tell("status").messages == 5, 20)
-    assert running.stop()[0] == 0  # in the middle of the second
+    assert running.stop()[0] == 0  # during the second recording
     assert odometry_in(tmp_path / "logs" / "run-2.mcap", bus)[0] == second
 
 
@@ -181,7 +184,7 @@ def test_health_counts_all_files_and_says_when_none_is_written(recorder, bus, te
 
 
 class Pretender(Service):
-    """Answers as the simulator does; its world changes."""
+    """Answers queries like the simulator, with a world that changes."""
 
     name = "simulator"
     queries = (WORLD,)
@@ -210,12 +213,12 @@ def test_every_file_says_what_the_session_is_now(recorder, bus, tell, tmp_path):
         active = tmp_path / "logs" / (began.file.rsplit("/", 1)[-1] + ".active")
         assert wait_until(lambda: b"world.yaml" in active.read_bytes(), 20)
         first = tell("stop").file
-        second_began = tell("start").file  # said again at once, before anybody is asked
+        second_began = tell("start").file  # the known description is written before any query
         second = tell("stop").file
         assert second == second_began
         pretender.world = made.WORLD.model_copy(update={"obstacles": made.WORLD.obstacles[:1]})
         active = tmp_path / "logs" / (tell("start").file.rsplit("/", 1)[-1] + ".active")
-        # The chair that was carried out: the file has the old world first, then the new one.
+        # An obstacle was removed: the file has the old world first, then the new one.
         assert wait_until(lambda: active.read_bytes().count(b"world.yaml") >= 2, 20)
         third = tell("stop").file
     finally:

@@ -1,4 +1,4 @@
-"""Every complete chunk comes back, and what is missing is said."""
+"""Recovery keeps every complete chunk and reports what is missing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from services.recorder.recover import recover
 
 KEY = "presage/r/truth"
 CHUNKS = 8
-EACH = 5  # messages in a chunk
+EACH = 5  # messages per chunk
 
 
 def truth(number):
@@ -25,7 +25,7 @@ def truth(number):
 
 
 def torn(path, compression="zstd"):
-    """An unfinished recording of a dead recorder; where each of its chunks ends."""
+    """An unfinished recording of a killed recorder, and the end offset of each chunk."""
     writer, ends = RecordingWriter(path, compression), []
     writer.metadata("presage", {"robot": "r"})
     writer.attachment("world.yaml", b"name: x", "application/yaml", 1)
@@ -97,7 +97,7 @@ def test_damage_in_the_middle_costs_its_own_chunk_alone(tmp_path_factory, data):
     (folder / "bad.mcap").write_bytes(whole)
     found = recover(folder / "bad.mcap")
     assert found.path == folder / "bad-recovered.mcap"
-    assert (folder / "bad.mcap").read_bytes() == whole  # a source that is not .active stays as it is
+    assert (folder / "bad.mcap").read_bytes() == whole  # a source that is not .active stays unchanged
     others = [n for n in range(CHUNKS * EACH) if n // EACH != chunk]
     assert set(others) <= set(stamps(found.path))
 

@@ -1,4 +1,4 @@
-"""A replay to be scrubbed through: begins paused, stays at its end, and knows its world."""
+"""A replay as the page uses it: begins paused, stays at its end, and answers the query for its world."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.recorder import sessions as made
 
 @pytest.fixture
 def scrubbed(tmp_path, link, bus):
-    """Calls start a replay under this test's robot: what is heard of its scans and beliefs, and a way to ask it."""
+    """Returns a function that starts a replay and returns its scans and beliefs and a function to control it."""
     stop, threads, heard = threading.Event(), [], Inbox()
     for topic in (SCAN, BELIEF):
         bus.subscribe(topic, heard, keep_all=True)

@@ -45,7 +45,7 @@ def only_file(folder, suffix=".mcap"):
 
 
 def publish(bus, count, seed=1):
-    """Arbitrary bytes on every topic; key and payload in order."""
+    """Publishes arbitrary bytes on every topic. Returns keys and payloads in order."""
     sent, source = [], random.Random(seed)
     for topic in TOPICS:
         assert bus.wait_matching(topic, 10, service="me")
@@ -87,7 +87,7 @@ def test_kill_9_leaves_what_came_more_than_a_flush_before(recorder, bus, tmp_pat
     key = HEALTH.key(bus.robot, "recorder")
     beats = Inbox()
     bus.subscribe(HEALTH, beats)
-    # Two pulses of the recorder's, a second apart: between them lies a flush.
+    # Two health messages of the recorder, a second apart: a flush lies between them.
     heard = 0
     while heard < 3:
         entry = beats.get(10)
@@ -102,7 +102,7 @@ def test_kill_9_leaves_what_came_more_than_a_flush_before(recorder, bus, tmp_pat
 
 
 def settle(bus, count):
-    """Until the recorder says that so many messages have come; an answer of its own may overtake what was put."""
+    """Waits until the recorder has received this many messages. A request may overtake messages sent before it."""
     pulses, own = Inbox(), HEALTH.key(bus.robot, "recorder")
     bus.subscribe(HEALTH, pulses, keep_all=True)
 
@@ -116,7 +116,7 @@ def settle(bus, count):
 
 
 class Pretender(Service):
-    """Answers as the simulator does."""
+    """Answers queries like the simulator."""
 
     name = "simulator"
     queries = (WORLD,)
@@ -194,7 +194,7 @@ def test_bad_input_is_one_line(process, args, said):
 
 LIMITED = """
 import resource, runpy, sys
-resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))  # a disk that is full after so much
+resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))  # acts like a full disk
 sys.argv = ["recorder", *sys.argv[1:]]
 runpy.run_module("services.recorder", run_name="__main__")
 """

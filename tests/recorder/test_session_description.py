@@ -1,4 +1,4 @@
-"""What the recorder asks, when it asks again, and what it makes of the answers."""
+"""Queries to services, their repetition, and the records made of the replies."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def stored(service, answer):
     metadata = {r.name: r.values for r in records if isinstance(r, MetadataRecord)}
     attachments = {r.name: r.data for r in records if isinstance(r, AttachmentRecord)}
     assert len(metadata) + len(attachments) == len(records)
-    assert isinstance(records[-1], MetadataRecord)  # speaks only of what is there
+    assert isinstance(records[-1], MetadataRecord)  # metadata follows the attachments that it refers to
     return metadata, attachments
 
 
@@ -94,7 +94,7 @@ def test_a_name_that_is_none_is_no_file(name):
 
 
 class FakeBus:
-    """Services that answer, or do not; notes every question."""
+    """Simulates services that answer, or do not, and records all queries."""
 
     def __init__(self):
         self.asked, self.replies = [], {}
@@ -126,7 +126,7 @@ def _impatient(monkeypatch):
 
 @pytest.fixture
 def describe(bus):
-    """Calls make a describer; all are stopped."""
+    """Returns a function that creates a collector. All collectors are stopped after the test."""
     made = []
 
     def make(*, weights=True):
@@ -200,7 +200,7 @@ def test_one_that_is_silent_is_asked_again_but_not_for_ever(bus, describe):
     bus.asked.clear()
     bus.changed("mute", True)
     assert wait_until(lambda: bus.asked.count(("mute", "config")) >= describing.MAX_ATTEMPTS, 10)
-    bus.changed("other", True)  # after which nothing waits for its turn
+    bus.changed("other", True)  # once its attempts are over, no other query is pending
     assert wait_until(lambda: bus.asked.count(("other", "config")) >= describing.MAX_ATTEMPTS, 10)
     assert bus.asked.count(("mute", "config")) == describing.MAX_ATTEMPTS
 
@@ -226,8 +226,8 @@ def test_a_model_not_known_yet_is_waited_for_and_another_one_noticed(bus, descri
     ((_, first),) = next_answers(describer, 1)
     assert first.weights.tobytes() == WEIGHTS.tobytes()
     before = len(bus.asked)
-    assert wait_until(lambda: len(bus.asked) > before + 3, 10)  # asked again and again, and
-    assert list(describer.answers()) == []  # the same is not stored twice
+    assert wait_until(lambda: len(bus.asked) > before + 3, 10)  # queried repeatedly, but
+    assert list(describer.answers()) == []  # an unchanged reply is not stored twice
     bus.replies["estimator", "model"] = a_model(WEIGHTS[:5])
     ((_, second),) = next_answers(describer, 1)
     assert second.weights.tobytes() == WEIGHTS[:5].tobytes()

@@ -1,4 +1,4 @@
-"""A visitor without a browser: what the page's script does, by the protocol's description alone."""
+"""A visitor without a browser, written only from the description of the protocol."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Frame:
 
 
 def read_frame(data: bytes) -> Frame:
-    """By the layout in the contract."""
+    """Decodes a binary message."""
     (length,) = struct.unpack_from("<I", data)
     assert (4 + length) % 4 == 0
     header = json.loads(data[4 : 4 + length], parse_constant=no_json)
@@ -44,13 +44,13 @@ def no_json(name):
 
 
 def page_of(running, timeout=PATIENCE):
-    """The link a viewer printed."""
+    """The link that a viewer printed."""
     running.wait_for("page: ", timeout)
     return next(line for line in running.output.splitlines() if line.startswith("page: ")).removeprefix("page: ")
 
 
 class Page:
-    """An open socket."""
+    """A visitor with an open web socket."""
 
     def __init__(self, link, origin=None, **options):
         parts = urlsplit(link)
@@ -75,7 +75,7 @@ class Page:
         return message
 
     def until(self, wanted, timeout=PATIENCE):
-        """The first message that is as wanted."""
+        """The first message that meets a condition."""
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
             try:
@@ -88,28 +88,28 @@ class Page:
         raise AssertionError(f"nothing as wanted within {timeout:g} s; the last were\n{last}")
 
     def told(self, kind, wanted=lambda _: True, timeout=PATIENCE):
-        """The first message of a type that is as wanted."""
+        """The next message of a type that meets a condition."""
         return self.until(lambda m: kind_of(m) == kind and wanted(m), timeout)
 
     def by_now(self, kind, wanted, timeout=PATIENCE):
-        """The same, or the last that came if it is."""
+        """Like `told`, but also accepts the last message that was already received."""
         last = self.last.get(kind)
         if last is not None and wanted(last):
             return last
         return self.told(kind, wanted, timeout)
 
     def frame(self, wanted=lambda _: True, timeout=PATIENCE):
-        """The first frame whose header is as wanted."""
+        """The next frame whose header meets a condition."""
         return self.told("frame", lambda m: wanted(m.header), timeout)
 
     def ask(self, do, timeout=PATIENCE, **fields):
-        """The answer to an action."""
+        """Requests an action and returns the answer."""
         number = next(self.numbers)
         self.socket.send(json.dumps({"id": number, "do": do, **fields}))
         return self.told("answer", lambda m: m["id"] == number, timeout)
 
     def done(self, do, **fields):
-        """The same, and it was done."""
+        """Like `ask`, and asserts success."""
         answer = self.ask(do, **fields)
         assert answer["ok"], answer
         return answer

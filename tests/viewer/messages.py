@@ -1,4 +1,4 @@
-"""Messages of a robot that stands somewhere, for one stamp."""
+"""Synthetic messages of a robot for one stamp."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RANGES = np.array([1.5, np.inf, -np.inf, 4.0, 25.0], np.float32)
 
 
 def at(stamp_s: float, x: float = 1.0, error: float = 0.5) -> dict:
-    """By topic, in the order in which they are sent."""
+    """Messages by topic, in the order in which they are published."""
     stamp = round(stamp_s * SECOND)
     covariance = np.diag([0.01, 0.04, 0.09])
     pose, twist = Pose(x=x, y=2.0, yaw=0.25), Twist(vx=0.3, vy=0.4)
@@ -57,7 +57,7 @@ def at(stamp_s: float, x: float = 1.0, error: float = 0.5) -> dict:
 
 
 def preference(stamp_s: float, x: float = 9.0, width: int = 3, height: int = 2) -> Preference:
-    """A field of distances to x, 2; the last cell is out of reach."""
+    """A goal field of distances to (x, 2). The last cell is unreachable."""
     distance = np.append(np.arange(width * height - 1, dtype=np.float32), np.float32(np.inf))
     return Preference(
         stamp_ns=round(stamp_s * SECOND), goal=Pose(x=x, y=2.0), origin=Pose(x=-1.0, y=-2.0), resolution=0.5,

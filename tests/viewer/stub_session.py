@@ -245,7 +245,7 @@ class Session:
 
 
 def as_pose(pose: np.ndarray) -> dict:
-    """GoalFields of a pose."""
+    """Fields of a pose."""
     return {"x": float(pose[0]), "y": float(pose[1]), "yaw": float(pose[2])}
 
 

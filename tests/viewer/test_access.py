@@ -1,4 +1,4 @@
-"""Who may connect: pages of this very server, under an address that is its own, with the token where there is one."""
+"""Access: only pages of this server, under its own address, with the token if there is one."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_a_port_that_was_asked_for_and_is_taken_is_said():
         port = first.getsockname()[1]
         with pytest.raises(UserError, match=f"127.0.0.1 port {port} cannot be used.*--port"):
             listen(ViewerSettings(port=port))
-        # One that was not asked for is the next free one.
+        # Without --port, the next free port is used.
         with listen(ViewerSettings()) as second, listen(ViewerSettings()) as third:
             assert second.getsockname()[1] != third.getsockname()[1]
 

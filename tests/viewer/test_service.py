@@ -1,4 +1,4 @@
-"""The viewer as a process, over zenoh: who is let in, a robot made of messages, hostile visitors."""
+"""The viewer as a process over zenoh: access, a robot made of synthetic messages, hostile visitors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.viewer.messages import RANGES, at, preference
 
 @pytest.fixture
 def viewer(process):
-    """Calls start a viewer with arguments: the process and its link."""
+    """Returns a function that starts a viewer and returns its process and link."""
 
     def start(*args, env=None):
         running = process("viewer", "--port", "0", *args, env=env)
@@ -49,7 +49,7 @@ def fetch(url, **headers):
 
 
 class Pretence:
-    """A robot made of messages."""
+    """A robot made of synthetic messages."""
 
     def __init__(self, bus):
         self.bus = bus
@@ -60,7 +60,7 @@ class Pretence:
             self.bus.put(topic, message.encode())
 
     def keep_saying(self, page, wanted, begin=1.0, timeout=WAIT_TIMEOUT_S):
-        """A stamp after another until a frame is as wanted."""
+        """Publishes one stamp after another until a frame meets a condition."""
         deadline, stamp = time.monotonic() + timeout, begin
         while time.monotonic() < deadline:
             stamp += 1 / 15
@@ -88,7 +88,7 @@ def test_an_empty_system_is_shown_as_such(viewer, link):
         answer = page.ask("teleport", x=1, y=1)
         assert not answer["ok"]
         assert "the simulator is not running; start it with: python -m services.simulator" in answer["reason"]
-        assert time.monotonic() - began < 2.0  # nobody waits for who is not there
+        assert time.monotonic() - began < 2.0  # the viewer does not wait for a service that is not alive
 
 
 def test_the_page_is_served_with_headers_that_keep_it_to_itself(viewer):
@@ -129,7 +129,7 @@ def test_a_token_is_asked_for(viewer):
     cookie = headers["set-cookie"].split(";")[0]
     assert "HttpOnly" in headers["set-cookie"]
     assert fetch(base, Cookie=cookie)[0] == 200
-    assert fetch(base, Cookie=cookie, Host="robot.example")[0] == 200  # a page of another's cannot have it
+    assert fetch(base, Cookie=cookie, Host="robot.example")[0] == 200  # a page of another host does not have the cookie
     with pytest.raises(InvalidStatus) as refused:
         Page(base)
     assert refused.value.response.status_code == 401
@@ -179,8 +179,10 @@ def test_a_robot_made_of_messages_is_shown(viewer, bus):
         np.testing.assert_array_equal(frame.arrays["ranges"], RANGES)
         np.testing.assert_array_equal(frame.arrays["predicted"], np.arange(5))
         services = page.told("services", lambda m: len(m["missing"]) < 3)
-        assert "simulator" not in [row["name"] for row in services["missing"]]  # scans come from somewhere
-    with Page(where) as page:  # who comes later sees the last frame and what has been
+        assert "simulator" not in [
+            row["name"] for row in services["missing"]
+        ]  # scans arrive, so no simulator is missing
+    with Page(where) as page:  # a later visitor gets the last frame and the history
         assert page.frame().header["stamp_ns"] == header["stamp_ns"]
         assert len(page.last["history"]["samples"]["t"]) > 0
         errors = page.last["history"]["samples"]["error"]
@@ -200,7 +202,7 @@ def test_who_comes_late_is_told_the_field_and_what_was_done(viewer, bus):
         bus.put(PREFERENCE, preference(2.0, x=3.0).encode())
         second = page.told("field")
         assert [field.header["goal"]["x"] for field in (first, second)] == [9.0, 3.0]
-    bus.put(PREFERENCE, preference(3.0, x=4.0).encode())  # nobody watches
+    bus.put(PREFERENCE, preference(3.0, x=4.0).encode())  # without visitors
     time.sleep(0.2)
     with Page(where) as page:
         assert page.by_now("field", lambda f: f.header["goal"]["x"] == 4.0).arrays["distance"][-1] == np.inf
@@ -232,13 +234,13 @@ def test_several_robots(viewer, bus, link):
         page.done("watch", robot=link.robot)
         assert page.frame().header["robot"] == link.robot
         page.told("services")
-        page.told("services")  # long enough for a robot that nobody watches to be let go
+        page.told("services")  # long enough to unfollow a robot without visitors
         page.done("watch", robot="two" + link.robot)
         assert page.told("field").header["robot"] == "two" + link.robot
 
 
 class Servant:
-    """Answers queries as services do."""
+    """Answers queries like the services."""
 
     def __init__(self, bus, *queries):
         self.inbox, self.world = Inbox(), load_world("maze")
@@ -246,7 +248,7 @@ class Servant:
             bus.serve(query, self.inbox)
 
     def answer(self, name, timeout=WAIT_TIMEOUT_S):
-        """Answer what comes until a query of that name was."""
+        """Answers all queries until one of this name was answered."""
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
             call = self.inbox.get(left)
@@ -294,7 +296,7 @@ def test_hostile_messages_are_answered_and_do_nothing(viewer, bus):
             page.socket.send(message)
             assert not page.told("answer")["ok"], message
         assert page.ask("recordings")["ok"]
-    with Page(where) as page:  # too long to be read at all
+    with Page(where) as page:  # longer than the server accepts
         page.told("hello")
         with pytest.raises(ConnectionClosed):  # noqa: PT012 - sending may fail already
             page.socket.send("x" * 200_000)
@@ -348,7 +350,7 @@ def test_who_does_not_read_slows_nobody_and_then_sees_the_newest(viewer, bus):
         quick.told("history")
         slow.told("history")
         seen = set()
-        for i in range(sent):  # 6 MB, more than any buffer on the way holds
+        for i in range(sent):  # 6 MB, more than any buffer in between holds
             stamp = 100.0 + i / 15
             message = at(stamp)
             for topic in (TRUTH, SCAN):
@@ -396,7 +398,7 @@ def test_it_ends_at_once_though_visitors_watch(viewer):
 def test_an_answer_that_does_not_come_is_said(viewer, bus):
     _, where = viewer()
     bus.declare_alive("simulator")
-    bus.serve(PAUSE, Inbox())  # takes the question, and keeps it
+    bus.serve(PAUSE, Inbox())  # receives the query but never answers
     with Page(where) as page:
         page.told("hello")
         answer = page.ask("pause")

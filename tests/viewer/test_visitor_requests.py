@@ -1,4 +1,4 @@
-"""What comes over the socket is an action or is refused with a reason; nothing else."""
+"""A message from a browser is an action, or is refused with a reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One socket's end: a connection that is gone is no error; an error of ours is one."""
+"""The end of a socket: a lost connection is no error, but a failing action is."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from services.viewer.visitors import Hub
 
 
 def talk(send, messages, act=None):
-    """Run a session that is sent ``messages`` and then nothing more."""
+    """Runs a session that receives ``messages`` and then nothing more."""
     coming = iter([{"type": "websocket.connect"}, *messages])
 
     async def receive():
@@ -32,7 +32,7 @@ def talk(send, messages, act=None):
 
 def test_a_socket_that_the_server_has_closed_already_is_gone_and_no_error():
     async def send(message):
-        if message["type"] == "websocket.send":  # as uvicorn says it, after a frame too long
+        if message["type"] == "websocket.send":  # as uvicorn raises it after a message that was too long
             raise RuntimeError("Unexpected ASGI message 'websocket.send', after sending 'websocket.close'.")
 
     talk(send, [])

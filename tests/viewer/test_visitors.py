@@ -1,4 +1,4 @@
-"""Frames go to whoever takes them; who does not, gets the newest when it does, and nobody waits."""
+"""Send queues of visitors: a slow visitor skips frames and does not delay others."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from services.viewer.visitors import MAX_QUEUED_TEXTS, Hub, TooSlowError, Visito
 
 
 class Line:
-    """A connection that takes one thing at each permit, or everything."""
+    """A connection that takes one message per permit if it is slow, or else everything."""
 
     def __init__(self, *, slow=False):
         self.taken = []
@@ -28,7 +28,7 @@ async def settle():
 
 
 def scene(*lines):
-    """A hub with a visitor for each line, all on one robot, and their running senders."""
+    """A hub with one visitor per line, all watching one robot, and their running send tasks."""
     hub = Hub()
     visitors = [Visitor(line.take, line.take) for line in lines]
     for visitor in visitors:

@@ -1,4 +1,4 @@
-"""What counts as lost."""
+"""Counts of gaps, missing messages and restarts."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def seen(*numbers):
     [
         ((0, 1, 2), (0, 0, 0, 0)),
         ((), (0, 0, 0, 0)),
-        ((700, 701), (0, 0, 0, 0)),  # the recorder came later
+        ((700, 701), (0, 0, 0, 0)),  # the recorder started later
         ((0, 1, 4, 5, 7), (2, 3, 0, 0)),
-        ((0, 1, 2, 0, 1), (0, 0, 1, 0)),  # began anew
-        ((998, 999, 3, 4), (0, 0, 1, 0)),  # began anew, its first ones were lost
+        ((0, 1, 2, 0, 1), (0, 0, 1, 0)),  # restarted
+        ((998, 999, 3, 4), (0, 0, 1, 0)),  # restarted, and its first messages were lost
         ((10, 11, 11, 10, 12), (0, 0, 0, 2)),
         ((10, 12, 11, 13), (1, 1, 0, 1)),
     ],

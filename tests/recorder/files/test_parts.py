@@ -1,4 +1,4 @@
-"""Parts: each is whole by itself, together they are everything."""
+"""Split recordings: each part is complete, and together they contain all messages."""
 
 from __future__ import annotations
 

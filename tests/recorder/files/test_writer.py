@@ -1,4 +1,4 @@
-"""What is written is read back, by our reader and by mcap's own; torn, foreign and missing files are named."""
+"""Written recordings are readable by this project and by mcap; unfinished, foreign and missing files are errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A replay's position against a made-up clock; which keys, and beside whom."""
+"""Position of a replay by a simulated clock, selection of keys, and conflicts with live services."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RATES = st.floats(0.01, 100)
 
 
 def play(player, times, now=0.0):
-    """The wall's times at which messages go out; nobody asks for anything."""
+    """Wall times at which messages are published, without any request."""
     went = []
     for at in times:
         now += player.wait(at, now)
@@ -81,7 +81,7 @@ def test_a_seek_goes_there_or_to_the_nearest_end(rate, place, now):
 
 @given(st.lists(st.booleans(), min_size=1, max_size=40), st.integers(1, 5))
 def test_a_step_goes_on_to_the_next_scan_and_stands(scans, steps):
-    """``scans`` says of each message whether it is one."""
+    """``scans``: for each message, whether it is a scan."""
     player = Player(0.0, 100.0)
     for _ in range(steps):
         ask(player, "step")

@@ -1,4 +1,4 @@
-"""Bytes that come back over real zenoh as they were, steered while they do, and not beside a live publisher."""
+"""Replays over real zenoh: unchanged payloads, control during the replay, conflicts with live publishers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def write(path, entries):
 
 @pytest.fixture
 def listening(bus, link):
-    """An inbox that hears every topic of the test's robot."""
+    """An inbox subscribed to every topic of the test's robot."""
     inbox = Inbox()
     for topic in TOPICS:
         bus.subscribe(topic, inbox, keep_all=True)
@@ -44,7 +44,7 @@ def listening(bus, link):
 
 @pytest.fixture
 def scans(tmp_path, link):
-    """A recording of a hundred seconds, a scan each, then its odometry; a payload is its number."""
+    """A recording of 100 s with one scan and one odometry message each second; payloads are their numbers."""
     scan, odom = SCAN.key(link.robot), ODOM.key(link.robot)
     entries = []
     for n in range(100):
@@ -54,7 +54,7 @@ def scans(tmp_path, link):
 
 @pytest.fixture
 def running(scans, link):
-    """Calls start a replay in a thread of its own; all are ended after the test. The remote and the counts."""
+    """Returns a function that starts a replay in a thread and returns its control, thread and counts."""
     stop, threads, failed = threading.Event(), [], []
 
     def start(choice, path=scans):
@@ -182,11 +182,11 @@ def test_it_is_steered_over_the_bus(running, listening, bus, link):
         return bus.ask(PLAYER, PlayerRequest(action=action, value=value), PlayerReply, timeout=10)
 
     scan, odom = SCAN.key(link.robot), ODOM.key(link.robot)
-    _, thread, counts = running(ReplayOptions(rate=1e-6))  # so slow that only what is asked for happens
+    _, thread, counts = running(ReplayOptions(rate=1e-6))  # so slow that messages are only published on request
     assert wait_until(lambda: len(listening) == 1, 10)  # the first is due at once
     assert ask("pause").paused
     assert ask("status").duration_s == pytest.approx(99.5)
-    for _ in range(2):  # a scan, and what came before it
+    for _ in range(2):  # a scan, and the odometry before it
         ask("step")
     assert wait_until(lambda: len(listening) == 5, 10)
     assert sorted(drain(listening)) == [(odom, bytes([n])) for n in range(2)] + [(scan, bytes([n])) for n in range(3)]
@@ -250,8 +250,8 @@ def test_a_loop_begins_anew(running, listening, link, monkeypatch):
 
 @pytest.fixture
 def alive(link):
-    """Calls make a service of this robot seem alive, in a session of its own."""
-    sessions = []  # held: zenoh undeclares what nobody holds
+    """Returns a function that declares a service of this robot alive, in a session of its own."""
+    sessions = []  # keeps references, because zenoh undeclares tokens of collected sessions
     with ExitStack() as stack:
 
         def declare(service):

@@ -1,4 +1,4 @@
-"""The health table of the page, who is missing, which robots there are."""
+"""Health table of the page, missing services, and the list of robots."""
 
 from __future__ import annotations
 

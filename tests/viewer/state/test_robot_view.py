@@ -1,4 +1,4 @@
-"""Which moment a frame shows, when it is sent, and its bytes."""
+"""Content of frames, when they are sent, and their binary layout."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from tests.viewer.client import read_frame
 from tests.viewer.messages import MOTION, PATH, PEOPLE, RANGES, UNMAPPED, at, preference
 
 PERIOD = 1 / 15
-REST = (BELIEF, PREDICTION, STATUS, CMD_VEL, PLAN)  # what answers a scan
+REST = (BELIEF, PREDICTION, STATUS, CMD_VEL, PLAN)  # the answers to a scan
 
 
 def feed(view, stamp, now=None, *leave_out, **how):
-    """All messages of a stamp; the frames that came of them."""
+    """Adds all messages of a stamp. Returns the resulting frames."""
     now = stamp if now is None else now
     sent = [view.add(t, m, now, round(now * 1e9)) for t, m in at(stamp, **how).items() if t not in leave_out]
     return [read_frame(frame) for frame in sent if frame is not None]
@@ -89,10 +89,10 @@ def test_it_waits_for_those_who_spoke_lately_and_no_longer_than_its_patience():
     assert view.overdue(1.1 + ANSWER_TIMEOUT_S / 2) is None
     frame = read_frame(view.overdue(1.1 + ANSWER_TIMEOUT_S))
     assert frame.header["stamp_ns"] == 1_100_000_000
-    assert frame.header["belief"]["stamp_ns"] == 1_000_000_000  # the last there is, and it says so
+    assert frame.header["belief"]["stamp_ns"] == 1_000_000_000  # the last belief, with its own stamp
     assert frame.header["error"] == pytest.approx(0.5)  # against the truth of its own stamp
     assert view.due(2.0) is None
-    # The belief that comes after all makes no second frame of that scan.
+    # A late belief makes no second frame of its scan.
     assert view.add(BELIEF, at(1.1)[BELIEF], 1.2) is None
 
 
@@ -120,14 +120,14 @@ def test_who_fell_silent_is_not_shown_and_not_waited_for():
 def test_while_time_stands_still_nobody_falls_silent():
     view = RobotView("robot")
     feed(view, 1.0)
-    assert feed(view, 1.1, 100.0, *REST) == []  # one step after a long pause: it waits
+    assert feed(view, 1.1, 100.0, *REST) == []  # one step after a long pause: the frame waits
     rest = {topic: message for topic, message in at(1.1).items() if topic in REST}
     frames = [view.add(topic, message, 100.01) for topic, message in rest.items()]
     assert read_frame(frames[-1]).header["belief"]["stamp_ns"] == 1_100_000_000
 
 
 def shown(view, now):
-    """The frame of a replay once it is quiet."""
+    """The frame of a replay, once no message arrives."""
     frame = view.overdue(now + QUIET_TIME_S)
     return frame if frame is None else read_frame(frame)
 
@@ -135,13 +135,13 @@ def shown(view, now):
 @pytest.mark.parametrize("seed", range(20))
 def test_a_replay_shows_the_whole_moment_whatever_the_order(seed):
     view, random = RobotView("ghost", live=False), Random(seed)
-    for step in range(1, 5):  # to the end of the next scan: the answers to the last one, and the scan
+    for step in range(1, 5):  # a step ends with the next scan: it has the answers to the last scan, and the scan
         sent = [(t, m) for t, m in at(step - 1.0).items() if t in REST] if step > 1 else []
         sent += [(t, m) for t, m in at(float(step)).items() if t not in REST]
         keys = {topic: [m for t, m in sent if t is topic] for topic, _ in sent}
         order = random.sample([topic for topic, _ in sent], len(sent))  # each key keeps its own order
         assert [view.add(topic, keys[topic].pop(0), float(step)) for topic in order] == [None] * len(sent)
-        assert shown(view, step - 0.01) is None  # more may come
+        assert shown(view, step - 0.01) is None  # more messages may arrive
         frame = shown(view, float(step))
         assert frame.header["t"] == (1.0 if step == 1 else step - 1.0)
         assert (frame.header["belief"] is None) == (step == 1)
@@ -225,7 +225,7 @@ def test_history_is_the_last_minute():
     assert columns["t"] == [float(i) for i in range(39, 100)]
     assert {len(column) for column in columns.values()} == {61}
     assert columns["error"] == [None] * 61
-    history.add(ChartSample(99.0, -1, -1, 0.0, 0.5, 0.1))  # sent again: it takes the place of the first
+    history.add(ChartSample(99.0, -1, -1, 0.0, 0.5, 0.1))  # a repeated stamp replaces the sample
     assert history.columns()["free_energy"][-2:] == [98, -1]
 
 
@@ -248,7 +248,7 @@ def test_a_truth_that_comes_after_its_belief_still_gives_the_error():
 def test_an_empty_plan_is_the_last_one_and_nobody_waits_for_another():
     view = RobotView("robot")
     feed(view, 1.0)
-    assert feed(view, 1.1, 1.1, PLAN) == []  # there was one
+    assert feed(view, 1.1, 1.1, PLAN) == []  # there was a plan before
     view.add(PLAN, Plan(stamp_ns=1_100_000_000), 1.11)
     (frame,) = feed(view, 1.2, 1.2, PLAN)
     assert len(frame.arrays["path"]) == len(frame.arrays["obstacles"]) == 0
@@ -289,7 +289,7 @@ def test_a_field_is_told_once_and_outlives_a_reset():
     np.testing.assert_array_equal(field.arrays["distance"], [0, 1, 2, 3, 4, np.inf])
     feed(view, 6.0)
     assert told_field(view) is None
-    feed(view, 1.0)  # the simulation began anew; its goal is the same
+    feed(view, 1.0)  # the simulation was restarted; its goal is the same
     assert view.time_restarted
     assert view.fields.shown == field.data
     view.add(PREFERENCE, preference(1.0, x=3.0), 7.0)
@@ -322,7 +322,7 @@ def test_a_large_field_is_thinned_out_and_its_cells_stay_where_they_were():
         x, y = (header["origin"][k] + (n + 0.5) * 1.5 for k, n in (("x", column), ("y", row)))
         old = int((y + 2) / 0.5) * side + int((x + 1) / 0.5)
         assert values[cell] == old
-        assert (x + 1) / 0.5 % 1 == pytest.approx(0.5)  # the middle of a cell
+        assert (x + 1) / 0.5 % 1 == pytest.approx(0.5)  # the centre of a cell
 
 
 def test_the_journal_has_a_row_for_each_change_of_mind():
