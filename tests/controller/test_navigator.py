@@ -1,4 +1,4 @@
-"""The controller's core: goals, limits, and what it says."""
+"""The navigator: goals, limits and statuses."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def scan(stamp_ns, pose, world=ROOM) -> Scan:
 
 
 def drive(navigator, pose, seconds, world=ROOM):
-    """A perfect robot that does what it is told; commands, statuses, poses."""
+    """Drive a perfect robot. Returns (command, status, pose) tuples."""
     pose, log = np.array(pose, float), []
     for number in range(int(seconds * 15)):
         stamp = number * PERIOD_NS
@@ -50,7 +50,7 @@ def goal(x, y, **rest) -> Goal:
 
 
 @pytest.mark.parametrize("yaw", [0.0, np.pi / 2, -2.0])
-def test_reaches_a_goal_at_any_heading_and_stands_there(yaw):
+def test_reaches_a_goal_from_any_heading_and_stands(yaw):
     navigator = Navigator(world=ROOM)
     navigator.on_goal(goal(8.5, 1.5))
     log = drive(navigator, [1.5, 2.5, yaw], 25)
@@ -61,7 +61,7 @@ def test_reaches_a_goal_at_any_heading_and_stands_there(yaw):
     assert path < 1.02 * np.hypot(7, 1)
 
 
-def test_limits_have_the_last_word():
+def test_commands_respect_the_limits():
     robot = Robot(max_speed=0.6, acceleration=0.5)
     navigator = Navigator(robot, world=ROOM)
     navigator.on_goal(goal(8.5, 1.5))
@@ -73,7 +73,7 @@ def test_limits_have_the_last_word():
     assert changes.max() <= 0.5 * PERIOD_NS * 1e-9 + 1e-6
 
 
-def test_commands_answer_the_belief_stamp():
+def test_commands_have_the_stamp_of_the_belief():
     command, status = Navigator().step(belief(123, [1, 1, 0]))
     assert command.stamp_ns == status.stamp_ns == 123
 
@@ -88,7 +88,7 @@ def test_idle_without_goal_and_after_cancel():
 
 
 @pytest.mark.parametrize(("x", "y", "why"), [(20, 20, "inside something"), (0.1, 2.0, "m from a wall")])
-def test_a_goal_in_a_wall_is_refused(x, y, why):
+def test_goal_in_a_wall_is_refused(x, y, why):
     navigator = Navigator(world=ROOM)
     navigator.on_goal(goal(x, y))
     log = drive(navigator, [1.5, 2, 0], 1)
@@ -97,7 +97,7 @@ def test_a_goal_in_a_wall_is_refused(x, y, why):
 
 
 @pytest.mark.parametrize("state", ["localising", "lost", "ambiguous"])
-def test_stands_until_it_knows_where_it_is(state):
+def test_stands_until_localised(state):
     navigator = Navigator(world=ROOM)
     navigator.on_goal(goal(8.5, 2))
     command, status = navigator.step(belief(0, [1.5, 2, 0], state))
@@ -110,9 +110,9 @@ def test_stands_until_it_knows_where_it_is(state):
     assert status.state == "navigating"
 
 
-def test_an_obstacle_the_scan_shows_blocks_without_contact():
+def test_blocked_by_an_obstacle_without_contact():
     crossed = World(name="crossed", boundary=ROOM.boundary, obstacles=[{"box": {"center": (5, 2), "size": (0.2, 3.9)}}])
-    navigator = Navigator(world=ROOM)  # its map does not know the box
+    navigator = Navigator(world=ROOM)  # the box is not in its map
     navigator.on_goal(goal(8.5, 2))
     log = drive(navigator, [1.5, 2, 0], 15, crossed)
     assert log[-1][1].state == "blocked"
@@ -120,7 +120,7 @@ def test_an_obstacle_the_scan_shows_blocks_without_contact():
     assert max(pose[0] for _, _, pose in log) + Robot().radius < 4.9
 
 
-def test_without_a_belief_it_stands_and_keeps_the_goal():
+def test_stops_without_a_belief_and_keeps_the_goal():
     navigator = Navigator(world=ROOM)
     navigator.on_goal(goal(8.5, 2))
     drive(navigator, [1.5, 2, 0], 1)
@@ -133,7 +133,7 @@ def test_without_a_belief_it_stands_and_keeps_the_goal():
     assert command.twist.vx > 0
 
 
-def test_without_a_belief_a_refused_goal_keeps_its_reason():
+def test_refused_goal_keeps_its_reason_without_a_belief():
     navigator = Navigator(world=ROOM)
     navigator.on_goal(goal(8.5, -3))
     refusal = navigator.status(5, None)
@@ -141,7 +141,7 @@ def test_without_a_belief_a_refused_goal_keeps_its_reason():
     assert navigator.stop_without_belief(5, "no belief")[1] == refusal
 
 
-def test_the_controller_needs_no_torch():
+def test_controller_does_not_import_torch():
     code = (
         "import sys, services.controller.service; assert 'torch' not in sys.modules and 'pybullet' not in sys.modules"
     )

@@ -1,4 +1,4 @@
-"""Robots that are not the shipped one: their own radius and limits decide where they go, and how fast."""
+"""Robots other than the default: radius and limits decide where they drive, and how fast."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def two_rooms(gap):
 
 
 @pytest.mark.parametrize(("robot", "gap"), [(BURGER, 0.45), (HEAVY, 1.3)])
-def test_each_goes_through_its_own_door_within_its_own_limits(robot, gap):
+def test_drives_through_a_fitting_door_within_its_limits(robot, gap):
     world = two_rooms(gap)
-    poses, said, contacts = drive(world, robot, (1.0, 1.5, 2.0), (5.0, 1.5), 900, scanner=CENTRED)
-    assert said[-1].state == "reached", said[-1]
+    poses, statuses, contacts = drive(world, robot, (1.0, 1.5, 2.0), (5.0, 1.5), 900, scanner=CENTRED)
+    assert statuses[-1].state == "reached", statuses[-1]
     assert not contacts
     assert world.clearance(poses[:, :2]).min() >= robot.radius
     steps = np.array([b - a for a, b in itertools.pairwise(poses)])
@@ -43,7 +43,7 @@ def test_each_goes_through_its_own_door_within_its_own_limits(robot, gap):
     assert np.abs(np.diff(speed)).max() * 15 <= robot.acceleration * 1.1
 
 
-def test_a_door_too_narrow_for_one_is_not_for_another():
+def test_door_fits_a_small_robot_only():
     world, goal = two_rooms(0.45), np.array([5.0, 1.5])
     for robot, fits in ((BURGER, True), (Robot(), False)):
         policy = GeodesicPolicy(robot, world)
@@ -52,11 +52,12 @@ def test_a_door_too_narrow_for_one_is_not_for_another():
         assert (graph.component[here] == graph.component[there]) is np.bool_(fits)
 
 
-POSTS = ((25, 0.12), (-110, 0.15), (110, 0.02))  # deg, m: of the robot itself; the last nearer than the scanner can say
+# Parts of the robot in deg and m; the last is closer than the scanner's minimum range.
+POSTS = ((25, 0.12), (-110, 0.15), (110, 0.02))
 
 
 def with_posts(scan):
-    """Scans of a scanner that sees three posts of its own robot, each 4 degrees wide."""
+    """The scan, with three posts of the robot itself in it, each 4 degrees wide."""
     ranges = scan.ranges.copy()
     for at, away in POSTS:
         beams = np.abs(np.rad2deg(scan.angles()) - at) <= 2
@@ -65,11 +66,11 @@ def with_posts(scan):
 
 
 @pytest.mark.parametrize(
-    "blind", [SelfFilter(tuple(tuple(np.deg2rad([at - 3, at + 3])) for at, _ in POSTS)), SelfFilter(radius=0.2)]
+    "self_filter", [SelfFilter(tuple(tuple(np.deg2rad([at - 3, at + 3])) for at, _ in POSTS)), SelfFilter(radius=0.2)]
 )
 @pytest.mark.parametrize("kind", ["holonomic", "differential"])
-def test_who_sees_himself_drives_once_told(kind, blind):
-    """Round what stands in the way, which is seen all the same; without being told it is blocked for ever."""
+def test_robot_in_its_own_scan_drives_with_a_self_filter(kind, self_filter):
+    """It also still sees and avoids the box. Without a self filter the robot does not move."""
     world = World(name="hall", boundary=[(0, 0), (8, 0), (8, 4), (0, 4)])
     box = Obstacle(name="box", circle={"center": (4.0, 2.0), "radius": 0.3})
     robot, found = Robot(drive=kind), world.with_obstacles([box])
@@ -77,24 +78,24 @@ def test_who_sees_himself_drives_once_told(kind, blind):
     def run(limit, seen):
         return drive(found, robot, (1.0, 2.0, 0.0), (7.0, 2.0), limit, known=world, seen=seen, stop=False)
 
-    _, said, contacts = run(600, lambda scan: blind.mask_for_planning(with_posts(scan)))
-    assert said[-1].state == "reached", said[-1]
+    _, statuses, contacts = run(600, lambda scan: self_filter.mask_for_planning(with_posts(scan)))
+    assert statuses[-1].state == "reached", statuses[-1]
     assert not contacts
-    poses, said, _ = run(150, with_posts)
-    assert said[-1].state != "reached"
+    poses, statuses, _ = run(150, with_posts)
+    assert statuses[-1].state != "reached"
     assert np.hypot(*(poses[-1] - poses[0])[:2]) < 0.5
 
 
-def test_the_bridges_stop_knows_it_too():
+def test_obstacle_stop_of_the_bridge_with_a_self_filter():
     world, robot = World(name="hall", boundary=[(0, 0), (8, 0), (8, 4), (0, 4)]), Robot()
     simulation = Simulation(Setup(world, SCANNER, robot, (1.0, 2.0, 0.0)))
     scan = with_posts(simulation.observe()[2])
     simulation.close()
-    command, blind, driven = CmdVel(stamp_ns=scan.stamp_ns, twist=Twist(vx=0.3)), SelfFilter(radius=0.2), []
-    for shown in (scan, blind.mask_for_bus(scan), blind.mask_for_planning(scan)):
+    command, self_filter, outputs = CmdVel(stamp_ns=scan.stamp_ns, twist=Twist(vx=0.3)), SelfFilter(radius=0.2), []
+    for shown in (scan, self_filter.mask_for_bus(scan), self_filter.mask_for_planning(scan)):
         gate = CommandGate(robot)
         gate.add_scan(shown, 0.0)
-        driven.append(gate.command(command, 0.01))
-    assert driven[0] is None or not driven[0].any()
-    assert driven[1][0] > 0
-    assert driven[2][0] > 0
+        outputs.append(gate.command(command, 0.01))
+    assert outputs[0] is None or not outputs[0].any()
+    assert outputs[1][0] > 0
+    assert outputs[2][0] > 0

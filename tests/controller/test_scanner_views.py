@@ -1,4 +1,4 @@
-"""Scanners that do not look ahead, all round, or the usual way round: where it drives, and what it takes for free."""
+"""Scanners with a limited view, mounted backwards or upside down: driving direction and free space."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.controller.policies.test_planner import belief_at
 
 HALL = World(name="hall", boundary=[(0, 0), (8, 0), (8, 6), (0, 6)])
 BOX = {"name": "new", "box": {"center": (4.0, 1.5), "size": (0.5, 0.5)}}
-LMS = SCANNERS["lms200"].model_copy(update={"rate": 15.0})  # its own rate is five times the work
+LMS = SCANNERS["lms200"].model_copy(update={"rate": 15.0})  # its real rate takes five times as long
 BACKWARDS = LMS.model_copy(update={"mount": (-0.2, 0.0, np.pi)})
 A1 = SCANNERS["rplidar-a1"]
 TURNED = {
@@ -60,7 +60,7 @@ def around(view, **more):
         (LMS.model_copy(update={"first": 0.0, "upside_down": True}), Sector(-np.pi / 2, np.pi / 2)),
     ],
 )
-def test_what_a_scanner_sees_of_base_link(scanner, sector):
+def test_sector_in_base_link(scanner, sector):
     scan = scan_of(scanner, HALL, np.array([4.0, 3.0, 1.0]))
     found = Sweep.of(scan).sector(scan.mount.yaw)
     assert found.half == pytest.approx(sector.half)
@@ -69,7 +69,7 @@ def test_what_a_scanner_sees_of_base_link(scanner, sector):
 
 @pytest.mark.parametrize("half_deg", [30, 60, 90, 135])
 @pytest.mark.parametrize("centre", [0.0, np.pi, 1.0])
-def test_no_action_leads_to_where_the_scanner_does_not_look(centre, half_deg):
+def test_actions_stay_within_the_view(centre, half_deg):
     view = Sector(centre, np.deg2rad(half_deg))
     for goal in np.arange(0, 2 * np.pi, 0.5):
         attractor = 3 * np.array([np.cos(goal), np.sin(goal)])
@@ -79,11 +79,11 @@ def test_no_action_leads_to_where_the_scanner_does_not_look(centre, half_deg):
             assert off <= max(view.half - VIEW_MARGIN_RAD, view.half / 3) + 1e-6
         else:
             turned = turn_to_attractor(action, attractor, Robot(), may_turn=True, forward=around(view).forward)
-            assert abs(turned[2]) > 0.1  # it turns until it sees
+            assert abs(turned[2]) > 0.1  # turns until the attractor is in view
 
 
 @pytest.mark.parametrize("name", TURNED)
-def test_what_went_away_is_forgotten_whichever_way_the_beams_run(name):
+def test_removed_obstacle_is_forgotten_for_any_beam_order(name):
     scanner, pose = TURNED[name], np.array([2.0, 1.5, 0.4])
     changed = World(name="hall", boundary=HALL.boundary, obstacles=[BOX])
     layer = TemporaryObstacles(FreeSpace.of(HALL))
@@ -95,7 +95,7 @@ def test_what_went_away_is_forgotten_whichever_way_the_beams_run(name):
 
 
 @pytest.mark.parametrize("name", TURNED)
-def test_lost_it_goes_where_there_is_room_whichever_way_the_beams_run(name):
+def test_wanders_to_free_space_for_any_beam_order(name):
     policy, pose = GeodesicPolicy(Robot(), HALL), np.array([1.0, 3.0, 0.0])
     scan = scan_of(TURNED[name], HALL, pose, 2 * 10**9)
     policy.observe(scan, belief_at(pose, scan.stamp_ns, "lost"))
@@ -103,18 +103,18 @@ def test_lost_it_goes_where_there_is_room_whichever_way_the_beams_run(name):
     for stamp in (0, 2 * 10**9):
         decision = localiser.decide(belief_at(pose, stamp, "lost"), scan, np.zeros((0, 2)), np.zeros(3), policy._view)
     assert decision.state == "exploring"
-    assert decision.action[0] > 0.1  # the hall lies ahead
+    assert decision.action[0] > 0.1  # there is most room ahead
     assert abs(decision.action[1]) < decision.action[0]
 
 
-def test_beams_that_measured_nothing_are_neither_room_nor_wall():
-    """Every other beam has no return: the way is the same; where none has measured anything there is no room."""
+def test_unmeasured_beams_count_neither_as_free_nor_as_wall():
+    """With every other beam unmeasured the action is the same; with all of them unmeasured there is no room."""
     pose, none = np.array([1.0, 3.0, 0.0]), np.zeros((0, 2))
     whole = scan_of(TURNED["0 to 359 deg"], HALL, pose)
     found = []
-    for silent in (slice(0, 0), slice(0, None, 2), slice(None)):
+    for unmeasured in (slice(0, 0), slice(0, None, 2), slice(None)):
         ranges = np.array(whole.ranges)
-        ranges[silent] = 0.0
+        ranges[unmeasured] = 0.0
         scan, policy = whole.model_copy(update={"ranges": ranges, "stamp_ns": 2 * 10**9}), GeodesicPolicy(Robot(), HALL)
         policy.observe(scan, belief_at(pose, scan.stamp_ns, "lost"))
         for stamp in (0, 2 * 10**9):
@@ -122,12 +122,12 @@ def test_beams_that_measured_nothing_are_neither_room_nor_wall():
         assert decision.state == "exploring"
         found.append(decision.action)
     np.testing.assert_allclose(found[1], found[0], atol=0.05)
-    assert not found[2][:2].any()  # it turns on the spot
+    assert not found[2][:2].any()  # turns on the spot
 
 
 @pytest.mark.parametrize("scanner", [LMS, BACKWARDS])
-def test_with_half_a_view_it_turns_before_it_drives_and_touches_nothing(scanner):
-    """The goal lies behind, and in the way a box that the map does not know: the wheels are held by nobody else."""
+def test_turns_before_driving_with_half_a_view(scanner):
+    """The goal lies behind, an unmapped box is in the way, and the simulator's obstacle stop is off."""
     world = World(name="hall", boundary=HALL.boundary, obstacles=[BOX])
     start, goal = (6.0, 1.5, scanner.mount[2]), (2.0, 1.5)
     simulation = Simulation(Setup(world, scanner, Robot(), start, 0, obstacle_stop=False))
@@ -141,7 +141,7 @@ def test_with_half_a_view_it_turns_before_it_drives_and_touches_nothing(scanner)
             navigator.on_scan(scan)
             command, status = navigator.step(belief_at(pose, scan.stamp_ns))
             speed = np.hypot(command.twist.vx, command.twist.vy)
-            if simulation.steps < 5:  # it has not turned yet
+            if simulation.steps < 5:  # before it has turned
                 assert speed < 0.05
             if status.state == "reached":
                 break
@@ -152,7 +152,7 @@ def test_with_half_a_view_it_turns_before_it_drives_and_touches_nothing(scanner)
     assert status.state == "reached", status
 
 
-def test_a_base_that_only_goes_forward_says_that_it_is_blind():
+def test_differential_base_that_cannot_see_ahead_is_blocked():
     robot, pose = Robot(drive="differential"), np.array([4.0, 3.0, 0.0])
     policy = GeodesicPolicy(robot, HALL)
     policy.set_goal(np.array([6.0, 3.0]))

@@ -1,4 +1,4 @@
-"""A ROS map in the simulator: pybullet's rays are those of the cells, contacts too; where nobody can stand."""
+"""A ROS map in the simulator: rays, contacts, refused poses, furniture."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ def simulation(world):
     made.close()
 
 
-def test_rays_agree_to_a_millimetre_but_for_edges(world, simulation, monkeypatch):
-    monkeypatch.setattr(physics, "MAX_WALLS_PER_BODY", 200)  # so that one map is several bodies
+def test_rays_match_exact_ranges_to_a_millimetre(world, simulation, monkeypatch):
+    monkeypatch.setattr(physics, "MAX_WALLS_PER_BODY", 200)  # so that the map is split into several bodies
     rng = np.random.default_rng(0)
     poses = np.column_stack([world.sample_free(40, rng, 0.27), rng.uniform(-np.pi, np.pi, 40)])
     lasers = se2.compose(poses, np.array(SCANNER.mount))
     exact = SCANNER.limit(world.ray_distances(lasers, SCANNER.angles()))
-    parted = Simulation(Setup(world, SCANNER))
-    for made in (simulation, parted):
+    split = Simulation(Setup(world, SCANNER))
+    for made in (simulation, split):
         seen = made.sample(poses, None, None)
-        off = ~np.isclose(seen, exact, atol=1e-3)
-        assert off.mean() < 3e-4  # beams that pass an edge of a cell within a millimetre
+        wrong = ~np.isclose(seen, exact, atol=1e-3)
+        assert wrong.mean() < 3e-4  # beams that pass within a millimetre of a cell's edge
         assert np.median(np.abs(seen - exact)[np.isfinite(exact)]) < 1e-5
-    parted.close()
+    split.close()
 
 
-def test_the_robot_is_stopped_by_cells(world, simulation):
+def test_cells_stop_the_robot(world, simulation):
     wall = int(np.argmax(simulation._cast_rays(simulation.physics.pose()[None], SCANNER, people=False)[0] < 2.5))
     heading = float(SCANNER.angles()[wall])
     turned = np.array([*simulation.physics.pose()[:2], heading])
@@ -60,7 +60,7 @@ def test_the_robot_is_stopped_by_cells(world, simulation):
     assert 0.2 < world.clearance(simulation.physics.pose()[:2])[0] < 0.3  # a body of 0.25 m
 
 
-def test_nobody_is_put_into_walls_or_what_is_unknown(world, simulation):
+def test_poses_in_occupied_or_unknown_cells_are_refused(world, simulation):
     for kind in (OCCUPIED, UNKNOWN):
         row, column = np.argwhere(world.grid.values == kind)[7]
         x, y = world.grid.shapes.points_in_cells(np.array([[column, row]]), 0.5)[0]
@@ -70,7 +70,7 @@ def test_nobody_is_put_into_walls_or_what_is_unknown(world, simulation):
             simulation.sample(np.array([[x, y, 0.0]]), 10, None)
 
 
-def test_furniture_comes_and_goes_on_a_map(world, simulation):
+def test_furniture_on_a_map(world, simulation):
     here = simulation.physics.pose()
     before = simulation._cast_rays(here[None], people=False)[0]
     place = here[:2] + 0.6 * np.array([np.cos(here[2]), np.sin(here[2])])

@@ -1,4 +1,4 @@
-"""Walking people without physics: where they may be, whom they wait for, that they go on."""
+"""Walking people without physics: distances, waiting, and progress."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PERIOD = 1 / 15  # s
 ROBOT = Robot().radius
 STANDING = np.zeros(2)
 HALL = World(name="hall", boundary=[(0, 0), (12, 0), (12, 8), (0, 8)])
-# Nobody passes anybody here.
+# Too narrow for two people to pass each other.
 ALLEY = World(name="alley", boundary=[(0, 0), (16, 0), (16, 0.9), (0, 0.9)])
 CORNER = np.array([0.5, 0.5])  # of the hall
 
@@ -43,7 +43,7 @@ def crowd(world: World, count: int, seed: int = 0, speed: float = 1.0, robot=Non
 
 
 def walk(people: People, seconds: float, robot, velocity=STANDING):
-    """(T, K, 2) m, the beginning included."""
+    """Places (T, K, 2) m, including the first ones."""
     places = [people.places.copy()]
     for _ in range(int(seconds / PERIOD)):
         people.step(PERIOD, np.asarray(robot, float), velocity)
@@ -52,14 +52,14 @@ def walk(people: People, seconds: float, robot, velocity=STANDING):
 
 
 def apart(places):
-    """(T,) m, the least distance of two centres."""
+    """Least distance (T,) m between the centres of two people."""
     gaps = np.hypot(*np.moveaxis(places[:, :, None] - places[:, None], -1, 0))
     gaps[:, np.arange(places.shape[1]), np.arange(places.shape[1])] = np.inf
     return gaps.min(axis=(1, 2))
 
 
 def longest_stand(moving):
-    """S, the longest stretch of False in ``moving`` (T,)."""
+    """Longest run of False in ``moving`` (T,), in s."""
     edges = np.flatnonzero(np.diff(np.concatenate([[1], moving.astype(int), [1]])))
     return float(np.diff(edges)[::2].max(initial=0)) * PERIOD
 
@@ -67,7 +67,7 @@ def longest_stand(moving):
 @pytest.mark.parametrize("name", ["corridor", "maze", "office"])
 @settings(max_examples=6)
 @given(seed=st.integers(0, 2**32 - 1), speed=st.sampled_from([0.3, 1.0, 3.0]))
-def test_nobody_is_ever_in_a_wall_or_in_another_or_in_the_robot(name, seed, speed):
+def test_people_never_touch_walls_each_other_or_the_robot(name, seed, speed):
     world = shipped(name)
     robot = world.sample_free(1, np.random.default_rng(seed), ROBOT)[0]
     people = crowd(world, 8, seed, speed, robot)
@@ -80,25 +80,26 @@ def test_nobody_is_ever_in_a_wall_or_in_another_or_in_the_robot(name, seed, spee
     assert steps.max() <= speed * PERIOD + 1e-9
 
 
-def test_same_seed_same_steps_other_seed_others():
+def test_steps_depend_on_the_seed():
     first, second, other = (walk(crowd(shipped("office"), 6, seed), 20, (1.5, 4.0)) for seed in (3, 3, 4))
     assert np.array_equal(first, second)
     assert not np.array_equal(first, other)
 
 
-def test_one_alone_walks_at_their_speed_and_gets_around():
+def test_one_person_walks_at_the_given_speed():
     places = walk(crowd(HALL, 1, seed=1, speed=0.8, robot=CORNER), 200, CORNER)[:, 0]
     gone = np.hypot(*np.diff(places, axis=0).T).sum()
-    assert gone == pytest.approx(0.8 * 200, rel=0.05)  # but for corners, cut within a step, and stops for the robot
+    # Slightly less, because corners are cut within a step, and the person stops for the robot.
+    assert gone == pytest.approx(0.8 * 200, rel=0.05)
     assert np.ptp(places, axis=0).min() > 5
 
 
-def test_who_has_no_speed_stands():
+def test_people_stand_at_speed_zero():
     places = walk(crowd(shipped("office"), 5, speed=0.0), 10, (1.5, 4.0))
     assert np.ptp(places, axis=0).max() == 0
 
 
-def test_people_come_through_every_door_of_the_office():
+def test_people_pass_every_door_of_the_office():
     places = walk(crowd(shipped("office"), 10, seed=2), 180, (1.5, 4.0)).reshape(-1, 2)
     for x, y in ((2.2, 2.97), (7.6, 2.97), (13.35, 2.97), (4.4, 4.97), (11.45, 4.97)):
         assert np.hypot(*(places - [x, y]).T).min() < 0.5, (x, y)
@@ -110,20 +111,20 @@ def test_ten_people_in_the_office_keep_moving():
     moving = np.hypot(*np.moveaxis(np.diff(places, axis=0), -1, 0)) > 1e-9
     assert longest_stand(moving.any(axis=1)) < 1.0
     assert moving.mean() > 0.5
-    assert max(longest_stand(one) for one in moving.T) < 20.0
+    assert max(longest_stand(person) for person in moving.T) < 20.0
 
 
-def test_two_who_meet_where_nobody_can_pass_turn_back():
+def test_two_people_turn_back_in_a_narrow_alley():
     robot = np.array([0.45, 0.45])
     places = walk(crowd(ALLEY, 2, seed=0, robot=robot), 300, robot)
     order = np.sign(places[:, 0, 0] - places[:, 1, 0])
     assert (order == order[0]).all()
     assert apart(places).min() == pytest.approx(2 * PERSON_RADIUS_M + PERSON_GAP_M, abs=PERIOD)  # they did meet
     moving = np.hypot(*np.moveaxis(np.diff(places, axis=0), -1, 0)) > 1e-9
-    assert max(longest_stand(one) for one in moving.T) < 20.0
+    assert max(longest_stand(person) for person in moving.T) < 20.0
 
 
-def test_who_walks_up_to_a_standing_robot_stops_half_a_metre_before_it_and_goes_elsewhere():
+def test_person_stops_before_a_standing_robot_and_turns_back():
     robot = np.array([8.0, 0.45])
     places = walk(crowd(ALLEY, 1, seed=3, robot=robot), 300, robot)[:, 0]
     gap = np.abs(places[:, 0] - 8.0) - PERSON_RADIUS_M - ROBOT
@@ -134,17 +135,17 @@ def test_who_walks_up_to_a_standing_robot_stops_half_a_metre_before_it_and_goes_
     assert gap[int(np.argmin(gap)) :].max() > 2.0
 
 
-def test_in_a_hall_people_go_round_a_standing_robot():
+def test_people_walk_around_a_standing_robot():
     robot = np.array([6.0, 4.0])
     places = walk(crowd(HALL, 6, seed=5, robot=robot), 200, robot)
     sides = np.sign(places[..., 0] - 6.0)
     assert (np.diff(sides, axis=0) != 0).any(axis=0).all()
 
 
-def test_nobody_steps_before_a_robot_that_cannot_brake_any_more():
-    """A robot that drives straight on at 1 m/s: who is within its braking distance does not come nearer, or in its way.
+def test_nobody_steps_in_front_of_a_robot_that_cannot_brake():
+    """People within the braking distance of a robot at 1 m/s do not step into its way, or closer if they are in it.
 
-    It would brake for them: what it runs over here is left out from then on.
+    The simulated robot does not brake. People it would have run over are ignored from then on.
     """
     world, rng, brakes = shipped("office"), np.random.default_rng(0), PERSON_RADIUS_M + ROBOT + 0.65
     met = 0
@@ -164,7 +165,7 @@ def test_nobody_steps_before_a_robot_that_cannot_brake_any_more():
     assert met > 50
 
 
-def test_who_is_in_the_way_of_furniture_or_of_the_robot_put_down_is_placed_anew_and_nobody_else():
+def test_only_people_in_the_way_are_moved():
     people = crowd(HALL, 5, seed=1, robot=CORNER)
     walk(people, 5, CORNER)
     before = people.places.copy()
@@ -181,7 +182,7 @@ def test_who_is_in_the_way_of_furniture_or_of_the_robot_put_down_is_placed_anew_
     assert world.clearance(walk(people, 60, CORNER).reshape(-1, 2)).min() >= PERSON_RADIUS_M
 
 
-def test_where_there_is_no_room_nothing_changes_and_the_error_says_so():
+def test_without_room_an_error_is_raised_and_nothing_changes():
     with pytest.raises(UserError, match=r"world 'alley' has room for \d+ people, .* not for 60: ask for fewer"):
         crowd(ALLEY, 60, robot=(8.0, 0.45))
     people = crowd(ALLEY, 1, robot=(0.5, 0.45))
@@ -193,13 +194,13 @@ def test_where_there_is_no_room_nothing_changes_and_the_error_says_so():
     assert len(walk(people, 5, (0.5, 0.45))) > 0
 
 
-def test_a_world_without_a_place_for_a_person_has_an_empty_floor():
+def test_grid_is_empty_in_a_world_too_narrow_for_people():
     grid = WalkableGrid(World(name="slit", boundary=[(0, 0), (9, 0), (9, 0.5), (0, 0.5)]), PERSON_RADIUS_M)
     assert len(grid.nodes) == len(grid.start_nodes) == 0
     assert not grid.can_start(np.array([4.0, 0.25]))
 
 
-def test_ways_keep_off_what_is_blocked_and_off_walls():
+def test_paths_keep_clear_of_walls_and_blocked_discs():
     world, rng = shipped("maze"), np.random.default_rng(0)
     grid = WalkableGrid(world, PERSON_RADIUS_M)
     blocked = np.array([[2.5, 3.5, 0.6], [7.5, 5.5, 0.6], [9.0, 2.5, 0.6]])
@@ -207,12 +208,12 @@ def test_ways_keep_off_what_is_blocked_and_off_walls():
     for node in rng.permutation(grid.start_nodes)[:60]:
         place = grid.nodes[node]
         gaps = np.hypot(*(blocked[:, :2] - place).T)
-        way = grid.random_path(place, rng, blocked)
-        if way is None:
+        path = grid.random_path(place, rng, blocked)
+        if path is None:
             continue
         count += 1
-        assert np.array_equal(way[0], place)
-        fine = np.concatenate([np.linspace(a, b, 50) for a, b in itertools.pairwise(way)])
+        assert np.array_equal(path[0], place)
+        fine = np.concatenate([np.linspace(a, b, 50) for a, b in itertools.pairwise(path)])
         assert world.clearance(fine).min() >= PERSON_RADIUS_M + 0.04
         nearest = np.hypot(fine[:, None, 0] - blocked[:, 0], fine[:, None, 1] - blocked[:, 1]).min(axis=0)
         assert (nearest >= np.minimum(blocked[:, 2], gaps) - 0.03).all()

@@ -1,4 +1,4 @@
-"""People in the simulator: seen, touched, waited for, and unknown to the map."""
+"""People in the simulator: rays, contacts, the obstacle stop, and the map."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def make():
 
 
 def run(simulation, seconds, twist=STANDING):
-    """Odometry, truth and scan of each period, the first included."""
+    """Odometry, truth and scan of each period, including the first."""
     seen = [simulation.observe()]
     for _ in range(int(seconds * 15)):
         simulation.command(simulation.stamp_ns, twist)
@@ -47,11 +47,11 @@ def run(simulation, seconds, twist=STANDING):
 
 
 def distance(truth) -> float:
-    """M between the robot's centre and the nearest person's."""
+    """Distance in m between the centres of the robot and the nearest person."""
     return float(np.hypot(*(truth.people - truth.pose.array()[:2]).T).min())
 
 
-def test_rays_hit_people_where_they_are(make):
+def test_rays_hit_people(make):
     simulation = make(scanner=EXACT, seed=4)
     hits = 0
     for _, truth, scan in run(simulation, 12, Twist(vx=0.3, wz=0.2))[::5]:
@@ -63,7 +63,7 @@ def test_rays_hit_people_where_they_are(make):
         peopled = World(name="peopled", boundary=office.boundary, obstacles=[*office.obstacles, *solid])
         laser = se2.compose(truth.pose.array()[None], np.array(EXACT.mount))
         exact = partial(peopled.ray_distances, laser)
-        # Where a beam grazes, what stands within 1 mm of it may be seen: both are right.
+        # Where a beam grazes an edge, anything within 1 mm of it is a correct result.
         around = np.stack([exact(scan.angles() + 1e-3 / scan.ranges.astype(float) * k)[0] for k in (-1, -0.5, 0.5, 1)])
         right = exact(scan.angles())[0]
         low, high = np.minimum(right, around.min(axis=0)) - 1e-3, np.maximum(right, around.max(axis=0)) + 1e-3
@@ -72,7 +72,7 @@ def test_rays_hit_people_where_they_are(make):
     assert hits > 500
 
 
-def test_without_people_the_same_bytes_and_with_them_the_same_where_nobody_is(make):
+def test_people_change_only_the_beams_that_hit_them(make):
     plain, peopled = (run(make(people=count, seed=7), 10) for count in (0, 6))
     shorter = 0
     for (odom, truth, scan), (odom_2, truth_2, scan_2) in zip(plain, peopled, strict=True):
@@ -93,7 +93,7 @@ def test_same_seed_same_bytes(make):
     assert once(3) != once(4)
 
 
-def test_a_sample_never_sees_people_and_the_world_does_not_list_them(make):
+def test_samples_and_the_world_do_not_contain_people(make):
     plain, peopled = make(people=0), make(people=30)
     poses = np.column_stack([plain.world.sample_free(40, np.random.default_rng(1), 0.3), np.zeros(40)])
     for _ in range(3):
@@ -103,7 +103,7 @@ def test_a_sample_never_sees_people_and_the_world_does_not_list_them(make):
     assert (plain.observe()[2].ranges != peopled.observe()[2].ranges).any()
 
 
-def test_who_walks_up_to_a_standing_robot_does_not_touch_it(make):
+def test_people_do_not_touch_a_standing_robot(make):
     simulation = make(ALLEY, people=2, start=(8.0, 0.45, 0.0), seed=3)
     truths = [truth for _, truth, _ in run(simulation, 45)]
     nearest = min(map(distance, truths)) - PERSON_RADIUS_M - Robot().radius
@@ -112,7 +112,7 @@ def test_who_walks_up_to_a_standing_robot_does_not_touch_it(make):
     assert truths[-1].pose.array() == pytest.approx([8.0, 0.45, 0.0], abs=1e-4)
 
 
-def test_a_robot_driven_into_a_standing_person_touches_them_and_stops_there(make):
+def test_contact_with_a_standing_person(make):
     simulation = make(ALLEY, people=1, start=(0.5, 0.45, 0.0), people_speed=0.0, obstacle_stop=False)
     truths = [truth for _, truth, _ in run(simulation, 16, Twist(vx=1.0))]
     assert any(truth.contact for truth in truths)
@@ -123,8 +123,8 @@ def test_a_robot_driven_into_a_standing_person_touches_them_and_stops_there(make
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_obstacle_stop_keeps_a_robot_from_people_who_stand_in_its_way(make, seed):
-    """At 1 m/s straight at one after the other, from where each is seen."""
+def test_obstacle_stop_before_standing_people(make, seed):
+    """Drive at 1 m/s straight at one person after the other."""
     simulation = make(HALL, people=12, start=(1.0, 1.0, 0.0), people_speed=0.0, seed=seed)
     stopped, fastest = 0, 0.0
     for place in simulation.people.places.copy():
@@ -142,8 +142,8 @@ def test_the_obstacle_stop_keeps_a_robot_from_people_who_stand_in_its_way(make, 
 
 
 @pytest.mark.parametrize("drive", ["holonomic", "differential"])
-def test_the_obstacle_stop_keeps_a_robot_from_people_who_walk(make, drive):
-    """A robot that drives on at 1 m/s wherever it looks, and turns where it is held: among ten, no contact."""
+def test_obstacle_stop_among_walking_people(make, drive):
+    """Drive at 1 m/s among ten people, turning on the spot when stopped."""
     simulation = make(people=10, seed=1, robot=Robot(drive=drive))
     rng, turn, contacts, gone = np.random.default_rng(0), 0.0, 0, 0.0
     simulation.observe()
@@ -159,7 +159,7 @@ def test_the_obstacle_stop_keeps_a_robot_from_people_who_walk(make, drive):
     assert gone > 8
 
 
-def test_a_teleport_onto_a_person_moves_them_and_is_seen_at_once(make):
+def test_teleport_onto_a_person_moves_them(make):
     simulation = make(seed=2)
     run(simulation, 3)
     target = simulation.people.places[0].copy()
@@ -172,7 +172,7 @@ def test_a_teleport_onto_a_person_moves_them_and_is_seen_at_once(make):
     assert not any(truth.contact for _, truth, _ in run(simulation, 3))
 
 
-def test_furniture_put_onto_a_person_moves_them_and_later_ways_go_round_it(make):
+def test_furniture_put_onto_a_person_moves_them(make):
     simulation = make(HALL, people=3, start=(1.0, 1.0, 0.0), seed=2)
     run(simulation, 2)
     place = simulation.people.places[1]

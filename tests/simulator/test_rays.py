@@ -27,8 +27,8 @@ def simulation(name: str) -> Simulation:
 @pytest.mark.parametrize("name", known_worlds())
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_ranges_agree_to_a_millimetre(name, seed):
-    """Where a beam grazes an edge, one that passes within 1 mm of it may see what lies behind: both are right."""
+def test_ranges_match_to_a_millimetre(name, seed):
+    """Where a beam grazes an edge, the range of any beam within 1 mm of it is a correct result."""
     world, rng = load_world(name), np.random.default_rng(seed)
     poses = np.column_stack([world.sample_free(2, rng, 0.27), rng.uniform(-np.pi, np.pi, 2)])
     seen = simulation(name).sample(poses, None, None)
@@ -40,10 +40,10 @@ def test_ranges_agree_to_a_millimetre(name, seed):
         turned = SCANNER.angles()[beam] + np.linspace(-sideways, sideways, 41)
         near = world.ray_distances(lasers[row : row + 1], turned)[0]
         assert near.min() - MM <= seen[row, beam] <= near.max() + MM, (poses[row], beam)
-    assert off.mean() < 0.01  # grazing beams are few
+    assert off.mean() < 0.01  # few beams graze an edge
 
 
-def test_a_scanner_that_reaches_less_far_sees_infinity_and_too_close_is_minus_infinity():
+def test_range_limits_give_plus_and_minus_infinity():
     short = SCANNER.model_copy(update={"range_max": 3.0, "range_min": 1.0, "sigma": 0.0})
     world = load_world("corridor")
     made = Simulation(Setup(world, short))
@@ -55,7 +55,7 @@ def test_a_scanner_that_reaches_less_far_sees_infinity_and_too_close_is_minus_in
     made.close()
 
 
-def test_noise_is_the_scanner_s_own_and_seeded():
+def test_noise_has_the_scanner_s_sigma_and_a_seed():
     pose = np.tile([[3.0, 1.5, 1.0]], (20, 1))
     clean = simulation("corridor").sample(pose, 622, None)
     a, b, c = (simulation("corridor").sample(pose, 622, seed) for seed in (1, 1, 2))
@@ -65,12 +65,12 @@ def test_noise_is_the_scanner_s_own_and_seeded():
     assert abs(np.mean(a - clean)) < 0.001
 
 
-def test_a_sample_inside_a_wall_is_refused():
+def test_sample_inside_a_wall_is_refused():
     with pytest.raises(UserError, match=r"1 of 2 poses .* such as \(6\.80, 3\.95\)"):
         simulation("corridor").sample(np.array([[3.0, 1.5, 0.0], [6.8, 3.95, 0.0]]), None, None)
 
 
-def test_a_sample_does_not_disturb_the_run():
+def test_sample_does_not_disturb_the_run():
     plain, disturbed = (Simulation(Setup(load_world("corridor"), SCANNER, seed=5)) for _ in range(2))
     for _ in range(3):
         disturbed.sample(np.array([[9.0, 1.0, 0.0]]), None, 3)

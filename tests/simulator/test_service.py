@@ -1,4 +1,4 @@
-"""The simulator's shell: pause, step by step, and the clock's speed."""
+"""The simulator service: pause, single steps, and speed."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class Clock:
 
 
 class Running:
-    """A simulator without a bus, whose clock the test turns."""
+    """A simulator without a bus, with a clock that the test controls."""
 
     def __init__(self, service, loop, bus, clock):
         self.service, self.loop, self.bus, self.clock = service, loop, bus, clock
 
     def ask(self, query, request=None):
-        """The reply."""
+        """Send a request and return the reply."""
         answers = []
         payload = (request or Request()).encode()
         self.loop._answer(Call(query, payload, lambda p: answers.append(query.reply.decode(p)), answers.append))
@@ -46,7 +46,7 @@ class Running:
         return answer
 
     def scans(self):
-        """Stamps, in periods, of the scans sent since the last look."""
+        """Stamps, in periods, of the scans sent since the last call."""
         found = [SCAN.message.decode(payload).stamp_ns / PERIOD_NS for topic, payload in self.bus.sent if topic is SCAN]
         self.bus.sent.clear()
         return [round(stamp) for stamp in found]
@@ -55,7 +55,7 @@ class Running:
         self.service.on_message(None, CmdVel(stamp_ns=number * PERIOD_NS, twist=Twist(vx=vx)))
 
     def run(self, seconds):
-        """Turn the clock; the timer is called when it is due."""
+        """Advance the clock, and call the timer when it is due."""
         end = self.clock.now + seconds
         while True:
             due = self.service.due()
@@ -85,7 +85,7 @@ def simulator(monkeypatch):
 
 
 @pytest.mark.parametrize("pace", ["realtime", "fast"])
-def test_steps_while_paused_and_only_then(simulator, pace):
+def test_steps_only_while_paused(simulator, pace):
     with simulator(pace=pace) as running:
         running.service.on_timer()
         assert running.scans() == [0]
@@ -105,7 +105,7 @@ def test_steps_while_paused_and_only_then(simulator, pace):
         assert running.scans() == [4]
 
 
-def test_steps_move_the_robot_as_running_time_does(simulator):
+def test_steps_move_the_robot_like_running_time(simulator):
     def poses(running):
         return [TRUTH.message.decode(p).pose.array() for topic, p in running.bus.sent if topic is TRUTH]
 
@@ -122,7 +122,7 @@ def test_steps_move_the_robot_as_running_time_does(simulator):
         assert np.hypot(*(poses(run)[-1] - poses(run)[0])[:2]) > 0.05
 
 
-def test_while_paused_a_controller_that_waits_in_vain_does_not_stop_the_robot(simulator):
+def test_stop_command_during_a_pause_is_ignored(simulator):
     with simulator() as running:
         running.service.on_timer()
         running.ask(PAUSE)
@@ -134,7 +134,7 @@ def test_while_paused_a_controller_that_waits_in_vain_does_not_stop_the_robot(si
         assert running.service.counters["stale_commands"] == 1
 
 
-def test_in_lockstep_a_step_waits_for_its_command_as_ever(simulator):
+def test_step_in_lockstep_needs_the_command(simulator):
     with simulator(pace="lockstep", wait_for="") as running:
         running.service.on_timer()
         running.ask(PAUSE)
@@ -150,7 +150,7 @@ def test_in_lockstep_a_step_waits_for_its_command_as_ever(simulator):
         assert not running.ask(STEP).ok
 
 
-def test_a_step_after_a_reset_is_the_first_scan(simulator):
+def test_step_after_a_reset_is_the_first_scan(simulator):
     with simulator() as running:
         running.service.on_timer()
         running.ask(PAUSE)
@@ -161,7 +161,7 @@ def test_a_step_after_a_reset_is_the_first_scan(simulator):
         assert running.scans() == [0]
 
 
-def test_time_that_waits_for_others_cannot_be_stepped(simulator):
+def test_no_step_before_required_services_run(simulator):
     with simulator(wait_for="estimator") as running:
         running.ask(PAUSE)
         reply = running.ask(STEP)
@@ -173,7 +173,7 @@ def test_time_that_waits_for_others_cannot_be_stepped(simulator):
 
 
 @pytest.mark.parametrize("factor", [0.1, 0.5, 1.0, 4.0, 20.0])
-def test_the_clock_runs_by_the_factor(simulator, factor):
+def test_speed_factor(simulator, factor):
     with simulator() as running:
         running.run(1.0)
         assert len(running.scans()) in {15, 16}
@@ -183,7 +183,7 @@ def test_the_clock_runs_by_the_factor(simulator, factor):
         assert running.service.note == ("" if factor == 1 else f"runs at {factor:g} x real time")
 
 
-def test_from_slow_to_fast_nobody_waits_for_the_slow_scan(simulator):
+def test_higher_speed_takes_effect_at_once(simulator):
     with simulator() as running:
         running.ask(SPEED, SpeedRequest(factor=0.1))
         running.run(0.01)
@@ -193,7 +193,7 @@ def test_from_slow_to_fast_nobody_waits_for_the_slow_scan(simulator):
         assert len(running.scans()) in {14, 15}
 
 
-def test_pause_is_said_before_speed(simulator):
+def test_note_shows_pause_before_speed(simulator):
     with simulator() as running:
         running.ask(SPEED, SpeedRequest(factor=2.0))
         running.ask(PAUSE)
@@ -203,7 +203,7 @@ def test_pause_is_said_before_speed(simulator):
 
 
 @pytest.mark.parametrize(("pace", "why"), [("lockstep", "each scan waits"), ("fast", "as fast as it can")])
-def test_other_paces_have_no_speed(simulator, pace, why):
+def test_speed_is_refused_at_other_paces(simulator, pace, why):
     with simulator(pace=pace) as running:
         reply = running.ask(SPEED, SpeedRequest(factor=2.0))
         assert not reply.ok
@@ -211,7 +211,7 @@ def test_other_paces_have_no_speed(simulator, pace, why):
         assert running.service.speed == 1.0
 
 
-def test_people_stand_while_paused_and_begin_again_with_a_reset(simulator):
+def test_people_stop_during_a_pause_and_restart_with_a_reset(simulator):
     def people(running):
         return TRUTH.message.decode([p for topic, p in running.bus.sent if topic is TRUTH][-1]).people
 
@@ -226,27 +226,27 @@ def test_people_stand_while_paused_and_begin_again_with_a_reset(simulator):
         running.run(5.0)
         running.ask(STEP)
         one = people(running)
-        assert np.hypot(*(one - walked).T).max() < 0.07  # a period's walk, no more
+        assert np.hypot(*(one - walked).T).max() < 0.07  # one period at 1 m/s
         for seed, same in ((None, True), (3, False), (2, True)):
             running.ask(RESET, ResetRequest(seed=seed))
             running.ask(STEP)
             assert np.array_equal(people(running), began) == same
 
 
-def test_people_are_not_in_the_world_that_is_told(simulator):
+def test_world_reply_does_not_contain_people(simulator):
     with simulator(world="office", people=5) as peopled, simulator(world="office") as plain:
         assert peopled.ask(WORLD).encode() == plain.ask(WORLD).encode()
 
 
 @pytest.mark.parametrize("stop", [True, False])
-def test_without_the_obstacle_stop_it_says_so_at_each_start(simulator, stop):
+def test_warning_without_the_obstacle_stop(simulator, stop):
     with capture_logs() as lines, simulator(obstacle_stop=stop) as running:
         assert running.service.simulation.setup.obstacle_stop is stop
-    said = [line for line in lines if line["event"].startswith("the obstacle stop is off")]
-    assert [line["log_level"] for line in said] == ([] if stop else ["warning"])
+    warnings = [line for line in lines if line["event"].startswith("the obstacle stop is off")]
+    assert [line["log_level"] for line in warnings] == ([] if stop else ["warning"])
 
 
-def test_more_people_than_there_is_room_for_is_one_clear_line(simulator, tmp_path):
+def test_too_many_people_raise_a_user_error(simulator, tmp_path):
     closet = tmp_path / "closet.yaml"
     closet.write_text("{name: closet, boundary: [[0, 0], [4, 0], [4, 4], [0, 4]]}")
     with pytest.raises(UserError, match=r"'closet' has room for \d+ people, .* not for 20: ask for fewer"):

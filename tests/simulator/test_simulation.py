@@ -1,4 +1,4 @@
-"""Motion through physics, safety where the wheels are, odometry, furniture, determinism."""
+"""Motion, safety limits, odometry, furniture, determinism."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def make():
 
 
 def drive(simulation, twist, seconds):
-    """Truths while a command is repeated at each scan."""
+    """Truths while the same twist is commanded at each scan."""
     truths = []
     for _ in range(int(seconds * 15)):
         assert simulation.command(simulation.stamp_ns, twist)
@@ -46,7 +46,7 @@ def speed(truth) -> float:
     return float(np.hypot(truth.twist.vx, truth.twist.vy))
 
 
-def test_time_is_counted_in_scan_periods(make):
+def test_time_advances_in_scan_periods(make):
     simulation = make()
     stamps = []
     for _ in range(4):
@@ -56,7 +56,7 @@ def test_time_is_counted_in_scan_periods(make):
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.2])
-def test_reaches_the_speed_asked_for_within_the_limits_of_acceleration(make, heading):
+def test_reaches_the_commanded_speed_within_acceleration_limits(make, heading):
     simulation = make(start=(2.0, 1.0, heading))
     truths = drive(simulation, Twist(vx=0.6), 2)
     assert speed(truths[-1]) == pytest.approx(0.6, abs=0.01)
@@ -74,18 +74,18 @@ def test_speed_and_turn_are_clipped(make):
     assert turning[-1].twist.wz == pytest.approx(Robot().max_turn, abs=0.02)
 
 
-def test_holonomic_goes_sideways_and_differential_does_not(make):
+def test_only_a_holonomic_base_moves_sideways(make):
     assert drive(make(), Twist(vy=0.5), 1)[-1].pose.y > 3.2
     differential = drive(make(robot=Robot(drive="differential")), Twist(vx=0.3, vy=0.5), 1)[-1]
     assert differential.pose.y == pytest.approx(3.0, abs=1e-3)
     assert differential.pose.x > 2.1
 
 
-def silence(simulation, again=None) -> float:
-    """Simulated s until the robot stands, without a new command."""
+def time_to_stop(simulation, repeated=None) -> float:
+    """Simulated time in s until the robot stands, without a new command."""
     for steps in range(1, 30):
-        if again is not None:
-            simulation.command(*again)
+        if repeated is not None:
+            simulation.command(*repeated)
         simulation.advance()
         if speed(simulation.observe()[1]) < 1e-3:
             return steps / 15
@@ -93,25 +93,25 @@ def silence(simulation, again=None) -> float:
 
 
 @pytest.mark.parametrize("kind", ["holonomic", "differential"])
-def test_stands_within_half_a_second_of_the_last_command(make, kind):
+def test_stops_within_half_a_second_of_the_last_command(make, kind):
     simulation = make(start=(1.0, 3.0, 0.0), robot=Robot(drive=kind))
     assert speed(drive(simulation, Twist(vx=1.0, wz=0.3), 1.5)[-1]) > 0.98
-    for _ in range(2):  # one that comes a scan or two late is nothing to brake hard for
+    for _ in range(2):  # a command that is one or two scans late does not trigger braking
         simulation.advance()
         assert speed(simulation.observe()[1]) > 0.98
     assert drive(simulation, Twist(vx=1.0, wz=0.3), 0.3)
-    assert silence(simulation) < 0.5 - 1 / 15  # whoever stops talking does so within a scan's period of its last word
+    assert time_to_stop(simulation) < 0.5 - 1 / 15  # one scan period is left for the time since the last command
 
 
-def test_a_command_said_again_keeps_nothing_going(make):
+def test_repeated_command_does_not_restart_the_timeout(make):
     simulation = make(start=(1.0, 3.0, 0.0))
     drive(simulation, Twist(vx=1.0), 1.5)
     last = simulation.stamp_ns, Twist(vx=1.0)
     assert simulation.command(*last)
-    assert silence(simulation, last) < 0.5
+    assert time_to_stop(simulation, last) < 0.5
 
 
-def test_a_command_older_than_the_last_one_is_refused(make):
+def test_command_older_than_the_last_one_is_refused(make):
     simulation = make(start=(1.0, 3.0, 0.0))
     drive(simulation, Twist(vx=0.5), 0.4)
     now = simulation.stamp_ns
@@ -136,8 +136,8 @@ def test_commands_too_old_or_from_the_future_are_refused(make):
 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (0.7, 0.7), (0.0, 1.0), (0.0, -1.0), (0.7, -0.7)])
-def test_the_obstacle_stop_prevents_contact_at_full_speed(make, direction):
-    """Every way the scanner looks; behind the robot (90 deg) it sees nothing, as on the real base."""
+def test_obstacle_stop_prevents_contact_at_full_speed(make, direction):
+    """In all directions that the scanner sees. The 90 deg behind the robot are out of its view, as on the real base."""
     simulation = make(start=(3.0, 3.0, 0.0))
     truths = drive(simulation, Twist(vx=direction[0], vy=direction[1]), 9)
     assert max(map(speed, truths)) > 0.9
@@ -149,12 +149,12 @@ def test_the_obstacle_stop_prevents_contact_at_full_speed(make, direction):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_no_contact_among_furniture_whatever_is_commanded(make, seed):
+def test_no_contact_among_furniture_for_random_commands(make, seed):
     rng, world = np.random.default_rng(seed), load_world("office")
     simulation = make(world, start=None, seed=seed)
     contacts = 0
     for _ in range(12):
-        forward = rng.uniform(-0.7, 0.7)  # mostly where it looks: forward and sideways
+        forward = rng.uniform(-0.7, 0.7)  # mostly into the field of view: forward and sideways
         contacts += sum(t.contact for t in drive(simulation, Twist(vx=abs(forward), vy=rng.uniform(-0.7, 0.7)), 1.0))
         simulation.command(simulation.stamp_ns, Twist(wz=2.0))
         for _ in range(7):
@@ -163,21 +163,21 @@ def test_no_contact_among_furniture_whatever_is_commanded(make, seed):
     assert contacts == 0
 
 
-def test_moving_away_from_a_wall_is_allowed_from_anywhere(make):
+def test_moving_away_from_a_wall_is_allowed(make):
     simulation = make(start=(7.72, 3.0, 0.0))  # 1 cm from the wall ahead
     assert drive(simulation, Twist(vx=0.5), 1)[-1].pose.x < 7.73
     assert drive(simulation, Twist(vx=-0.5), 1)[-1].pose.x < 7.5
 
 
-def test_contacts_are_real_without_the_stop(make):
+def test_contact_without_the_obstacle_stop(make):
     simulation = make(obstacle_stop=False)
     truths = drive(simulation, Twist(vx=1.0), 8)
     assert any(t.contact for t in truths)
-    assert truths[-1].pose.x + Robot().radius < 8.02  # it does not go through the wall
+    assert truths[-1].pose.x + Robot().radius < 8.02  # the wall stops it
     assert speed(truths[-1]) < 0.05
 
 
-def test_same_seed_same_bytes_other_seed_others(make):
+def test_bytes_depend_on_the_seed(make):
     def run(seed):
         simulation, out = make(seed=seed), []
         for number in range(20):
@@ -190,7 +190,7 @@ def test_same_seed_same_bytes_other_seed_others(make):
     assert run(3) != run(4)
 
 
-def test_odometry_without_drift_is_the_truth_and_with_it_drifts_as_it_says(make):
+def test_odometry_drift_matches_its_covariance(make):
     exact = make(start=(2.0, 3.0, 0.7), drift=Drift(0, 0, 0, 0))
     drive(exact, Twist(vx=0.5, vy=0.2, wz=0.5), 3)
     odom, truth, _ = exact.observe()
@@ -206,10 +206,11 @@ def test_odometry_without_drift_is_the_truth_and_with_it_drifts_as_it_says(make)
         odom, truth, _ = drifting.observe()
         error = odom.pose.array() - (truth.pose.array() - [2.0, 3.0, 0.0])
         normalised.append(error @ np.linalg.solve(odom.covariance, error))
-    assert 1.8 < np.mean(normalised) < 4.5  # chi² of 3: 30 runs lie within 2.2 and 4.0 in 95 of 100 cases
+    # chi² with 3 degrees of freedom: the mean of 30 runs is between 2.2 and 4.0 in 95 % of cases.
+    assert 1.8 < np.mean(normalised) < 4.5
 
 
-def test_teleport_is_unseen_by_odometry_and_refused_in_walls(make):
+def test_teleport(make):
     simulation = make()
     before = simulation.observe()[0]
     simulation.teleport(np.array([6.0, 2.0, 1.0]))
@@ -222,7 +223,7 @@ def test_teleport_is_unseen_by_odometry_and_refused_in_walls(make):
     assert simulation.observe()[1].pose.array() == pytest.approx([6.0, 2.0, 1.0])
 
 
-def test_furniture_comes_moves_and_goes(make):
+def test_furniture_is_added_moved_and_removed(make):
     simulation = make()
     box = Obstacle.model_validate({"box": {"center": (5, 3), "size": (1, 1)}})
     further = Obstacle.model_validate({"circle": {"center": (6, 3), "radius": 0.5}})
@@ -251,7 +252,7 @@ def test_furniture_comes_moves_and_goes(make):
         ("remove", "nothing", (5, 3), "no obstacle 'nothing'"),
     ],
 )
-def test_furniture_that_cannot_be_is_refused(make, action, name, center, why):
+def test_impossible_furniture_is_refused(make, action, name, center, why):
     shape = Obstacle.model_validate({"circle": {"center": center, "radius": 0.3}})
     simulation = make()
     with pytest.raises(UserError, match=why):
@@ -259,14 +260,14 @@ def test_furniture_that_cannot_be_is_refused(make, action, name, center, why):
     assert simulation.world.obstacles == []
 
 
-def test_a_start_in_a_wall_is_one_clear_line():
+def test_start_in_a_wall_raises_a_user_error():
     with pytest.raises(UserError, match=r"start \(0\.10, 3\.00\) is 0\.10 m from a wall of 'hall'"):
         Simulation(Setup(HALL, SCANNER, start=(0.1, 3.0, 0.0)))
 
 
 @pytest.mark.parametrize("radius", [0.105, 0.27, 0.4])
-def test_the_body_is_as_wide_as_it_is_told(make, radius):
-    """Without the stop it drives into the wall at x = 8 m, and stands at its own radius from it."""
+def test_body_has_the_given_radius(make, radius):
+    """Without the obstacle stop the robot drives into the wall at x = 8 m and stops at its radius from it."""
     robot = Robot(radius=radius, max_speed=0.3)
     last = drive(make(start=(7.2, 3.0, 0.0), robot=robot, obstacle_stop=False), Twist(vx=1.0), 5)
     assert last[-1].contact
@@ -274,7 +275,7 @@ def test_the_body_is_as_wide_as_it_is_told(make, radius):
     assert 8 - last[-1].pose.x == pytest.approx(radius, abs=0.02)
 
 
-def test_a_strong_base_gains_speed_as_fast_as_it_may(make):
+def test_base_with_high_acceleration_limits(make):
     robot = Robot(max_speed=3.0, acceleration=8.0)
     truths = drive(make(robot=robot, obstacle_stop=False), Twist(vx=3.0), 0.6)
     assert speed(truths[-1]) == pytest.approx(3.0, abs=0.05)

@@ -1,4 +1,4 @@
-"""Distance to go over free space: never through walls, near the exact shortest, with an attractor that can be seen."""
+"""Cost over free space: paths around walls, of nearly the shortest length, and visible attractors."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ def test_interpolation_is_exact_for_a_plane(x, y):
     assert grid.cell_of(centres).tolist() == list(range(grid.cells))
 
 
-def test_clearance_on_the_grid_is_that_of_the_world():
+def test_grid_clearance_matches_the_world():
     world, rng = load_world("office"), np.random.default_rng(0)
     points = world.sample_free(2000, rng, 0.1)
-    apart = np.abs(FreeSpace.of(world).clearance_at(points) - world.clearance(points))
-    assert apart.max() < 0.05  # less than half a cell, at corners
-    assert np.median(apart) < 1e-3
+    distance = np.abs(FreeSpace.of(world).clearance_at(points) - world.clearance(points))
+    assert distance.max() < 0.05  # less than half a cell, at corners
+    assert np.median(distance) < 1e-3
 
 
-def test_without_walls_it_is_the_distance_itself_but_for_the_grid():
+def test_cost_without_walls_is_the_distance():
     graph = FreeSpaceGraph(FreeSpace.of(EMPTY), RADIUS)
     goal = np.array([2.05, 3.05])
     field = graph.cost_field(goal)
@@ -59,9 +59,9 @@ def test_without_walls_it_is_the_distance_itself_but_for_the_grid():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_ways_keep_their_distance_and_are_hardly_longer_than_the_shortest(name):
+def test_paths_keep_clear_and_are_nearly_shortest(name):
     world, graph, rng = load_world(name), GRAPHS[name], np.random.default_rng(1)
-    room = shapely.buffer(world.free_space, -(RADIUS + WALL_GAP_M) + 0.05)  # what the grid may cut off a corner
+    room = shapely.buffer(world.free_space, -(RADIUS + WALL_GAP_M) + 0.05)  # the grid may cut corners by 5 cm
     places = world.sample_free(40, rng, RADIUS + WALL_GAP_M).reshape(-1, 2, 2)
     reached = 0
     for start, goal in places:
@@ -73,7 +73,7 @@ def test_ways_keep_their_distance_and_are_hardly_longer_than_the_shortest(name):
         reached += 1
         np.testing.assert_array_equal(path[0], start)
         assert np.hypot(*(path[-1] - goal)) < 0.1
-        # Start and goal lie where they do; between them all of it is clear.
+        # Start and goal may be closer to walls; between them the path is clear.
         assert shapely.covers(room, shapely.LineString(path[2:-2])) or len(path) < 6
         straight = float(np.hypot(*(goal - start)))
         assert length(path) >= straight - 1e-9
@@ -83,10 +83,10 @@ def test_ways_keep_their_distance_and_are_hardly_longer_than_the_shortest(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_following_the_attractor_leads_to_the_goal_along_free_lines(name):
+def test_following_the_attractor_leads_to_the_goal(name):
     world, graph, rng = load_world(name), GRAPHS[name], np.random.default_rng(2)
     for start, goal in world.sample_free(20, rng, 0.4).reshape(-1, 2, 2):
-        field, here, gone = graph.cost_field(goal), start, 0.0
+        field, here, travelled = graph.cost_field(goal), start, 0.0
         first = length(field.path(start)) if field.reaches(start) else None
         for _ in range(200):
             if first is None or np.hypot(*(here - field.goal)) < 0.01:
@@ -95,23 +95,23 @@ def test_following_the_attractor_leads_to_the_goal_along_free_lines(name):
             ok, _ = graph.clear_line(here, point[None])
             assert ok[0], (start, goal, here, point)
             step = min(0.3, float(np.hypot(*(point - here))))
-            gone += step
+            travelled += step
             here = here + (point - here) * step / max(float(np.hypot(*(point - here))), 1e-9)
         else:
             pytest.fail(f"not there from {start} to {goal}")
-        # Looking ahead shortens what the grid made longer.
-        assert first is None or gone <= first + 0.05
+        # The attractor shortens the detours of the grid.
+        assert first is None or travelled <= first + 0.05
 
 
-def test_an_obstacle_is_gone_round_and_forgotten_again():
+def test_path_around_an_obstacle_and_after_its_removal():
     graph = FreeSpaceGraph(FreeSpace.of(EMPTY), RADIUS)
     start, goal = np.array([1.0, 3.0]), np.array([9.0, 3.0])
     free = length(graph.cost_field(goal).path(start))
     wall = np.stack([np.full(41, 5.0), np.linspace(1.0, 5.0, 41)], axis=-1)
     graph.set_obstacles(wall)
-    round_it = graph.cost_field(goal).path(start)
-    assert np.hypot(*(round_it[:, None] - wall).transpose(2, 0, 1)).min() >= RADIUS + WALL_GAP_M - 0.06
-    assert length(round_it) > free + 1.0
+    detour = graph.cost_field(goal).path(start)
+    assert np.hypot(*(detour[:, None] - wall).transpose(2, 0, 1)).min() >= RADIUS + WALL_GAP_M - 0.06
+    assert length(detour) > free + 1.0
     graph.set_obstacles(np.stack([np.full(60, 5.0), np.linspace(0.05, 5.95, 60)], axis=-1))
     closed = graph.cost_field(goal)
     assert not closed.reaches(start)
@@ -121,26 +121,26 @@ def test_an_obstacle_is_gone_round_and_forgotten_again():
 
 
 @pytest.mark.parametrize("world", GRAPHS)
-def test_whatever_stood_about_before_the_roads_are_those_of_what_stands_now(world):
+def test_graph_depends_on_present_obstacles_only(world):
     graph, rng = FreeSpaceGraph(GRAPHS[world].free, RADIUS), np.random.default_rng(2)
     x0, y0, x1, y1 = load_world(world).bounds
     for count in (40, 3, 200, 1, 0):
         points = rng.uniform((x0 - 1, y0 - 1), (x1 + 1, y1 + 1), (count, 2))  # some beyond the map
         graph.set_obstacles(points)
-        anew = FreeSpaceGraph(graph.free, RADIUS)
-        anew.set_obstacles(points)
-        apart = np.hypot(*(graph.grid.centres()[:, None] - points).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
-        exact = np.minimum(graph.free.clearance.ravel(), apart)
+        rebuilt = FreeSpaceGraph(graph.free, RADIUS)
+        rebuilt.set_obstacles(points)
+        distance = np.hypot(*(graph.grid.centres()[:, None] - points).transpose(2, 0, 1)).min(axis=1, initial=np.inf)
+        exact = np.minimum(graph.free.clearance.ravel(), distance)
         relevant = exact < graph.min_clearance + WALL_COST_RANGE_M
         assert np.allclose(graph.clearance.ravel()[relevant], exact[relevant], rtol=0, atol=1e-12)
         assert (graph.clearance.ravel()[~relevant] >= graph.min_clearance + WALL_COST_RANGE_M).all()
         assert np.allclose(graph.slowness.ravel(), slowness(exact, graph.min_clearance), rtol=0, atol=1e-12)
         goal = graph.nearest_free(np.array([(x0 + x1) / 2, (y0 + y1) / 2]))
         place = graph.grid.centres([goal])[0]
-        assert np.array_equal(graph.cost_field(place).cost, anew.cost_field(place).cost)
+        assert np.array_equal(graph.cost_field(place).cost, rebuilt.cost_field(place).cost)
 
 
-def test_a_metre_near_a_wall_costs_more_and_none_costs_less():
+def test_slowness_is_between_one_and_its_maximum():
     for graph in GRAPHS.values():
         assert graph.slowness.min() >= 1
         assert graph.slowness.max() <= 1 + MAX_WALL_COST
@@ -148,7 +148,7 @@ def test_a_metre_near_a_wall_costs_more_and_none_costs_less():
         assert (graph.slowness[far] == 1).all()
 
 
-def test_where_there_is_room_the_way_keeps_away_from_the_wall():
+def test_path_keeps_away_from_a_wall():
     graph = FreeSpaceGraph(FreeSpace.of(EMPTY), RADIUS)
     path = graph.cost_field(np.array([9.0, 0.35])).path(np.array([1.0, 0.35]))
     assert path[len(path) // 2, 1] > 0.5

@@ -1,4 +1,4 @@
-"""Where an action leads, as the robot's own limits have it; and which action is chosen."""
+"""Predicted motion within the robot's limits, and the choice of an action."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ PERIOD = 1 / 15
 speeds = st.floats(-1, 1).map(lambda v: round(v, 3))
 
 
-def nothing(places):
+def no_walls(places):
     return np.full(places.shape[:-1], np.inf)
 
 
-def around(points=(), moving=(), known=nothing, **more):
+def around(points=(), moving=(), known=no_walls, **more):
     points = np.array(points, float).reshape(-1, 2)
     return Surroundings(known, points, np.array(moving, bool).reshape(-1), 0.3, 0.33, **more)
 
 
 @settings(max_examples=15)
 @given(speeds, speeds, speeds, speeds)
-def test_a_differential_rollout_is_what_the_ramp_makes_of_it(v0, w0, v, w):
+def test_differential_rollout_matches_a_fine_simulation(v0, w0, v, w):
     robot = Robot(drive="differential")
     poses, times, stands = rollouts(np.array([v0, 0, w0]), np.array([[v, 0, w]]), robot)
     fine, velocity, pose, count = 1e-3, np.array([v0, 0.0, w0]), np.zeros(3), 0
@@ -54,7 +54,7 @@ def test_a_differential_rollout_is_what_the_ramp_makes_of_it(v0, w0, v, w):
 
 
 @given(st.floats(0.01, 20))
-def test_the_braking_speed_ends_where_it_should(distance):
+def test_braking_speed_covers_the_distance(distance):
     robot = Robot()
     v = braking_speed(distance, robot)
     assert v <= robot.max_speed
@@ -63,20 +63,20 @@ def test_the_braking_speed_ends_where_it_should(distance):
 
 
 @given(st.floats(-np.pi, np.pi))
-def test_a_turn_is_braked_in_time(angle):
+def test_turn_is_braked_in_time(angle):
     robot, left, rate = Robot(), angle, 0.0
     for _ in range(120):
         wanted = turn_rate(left, robot)
         rate += float(np.clip(wanted - rate, -robot.turn_acceleration * PERIOD, robot.turn_acceleration * PERIOD))
         left -= rate * PERIOD
         assert abs(left) <= abs(angle) + 1e-9
-        assert np.sign(left) * np.sign(angle) >= 0 or abs(left) < 0.12  # hardly over it
+        assert np.sign(left) * np.sign(angle) >= 0 or abs(left) < 0.12  # hardly any overshoot
     assert abs(left) < 0.02
 
 
 @pytest.mark.parametrize("robot", DRIVES, ids=lambda robot: robot.drive)
 @given(x=st.floats(-4, 4), y=st.floats(-4, 4), v=speeds, w=speeds)
-def test_the_choice_never_leaves_the_robot_farther_off(robot, x, y, v, w):
+def test_choice_never_increases_the_distance(robot, x, y, v, w):
     current, goal = np.array([v, 0.0, w]), np.array([x, y])
     choice = choose(current, goal, around(), robot)
     poses, _, _ = rollouts(current, np.zeros((1, 3)), robot)
@@ -88,8 +88,8 @@ def test_the_choice_never_leaves_the_robot_farther_off(robot, x, y, v, w):
 
 
 @pytest.mark.parametrize("robot", DRIVES, ids=lambda robot: robot.drive)
-def test_the_speed_does_not_die_away_before_the_goal(robot):
-    """The weak point of a quadratic prior: its slope, and with it the speed, shrinks as the goal comes near."""
+def test_speed_is_kept_up_to_the_goal(robot):
+    """With a quadratic prior the slope, and with it the speed, would decrease towards the goal."""
     pose, velocity, taken = np.zeros(3), np.zeros(3), 0
     goal = np.array([4.0, 0.0])
     while np.hypot(*(goal - pose[:2])) > 0.05 and taken < 200:
@@ -98,12 +98,12 @@ def test_the_speed_does_not_die_away_before_the_goal(robot):
         pose, taken = se2.compose(pose, velocity * PERIOD), taken + 1
     least = 4.0 / robot.max_speed + robot.max_speed / robot.acceleration  # accelerate, cruise, brake
     assert taken * PERIOD < 1.12 * least
-    assert pose[0] < 4.06  # and it does not run past it
+    assert pose[0] < 4.06  # no overshoot
 
 
 @pytest.mark.parametrize("robot", DRIVES, ids=lambda robot: robot.drive)
 @given(st.lists(st.tuples(st.floats(-2, 2), st.floats(-2, 2)), max_size=12), st.integers(0, 100))
-def test_a_chosen_way_is_free_until_the_robot_stands(robot, points, seed):
+def test_chosen_motion_is_free_until_standstill(robot, points, seed):
     points = [p for p in points if np.hypot(*p) > 0.35]
     v, w = np.random.default_rng(seed).uniform([0, -1], [0.5, 1])
     here = around(points, [False] * len(points))
@@ -113,26 +113,26 @@ def test_a_chosen_way_is_free_until_the_robot_stands(robot, points, seed):
         assert gaps.min() >= -1e-3
 
 
-def test_somebody_who_walks_is_given_room_to_and_furniture_is_not():
+def test_moving_obstacle_slows_the_robot_and_static_one_does_not():
     robot, current, goal = Robot(), np.array([0.6, 0.0, 0.0]), np.array([3.0, 0.0])
     still = choose(current, goal, around([(1.6, 0.0)], [False]), robot)
     walking = choose(current, goal, around([(1.6, 0.0)], [True]), robot)
     assert np.hypot(*still.action[:2]) > 0.6
-    assert np.hypot(*walking.action[:2]) < 0.6  # straight at them it would have to stand before they come
+    assert np.hypot(*walking.action[:2]) < 0.6  # driving at them it must be able to stop before they arrive
     assert walking.hindered
     assert not still.hindered
     beside = choose(current, goal, around([(0.0, 0.5)], [False]), robot)
     assert beside.action[0] > 0.6
 
 
-def test_a_wall_across_the_way_is_waited_at():
+def test_stops_before_a_wall_across_the_path():
     wall = [(0.4, y) for y in np.linspace(-2, 2, 81)]
     choice = choose(np.zeros(3), np.array([3.0, 0.0]), around(wall, [False] * 81), Robot(drive="differential"))
     assert choice.hindered
     assert choice.motion[-1, 0] < 0.4 - 0.33 + 1e-3
 
 
-def test_where_the_scanner_does_not_look_it_turns_first_or_goes_slowly():
+def test_turns_or_slows_towards_unseen_directions():
     behind, view = np.array([-3.0, 0.0]), Sector(0.0, np.deg2rad(135))
     choice = choose(np.zeros(3), behind, around(view=view), Robot())
     assert abs(np.arctan2(choice.action[1], choice.action[0])) <= np.pi / 2 + 1e-9  # the body is wide
@@ -141,8 +141,8 @@ def test_where_the_scanner_does_not_look_it_turns_first_or_goes_slowly():
     assert 0 < np.hypot(*kept.action[:2]) <= 0.25 + 1e-9
 
 
-def test_candidates_hold_standing_and_going_on():
+def test_candidates_contain_standing_and_the_current_velocity():
     for robot in DRIVES:
-        many = candidate_actions(np.array([0.3, 0.0, 0.1]), np.array([1.0, 0.2]), robot)
-        np.testing.assert_array_equal(many[:2], [[0, 0, 0], [0.3, 0, 0.1]])
-        assert len(many) < 130
+        actions = candidate_actions(np.array([0.3, 0.0, 0.1]), np.array([1.0, 0.2]), robot)
+        np.testing.assert_array_equal(actions[:2], [[0, 0, 0], [0.3, 0, 0.1]])
+        assert len(actions) < 130

@@ -1,4 +1,4 @@
-"""What the map does not know: found, told from the map, aged, and forgotten when a beam passes where it was."""
+"""Unmapped obstacles: detection, ageing, and removal when a beam passes through."""
 
 from __future__ import annotations
 
@@ -34,80 +34,83 @@ def with_box(world, x, y, size=0.4):
 
 
 @pytest.mark.parametrize("name", ["corridor", "maze", "office"])
-def test_in_the_world_of_the_map_nothing_is_found(name):
+def test_nothing_is_found_in_the_mapped_world(name):
     world, rng = load_world(name), np.random.default_rng(0)
     free = FreeSpace.of(world)
     for x, y in world.sample_free(15, rng, 0.4):
-        layer, pose = TemporaryObstacles(free), np.array([x, y, rng.uniform(-np.pi, np.pi)])
+        obstacles, pose = TemporaryObstacles(free), np.array([x, y, rng.uniform(-np.pi, np.pi)])
         believed = pose + rng.normal(0, [0.01, 0.01, 0.004])
-        layer.update(scan_of(world, pose, 0, rng), believed)
-        assert len(layer.points()) == 0
+        obstacles.update(scan_of(world, pose, 0, rng), believed)
+        assert len(obstacles.points()) == 0
 
 
-def test_a_new_box_is_found_where_it_is_and_becomes_furniture():
+def test_new_box_is_found_and_becomes_static():
     world = load_world("maze")
-    changed, pose, layer = with_box(world, 3.2, 3.0), np.array([1.5, 3.0, 0.0]), TemporaryObstacles(FreeSpace.of(world))
+    changed, pose = with_box(world, 3.2, 3.0), np.array([1.5, 3.0, 0.0])
+    obstacles = TemporaryObstacles(FreeSpace.of(world))
     for number in range(20):
         stamp = number * SECOND // 15
-        layer.update(scan_of(changed, pose, stamp), pose)
-        points = layer.points()
+        obstacles.update(scan_of(changed, pose, stamp), pose)
+        points = obstacles.points()
         assert len(points) >= 4
         assert np.abs(points - [3.0, 3.0]).max() < 0.3  # its near face
-        assert layer.moving(stamp).all() == (stamp < STATIC_AFTER_NS)
+        assert obstacles.moving(stamp).all() == (stamp < STATIC_AFTER_NS)
 
 
-def test_beams_that_measured_nothing_neither_find_nor_clear():
+def test_unmeasured_beams_change_nothing():
     world = load_world("maze")
-    changed, pose, layer = with_box(world, 3.2, 3.0), np.array([1.5, 3.0, 0.0]), TemporaryObstacles(FreeSpace.of(world))
-    layer.update(scan_of(changed, pose, 0), pose)
-    before = layer.points()
+    changed, pose = with_box(world, 3.2, 3.0), np.array([1.5, 3.0, 0.0])
+    obstacles = TemporaryObstacles(FreeSpace.of(world))
+    obstacles.update(scan_of(changed, pose, 0), pose)
+    before = obstacles.points()
     scan = scan_of(world, pose, SECOND // 15)
-    layer.update(scan.model_copy(update={"ranges": np.zeros_like(scan.ranges)}), pose)
-    np.testing.assert_array_equal(layer.points(), before)
+    obstacles.update(scan.model_copy(update={"ranges": np.zeros_like(scan.ranges)}), pose)
+    np.testing.assert_array_equal(obstacles.points(), before)
     assert len(before)
 
 
-def test_what_went_away_is_forgotten_once_a_beam_passes_and_not_before():
+def test_removed_obstacle_is_forgotten_when_a_beam_passes():
     world = load_world("maze")
-    changed, pose, layer = with_box(world, 3.2, 3.0), np.array([1.5, 3.0, 0.0]), TemporaryObstacles(FreeSpace.of(world))
-    layer.update(scan_of(changed, pose, 0), pose)
-    before = layer.points()
-    away = np.array([1.5, 3.0, np.pi])  # the box lies where the scanner does not look
-    layer.update(scan_of(world, away, SECOND), away)
-    np.testing.assert_array_equal(layer.points(), before)
-    layer.update(scan_of(world, pose, 2 * SECOND), pose)
-    assert len(layer.points()) == 0
+    changed, pose = with_box(world, 3.2, 3.0), np.array([1.5, 3.0, 0.0])
+    obstacles = TemporaryObstacles(FreeSpace.of(world))
+    obstacles.update(scan_of(changed, pose, 0), pose)
+    before = obstacles.points()
+    away = np.array([1.5, 3.0, np.pi])  # the box is out of the scanner's view
+    obstacles.update(scan_of(world, away, SECOND), away)
+    np.testing.assert_array_equal(obstacles.points(), before)
+    obstacles.update(scan_of(world, pose, 2 * SECOND), pose)
+    assert len(obstacles.points()) == 0
 
 
-def test_who_walks_stays_moving_and_leaves_no_trail():
-    world, layer, pose = load_world("maze"), None, np.array([1.5, 3.0, 0.0])
-    layer = TemporaryObstacles(FreeSpace.of(world))
+def test_walking_person_stays_moving_and_leaves_no_trail():
+    world, pose = load_world("maze"), np.array([1.5, 3.0, 0.0])
+    obstacles = TemporaryObstacles(FreeSpace.of(world))
     for number in range(30):
         stamp, y = number * SECOND // 15, 2.0 + number / 15
-        layer.update(scan_of(with_box(world, 3.2, y), pose, stamp), pose)
-        assert np.abs(layer.points() - [3.2, y]).max() < 0.45
-        assert layer.moving(stamp).any()
+        obstacles.update(scan_of(with_box(world, 3.2, y), pose, stamp), pose)
+        assert np.abs(obstacles.points() - [3.2, y]).max() < 0.45
+        assert obstacles.moving(stamp).any()
 
 
-def test_out_of_sight_it_is_forgotten_after_a_while_and_when_time_goes_back():
+def test_unseen_obstacle_is_forgotten_after_a_time_or_a_reset():
     world = load_world("maze")
     pose, away = np.array([1.5, 3.0, 0.0]), np.array([1.5, 3.0, np.pi])
-    layer = TemporaryObstacles(FreeSpace.of(world))
-    layer.update(scan_of(with_box(world, 3.2, 3.0), pose, 5 * SECOND), pose)
-    layer.update(scan_of(world, away, 30 * SECOND), away)
-    assert len(layer.points()) == 0
-    layer.update(scan_of(with_box(world, 3.2, 3.0), pose, 31 * SECOND), pose)
-    layer.update(scan_of(world, away, 0), away)
-    assert len(layer.points()) == 0
+    obstacles = TemporaryObstacles(FreeSpace.of(world))
+    obstacles.update(scan_of(with_box(world, 3.2, 3.0), pose, 5 * SECOND), pose)
+    obstacles.update(scan_of(world, away, 30 * SECOND), away)
+    assert len(obstacles.points()) == 0
+    obstacles.update(scan_of(with_box(world, 3.2, 3.0), pose, 31 * SECOND), pose)
+    obstacles.update(scan_of(world, away, 0), away)
+    assert len(obstacles.points()) == 0
 
 
-def test_furniture_out_of_sight_is_kept_for_a_while_and_not_for_ever():
+def test_unseen_furniture_is_kept_for_a_limited_time():
     world = load_world("maze")
     pose, away = np.array([1.5, 3.0, 0.0]), np.array([1.5, 3.0, np.pi])
-    layer = TemporaryObstacles(FreeSpace.of(world))
+    obstacles = TemporaryObstacles(FreeSpace.of(world))
     for half in range(9):
-        layer.update(scan_of(with_box(world, 3.2, 3.0), pose, half * SECOND // 2), pose)
-    layer.update(scan_of(world, away, 14 * SECOND), away)
-    assert len(layer.points()) >= 4
-    layer.update(scan_of(world, away, 29 * SECOND), away)
-    assert len(layer.points()) == 0
+        obstacles.update(scan_of(with_box(world, 3.2, 3.0), pose, half * SECOND // 2), pose)
+    obstacles.update(scan_of(world, away, 14 * SECOND), away)
+    assert len(obstacles.points()) >= 4
+    obstacles.update(scan_of(world, away, 29 * SECOND), away)
+    assert len(obstacles.points()) == 0

@@ -1,4 +1,4 @@
-"""Equation 4 as arithmetic on a belief: gradients against finite differences, and where it leads."""
+"""Equation 4: gradients against finite differences, and convergence."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ parameter_sets = st.builds(
 
 
 @given(pair, pair, pair, st.floats(-np.pi, np.pi), parameter_sets)
-def test_gradient_agrees_with_finite_differences(action, observed, preferred, yaw, parameters):
+def test_gradient_matches_finite_differences(action, observed, preferred, yaw, parameters):
     found = action_gradient(action, observed, preferred, yaw, parameters)
     h = 1e-5
     for axis in range(2):
@@ -46,16 +46,17 @@ def test_each_step_lowers_the_free_energy_of_action(action, observed, preferred,
 
 
 @given(pair, pair, st.floats(-np.pi, np.pi))
-def test_action_settles_at_the_minimum_and_points_to_what_is_preferred(observed, preferred, yaw):
+def test_action_converges_towards_the_preferred_position(observed, preferred, yaw):
     parameters, action = ActionParameters(), np.zeros(2)
     for _ in range(100):
         action = next_action(action, observed, preferred, yaw, parameters)
     in_map = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ action
-    assert in_map == pytest.approx((preferred - observed) / 2, abs=1e-6)  # half: as precise a wish to stand
+    # Half of the way, because the prior on standing still has the same precision.
+    assert in_map == pytest.approx((preferred - observed) / 2, abs=1e-6)
 
 
-def test_the_scan_corrects_the_belief_to_first_order():
-    """Where g is linear, the belief plus H^-1 xi is the truth."""
+def test_scan_corrects_the_belief_to_first_order():
+    """For a linear generative model, the belief plus H^-1 xi is the truth."""
     J = np.random.default_rng(0).normal(size=(50, 3))
     J[:, 2] = 0
     truth, pose = np.array([2.0, 1.0, 0.0]), np.array([1.9, 1.1, 0.0])
@@ -63,10 +64,10 @@ def test_the_scan_corrects_the_belief_to_first_order():
     assert found == pytest.approx(truth[:2], abs=1e-3)
 
 
-def test_without_curvature_or_information_the_belief_stands():
+def test_belief_is_kept_without_curvature_or_information():
     pose = np.array([1.0, 2.0, 0.0])
     assert observed_position(pose, np.array([100.0, 0, 0]), None) == pytest.approx(pose[:2])
-    blind = np.diag([400.0, 0.0, 0.0])  # a bare corridor says nothing along y
+    blind = np.diag([400.0, 0.0, 0.0])  # a bare corridor has no information along y
     found = observed_position(pose, np.array([40.0, 0.0, 0.0]), blind)
     assert found == pytest.approx([1.1, 2.0], abs=1e-3)
 

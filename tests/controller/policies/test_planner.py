@@ -1,4 +1,4 @@
-"""Driving in the simulator's physics with a belief that is the truth: round walls and what no map knows, no contact."""
+"""Driving in the simulator with the true pose as belief: around walls and unmapped obstacles, without contact."""
 
 from __future__ import annotations
 
@@ -28,14 +28,15 @@ def drive(
     world, robot, start, goal, limit=900, *, known=None, change=None, more=None, seed=0, stop=True, scanner=SCANNER,
     seen=None,
 ):  # fmt: skip
-    """Scans until it is there: true poses, statuses, contacts, scans held back. ``known`` is the controller's map.
+    """Drive until the goal is reached. Returns true poses (T, 3), statuses and the number of scans with contact.
 
-    Without ``stop`` nobody holds the wheels back but the controller. ``seen``: what it is shown of a scan.
+    ``known`` is the controller's map, ``stop`` the simulator's obstacle stop, ``change`` a function called before each
+    scan, and ``seen`` a function that changes the scan for the controller. ``more`` are further fields of the goal.
     """
     simulation = Simulation(Setup(world, scanner, robot, start, seed, obstacle_stop=stop))
     navigator = Navigator(robot, world=known or world, preset=GeodesicPolicy(robot, known or world))
     navigator.on_goal(Goal(stamp_ns=0, pose=Pose(x=goal[0], y=goal[1], yaw=(more or {}).pop("yaw", 0)), **(more or {})))
-    poses, said, contacts = [], [], 0
+    poses, statuses, contacts = [], [], 0
     try:
         while simulation.steps < limit:
             if change is not None:
@@ -45,57 +46,57 @@ def drive(
             contacts += truth.contact
             navigator.on_scan(seen(scan) if seen else scan)
             command, status = navigator.step(belief_at(poses[-1], scan.stamp_ns))
-            said.append(status)
+            statuses.append(status)
             if status.state == "reached" and not np.any(simulation.physics.twist().round(3)):
                 break
             simulation.command(scan.stamp_ns, command.twist)
             simulation.advance()
     finally:
         simulation.close()
-    return np.array(poses), said, contacts
+    return np.array(poses), statuses, contacts
 
 
 @pytest.mark.parametrize("kind", DRIVES)
 @pytest.mark.parametrize("name", ["maze", "office"])
-def test_it_goes_round_walls_without_touching_them(name, kind):
+def test_drives_around_walls_without_contact(name, kind):
     world, robot, rng = load_world(name), Robot(drive=kind), np.random.default_rng(3)
     policy = GeodesicPolicy(robot, world)
     for number in range(2):
         start, goal = world.sample_free(2, rng, 0.32)
         field = policy.graph.cost_field(goal)
         shortest = float(np.hypot(*np.diff(field.path(start), axis=0).T).sum())
-        poses, said, contacts = drive(world, robot, (*start, rng.uniform(-np.pi, np.pi)), goal, seed=number)
-        assert said[-1].state == "reached", (start, goal, said[-1])
+        poses, statuses, contacts = drive(world, robot, (*start, rng.uniform(-np.pi, np.pi)), goal, seed=number)
+        assert statuses[-1].state == "reached", (start, goal, statuses[-1])
         assert contacts == 0
         assert np.hypot(*(poses[-1][:2] - goal)) <= 0.2
         assert np.hypot(*np.diff(poses[:, :2], axis=0).T).sum() <= 1.1 * shortest + 0.2
 
 
 @pytest.mark.parametrize("kind", DRIVES)
-def test_a_heading_is_taken_where_one_is_asked_for(kind):
+def test_turns_to_the_heading_of_the_goal(kind):
     world = load_world("corridor")
-    asked = {"yaw": 2.0, "yaw_tolerance": 0.1}
-    poses, said, _ = drive(world, Robot(drive=kind), (3.0, 1.5, 0.0), (5.0, 1.5), more=asked)
-    assert said[-1].state == "reached"
+    heading = {"yaw": 2.0, "yaw_tolerance": 0.1}
+    poses, statuses, _ = drive(world, Robot(drive=kind), (3.0, 1.5, 0.0), (5.0, 1.5), more=heading)
+    assert statuses[-1].state == "reached"
     assert abs(poses[-1][2] - 2.0) <= 0.1
-    turning = [status for status in said if "turning into" in status.reason]
-    assert turning  # and not reached before
+    turning = [status for status in statuses if "turning into" in status.reason]
+    assert turning  # the goal is not reached before the turn ends
     assert {status.state for status in turning} == {"navigating"}
 
 
 @pytest.mark.parametrize("kind", DRIVES)
-def test_a_box_that_no_map_knows_is_gone_round_and_said(kind):
+def test_drives_around_an_unmapped_box(kind):
     world = World(name="hall", boundary=[(0, 0), (10, 0), (10, 5), (0, 5)])
     box = {"name": "box", "box": {"center": (5, 2.5), "size": (0.6, 1.2)}}
     changed = World(name="hall", boundary=world.boundary, obstacles=[box])
-    poses, said, contacts = drive(changed, Robot(drive=kind), (1.5, 2.5, 0.0), (8.5, 2.5), known=world)
-    assert said[-1].state == "reached"
+    poses, statuses, contacts = drive(changed, Robot(drive=kind), (1.5, 2.5, 0.0), (8.5, 2.5), known=world)
+    assert statuses[-1].state == "reached"
     assert contacts == 0
     assert np.abs(poses[:, 1] - 2.5).max() > 0.8
     assert np.hypot(*np.diff(poses[:, :2], axis=0).T).sum() < 9.0
 
 
-def test_a_box_just_put_in_the_way_may_move_until_it_has_stood_for_a_second():
+def test_new_box_counts_as_moving_for_one_second():
     hall = World(name="hall", boundary=[(0, 0), (10, 0), (10, 3), (0, 3)])
     far, near = (Obstacle(name="box", box={"center": (x, 1.5), "size": (0.6, 1.2)}) for x in (9.5, 3.9))
     world = hall.model_copy(update={"obstacles": [far]})
@@ -104,13 +105,13 @@ def test_a_box_just_put_in_the_way_may_move_until_it_has_stood_for_a_second():
         if simulation.steps == 30:
             simulation.change_obstacle("move", "box", near)
 
-    _, said, _ = drive(world, Robot(), (1.5, 1.5, 0.0), (8.5, 1.5), 60, known=hall, change=move)
-    nearby = [status.reason.split(",")[0] for status in said[30:]]
+    _, statuses, _ = drive(world, Robot(), (1.5, 1.5, 0.0), (8.5, 1.5), 60, known=hall, change=move)
+    nearby = [status.reason.split(",")[0] for status in statuses[30:]]
     assert {"waiting: something that may move"} == set(nearby[:15])
     assert not any("may move" in reason for reason in nearby[15:])
 
 
-def test_a_door_that_was_shut_is_said_and_once_it_opens_it_goes_on():
+def test_waits_at_a_closed_door_until_it_opens():
     walls = [
         {"name": "left", "box": {"center": (5, 1), "size": (0.2, 2)}},
         {"name": "right", "box": {"center": (5, 4.1), "size": (0.2, 1.8)}},
@@ -123,16 +124,16 @@ def test_a_door_that_was_shut_is_said_and_once_it_opens_it_goes_on():
         if simulation.steps == 300:
             simulation.change_obstacle("remove", "door", None)
 
-    poses, said, contacts = drive(shut, Robot(), (2.0, 2.5, 0.0), (8.0, 2.5), known=known, change=change)
-    blocked = [status for status in said[:300] if status.state == "blocked"]
+    poses, statuses, contacts = drive(shut, Robot(), (2.0, 2.5, 0.0), (8.0, 2.5), known=known, change=change)
+    blocked = [status for status in statuses[:300] if status.state == "blocked"]
     assert blocked
     assert any("no way" in status.reason for status in blocked)
     assert (poses[:300, 0] < 5).all()
-    assert said[-1].state == "reached"
+    assert statuses[-1].state == "reached"
     assert contacts == 0
 
 
-def test_goals_that_cannot_be_are_refused_with_the_nearest_that_can():
+def test_refusal_names_the_nearest_reachable_place():
     walls = [{"name": "wall", "box": {"center": (5, 2.5), "size": (0.2, 5)}}]
     world = World(name="two", boundary=[(0, 0), (10, 0), (10, 5), (0, 5)], obstacles=walls)
     navigator = Navigator(world=world, preset=GeodesicPolicy(Robot(), world))
@@ -140,7 +141,7 @@ def test_goals_that_cannot_be_are_refused_with_the_nearest_that_can():
     assert (navigator.state, "is inside something" in navigator.reason) == ("blocked", True)
     navigator.on_goal(Goal(stamp_ns=0, pose=Pose(x=0.2, y=2.5)))
     assert "is 0.20 m from a wall; the nearest place that can be reached is (0.35, 2." in navigator.reason
-    # The other room: refused as soon as it is known in which one the robot is.
+    # In the other room: refused as soon as it is known in which room the robot is.
     navigator.on_goal(Goal(stamp_ns=0, pose=Pose(x=8.0, y=2.5)))
     simulation = Simulation(Setup(world, SCANNER, Robot(), (2.0, 2.5, 0.0)))
     try:
@@ -155,8 +156,8 @@ def test_goals_that_cannot_be_are_refused_with_the_nearest_that_can():
 
 
 @pytest.mark.parametrize("kind", DRIVES)
-def test_the_controller_alone_touches_nothing_though_its_map_is_empty(kind):
-    """The base's obstacle stop is off, and every wall within the boundary is a surprise."""
+def test_no_contact_with_an_empty_map_and_no_obstacle_stop(kind):
+    """Every wall within the boundary is unmapped."""
     world, robot, rng = load_world("maze"), Robot(drive=kind), np.random.default_rng(5)
     empty = World(name="empty", boundary=world.boundary)
     fastest = 0.0
@@ -167,11 +168,11 @@ def test_the_controller_alone_touches_nothing_though_its_map_is_empty(kind):
         )
         assert contacts == 0, (start, goal)
         fastest = max(fastest, np.hypot(*np.diff(poses[:, :2], axis=0).T).max() * 15)
-    assert fastest > 0.9  # m/s: there was something to brake
+    assert fastest > 0.9  # m/s, so braking was necessary
 
 
 @pytest.mark.parametrize("kind", DRIVES)
-def test_before_a_closed_door_it_is_blocked_and_backs_off_and_stays_blocked_meanwhile(kind):
+def test_stays_blocked_while_backing_off_from_a_closed_door(kind):
     walls = [
         {"name": "left", "box": {"center": (5, 1), "size": (0.2, 2)}},
         {"name": "right", "box": {"center": (5, 4.1), "size": (0.2, 1.8)}},
@@ -181,16 +182,17 @@ def test_before_a_closed_door_it_is_blocked_and_backs_off_and_stays_blocked_mean
         name="door", boundary=known.boundary,
         obstacles=[*walls, {"name": "door", "box": {"center": (5, 2.6), "size": (0.1, 1.3)}}],
     )  # fmt: skip
-    _, said, contacts = drive(shut, Robot(drive=kind), (2.0, 2.5, 0.0), (8.0, 2.5), known=known, limit=600)
+    _, statuses, contacts = drive(shut, Robot(drive=kind), (2.0, 2.5, 0.0), (8.0, 2.5), known=known, limit=600)
     assert contacts == 0
-    backing = [status for status in said if status.reason == "stuck: backing off"]
+    backing = [status for status in statuses if status.reason == "stuck: backing off"]
     assert {status.state for status in backing} == {"blocked"}
-    blocked = sum(status.state == "blocked" for status in said)
-    assert blocked > 0.4 * (len(said) - 150)  # after ten seconds to go there; between, it goes back to the door
+    blocked = sum(status.state == "blocked" for status in statuses)
+    # The first 150 scans are the way to the door. Between two recoveries the robot returns to the door.
+    assert blocked > 0.4 * (len(statuses) - 150)
 
 
-def test_who_is_held_by_the_limits_alone_is_stuck_too():
-    """A doorway that the plan takes and the limits do not: returns of the scan hold the robot, whatever it wishes."""
+def test_backs_off_if_only_the_limits_stop_the_robot():
+    """As in a doorway that is free for the planner but not for the limits: the velocity stays zero."""
     policy = GeodesicPolicy(Robot(), load_world("corridor"))
     policy.set_goal(np.array([15.0, 1.5]))
     reasons = [
@@ -201,7 +203,7 @@ def test_who_is_held_by_the_limits_alone_is_stuck_too():
 
 
 @pytest.mark.parametrize("kind", DRIVES)
-def test_who_does_not_know_where_it_is_goes_slowly(kind):
+def test_drives_slowly_while_not_localised(kind):
     world, robot = load_world("office"), Robot(drive=kind)
     simulation = Simulation(Setup(world, SCANNER, robot, (6.0, 4.0, 0.0), 0))
     navigator = Navigator(robot, world=world, preset=GeodesicPolicy(robot, world))
