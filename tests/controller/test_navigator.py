@@ -28,9 +28,14 @@ def belief(stamp_ns, pose, state="tracking") -> Belief:
 def scan(stamp_ns, pose, world=ROOM) -> Scan:
     ranges = world.ray_distances(se2.compose(pose, SCANNER.mount)[None], SCANNER.angles())[0]
     return Scan(
-        stamp_ns=stamp_ns, angle_min=SCANNER.angle_min, angle_increment=SCANNER.angle_increment, range_min=0.05,
-        range_max=25.0, ranges=ranges, mount=Pose.of(SCANNER.mount),
-    )  # fmt: skip
+        stamp_ns=stamp_ns,
+        angle_min=SCANNER.angle_min,
+        angle_increment=SCANNER.angle_increment,
+        range_min=0.05,
+        range_max=25.0,
+        ranges=ranges,
+        mount=Pose.of(SCANNER.mount),
+    )
 
 
 def drive(navigator, pose, seconds, world=ROOM):

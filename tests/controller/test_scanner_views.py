@@ -36,10 +36,14 @@ TURNED = {
 def scan_of(scanner, world, pose, stamp_ns=0):
     ranges = world.ray_distances(se2.compose(pose, np.array(scanner.mount))[None], scanner.angles())[0]
     return Scan(
-        stamp_ns=stamp_ns, angle_min=scanner.angle_min, angle_increment=scanner.angle_increment,
-        range_min=scanner.range_min, range_max=scanner.range_max, ranges=scanner.limit(ranges).astype(np.float32),
+        stamp_ns=stamp_ns,
+        angle_min=scanner.angle_min,
+        angle_increment=scanner.angle_increment,
+        range_min=scanner.range_min,
+        range_max=scanner.range_max,
+        ranges=scanner.limit(ranges).astype(np.float32),
         mount=Pose.of(scanner.mount),
-    )  # fmt: skip
+    )
 
 
 def around(view, **more):

@@ -22,10 +22,14 @@ def scan_of(world, pose, stamp_ns, rng=None):
     if rng is not None:
         ranges = ranges + 0.02 * rng.standard_normal(len(ranges))
     return Scan(
-        stamp_ns=stamp_ns, angle_min=SCANNER.angle_min, angle_increment=SCANNER.angle_increment,
-        range_min=SCANNER.range_min, range_max=SCANNER.range_max, ranges=SCANNER.limit(ranges).astype(np.float32),
+        stamp_ns=stamp_ns,
+        angle_min=SCANNER.angle_min,
+        angle_increment=SCANNER.angle_increment,
+        range_min=SCANNER.range_min,
+        range_max=SCANNER.range_max,
+        ranges=SCANNER.limit(ranges).astype(np.float32),
         mount=Pose.of(SCANNER.mount),
-    )  # fmt: skip
+    )
 
 
 def with_box(world, x, y, size=0.4):

@@ -20,9 +20,12 @@ from services.controller.policies.paper_action import (
 number = st.floats(-5, 5)
 pair = st.tuples(number, number).map(np.array)
 parameter_sets = st.builds(
-    ActionParameters, gamma=st.floats(0.01, 0.45), horizon=st.floats(0.2, 2.0), reach=st.floats(0.1, 3.0),
+    ActionParameters,
+    gamma=st.floats(0.01, 0.45),
+    horizon=st.floats(0.2, 2.0),
+    reach=st.floats(0.1, 3.0),
     action_precision=st.floats(0.1, 3.0),
-)  # fmt: skip
+)
 
 
 @given(pair, pair, pair, st.floats(-np.pi, np.pi), parameter_sets)

@@ -19,15 +19,31 @@ DRIVES = ("holonomic", "differential")
 
 def belief_at(pose, stamp_ns, state="tracking", hypotheses=()):
     return Belief(
-        stamp_ns=stamp_ns, state=state, pose=Pose.of(pose), xi=np.zeros(3, np.float32), free_energy=0, accuracy=0,
+        stamp_ns=stamp_ns,
+        state=state,
+        pose=Pose.of(pose),
+        xi=np.zeros(3, np.float32),
+        free_energy=0,
+        accuracy=0,
         hypotheses=list(hypotheses),
-    )  # fmt: skip
+    )
 
 
 def drive(
-    world, robot, start, goal, limit=900, *, known=None, change=None, more=None, seed=0, stop=True, scanner=SCANNER,
+    world,
+    robot,
+    start,
+    goal,
+    limit=900,
+    *,
+    known=None,
+    change=None,
+    more=None,
+    seed=0,
+    stop=True,
+    scanner=SCANNER,
     seen=None,
-):  # fmt: skip
+):
     """Drive until the goal is reached. Returns true poses (T, 3), statuses and the number of scans with contact.
 
     ``known`` is the controller's map, ``stop`` the simulator's obstacle stop, ``change`` a function called before each
@@ -179,9 +195,10 @@ def test_stays_blocked_while_backing_off_from_a_closed_door(kind):
     ]
     known = World(name="door", boundary=[(0, 0), (10, 0), (10, 5), (0, 5)], obstacles=walls)
     shut = World(
-        name="door", boundary=known.boundary,
+        name="door",
+        boundary=known.boundary,
         obstacles=[*walls, {"name": "door", "box": {"center": (5, 2.6), "size": (0.1, 1.3)}}],
-    )  # fmt: skip
+    )
     _, statuses, contacts = drive(shut, Robot(drive=kind), (2.0, 2.5, 0.0), (8.0, 2.5), known=known, limit=600)
     assert contacts == 0
     backing = [status for status in statuses if status.reason == "stuck: backing off"]
