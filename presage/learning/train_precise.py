@@ -20,7 +20,7 @@ from common.robot.base import Robot
 from common.robot.scanner import SCANNERS, Scanner
 from common.versions import commit, versions
 from presage.learning.train_simulated import collect, scanner_on_bus
-from services.estimator.factory import LEAST_SIGMA
+from services.estimator.factory import MIN_SIGMA_M
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.global_seeds import SEED_SPACING_M, thin_places
 from services.estimator.precise.learning import weights
@@ -106,7 +106,7 @@ def _learn(
         angles,
         scans["test"][half:],
         scanner.range_max,
-        max(scanner.sigma, LEAST_SIGMA),
+        max(scanner.sigma, MIN_SIGMA_M),
         scanner.sigma_relative,
     )
     bar.update(task, description="learned", completed=1.0)

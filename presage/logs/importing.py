@@ -29,7 +29,7 @@ from presage.logs.log import Log, LoggedScan, Reading
 from presage.logs.opening import IS_A_RECORDING, kind_of, open_log
 from presage.terminal.output import check_file, write_json
 from presage.terminal.progress import progress, working
-from services.estimator.factory import SIGMA
+from services.estimator.factory import DEFAULT_SIGMA_M
 from services.recorder.files.message_counts import Ledger, as_metadata
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.recording import write_description
@@ -166,7 +166,7 @@ def scanner_of(log: Log, start: float, step: float, period: float, sigma: float 
     try:
         return Scanner(
             name="log", beams=len(log.angles), fov=fov, rate=1 / period if period else 0.0,
-            range_min=log.range_min, range_max=log.range_max, sigma=SIGMA if sigma is None else sigma,
+            range_min=log.range_min, range_max=log.range_max, sigma=DEFAULT_SIGMA_M if sigma is None else sigma,
             mount=(x, y, yaw), first=start,
         )  # fmt: skip
     except ValidationError:

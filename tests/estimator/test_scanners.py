@@ -12,7 +12,7 @@ from common.robot.scanner import SCANNERS, Scanner
 from lab.accuracy import bound, tasks
 from lab.accuracy.runner import quick_field
 from lab.accuracy.scenes import Scene
-from services.estimator.factory import SIGMA, Choice, Geometry, prepare
+from services.estimator.factory import DEFAULT_SIGMA_M, Choice, Geometry, prepare
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.gauss_newton import View, polish
@@ -130,5 +130,5 @@ def test_noise_comes_with_the_scan_unless_it_is_set():
     assert stated.deviation(np.array([5.0, np.inf])) == pytest.approx([0.05, 1e-3], rel=1e-3)
     assert Geometry.of(scanner).likelihood(0.03).deviation(np.array([5.0])) == 0.03
     silent = Geometry(scanner.angles(), np.zeros(3), 12.0)
-    assert silent.likelihood().deviation(np.array([5.0])) == SIGMA
+    assert silent.likelihood().deviation(np.array([5.0])) == DEFAULT_SIGMA_M
     assert not silent.same(Geometry.of(scanner.model_copy(update={"mount": (0.0, 0.0, 0.0)})), bound_to_beams=False)
