@@ -9,13 +9,13 @@ if TYPE_CHECKING:
 
 
 class UserError(Exception):
-    """Shown as one line, without a traceback; the process ends with status 2."""
+    """An error that the user can correct: shown as one line, without a traceback; the process ends with status 2."""
 
 
 def first_fault(error: ValidationError) -> str:
-    """``field.path: what is wrong``, of the first of pydantic's complaints."""
+    """The first error of a validation, as ``field.path: problem``."""
     first = error.errors(include_url=False)[0]
-    what = str(first["msg"])
-    if first["type"] in ("model_type", "model_attributes_type"):  # pydantic would name a class of ours
-        what = f"keys with values are expected, such as {{x: 1, y: 2}}, not {str(first['input'])[:40]!r}"
-    return ": ".join(filter(None, [".".join(map(str, first["loc"])), what]))
+    problem = str(first["msg"])
+    if first["type"] in ("model_type", "model_attributes_type"):  # pydantic's message names an internal class
+        problem = f"expected keys with values, such as {{x: 1, y: 2}}, not {str(first['input'])[:40]!r}"
+    return ": ".join(filter(None, [".".join(map(str, first["loc"])), problem]))

@@ -19,30 +19,30 @@ if TYPE_CHECKING:
     from types import TracebackType
 
 Logger = structlog.stdlib.BoundLogger
-_captured: list[TextIO] = []  # the old stderr, once descriptors were taken over
+_original_stderr: list[TextIO] = []  # the stream in use since stderr was redirected; empty before
 
 
 def begin_logging(service: str, argv: Sequence[str] | None = None) -> None:
-    """Where lines are to be JSON, so from the first one on: what is wrong with the settings is a line too."""
-    words = sys.argv[1:] if argv is None else argv
-    variable = os.environ.get("PRESAGE_LOG_JSON", "").lower() in {"1", "true", "yes", "on", "t", "y"}
-    if "--no-log-json" not in words and ("--log-json" in words or variable):
+    """Set up JSON logging before the settings are read, if they ask for it, so that errors in them are JSON too."""
+    arguments = sys.argv[1:] if argv is None else argv
+    enabled = os.environ.get("PRESAGE_LOG_JSON", "").lower() in {"1", "true", "yes", "on", "t", "y"}
+    if "--no-log-json" not in arguments and ("--log-json" in arguments or enabled):
         set_up_logging(as_json=True, service=service)
 
 
 def report_failure(service: str, error: Exception) -> None:
-    """Why a process ends, in one line."""
-    if _captured:
+    """Log or print, in one line, the error that ends the process."""
+    if _original_stderr:
         logger(service).error(str(error))
     else:
         print(f"{service}: {error}", file=sys.stderr)
 
 
 def set_up_logging(level: str = "info", *, as_json: bool = False, service: str = "", robot: str = "") -> None:
-    """One handler for structlog and for the standard library's loggers (zenoh.handlers reports callbacks there).
+    """Install one handler for structlog and the standard library's loggers (used by zenoh.handlers for callbacks).
 
-    As JSON every line is one object with time, level, service, robot, event: warnings, uncaught exceptions and what
-    native code writes included.
+    With ``as_json``, every line is an object with time, level, service, robot and event, including warnings, uncaught
+    exceptions and the output of native code.
     """
     shared: list[structlog.types.Processor] = [
         structlog.stdlib.add_log_level,
@@ -55,7 +55,7 @@ def set_up_logging(level: str = "info", *, as_json: bool = False, service: str =
     ]
     if as_json:
         renderers = [
-            _of_whom(service, robot),
+            _add_origin(service, robot),
             structlog.processors.format_exc_info,
             structlog.processors.JSONRenderer(serializer=_as_json),
         ]
@@ -74,19 +74,19 @@ def set_up_logging(level: str = "info", *, as_json: bool = False, service: str =
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
 
 
-def _of_whom(service: str, robot: str) -> structlog.types.Processor:
-    """Whose line it is; a line that names a robot itself speaks of that one."""
+def _add_origin(service: str, robot: str) -> structlog.types.Processor:
+    """Processor that adds service and robot to a line, unless it has its own, and puts the keys in order."""
 
     def add(_logger: Any, _method: str, event: structlog.types.EventDict) -> structlog.types.EventDict:
         head = {name: event.pop(name) for name in ("time", "level") if name in event}
-        whose = {"service": event.pop("service", service), "robot": event.pop("robot", robot)}
-        return {**head, **whose, "event": event.pop("event", ""), **event}
+        origin = {"service": event.pop("service", service), "robot": event.pop("robot", robot)}
+        return {**head, **origin, "event": event.pop("event", ""), **event}
 
     return add
 
 
 def _as_json(event: Any, **options: Any) -> str:
-    """One line of JSON; a number that JSON does not know becomes a word."""
+    """One line of JSON; NaN and infinities, which JSON lacks, become strings."""
     try:
         return json.dumps(event, allow_nan=False, **options)
     except ValueError:
@@ -95,17 +95,17 @@ def _as_json(event: Any, **options: Any) -> str:
 
 
 def _json_stream() -> TextIO:
-    """The old stderr; descriptors, warnings and exceptions are led into the log the first time."""
-    if not _captured:
-        _captured.append(capture(_tell))
-        logging.raiseExceptions = False  # a stderr that nobody reads must not feed itself with complaints
+    """The original stderr; the first call redirects file descriptors, warnings and exceptions into the log."""
+    if not _original_stderr:
+        _original_stderr.append(capture(_log_line))
+        logging.raiseExceptions = False  # otherwise errors in writing to stderr would themselves be logged to stderr
         logging.captureWarnings(capture=True)
         sys.excepthook = _uncaught
         threading.excepthook = lambda args: _uncaught(args.exc_type, args.exc_value, args.exc_traceback)
-    return _captured[0]
+    return _original_stderr[0]
 
 
-def _tell(line: Line) -> None:
+def _log_line(line: Line) -> None:
     logging.getLogger(line.logger).log(logging.getLevelName(line.level.upper()), "%s", line.text)
 
 
@@ -120,20 +120,19 @@ def logger(service: str) -> Logger:
 
 
 class LogRateLimiter:
-    """Says yes at most once a second for each subject, and counts what it silenced."""
+    """Allows one log line a second for each subject, and counts those that it suppressed."""
 
     def __init__(self) -> None:
-        """Begin with a yes for everything."""
         self._last: dict[str, float] = {}
-        self.silenced: dict[str, int] = {}
+        self.suppressed: dict[str, int] = {}
 
     def __call__(self, subject: str) -> bool:
-        """Whether it may be said now."""
+        """Whether to log a line about ``subject`` now."""
         now = time.monotonic()
         if now - self._last.get(subject, -1.0) < 1.0:
-            self.silenced[subject] = self.silenced.get(subject, 0) + 1
+            self.suppressed[subject] = self.suppressed.get(subject, 0) + 1
             return False
-        if len(self._last) > 1000:  # hostile keys must not fill memory
+        if len(self._last) > 1000:  # invented keys must not fill memory
             self._last.clear()
         self._last[subject] = now
         return True

@@ -17,15 +17,18 @@ ZENOH = re.compile(r"\d{4}-\d\d-\d\dT\S+\s+(?P<level>[A-Z]+)\s.*?(?P<logger>zeno
 
 @dataclass(frozen=True)
 class Line:
-    """One line of somebody who does not know our log."""
+    """A line that native code wrote to stdout or stderr."""
 
     level: str  # debug, info, warning, error
-    logger: str  # zenoh's module, or the stream it came from
+    logger: str  # zenoh's module, or the name of the stream
     text: str
 
 
 def parse_line(raw: str, stream: str) -> Line | None:
-    """Of zenoh what it says of itself; of others: on stderr a warning, on stdout worth knowing. None: nothing in it."""
+    """Parse a line: zenoh's lines state level and module; others are warnings on stderr and information on stdout.
+
+    Returns None for an empty line.
+    """
     text = COLOUR.sub("", raw).rstrip()
     if (found := ZENOH.fullmatch(text)) is not None:
         level = found["level"].lower()
@@ -33,30 +36,31 @@ def parse_line(raw: str, stream: str) -> Line | None:
     return Line("warning" if stream == "stderr" else "info", stream, text) if text else None
 
 
-def capture(tell: Callable[[Line], None]) -> TextIO:
-    """From now on file descriptors 1 and 2 feed ``tell``, from threads of their own; the stream that is the old stderr.
+def capture(handle: Callable[[Line], None]) -> TextIO:
+    """Redirect file descriptors 1 and 2 to ``handle``, which is called from other threads.
 
-    Python's `print` still reaches the old stdout. What waits is told before the interpreter ends.
+    Returns a stream that writes to the original stderr. Python's `print` still writes to the original stdout. Pending
+    lines are handled before the interpreter exits.
     """
     sys.stdout.flush()
     sys.stderr.flush()
-    old = {"stdout": os.dup(1), "stderr": os.dup(2)}
-    threads = [_follow(number, name, tell) for number, name in ((1, "stdout"), (2, "stderr"))]
-    # Of its own descriptor: `print` is for who asked for the text (--help, the page's link).
-    sys.stdout = os.fdopen(os.dup(old["stdout"]), "w", buffering=1, encoding="utf-8", errors="replace")
+    original = {"stdout": os.dup(1), "stderr": os.dup(2)}
+    threads = [_redirect(number, name, handle) for number, name in ((1, "stdout"), (2, "stderr"))]
+    # `print` keeps its destination: it is used for text that the user requested (--help, the page's link).
+    sys.stdout = os.fdopen(os.dup(original["stdout"]), "w", buffering=1, encoding="utf-8", errors="replace")
 
     def release() -> None:
         sys.stderr.flush()
-        os.dup2(old["stdout"], 1)
-        os.dup2(old["stderr"], 2)
-        for thread in threads:  # the pipe's last writer is gone, unless a child has it
+        os.dup2(original["stdout"], 1)
+        os.dup2(original["stderr"], 2)
+        for thread in threads:  # they end when the last writer closes the pipe; a child process may keep it open
             thread.join(timeout=1.0)
 
     atexit.register(release)
-    return os.fdopen(os.dup(old["stderr"]), "w", buffering=1, encoding="utf-8", errors="backslashreplace")
+    return os.fdopen(os.dup(original["stderr"]), "w", buffering=1, encoding="utf-8", errors="backslashreplace")
 
 
-def _follow(number: int, name: str, tell: Callable[[Line], None]) -> threading.Thread:
+def _redirect(number: int, name: str, handle: Callable[[Line], None]) -> threading.Thread:
     reading, writing = os.pipe()
     os.dup2(writing, number)
     os.close(writing)
@@ -65,7 +69,7 @@ def _follow(number: int, name: str, tell: Callable[[Line], None]) -> threading.T
         with os.fdopen(reading, encoding="utf-8", errors="replace") as lines:
             for raw in lines:
                 if (line := parse_line(raw, name)) is not None:
-                    tell(line)
+                    handle(line)
 
     thread = threading.Thread(target=run, name=f"log-{name}", daemon=True)
     thread.start()

@@ -9,19 +9,20 @@ from collections.abc import Callable
 
 
 def end_with_parent(parent: int, how: int = signal.SIGTERM) -> None:
-    """Linux: end this process by the signal ``how`` when its parent ends, even by SIGKILL.
+    """Make Linux send the signal ``how`` to this process when its parent ends, even if that is killed.
 
-    The kernel looks at the thread that made the child: it has to live as long as the parent.
+    ``parent`` is the parent's process id. The kernel sends the signal when the thread that started this process ends,
+    so that thread has to live as long as the parent.
     """
     pr_set_pdeathsig = 1
     libc = ctypes.CDLL(None, use_errno=True)
     if hasattr(libc, "prctl"):
         libc.prctl(pr_set_pdeathsig, how)
-        if os.getppid() != parent:  # it ended before we asked
+        if os.getppid() != parent:  # the parent ended before the call above
             os._exit(1)
 
 
 def end_with_this_process(how: int = signal.SIGTERM) -> Callable[[], None]:
-    """For a child's ``preexec_fn``."""
+    """A function for ``preexec_fn`` of subprocess.Popen with which the child ends when this process ends."""
     parent = os.getpid()
     return lambda: end_with_parent(parent, how)

@@ -8,8 +8,9 @@ import platform
 import subprocess
 from pathlib import Path
 
-# Of messages, requests and keys. Raised when an older service would misread a newer one's; a new field with a default,
-# a new topic or a new queryable is no reason. Services of different protocols refuse one another (compatibility.py).
+# Version of the messages, requests and keys. Increase it when an older service would misread a newer one's messages; a
+# new field with a default, a new topic or a new queryable does not require it. Services of different protocol versions
+# do not run together (common/runtime/protocol_check.py).
 PROTOCOL = 1
 
 PACKAGES = ("presage", "eclipse-zenoh", "msgpack", "numpy", "pydantic", "mcap", "torch", "pybullet")
@@ -17,7 +18,7 @@ PACKAGES = ("presage", "eclipse-zenoh", "msgpack", "numpy", "pydantic", "mcap", 
 
 @functools.cache
 def commit() -> str:
-    """The checkout's commit, with + where files differ from it; 'unknown' outside a checkout."""
+    """The commit of the checkout, followed by + if files were changed; 'unknown' outside a checkout."""
     root = Path(__file__).resolve().parent.parent
     if not (root / ".git").exists():
         return "unknown"
@@ -32,7 +33,7 @@ def commit() -> str:
 
 @functools.cache
 def versions() -> dict[str, str]:
-    """Versions of Python, presage and the packages that matter, where they are installed."""
+    """Versions of Python and of the installed packages of `PACKAGES`, and the commit."""
     found = {"python": platform.python_version(), "commit": commit()}
     for name in PACKAGES:
         try:

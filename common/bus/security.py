@@ -219,7 +219,8 @@ def credentials(folder: Path, names: Sequence[str], robot: str = "*") -> Credent
         raise UserError(f"{folder}: no such folder (--security, PRESAGE_SECURITY); `presage secure init` creates one")
     raise UserError(
         f"{folder}: no credentials of {' or '.join(map(repr, names))}, "
-        f"but of {', '.join(_stored(folder)) or 'no member'}: choose some with --role, or create more with `presage secure add`"
+        f"but of {', '.join(_stored(folder)) or 'no member'}: "
+        "choose some with --role, or create more with `presage secure add`"
     )
 
 

@@ -1,7 +1,7 @@
 """Exact distances from grid nodes to occupied cells.
 
-The squared distance to a union of squares that lie in rows and columns is separable, as Felzenszwalb and Huttenlocher
-use it (Distance Transforms of Sampled Functions, 2012): first along a column, then the least over the columns.
+The squared distance to a union of grid cells is separable (Felzenszwalb and Huttenlocher, Distance Transforms of
+Sampled Functions, 2012): it is computed along each column first and then minimised over the columns.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
 
 
-def signed_distance(mask: npt.NDArray[np.bool_], x: Array, y: Array, most: float = np.inf) -> Array:
-    """(len(y), len(x)), in cells, from nodes (x[i], y[j]) to the edge of ``mask`` (rows, columns): positive outside it.
+def signed_distance(mask: npt.NDArray[np.bool_], x: Array, y: Array, max_distance: float = np.inf) -> Array:
+    """(len(y), len(x)) distances in cells from nodes (x[i], y[j]) to the edge of ``mask``, positive outside it.
 
-    x and y are in cells from the lower left corner, ascending; what lies off the cells is outside. The distance is
-    not looked for beyond ``most``.
+    ``mask`` has shape (rows, columns); x and y are in cells from its lower left corner, ascending. Everything beyond
+    the mask is outside. Distances are limited to ``max_distance``, which saves time.
     """
     padded = np.pad(mask, 1)
-    outside = _to_cells(padded, x + 1, y + 1, most)
+    outside = _to_cells(padded, x + 1, y + 1, max_distance)
     row, column = np.floor(y + 1).astype(int), np.floor(x + 1).astype(int)
     rows, columns = padded.shape
     inside = np.ix_((row >= 0) & (row < rows), (column >= 0) & (column < columns))
-    into = np.zeros_like(outside)
+    depth = np.zeros_like(outside)
     x, y = x[inside[1][0]] + 1, y[inside[0][:, 0]] + 1
-    into[inside] = _to_cells(~padded, x, y, most)
-    return outside - into
+    depth[inside] = _to_cells(~padded, x, y, max_distance)
+    return outside - depth
 
 
-def inner_distance(mask: npt.NDArray[np.bool_], x: Array, y: Array, most: float = np.inf) -> Array:
-    """(len(y), len(x)), in cells, from nodes on the cells to the nearest place outside ``mask``; 0 outside it."""
-    return _to_cells(~np.pad(mask, 1), x + 1, y + 1, most)
+def inner_distance(mask: npt.NDArray[np.bool_], x: Array, y: Array, max_distance: float = np.inf) -> Array:
+    """(len(y), len(x)) distances in cells from nodes on the grid to the nearest point outside ``mask``; 0 outside."""
+    return _to_cells(~np.pad(mask, 1), x + 1, y + 1, max_distance)
 
 
-def _to_cells(mask: npt.NDArray[np.bool_], x: Array, y: Array, most: float) -> Array:
-    """(len(y), len(x)) to the nearest True cell, 0 in one; ``most`` where none is so near."""
+def _to_cells(mask: npt.NDArray[np.bool_], x: Array, y: Array, max_distance: float) -> Array:
+    """(len(y), len(x)) distances to the nearest True cell, 0 inside one, at most ``max_distance``."""
     along = _along_columns(mask, y)  # (columns, len(y))
-    nearest = np.full((len(x), len(y)), float(most) ** 2)
+    nearest = np.full((len(x), len(y)), float(max_distance) ** 2)
     if not len(x) or not len(y):
         return np.asarray(np.sqrt(nearest.T))
     column = np.floor(x).astype(int)
@@ -50,8 +50,8 @@ def _to_cells(mask: npt.NDArray[np.bool_], x: Array, y: Array, most: float) -> A
     while len(active) and step <= furthest:
         for side in (-step, step) if step else (0,):
             candidate = column[active] + side
-            there = (candidate >= 0) & (candidate < len(along))
-            nodes, candidate = active[there], candidate[there]
+            exists = (candidate >= 0) & (candidate < len(along))
+            nodes, candidate = active[exists], candidate[exists]
             gap = np.maximum(np.maximum(candidate - x[nodes], x[nodes] - candidate - 1), 0.0)
             nearest[nodes] = np.minimum(nearest[nodes], along[candidate] + gap[:, None] ** 2)
         # The next columns are at least `step` away.
@@ -61,14 +61,14 @@ def _to_cells(mask: npt.NDArray[np.bool_], x: Array, y: Array, most: float) -> A
 
 
 def _along_columns(mask: npt.NDArray[np.bool_], y: Array) -> Array:
-    """(columns, len(y)) squared distance along the column to its nearest True cell; +inf where it has none."""
-    rows, nowhere = len(mask), 10**7
+    """(columns, len(y)) squared distances along a column to its nearest True cell; +inf if it has none."""
+    rows, no_cell = len(mask), 10**7
     number = np.arange(rows)[:, None]
-    below = np.maximum.accumulate(np.where(mask, number, -nowhere), axis=0)
-    above = np.minimum.accumulate(np.where(mask, number, nowhere)[::-1], axis=0)[::-1]
+    below = np.maximum.accumulate(np.where(mask, number, -no_cell), axis=0)
+    above = np.minimum.accumulate(np.where(mask, number, no_cell)[::-1], axis=0)[::-1]
     row = np.clip(np.floor(y).astype(int), 0, rows - 1)
     height = y[:, None]
     down = np.where(height >= 0, np.maximum(height - below[row] - 1, 0.0), np.inf)
     up = np.where(height < rows, np.maximum(above[row] - height, 0.0), np.inf)
     gap = np.minimum(down, up)
-    return np.ascontiguousarray(np.where(gap < nowhere // 2, gap, np.inf).T ** 2)
+    return np.ascontiguousarray(np.where(gap < no_cell // 2, gap, np.inf).T ** 2)

@@ -1,7 +1,7 @@
 """An occupancy grid: free, occupied and unknown cells, and the geometry derived from them.
 
-Occupied cells are squares: a beam ends where it meets the first one. Unknown cells stop no beam, but nobody may be in
-them. What follows from the cells is computed once for a map, however many worlds are made of it.
+Occupied cells are squares, and a beam ends at the first one it meets. Unknown cells do not stop beams, but no robot may
+be in them. Geometry derived from the cells is cached for each map, also if several worlds share the map.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 Cells = npt.NDArray[np.uint8]
 
-FREE, OCCUPIED, UNKNOWN = 0, 100, 255  # as in nav_msgs/OccupancyGrid, whose -1 is 255 in a byte without a sign
+FREE, OCCUPIED, UNKNOWN = 0, 100, 255  # as in nav_msgs/OccupancyGrid, whose -1 is 255 in an unsigned byte
 MAX_CELLS = 16_000_000  # 4000 by 4000
-KEPT = 4  # maps whose shapes are remembered
+CACHED_MAPS = 4
 
 
 class OccupancyGrid(BaseModel):
@@ -40,16 +40,19 @@ class OccupancyGrid(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    width: Annotated[int, Field(ge=1, le=MAX_CELLS)]  # cells along the map's own x
-    height: Annotated[int, Field(ge=1, le=MAX_CELLS)]  # cells along its y
-    resolution: Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e3)]  # m, a cell's edge
-    origin: tuple[Coordinate, Coordinate, Angle]  # m, m, rad: lower left corner of the first cell, in map
+    width: Annotated[int, Field(ge=1, le=MAX_CELLS)]  # cells along the grid's x axis
+    height: Annotated[int, Field(ge=1, le=MAX_CELLS)]  # cells along its y axis
+    resolution: Annotated[float, Field(allow_inf_nan=False, gt=0, le=1e3)]  # m, edge length of a cell
+    origin: tuple[Coordinate, Coordinate, Angle]  # x m, y m, yaw rad in map of the first cell's lower left corner
     cells: Annotated[str, Field(max_length=4 * MAX_CELLS)]
-    # base64 of zlib of a byte a cell, row by row from the lower left: 0 free, 100 occupied, 255 unknown
+    # one byte per cell, row by row from the lower left, zlib, base64: 0 free, 100 occupied, 255 unknown
 
     @classmethod
     def of(cls, values: Cells, resolution: float, origin: tuple[float, float, float]) -> OccupancyGrid:
-        """From (rows, columns) of FREE, OCCUPIED, UNKNOWN, the lowest row first; ValueError for other values."""
+        """Create a grid from cells (rows, columns) of FREE, OCCUPIED and UNKNOWN, lowest row first.
+
+        Raises ValueError for other values.
+        """
         packed = base64.b64encode(zlib.compress(np.ascontiguousarray(values, np.uint8).tobytes())).decode()
         height, width = values.shape
         return cls(width=width, height=height, resolution=resolution, origin=origin, cells=packed)
@@ -63,44 +66,44 @@ class OccupancyGrid(BaseModel):
 
     @property
     def values(self) -> Cells:
-        """(height, width) of FREE, OCCUPIED, UNKNOWN, the lowest row first; read-only."""
+        """(height, width) cells of FREE, OCCUPIED and UNKNOWN, lowest row first; read-only."""
         return _unpacked(self.cells, self.width, self.height)
 
     @property
     def shapes(self) -> GridShapes:
-        """What follows from the cells."""
+        """Geometry derived from the cells."""
         return _shapes(self)
 
     def corners(self) -> list[tuple[float, float]]:
-        """The map's edge, counter-clockwise, m in map; no wall."""
-        wide, high = self.width * self.resolution, self.height * self.resolution
-        x, y = self.to_map(np.array([[0, 0], [wide, 0], [wide, high], [0, high]])).T.tolist()
+        """Corners of the grid in m in map, counter-clockwise. Its edge is not a wall."""
+        width, height = self.width * self.resolution, self.height * self.resolution
+        x, y = self.to_map(np.array([[0, 0], [width, 0], [width, height], [0, height]])).T.tolist()
         return list(zip(x, y, strict=True))
 
     def to_map(self, points: npt.ArrayLike) -> Array:
-        """(N, 2) m in map of points (N, 2) m from the map's lower left corner, along its edges."""
+        """Transform points (N, 2) in m from the grid's frame, with origin at its lower left corner, to map."""
         x, y, yaw = self.origin
         moved: Array = (rotate(yaw, points) if yaw else np.asarray(points, float)) + np.array([x, y])
         return moved
 
     def from_map(self, points: Array) -> Array:
-        """The inverse of `to_map`."""
+        """Inverse of `to_map`."""
         x, y, yaw = self.origin
         moved = np.asarray(points, float) - np.array([x, y])
         return rotate(-yaw, moved) if yaw else moved
 
     def at(self, points: Array) -> Cells:
-        """(N,) the cells that points (N, 2) m in map lie in; UNKNOWN off the map."""
+        """(N,) values of the cells at points (N, 2) in m in map; UNKNOWN outside the grid."""
         column, row = np.floor(self.from_map(points) / self.resolution).astype(int).T
-        on = (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
-        found = np.full(len(on), UNKNOWN, np.uint8)
-        found[on] = self.values[row[on], column[on]]
+        inside = (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
+        found = np.full(len(inside), UNKNOWN, np.uint8)
+        found[inside] = self.values[row[inside], column[inside]]
         return found
 
 
-@functools.lru_cache(KEPT)
+@functools.lru_cache(CACHED_MAPS)
 def _unpacked(packed: str, width: int, height: int) -> Cells:
-    """Raises ValueError where the text is not this many cells; it never becomes more bytes than they are."""
+    """Decode cells; raises ValueError if they are invalid. Never decompresses more bytes than there are cells."""
     reader, count = zlib.decompressobj(), width * height
     try:
         plain = reader.decompress(base64.b64decode(packed, validate=True), count)
@@ -114,21 +117,21 @@ def _unpacked(packed: str, width: int, height: int) -> Cells:
     return values
 
 
-@functools.lru_cache(KEPT)
+@functools.lru_cache(CACHED_MAPS)
 def _shapes(grid: OccupancyGrid) -> GridShapes:
     return GridShapes(grid)
 
 
 @dataclass(frozen=True, eq=False)
 class GridShapes:
-    """Geometry of one map, made when it is first asked for."""
+    """Geometry of one grid, computed when it is first used."""
 
     grid: OccupancyGrid
-    _trees: dict[int, shapely.STRtree] = field(default_factory=dict)  # of the edges of the cells of a kind
+    _trees: dict[int, shapely.STRtree] = field(default_factory=dict)  # by cell value: outlines of cells with that value
 
     @functools.cached_property
     def walls(self) -> Array:
-        """(S, 4) x0, y0, x1, y1 in m in map: the faces of occupied cells, those in line and side by side as one."""
+        """(S, 4) x0, y0, x1, y1 in m in map of the occupied cells' outlines; collinear edges are merged."""
         return self._in_map(outline(self.grid.values == OCCUPIED))
 
     @functools.cached_property
@@ -138,16 +141,16 @@ class GridShapes:
         faces = shapely.get_parts(shapely.polygonize(_lines(outline(free).astype(float))))
         column, row = np.floor(shapely.get_coordinates(shapely.point_on_surface(faces))).astype(int).T.reshape(2, -1)
         local = shapely.multipolygons(faces[free[row, column]])
-        turned: shapely.Geometry = shapely.transform(local, lambda at: self.grid.to_map(at * self.grid.resolution))
-        return turned
+        in_map: shapely.Geometry = shapely.transform(local, lambda at: self.grid.to_map(at * self.grid.resolution))
+        return in_map
 
     @functools.cached_property
     def rays(self) -> CellRays:
-        """Where beams end."""
+        """Ray caster against the occupied cells."""
         return CellRays(self.grid.values == OCCUPIED)
 
     def ray_distances(self, poses: Array, angles: Array) -> Array:
-        """(N, B) m from poses (N, 3) in map along ``angles`` (B,) to occupied cells; +inf where none is hit."""
+        """(N, B) distances in m from poses (N, 3) in map along ``angles`` (B,) to occupied cells, or +inf."""
         grid = self.grid
         x, y = np.repeat(grid.from_map(poses[:, :2]) / grid.resolution, len(angles), axis=0).T
         heading = (poses[:, 2:3] + angles - grid.origin[2]).ravel()
@@ -155,8 +158,8 @@ class GridShapes:
         return (found * grid.resolution).reshape(len(poses), len(angles))
 
     def distance(self, kind: int, points: Array) -> Array:
-        """(N,) m from points (N, 2) in map to the edge of the cells of a kind; negative within them."""
-        within = self.grid.at(points) == kind
+        """(N,) distances in m from points (N, 2) in map to the edge of the cells of value ``kind``; negative inside."""
+        inside = self.grid.at(points) == kind
         if kind not in self._trees:
             self._trees[kind] = shapely.STRtree(_lines(self._in_map(outline(self.grid.values == kind))))
         away = np.full(len(points), np.inf)
@@ -165,19 +168,22 @@ class GridShapes:
                 shapely.points(points), return_distance=True, all_matches=False
             )
             away[found[0]] = distance
-        return np.where(within, -away, away)
+        return np.where(inside, -away, away)
 
-    def lattice_distances(self, kind: int, x: Array, y: Array, most: float = np.inf) -> Array:
-        """(len(y), len(x)) m: `distance` of nodes in map, ascending, as far as ``most``; fast on a map not turned."""
+    def lattice_distances(self, kind: int, x: Array, y: Array, max_distance: float = np.inf) -> Array:
+        """(len(y), len(x)) `distance` in m at the nodes x, y of a lattice in map, which are ascending.
+
+        Distances are limited to ``max_distance``. It is fast if the grid is not rotated in map.
+        """
         grid = self.grid
         if grid.origin[2]:
             nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-            return np.clip(self.distance(kind, nodes).reshape(len(y), len(x)), -most, most)
+            return np.clip(self.distance(kind, nodes).reshape(len(y), len(x)), -max_distance, max_distance)
         x, y = (x - grid.origin[0]) / grid.resolution, (y - grid.origin[1]) / grid.resolution
-        return signed_distance(grid.values == kind, x, y, most / grid.resolution) * grid.resolution
+        return signed_distance(grid.values == kind, x, y, max_distance / grid.resolution) * grid.resolution
 
     def cells_with_clearance(self, clearance: float) -> npt.NDArray[np.int_]:
-        """(K, 2) column and row of the free cells with ``clearance`` m or more from middle to edge of free space."""
+        """(K, 2) column and row of free cells whose centre is at least ``clearance`` m from the edge of free space."""
         free, size = self.grid.values == FREE, self.grid.resolution
         if clearance <= size / 2:
             return np.argwhere(free)[:, ::-1]
@@ -185,7 +191,10 @@ class GridShapes:
         return np.argwhere(inner_distance(free, x, y, clearance / size + 1) * size >= clearance)[:, ::-1]
 
     def points_in_cells(self, cells: npt.NDArray[np.int_], shares: npt.ArrayLike) -> Array:
-        """(N, 2) m in map, at ``shares`` (N, 2) of the edges of cells (N, 2) column, row."""
+        """(N, 2) points in m in map inside cells (N, 2) column, row.
+
+        ``shares`` (N, 2), from 0 to 1, are the positions along the cell's edges; 0.5 is its centre.
+        """
         return self.grid.to_map((cells + np.asarray(shares)) * self.grid.resolution)
 
     def _in_map(self, runs: npt.NDArray[np.int_]) -> Array:
@@ -193,9 +202,9 @@ class GridShapes:
 
 
 def outline(mask: Mask) -> npt.NDArray[np.int_]:
-    """(S, 4) x0, y0, x1, y1 in cells: where ``mask`` (rows, columns) and the rest meet, whole straight pieces.
+    """(S, 4) x0, y0, x1, y1 in cells of the edges of a mask (rows, columns), with collinear edges merged.
 
-    Pieces meet at their ends alone: where two cells touch with a corner, they end.
+    Segments meet only at their ends: where two cells touch at a corner, segments end there.
     """
     padded = np.pad(mask, 1).astype(np.int8)
     line, begin, end = _runs(np.diff(padded, axis=0))
@@ -205,9 +214,9 @@ def outline(mask: Mask) -> npt.NDArray[np.int_]:
 
 
 def _runs(step: npt.NDArray[np.int8]) -> tuple[npt.NDArray[np.int_], npt.NDArray[np.int_], npt.NDArray[np.int_]]:
-    """Line, begin and end of the runs of equal steps up or down in padded cells."""
-    nothing = np.zeros((len(step), 1), np.int8)
-    edged = np.hstack([nothing, step, nothing])
+    """Line, begin and end of the runs of equal nonzero steps, in coordinates of the cells before padding."""
+    zeros = np.zeros((len(step), 1), np.int8)
+    edged = np.hstack([zeros, step, zeros])
     before, after = edged[:, :-1], edged[:, 1:]
     changes = before != after
     line, begin = np.nonzero(changes & (after != 0))
@@ -216,5 +225,5 @@ def _runs(step: npt.NDArray[np.int8]) -> tuple[npt.NDArray[np.int_], npt.NDArray
 
 
 def _lines(segments: Array) -> npt.NDArray[np.object_]:
-    """(S,) from (S, 4)."""
+    """(S,) shapely lines from segments (S, 4)."""
     return np.asarray(shapely.linestrings(segments.reshape(-1, 2, 2)))

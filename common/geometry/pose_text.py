@@ -11,14 +11,14 @@ from common.geometry.se2 import Array
 from common.limits import MAX_COORDINATE_M
 
 NUMBER = r"-?(\d{1,9}\.?\d*|\.\d+)"
-POSE_TEXT = rf"^$|^{NUMBER},{NUMBER}(,{NUMBER})?$"  # or nothing
+POSE_TEXT = rf"^$|^{NUMBER},{NUMBER}(,{NUMBER})?$"  # or empty
 
 
 def pose_of_text(text: str, option: str) -> Array:
-    """(3,) m, m, rad; without the yaw it is 0. Raises UserError naming ``option``."""
+    """(3,) x, y in m and yaw in rad, which defaults to 0. Raises UserError, naming ``option``, for invalid text."""
     if not text or not re.fullmatch(POSE_TEXT, text):
         raise UserError(f"{option} {text!r}: give x,y[,yaw_deg] in m and degrees, such as 0.2,0,180")
     x, y, *yaw = (float(part) for part in text.split(","))
     if max(abs(x), abs(y)) > MAX_COORDINATE_M:
-        raise UserError(f"{option} {text!r}: x and y are within {MAX_COORDINATE_M:g} m of the origin")
+        raise UserError(f"{option} {text!r}: x and y must be within {MAX_COORDINATE_M:g} m of the origin")
     return np.array([x, y, np.deg2rad(yaw[0]) if yaw else 0.0])

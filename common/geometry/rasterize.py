@@ -14,11 +14,13 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import World
 
-CELL, MAX_CELLS = 0.05, 4_000_000  # m; larger worlds get larger cells
+CELL_M, MAX_CELLS = 0.05, 4_000_000  # worlds that would need more cells get larger ones
 
 
-def classify_points(world: World, x: Array, y: Array, cell: float) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
-    """Which places x, y (rows, columns) m are free, and which are drawn as walls and furniture."""
+def classify_points(
+    world: World, x: Array, y: Array, cell: float
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """Masks (rows, columns) of the points x, y in m: those that are free, and those drawn as walls or furniture."""
     if world.grid is not None:
         values = world.grid.at(np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(x.shape)
         covered = shapely.contains_xy(world.furniture, x, y)
@@ -28,20 +30,25 @@ def classify_points(world: World, x: Array, y: Array, cell: float) -> tuple[npt.
     return free, shapely.contains_xy(around, x, y) & ~free
 
 
-def cell_centres(world: World, finest: float = CELL) -> tuple[tuple[float, float], float, Array, Array]:
-    """Lower left corner (m), edge of a cell (m), and x, y (rows, columns) m of cells all over a world and its walls."""
+def cell_centres(world: World, min_cell: float = CELL_M) -> tuple[tuple[float, float], float, Array, Array]:
+    """A grid over a world and its walls.
+
+    Returns its lower left corner in m, the edge length of a cell in m, and x and y of the cells' centres, (rows,
+    columns) in m.
+    """
     x0, y0, x1, y1 = world.bounds
-    cell = max(finest, float(np.sqrt((x1 - x0) * (y1 - y0) / MAX_CELLS)))
+    cell = max(min_cell, float(np.sqrt((x1 - x0) * (y1 - y0) / MAX_CELLS)))
     x0, y0 = x0 - 2 * cell, y0 - 2 * cell
     columns, rows = int(np.ceil((x1 - x0) / cell)) + 2, int(np.ceil((y1 - y0) / cell)) + 2
     x, y = np.meshgrid(x0 + cell * (np.arange(columns) + 0.5), y0 + cell * (np.arange(rows) + 0.5))
     return (x0, y0), cell, x, y
 
 
-def rasterise(world: World, cell: float = CELL) -> OccupancyGrid:
-    """A ROS map's own cells, with what furniture covers of them; else a map of the polygons, unknown outside them.
+def rasterise(world: World, cell: float = CELL_M) -> OccupancyGrid:
+    """Occupancy grid of a world; cells outside its walls are unknown.
 
-    Nothing is too thin for a cell: what lies within half a cell of a middle is there.
+    A world with a ROS map keeps the map's cells. Furniture occupies all cells with centres within half a cell of it, so
+    that thin pieces are not lost.
     """
     if world.grid is not None:
         grid = world.grid

@@ -1,7 +1,7 @@
 """Reads a ROS map (map.yaml and its image) by the rules of nav2's map_server.
 
-How dark a pixel is says how sure it is that something stands there; the mode says what becomes of it. Where map_server
-leaves a percentage between free and occupied, presage has to say what that is: see `_percent`.
+A darker pixel is more likely to be occupied; the mode defines how it is interpreted. map_server may leave a percentage
+between free and occupied, for which presage has to decide: see `cells`.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ if TYPE_CHECKING:
     from common.geometry.occupancy_grid import Cells
     from common.geometry.se2 import Array
 
-SAVED = (0, 205, 254)  # what map_saver paints in mode trinary: occupied, unknown, free
+MAP_SAVER_GREYS = (0, 205, 254)  # of map_saver's trinary images: occupied, unknown, free
 IMAGES = {".pgm", ".png", ".bmp"}
-OWN = ("name", "start", "obstacles")  # keys map_server does not know; presage's own, as in its world files
+WORLD_KEYS = ("name", "start", "obstacles")  # presage's additional keys, as in world files; map_server ignores them
 
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class MapFile(BaseModel):
-    """The keys of map.yaml; others are not looked at, as map_server does not. Defaults are map_saver's."""
+    """The keys of map.yaml, with map_saver's defaults; others are ignored, as by map_server."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
-    image: Annotated[str, Field(min_length=1)]  # path, from the folder of map.yaml
-    resolution: Annotated[float, Field(gt=0, le=1e3)]  # m, a pixel's edge
-    origin: tuple[Coordinate, Coordinate, Angle]  # m, m, rad: lower left corner of the lower left pixel
+    image: Annotated[str, Field(min_length=1)]  # path, relative to the folder of map.yaml
+    resolution: Annotated[float, Field(gt=0, le=1e3)]  # m, edge length of a pixel
+    origin: tuple[Coordinate, Coordinate, Angle]  # x m, y m, yaw rad of the lower left pixel's lower left corner
     negate: bool = False  # white is occupied
-    occupied_thresh: Share = 0.65  # darker is occupied
-    free_thresh: Share = 0.25  # lighter is free
+    occupied_thresh: Share = 0.65  # darker pixels are occupied
+    free_thresh: Share = 0.25  # lighter pixels are free
     mode: Literal["trinary", "scale", "raw"] = "trinary"
 
     @field_validator("mode", mode="before")
@@ -57,71 +57,75 @@ class MapFile(BaseModel):
     @model_validator(mode="after")
     def _in_order(self) -> MapFile:
         if self.free_thresh >= self.occupied_thresh:
-            raise ValueError(f"free_thresh {self.free_thresh:g} is not below occupied_thresh {self.occupied_thresh:g}")
+            raise ValueError(f"free_thresh {self.free_thresh:g} must be below occupied_thresh {self.occupied_thresh:g}")
         return self
 
 
 def is_map(data: object) -> bool:
-    """Whether YAML's ``data`` are meant as a ROS map and no world."""
+    """Whether the contents of a YAML file are a ROS map and not a world."""
     return isinstance(data, dict) and bool({"image", "resolution"} & data.keys()) and "boundary" not in data
 
 
 def read_map(path: Path, data: dict[str, Any]) -> dict[str, Any]:
-    """The fields of the World that map.yaml at ``path``, its keys in ``data``, describes; or UserError."""
+    """Fields of the World for the ROS map ``path``, whose contents are ``data``.
+
+    Raises UserError if the keys or the image are invalid.
+    """
     try:
-        described = MapFile.model_validate(data)
+        map_file = MapFile.model_validate(data)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         raise UserError(f"map {path}: {'.'.join(map(str, first['loc'])) or 'file'}: {first['msg']}") from None
-    image = path.parent / described.image
-    brightness, alpha = _pixels(image)
-    grid = OccupancyGrid.of(cells(described, brightness, alpha)[::-1], described.resolution, described.origin)
+    image = path.parent / map_file.image
+    colours, alpha = _pixels(image)
+    grid = OccupancyGrid.of(cells(map_file, colours, alpha)[::-1], map_file.resolution, map_file.origin)
     name = re.sub(r"[^\w.-]+", "-", path.resolve().stem)
-    return {"name": name, **{key: data[key] for key in OWN if key in data}, "grid": grid}
+    return {"name": name, **{key: data[key] for key in WORLD_KEYS if key in data}, "grid": grid}
 
 
-def cells(described: MapFile, colours: Array, alpha: Array | None) -> Cells:
-    """(H, W) FREE, OCCUPIED, UNKNOWN of ``colours`` (H, W, C) and ``alpha`` (H, W), 0 to 1; rows as in the image.
+def cells(map_file: MapFile, colours: Array, alpha: Array | None) -> Cells:
+    """(H, W) cells FREE, OCCUPIED or UNKNOWN, with rows as in the image.
 
-    Where map_server leaves a percentage: of mode scale 0 is free, 100 occupied, and the rest unknown, as AMCL takes it;
-    of mode raw the thresholds decide.
+    ``colours`` (H, W, C) and ``alpha`` (H, W) are from 0 to 1. Percentages of map_server are interpreted as follows: in
+    mode scale, 0 is free, 100 is occupied and everything between is unknown, as in AMCL; in mode raw, the thresholds
+    are used.
     """
-    percent = percentages(described, colours, alpha)
-    low, high = (100 * described.free_thresh, 100 * described.occupied_thresh) if described.mode == "raw" else (1, 99)
+    percent = percentages(map_file, colours, alpha)
+    low, high = (100 * map_file.free_thresh, 100 * map_file.occupied_thresh) if map_file.mode == "raw" else (1, 99)
     found = np.where(percent > high, OCCUPIED, np.where((percent >= 0) & (percent < low), FREE, UNKNOWN))
-    if described.mode == "trinary" and not described.negate and alpha is None:
-        # map_saver of 2025 and before wrote free_thresh 0.25, by which its own grey for unknown, 205, would be free.
+    if map_file.mode == "trinary" and not map_file.negate and alpha is None:
+        # Until 2025 map_saver wrote free_thresh 0.25, with which its own grey for unknown, 205, would be free.
         grey = np.rint(colours.mean(axis=-1) * 255)
-        if np.isin(grey, SAVED).all():
-            found[grey == SAVED[1]] = UNKNOWN
+        if np.isin(grey, MAP_SAVER_GREYS).all():
+            found[grey == MAP_SAVER_GREYS[1]] = UNKNOWN
     return found.astype(np.uint8)
 
 
-def percentages(described: MapFile, colours: Array, alpha: Array | None) -> npt.NDArray[np.int_]:
-    """(H, W) what map_server publishes: 0 to 100, or -1 for unknown."""
-    if described.mode == "trinary" and alpha is not None:
-        colours = np.concatenate([colours, alpha[..., None]], axis=-1)  # one more colour to map_server
+def percentages(map_file: MapFile, colours: Array, alpha: Array | None) -> npt.NDArray[np.int_]:
+    """(H, W) occupancy as map_server publishes it: 0 to 100, or -1 for unknown. Arguments as of `cells`."""
+    if map_file.mode == "trinary" and alpha is not None:
+        colours = np.concatenate([colours, alpha[..., None]], axis=-1)  # map_server averages alpha like a colour
     shade = colours.mean(axis=-1)
-    if described.mode == "raw":
+    if map_file.mode == "raw":
         raw = np.rint(shade * 255)
         return np.where(raw <= 100, raw, -1).astype(int)
-    low, high = described.free_thresh, described.occupied_thresh
-    dark = shade if described.negate else 1.0 - shade
-    between = np.rint((dark - low) / (high - low) * 100) if described.mode == "scale" else -1
+    low, high = map_file.free_thresh, map_file.occupied_thresh
+    dark = shade if map_file.negate else 1.0 - shade
+    between = np.rint((dark - low) / (high - low) * 100) if map_file.mode == "scale" else -1
     percent = np.where(dark > high, 100, np.where(dark < low, 0, between))
-    if described.mode == "scale" and alpha is not None:
+    if map_file.mode == "scale" and alpha is not None:
         percent[alpha < 1] = -1
     return percent.astype(int)
 
 
 def _pixels(path: Path) -> tuple[Array, Array | None]:
-    """Colours (H, W, C) and alpha (H, W) or None, 0 to 1."""
+    """Colours (H, W, C) and alpha (H, W) of an image file, from 0 to 1; alpha is None if it has none."""
     try:
-        # Only who reads an image needs it.
+        # Imported here because Pillow is an optional dependency.
         from PIL import Image, UnidentifiedImageError  # noqa: PLC0415
     except ImportError:
         raise UserError(f"map image {path}: reading it needs the package Pillow: pip install pillow") from None
-    if path.exists() and not path.is_file():  # opening a pipe would wait for its other end
+    if path.exists() and not path.is_file():  # opening a pipe would block
         raise UserError(f"map image {path}: not a file but a folder, a pipe or a device")
     try:
         with Image.open(path) as image:
@@ -130,18 +134,20 @@ def _pixels(path: Path) -> tuple[Array, Array | None]:
                     f"map image {path}: {image.width} x {image.height} pixels are more than {MAX_CELLS}; "
                     "crop it, or scale it down and make the resolution coarser"
                 )
-            return _shares(image)
+            return _normalised(image)
     except FileNotFoundError:
-        raise UserError(f"map image {path}: no such file (image: in map.yaml is a path from its folder)") from None
+        raise UserError(
+            f"map image {path}: no such file (the path image: in map.yaml is relative to its folder)"
+        ) from None
     except UnidentifiedImageError:
-        raise UserError(f"map image {path}: no image; PGM, PNG and BMP are read") from None
+        raise UserError(f"map image {path}: not an image; use PGM, PNG or BMP") from None
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, Warning) as error:
         raise UserError(f"map image {path}: cannot be read ({' '.join(str(error).split())})") from None
 
 
-def _shares(image: Image) -> tuple[Array, Array | None]:
-    """Of an image of any kind."""
-    if image.mode.startswith(("I", "F")):  # 16 bits a pixel
+def _normalised(image: Image) -> tuple[Array, Array | None]:
+    """Colours and alpha as of `_pixels`, for an image of any pixel type."""
+    if image.mode.startswith(("I", "F")):  # 16 bits per pixel
         return np.asarray(image, float)[..., None] / 65535, None
     wanted = "RGBA" if image.has_transparency_data else "RGB"
     values = np.asarray(image if image.mode in {"L", wanted} else image.convert(wanted), np.uint8)

@@ -9,15 +9,15 @@ Array = npt.NDArray[np.float64]
 
 
 def wrap(angle: npt.ArrayLike) -> Array:
-    """Angle(s) in rad brought into [-pi, pi)."""
+    """Angles in rad of any shape, wrapped to [-pi, pi)."""
     a = np.asarray(angle, float)
     wrapped = (a + np.pi) % (2 * np.pi) - np.pi
-    # The remainder of a tiny negative number rounds up to 2 pi itself.
+    # The remainder of a tiny negative number is rounded up to 2 pi.
     return np.asarray(np.where(wrapped >= np.pi, wrapped - 2 * np.pi, wrapped))
 
 
 def compose(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
-    """Pose of c in A's parent, for a = pose of B, b = pose of c in B; shapes (..., 3) broadcast."""
+    """Pose in the parent of ``a`` of a frame with pose ``b`` in the frame ``a``; shapes (..., 3) broadcast."""
     a, b = np.broadcast_arrays(np.asarray(a, float), np.asarray(b, float))
     cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
     return np.stack(
@@ -31,7 +31,7 @@ def compose(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
 
 
 def inverse(a: npt.ArrayLike) -> Array:
-    """The pose that undoes ``a``: compose(a, inverse(a)) = 0; shape (..., 3)."""
+    """Inverse pose, for which compose(a, inverse(a)) = 0; shape (..., 3)."""
     a = np.asarray(a, float)
     cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
     return np.stack(
@@ -41,12 +41,12 @@ def inverse(a: npt.ArrayLike) -> Array:
 
 
 def between(a: npt.ArrayLike, b: npt.ArrayLike) -> Array:
-    """Pose of b seen from a: compose(a, between(a, b)) = b; shapes (..., 3) broadcast."""
+    """Pose of ``b`` relative to ``a``, for which compose(a, between(a, b)) = b; shapes (..., 3) broadcast."""
     return compose(inverse(a), b)
 
 
 def compose_jacobians(a: npt.ArrayLike, b: npt.ArrayLike) -> tuple[Array, Array]:
-    """Derivatives of compose(a, b) by a and by b, each (3, 3), for poses (3,)."""
+    """Derivatives of compose(a, b) with respect to a and b, each (3, 3), for poses (3,)."""
     a, b = np.asarray(a, float), np.asarray(b, float)
     cos, sin = np.cos(a[2]), np.sin(a[2])
     by_a = np.array(
@@ -57,13 +57,13 @@ def compose_jacobians(a: npt.ArrayLike, b: npt.ArrayLike) -> tuple[Array, Array]
 
 
 def rotate(yaw: float, vector: npt.ArrayLike) -> Array:
-    """Vectors (..., 2) turned by ``yaw`` rad, counter-clockwise."""
+    """Vectors (..., 2) rotated by ``yaw`` rad counter-clockwise."""
     v = np.asarray(vector, float)
     cos, sin = np.cos(yaw), np.sin(yaw)
     return np.stack([cos * v[..., 0] - sin * v[..., 1], sin * v[..., 0] + cos * v[..., 1]], axis=-1)
 
 
 def transform(pose: npt.ArrayLike, points: npt.ArrayLike) -> Array:
-    """Points (..., 2) m seen from ``pose`` (3,), in its parent."""
+    """Transform points (..., 2) in m from the frame with the given ``pose`` (3,) to its parent frame."""
     p = np.asarray(pose, float)
     return np.asarray(p[:2] + rotate(float(p[2]), points))

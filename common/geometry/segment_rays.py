@@ -11,8 +11,11 @@ if TYPE_CHECKING:
 
 
 def distances(segments: Array, circles: Array, poses: Array, angles: Array) -> Array:
-    """(N, B) m from poses (N, 3) along ``angles`` (B,) to segments (S, 4) and circles (C, 3); +inf: nothing is hit."""
-    # Blocks of about 20 MB keep the temporaries in memory that is already there.
+    """(N, B) distances in m from poses (N, 3) along ``angles`` (B,) to the nearest segment (S, 4) or circle (C, 3).
+
+    A segment is x0, y0, x1, y1 in m, a circle x, y, radius in m. The distance is +inf if nothing is hit.
+    """
+    # Temporary arrays of about 20 MB can be reused from one block to the next.
     block = max(1, 2_500_000 // (len(angles) * max(len(segments), 1)))
     parts = [_block(segments, circles, poses[i : i + block], angles) for i in range(0, len(poses), block)]
     return np.concatenate(parts) if parts else np.zeros((0, len(angles)))
@@ -32,7 +35,7 @@ def _block(segments: Array, circles: Array, poses: Array, angles: Array) -> Arra
     for cx, cy, radius in circles:
         px, py = cx - poses[:, 0:1], cy - poses[:, 1:2]  # (N, 1)
         middle = px * dx[..., 0] + py * dy[..., 0]
-        under = middle**2 - (px**2 + py**2 - radius**2)
-        near = middle - np.sqrt(np.where(under >= 0, under, np.nan))
+        discriminant = middle**2 - (px**2 + py**2 - radius**2)
+        near = middle - np.sqrt(np.where(discriminant >= 0, discriminant, np.nan))
         best = np.fmin(best, np.where(near >= 0, near, np.inf))
     return np.asarray(best)

@@ -13,7 +13,7 @@ from common.limits import Coordinate, PositiveDistance
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
 
-CIRCLE_SEGMENTS = 64  # a quarter circle in free space: 0.04 mm off at a radius of 0.5 m
+CIRCLE_SEGMENTS = 64  # per quarter circle in free space; the error is 0.04 mm at a radius of 0.5 m
 
 Degrees = Annotated[float, Field(allow_inf_nan=False, ge=-1e5, le=1e5)]
 Point = tuple[Coordinate, Coordinate]
@@ -21,7 +21,7 @@ Ring = Annotated[list[Point], Field(min_length=3, max_length=10_000)]
 
 
 class Model(BaseModel):
-    """Frozen, and without keys nobody knows."""
+    """Base of the parts of a world: immutable, and without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -78,7 +78,7 @@ class Obstacle(Model):
 
 
 def check_ring(ring: list[tuple[float, float]]) -> None:
-    """Raise ValueError where corners in order are no simple polygon."""
+    """Raise ValueError if the corners, in order, do not form a simple polygon."""
     polygon = shapely.Polygon(ring)
     if not polygon.is_valid or polygon.area <= 0:
         raise ValueError(f"the polygon is not simple: {shapely.is_valid_reason(polygon)}")

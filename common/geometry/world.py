@@ -27,15 +27,14 @@ __all__ = ["NOT_YAML", "Box", "Circle", "Obstacle", "Start", "World", "known_wor
 
 FOLDER = Path(__file__).resolve().parents[2] / "worlds"
 
-# What `parse_yaml` raises.
-NOT_YAML = (yaml.YAMLError, ValueError)
+NOT_YAML = (yaml.YAMLError, ValueError)  # raised by `parse_yaml`
 
-POINTS = 100_000  # at once: as shapely's objects they need a few hundred bytes each
-LOOKS = 50  # in vain, before a place on a grid is taken to be nowhere
+POINTS_PER_BLOCK = 100_000  # a shapely point needs a few hundred bytes
+MAX_SAMPLING_ATTEMPTS = 50  # without a result, before a grid counts as having no suitable place
 
 
 class Start(Model):
-    """Where the robot stands at first."""
+    """Initial pose of the robot."""
 
     x: Coordinate  # m
     y: Coordinate  # m
@@ -43,18 +42,21 @@ class Start(Model):
 
 
 class World(Model):
-    """The boundary's inside, less the obstacles, is free; with a grid, its free cells are, and its edge is no wall."""
+    """A world. Free space is the inside of the boundary, or the free cells of the grid, without the obstacles.
+
+    The edge of a grid is not a wall.
+    """
 
     name: Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[\w.-]+$")]
-    boundary: Ring  # m, the walls; with a grid its edge, which need not be given
+    boundary: Ring  # m, the walls; with a grid, the grid's edge, which may be left out
     obstacles: Annotated[list[Obstacle], Field(max_length=10_000)] = []  # noqa: RUF012 - pydantic copies it
     start: Start | None = None
     grid: Annotated[OccupancyGrid | None, Field(exclude_if=lambda grid: grid is None)] = None
-    # a ROS map; a world without one is sent without this field
+    # a ROS map; worlds without one are sent without this field
 
     @model_validator(mode="before")
     @classmethod
-    def _grid_has_an_edge(cls, data: Any) -> Any:
+    def _boundary_from_grid(cls, data: Any) -> Any:
         if isinstance(data, dict) and data.get("grid") is not None and "boundary" not in data:
             grid = OccupancyGrid.model_validate(data["grid"])
             return {**data, "grid": grid, "boundary": grid.corners()}
@@ -66,38 +68,39 @@ class World(Model):
         if self.grid is not None and not (
             len(self.boundary) == 4 and np.allclose(self.boundary, self.grid.corners(), rtol=0, atol=1e-6)
         ):
-            raise ValueError("with a grid the boundary is the grid's edge: leave it out")
+            raise ValueError("the boundary of a world with a grid is the grid's edge: leave it out")
         return self
 
     def with_obstacles(self, obstacles: list[Obstacle]) -> World:
-        """The same walls with other furniture; built anew, for a copy would keep the old geometry."""
+        """The same world with other obstacles."""
+        # Not a copy, which would keep the cached geometry.
         return World(name=self.name, boundary=self.boundary, obstacles=obstacles, start=self.start, grid=self.grid)
 
     @functools.cached_property
     def segments(self) -> Array:
-        """(S, 4) x0, y0, x1, y1 in m of every straight edge."""
+        """(S, 4) x0, y0, x1, y1 in m of all straight edges of walls and obstacles."""
         return self.outlines if self.grid is None else np.concatenate([self.grid.shapes.walls, self.outlines])
 
     @functools.cached_property
     def outlines(self) -> Array:
-        """(S, 4) those of `segments` that are not the grid's cells'."""
+        """(S, 4) the `segments` without those of the grid's cells."""
         rings = [] if self.grid is not None else [np.array(self.boundary)]
         rings += [ring for o in self.obstacles if (ring := o.ring()) is not None]
         return np.concatenate([np.zeros((0, 4)), *(np.hstack([ring, np.roll(ring, -1, axis=0)]) for ring in rings)])
 
     @functools.cached_property
     def circles(self) -> Array:
-        """(C, 3) x, y, radius in m."""
+        """(C, 3) x, y, radius in m of the round obstacles."""
         return np.array([[*o.circle.center, o.circle.radius] for o in self.obstacles if o.circle]).reshape(-1, 3)
 
     @functools.cached_property
     def furniture(self) -> shapely.Geometry:
-        """What the obstacles cover."""
+        """The area that the obstacles cover."""
         return shapely.union_all([o.shape() for o in self.obstacles])
 
     @functools.cached_property
     def free_space(self) -> shapely.Geometry:
-        """Where a point may be."""
+        """The free area."""
         room = shapely.Polygon(self.boundary) if self.grid is None else self.grid.shapes.free_space
         return shapely.difference(room, self.furniture)
 
@@ -111,32 +114,32 @@ class World(Model):
 
     @property
     def free_area(self) -> float:
-        """m²; of a grid all its free cells, whether or not obstacles cover them."""
+        """Size of the free area in m²; for a grid, that of its free cells, including those under obstacles."""
         if self.grid is None:
             return float(shapely.area(self.free_space))
         return float(np.count_nonzero(self.grid.values == FREE)) * self.grid.resolution**2
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
-        """x0, y0, x1, y1 in m of the boundary."""
+        """x0, y0, x1, y1 in m of the boundary's bounding box."""
         corners = np.array(self.boundary)
         (x0, y0), (x1, y1) = corners.min(axis=0), corners.max(axis=0)
         return float(x0), float(y0), float(x1), float(y1)
 
     def center(self) -> Array:
-        """(2,) m, the middle of the boundary's bounding box: where the paper's belief begins."""
+        """(2,) centre of the bounding box in m, at which the paper's belief starts."""
         x0, y0, x1, y1 = self.bounds
         return np.array([(x0 + x1) / 2, (y0 + y1) / 2])
 
     def clearance(self, points: npt.ArrayLike) -> Array:
-        """(N,) m from points (N, 2) to the nearest place that is not free; negative where it is not free itself."""
+        """(N,) distances in m from points (N, 2) to the edge of free space; negative outside it."""
         points = np.asarray(points, float).reshape(-1, 2)
         if self.grid is None:
             return self._free_area.signed(points)
-        return self._off_furniture(points, 0.0 - self.grid.shapes.distance(FREE, points))
+        return self._limit_by_obstacles(points, 0.0 - self.grid.shapes.distance(FREE, points))
 
     def why_no_room(self, place: Array, radius: float) -> str | None:
-        """Why a robot of ``radius`` m cannot stand at ``place`` (2,) or a pose, or None."""
+        """Explanation why a robot of ``radius`` m cannot stand at a point (2,) or pose (3,), or None if it can."""
         clearance = float(self.clearance(place[:2])[0])
         if clearance >= radius:
             return None
@@ -144,30 +147,35 @@ class World(Model):
         return f"({place[0]:.2f}, {place[1]:.2f}) {what} {self.name!r}; the robot needs {radius:g} m around it"
 
     def clearances(self, x: Array, y: Array) -> Array:
-        """(len(y), len(x)) m: `clearance` of the nodes of a lattice in map, ascending."""
+        """(len(y), len(x)) `clearance` in m at the nodes x, y of a lattice in map, ascending."""
         nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
         if self.grid is None:
             return self.clearance(nodes).reshape(len(y), len(x))
-        away = 0.0 - self.grid.shapes.lattice_distances(FREE, x, y)  # never -0.0
-        return self._off_furniture(nodes, away.ravel()).reshape(len(y), len(x))
+        clearance = 0.0 - self.grid.shapes.lattice_distances(FREE, x, y)  # subtracted, to avoid -0.0
+        return self._limit_by_obstacles(nodes, clearance.ravel()).reshape(len(y), len(x))
 
-    def surface_distances(self, x: Array, y: Array, most: float) -> Array:
-        """(len(y), len(x)) m to what a laser sees, at most ``most``; negative behind it. It sees no unknown cells."""
+    def surface_distances(self, x: Array, y: Array, max_distance: float) -> Array:
+        """(len(y), len(x)) distances in m to the nearest surface that a laser sees, negative behind surfaces.
+
+        x and y are the nodes of a lattice in map, ascending. Distances are limited to ``max_distance``. A laser does
+        not see unknown cells.
+        """
         if self.grid is not None:
             nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-            away = self._off_furniture(nodes, self.grid.shapes.lattice_distances(OCCUPIED, x, y, most).ravel())
-            return np.clip(away, -most, most).reshape(len(y), len(x))
+            distance = self.grid.shapes.lattice_distances(OCCUPIED, x, y, max_distance).ravel()
+            distance = self._limit_by_obstacles(nodes, distance)
+            return np.clip(distance, -max_distance, max_distance).reshape(len(y), len(x))
         columns = [self._free_area.signed(np.column_stack([np.full(len(y), at), y])) for at in x]
-        return np.clip(np.stack(columns, axis=1), -most, most)
+        return np.clip(np.stack(columns, axis=1), -max_distance, max_distance)
 
-    def _off_furniture(self, points: Array, away: Array) -> Array:
-        """(N,) ``away``, or what the obstacles leave of it."""
-        return np.minimum(away, -self._furniture_area.signed(points)) if self.obstacles else away
+    def _limit_by_obstacles(self, points: Array, distance: Array) -> Array:
+        """(N,) the smaller one of ``distance`` and the distance of points (N, 2) to the obstacles."""
+        return np.minimum(distance, -self._furniture_area.signed(points)) if self.obstacles else distance
 
     def sample_free(self, count: int, rng: np.random.Generator, clearance: float = 0.0) -> Array:
-        """(count, 2) points uniform over free space, at least ``clearance`` m from everything.
+        """(count, 2) points distributed uniformly over free space, at least ``clearance`` m from its edge.
 
-        Raises UserError where there is no such place.
+        Raises UserError if there is no such place.
         """
         if self.grid is not None:
             return self._sample_cells(count, rng, clearance)
@@ -181,31 +189,35 @@ class World(Model):
         return np.concatenate(found)[:count]
 
     def _sample_cells(self, count: int, rng: np.random.Generator, clearance: float) -> Array:
-        """`sample_free` on a grid: places in cells that may be far enough from everything, those that are."""
-        assert self.grid is not None  # noqa: S101 - asked for grids alone
+        """`sample_free` on a grid: samples points in cells that may have the clearance, and keeps those that do."""
+        assert self.grid is not None  # noqa: S101 - for the type checker
         shapes = self.grid.shapes
-        cells = shapes.cells_with_clearance(clearance - self.grid.resolution)  # half a diagonal and more: no place is forgotten
-        found, left = [np.zeros((0, 2))], LOOKS
-        while left and len(cells) and sum(map(len, found)) < count:
+        # The resolution is more than half a cell's diagonal, so that all cells with suitable points are included.
+        cells = shapes.cells_with_clearance(clearance - self.grid.resolution)
+        found, attempts_left = [np.zeros((0, 2))], MAX_SAMPLING_ATTEMPTS
+        while attempts_left and len(cells) and sum(map(len, found)) < count:
             chosen = rng.integers(len(cells), size=max(count, 256))
             points = shapes.points_in_cells(cells[chosen], rng.random((len(chosen), 2)))
             found.append(points[self.clearance(points) >= clearance])
-            left = left if len(found[-1]) else left - 1
+            attempts_left = attempts_left if len(found[-1]) else attempts_left - 1
         if sum(map(len, found)) < count:
             raise self._no_room(clearance)
         return np.concatenate(found)[:count]
 
     def _no_room(self, clearance: float) -> UserError:
-        return UserError(f"world {self.name!r} has no place {clearance} m clear of everything")
+        return UserError(f"world {self.name!r} has no place {clearance} m clear of walls and obstacles")
 
     def start_pose(self, clearance: float) -> Array:
-        """(3,) the start, or where none is stated the free place nearest the centre."""
+        """(3,) the world's start pose; if it has none, the position with ``clearance`` m that is nearest to the centre.
+
+        Raises UserError if there is no such position.
+        """
         if self.start is not None:
             return np.array([self.start.x, self.start.y, np.deg2rad(self.start.yaw_deg)])
         if self.grid is not None:
             shapes = self.grid.shapes
             places = shapes.points_in_cells(shapes.cells_with_clearance(clearance), 0.5)
-            places = places[self._off_furniture(places, np.full(len(places), np.inf)) >= clearance]
+            places = places[self._limit_by_obstacles(places, np.full(len(places), np.inf)) >= clearance]
             if not len(places):
                 raise self._no_room(clearance)
             return np.array([*places[np.argmin(np.hypot(*(places - self.center()).T))], 0.0])
@@ -213,16 +225,16 @@ class World(Model):
         return np.array([*shapely.get_coordinates(nearest)[0], 0.0])
 
     def _room(self, clearance: float) -> shapely.Geometry:
-        """Where a point is so far from everything; raises UserError where that is nowhere."""
+        """The part of free space at least ``clearance`` m from its edge; raises UserError if it is empty."""
         room = shapely.buffer(self.free_space, -clearance)
         if room.is_empty:
             raise self._no_room(clearance)
         return room
 
     def ray_distances(self, poses: npt.ArrayLike, angles: npt.ArrayLike) -> Array:
-        """(N, B) m from scanner poses (N, 3) in map along ``angles`` (B,) in laser; +inf where nothing is hit.
+        """(N, B) distances in m from scanner poses (N, 3) in map along ``angles`` (B,) in laser.
 
-        Exact: rays against segments and circles, or against the very cells of a grid.
+        They are exact, from intersections with segments, circles and the cells of a grid, and +inf if nothing is hit.
         """
         poses, angles = np.asarray(poses, float).reshape(-1, 3), np.asarray(angles, float)
         found = segment_rays.distances(self.outlines, self.circles, poses, angles)
@@ -230,7 +242,7 @@ class World(Model):
 
 
 class _Area:
-    """A geometry with an index of its edges: what a distance costs hardly grows with their number."""
+    """An area with a spatial index of its edges, for fast distances."""
 
     def __init__(self, area: shapely.Geometry) -> None:
         shapely.prepare(area)
@@ -240,8 +252,8 @@ class _Area:
         self._edges = shapely.STRtree(shapely.linestrings(np.stack([ends[:-1], ends[1:]], axis=1)[joined]))
 
     def signed(self, points: Array) -> Array:
-        """(N,) m from points (N, 2) to the edge; positive within."""
-        blocks = [points[begin : begin + POINTS] for begin in range(0, len(points), POINTS)]
+        """(N,) distances in m from points (N, 2) to the edge of the area; positive inside."""
+        blocks = [points[begin : begin + POINTS_PER_BLOCK] for begin in range(0, len(points), POINTS_PER_BLOCK)]
         return np.concatenate([self._signed(block) for block in blocks]) if blocks else np.zeros(0)
 
     def _signed(self, points: Array) -> Array:
@@ -253,12 +265,12 @@ class _Area:
 
 
 def known_worlds() -> list[str]:
-    """Names of the worlds that are shipped."""
+    """Names of the shipped worlds."""
     return sorted(path.stem for path in FOLDER.glob("*.yaml"))
 
 
 def load_world(name: str) -> World:
-    """The shipped world of that name, or the world or ROS map in that file; UserError says what is wrong, and where."""
+    """The shipped world of that name, or the world or ROS map in that file; raises UserError if it is invalid."""
     path = FOLDER / f"{name}.yaml" if name in known_worlds() else Path(name)
     try:
         data: Any = parse_yaml(path.read_text(encoding="utf-8"))
@@ -267,7 +279,9 @@ def load_world(name: str) -> World:
         raise UserError(f"no world {name!r}: give a file or one of {', '.join(known_worlds())}") from None
     except UnicodeDecodeError:
         image = path.suffix.lower() in map_file.IMAGES
-        hint = f"an image: give the map.yaml that names it, such as {path.with_suffix('.yaml')}" if image else "no text"
+        hint = (
+            f"an image: give the map.yaml that names it, such as {path.with_suffix('.yaml')}" if image else "not text"
+        )
         raise UserError(f"world {path}: {hint}") from None
     except OSError as error:
         raise UserError(f"world {path}: cannot be read ({error})") from None

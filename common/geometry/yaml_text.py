@@ -8,20 +8,20 @@ import yaml
 
 MAX_NODES = 1_000_000  # 10 000 obstacles need about 200 000
 MAX_DEPTH = 100
-# PyYAML's C parser, ten times as fast, is missing where PyYAML was built without libyaml.
+# PyYAML's C parser is ten times as fast, but missing if PyYAML was built without libyaml.
 LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class TooLargeError(ValueError):
-    """Beyond the limits."""
+    """Raised for YAML with more values or deeper nesting than the limits allow."""
 
 
 def parse_yaml(text: str | bytes) -> Any:
-    """The value that ``text`` describes.
+    """Parse ``text`` safely.
 
-    Raises yaml.YAMLError or ValueError (a date such as 2020-13-45) where it is no YAML, and TooLargeError where it is
-    beyond the limits. These are checked first: the C loader crashes the process on 100 000 nested brackets, and takes
-    long for what no world can hold.
+    Raises yaml.YAMLError or ValueError (for a date such as 2020-13-45) if it is not valid YAML, and TooLargeError if it
+    exceeds the limits. The limits are checked before loading, because 100 000 nested brackets crash the process in the
+    C loader and many values take long to load.
     """
     depth = 0
     for count, event in enumerate(yaml.parse(text, Loader=LOADER)):

@@ -1,7 +1,8 @@
 """The messages published on topics.
 
-Frames: `map` is the world, `odom` drifts, `base_link` is the robot's centre, `laser` the scanner.
-A new field gets a default; a field never changes its type. docs/messages.md is written from this file.
+Frames: `map` is fixed to the world, `odom` drifts, `base_link` is the robot's centre, `laser` the scanner.
+A new field gets a default; a field never changes its type. docs/messages.md is generated from the docstrings and the
+comments beside the fields.
 """
 
 from __future__ import annotations
@@ -13,34 +14,35 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from common.limits import Angle, Distance, PositiveAngle, PositiveDistance
-from common.messages.pose import Pose as Pose  # noqa: PLC0414 - most take it from here
+from common.messages.pose import Pose as Pose  # noqa: PLC0414 - most modules import it from here
 from common.messages.pose import Twist as Twist  # noqa: PLC0414
 from common.messages.wire import Beams, Costs, Count, Finite, Floats, Matrix3, Message, Name, NotNegative, Points, Text
 
 
 class Stamped(Message):
-    """What every topic's message begins with."""
+    """Base of all messages on topics."""
 
-    stamp_ns: Count  # ns, time of the measurement this message is about (simulation or sensor time, not wall time)
-    seq: Count = 0  # counts the publisher's messages on this key, from 0; a gap is a loss
+    stamp_ns: Count  # ns, time of the measurement that this message is about (simulation or sensor time, not wall time)
+    seq: Count = 0  # number of this message among those of its publisher on this key, from 0; a gap means loss
 
 
 class Scan(Stamped):
     """One sweep of the scanner (sensor_msgs/LaserScan)."""
 
-    angle_min: Angle  # rad, first beam, laser: counter-clockwise seen from above, however the scanner is mounted
-    angle_increment: Angle  # rad, between beams; negative: they run clockwise, as of a scanner mounted upside down
+    angle_min: Angle  # rad, direction of the first beam in laser, counter-clockwise seen from above in any mounting
+    angle_increment: Angle  # rad, between beams; negative if they run clockwise, as of a scanner mounted upside down
     range_min: Distance  # m
     range_max: PositiveDistance  # m
-    ranges: Beams  # (B,) m; +inf nothing within range_max, -inf too close (REP-117), 0 not measured
-    mount: Pose = Pose(x=0.0, y=0.0)  # the scanner's pose in base_link
+    ranges: Beams  # (B,) m; +inf is nothing within range_max, -inf is too close (REP-117), 0 is not measured
+    mount: Pose = Pose(x=0.0, y=0.0)  # pose of the scanner in base_link
     scan_time: NotNegative = 0.0  # s, between scans
     frame_id: Name = "laser"
-    sigma: Distance = 0.0  # m, standard deviation of a range; 0 with the next: not stated
-    sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.0  # the part that grows with the range, in quadrature
+    sigma: Distance = 0.0  # m, standard deviation of a range; unknown if this and sigma_relative are 0
+    sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.0  # standard deviation as a share of the range,
+    # added to sigma in quadrature
 
     def angles(self) -> npt.NDArray[np.float64]:
-        """(B,) rad, beam directions in laser."""
+        """(B,) beam directions in laser, rad."""
         return self.angle_min + self.angle_increment * np.arange(len(self.ranges), dtype=np.float64)
 
 
@@ -54,13 +56,13 @@ class Odom(Stamped):
 
 
 class Truth(Stamped):
-    """What only a simulator knows."""
+    """The true state, which only a simulator knows."""
 
     pose: Pose  # base_link in map
     twist: Twist  # base_link
-    contact: bool = False  # the body touches something
-    stopped: bool = False  # the obstacle stop holds the wheels back
-    people: Points = np.zeros((0, 2), np.float32)  # (K, 2) m in map, where people stand; no map knows them
+    contact: bool = False  # the robot touches something
+    stopped: bool = False  # the obstacle stop slows or stops the robot
+    people: Points = np.zeros((0, 2), np.float32)  # (K, 2) m in map, positions of people, who are in no map
     frame_id: Name = "map"
 
 
@@ -68,105 +70,105 @@ class Hypothesis(Message):
     """One Gaussian of a belief's mixture."""
 
     pose: Pose  # base_link in map
-    covariance: Matrix3 | None = None  # (3, 3) of x, y, yaw in map; None: this estimator has none
-    weight: Annotated[float, Field(ge=0, le=1)]  # of the mixture, sums to 1
+    covariance: Matrix3 | None = None  # (3, 3) of x, y, yaw in map; nil if the estimator computes none
+    weight: Annotated[float, Field(ge=0, le=1)]  # in the mixture; the weights sum to 1
 
     @model_validator(mode="after")
     def _shape(self) -> Hypothesis:
         if self.covariance is not None and self.covariance.shape != (3, 3):
-            raise ValueError(f"covariance has {self.covariance.shape}, not (3, 3)")
+            raise ValueError(f"covariance has shape {self.covariance.shape}, not (3, 3)")
         return self
 
 
 class Belief(Stamped):
-    """The estimator's posterior about the pose, one for each scan, with that scan's stamp."""
+    """The estimator's posterior of the pose: one for each scan, with the stamp of the scan."""
 
     state: Literal["localising", "tracking", "ambiguous", "lost"]
     pose: Pose  # base_link in map
-    covariance: Matrix3 | None = None  # (3, 3) of x, y, yaw in map; None: this estimator has none
+    covariance: Matrix3 | None = None  # (3, 3) of x, y, yaw in map; nil if the estimator computes none
     xi: Annotated[Floats, Field(description="prediction error in pose space")]
     # (3,) xi = dg' Pi (o - g), the negative gradient of accuracy in map: 1/m, 1/m, 1/rad (nats)
     curvature: Matrix3 | None = None  # (3, 3) dg' Pi dg, Gauss-Newton Hessian of F at the pose, map
     free_energy: Finite  # nats, accuracy + complexity
     accuracy: Finite  # nats, -ln p(o | pose)
-    complexity: Finite = 0.0  # nats, how far the posterior is from the prior
+    complexity: Finite = 0.0  # nats, divergence of the posterior from the prior
     hypotheses: Annotated[list[Hypothesis], Field(max_length=64)] = []  # noqa: RUF012
-    # best first: the first is the pose above
+    # best first; the first one is at `pose`
     estimator: Name = ""
     frame_id: Name = "map"
 
     @model_validator(mode="after")
     def _shapes(self) -> Belief:
         if self.xi.shape != (3,):
-            raise ValueError(f"xi has {self.xi.shape}, not (3,)")
+            raise ValueError(f"xi has shape {self.xi.shape}, not (3,)")
         for name in ("covariance", "curvature"):
             matrix = getattr(self, name)
             if matrix is not None and matrix.shape != (3, 3):
-                raise ValueError(f"{name} has {matrix.shape}, not (3, 3)")
+                raise ValueError(f"{name} has shape {matrix.shape}, not (3, 3)")
         return self
 
 
 class Prediction(Stamped):
-    """The scan the estimator expected, beam for beam beside the scan of the same stamp."""
+    """The scan that the estimator predicts for its belief, with the stamp of the measured scan."""
 
-    angle_min: Angle  # rad, laser
+    angle_min: Angle  # rad, in laser
     angle_increment: Angle  # rad
     ranges: Beams  # (B,) m, g(pose)
-    sigma: Floats = np.zeros(0, np.float32)  # (B,) m, stated standard deviation; empty: none stated
+    sigma: Floats = np.zeros(0, np.float32)  # (B,) m, standard deviation of the ranges; empty if unknown
     frame_id: Name = "laser"
 
 
 class Goal(Stamped):
-    """Where the robot prefers to be."""
+    """The pose that the robot is to reach."""
 
     pose: Pose  # base_link in map
-    tolerance: PositiveDistance = 0.2  # m, reached within it
-    yaw_tolerance: PositiveAngle | None = None  # rad, of the heading once it is there; None: any heading will do
-    cancel: bool = False  # forget the goal and stand
+    tolerance: PositiveDistance = 0.2  # m, the goal is reached within this distance
+    yaw_tolerance: PositiveAngle | None = None  # rad, of the final heading; nil accepts any heading
+    cancel: bool = False  # drop the goal and stop
 
 
 class Drive(Stamped):
-    """A velocity steered by hand; it goes before any goal, for 0.5 s unless said again."""
+    """A velocity steered by hand. It takes precedence over the goal for 0.5 s; repeat it to continue."""
 
-    twist: Twist  # base_link; zero for longer than 0.5 s: the goal counts again
+    twist: Twist  # base_link; after 0.5 s of zeros, the robot drives to its goal again
 
 
 class CmdVel(Stamped):
-    """A velocity command; its stamp is that of the scan it answers, so that an old one is known as old."""
+    """A velocity command; its stamp is that of the scan it responds to, so that its age is known."""
 
     twist: Twist  # base_link
 
 
 class Status(Stamped):
-    """What the controller is doing, and why."""
+    """What the controller does, and why."""
 
     state: Literal["idle", "navigating", "reached", "blocked", "lost", "manual", "exploring"]
-    # manual: driven by hand; exploring: it moves to find out where it is
+    # manual: driven by hand; exploring: moving to find out where the robot is
     reason: Text = ""
-    refused: bool = False  # blocked for good: the goal cannot be; blocked otherwise, the way may clear
+    refused: bool = False  # blocked permanently, as the goal cannot be reached; if false, the way may become free
     goal: Pose | None = None  # base_link in map
-    goal_seq: Count = 0  # which goal this is about
+    goal_seq: Count = 0  # seq of the goal that this is about
     distance: Distance | None = None  # m, from the believed pose to the goal
 
 
 class Plan(Stamped):
-    """The way the controller means to take, and what it knows that its map does not."""
+    """The path that the controller plans, and the obstacles that are not in its map."""
 
-    path: Points = np.zeros((0, 2), np.float32)  # (K, 2) m in map, from the believed place to the goal; empty: none
-    motion: Points = np.zeros((0, 2), np.float32)  # (T, 2) m in map, where the command leads until it would stand
-    obstacles: Points = np.zeros((0, 2), np.float32)  # (M, 2) m in map, seen by the scan and not in the map
+    path: Points = np.zeros((0, 2), np.float32)  # (K, 2) m in map, from the believed position to the goal; may be empty
+    motion: Points = np.zeros((0, 2), np.float32)  # (T, 2) m in map, positions under the command until it would stop
+    obstacles: Points = np.zeros((0, 2), np.float32)  # (M, 2) m in map, measured by the scan and not in the map
     frame_id: Name = "map"
 
 
 class Preference(Stamped):
-    """The goal prior as a field over known free space; sent when map, goal or obstacles change."""
+    """The goal prior as a field over known free space; published when map, goal or obstacles change."""
 
     goal: Pose  # base_link in map
     origin: Pose  # lower left corner of the first cell, in map; yaw 0
-    resolution: PositiveDistance  # m, a cell's edge
+    resolution: PositiveDistance  # m, edge length of a cell
     width: Annotated[int, Field(ge=1, le=4096)]  # cells along x
     height: Annotated[int, Field(ge=1, le=4096)]  # cells along y
-    distance: Costs  # (height * width,) m to go with clearance, row by row along x; +inf: out of reach
+    distance: Costs  # (height * width,) m, length of the path to the goal, row by row along x; +inf if unreachable
     frame_id: Name = "map"
 
     @model_validator(mode="after")
@@ -182,19 +184,19 @@ class TopicHealth(Message):
     key: Name
     received: Count = 0
     published: Count = 0
-    dropped: Count = 0  # older than the newest, by the topic's queue policy, or a full queue
+    dropped: Count = 0  # replaced by a newer one, by the topic's queue policy, or refused by a full queue
     undecodable: Count = 0
-    written: Count = 0  # into the recording; 0 in all but the recorder
-    missing: Count = 0  # by the publisher's sequence numbers, sent and never received; counted by the recorder
+    written: Count = 0  # written to the recording; counted by the recorder only
+    missing: Count = 0  # sent and never received, by the sequence numbers; counted by the recorder only
     rate: NotNegative = 0.0  # Hz over the last second
 
 
 class Health(Stamped):
-    """A service's pulse, once a second of wall time."""
+    """State and counters of a service, published once a second of wall time."""
 
     service: Name
     uptime: NotNegative  # s, wall time
     topics: list[TopicHealth] = []  # noqa: RUF012
     counters: dict[str, Count] = {}  # noqa: RUF012 - pydantic copies defaults
-    note: Text = ""  # what the service waits for or last complained of
-    instance: Name = ""  # which process of the service; each numbers its own messages
+    note: Text = ""  # what the service waits for, or its last problem
+    instance: Name = ""  # name of the process; each process numbers its own messages

@@ -10,19 +10,19 @@ from common.messages.wire import Message
 
 
 class Pose(Message):
-    """A pose in the plane; its frame is said where it is used."""
+    """A pose in the plane, in the frame that the containing field states."""
 
     x: Coordinate  # m
     y: Coordinate  # m
     yaw: Angle = 0.0  # rad, counter-clockwise from x
 
     def array(self) -> npt.NDArray[np.float64]:
-        """(3,) x, y, yaw."""
+        """(3,) x, y, yaw in m and rad."""
         return np.array([self.x, self.y, self.yaw])
 
     @classmethod
     def of(cls, pose: npt.ArrayLike) -> Pose:
-        """From (3,) x, y, yaw."""
+        """Create a pose from (3,) x, y, yaw in m and rad."""
         x, y, yaw = np.asarray(pose, float)
         return cls(x=float(x), y=float(y), yaw=float(yaw))
 
@@ -35,5 +35,5 @@ class Twist(Message):
     wz: Speed = 0.0  # rad/s, counter-clockwise
 
     def array(self) -> npt.NDArray[np.float64]:
-        """(3,) vx, vy, wz."""
+        """(3,) vx, vy, wz in m/s and rad/s."""
         return np.array([self.vx, self.vy, self.wz])

@@ -1,6 +1,7 @@
 """Requests to queryables and their replies.
 
-A new field gets a default; a field never changes its type. docs/messages.md is written from this file.
+A new field gets a default; a field never changes its type. docs/messages.md is generated from the docstrings and the
+comments beside the fields.
 """
 
 from __future__ import annotations
@@ -19,38 +20,38 @@ from common.robot.scanner import Scanner
 
 
 class Request(Message):
-    """What a queryable is asked; this one needs nothing."""
+    """Base of all requests, and a request without parameters."""
 
 
 class Reply(Message):
-    """What a queryable answers."""
+    """Base of all replies, and a reply without data."""
 
     ok: bool = True
-    reason: Text = ""  # why not, where ok is false
+    reason: Text = ""  # of the failure, if ok is false
 
 
 class PoseRequest(Request):
-    """Carry the robot, or the belief, to a pose."""
+    """Move the robot to a pose."""
 
     pose: Pose  # base_link in map
 
 
 class LocaliseRequest(Request):
-    """Begin localisation anew, from a pose or from nothing."""
+    """Restart localisation, from a known pose or globally."""
 
-    pose: Pose | None = None  # base_link in map
+    pose: Pose | None = None  # base_link in map; nil searches the whole map
 
 
 class ResetRequest(Request):
-    """Begin the simulation anew."""
+    """Restart the simulation."""
 
-    seed: Count | None = None  # None keeps the seed
+    seed: Count | None = None  # nil keeps the present seed
 
 
 class SpeedRequest(Request):
-    """How fast the simulation's clock runs in realtime pace."""
+    """Set the speed of the simulation's clock in realtime pace."""
 
-    factor: Annotated[float, Field(allow_inf_nan=False, ge=0.1, le=20)]  # times wall time
+    factor: Annotated[float, Field(allow_inf_nan=False, ge=0.1, le=20)]  # simulated seconds per second of wall time
 
 
 class ObstacleRequest(Request):
@@ -58,42 +59,42 @@ class ObstacleRequest(Request):
 
     action: Literal["add", "move", "remove"]
     name: Name
-    obstacle: Obstacle | None = None  # for add and move, in map
+    obstacle: Obstacle | None = None  # shape in map, for add and move
 
 
 class SampleRequest(Request):
-    """Ask what the scanner would see from poses."""
+    """Simulate scans from given poses."""
 
     poses: Poses  # (N, 3) base_link in map
-    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)] | None = None  # None: the scanner's own count
+    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)] | None = None  # number of beams; nil for that of the scanner
     noise: bool = False
     seed: Count = 0  # of the noise
 
 
 class SampleReply(Reply):
-    """Scans, row by row."""
+    """The simulated scans."""
 
     scanner: Scanner | None = None
     ranges: Ranges = np.zeros(0, np.float32)  # (N * B,) m, row-major
 
 
 class PredictRequest(Request):
-    """Ask the estimator what it expects the scanner to see from poses."""
+    """Predict scans from given poses with the estimator's model."""
 
     poses: Poses  # (N, 3) base_link in map, N at most 1000
-    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)] | None = None  # of the scanner's, evenly chosen; None: all
+    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)] | None = None  # evenly chosen from the scanner's; nil for all
 
 
 class PredictReply(Reply):
-    """Expected scans, row by row."""
+    """The predicted scans."""
 
     angles: Floats = np.zeros(0, np.float32)  # (B,) rad in laser
-    ranges: Ranges = np.zeros(0, np.float32)  # (N * B,) m, row-major; +inf: no return expected
-    sigma: Floats = np.zeros(0, np.float32)  # (N * B,) m, stated standard deviation; empty: none stated
+    ranges: Ranges = np.zeros(0, np.float32)  # (N * B,) m, row-major; +inf if no return is expected
+    sigma: Floats = np.zeros(0, np.float32)  # (N * B,) m, standard deviation of the ranges; empty if unknown
 
 
 class WorldReply(Reply):
-    """What the scanner's side knows of itself."""
+    """The simulator's world, scanner and robot."""
 
     world: World | None = None
     scanner: Scanner | None = None
@@ -101,62 +102,63 @@ class WorldReply(Reply):
 
 
 class PlayerRequest(Request):
-    """Steer a running replay."""
+    """Control a running replay."""
 
-    action: Literal["pause", "resume", "step", "seek", "rate", "status"]  # step: to the end of the next scan, paused
+    action: Literal["pause", "resume", "step", "seek", "rate", "status"]  # step plays to the end of a scan and pauses
     value: Finite = 0.0
-    # seek: s from the recording's beginning; rate: times the original timing, 0 flat out; step: how many, at least 1
+    # seek: s from the recording's start; rate: times the original speed, 0 for the maximum; step: number of scans
 
 
 class PlayerReply(Reply):
-    """Where a replay stands after the request."""
+    """State of the replay after the request."""
 
     paused: bool = False
-    position_s: NotNegative = 0.0  # s from the recording's beginning
-    duration_s: NotNegative = 0.0  # s, of the recording
-    rate: NotNegative = 1.0  # times the original timing; 0: as fast as it goes
-    loop: bool = False  # begins anew at its end
+    position_s: NotNegative = 0.0  # s from the recording's start
+    duration_s: NotNegative = 0.0  # s, length of the recording
+    rate: NotNegative = 1.0  # times the original speed; 0 is as fast as possible
+    loop: bool = False  # the replay starts again at its end
 
 
 class RecordRequest(Request):
-    """Begin or end a recording, or ask how it stands."""
+    """Start or stop a recording, or query its state."""
 
-    action: Literal["start", "stop", "status"]  # stop: the file is complete; start: a new one
+    action: Literal["start", "stop", "status"]  # stop completes the file, start begins a new one
 
 
 class RecordReply(Reply):
-    """How the recorder stands after the request."""
+    """State of the recorder after the request."""
 
     recording: bool = False
-    file: Text = ""  # path as the recorder sees it: the one being written, or the last one; empty: none yet
+    file: Text = ""  # path on the recorder's machine of the present or last recording; empty if there is none yet
     messages: Count = 0  # in that recording
-    seconds: NotNegative = 0.0  # s, wall time, since it was begun; once complete, from beginning to end
+    seconds: NotNegative = 0.0  # s of wall time since its start, or its length once it is complete
 
 
 class ConfigReply(Reply):
     """Effective configuration and versions of a service."""
 
     service: Name = ""
-    config: Text = ""  # JSON
+    config: Text = ""  # the settings as JSON
     versions: dict[str, str] = {}  # noqa: RUF012
-    protocol: Count = 0  # of its messages, `PROTOCOL` in common/versions.py; 0: not said
-    host: Name = ""  # where it runs
-    uptime: NotNegative = 0.0  # s, wall time, since its start
+    # versions of Python and packages, by name
+    protocol: Count = 0  # version of its messages, `PROTOCOL` in common/versions.py; 0 if unknown
+    host: Name = ""  # name of its machine
+    uptime: NotNegative = 0.0  # s of wall time since its start
 
 
 class ModelRequest(Request):
-    """Ask the estimator what it was made of."""
+    """Query the estimator's map and weights."""
 
-    weights: bool = False  # with the weights themselves
+    weights: bool = False  # include the weights themselves
 
 
 class ModelReply(Reply):
-    """What makes the estimator the very same again: its map, and the weights it loaded with their card."""
+    """Everything needed to rebuild the estimator: its map, and the weights it loaded with their model card."""
 
     estimator: Name = ""
     world: World | None = None  # the estimator's map
-    card: Text = ""  # JSON, the model card; empty: nothing was learned
-    file: Text = ""  # of the weights, NAME.safetensors, the card's is NAME.json; empty: nothing was learned
+    card: Text = ""  # the model card as JSON; empty if the model has no weights
+    file: Text = ""  # NAME.safetensors, the file of the weights (the card is NAME.json); empty if there are none
     size: Count = 0  # bytes of the weights
     sha256: Name = ""  # of the weights, hexadecimal
-    weights: Bytes = np.zeros(0, np.uint8)  # the weights, where they were asked for
+    weights: Bytes = np.zeros(0, np.uint8)  # the weights, if they were requested

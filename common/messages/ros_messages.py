@@ -9,30 +9,30 @@ import numpy as np
 
 from common.geometry.se2 import Array
 
-TILT = np.deg2rad(5)  # a scanner inclined by more does not see a plane of the map
+MAX_TILT_RAD = np.deg2rad(5)  # the scan plane of a scanner tilted further does not match a planar map
 
 
 @dataclass(frozen=True)
 class Transform:
-    """Pose of a child frame in its parent."""
+    """Pose of a child frame in its parent frame."""
 
     translation: Array  # (3,) m
     rotation: Array  # (3, 3)
 
     def then(self, child: Transform) -> Transform:
-        """The child's child in this one's parent."""
+        """Compose with the pose of a frame in the child: returns its pose in this transform's parent."""
         return Transform(self.translation + self.rotation @ child.translation, self.rotation @ child.rotation)
 
     def inverse(self) -> Transform:
-        """The parent in the child."""
+        """Pose of the parent in the child."""
         return Transform(-self.rotation.T @ self.translation, self.rotation.T)
 
     def planar(self) -> Array:
-        """(3,) x m, y m, yaw rad of the x axis."""
+        """(3,) projection to the plane: x and y in m, yaw of the x axis in rad."""
         return np.array([*self.translation[:2], np.arctan2(self.rotation[1, 0], self.rotation[0, 0])])
 
     def apart(self, other: Transform) -> float:
-        """The largest difference in m, or between elements of the rotations, which is about rad."""
+        """Largest difference of the translations in m and of the rotation matrices' elements (about rad)."""
         moved, turned = np.abs(self.translation - other.translation), np.abs(self.rotation - other.rotation)
         return float(max(moved.max(), turned.max()))
 
@@ -42,23 +42,23 @@ IDENTITY = Transform(np.zeros(3), np.eye(3))
 
 @dataclass(frozen=True)
 class Mount:
-    """How the scanner sits on the base."""
+    """Mounting of the scanner on the base."""
 
-    pose: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x m, y m, yaw rad in base_link, of the laser's x axis
-    upside_down: bool = False  # its z axis points to the floor: angles grow clockwise seen from above
+    pose: tuple[float, float, float] = (0.0, 0.0, 0.0)  # x m, y m, yaw rad of the laser's x axis, in base_link
+    upside_down: bool = False  # the z axis points to the floor, so angles increase clockwise seen from above
 
 
 def stamp_of(header: Any) -> int:
-    """Ns of a std_msgs/Header."""
+    """Stamp of a std_msgs/Header in ns."""
     return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
 
 
 def read_rotation(q: Any) -> Array:
-    """(3, 3) of a geometry_msgs/Quaternion; raises ValueError where it is none."""
+    """(3, 3) rotation matrix of a geometry_msgs/Quaternion; raises ValueError if it is not a unit quaternion."""
     xyzw = np.array([q.x, q.y, q.z, q.w], float)
     norm = float(np.linalg.norm(xyzw))
     if not np.isfinite(norm) or abs(norm - 1) > 0.1:
-        raise ValueError(f"quaternion {xyzw.tolist()} is no rotation")
+        raise ValueError(f"quaternion {xyzw.tolist()} is not a rotation")
     x, y, z, w = xyzw / norm
     return np.array(
         [
@@ -70,7 +70,7 @@ def read_rotation(q: Any) -> Array:
 
 
 def read_pose(position: Any, orientation: Any) -> Transform:
-    """Of a geometry_msgs/Pose or Transform; raises ValueError where a number is none."""
+    """Read a geometry_msgs/Pose or Transform; raises ValueError if it is not finite or not a rotation."""
     translation = np.array([position.x, position.y, position.z], float)
     if not np.isfinite(translation).all():
         raise ValueError(f"position {translation.tolist()} m is not finite")
@@ -78,10 +78,13 @@ def read_pose(position: Any, orientation: Any) -> Transform:
 
 
 def mount_of(transform: Transform) -> Mount:
-    """Of the laser in the base; raises ValueError where it is inclined: neither upright nor upside down."""
+    """Mounting of a scanner from the pose of its frame in the base.
+
+    Raises ValueError if it is neither level nor upside down.
+    """
     up = float(transform.rotation[2, 2])
-    if abs(up) < np.cos(TILT):
-        inclined = np.rad2deg(np.arccos(np.clip(abs(up), 0, 1)))
-        raise ValueError(f"the scanner is inclined by {inclined:.0f} degrees; it has to lie level, or upside down")
+    if abs(up) < np.cos(MAX_TILT_RAD):
+        tilt = np.rad2deg(np.arccos(np.clip(abs(up), 0, 1)))
+        raise ValueError(f"the scanner is inclined by {tilt:.0f} degrees; it has to be mounted level or upside down")
     x, y, yaw = (float(v) for v in transform.planar())
     return Mount((x, y, yaw), upside_down=up < 0)

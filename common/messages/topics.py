@@ -9,78 +9,102 @@ from common.messages import definitions as m
 from common.messages import requests as r
 
 ROOT = "presage"
-# Roles, as they stand in certificates; what each is for: common/bus/security.py. Services have the role of their name.
-CONTROL_ROLES = ("operator", "viewer-control")  # may move the robot, delete, or change what runs
+# Roles as named in certificates, described in common/bus/security.py. The role of a service has the service's name.
+CONTROL_ROLES = ("operator", "viewer-control")  # may move the robot, delete data, or change what runs
 SERVICE_ROLES = ("simulator", "bridge_ros2", "estimator", "controller", "recorder", "viewer", "viewer-control")
-ROBOT_ROLES = ("simulator", "bridge_ros2")  # speaks for the robot
-GOAL_ROLES = (*CONTROL_ROLES, "bridge_ros2")  # whoever sits at rviz
-COMPUTE_ROLES = (*SERVICE_ROLES, "operator")  # may ask for work that costs time
+ROBOT_ROLES = ("simulator", "bridge_ros2")  # publish what the robot measures
+GOAL_ROLES = (*CONTROL_ROLES, "bridge_ros2")  # may set goals and poses; with the bridge, rviz may
+COMPUTE_ROLES = (*SERVICE_ROLES, "operator")  # may send requests that need much computing time
 ALL_ROLES = (*SERVICE_ROLES, "operator", "observer", "replay", "remote")
-MAX_BYTES = 1 << 20  # a larger payload is not even queued
+MAX_BYTES = 1 << 20  # larger payloads are dropped before they are queued
 
 
 @dataclass(frozen=True)
 class Topic:
-    """One row: what is sent, by whom, how often, and what a full queue does."""
+    """One row of the table: what is published, by which service, how often, and how receivers queue it."""
 
     name: str
     message: type[m.Stamped]
-    publisher: str  # the service(s) that publish it
-    rate: float  # Hz nominal; 0: when something happens
-    queue: Literal["newest", "all"]  # what a receiver keeps that falls behind; the recorder keeps all of everything
+    publisher: str  # the service or services that publish it
+    rate: float  # nominal, Hz; 0 if it is published on events
+    queue: Literal["newest", "all"]  # which messages a slow receiver keeps; the recorder keeps all of every topic
     recorded: bool = True
-    per_service: bool = False  # one key a service, beneath the topic's own
-    multiple_publishers: bool = False  # several may publish it at once; else the first counts until it is silent
-    latched: bool = False  # whoever hears it tells the last one to services that come later
-    publisher_roles: tuple[str, ...] = ()  # roles; none: the publisher's, and of a per-service topic each service its own
+    per_service: bool = False  # each service has its own key below that of the topic
+    multiple_publishers: bool = False  # several sessions may publish at once; else the first, until it is silent
+    latched: bool = False  # subscribers store the last message for services that start later
+    publisher_roles: tuple[str, ...] = ()  # defaults to the publisher; of a per-service topic, to the service itself
     about: str = ""
 
     def key(self, robot: str, service: str = "*") -> str:
-        """The key expression; for a per-service topic ``service`` is the last chunk."""
+        """The key expression; for a per-service topic, ``service`` is the last chunk."""
         return f"{ROOT}/{robot}/{self.name}" + (f"/{service}" if self.per_service else "")
 
 
 @dataclass(frozen=True)
 class Query:
-    """One queryable: request in, reply out."""
+    """One queryable: a service that replies to requests."""
 
     name: str
     request: type[r.Request]
     reply: type[r.Reply]
-    server: str
-    per_service: bool = False
-    requester_roles: tuple[str, ...] = CONTROL_ROLES  # roles
+    server: str  # the service that replies
+    per_service: bool = False  # each service has its own key below that of the query
+    requester_roles: tuple[str, ...] = CONTROL_ROLES
     about: str = ""
 
     def key(self, robot: str, service: str = "*") -> str:
-        """The key expression."""
+        """The key expression; for a per-service query, ``service`` is the last chunk."""
         return f"{ROOT}/{robot}/{self.name}" + (f"/{service}" if self.per_service else "")
 
 
-SCAN = Topic("scan", m.Scan, "simulator", 15, "newest", publisher_roles=ROBOT_ROLES, about="what the laser sees")
-ODOM = Topic("odom", m.Odom, "simulator", 15, "newest", publisher_roles=ROBOT_ROLES, about="dead reckoning, drifts")
-TRUTH = Topic("truth", m.Truth, "simulator", 15, "newest", about="where the robot really is")
-BELIEF = Topic("belief", m.Belief, "estimator", 15, "newest", about="where the estimator believes it is, and F")
-PREDICTION = Topic("prediction", m.Prediction, "estimator", 15, "newest", about="the scan expected at the belief")
+SCAN = Topic("scan", m.Scan, "simulator", 15, "newest", publisher_roles=ROBOT_ROLES, about="the laser scan")
+ODOM = Topic(
+    "odom", m.Odom, "simulator", 15, "newest", publisher_roles=ROBOT_ROLES, about="dead reckoning, which drifts"
+)
+TRUTH = Topic("truth", m.Truth, "simulator", 15, "newest", about="true pose and velocity of the robot")
+BELIEF = Topic("belief", m.Belief, "estimator", 15, "newest", about="estimated pose, its uncertainty and free energy")
+PREDICTION = Topic("prediction", m.Prediction, "estimator", 15, "newest", about="the scan predicted for the belief")
 CMD_VEL = Topic("cmd_vel", m.CmdVel, "controller", 15, "newest", about="velocity command")
 GOAL = Topic(
-    "goal", m.Goal, "presage goal, viewer", 0, "newest", multiple_publishers=True, latched=True, publisher_roles=GOAL_ROLES, about="where to go"
+    "goal",
+    m.Goal,
+    "presage goal, viewer",
+    0,
+    "newest",
+    multiple_publishers=True,
+    latched=True,
+    publisher_roles=GOAL_ROLES,
+    about="pose to drive to",
 )
 DRIVE = Topic(
-    "drive", m.Drive, "viewer", 0, "newest", multiple_publishers=True, publisher_roles=CONTROL_ROLES, about="velocity by hand, before any goal"
+    "drive",
+    m.Drive,
+    "viewer",
+    0,
+    "newest",
+    multiple_publishers=True,
+    publisher_roles=CONTROL_ROLES,
+    about="velocity steered by hand; takes precedence over the goal",
 )
 STATUS = Topic("status", m.Status, "controller", 15, "newest", latched=True, about="what the controller does, and why")
-PLAN = Topic("plan", m.Plan, "controller", 0, "newest", about="the way ahead, and what the map does not know")
+PLAN = Topic("plan", m.Plan, "controller", 0, "newest", about="planned path, and obstacles that are not in the map")
 PREFERENCE = Topic(
     "preference",
     m.Preference,
     "controller",
     0,
     "newest",
-    about="the goal prior, on change and every 5 s",
+    about="goal prior as a field, on change and every 5 s",
 )
 HEALTH = Topic(
-    "health", m.Health, "every service", 1, "all", per_service=True, multiple_publishers=True, about="counters of a service"
+    "health",
+    m.Health,
+    "every service",
+    1,
+    "all",
+    per_service=True,
+    multiple_publishers=True,
+    about="counters of a service",
 )
 
 TOPICS: tuple[Topic, ...] = (
@@ -98,12 +122,12 @@ TOPICS: tuple[Topic, ...] = (
     HEALTH,
 )
 
-TELEPORT = Query("teleport", r.PoseRequest, r.Reply, "simulator", about="carry the robot to a pose")
-RESET = Query("reset", r.ResetRequest, r.Reply, "simulator", about="begin anew, with a seed")
+TELEPORT = Query("teleport", r.PoseRequest, r.Reply, "simulator", about="move the robot to a pose")
+RESET = Query("reset", r.ResetRequest, r.Reply, "simulator", about="restart, optionally with a new seed")
 PAUSE = Query("pause", r.Request, r.Reply, "simulator", about="stop the simulation's clock")
-RESUME = Query("resume", r.Request, r.Reply, "simulator", about="let it run on")
-STEP = Query("step", r.Request, r.Reply, "simulator", about="while paused, one scan further")
-SPEED = Query("speed", r.SpeedRequest, r.Reply, "simulator", about="how fast the simulation's clock runs")
+RESUME = Query("resume", r.Request, r.Reply, "simulator", about="resume the simulation's clock")
+STEP = Query("step", r.Request, r.Reply, "simulator", about="advance a paused simulation by one scan")
+SPEED = Query("speed", r.SpeedRequest, r.Reply, "simulator", about="set the speed of the simulation's clock")
 OBSTACLE = Query("obstacle", r.ObstacleRequest, r.Reply, "simulator", about="add, move or remove furniture")
 SAMPLE = Query(
     "sample",
@@ -111,14 +135,23 @@ SAMPLE = Query(
     r.SampleReply,
     "simulator",
     requester_roles=COMPUTE_ROLES,
-    about="the scans seen from a batch of poses",
+    about="simulate scans from given poses",
 )
-WORLD = Query("world", r.Request, r.WorldReply, "simulator", requester_roles=ALL_ROLES, about="world, scanner and robot as data")
-LOCALISE = Query("localise", r.LocaliseRequest, r.Reply, "estimator", requester_roles=GOAL_ROLES, about="begin localisation anew")
-PLAYER = Query("player", r.PlayerRequest, r.PlayerReply, "replay", about="pause, step, seek a replay")
-RECORDING = Query("recording", r.RecordRequest, r.RecordReply, "recorder", about="begin or end a recording")
+WORLD = Query(
+    "world", r.Request, r.WorldReply, "simulator", requester_roles=ALL_ROLES, about="world, scanner and robot as data"
+)
+LOCALISE = Query(
+    "localise", r.LocaliseRequest, r.Reply, "estimator", requester_roles=GOAL_ROLES, about="restart localisation"
+)
+PLAYER = Query("player", r.PlayerRequest, r.PlayerReply, "replay", about="control a replay")
+RECORDING = Query("recording", r.RecordRequest, r.RecordReply, "recorder", about="start or stop a recording")
 MODEL = Query(
-    "model", r.ModelRequest, r.ModelReply, "estimator", requester_roles=ALL_ROLES, about="the model in use: card, map, weights"
+    "model",
+    r.ModelRequest,
+    r.ModelReply,
+    "estimator",
+    requester_roles=ALL_ROLES,
+    about="the estimator's model: card, map, weights",
 )
 PREDICT = Query(
     "predict",
@@ -126,7 +159,7 @@ PREDICT = Query(
     r.PredictReply,
     "estimator",
     requester_roles=COMPUTE_ROLES,
-    about="the scans expected from poses",
+    about="predict scans from given poses",
 )
 CONFIG = Query(
     "config",
@@ -135,27 +168,40 @@ CONFIG = Query(
     "every service",
     per_service=True,
     requester_roles=ALL_ROLES,
-    about="effective configuration",
+    about="effective settings and versions",
 )
 
 QUERIES: tuple[Query, ...] = (
-    TELEPORT, RESET, PAUSE, RESUME, STEP, SPEED, OBSTACLE, SAMPLE, WORLD, LOCALISE, PLAYER, RECORDING, MODEL, PREDICT,
+    TELEPORT,
+    RESET,
+    PAUSE,
+    RESUME,
+    STEP,
+    SPEED,
+    OBSTACLE,
+    SAMPLE,
+    WORLD,
+    LOCALISE,
+    PLAYER,
+    RECORDING,
+    MODEL,
+    PREDICT,
     CONFIG,
-)  # fmt: skip
+)
 
 
 def alive_key(robot: str, service: str = "*", instance: str = "*") -> str:
-    """Liveliness token of a service's instance that leads."""
+    """Key of the liveliness token of an active instance of a service."""
     return f"{ROOT}/{robot}/alive/{service}/{instance}"
 
 
 def standby_key(robot: str, service: str = "*", instance: str = "*") -> str:
-    """Liveliness token of one that waits until no other leads."""
+    """Key of the liveliness token of an instance that waits until no other is active."""
     return f"{ROOT}/{robot}/standby/{service}/{instance}"
 
 
 def topic_of(key: str) -> Topic | None:
-    """The row a concrete key belongs to, or None."""
+    """The topic that a key belongs to, or None if there is none."""
     parts = key.split("/")
     for topic in TOPICS:
         depth = 4 if topic.per_service else 3
@@ -165,5 +211,5 @@ def topic_of(key: str) -> Topic | None:
 
 
 def expected_rate(topic: Topic, scan_time: float) -> float:
-    """Hz of a topic where a scan comes each ``scan_time`` s (0: not said): the table has those of a 15 Hz scanner."""
+    """Rate of a topic in Hz for a scanner with a period of ``scan_time`` s, or the table's 15 Hz if that is 0."""
     return 1 / scan_time if scan_time > 0 and topic.rate == SCAN.rate else topic.rate

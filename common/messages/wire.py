@@ -1,6 +1,6 @@
 """Encodes messages as MessagePack maps and validates them when decoding.
 
-A class that derives from `Message` states its fields once; encoding, validation and the JSON schema follow from it.
+Encoding, validation and the JSON schema are derived from the fields of a `Message` class.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 ENCODING = "application/msgpack"
-FROM_WIRE: dict[str, bool] = {"wire": True}  # validation context of a payload: arrays are binary there, never lists
+FROM_WIRE: dict[str, bool] = {"wire": True}  # validation context of payloads, in which arrays must be binary
 
 
 class DecodeError(ValueError):
-    """A payload that is not the message it should be; the text names the field and what is wrong with it."""
+    """Raised if a payload is not a valid message; the text names the field and the problem."""
 
 
 @dataclass(frozen=True)
 class Binary:
-    """Schema of an array field: element type and the shape behind the first, free, dimension.
+    """Schema of an array field of shape (N, *row) with elements of type ``dtype``.
 
-    ``values`` says which numbers may stand in it: ``finite``, or ``ranges`` (REP-117: +inf is no return,
-    -inf too close, never NaN). ``largest`` limits the size of the finite ones, ``max_rows`` the number of rows.
+    ``values`` are the allowed numbers: ``finite``, or ``ranges`` (REP-117: +inf is no return, -inf is too close, NaN is
+    not allowed). ``largest`` limits the magnitude of the finite ones, ``max_rows`` the number of rows.
     """
 
     dtype: Literal["<f4", "<f8", "u1"]
@@ -43,26 +43,29 @@ class Binary:
     max_rows: int | None = None
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Bytes or anything numpy reads goes in, a read-only array comes out, bytes go on the wire."""
+        """Accept bytes or anything that numpy converts; store a read-only array; serialise it as bytes."""
         return core_schema.with_info_plain_validator_function(
             self.validate,
             serialization=core_schema.plain_serializer_function_ser_schema(lambda array: array.tobytes()),
         )
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """MessagePack's bin type has no JSON twin; the x- keys say how to read it."""
+        """Describe the bytes with keys that begin with x-, as JSON has no equivalent of MessagePack's bin type."""
         limits = {"x-largest": self.largest, "x-max-rows": self.max_rows}
         return {
-            "type": "string", "contentEncoding": "binary", "x-dtype": self.dtype, "x-shape": ["N", *self.row],
+            "type": "string",
+            "contentEncoding": "binary",
+            "x-dtype": self.dtype,
+            "x-shape": ["N", *self.row],
             **{name: limit for name, limit in limits.items() if limit is not None},
-        }  # fmt: skip
+        }
 
     def validate(self, value: Any, info: core_schema.ValidationInfo) -> npt.NDArray[Any]:
-        """The array, shape (N, *row); raises ValueError where length, type or numbers are wrong."""
+        """Convert to an array of shape (N, *row); raises ValueError for a wrong length, type or number."""
         dtype = np.dtype(self.dtype)
         if isinstance(value, bytes):
             if len(value) % (dtype.itemsize * int(np.prod(self.row))):
-                raise ValueError(f"{len(value)} bytes are no whole number of rows {self.row} of {self.dtype}")
+                raise ValueError(f"{len(value)} bytes are not a whole number of rows {self.row} of {self.dtype}")
             array = np.frombuffer(value, dtype)
         elif isinstance(value, np.ndarray | list | tuple) and info.context is not FROM_WIRE:
             array = np.array(value, dtype, order="C")
@@ -71,11 +74,12 @@ class Binary:
         array = array.reshape(-1, *self.row)
         if self.max_rows is not None and len(array) > self.max_rows:
             raise ValueError(f"{len(array)} values are more than {self.max_rows}")
-        bad = np.isnan(array) if self.values == "ranges" else ~np.isfinite(array)
-        if bad.any():
-            raise ValueError(f"{np.count_nonzero(bad)} values are {'NaN' if self.values == 'ranges' else 'not finite'}")
-        if self.largest is not None and (wide := np.isfinite(array) & (np.abs(array) > self.largest)).any():
-            raise ValueError(f"{np.count_nonzero(wide)} values are beyond {self.largest:g}")
+        invalid = np.isnan(array) if self.values == "ranges" else ~np.isfinite(array)
+        if invalid.any():
+            problem = "NaN" if self.values == "ranges" else "not finite"
+            raise ValueError(f"{np.count_nonzero(invalid)} values are {problem}")
+        if self.largest is not None and (large := np.isfinite(array) & (np.abs(array) > self.largest)).any():
+            raise ValueError(f"{np.count_nonzero(large)} values are beyond {self.largest:g}")
         array.setflags(write=False)
         return array
 
@@ -97,29 +101,29 @@ Matrix3 = Annotated[npt.NDArray[np.float64], Binary("<f8", (3,))]
 
 
 class Message(BaseModel):
-    """Frozen, typed, validated; two messages are equal where their bytes are."""
+    """Base of all messages: immutable and validated. Two messages are equal if their encoded bytes are."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore", arbitrary_types_allowed=True)
 
     def encode(self) -> bytes:
-        """The MessagePack bytes."""
+        """Encode as MessagePack."""
         return bytes(msgpack.packb(self.model_dump()))
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """The message in ``payload``; raises DecodeError and nothing else, whatever the bytes are."""
+        """Decode and validate a payload; raises DecodeError, and nothing else, for any invalid bytes."""
         try:
             return cls.model_validate(msgpack.unpackb(payload), context=FROM_WIRE)
         except ValidationError as error:
             first = error.errors(include_url=False, include_context=False, include_input=False)[0]
             field = ".".join(map(str, first["loc"])) or "payload"
             raise DecodeError(f"{cls.__name__}.{field}: {first['msg']}") from None
-        except Exception as error:  # noqa: BLE001 - msgpack raises many kinds, and a hostile payload may find another
-            raise DecodeError(f"{cls.__name__}: no MessagePack ({type(error).__name__}: {error})") from None
+        except Exception as error:  # noqa: BLE001 - msgpack raises many kinds of errors for hostile payloads
+            raise DecodeError(f"{cls.__name__}: not valid MessagePack ({type(error).__name__}: {error})") from None
 
     @classmethod
     def json_schema(cls) -> dict[str, Any]:
-        """JSON schema derived from the fields, for recordings, docs and other languages."""
+        """JSON schema of the fields, for recordings, documentation and other languages."""
         return cls.model_json_schema(mode="serialization")
 
     def __eq__(self, other: object) -> bool:

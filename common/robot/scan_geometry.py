@@ -15,50 +15,50 @@ if TYPE_CHECKING:
 
 
 class Sector(NamedTuple):
-    """Directions seen, in base_link."""
+    """The directions in base_link that a scanner sees."""
 
     centre: float  # rad
-    half: float  # rad to either side; pi: all round
+    half: float  # rad to either side of the centre; pi for the full circle
 
 
 ALL_ROUND = Sector(0.0, float(np.pi))
 
 
 class Sweep(NamedTuple):
-    """Evenly spaced beams."""
+    """Directions of the evenly spaced beams of a scan."""
 
     first: float  # rad in laser
-    increment: float  # rad, negative where they run clockwise
+    increment: float  # rad, negative if the beams run clockwise
     beams: int
 
     @classmethod
     def of(cls, scan: Scan) -> Sweep:
-        """Of a message."""
+        """Beam directions of a scan message."""
         return cls(scan.angle_min, scan.angle_increment, len(scan.ranges))
 
     @property
     def spacing(self) -> float:
-        """Rad between neighbours."""
+        """Angle between neighbouring beams, rad."""
         return abs(self.increment)
 
     @property
     def all_round(self) -> bool:
-        """Whether the gap from the last beam to the first is no wider than that between others."""
+        """Whether the beams cover the full circle, without a gap between the last beam and the first."""
         return self.beams > 2 and self.spacing * self.beams >= 2 * np.pi - self.spacing / 2
 
     @property
     def middle(self) -> float:
-        """Rad in laser, of the field of view."""
+        """Centre of the field of view, rad in laser."""
         return self.first + self.increment * (self.beams - 1) / 2
 
     def sector(self, yaw: float) -> Sector:
-        """What a scanner mounted at ``yaw`` rad looks at."""
+        """Directions in base_link that a scanner mounted with ``yaw`` rad sees."""
         if self.all_round:
             return ALL_ROUND
         return Sector(float(wrap(self.middle + yaw)), float(min(np.pi, self.spacing * max(self.beams - 1, 0) / 2)))
 
     def beams_at(self, bearings: Array) -> npt.NDArray[np.intp]:
-        """(K,) index of the beam nearest to bearings (K,) rad in laser; -1 where the scanner does not look."""
+        """(K,) index of the beam nearest to each of ``bearings`` (K,) rad in laser; -1 outside the field of view."""
         if not self.increment or not self.beams:
             return np.full(np.shape(bearings), -1)
         beam = np.rint(wrap(bearings - self.middle) / self.increment + (self.beams - 1) / 2).astype(int)

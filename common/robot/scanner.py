@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Scanner(BaseModel):
-    """A planar scanner: geometry of its beams, limits, noise and mounting."""
+    """A planar laser scanner: geometry of its beams, limits, noise and mounting."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -27,10 +27,11 @@ class Scanner(BaseModel):
     range_max: PositiveDistance  # m
     sigma: Distance  # m, standard deviation of a range
     mount: tuple[Coordinate, Coordinate, Angle] = (0.0, 0.0, 0.0)  # x m, y m, yaw rad in base_link
-    sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.0  # the part that grows with the range; in quadrature
+    sigma_relative: Annotated[float, Field(ge=0, le=1)] = 0.0  # standard deviation as a share of the range,
+    # added to sigma in quadrature
     first: Annotated[float, Field(ge=-2 * np.pi, le=2 * np.pi)] | None = None
-    # rad, the first beam as the scanner itself counts, counter-clockwise from its x axis; None: -fov / 2
-    upside_down: bool = False  # mounted with a roll of 180 deg: seen from above the beams run clockwise
+    # rad, direction of the first beam in the scanner's own frame, counter-clockwise from x; nil for -fov / 2
+    upside_down: bool = False  # mounted with a roll of 180 deg, so that the beams run clockwise seen from above
 
     @model_validator(mode="after")
     def _limits(self) -> Scanner:
@@ -40,13 +41,13 @@ class Scanner(BaseModel):
 
     @property
     def angle_min(self) -> float:
-        """First beam, rad in laser, whose z points up however the scanner is mounted."""
+        """Direction of the first beam, rad in laser, whose z axis points up in any mounting."""
         first = -self.fov / 2 if self.first is None else self.first
         return -first if self.upside_down else first
 
     @property
     def angle_increment(self) -> float:
-        """Between beams, rad; negative where they run clockwise."""
+        """Angle between beams, rad; negative if they run clockwise."""
         step = self.fov / (self.beams - 1)
         return -step if self.upside_down else step
 
@@ -55,7 +56,10 @@ class Scanner(BaseModel):
         return self.angle_min + self.angle_increment * np.arange(self.beams, dtype=np.float64)
 
     def with_beams(self, beams: int | None) -> Scanner:
-        """The same scanner with another number over the same field of view; raises UserError for an impossible one."""
+        """The same scanner with another number of beams over the same field of view; unchanged if it is None.
+
+        Raises UserError for an invalid number.
+        """
         if beams is None:
             return self
         try:
@@ -64,24 +68,23 @@ class Scanner(BaseModel):
             raise UserError(f"{self.name} with {beams} beams: {first_fault(error)}") from None
 
     def deviation(self, ranges: Array) -> Array:
-        """Standard deviation (m) of what is measured of ``ranges`` m, of any shape; +inf where that is +inf."""
+        """Standard deviation in m of measurements of ``ranges`` m, of the same shape."""
         if not self.sigma_relative:
             return np.full(np.shape(ranges), self.sigma)
         return np.hypot(self.sigma, self.sigma_relative * np.asarray(ranges))
 
     def noisy(self, ranges: Array, rng: np.random.Generator) -> Array:
-        """Exact ``ranges`` m with this scanner's noise; +inf stays."""
+        """Exact ``ranges`` in m plus this scanner's noise; +inf stays +inf."""
         draws = rng.standard_normal(np.shape(ranges))
-        seen = np.isfinite(ranges)
-        return np.asarray(ranges + np.where(seen, self.deviation(np.where(seen, ranges, 0.0)), 0.0) * draws)
+        finite = np.isfinite(ranges)
+        return np.asarray(ranges + np.where(finite, self.deviation(np.where(finite, ranges, 0.0)), 0.0) * draws)
 
     def limit(self, ranges: Array) -> Array:
-        """Ranges beyond the scanner's limits as it reports them (REP-117): +inf too far, -inf too close."""
+        """Replace ranges beyond the scanner's limits (REP-117): +inf for too far, -inf for too close."""
         far = np.where(ranges > self.range_max, np.inf, ranges)
         return np.where(far < self.range_min, -np.inf, far)
 
     def __str__(self) -> str:
-        """One line for people."""
         x, y, yaw = self.mount
         relative = f" and {self.sigma_relative:.2g} of the range" if self.sigma_relative else ""
         return (
@@ -92,7 +95,7 @@ class Scanner(BaseModel):
         )
 
 
-# Figures of the makers' data sheets; where a sheet has no standard deviation, what stands for one is said.
+# Values from the manufacturers' data sheets. Comments give a substitute where a sheet states no standard deviation.
 SCANNERS: dict[str, Scanner] = {
     # SICK TiM571-2050101: 270 deg, 1/3 deg, 15 Hz, 0.05 to 25 m, statistical error 20 mm (1 sigma); mounted as on PAL's
     # PMB-2.
@@ -106,7 +109,7 @@ SCANNERS: dict[str, Scanner] = {
         sigma=0.02,
         mount=(0.2, 0.0, 0.0),
     ),
-    # Hokuyo UST-10LX: 270 deg, 0.25 deg, 25 ms a scan, 0.06 to 10 m, repeated accuracy sigma < 30 mm: an upper limit.
+    # Hokuyo UST-10LX: 270 deg, 0.25 deg, 25 ms per scan, 0.06 to 10 m, repeated accuracy sigma < 30 mm (upper limit).
     "ust-10lx": Scanner(
         name="ust-10lx",
         beams=1081,
@@ -117,8 +120,8 @@ SCANNERS: dict[str, Scanner] = {
         sigma=0.03,
         mount=(0.2, 0.0, 0.0),
     ),
-    # SICK LMS 200 at 180 deg and 1 deg: 13.3 ms a scan, statistical error 5 mm (1 sigma) within 8 m in millimetre mode,
-    # whose largest number is 8.19 m. No least distance is given.
+    # SICK LMS 200 at 180 deg and 1 deg: 13.3 ms per scan, statistical error 5 mm (1 sigma) within 8 m in millimetre
+    # mode, whose largest value is 8.19 m. No minimum range is given.
     "lms200": Scanner(
         name="lms200",
         beams=181,
@@ -129,9 +132,9 @@ SCANNERS: dict[str, Scanner] = {
         sigma=0.005,
         mount=(0.2, 0.0, 0.0),
     ),
-    # Slamtec RPLIDAR A1M8: 360 samples a turn at 5.5 Hz, 0.15 to 12 m, "distance resolution" < 0.5 mm below 1.5 m and
-    # < 1 % of the distance everywhere. No statistical error is given: 1 % stands for it. The ROS driver publishes
-    # 360 beams from -179 to 180 deg, so the last is one step short of the first.
+    # Slamtec RPLIDAR A1M8: 360 samples per turn at 5.5 Hz, 0.15 to 12 m, "distance resolution" < 0.5 mm below 1.5 m and
+    # < 1 % of the distance everywhere. No statistical error is given, so 1 % is used. The ROS driver publishes 360
+    # beams from -179 to 180 deg, so the last beam is one step before the first.
     "rplidar-a1": Scanner(
         name="rplidar-a1",
         beams=360,

@@ -29,8 +29,8 @@ class _Mount(BaseModel):
     yaw_deg: Degrees = 0.0
 
 
-class _File(BaseModel):
-    """A scanner as a user writes it: metres, seconds, and degrees where the key says so."""
+class _ScannerFile(BaseModel):
+    """Contents of a scanner file: SI units, but degrees for keys that end with _deg."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -47,10 +47,8 @@ class _File(BaseModel):
     upside_down: bool = False
 
     def scanner(self) -> Scanner:
-        """In radians."""
-        given = self.model_dump(exclude={"fov_deg", "first_deg", "mount"})
         return Scanner(
-            **given,
+            **self.model_dump(exclude={"fov_deg", "first_deg", "mount"}),
             fov=float(np.deg2rad(self.fov_deg)),
             first=None if self.first_deg is None else float(np.deg2rad(self.first_deg)),
             mount=(self.mount.x, self.mount.y, float(np.deg2rad(self.mount.yaw_deg))),
@@ -58,13 +56,13 @@ class _File(BaseModel):
 
 
 def load_scanner(name: str) -> Scanner:
-    """The scanner known by that name, or described in that YAML file; raises UserError: what is wrong, and where."""
+    """The known scanner of that name, or the one described in that YAML file; raises UserError if there is none."""
     if name in SCANNERS:
         return SCANNERS[name]
     path = Path(name)
     try:
         data: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return _File.model_validate(data).scanner()
+        return _ScannerFile.model_validate(data).scanner()
     except (FileNotFoundError, NotADirectoryError):
         raise UserError(f"no scanner {name!r}: choose one of {', '.join(SCANNERS)}, or give a file") from None
     except ValidationError as error:
@@ -80,10 +78,10 @@ def load_scanner(name: str) -> Scanner:
 def chosen_scanner(
     name: str, beams: int | None = None, noise: float | None = None, mount: str = "", *, upside_down: bool | None = None
 ) -> Scanner:
-    """A known scanner or a file's, with what was asked for instead of its own; raises UserError.
+    """A known scanner, or that of a file, with some properties replaced; raises UserError for invalid ones.
 
-    ``noise`` is the standard deviation of a range in m; ``mount`` is x,y[,yaw_deg] in base_link, in m and deg.
-    Empty or None: the scanner's own.
+    ``noise`` is the standard deviation of a range in m; ``mount`` is x,y[,yaw_deg] in base_link, in m and degrees.
+    Empty text or None keeps the scanner's own value.
     """
     scanner = load_scanner(name).with_beams(beams)
     changes: dict[str, Any] = {}
@@ -100,8 +98,8 @@ def chosen_scanner(
 
 
 def scanner_arguments(name: str, beams: int | None, mount: str, *, upside_down: bool) -> tuple[str, ...]:
-    """The simulator's options for what was asked for here; raises UserError where it is no scanner."""
+    """Command-line options of the simulator for this scanner; raises UserError if it is invalid."""
     chosen_scanner(name, beams, mount=mount)
-    given = {"--beams": "" if beams is None else str(beams), "--mount": mount}
-    more = [part for option, value in given.items() if value for part in (f"{option}={value}",)]
-    return ("--scanner", name, *more, *(["--upside-down"] if upside_down else []))
+    options = {"--beams": "" if beams is None else str(beams), "--mount": mount}
+    given = [f"{option}={value}" for option, value in options.items() if value]
+    return ("--scanner", name, *given, *(["--upside-down"] if upside_down else []))

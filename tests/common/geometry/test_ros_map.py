@@ -126,7 +126,7 @@ def test_keys_left_out_are_map_savers_defaults_and_presages_own_are_taken(tmp_pa
     ("keys", "why"),
     [
         ({"image": "none.pgm"}, "none.pgm: no such file"),
-        ({"image": "map.yaml"}, "no image"),
+        ({"image": "map.yaml"}, "not an image"),
         ({"image": "cut.png"}, "cut.png: cannot be read"),
         ({"image": ""}, "image: .*at least 1 character"),
         ({"mode": "quaternary"}, "mode: .*'trinary', 'scale' or 'raw'"),
@@ -136,7 +136,7 @@ def test_keys_left_out_are_map_savers_defaults_and_presages_own_are_taken(tmp_pa
         ({"resolution": float("inf")}, "resolution: "),
         ({"resolution": "five"}, "resolution: .*valid number"),
         ({"negate": "perhaps"}, "negate: "),
-        ({"free_thresh": 0.7}, "free_thresh 0.7 is not below occupied_thresh 0.65"),
+        ({"free_thresh": 0.7}, "free_thresh 0.7 must be below occupied_thresh 0.65"),
         ({"occupied_thresh": 1.2}, "occupied_thresh: .*less than or equal to 1"),
         ({"image": "huge.png"}, "5000 x 4000 pixels are more than 16000000"),
         ({"start": {"x": 1}}, "start.y: Field required"),

@@ -23,9 +23,9 @@ def test_every_row_and_field_is_on_it_with_what_the_source_says():
     for cls in (Scan, Belief):
         section = text.split(f"### {cls.__name__}\n")[1].split("###")[0]
         assert all(f"| `{name}` |" in section for name in cls.model_fields)
-    said = "(B,) m; +inf nothing within range_max, -inf too close (REP-117), 0 not measured"
+    meaning = "(B,) m; +inf is nothing within range_max, -inf is too close (REP-117), 0 is not measured"
     limits = "N at most 32768, finite values within ±30000"
-    assert f"| `ranges` | binary `<f4` (N,), {limits} | required | {said} |" in text
+    assert f"| `ranges` | binary `<f4` (N,), {limits} | required | {meaning} |" in text
     assert "the negative gradient of accuracy" in text  # a comment below its field
 
 

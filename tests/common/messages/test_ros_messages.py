@@ -60,7 +60,7 @@ def test_a_scanner_that_leans_is_none(lean_deg):
 
 @pytest.mark.parametrize("wrong", [dict.fromkeys("xyzw", 0.0), {**dict.fromkeys("xyz", 0.0), "w": np.nan}])
 def test_what_is_no_rotation_is_refused(wrong):
-    with pytest.raises(ValueError, match="no rotation"):
+    with pytest.raises(ValueError, match="not a rotation"):
         read_rotation(vector(**wrong))
     with pytest.raises(ValueError, match="m is not finite"):
         read_pose(vector(x=np.inf, y=0.0, z=0.0), quaternion())

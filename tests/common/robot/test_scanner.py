@@ -109,8 +109,8 @@ def test_a_file_describes_a_scanner(tmp_path):
         (("range_max: 8", "range_max: 0.1"), "range_max 0.1 m must be more than range_min 0.1 m"),
         (("x: 0.1", "z: 0.1"), "mount.z: Extra inputs"),
         (("name: mine", "name: [mine"), "not valid YAML"),
-        ((FILE, "- 1"), "keys with values are expected"),
-        (("{x: 0.1, yaw_deg: 90}", "3"), r"mount: keys with values are expected, such as {x: 1, y: 2}, not '3' \(m"),
+        ((FILE, "- 1"), "expected keys with values"),
+        (("{x: 0.1, yaw_deg: 90}", "3"), r"mount: expected keys with values, such as {x: 1, y: 2}, not '3' \(m"),
     ],
 )
 def test_a_wrong_file_says_what_and_where(tmp_path, change, wrong):

@@ -38,7 +38,11 @@ def degrees(found):
 def test_off_unless_told():
     for settings in (ControllerSettings(), BridgeRos2Settings()):
         whole = scan()
-        assert settings.build_self_filter().mask_for_planning(whole) is settings.build_self_filter().mask_for_bus(whole) is whole
+        assert (
+            settings.build_self_filter().mask_for_planning(whole)
+            is settings.build_self_filter().mask_for_bus(whole)
+            is whole
+        )
 
 
 def test_a_post_says_nothing():

@@ -88,7 +88,7 @@ def test_what_is_no_pose_is_refused(text):
 
 
 def test_a_pose_beyond_all_maps_is_refused():
-    with pytest.raises(UserError, match=r"--start '999999999,1': x and y are within 10000 m of the origin"):
+    with pytest.raises(UserError, match=r"--start '999999999,1': x and y must be within 10000 m of the origin"):
         pose_of_text("999999999,1", "--start")
 
 
