@@ -114,7 +114,9 @@ def e3(
     from lab.experiments.estimators import ExperimentWorld, descent_of, parse_estimators  # noqa: PLC0415
     from lab.paper import e3_navigation as navigation  # noqa: PLC0415
 
-    job = navigation.Job(0, seed, apart, free=free, field=ExperimentWorld(world, beams), descent=descent_of(alpha, steps))
+    job = navigation.Job(
+        0, seed, apart, free=free, field=ExperimentWorld(world, beams), descent=descent_of(alpha, steps)
+    )
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
     show(navigation, lambda: navigation.run(job, trials, out, workers, console), out)
 

@@ -162,7 +162,9 @@ def draw(result: results.Result) -> Figure:
     bottoms[0].set_ylabel("measured − expected (m)")
     tops[1].sharey(tops[0])
     tops[1].legend(fontsize=9, frameon=False, loc="upper right")
-    _calibration(drawing.style_axes(figure.add_subplot(grid[:, 2])), row["models"]["precise"], result.parameters["scans"])
+    _calibration(
+        drawing.style_axes(figure.add_subplot(grid[:, 2])), row["models"]["precise"], result.parameters["scans"]
+    )
     figure.suptitle("; ".join(result.notes[:1]), fontsize=10)
     return figure
 

@@ -1,8 +1,8 @@
-"""`make bless`: show what services answer differently than their references, and make that the new reference.
+"""`make bless`: shows where services answer differently from their references, and writes new references.
 
-python -m tests.process_replay.bless                 all of them
-python -m tests.process_replay.bless controller      one
-python -m tests.process_replay.bless --show          show, write nothing
+python -m tests.process_replay.bless                 all services
+python -m tests.process_replay.bless controller      one service
+python -m tests.process_replay.bless --show          only show the differences
 """
 
 from __future__ import annotations
@@ -17,32 +17,34 @@ from tests.process_replay import reference
 from tests.process_replay.reference import FOLDER, Row
 from tests.process_replay.sessions import SESSIONS
 
-SHOWN = 12  # differences of a service
+MAX_SHOWN_DIFFERENCES = 12  # per service
 
 
 def bless(
-    name: str, rows: list[Row], folder: Path = FOLDER, *, write: bool = True, say: Callable[[str], object] = print
+    name: str, rows: list[Row], folder: Path = FOLDER, *, write: bool = True, report: Callable[[str], object] = print
 ) -> bool:
-    """Whether there was anything to accept; says what before it writes."""
+    """Reports the differences and writes the new reference. Returns whether there were any differences."""
     path = folder / f"{name}.jsonl"
     old = reference.read(name, folder)
     if old:
         differences = list(reference.compare(old, rows))
         if not differences:
-            say(f"{name}: as before")
+            report(f"{name}: unchanged")
             return False
-        say(reference.report(name, differences, SHOWN))
+        report(reference.report(name, differences, MAX_SHOWN_DIFFERENCES))
     else:
-        say(f"{name}: no reference yet; {len(rows)} messages")
+        report(f"{name}: no reference yet; {len(rows)} messages")
     if write:
         before = path.read_text().splitlines() if old else []
         after = reference.write(name, reference.merged(old, rows), folder).read_text().splitlines()
-        say(f"{name}: written to {path.name}, {len(set(after) - set(before))} of {len(after)} lines new; see git diff")
+        report(
+            f"{name}: written to {path.name}, {len(set(after) - set(before))} of {len(after)} lines new; see git diff"
+        )
     return True
 
 
 def main(arguments: list[str], sessions: Mapping[str, Callable[..., list[Row]]] = SESSIONS) -> None:
-    """Of the services named, or all."""
+    """Updates the references of the named services, or of all."""
     names = [argument for argument in arguments if argument != "--show"] or list(sessions)
     if unknown := set(names) - set(sessions):
         sys.exit(f"no session {', '.join(sorted(unknown))}: choose from {', '.join(sessions)}")

@@ -1,4 +1,4 @@
-"""Puts a service on a bus that is none: events in, everything it sends, answers and counts out, as plain rows."""
+"""Runs a service on a fake bus: events go in; its messages, answers and counters come out as plain rows."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from common.runtime.service import Loop, Service
 from tests.process_replay.reference import Row, of_array, of_symmetric
 
 ROBOT = "replayed"
-SHORT = 9  # numbers; an array up to it is written in full
-# Of these answers what is checked elsewhere and would fill pages is left out.
-LEFT_OUT = {WorldReply: {"world"}, SampleReply: {"scanner"}, ModelReply: {"world", "card"}}
+MAX_FULL_ARRAY = 9  # arrays of up to this many numbers are written in full
+# Fields left out of these replies, because they are long and checked elsewhere.
+OMITTED_FIELDS = {WorldReply: {"world"}, SampleReply: {"scanner"}, ModelReply: {"world", "card"}}
 
 
 @dataclass
 class FakeBus:
-    """What a service needs of `common.bus.bus.Bus`; keeps what is put."""
+    """The part of `common.bus.bus.Bus` that services use; stores what they publish."""
 
     robot: str = ROBOT
     instance: str = "replayed"
     sent: list[tuple[Topic, bytes]] = field(default_factory=list)
-    replies: dict[tuple[str, str], Reply] = field(default_factory=dict)  # by service and query, of those beside it
+    replies: dict[tuple[str, str], Reply] = field(default_factory=dict)  # of other services, by service and query
     subscribed: dict[Topic, Inbox] = field(default_factory=dict)
 
     def put(self, topic: Topic, payload: bytes, service: str = "*", key: str | None = None) -> None:
@@ -53,7 +53,7 @@ class FakeBus:
         inbox.put(Answer(query, number, reply.encode() if reply else b"", "" if reply else "nobody answers"))
 
     def ask_each(self, *args: Any, **rest: Any) -> threading.Event:
-        """Nobody answers, at once."""
+        """Completes at once, without answers."""
         done = threading.Event()
         done.set()
         return done
@@ -69,9 +69,9 @@ class FakeBus:
 
 @dataclass(frozen=True)
 class Event:
-    """One thing that happens to a service: a payload, a request, or its timer."""
+    """An input of a service: a payload, a request, or its timer."""
 
-    what: Topic | Query | None  # None: the time asked for in `due` has come
+    what: Topic | Query | None  # None for the timer, at the time returned by `due`
     payload: bytes = b""
 
     @classmethod
@@ -87,14 +87,17 @@ def sample(topic: Topic, payload: bytes, at_ns: int = 1, service: str = "other")
 
 
 def drive(service: Service, events: Iterable[Event]) -> list[Row]:
-    """Every message and answer in order, with the number of the event that caused it; at the end the counters."""
+    """Feeds the events to the service. Returns its messages and answers in order, and finally its counters.
+
+    Each row has the number of the event that caused it.
+    """
     bus = FakeBus()
     loop = Loop(service, bus, Inbox())  # type: ignore[arg-type]
     service.open()
     rows: list[Row] = []
     try:
         for number, event in enumerate(events):
-            _happen(loop, event, number, rows)
+            _feed(loop, event, number, rows)
             while isinstance(answer := loop.inbox.get(0), Answer):
                 loop.service.on_reply(answer.query, answer.number, answer.reply())
             rows += [
@@ -105,7 +108,7 @@ def drive(service: Service, events: Iterable[Event]) -> list[Row]:
     finally:
         service.close()
     counts = {
-        # Times are this machine's.
+        # Times differ between machines.
         "counters": {name: count for name, count in sorted(service.counters.items()) if "_us" not in name},
         "published": dict(sorted(loop.published.items())),
         "undecodable": dict(sorted(loop.undecodable.items())),
@@ -115,7 +118,7 @@ def drive(service: Service, events: Iterable[Event]) -> list[Row]:
     return [*rows, {"end": counts}]
 
 
-def _happen(loop: Loop, event: Event, number: int, rows: list[Row]) -> None:
+def _feed(loop: Loop, event: Event, number: int, rows: list[Row]) -> None:
     if event.what is None:
         loop.guard(loop.service.on_timer)
     elif isinstance(event.what, Topic):
@@ -134,11 +137,11 @@ def _happen(loop: Loop, event: Event, number: int, rows: list[Row]) -> None:
 
 
 def row_of(model: BaseModel) -> Row:
-    """Fields by name, less those at their default."""
+    """The model's fields by name, without those that have their default value."""
     row: Row = {}
-    for name, about in type(model).model_fields.items():
+    for name, info in type(model).model_fields.items():
         value = getattr(model, name)
-        if name in LEFT_OUT.get(type(model), ()) or (not isinstance(value, np.ndarray) and value == about.default):
+        if name in OMITTED_FIELDS.get(type(model), ()) or (not isinstance(value, np.ndarray) and value == info.default):
             continue
         if isinstance(value, np.ndarray) and not value.size:
             continue
@@ -153,7 +156,7 @@ def _plain(value: Any) -> Any:
         if value.shape == (3, 3) and np.allclose(value, value.T):
             return of_symmetric(value)
         flat = value.astype(float).ravel()
-        return flat.tolist() if len(flat) <= SHORT else of_array(flat)
+        return flat.tolist() if len(flat) <= MAX_FULL_ARRAY else of_array(flat)
     if isinstance(value, list | tuple):
         return [_plain(each) for each in value]
     return value

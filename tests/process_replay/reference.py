@@ -1,7 +1,7 @@
-"""References as text: rows of plain values, numbers rounded, long arrays as a few statistics and samples.
+"""References as text files: rows of plain values with rounded numbers; long arrays as a few statistics and samples.
 
-Two rows are compared field by field. States, counts and text must be equal. Numbers may differ by `tolerance`: another
-processor sums in another order and rounds a sine another way, so the last digits are nobody's decision.
+Rows are compared field by field. States, counts and text must be equal. Numbers may differ by `tolerance`, because
+processors differ in the order of sums and in the rounding of functions such as the sine.
 """
 
 from __future__ import annotations
@@ -19,23 +19,24 @@ import numpy as np
 Row = dict[str, Any]
 
 FOLDER = Path(__file__).resolve().parent / "references"
-DIGITS = 7  # significant, of a number in a file
-SAMPLES = 6  # of a long array
-FIRST = 6  # differences that are shown
+DIGITS = 7  # significant digits of numbers in a file
+SAMPLES = 6  # stored values of a long array
+MAX_SHOWN_DIFFERENCES = 6
 MISSING = "nothing"
-# Absolute and relative, by the last name of a field's path that has a row here; else that of "". Where the same code
-# ran without AVX and FMA, with another BLAS kernel and two threads, the network of preset paper (float32) was off by
-# 6e-7 relative and 3e-7 m, all else by 1e-15: ten times that is allowed. xi is a difference of large numbers.
+# Absolute and relative tolerance by the last name in a field's path that is listed here, otherwise of "". Run without
+# AVX and FMA, with another BLAS kernel and two threads, the same code gave differences of 6e-7 (relative) and 3e-7 m in
+# the network of preset paper (float32), and of 1e-15 elsewhere; ten times that is allowed. xi is a difference of large
+# numbers.
 TOLERANCES = {"": (1e-6, 5e-6), "xi": (1e-2, 1e-5)}
 
 
 @dataclass(frozen=True)
 class Difference:
-    """One field of one message that is not as the reference has it."""
+    """A field of a message that differs from the reference."""
 
-    number: int  # of the row in the reference, from 0; of a new one, its own
-    message: str  # what it is
-    field: str  # its path; empty: the whole message
+    number: int  # of the row in the reference, from 0; for a new message its own number
+    message: str  # kind and stamp
+    field: str  # path of the field; empty for the whole message
     expected: Any
     got: Any
 
@@ -51,7 +52,7 @@ class Difference:
 
 
 def of_array(values: np.ndarray) -> Row:
-    """A long array (N,) in a few numbers."""
+    """A few statistics and samples of a long array (N,)."""
     finite = values[np.isfinite(values)]
     row: Row = {"count": len(values), "inf": int(np.isposinf(values).sum()), "-inf": int(np.isneginf(values).sum())}
     if len(finite):
@@ -63,7 +64,7 @@ def of_array(values: np.ndarray) -> Row:
 
 
 def of_symmetric(matrix: np.ndarray) -> Row:
-    """A covariance or a curvature (3, 3): its scale by axis, and what is left of the rest, from -1 to 1."""
+    """A covariance or curvature (3, 3) as the roots of its diagonal and its correlations."""
     root = np.sqrt(np.abs(np.diag(matrix)))
     scale = np.where(root > 0, root, 1.0)
     scaled = matrix / np.outer(scale, scale)
@@ -71,14 +72,14 @@ def of_symmetric(matrix: np.ndarray) -> Row:
 
 
 def tolerance(field: str, expected: float) -> float:
-    """By how much a number may differ from the reference's."""
+    """How much a number may differ from the reference."""
     names = [part.partition("[")[0] for part in field.split(".")]
     absolute, relative = next((TOLERANCES[name] for name in reversed(names) if name in TOLERANCES), TOLERANCES[""])
     return absolute + relative * abs(expected)
 
 
 def compare(expected: Sequence[Row], got: Sequence[Row]) -> Iterator[Difference]:
-    """Every field that differs, and every message that is missing or new."""
+    """Yields every field that differs, and every message that is missing or new."""
     for number, old, new in _aligned(expected, got):
         if old is None or new is None:
             kind = _kind(new if old is None else old)
@@ -88,7 +89,7 @@ def compare(expected: Sequence[Row], got: Sequence[Row]) -> Iterator[Difference]
 
 
 def _aligned(expected: Sequence[Row], got: Sequence[Row]) -> Iterator[tuple[int, Row | None, Row | None]]:
-    """Number, expected and got, of messages of one kind and stamp; those without a partner alone."""
+    """Pairs messages of the same kind and stamp. Yields number, expected and new row; None where one is missing."""
     matcher = SequenceMatcher(None, [_kind(row) for row in expected], [_kind(row) for row in got], autojunk=False)
     for what, a, after_a, b, after_b in matcher.get_opcodes():
         if what == "equal":
@@ -117,7 +118,7 @@ def _same(path: str, old: Any, new: Any) -> bool:
 
 
 def merged(expected: Sequence[Row], got: Sequence[Row]) -> list[Row]:
-    """The new rows, but the old number wherever it is within tolerance: a bless changes no line without need."""
+    """The new rows, with the old numbers where they agree within tolerance, so that unchanged lines stay the same."""
     pairs = _aligned(expected, got)
     return [new if old is None else _merged(old, new, "") for _, old, new in pairs if new is not None]
 
@@ -130,8 +131,8 @@ def _merged(old: Any, new: Any, path: str) -> Any:
     return old if _same(path, old, new) else new
 
 
-def report(name: str, differences: Sequence[Difference], first: int = FIRST) -> str:
-    """For a person: the first few, and how many of what."""
+def report(name: str, differences: Sequence[Difference], first: int = MAX_SHOWN_DIFFERENCES) -> str:
+    """Readable report: the first differences, and a count by kind."""
     messages = len({d.number for d in differences})
     lines = [f"{name}: {messages} message(s) differ from the reference, {len(differences)} field(s):"]
     lines += [f"  {difference}" for difference in differences[:first]]
@@ -141,8 +142,12 @@ def report(name: str, differences: Sequence[Difference], first: int = FIRST) -> 
         for each in differences:
             kinds.setdefault(f"{each.message.split(',')[0]} {_without_index(each.field)}".strip(), []).append(each)
         by_count = sorted(kinds.items(), key=lambda item: -len(item[1]))
-        lines += [f"    {len(of_kind):4} x {kind}{_farthest(of_kind)}" for kind, of_kind in by_count[:FIRST]]
-        lines += [f"    and {len(kinds) - FIRST} more fields"] if len(kinds) > FIRST else []
+        lines += [
+            f"    {len(of_kind):4} x {kind}{_farthest(of_kind)}" for kind, of_kind in by_count[:MAX_SHOWN_DIFFERENCES]
+        ]
+        lines += (
+            [f"    and {len(kinds) - MAX_SHOWN_DIFFERENCES} more fields"] if len(kinds) > MAX_SHOWN_DIFFERENCES else []
+        )
     return "\n".join(lines)
 
 
@@ -153,13 +158,13 @@ def _farthest(differences: Sequence[Difference]) -> str:
 
 
 def read(name: str, folder: Path = FOLDER) -> list[Row]:
-    """A reference; empty where there is none yet."""
+    """Reads a reference; empty if there is none yet."""
     path = folder / f"{name}.jsonl"
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
 def write(name: str, rows: Sequence[Row], folder: Path = FOLDER) -> Path:
-    """One line a row, numbers rounded."""
+    """Writes a reference, one line per row, with rounded numbers."""
     path = folder / f"{name}.jsonl"
     path.write_text("".join(json.dumps(_rounded(row)) + "\n" for row in rows))
     return path

@@ -1,6 +1,6 @@
-"""Short sessions, generated from a seed, that go through one service each.
+"""Short sessions, generated from a seed, each for one service.
 
-No service's input is another's output: a change of one shows in that one's reference alone.
+No service's output is used as another's input, so a change in a service changes only its own reference.
 """
 
 from __future__ import annotations
@@ -68,11 +68,11 @@ SEED = 5
 PERIOD_NS = 66_666_667
 CORRIDOR = load_world("corridor")
 SCANNER = SCANNERS["tim571"].with_beams(622)
-NORTH = np.pi / 2  # the heading that preset paper knows
+NORTH = np.pi / 2  # the heading for which preset paper is trained
 
 
 def scan_at(number: int, pose: np.ndarray, rng: np.random.Generator, **changes: Any) -> Scan:
-    """What the scanner sees at base_link ``pose`` (3,): exact rays and its noise."""
+    """Scan at base_link ``pose`` (3,): exact rays with the scanner's noise."""
     exact = CORRIDOR.ray_distances(se2.compose(pose, np.array(SCANNER.mount))[None], SCANNER.angles())[0]
     ranges = SCANNER.limit(exact + SCANNER.sigma * rng.standard_normal(len(exact)))
     values = {
@@ -83,7 +83,7 @@ def scan_at(number: int, pose: np.ndarray, rng: np.random.Generator, **changes: 
 
 
 def simulator_events() -> Iterator[Event]:
-    """Drive, turn, run at a wall, be carried off, meet new furniture; late, foreign and broken commands."""
+    """Driving, turning, a wall, a teleport, new obstacles; and late, foreign and malformed commands."""
 
     def command(number: int, vx: float, vy: float = 0.0, wz: float = 0.0) -> Event:
         return Event.of(CMD_VEL, CmdVel(stamp_ns=number * PERIOD_NS, twist=Twist(vx=vx, vy=vy, wz=wz)))
@@ -95,8 +95,8 @@ def simulator_events() -> Iterator[Event]:
     yield command(2, 0.1)  # answers a scan of long ago
     yield Event(CMD_VEL, b"no message")
     for number in range(4, 7):
-        yield command(number, 0.0, 3.0)  # faster than it may be
-    yield Event.of(TELEPORT, PoseRequest(pose=Pose(x=1.0, y=0.1)))  # its place is too narrow
+        yield command(number, 0.0, 3.0)  # above the speed limit
+    yield Event.of(TELEPORT, PoseRequest(pose=Pose(x=1.0, y=0.1)))  # too close to a wall
     yield Event.of(TELEPORT, PoseRequest(pose=Pose(x=9.0, y=3.0, yaw=NORTH)))
     box = Obstacle(box=Box(center=(9.0, 4.0), size=(0.6, 0.3), yaw_deg=20))
     yield Event.of(OBSTACLE, ObstacleRequest(action="add", name="crate", obstacle=box))
@@ -110,19 +110,19 @@ def simulator_events() -> Iterator[Event]:
     yield Event.of(RESET, ResetRequest(seed=9))
     yield TIMER
     yield command(0, 0.5)
-    yield Event.of(SPEED, SpeedRequest(factor=2.0))  # of a lockstep there is none
-    yield Event.of(STEP, Request())  # time runs
+    yield Event.of(SPEED, SpeedRequest(factor=2.0))  # refused in lockstep
+    yield Event.of(STEP, Request())  # refused while not paused
     yield Event.of(PAUSE, Request())
-    yield Event.of(STEP, Request())  # no command answers this scan yet
+    yield Event.of(STEP, Request())  # this scan has no command yet
     yield command(1, 0.5)
-    yield command(1, 0.0)  # a controller that got tired of waiting
+    yield command(1, 0.0)  # a second command for the same scan
     yield Event.of(STEP, Request())
     yield command(2, 0.5)
     yield Event.of(STEP, Request())
 
 
 def estimator_events() -> Iterator[Event]:
-    """Localise from nothing, drive, be carried off; a scan twice, a scan of another scanner, no scan at all."""
+    """Global localisation, driving and a new pose; a repeated scan, a scan of another scanner, a malformed scan."""
     rng = np.random.default_rng(SEED)
     yield Event.of(MODEL, ModelRequest())
     yield Event.of(LOCALISE, LocaliseRequest())
@@ -146,7 +146,7 @@ def estimator_events() -> Iterator[Event]:
 
 
 def controller_events() -> Iterator[Event]:
-    """Goals refused, taken, reached and cancelled; a belief that does not know, one twice, none any more; by hand."""
+    """Goals refused, accepted, reached and cancelled; unsure, repeated and missing beliefs; manual driving."""
     rng = np.random.default_rng(SEED)
     target = np.array([5.2, 1.5])
     for number in [*range(39), 55, 72, 73, *range(90, 112)]:
@@ -160,9 +160,9 @@ def controller_events() -> Iterator[Event]:
         if goal is not None:
             yield Event.of(GOAL, goal)
         scan = scan_at(number, np.array([*position, 0.1]), rng)
-        if number in range(92, 104):  # then stands, by hand, until the goal's turn comes again
+        if number in range(92, 104):  # stands under manual control until the goal becomes active again
             yield Event.of(DRIVE, Drive(stamp_ns=0, twist=Twist(vx=-0.3, vy=2.0, wz=0.5) if number < 96 else Twist()))
-        if number in {18, 19, 38, 55, 72}:  # somebody steps in front of it; from 38 on, and stays
+        if number in {18, 19, 38, 55, 72}:  # a person in front of the robot, from 38 on closer
             near = np.where(np.abs(scan.angles()) < 0.3, 0.25 if number < 38 else 0.12, scan.ranges)
             scan = scan.model_copy(update={"ranges": near.astype(np.float32)})
         yield Event.of(SCAN, scan)
@@ -174,21 +174,21 @@ def controller_events() -> Iterator[Event]:
         yield Event.of(BELIEF, belief)
         if number == 20:
             yield Event.of(BELIEF, belief)
-    yield TIMER  # nothing came for too long
-    for number in range(112, 126):  # a hand needs no belief; it falls silent, and the robot brakes
+    yield TIMER  # no belief for too long
+    for number in range(112, 126):  # manual driving without belief; when its commands end, the robot brakes
         if number < 114:
             yield Event.of(DRIVE, Drive(stamp_ns=0, twist=Twist(vx=-0.8)))
         yield Event.of(SCAN, scan_at(number, np.array([*target, 0.1]), rng))
 
 
 def simulator(folder: Path, **changes: Any) -> list[Row]:
-    """One scan answers each command, so the machine's speed does not count."""
+    """Runs the simulator in lockstep, so that the machine's speed does not matter."""
     settings = {"pace": "lockstep", "seed": SEED, "beams": 622, "robot": ROBOT, "lockstep_deadline": 60.0}
     return drive(SimulatorService(SimulatorSettings(**{**settings, **changes})), simulator_events())
 
 
 def estimator(name: str) -> Callable[..., list[Row]]:
-    """One of that name."""
+    """Returns a function that runs the named estimator."""
 
     def run(folder: Path, **changes: Any) -> list[Row]:
         near = {"initial_pose": "9.2,2.2,90"} if name == "particle-filter" else {}
@@ -199,7 +199,7 @@ def estimator(name: str) -> Callable[..., list[Row]]:
 
 
 def controller(preset: str) -> Callable[..., list[Row]]:
-    """Of that preset; with the world, so that it can refuse a goal."""
+    """Returns a function that runs the controller with a preset, and with the world, so that it can refuse goals."""
 
     def run(folder: Path, **changes: Any) -> list[Row]:
         settings = {"world": "corridor", "preset": preset, "robot": ROBOT}
@@ -209,7 +209,7 @@ def controller(preset: str) -> Callable[..., list[Row]]:
 
 
 def recorder(folder: Path, **changes: Any) -> list[Row]:
-    """Its loop runs in a thread, as it is the loop that fills the file; what comes out is read from the file."""
+    """Runs the recorder's loop in a thread, because the loop writes the file. Returns the contents of the file."""
     settings = {"directory": folder, "file": "session.mcap", "robot": ROBOT, **changes}
     service, bus = RecorderService(RecorderSettings(**settings)), FakeBus()
     model = ModelReply(
@@ -241,7 +241,7 @@ def recorder(folder: Path, **changes: Any) -> list[Row]:
 
 
 def recorded_payloads() -> Iterator[tuple[Any, bytes]]:
-    """Of several topics; with a gap in the numbers, and bytes that are no message."""
+    """Payloads of several topics, with a gap in the sequence numbers and a malformed payload."""
     rng = np.random.default_rng(SEED)
     for number in range(6):
         seq = number if number < 3 else number + 2
@@ -259,9 +259,9 @@ def _rows_of_file(path: Path) -> Iterator[Row]:
     for name, data in sorted(recording.attachments.items()):
         yield {"attachment": name, "bytes": len(data)}
     for name, values in sorted(recording.metadata.items()):
-        # Versions, the commit and the command change from day to day: they are there, but no reference.
-        told = {"keys": sorted(values)} if name in {"presage", "config:recorder"} else {"values": values}
-        yield {"metadata": name, **told}
+        # Versions, commit and command change often, so only their keys are part of the reference.
+        row = {"keys": sorted(values)} if name in {"presage", "config:recorder"} else {"values": values}
+        yield {"metadata": name, **row}
 
 
 SESSIONS: dict[str, Callable[..., list[Row]]] = {

@@ -1,4 +1,4 @@
-"""Each service answers a session as it did when its reference was blessed; where not, a person can read how."""
+"""Each service answers a session as in its reference; otherwise the differences are reported readably."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.process_replay.sessions import SESSIONS
 
 @functools.cache
 def rows_of(name):
-    """What the service does now; run once for all tests."""
+    """The service's current rows; it runs once for all tests."""
     with tempfile.TemporaryDirectory() as folder:
         return SESSIONS[name](Path(folder))
 
@@ -32,7 +32,7 @@ def differences(name, rows):
 def test_a_service_answers_as_its_reference_says(name):
     found = differences(name, rows_of(name))
     if found:
-        pytest.fail(f"{reference.report(name, found)}\nIf this is what you want: make bless", pytrace=False)
+        pytest.fail(f"{reference.report(name, found)}\nIf this change is intended: make bless", pytrace=False)
 
 
 def test_references_are_there_small_and_of_sessions_alone():
@@ -170,12 +170,12 @@ def test_a_covariance_is_scale_and_correlation():
 
 def test_bless_says_what_changed_and_writes_that_alone(tmp_path):
     said = []
-    assert bless("x", ROWS, tmp_path, say=said.append)
+    assert bless("x", ROWS, tmp_path, report=said.append)
     assert said[0] == "x: no reference yet; 4 messages"
     path = tmp_path / "x.jsonl"
     first, inode = path.read_text(), path.stat().st_mtime_ns
-    assert not bless("x", changed(lambda r: r[1]["pose"].update(x=9.00001)), tmp_path, say=said.append)
-    assert said[-1] == "x: as before"
+    assert not bless("x", changed(lambda r: r[1]["pose"].update(x=9.00001)), tmp_path, report=said.append)
+    assert said[-1] == "x: unchanged"
     assert (path.read_text(), path.stat().st_mtime_ns) == (first, inode)
 
     def both(rows):
@@ -183,15 +183,15 @@ def test_bless_says_what_changed_and_writes_that_alone(tmp_path):
         rows[1]["pose"].update(x=9.5, y=2.000001)
 
     said.clear()
-    assert bless("x", changed(both), tmp_path, write=False, say=said.append)
+    assert bless("x", changed(both), tmp_path, write=False, report=said.append)
     assert path.read_text() == first
-    assert bless("x", changed(both), tmp_path, say=said.append)
+    assert bless("x", changed(both), tmp_path, report=said.append)
     assert "pose.x: expected 9, got 9.5" in said[1]
     assert "1 of 4 lines new" in said[2]
     before, after = first.splitlines(), path.read_text().splitlines()
     assert [a == b for a, b in zip(before, after, strict=True)] == [True, False, True, True]
     assert '"x": 9.5, "y": 2.0}' in after[1]
-    assert not bless("x", changed(both), tmp_path, say=said.append)
+    assert not bless("x", changed(both), tmp_path, report=said.append)
 
 
 @given(st.lists(st.sampled_from(ROWS), max_size=6), st.lists(st.sampled_from(ROWS), max_size=6))
@@ -199,7 +199,7 @@ def test_what_was_blessed_is_what_is_expected_from_then_on(old, new):
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         reference.write("x", old, folder)
-        bless("x", new, folder, say=lambda _: None)
+        bless("x", new, folder, report=lambda _: None)
         assert not list(reference.compare(reference.read("x", folder), new))
         assert len(reference.read("x", folder)) == len(new)
 

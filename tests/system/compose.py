@@ -1,4 +1,4 @@
-"""`docker compose` for tests: images under a tag of their own; a project, ports and recordings of each test's own."""
+"""`docker compose` for tests, with a separate image tag, and a separate project, ports and recordings for each test."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from pathlib import Path
 from common.bus.bus import wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
-SERVICES = ("router", "simulator", "estimator", "controller", "recorder")  # that run without being asked for
-PATIENCE = 120.0  # s, for what takes some ten seconds on an idle machine
+SERVICES = ("router", "simulator", "estimator", "controller", "recorder")  # started by default
+TIMEOUT_S = 120.0  # for events that take some ten seconds on an idle machine
 
 
 def docker(*args, timeout=60):
@@ -27,13 +27,13 @@ def engine() -> bool:
         return False
 
 
-def say_that_nothing_was_tested() -> str:
+def report_skipped() -> str:
     print("\n==== NO DOCKER ENGINE HERE: docker compose was NOT tested ====", file=sys.__stderr__)
     return "NO DOCKER ENGINE: docker compose was NOT tested"
 
 
 class Compose:
-    """One project; its settings are environment variables, as a user would set them."""
+    """A compose project; its settings are environment variables, as a user would set them."""
 
     def __init__(self, image: str, folder: Path, ports: tuple[int, int], **settings: str) -> None:
         self.name, self.folder, self.router = f"presage-test-{uuid.uuid4().hex[:8]}", folder, ports[0]
@@ -46,33 +46,33 @@ class Compose:
             **settings,
         }  # fmt: skip
 
-    def __call__(self, *args, timeout=PATIENCE, **settings):
-        """`docker compose ARGS`, which may fail."""
+    def __call__(self, *args, timeout=TIMEOUT_S, **settings):
+        """Runs `docker compose ARGS`; it may fail."""
         command, environment = ["docker", "compose", *args], {**self.environment, **settings}
         return subprocess.run(
             command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=timeout, check=False
         )
 
-    def do(self, *args, timeout=PATIENCE, **settings) -> str:
-        """`docker compose ARGS`, which must not fail; what it printed."""
+    def do(self, *args, timeout=TIMEOUT_S, **settings) -> str:
+        """Runs `docker compose ARGS`, which must not fail. Returns its output."""
         done = self(*args, timeout=timeout, **settings)
         assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-5000:]
         return done.stdout
 
     def state(self, service: str) -> dict:
-        """Of the service's container, as the engine has it."""
+        """State of the service's container."""
         (row,) = self.do("ps", "--all", "--quiet", service).split()
         return json.loads(docker("inspect", row).stdout)[0]["State"]
 
     def health(self, service: str) -> str:
         return self.state(service)["Health"]["Status"]
 
-    def becomes(self, service: str, health: str, timeout=PATIENCE) -> None:
-        """Wait until the engine calls it so."""
+    def becomes(self, service: str, health: str, timeout=TIMEOUT_S) -> None:
+        """Waits until the container has the given health status."""
         assert wait_until(lambda: self.health(service) == health, timeout, 0.5), self.explain(service)
 
-    def ends(self, service: str, timeout=PATIENCE) -> int:
-        """Wait until the container has ended; its status."""
+    def ends(self, service: str, timeout=TIMEOUT_S) -> int:
+        """Waits until the container has ended. Returns its exit status."""
         over = lambda: self.state(service)["Status"] == "exited"  # noqa: E731
         assert wait_until(over, timeout, 0.5), self.explain(service)
         return self.state(service)["ExitCode"]
@@ -82,7 +82,7 @@ class Compose:
         return f"{service}: {json.dumps(self.state(service))[:3000]}\n{log}"
 
     def recordings(self) -> list[Path]:
-        """Complete ones, the oldest first."""
+        """Complete recordings, the oldest first."""
         return sorted(self.folder.glob("*.mcap"))
 
     def down(self) -> str:

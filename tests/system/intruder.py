@@ -1,7 +1,7 @@
-"""Somebody who does not use our code: a bare zenoh session with settings of its own, in a process of its own.
+"""A plain zenoh session with its own settings, which uses none of presage's code, as an attacker would.
 
-`python intruder.py SETTINGS [ACTION...]`, both JSON. Says `let in` or `not let in`, then what came of each action:
-["put", KEY, HEX], ["get", KEY, HEX], ["serve", KEY] (answers, until its input ends).
+`python intruder.py SETTINGS [ACTION...]`, both JSON. Prints `let in` or `not let in`, then the result of each action:
+["put", KEY, HEX], ["get", KEY, HEX], ["serve", KEY, HEX] (answers until the process is ended).
 """
 
 import json
@@ -25,7 +25,7 @@ def main() -> None:
         what, key, *rest = json.loads(text)
         if what == "put":
             publisher = session.declare_publisher(key)
-            # Somebody who wants harm does not wait to be asked for it; a first put may come before the route stands.
+            # Without waiting for a matching subscriber; the first put may be sent before the route is established.
             for _ in range(5):
                 publisher.put(bytes.fromhex(rest[0]))
                 session.put(key, bytes.fromhex(rest[0]))

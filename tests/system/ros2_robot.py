@@ -1,7 +1,7 @@
-"""A stand-in for a robot in ROS 2: base and scanner in the corridor, speaking as rmw_zenoh or zenoh-bridge-ros2dds.
+"""A simulated ROS 2 robot: base and scanner in the corridor, with the protocol of rmw_zenoh or zenoh-bridge-ros2dds.
 
-Nothing of the bridge is in it: keys, tokens and attachments are written out here, and its CDR is another's. Five times
-a second it says on stdout, as JSON, where it is and what it heard.
+It shares no code with the bridge: keys, tokens and attachments are written out here, and the CDR encoding is
+independent. Five times a second it prints its state and what it received as JSON.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ QOS = {"scan": "2::,5:,:,:,,", "tf_static": ":1:,1:,:,:,,", "amcl_pose": ":1:,1:
 
 
 class Ros:
-    """A node, one way or the other."""
+    """A ROS 2 node, using rmw_zenoh or zenoh-bridge-ros2dds."""
 
     def __init__(self, port: int, flavor: str, distro: str) -> None:
         self.rmw, self.humble = flavor == "rmw_zenoh", distro == "humble"
@@ -70,7 +70,7 @@ class Ros:
         self.kept.append(self.session.liveliness().declare_token(key))
 
     def declare(self, kind: str, topic: str, dds: str) -> str:
-        """The key, announced."""
+        """Declares a publisher or subscriber with a liveliness token. Returns its zenoh key."""
         if not self.rmw:
             package, _, _, name = dds.split("::")
             self.token(f"@/{self.zid}/@ros2_lv/{kind}/{topic}/{package}§msg§{name.removesuffix('_')}/:::")
@@ -89,7 +89,7 @@ class Ros:
                 self.session, key, cache=zenoh.ext.CacheConfig(1), publisher_detection=True,
                 sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
             )  # fmt: skip
-        else:  # its cache answers on a key of its own
+        else:  # the bridge's cache answers on a separate key
             made, last = self.session.declare_publisher(key), []
 
             def answer(query: zenoh.Query) -> None:
@@ -114,18 +114,18 @@ class Ros:
         def move(sample: zenoh.Sample) -> None:
             data = sample.attachment.to_bytes() if sample.attachment is not None else b""
             if self.rmw and (len(data) != 33 or data[16] != 16):
-                raise ValueError(f"{topic}: an attachment of {len(data)} bytes, of which rmw_zenoh dies")
+                raise ValueError(f"{topic}: an attachment of {len(data)} bytes, which crashes rmw_zenoh")
             hear(decode(name, sample.payload.to_bytes()))
 
         self.kept.append(self.session.declare_subscriber(self.declare("MS", topic, dds), move))
 
 
 class StandIn:
-    """The base, its scanner, and what it hears. Its own watchdog, 0.2 s, is the simulation's."""
+    """The base, its scanner and the messages it receives. The simulation's own watchdog of 0.2 s is active."""
 
     def __init__(self, ros: Ros, *, stamped: bool) -> None:
         scanner = SCANNERS["tim571"].with_beams(622).model_copy(update={"mount": MOUNT})
-        # No obstacle stop: that is the bridge's here.
+        # Without the simulator's obstacle stop, because the bridge's is tested.
         self.simulation = Simulation(Setup(load_world("corridor"), scanner, Robot(), None, 3, obstacle_stop=False))
         self.lock = threading.Lock()
         self.heard = {"commands": 0, "zeros": 0, "transforms": 0, "pose": None, "odom_in_map": None}
@@ -165,7 +165,7 @@ class StandIn:
                 self.heard["odom_in_map"] = [at.x, at.y, 2 * np.arctan2(turn.z, turn.w)]
 
     def step(self) -> dict:
-        """One scan further: say in ROS what is measured. What is true, for the test."""
+        """Advances by one scan and publishes the measurements. Returns the true state for the test."""
         with self.lock:
             self.simulation.advance()
             odom, truth, scan = self.simulation.observe()
@@ -179,7 +179,7 @@ class StandIn:
             "pose": {"pose": pose, "covariance": still}, "twist": {"twist": twist, "covariance": still},
         }  # fmt: skip
         self.put_odom(encode("nav_msgs/msg/Odometry", odometry))
-        # Upside down the first beam is the leftmost; nothing is said as 0.
+        # The scanner is mounted upside down, so the first beam is the leftmost. It reports no return as 0.
         ranges = np.where(np.isposinf(scan.ranges), 0, scan.ranges)[::-1]
         sweep = {
             "header": header(stamp, "laser"), "angle_min": scan.angle_min, "angle_max": -scan.angle_min,
@@ -204,12 +204,12 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: done.set())
     with Ros(options.port, options.flavor, options.distro) as ros:
         robot = StandIn(ros, stamped=options.stamped)
-        due, said = time.monotonic(), 0.0
+        due, reported = time.monotonic(), 0.0
         while not done.wait(max(0.0, due - time.monotonic())):
             now = robot.step()
             due = max(due + 1 / 15, time.monotonic() - 0.2)
-            if time.monotonic() >= said + 0.2:
-                said = time.monotonic()
+            if time.monotonic() >= reported + 0.2:
+                reported = time.monotonic()
                 print(json.dumps(now), flush=True)
     robot.simulation.close()
 

@@ -1,4 +1,4 @@
-"""`presage bench latency`, `viewer` and `recorder`: they measure, and nothing of them stays, however they end."""
+"""`presage bench latency`, `viewer` and `recorder`: they measure, and leave no process behind, however they end."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ def test_no_process_outlives_bench_latency(process, number):
     assert "Traceback" not in bench.output
 
 
-def test_numbers_that_cannot_be_written_are_said_first(process, tmp_path):
+def test_an_unwritable_output_file_is_reported_first(process, tmp_path):
     bench = process("presage.__main__", "bench", "latency", "--json", str(tmp_path / "no" / "l.json"))
     assert bench.wait(60) == 2
     assert "l.json: cannot be written to (No such file or directory)" in bench.output
     assert "Traceback" not in bench.output
 
 
-def test_what_the_viewer_costs_is_measured_and_written(process, tmp_path):
+def test_viewer_costs_are_measured_and_written(process, tmp_path):
     args = ("--seconds", "2", "--rounds", "1", "--json", str(tmp_path / "v.json"))
     bench = process("presage.__main__", "bench", "viewer", *args)
     assert bench.wait(150) == 0, bench.output
@@ -75,8 +75,8 @@ def test_a_recorder_under_load_keeps_every_byte(process, tmp_path):
     assert [file.name for file in tmp_path.glob("kept/*.mcap*")] == ["bench.mcap"]
 
 
-def test_a_loss_is_noticed(tmp_path):
-    """The comparison itself: one message less in the file, or one byte other."""
+def test_a_lost_or_altered_message_is_detected(tmp_path):
+    """The comparison detects a missing message, a changed byte and a changed order."""
     key = TRUTH.key("bench")
     for payloads, whole in (([b"a", b"b"], True), ([b"a"], False), ([b"a", b"c"], False), ([b"b", b"a"], False)):
         writer = RecordingWriter(tmp_path / f"{b''.join(payloads).decode()}.mcap")

@@ -1,6 +1,7 @@
-"""Faults into a driving system, as `presage bench chaos` has them; here what must happen, there how quickly.
+"""Fault injection into a driving system with `presage bench chaos`.
 
-On machines that are shared, times say little: what is asserted is that it happens. All rows: `make chaos`.
+These tests only assert that the system stops and recovers. The times, which depend on the machine's load, are measured
+by `make chaos`, which injects all faults.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ ROWS = (
 
 @pytest.fixture(scope="module")
 def outcomes(tmp_path_factory):
-    """One system for all of them."""
+    """Results of all faults, injected into one system."""
     folder = tmp_path_factory.mktemp("chaos")
     processes, file = Processes(folder), folder / "chaos.json"
     try:
@@ -32,13 +33,13 @@ def outcomes(tmp_path_factory):
         processes.close()
 
 
-def test_the_rows_are_of_the_table():
+def test_the_tested_faults_exist():
     assert set(ROWS) <= {fault.name for fault in FAULTS}
     assert len({fault.name for fault in FAULTS}) == len(FAULTS)
 
 
 @pytest.mark.parametrize("name", ROWS)
-def test_the_robot_stops_where_it_must_and_all_work_again(outcomes, name):
+def test_the_robot_stops_if_expected_and_recovers(outcomes, name):
     if name in outcomes["skipped"]:
         pytest.skip(f"NOT TRIED: {outcomes['skipped'][name]}")
     (row,) = [row for row in outcomes["rows"] if row["fault"] == name]

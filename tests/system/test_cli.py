@@ -1,4 +1,4 @@
-"""The command line: bad input is one clear line with what to do, status not 0, no traceback."""
+"""The command line: invalid input gives one clear line with advice and a non-zero status, without a traceback."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from common.bus.bus import wait_until
 from tests.conftest import Processes
 from tests.recorder import sessions as made
 
-AT_ONCE = 4
-NOWHERE = ("--connect", "tcp/127.0.0.1:9")  # the discard port: nobody is there
+MAX_PARALLEL = 4
+NO_SESSION = ("--connect", "tcp/127.0.0.1:9")  # the discard port, on which nothing listens
 
 
-WRONG = [
+INVALID_COMMANDS = [
     (("up", "--world", "nowhere"), "give a file or one of corridor, maze, office"),
     (("up", "--model", "exakt", "--port", "0"), "presage: no model 'exakt': give learned, exact"),
     (("up", "--drive", "sideways", "--port", "0"), "presage: drive: Input should be 'holonomic' or 'differential'"),
@@ -27,19 +27,19 @@ WRONG = [
     (("demo", "--world", "{tmp}/no.yaml"), "give a file or one of"),
     (("demo", "--goal", "6.8", "3.95"), "from a wall of 'corridor'"),
     (("up", "--world", "maze", "--estimator", "paper", "--port", "0"), "presage train --world maze"),
-    (("goal", "1", "1", *NOWHERE), "start a session with `presage up`"),
+    (("goal", "1", "1", *NO_SESSION), "start a session with `presage up`"),
     (("goal",), "X Y in m"),
-    (("goal", "-1", "2", *NOWHERE), "start a session"),
+    (("goal", "-1", "2", *NO_SESSION), "start a session"),
     (("goal", "nan", "1"), "nan 1: a place is finite numbers"),
     (("goal", "1", "1", "--tolerance", "inf"), "--tolerance inf"),
     (("goal", "1", "2", "--wiat"), "--wiat"),
     (("goal", "1e300", "1"), "1e+300 1: X and Y must be within 10000 m of the origin"),
     (("teleport", "inf", "1"), "inf 1 90: a place is finite numbers"),
-    (("teleport", "-1", "-1.5", "-90", *NOWHERE), "start a session"),
+    (("teleport", "-1", "-1.5", "-90", *NO_SESSION), "start a session"),
     (("obstacle", "add", "crate", "-1", "2", "--radius", "-1"), "the obstacle: circle.radius"),
-    (("obstacle", "add", "crate", "1", "2", *NOWHERE), "start a session"),
+    (("obstacle", "add", "crate", "1", "2", *NO_SESSION), "start a session"),
     (("localise", "nan", "1"), "a place is finite numbers"),
-    (("localise", "-1", "-.5", *NOWHERE), "start a session"),
+    (("localise", "-1", "-.5", *NO_SESSION), "start a session"),
     (("localise", "1"), "a position is two numbers"),
     (("demo", "--goal", "nan", "1"), "two finite numbers"),
     (("demo", "--out", "/dev/null/x"), "/dev/null/x: cannot be written to"),
@@ -52,11 +52,11 @@ WRONG = [
     (("bench", "latency", "--beams", "1"), "tim571 with 1 beams"),
     (("train", "--out", "/dev/null/m"), "/dev/null/m: cannot be written to"),
     (("record", "--out", "/dev/null"), "/dev/null: cannot be written to"),
-    (("teleport", "1", "1", *NOWHERE), "start a session"),
+    (("teleport", "1", "1", *NO_SESSION), "start a session"),
     (("echo", "nothing"), "no topic 'nothing': choose one of scan"),
-    (("hz", *NOWHERE), "start a session"),
+    (("hz", *NO_SESSION), "start a session"),
     (("replay", "{tmp}/no.mcap"), "no.mcap"),
-    (("replay", "{tmp}/run.mcap", *NOWHERE), "start a session"),
+    (("replay", "{tmp}/run.mcap", *NO_SESSION), "start a session"),
     (("plot", "{tmp}/foreign.mcap"), "foreign.mcap"),
     (("train", "--preset", "better"), "no preset 'better'"),
     (("train", "--scanner", "sonar", "--out", "{tmp}/m"), "no scanner 'sonar': choose one of tim571"),
@@ -66,34 +66,36 @@ WRONG = [
 
 
 @pytest.fixture(scope="module")
-def ended(tmp_path_factory, router):
-    """Each of `WRONG`, ended. Several run at once: most wait for somebody who is not there."""
+def finished(tmp_path_factory, router):
+    """All `INVALID_COMMANDS`, run to their end; several in parallel, because most wait for a missing session."""
     folder = tmp_path_factory.mktemp("wrong")
     (folder / "foreign.mcap").write_bytes(b"no recording at all, but long enough to be looked at twice")
     (folder / "bad.yaml").write_text("since: 2020-13-45")
     made.write(folder / "run.mcap")
     children = Processes(folder)
-    talk = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{router}", "PRESAGE_ROBOT": "wrong"}
+    environment = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{router}", "PRESAGE_ROBOT": "wrong"}
     try:
-        for number, (args, _) in enumerate(WRONG):
-            if number >= AT_ONCE:
-                children.started[number - AT_ONCE].wait(90)
-            children.start("presage.__main__", *[a.format(tmp=folder) for a in args], env=talk)
+        for number, (args, _) in enumerate(INVALID_COMMANDS):
+            if number >= MAX_PARALLEL:
+                children.started[number - MAX_PARALLEL].wait(90)
+            children.start("presage.__main__", *[a.format(tmp=folder) for a in args], env=environment)
         yield children.started
     finally:
         children.close()
 
 
-@pytest.mark.parametrize("number", range(len(WRONG)), ids=lambda number: " ".join(WRONG[number][0])[:40])
-def test_bad_input_is_one_line(ended, number):
-    running, says = ended[number], WRONG[number][1]
+@pytest.mark.parametrize(
+    "number", range(len(INVALID_COMMANDS)), ids=lambda number: " ".join(INVALID_COMMANDS[number][0])[:40]
+)
+def test_bad_input_is_one_line(finished, number):
+    running, says = finished[number], INVALID_COMMANDS[number][1]
     assert running.wait(90) not in {0, None}
     assert "Traceback" not in running.output, running.output
-    complaints = [line for line in running.output.splitlines() if says in line]
-    assert complaints, running.output
+    messages = [line for line in running.output.splitlines() if says in line]
+    assert messages, running.output
 
 
-def test_a_port_in_use_is_said(process):
+def test_port_in_use_is_reported(process):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

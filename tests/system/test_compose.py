@@ -1,4 +1,4 @@
-"""`docker compose` with a real engine: what images hold, the goal reached, services exchanged while others go on."""
+"""`docker compose` with a real engine: contents of the images, reaching a goal, and replacing running services."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from presage.live.bus_watch import Watch
 from presage.session import credentials as secure
 from services.recorder.reader import read_recording
 from tests.conftest import free_tcp_port
-from tests.system.compose import PATIENCE, SERVICES, Compose, docker, engine, say_that_nothing_was_tested
+from tests.system.compose import SERVICES, TIMEOUT_S, Compose, docker, engine, report_skipped
 
 pytestmark = [pytest.mark.docker, pytest.mark.timeout(1500)]
 HEAVY = ("pybullet", "torch", "numba", "scipy", "mcap", "starlette", "typer", "matplotlib", "rosbags")
@@ -30,9 +30,9 @@ HOLDS = {
 
 @pytest.fixture(scope="module")
 def image(tmp_path_factory):
-    """The beginning of the names of images built for these tests; removed afterwards."""
+    """Name prefix of the images built for these tests; they are removed afterwards."""
     if not engine():
-        pytest.skip(say_that_nothing_was_tested())
+        pytest.skip(report_skipped())
     tag = f"presage-test-{uuid.uuid4().hex[:8]}"
     builder = Compose(tag, tmp_path_factory.mktemp("build"), (0, 0))
     try:
@@ -46,7 +46,7 @@ def image(tmp_path_factory):
 
 @pytest.fixture
 def compose(image, tmp_path):
-    """Calls make a project; all are taken down afterwards."""
+    """A function that creates compose projects; all are taken down afterwards."""
     made = []
 
     def make(**settings):
@@ -58,7 +58,7 @@ def compose(image, tmp_path):
         each.down()
 
 
-LOOK = f"""
+LIST_PACKAGES = f"""
 import importlib, importlib.util, os
 found = [name for name in {HEAVY} if importlib.util.find_spec(name)]
 for name in found:
@@ -69,16 +69,16 @@ print(f"user{{os.getuid()}}", *found)
 
 
 @pytest.mark.parametrize("target", HOLDS)
-def test_an_image_holds_what_is_its_own_and_no_more(image, target):
+def test_an_image_contains_only_what_its_service_needs(image, target):
     how = ("--rm", "--read-only", "--tmpfs", "/tmp", "--network", "none")
-    done = docker("run", *how, f"{image}-{target}", "python", "-c", LOOK)
+    done = docker("run", *how, f"{image}-{target}", "python", "-c", LIST_PACKAGES)
     assert done.returncode == 0, done.stderr
-    words = set(done.stdout.split())  # pybullet has more to say
+    words = set(done.stdout.split())  # pybullet prints more
     assert "user1000" in words
     assert words & set(HEAVY) == HOLDS[target]
 
 
-def test_up_ends_in_a_robot_at_its_goal(compose):
+def test_up_drives_the_robot_to_its_goal(compose):
     project = compose()
     up = project("up", "--exit-code-from", "goal", timeout=300)
     assert up.returncode == 0, up.stdout[-5000:] + up.stderr[-2000:]
@@ -94,7 +94,7 @@ def test_up_ends_in_a_robot_at_its_goal(compose):
     assert recording.world().name == "corridor"
 
 
-def test_in_secure_mode_the_goal_is_reached_and_a_stranger_hears_nothing(compose, tmp_path):
+def test_secure_mode_reaches_the_goal_and_hides_it_from_unauthenticated_clients(compose, tmp_path):
     keys = tmp_path / "keys"
     secure.init(keys)
     both = os.pathsep.join(["docker-compose.yml", "docker-compose.secure.yml"])
@@ -104,7 +104,7 @@ def test_in_secure_mode_the_goal_is_reached_and_a_stranger_hears_nothing(compose
     with open_bus(Link(connect=router)) as stranger:
         with open_bus(Link(connect=router, security=credentials(keys, ("observer",)))) as known:
             watch = Watch(known, TRUTH, STATUS)
-            assert watch.until(Truth, lambda truth: truth.pose.x > 5.0, PATIENCE), project.explain("goal")
+            assert watch.until(Truth, lambda truth: truth.pose.x > 5.0, TIMEOUT_S), project.explain("goal")
             assert known.alive() >= {"simulator", "estimator", "controller", "recorder"}
         assert project.ends("goal") == 0
         assert "reached: within 0.2 m of the goal" in project.do("logs", "goal")
@@ -113,59 +113,59 @@ def test_in_secure_mode_the_goal_is_reached_and_a_stranger_hears_nothing(compose
 
 
 def gaps(messages):
-    """Where the sequence numbers jump."""
+    """Pairs of sequence numbers between which messages are missing."""
     return [(before.seq, later.seq) for before, later in pairwise(messages) if later.seq != before.seq + 1]
 
 
-def the_pause(recording):
-    """The last belief of the first estimator and the first of the second: message and payload as recorded."""
+def replacement_beliefs(recording):
+    """The last belief of the first estimator and the first one of the second, each with its recorded payload."""
     beliefs = [(message, raw) for _, message, raw in recording.messages(BELIEF)]
     first = [each for each in beliefs if each[0].estimator == beliefs[0][0].estimator]
     second = [each for each in beliefs if each[0].estimator != beliefs[0][0].estimator]
     assert {message.estimator for message, _ in second} == {"particle-filter"}
-    assert first[-1][0].stamp_ns < second[0][0].stamp_ns  # never two at once
+    assert first[-1][0].stamp_ns < second[0][0].stamp_ns  # the estimators never ran at the same time
     return first[-1], second[0]
 
 
-def test_services_are_exchanged_while_the_others_go_on(compose):
+def test_services_are_replaced_while_the_others_run(compose):
     project = compose(PRESAGE_VIEWER="0", PRESAGE_MAX_SPEED="0.5")
     project.do("up", "--detach")
     assert project.do("ps", "--all", "--quiet", "viewer") == ""
     with open_bus(Link(connect=(f"tcp/127.0.0.1:{project.router}",))) as bus:
         watch = Watch(bus, TRUTH, STATUS, BELIEF, SCAN)
-        assert watch.until(Truth, lambda truth: truth.pose.x > 5.0, PATIENCE), project.explain("goal")
+        assert watch.until(Truth, lambda truth: truth.pose.x > 5.0, TIMEOUT_S), project.explain("goal")
 
-        # Another estimator, while it drives: it stands meanwhile, however short that is, then goes on to its goal.
+        # Replace the estimator while the robot drives: the robot stops, then continues to its goal.
         project.do("stop", "estimator")
-        alone = watch.until(Status, lambda status: "no belief for" in status.reason, PATIENCE)
+        alone = watch.until(Status, lambda status: "no belief for" in status.reason, TIMEOUT_S)
         assert alone is not None
-        assert watch.until(Truth, lambda truth: truth.stamp_ns > alone.stamp_ns + 2e9, PATIENCE) is not None
+        assert watch.until(Truth, lambda truth: truth.stamp_ns > alone.stamp_ns + 2e9, TIMEOUT_S) is not None
         project.do("up", "--detach", "--no-deps", "estimator", PRESAGE_ESTIMATOR="particle-filter")
         assert project.ends("goal") == 0
         assert "reached: within 0.2 m of the goal" in project.do("logs", "goal")
 
-        # Another controller: the robot stands, and takes the next goal.
+        # Replace the controller: the robot stops, then accepts the next goal.
         project.do("up", "--detach", "--no-deps", "controller", PRESAGE_MAX_SPEED="0.8")
         project.becomes("controller", "healthy")
         project.do("run", "--rm", "--no-deps", "goal", "presage", "goal", "13", "1.5", "--wait")
 
-        # What was recorded so far in the simulator's place: the same estimator and controller take it.
+        # Replace the simulator by a replay of the recording, with the same estimator and controller.
         project.do("stop", "recorder")
         (file,) = project.recordings()
         project.do("start", "recorder")
         replayed = {"PRESAGE_SCANNER": "replay", "PRESAGE_REPLAY": file.name}
         project.do("up", "--detach", "--no-deps", "simulator", **replayed)
         project.becomes("simulator", "healthy")
-        again = watch.until(Scan, lambda scan: scan.seq < 100, PATIENCE)
+        again = watch.until(Scan, lambda scan: scan.seq < 100, TIMEOUT_S)
         assert again is not None
-        assert watch.until(Belief, lambda belief: belief.stamp_ns >= again.stamp_ns, PATIENCE) is not None
+        assert watch.until(Belief, lambda belief: belief.stamp_ns >= again.stamp_ns, TIMEOUT_S) is not None
         assert bus.alive() >= {"replay", "estimator", "controller", "recorder"}
     project.down()
 
     recording = read_recording(file)
     scans = [message for _, message, _ in recording.messages(SCAN)]
     assert gaps(scans) == []
-    (last, last_raw), (first, first_raw) = the_pause(recording)
+    (last, last_raw), (first, first_raw) = replacement_beliefs(recording)
     before, after = last.stamp_ns * 1e-9, first.stamp_ns * 1e-9
     moving = [raw.logged_ns for _, command, raw in recording.messages(CMD_VEL) if np.any(command.twist.array())]
     assert moving[0] < last_raw.logged_ns
@@ -182,37 +182,37 @@ def test_services_are_exchanged_while_the_others_go_on(compose):
     assert any("no belief for" in reason for reason in reasons)
 
 
-def signal_it(project, number):
-    """To the service itself: the engine's init, process 1, passes no such signal on."""
+def send_signal(project, number):
+    """Sends a signal to the service itself, because the container's init process does not forward it."""
     find = "for p in /proc/[0-9]*; do [ $p = /proc/1 ] || [ $p = /proc/$$ ] || "
     find += "! grep -qs services.estimator $p/cmdline || "
     project.do("exec", "-T", "estimator", "sh", "-c", f"{find} kill -{number} ${{p#/proc/}}; done")
 
 
-def test_a_frozen_service_is_unhealthy_until_it_goes_on(compose):
+def test_a_frozen_service_is_unhealthy_until_it_continues(compose):
     project = compose(PRESAGE_VIEWER="0")
     project.do("up", "--detach", "router", "simulator", "estimator")
     for service in ("router", "simulator", "estimator"):
         project.becomes(service, "healthy")
-    signal_it(project, "STOP")
+    send_signal(project, "STOP")
     project.becomes("estimator", "unhealthy")
     said = project.state("estimator")["Health"]["Log"][-1]["Output"]
     assert "its loop has not turned for" in said
     assert project.health("simulator") == "healthy"
-    signal_it(project, "CONT")
+    send_signal(project, "CONT")
     project.becomes("estimator", "healthy")
 
-    # One that is killed comes back by itself.
+    # A killed service is restarted by the engine.
     began = project.state("estimator")["StartedAt"]
-    signal_it(project, "KILL")
-    assert wait_until(lambda: project.state("estimator")["StartedAt"] > began, PATIENCE, 0.5)
+    send_signal(project, "KILL")
+    assert wait_until(lambda: project.state("estimator")["StartedAt"] > began, TIMEOUT_S, 0.5)
     project.becomes("estimator", "healthy")
 
 
 def test_two_robots(compose):
     project = compose(ROBOTS="2", GOAL_X="6", PRESAGE_VIEWER="0")
     project.do("up", "--detach")
-    assert project.ends("goal", 2 * PATIENCE) == 0, project.explain("goal")
+    assert project.ends("goal", 2 * TIMEOUT_S) == 0, project.explain("goal")
     log = project.do("logs", "--no-log-prefix", "goal")
     for robot in ("robot-1", "robot-2"):
         assert f"{robot} | reached: within 0.2 m of the goal" in log

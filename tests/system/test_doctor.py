@@ -1,4 +1,4 @@
-"""`presage doctor` finds each fault, produced for real: other processes, sessions that misbehave, a small full disk."""
+"""`presage doctor` finds real faults: in other processes, in misbehaving sessions and on a small full disk."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.conftest import ROOT, WAIT_TIMEOUT_S
 
 
 class Participant:
-    """A service of a session of its own: answers what it is, pulses four times a second, all as a test wishes."""
+    """A fake service in its own session with configurable replies and health messages, four times a second."""
 
     def __init__(self, link, name: str, *, said=None, ahead_s=0.0, scans=False, frozen=False) -> None:
         self.link, self.name, self.ahead_s, self.scans, self.frozen = link, name, ahead_s, scans, frozen
@@ -70,15 +70,15 @@ class Participant:
         self.thread.join(WAIT_TIMEOUT_S)
 
 
-def doctor(process, folder: Path, *args: str):
+def run_doctor(process, folder: Path, *args: str):
     return process("presage.__main__", "doctor", "--json", str(folder / "found.json"), *args)
 
 
-def read(folder: Path) -> list[dict]:
+def read_findings(folder: Path) -> list[dict]:
     return json.loads((folder / "found.json").read_text())["findings"]
 
 
-def fault(found: list[dict], code: str, words: str) -> dict:
+def find_fault(found: list[dict], code: str, words: str) -> dict:
     fits = [f for f in found if f["code"] == code and f["ok"] is False and words in f["what"]]
     assert fits, (code, [f["what"] for f in found if f["ok"] is False])
     assert fits[0]["where"]
@@ -86,8 +86,8 @@ def fault(found: list[dict], code: str, words: str) -> dict:
 
 
 @pytest.fixture
-def sick(link):
-    """An estimator that runs twice, of other versions, its clock wrong; a scanner that runs twice."""
+def faulty_session(link):
+    """Two estimators of other versions with wrong clocks, two simulators, and a frozen viewer."""
     made = [
         Participant(link, "estimator", said={"protocol": PROTOCOL + 1, "host": "far"}, ahead_s=60.0),
         Participant(link, "estimator", said={"versions": {"presage": "9.9"}, "host": "near"}, ahead_s=60.0),
@@ -102,48 +102,48 @@ def sick(link):
         each.stop()
 
 
-def test_a_sick_session(process, bus, sick, tmp_path):
+def test_all_faults_of_a_session_are_found(process, bus, faulty_session, tmp_path):
     assert wait_until(lambda: {"viewer", "estimator", "simulator"} <= bus.alive(), WAIT_TIMEOUT_S)
-    running = doctor(process, tmp_path, "--seconds", "4")
+    running = run_doctor(process, tmp_path, "--seconds", "4")
     assert running.wait(90) == 1, running.output
-    found = read(tmp_path)
-    assert "far for 9 s" in fault(found, "doubled", "estimator of")["what"]
-    assert "stop" in fault(found, "doubled", "simulator of")["advice"]
-    assert "scan" in fault(found, "two_publishers", "back and forth")["where"]
-    assert fault(found, "protocol", f"protocol {PROTOCOL + 1}")["where"] == "estimator on far"
-    assert fault(found, "versions", "presage")["where"] == "estimator on near"
-    assert "ahead of" in fault(found, "clocks", "estimator on far, near: its clock is 60.0 s")["what"]
-    assert fault(found, "frozen", "no health message came")["where"] == "viewer"
-    assert "python -m services.controller" in fault(found, "missing", "controller")["advice"]
-    fault(found, "rate", "scan: ")
-    fault(found, "rate", "cmd_vel: 0.0 of 15 Hz")
-    assert fault(found, "undecodable", "odom")["where"] == ODOM.key(bus.robot)
-    fault(found, "undecodable_rising", "estimator: ")
-    fault(found, "dropped_rising", "estimator: ")
-    fault(found, "failed", "simulator: ")
-    fault(found, "weights", "estimator reports: no weights of this world")
+    found = read_findings(tmp_path)
+    assert "far for 9 s" in find_fault(found, "doubled", "estimator of")["what"]
+    assert "stop" in find_fault(found, "doubled", "simulator of")["advice"]
+    assert "scan" in find_fault(found, "two_publishers", "back and forth")["where"]
+    assert find_fault(found, "protocol", f"protocol {PROTOCOL + 1}")["where"] == "estimator on far"
+    assert find_fault(found, "versions", "presage")["where"] == "estimator on near"
+    assert "ahead of" in find_fault(found, "clocks", "estimator on far, near: its clock is 60.0 s")["what"]
+    assert find_fault(found, "frozen", "no health message came")["where"] == "viewer"
+    assert "python -m services.controller" in find_fault(found, "missing", "controller")["advice"]
+    find_fault(found, "rate", "scan: ")
+    find_fault(found, "rate", "cmd_vel: 0.0 of 15 Hz")
+    assert find_fault(found, "undecodable", "odom")["where"] == ODOM.key(bus.robot)
+    find_fault(found, "undecodable_rising", "estimator: ")
+    find_fault(found, "dropped_rising", "estimator: ")
+    find_fault(found, "failed", "simulator: ")
+    find_fault(found, "weights", "estimator reports: no weights of this world")
     assert "Traceback" not in running.output
     assert "install the same version of presage" in " ".join(running.output.split())
 
 
-def test_a_stopped_process_is_told_from_one_that_is_not_there(process, bus, tmp_path):
+def test_a_frozen_process_is_distinguished_from_a_missing_one(process, bus, tmp_path):
     controller = process("controller", fresh=True)  # found by its command line
     assert wait_until(lambda: "controller" in bus.alive(), WAIT_TIMEOUT_S), controller.output
     controller.send(signal.SIGSTOP)
-    running = doctor(process, tmp_path)
+    running = run_doctor(process, tmp_path)
     assert running.wait(90) == 1, running.output
-    found = read(tmp_path)
+    found = read_findings(tmp_path)
     frozen = [f for f in found if f["code"] == "frozen" and f["ok"] is False]
     assert frozen, running.output
     assert any(str(controller.child.pid) in f["what"] or f["where"].startswith("controller") for f in frozen)
 
 
-def test_no_session_says_why(processes, free_port, tmp_path):
+def test_the_reason_for_a_missing_session_is_given(processes, free_port, tmp_path):
     with socket.socket() as silent, socket.socket() as full, socket.socket() as first, socket.socket() as second:
         for listener, backlog in ((silent, 5), (full, 0)):
             listener.bind(("127.0.0.1", 0))
             listener.listen(backlog)
-        for filler in (first, second):  # a full queue drops what comes next, as a firewall does
+        for filler in (first, second):  # a full queue drops further connections, as a firewall does
             filler.setblocking(False)
             filler.connect_ex(full.getsockname())
         ports = [silent.getsockname()[1], full.getsockname()[1], free_port()]
@@ -151,31 +151,31 @@ def test_no_session_says_why(processes, free_port, tmp_path):
         for number, port in enumerate(ports):
             folder = tmp_path / str(number)
             folder.mkdir()
-            started.append(doctor(processes.start, folder, "--connect", f"tcp/127.0.0.1:{port}"))
+            started.append(run_doctor(processes.start, folder, "--connect", f"tcp/127.0.0.1:{port}"))
         for running in started:
             assert running.wait(120) == 1, running.output
-    said = [read(tmp_path / str(number)) for number in range(3)]
-    assert "TLS" in fault(said[0], "no_router", "something listens there")["advice"]
-    assert "firewall" in fault(said[1], "blocked", "no answer")["advice"]
-    assert "presage up" in fault(said[2], "no_router", "nothing listens there")["advice"]
+    said = [read_findings(tmp_path / str(number)) for number in range(3)]
+    assert "TLS" in find_fault(said[0], "no_router", "something listens there")["advice"]
+    assert "firewall" in find_fault(said[1], "blocked", "no answer")["advice"]
+    assert "presage up" in find_fault(said[2], "no_router", "nothing listens there")["advice"]
 
 
-def test_a_full_disk_that_cannot_be_written_to_and_a_world_nobody_learned(tmp_path, free_port):
+def test_a_full_read_only_disk_and_a_world_without_weights(tmp_path, free_port):
     if shutil.which("unshare") is None or subprocess.run(["unshare", "-m", "true"], capture_output=True).returncode:
         pytest.skip("needs `unshare -m` (root): a small disk is mounted for this test alone")
     disk, world = tmp_path / "disk", tmp_path / "shed.yaml"
     disk.mkdir()
     world.write_text("name: shed\nboundary: [[0, 0], [4, 0], [4, 3], [0, 3]]\nstart: {x: 2, y: 1, yaw_deg: 0}\n")
-    ask = (
+    command = (
         f"mount -t tmpfs -o size=1m,ro tmpfs {disk} && exec {sys.executable} -m presage doctor --seconds 1 "
         f"--recordings {disk} --world {world} --json {tmp_path}/found.json --connect tcp/127.0.0.1:{free_port()}"
     )
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
-        ["unshare", "-m", "sh", "-c", ask], env=environment, capture_output=True, text=True, timeout=120
+        ["unshare", "-m", "sh", "-c", command], env=environment, capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 1, done.stderr
-    found = read(tmp_path)
-    assert "Read-only file system" in fault(found, "not_writable", "recordings cannot be written to")["what"]
-    assert fault(found, "disk", "MB free")["where"] == str(disk)
-    assert f"presage train --world {world}" in fault(found, "weights", "no field of world 'shed'")["advice"]
+    found = read_findings(tmp_path)
+    assert "Read-only file system" in find_fault(found, "not_writable", "recordings cannot be written to")["what"]
+    assert find_fault(found, "disk", "MB free")["where"] == str(disk)
+    assert f"presage train --world {world}" in find_fault(found, "weights", "no field of world 'shed'")["advice"]

@@ -1,4 +1,4 @@
-"""Two of what should be one, by mistake or on purpose: one leads, the other is named and waits."""
+"""Two instances of one service: one is active, the other is reported and waits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from common.messages.definitions import CmdVel, Goal, Health, Pose, Status, Trut
 from common.messages.topics import CMD_VEL, GOAL, HEALTH, STATUS, TRUTH
 from tests.conftest import received_messages, wait_for_message
 
-PATIENCE = 60.0
+TIMEOUT_S = 60.0
 
 
 def speed(truth):
@@ -22,7 +22,7 @@ def speed(truth):
 
 @pytest.fixture
 def heard(bus):
-    """What of a topic arrives from now on."""
+    """A function that subscribes to a topic and returns an inbox of the messages from now on."""
 
     def begin(topic):
         inbox = Inbox()
@@ -32,20 +32,20 @@ def heard(bus):
     return begin
 
 
-def test_the_second_controller_stands_by_and_takes_the_goal_over(process, bus, heard):
+def test_a_second_controller_stands_by_and_takes_over_the_goal(process, bus, heard):
     first = process("controller")
-    assert wait_until(lambda: "controller" in bus.alive(), PATIENCE), first.output
+    assert wait_until(lambda: "controller" in bus.alive(), TIMEOUT_S), first.output
     second = process("controller")
-    second.wait_for("standing by", PATIENCE)
+    second.wait_for("standing by", TIMEOUT_S)
     assert f"process {first.child.pid} on" in second.output
     process("simulator")
     process("estimator", "--initial-pose", "3,1.5")
-    assert wait_until(lambda: {"simulator", "estimator", "controller"} <= bus.alive(), PATIENCE)
+    assert wait_until(lambda: {"simulator", "estimator", "controller"} <= bus.alive(), TIMEOUT_S)
     assert [len(names) for names in bus.alive_instances().values()] == [1, 1, 1]
     assert list(bus.alive_instances(standby=True)) == ["controller"]
 
     truths, commands, states = heard(TRUTH), heard(CMD_VEL), heard(STATUS)
-    assert bus.wait_matching(GOAL, PATIENCE)
+    assert bus.wait_matching(GOAL, TIMEOUT_S)
     bus.put(GOAL, Goal(stamp_ns=0, seq=7, pose=Pose(x=16.5, y=1.5)).encode())
     wait_for_message(truths, Truth, lambda t: speed(t) > 0.5)
     drivers = set()
@@ -53,27 +53,27 @@ def test_the_second_controller_stands_by_and_takes_the_goal_over(process, bus, h
         drivers.add(sample.source)
     assert len(drivers) == 1
 
-    # Frozen, it loses the lead; the other goes on to the same goal.
+    # A frozen controller is no longer the active one; the other continues to the same goal.
     first.send(signal.SIGSTOP)
     wait_for_message(truths, Truth, lambda t: speed(t) < 1e-3)
-    second.wait_for("taking over", PATIENCE)
-    second.wait_for("resuming the goal of the previous controller instance", PATIENCE)
+    second.wait_for("taking over", TIMEOUT_S)
+    second.wait_for("resuming the goal of the previous controller instance", TIMEOUT_S)
     wait_for_message(states, Status, lambda s: s.goal_seq == 7 and s.state == "navigating")
     wait_for_message(truths, Truth, lambda t: speed(t) > 0.3)
 
-    # Back again, the older one leads; never are both heard.
+    # When it runs again, the older instance becomes active, and the newer one ends.
     first.send(signal.SIGCONT)
-    assert second.wait(PATIENCE) == 2
+    assert second.wait(TIMEOUT_S) == 2
     assert "was started before this one and is active, so this one ends" in second.output
-    assert wait_until(lambda: list(bus.alive_instances().get("controller", [])) != [], PATIENCE)
+    assert wait_until(lambda: list(bus.alive_instances().get("controller", [])) != [], TIMEOUT_S)
     wait_for_message(states, Status, lambda s: s.state == "reached", 120)
     assert first.running
 
 
-def test_the_one_that_leads_is_obeyed_and_another_source_is_counted_and_named(process, bus, heard, link):
+def test_only_the_active_controller_is_obeyed_and_other_sources_are_counted(process, bus, heard, link):
     simulator = process("simulator")
     truths, health = heard(TRUTH), heard(HEALTH)
-    assert bus.wait_matching(CMD_VEL, PATIENCE), simulator.output
+    assert bus.wait_matching(CMD_VEL, TIMEOUT_S), simulator.output
 
     def command(driver, **twist):
         now = wait_for_message(truths, Truth, lambda _: True).stamp_ns
@@ -81,26 +81,26 @@ def test_the_one_that_leads_is_obeyed_and_another_source_is_counted_and_named(pr
 
     with open_bus(link) as leader:
         leader.declare_alive("controller")
-        assert leader.wait_matching(CMD_VEL, PATIENCE)
+        assert leader.wait_matching(CMD_VEL, TIMEOUT_S)
         for _ in range(10):
             command(leader, wz=0.5)
-        assert wait_until(lambda: "controller" in bus.alive(), PATIENCE)
+        assert wait_until(lambda: "controller" in bus.alive(), TIMEOUT_S)
         before = wait_for_message(health, Health, lambda h: h.service == "simulator").counters.get("other_sources", 0)
 
         def counted() -> bool:
             command(leader, wz=0.5)
-            command(bus, vx=1.0)  # of several a busy simulator sees the newest
+            command(bus, vx=1.0)  # a busy simulator processes only the newest of several commands
             return any(h.counters.get("other_sources", 0) >= before + 20 for h in received_messages(health, Health))
 
-        assert wait_until(counted, PATIENCE)
+        assert wait_until(counted, TIMEOUT_S)
         truth = wait_for_message(truths, Truth, lambda _: True)
         assert speed(truth) < 1e-3
         assert bus.zid in simulator.output
-    assert wait_until(lambda: "controller" not in bus.alive(), PATIENCE)
-    # Nobody leads now: a driver of the robot's own is heard.
+    assert wait_until(lambda: "controller" not in bus.alive(), TIMEOUT_S)
+    # Without an active controller, commands from another source are obeyed.
 
     def driven() -> bool:
         command(bus, vx=0.5)
         return speed(wait_for_message(truths, Truth, lambda _: True)) > 0.1
 
-    assert wait_until(driven, PATIENCE)
+    assert wait_until(driven, TIMEOUT_S)

@@ -16,19 +16,19 @@ from services.estimator.multi_robot_service import key_expression
 
 NUMBERS = (1, 2, 3)
 STARTS = {1: "3,1.5,90", 2: "9,1.5,0", 3: "14,1.5,180"}
-NEAR = 0.15  # m, with 64 beams
+MAX_ERROR = 0.15  # m, with 64 beams
 
 
-class Ear:
-    """What is said of one robot, newest last."""
+class RobotListener:
+    """Receives the beliefs, true states and health messages of one robot."""
 
     def __init__(self, bus, robot):
         self.robot, self._inbox, self._truths = robot, Inbox(), {}
         for topic in (BELIEF, TRUTH, HEALTH):
             bus.subscribe(topic, self._inbox, keep_all=True, robot=robot)
 
-    def hear(self, condition):
-        """Whether a message that came meanwhile meets the condition."""
+    def matches(self, condition):
+        """Whether one of the messages received since the last call meets the condition."""
         while isinstance(sample := self._inbox.get(0), Sample):
             message = sample.topic.message.decode(sample.payload)
             if isinstance(message, Truth):
@@ -37,7 +37,7 @@ class Ear:
                 return True
         return False
 
-    def forget_what_was(self):
+    def discard_messages(self):
         while self._inbox.get(0) is not None:
             pass
         self._truths.clear()
@@ -46,10 +46,10 @@ class Ear:
         truth = self._truths.get(message.stamp_ns)
         if not isinstance(message, Belief) or message.state != "tracking" or truth is None:
             return False
-        return np.hypot(message.pose.x - truth.pose.x, message.pose.y - truth.pose.y) < NEAR
+        return np.hypot(message.pose.x - truth.pose.x, message.pose.y - truth.pose.y) < MAX_ERROR
 
     def wait(self, condition, what, timeout=60.0):
-        assert wait_until(lambda: self.hear(condition), timeout), f"{self.robot}: not {what}"
+        assert wait_until(lambda: self.matches(condition), timeout), f"{self.robot}: not {what}"
 
 
 @pytest.fixture
@@ -68,63 +68,65 @@ def simulate(process, names):
     return start
 
 
-def test_three_robots_one_estimator(process, bus, link, names, simulate):
+def test_one_estimator_process_serves_three_robots(process, bus, link, names, simulate):
     estimator = process("estimator", "--robots", f"{names[1]},{link.robot}-?", "--forget", "1.5")
-    ears = {k: Ear(bus, name) for k, name in names.items()}
+    listeners = {k: RobotListener(bus, name) for k, name in names.items()}
     simulators = {k: simulate(k) for k in NUMBERS}
-    for ear in ears.values():
-        ear.wait(ear.localised, "localised")
+    for listener in listeners.values():
+        listener.wait(listener.localised, "localised")
 
-    # Each robot has an estimator of its own, as far as anybody can tell.
-    for ear in ears.values():
-        assert wait_until(lambda r=ear.robot: "estimator" in bus.alive(robot=r), 30)
-        ear.wait(
-            lambda m, r=ear.robot: (
+    # Seen from outside, each robot has its own estimator.
+    for listener in listeners.values():
+        assert wait_until(lambda r=listener.robot: "estimator" in bus.alive(robot=r), 30)
+        listener.wait(
+            lambda m, r=listener.robot: (
                 isinstance(m, Health)
                 and m.service == "estimator"
                 and {row.key for row in m.topics if row.published} >= {BELIEF.key(r)}
-                and all(row.key.startswith(f"presage/{r}/") for row in m.topics if "/" in row.key)  # else a request's
+                and all(
+                    row.key.startswith(f"presage/{r}/") for row in m.topics if "/" in row.key
+                )  # the other rows are of requests
             ),
             "healthy",
         )
-        config = bus.ask(CONFIG, Request(), ConfigReply, service="estimator", robot=ear.robot)
-        assert f'"robot": "{ear.robot}"' in config.config
-        assert bus.ask(MODEL, ModelRequest(), ModelReply, robot=ear.robot).ok
+        config = bus.ask(CONFIG, Request(), ConfigReply, service="estimator", robot=listener.robot)
+        assert f'"robot": "{listener.robot}"' in config.config
+        assert bus.ask(MODEL, ModelRequest(), ModelReply, robot=listener.robot).ok
 
-    # What one robot's scanner gets wrong is counted there, and the others do not notice.
+    # Malformed scans of one robot are counted for that robot and do not affect the others.
     garbage, before = bus.for_robot(names[2]), Inbox()
     assert garbage.wait_matching(SCAN, 10)
     bus.subscribe(BELIEF, before, keep_all=True, robot=names[1])
     for k in range(1000):
         garbage.put(SCAN, bytes([k % 256]) * (k % 300))
-    ears[2].wait(
+    listeners[2].wait(
         lambda m: isinstance(m, Health) and m.service == "estimator" and m.counters.get("other_sources", 0) > 0,
         "told of scans that do not come from its simulator",
     )
-    for ear in ears.values():
-        ear.forget_what_was()
-        ear.wait(ear.localised, "localised after the malformed scans")
+    for listener in listeners.values():
+        listener.discard_messages()
+        listener.wait(listener.localised, "localised after the malformed scans")
     stamps = [BELIEF.message.decode(s.payload).stamp_ns for s in iter(lambda: before.get(0), None)]
     assert len(stamps) == len(set(stamps)) > 0
 
-    # Who was found by a pattern is forgotten when gone, and found again elsewhere; a named one keeps its keys.
+    # A robot found by a pattern is dropped when it is gone and localised again later; a named robot keeps its keys.
     simulators[1].stop()
     simulators[2].stop()
     assert wait_until(lambda: "estimator" not in bus.alive(robot=names[2]), 30)
     estimator.wait_for(f"robot={names[1]} seconds=1.5")
     assert wait_until(lambda: "estimator" in bus.alive(robot=names[1]), 30)
     for k in (1, 2):
-        ears[k].forget_what_was()
+        listeners[k].discard_messages()
         simulate(k, "6,2,45")
-    for ear in (ears[1], ears[2]):
-        ear.wait(ear.localised, "localised after it came back")
-    ears[3].forget_what_was()
-    ears[3].wait(ears[3].localised, "served all the time")
+    for listener in (listeners[1], listeners[2]):
+        listener.wait(listener.localised, "localised after it came back")
+    listeners[3].discard_messages()
+    listeners[3].wait(listeners[3].localised, "served all the time")
     assert "Traceback" not in estimator.output
     assert estimator.stop()[0] == 0
 
 
-def test_no_more_robots_than_asked_and_none_that_has_an_estimator(process, bus, link, names, simulate):
+def test_the_robot_limit_holds_and_robots_with_an_estimator_are_skipped(process, bus, link, names, simulate):
     own = process("estimator", env={"PRESAGE_ROBOT": names[1]})
     assert wait_until(lambda: "estimator" in bus.alive(robot=names[1]), 60)
     simulators = [simulate(k) for k in NUMBERS]
@@ -146,7 +148,7 @@ def test_no_more_robots_than_asked_and_none_that_has_an_estimator(process, bus, 
         (("--robots", "a,b,c", "--max-robots", "2"), "--max-robots"),
     ],
 )
-def test_what_cannot_be_served_is_said_in_one_line(process, arguments, words):
+def test_invalid_robot_options_are_refused_in_one_line(process, arguments, words):
     refused = process("estimator", *arguments)
     assert refused.wait(60) == 2
     assert len(refused.output.strip().splitlines()) == 1
@@ -161,8 +163,8 @@ def test_up_with_two_robots(process, free_port):
     up.wait_for("all alive", 120)
     with open_bus(Link(robot="r-1", connect=(f"tcp/127.0.0.1:{port}",))) as bus:
         for robot in ("r-1", "r-2"):
-            ear = Ear(bus, robot)
-            ear.wait(ear.localised, "localised")
+            listener = RobotListener(bus, robot)
+            listener.wait(listener.localised, "localised")
             assert bus.alive(robot=robot) == {"estimator", "simulator", "controller"}
     assert up.output.count("estimator | ") > 0
     assert up.stop(signal.SIGINT, 60)[0] == 130
@@ -172,7 +174,7 @@ def test_up_with_two_robots(process, free_port):
     ("pattern", "hears", "not_heard"),
     [("*", "a-1", ""), ("a-*", "a-1", "b-1"), ("a-?", "a-1", "b-1"), ("*-1", "b-1", "b-2"), ("??", "ab", "")],
 )
-def test_a_pattern_hears_of_a_robot_by_its_scans_alone(bus, link, pattern, hears, not_heard):
+def test_a_pattern_matches_robots_by_their_scans(bus, link, pattern, hears, not_heard):
     prefix = "" if pattern in {"*", "??"} else link.robot
     inbox = Inbox()
     bus.subscribe(SCAN, inbox, keep_all=True, robot=key_expression(prefix + pattern))

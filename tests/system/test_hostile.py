@@ -1,4 +1,4 @@
-"""Over 10 000 payloads that are not what they should be, on every key of a running system: it does not care."""
+"""A running system survives more than 10 000 malformed payloads on every key."""
 
 from __future__ import annotations
 
@@ -19,10 +19,14 @@ from tests.common.samples import message_of
 from tests.conftest import Processes
 
 SERVICES = ("simulator", "estimator", "controller", "recorder")
-EXAMPLES = 400  # a key; 26 keys
-HEARD = {"simulator": ["cmd_vel"], "estimator": ["scan", "goal"], "controller": ["scan", "belief", "goal", "drive"]}
+EXAMPLES = 400  # per key; there are 26 keys
+SUBSCRIBED_TOPICS = {
+    "simulator": ["cmd_vel"],
+    "estimator": ["scan", "goal"],
+    "controller": ["scan", "belief", "goal", "drive"],
+}
 
-JUNK = st.one_of(
+ARBITRARY_VALUES = st.one_of(
     st.none(),
     st.sampled_from(
         [float("nan"), float("inf"), float("-inf"), -1, 2**63, 2**64 - 1, "", "x" * 300, True, b"", b"\x00" * 7]
@@ -41,11 +45,11 @@ def decodes(cls, payload) -> bool:
     return True
 
 
-def hostile(cls):
-    """Bytes that are no message of the class: junk, and valid messages with something broken."""
+def malformed_payloads(cls):
+    """Strategy for payloads that are no valid message of the class: random bytes, and damaged valid messages."""
     whole = message_of(cls).map(lambda message: message.encode())
     fields = whole.map(msgpack.unpackb).filter(bool)
-    replaced = st.tuples(fields, st.randoms(use_true_random=False), JUNK).map(
+    replaced = st.tuples(fields, st.randoms(use_true_random=False), ARBITRARY_VALUES).map(
         lambda parts: msgpack.packb({**parts[0], parts[1].choice(sorted(parts[0])): parts[2]})
     )
     without = fields.map(lambda values: msgpack.packb(dict(list(values.items())[1:])))
@@ -64,15 +68,17 @@ def hostile(cls):
 
 @pytest.fixture(scope="module")
 def system(tmp_path_factory, router):
-    """The four services, a session beside them, and the folder of the recording."""
+    """A session, the four running services, and the folder of the recording."""
     link = Link(robot="hostile", connect=(f"tcp/127.0.0.1:{router}",))
     folder = tmp_path_factory.mktemp("hostile")
     processes = Processes(folder)
-    talk = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": link.robot}
+    environment = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": link.robot}
     try:
         with open_bus(link) as bus:
             running = {
-                name: processes.start(name, *(("--directory", str(folder)) if name == "recorder" else ()), env=talk)
+                name: processes.start(
+                    name, *(("--directory", str(folder)) if name == "recorder" else ()), env=environment
+                )
                 for name in SERVICES
             }
             assert wait_until(lambda: set(SERVICES) <= bus.alive(), 60)
@@ -81,25 +87,25 @@ def system(tmp_path_factory, router):
         processes.close()
 
 
-def latest(bus, topic, kind, condition=lambda _: True):
-    """A message that arrives from now on."""
+def next_message(bus, topic, kind, condition=lambda _: True):
+    """Waits for a message from now on that meets the condition, and returns it."""
     inbox, found = Inbox(), []
     bus.subscribe(topic, inbox, keep_all=True)
 
-    def look():
+    def check():
         while isinstance(sample := inbox.get(0), Sample):
             if decodes(kind, sample.payload) and condition(message := kind.decode(sample.payload)):
                 found.append(message)
         return bool(found)
 
-    assert wait_until(look, 30), f"no {kind.__name__}"
+    assert wait_until(check, 30), f"no {kind.__name__}"
     return found[-1]
 
 
 @pytest.fixture(scope="module")
 def before(system):
-    """Where the robot stands before anything hostile is said."""
-    return latest(system[0], TRUTH, Truth)
+    """The robot's true state before the first malformed payload."""
+    return next_message(system[0], TRUTH, Truth)
 
 
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
@@ -107,7 +113,7 @@ def test_hostile_payloads_on_every_topic(system, before, topic):
     bus, running, _ = system
 
     @settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck))
-    @given(hostile(topic.message))
+    @given(malformed_payloads(topic.message))
     def send(payload):
         bus.put(topic, payload, service="intruder")
 
@@ -128,7 +134,7 @@ def test_hostile_requests_are_refused_with_a_reason(system, before, query):
     service = "estimator" if query is CONFIG else "*"
 
     @settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck))
-    @given(hostile(query.request))
+    @given(malformed_payloads(query.request))
     def ask(payload):
         answers = list(bus._session.get(query.key(bus.robot, service), payload=payload, timeout=30))
         assert len(answers) == 1
@@ -140,22 +146,22 @@ def test_hostile_requests_are_refused_with_a_reason(system, before, query):
     assert all(process.running for process in running.values())
 
 
-def test_after_all_that_everything_runs_and_the_robot_has_not_moved(system, before):
+def test_afterwards_everything_runs_and_the_robot_has_not_moved(system, before):
     bus, running, _ = system
-    after = latest(bus, TRUTH, Truth, lambda truth: truth.stamp_ns > before.stamp_ns + 10**9)
+    after = next_message(bus, TRUTH, Truth, lambda truth: truth.stamp_ns > before.stamp_ns + 10**9)
     assert after.pose.array() == pytest.approx(before.pose.array(), abs=1e-3)
-    first = latest(bus, SCAN, Scan)
-    assert latest(bus, SCAN, Scan, lambda scan: scan.seq > first.seq + 5)
+    first = next_message(bus, SCAN, Scan)
+    assert next_message(bus, SCAN, Scan, lambda scan: scan.seq > first.seq + 5)
     for name in SERVICES:
         assert running[name].running
         assert bus.ask(CONFIG, Request(), ConfigReply, service=name).service == name
         assert "Traceback" not in running[name].output, running[name].output[-3000:]
 
 
-def test_it_was_counted_and_logged_but_not_each_time(system, before):
+def test_malformed_payloads_are_counted_and_logged_at_a_limited_rate(system, before):
     bus, running, _ = system
-    for name, topics in HEARD.items():
-        health = latest(bus, HEALTH, Health, lambda h, n=name: h.service == n)
+    for name, topics in SUBSCRIBED_TOPICS.items():
+        health = next_message(bus, HEALTH, Health, lambda h, n=name: h.service == n)
         rows = {row.key: row for row in health.topics}
         for topic in topics:
             row = rows[f"presage/hostile/{topic}"]
@@ -163,11 +169,11 @@ def test_it_was_counted_and_logged_but_not_each_time(system, before):
             assert row.undecodable > 0
         assert health.counters["failed"] == 0
         assert "payload dropped" in running[name].output
-        assert running[name].output.count("payload dropped") < EXAMPLES  # once a second and key at most
+        assert running[name].output.count("payload dropped") < EXAMPLES  # at most once per second and key
     assert before.seq >= 0
 
 
-def test_the_recorder_has_it_all(system):
+def test_the_recorder_has_recorded_every_payload(system):
     bus, running, folder = system
     assert running["recorder"].stop()[0] == 0
     (file,) = folder.glob("*.mcap")

@@ -1,4 +1,4 @@
-"""The page's own configuration on three hosts: network namespaces that nobody else sees."""
+"""The documented configuration on three hosts, which are private network namespaces."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from services.recorder.reader import read_recording
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_the_three_hosts_of_the_page_drive_the_robot_to_its_goal(process, tmp_path):
+def test_the_documented_three_hosts_drive_the_robot_to_its_goal(process, tmp_path):
     if why := missing_for_namespaces():
         print(f"\n==== NO NETWORK NAMESPACES HERE ({why}): several hosts were NOT tested ====", file=sys.__stderr__)
         pytest.skip(f"several hosts were NOT tested: {why}")

@@ -1,4 +1,4 @@
-"""The whole loop as processes over zenoh: it repeats itself in lockstep, and a replay gives the same beliefs."""
+"""The whole loop as processes over zenoh: lockstep runs are reproducible, and a replay gives the same beliefs."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ REPEATED = (SCAN, ODOM, TRUTH, BELIEF, PREDICTION, STATUS, CMD_VEL)
 
 
 def run_in_lockstep(process, bus, folder, name):
-    """Localise and drive for SCANS scans, recorded; payloads by topic."""
+    """Records localisation and driving for SCANS scans. Returns the payloads by topic."""
     inbox = Inbox()
     for topic in (SCAN, HEALTH):
         bus.subscribe(topic, inbox, keep_all=True)
-    driver = f"driver-{name}"  # the simulator waits for it, and so the goal is there before the first scan
+    driver = f"driver-{name}"  # the simulator waits for this token, so that the goal is set before the first scan
     started = [
         process("recorder", "--directory", str(folder), "--file", f"{name}.mcap"),
         process("controller", "--belief-timeout", "60"),
@@ -50,14 +50,14 @@ def run_in_lockstep(process, bus, folder, name):
     return {topic.name: [r.payload for r in raw if r.key == topic.key(bus.robot)][:SCANS] for topic in REPEATED}
 
 
-def test_in_lockstep_a_seed_gives_the_same_bytes_twice(process, bus, tmp_path):
+def test_lockstep_with_a_seed_is_reproducible_byte_for_byte(process, bus, tmp_path):
     first = run_in_lockstep(process, bus, tmp_path, "first")
     second = run_in_lockstep(process, bus, tmp_path, "second")
     for topic in REPEATED:
         assert len(first[topic.name]) == SCANS, topic.name
         assert first[topic.name] == second[topic.name], topic.name
     moved = [TRUTH.message.decode(p).pose.x for p in first["truth"]]
-    assert moved[-1] - moved[0] > 1.0  # there was something to repeat
+    assert moved[-1] - moved[0] > 1.0  # the robot really moved
 
 
 def test_recorded_scans_give_the_recorded_beliefs(process, bus, tmp_path):
@@ -92,7 +92,7 @@ def test_demo_localises_navigates_records_and_draws(process, tmp_path):
         str(tmp_path / "d.json"),
     )
     recording = wait_for_one(demo, tmp_path / "out", "*.mcap.active")
-    made.write(tmp_path / "out" / "another.mcap")  # somebody else's, meanwhile
+    made.write(tmp_path / "out" / "another.mcap")  # a file of another program, written during the demo
     assert demo.wait(170) == 0, demo.output
     numbers = json.loads((tmp_path / "d.json").read_text())
     assert numbers["goal_reached"]
@@ -105,7 +105,7 @@ def test_demo_localises_navigates_records_and_draws(process, tmp_path):
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {"another.mcap", recording.stem, recording.with_suffix("").with_suffix(".png").name}
     told = read_recording(recording.with_suffix(""))
-    # No scan is lost: on a slow machine one is sent again, and what is dropped then is known already.
+    # No scan is lost. On a slow machine a scan is sent again, and only such repetitions may be dropped.
     scans, beliefs = ({message.stamp_ns for _, message, _ in told.messages(topic)} for topic in (SCAN, BELIEF))
     assert scans - beliefs <= {max(scans)}
     simulated = [health for _, health, _ in told.messages(HEALTH) if health.service == "simulator"]
@@ -126,17 +126,17 @@ def test_demo_localises_navigates_records_and_draws(process, tmp_path):
         assert word in demo.output
 
 
-def test_demo_as_fast_as_it_goes_begins_with_everybody_there(process, tmp_path):
+def test_demo_at_full_speed_starts_when_all_services_are_alive(process, tmp_path):
     numbers = tmp_path / "d.json"
     demo = process("presage.__main__", "demo", "--pace", "fast", "--out", str(tmp_path), "--json", str(numbers))
-    assert demo.wait(170) in {0, 1}, demo.output  # a slow machine may be late with its commands
+    assert demo.wait(170) in {0, 1}, demo.output  # on a slow machine commands may be late
     assert "localised after" in demo.output
     recording = read_recording(next(tmp_path.glob("*.mcap")))
     assert next(recording.messages(SCAN))[1].seq == 0
     assert json.loads(numbers.read_text())["localised_after_scans"] is not None
 
 
-def test_demo_without_a_belief_says_why(process, tmp_path):
+def test_demo_without_a_belief_reports_the_reason(process, tmp_path):
     demo = process(
         "presage.__main__", "demo", "--beams", "100", "--estimator", "paper", "--out", str(tmp_path), "--quiet"
     )
@@ -152,13 +152,13 @@ def test_no_process_outlives_presage_up(process, free_port, number):
     up = process("presage.__main__", "up", "--port", str(free_port()))
     up.wait_for("all alive", 90)
     children = psutil.Process(up.child.pid).children(recursive=True)
-    assert len(children) == 6  # router, simulator, estimator, controller, viewer, and a recorder that waits
+    assert len(children) == 6  # router, simulator, estimator, controller, viewer and an idle recorder
     up.send(number)
     assert up.wait(20) == (-9 if number == signal.SIGKILL else 130)
     assert wait_until(lambda: not any(child.is_running() and child.status() != "zombie" for child in children), 10)
 
 
-def test_up_names_a_service_that_ends_and_keeps_the_others(process, free_port):
+def test_up_reports_a_service_that_ends_and_keeps_the_others(process, free_port):
     up = process("presage.__main__", "up", "--port", str(free_port()))
     up.wait_for("all alive", 90)
     estimator = next(c for c in psutil.Process(up.child.pid).children() if "services.estimator" in c.cmdline())

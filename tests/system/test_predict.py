@@ -1,4 +1,4 @@
-"""`predict` through a real estimator over zenoh: asked by somebody who waits and by somebody who does not."""
+"""The query `predict` of a real estimator over zenoh, blocking and asynchronous."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from common.messages.requests import PredictReply, PredictRequest
 from common.messages.topics import BELIEF, PREDICT, SCAN
 from common.robot.scanner import SCANNERS
 
-PATIENCE = 60.0
+TIMEOUT_S = 60.0
 SCANNER = SCANNERS["tim571"].with_beams(180)
 WORLD = load_world("office")
 
@@ -26,11 +26,11 @@ def seen(pose):
 
 @pytest.fixture
 def estimator(bus, process):
-    """A running estimator that has had one scan, and answered it."""
+    """A running estimator that has processed one scan."""
     running, beliefs = process("estimator", "--world", "office"), Inbox()
     bus.subscribe(BELIEF, beliefs)
-    assert wait_until(lambda: "estimator" in bus.alive(), PATIENCE), running.output
-    assert bus.wait_matching(SCAN, PATIENCE)
+    assert wait_until(lambda: "estimator" in bus.alive(), TIMEOUT_S), running.output
+    assert bus.wait_matching(SCAN, TIMEOUT_S)
     early = bus.ask(PREDICT, PredictRequest(poses=np.zeros((1, 3))), PredictReply)
     assert early.reason == "no scan has come yet"
     scan = Scan(
@@ -38,11 +38,11 @@ def estimator(bus, process):
         range_max=25.0, ranges=seen(np.array([3.0, 4.0, 0.0])), mount=Pose.of(SCANNER.mount),
     )  # fmt: skip
     bus.put(SCAN, scan.encode())
-    assert wait_until(lambda: len(beliefs) > 0, PATIENCE), running.output
+    assert wait_until(lambda: len(beliefs) > 0, TIMEOUT_S), running.output
     return running
 
 
-def test_predictions_come_to_who_asks(estimator, bus):
+def test_predictions_answer_blocking_and_asynchronous_queries(estimator, bus):
     rng = np.random.default_rng(0)
     poses = np.column_stack([WORLD.sample_free(100, rng, 0.27), rng.uniform(-np.pi, np.pi, 100)])
     request = PredictRequest(poses=poses, beams=61)
@@ -52,8 +52,8 @@ def test_predictions_come_to_who_asks(estimator, bus):
     assert np.median(np.abs(ranges - exact)) < 0.001
     inbox = Inbox()
     for number in range(5):
-        bus.request(PREDICT, request, number, inbox, PATIENCE)
-    assert wait_until(lambda: len(inbox) == 5, PATIENCE)
+        bus.request(PREDICT, request, number, inbox, TIMEOUT_S)
+    assert wait_until(lambda: len(inbox) == 5, TIMEOUT_S)
     answers = [inbox.get(0) for _ in range(5)]
     assert all(isinstance(each, Answer) and each.reply() == waited for each in answers)
     assert sorted(each.number for each in answers) == list(range(5))

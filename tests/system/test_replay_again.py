@@ -1,4 +1,4 @@
-"""`presage replay FILE --with estimator`: from the file alone, what a lockstep session believed, to the last bit."""
+"""`presage replay FILE --with estimator` reproduces a lockstep session's beliefs bit for bit from its recording."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from tests.system.test_loop import SCANS, run_in_lockstep
 
 
 def command(process, numbers, *args, env=None):
-    """Status, output and numbers of a command with ``--json``."""
+    """Runs a command with ``--json``. Returns its status, output and numbers."""
     done = process("presage.__main__", *map(str, args), "--json", str(numbers), env=env)
     status = done.wait(120)
     return status, done.output, json.loads(numbers.read_text()) if numbers.exists() else {}
 
 
-def altered(recording, path, stamp_ns, count):
-    """The recording's first scans, with one belief a nanometre elsewhere."""
+def alter_one_belief(recording, path, stamp_ns, count):
+    """Writes the recording's first scans, with one belief moved by a nanometre."""
     writer, scans = RecordingWriter(path), 0
     for name, values in recording.metadata.items():
         writer.metadata(name, values)
@@ -43,25 +43,25 @@ def altered(recording, path, stamp_ns, count):
     return writer.finish()
 
 
-def test_a_lockstep_session_is_believed_again_to_the_last_bit(process, bus, tmp_path):
+def test_a_replayed_lockstep_session_gives_bit_identical_beliefs(process, bus, tmp_path):
     run_in_lockstep(process, bus, tmp_path, "run")
     file = tmp_path / "run.mcap"
-    # What the environment says is not what was recorded.
-    status, said, numbers = command(
+    # The environment differs from the recorded settings and must be ignored.
+    status, output, numbers = command(
         process, tmp_path / "a.json", "replay", file, "--with", "estimator,controller", env={"PRESAGE_SIGMA": "0.5"}
     )
-    assert status == 0, said
+    assert status == 0, output
     beliefs, commands = numbers["beliefs"], numbers["commands"]
     assert numbers["lockstep"]
     assert beliefs["equal"] == beliefs["compared"] >= SCANS
     assert beliefs["position_difference_max_m"] == 0.0
     assert beliefs["recorded_without_new"] == 0
     assert commands["equal"] == commands["compared"] >= SCANS
-    assert "this is what it believed" in said
+    assert "this is what it believed" in output
 
-    # Offline too.
-    status, said, numbers = command(process, tmp_path / "r.json", "rerun", file, "--out", tmp_path / "new.mcap")
-    assert status == 0, said
+    # The same without processes.
+    status, output, numbers = command(process, tmp_path / "r.json", "rerun", file, "--out", tmp_path / "new.mcap")
+    assert status == 0, output
     assert numbers["difference"] == {"position_median_m": 0.0, "position_max_m": 0.0, "heading_max_rad": 0.0}
     assert numbers["scans_compared"] >= SCANS
     bytes_of = {"robot": [], "robot-rerun": []}
@@ -71,18 +71,18 @@ def test_a_lockstep_session_is_believed_again_to_the_last_bit(process, bus, tmp_
             bytes_of[whose].append(raw.payload)
     assert bytes_of["robot"] == bytes_of["robot-rerun"][: len(bytes_of["robot"])]
 
-    # A nanometre is seen.
+    # A difference of a nanometre is detected.
     stamp = Belief.decode(bytes_of["robot"][10]).stamp_ns
-    other = altered(read_recording(file), tmp_path / "other.mcap", stamp, 20)
-    status, said, numbers = command(process, tmp_path / "o.json", "replay", other, "--with", "estimator")
-    assert status == 1, said
+    other = alter_one_belief(read_recording(file), tmp_path / "other.mcap", stamp, 20)
+    status, output, numbers = command(process, tmp_path / "o.json", "replay", other, "--with", "estimator")
+    assert status == 1, output
     assert numbers["beliefs"]["equal"] == numbers["beliefs"]["compared"] - 1
     assert 0.5e-9 < numbers["beliefs"]["position_difference_max_m"] < 2e-9
-    assert "should be equal bit for bit, and are not" in said
+    assert "should be equal bit for bit, and are not" in output
 
 
-def test_what_a_file_does_not_hold_is_named(process, tmp_path):
-    file = made.write(tmp_path / "made.mcap")  # of no process at all
+def test_missing_contents_of_a_recording_are_reported(process, tmp_path):
+    file = made.write(tmp_path / "made.mcap")  # not from a real session
     started = {
         "the estimator's configuration was not recorded": ("replay", str(file), "--with", "estimator"),
         "give estimator, or estimator,controller": ("replay", str(file), "--with", "simulator"),
@@ -97,24 +97,26 @@ def test_what_a_file_does_not_hold_is_named(process, tmp_path):
         assert says in line
 
 
-def test_an_imported_log_is_answered_scan_by_scan(process, tmp_path):
-    """There is no belief to compare with; the estimator is as it is by default, in the world it was imported with."""
+def test_every_scan_of_an_imported_log_is_answered(process, tmp_path):
+    """An imported log has no beliefs to compare with; the estimator has default settings and the import's world."""
     log = write_bag(tmp_path, Bag(localised=True))
     for name, world in (("there", "corridor"), ("nowhere", "")):
         import_command(
             ImportOptions(log, tmp_path / f"{name}.mcap", world=world), None, Console(quiet=True), Console(quiet=True)
         )
-    status, said, numbers = command(
+    status, output, numbers = command(
         process, tmp_path / "a.json", "replay", tmp_path / "there.mcap", "--with", "estimator"
     )
-    assert status == 0, said
+    assert status == 0, output
     assert numbers["imported"]
     assert (numbers["scans"], numbers["scans_unanswered"]) == (SCANS_OF_LOG, 0)
     assert numbers["tracking"] > SCANS_OF_LOG / 2
-    assert "presage rerun" in said
+    assert "presage rerun" in output
     for file, services, why in (
         ("nowhere", "estimator", "import it with --world"), ("there", "estimator,controller", "no goal"),
     ):  # fmt: skip
-        status, said, _ = command(process, tmp_path / "b.json", "replay", tmp_path / f"{file}.mcap", "--with", services)
+        status, output, _ = command(
+            process, tmp_path / "b.json", "replay", tmp_path / f"{file}.mcap", "--with", services
+        )
         assert status == 2
-        assert why in said
+        assert why in output

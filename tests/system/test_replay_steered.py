@@ -1,4 +1,4 @@
-"""`presage replay` in a terminal, and what services make of a time that goes back."""
+"""`presage replay` in a terminal, and services whose time jumps back."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from tests.conftest import ROOT, WAIT_TIMEOUT_S
 SECOND = 10**9
 
 
-def hour(path, robot):
-    """A recording that lasts: a scan a second."""
+def write_one_hour(path, robot):
+    """Writes a recording of one hour with one scan per second."""
     writer = RecordingWriter(path)
     for n in range(3600):
         writer.write(SCAN, SCAN.key(robot), bytes([n % 256]), n * SECOND, n * SECOND)
@@ -41,7 +41,7 @@ def hour(path, robot):
 
 @pytest.fixture
 def terminal(tmp_path, link):
-    """A replay of an hour in a terminal of its own: the process, our end of the terminal, its modes before."""
+    """A replay in a pseudo-terminal: the process, the terminal's other end, and whether its modes are restored."""
     ours, theirs = pty.openpty()
     before = termios.tcgetattr(theirs)
 
@@ -49,7 +49,7 @@ def terminal(tmp_path, link):
         os.setsid()
         fcntl.ioctl(theirs, termios.TIOCSCTTY, 0)
 
-    args = ["replay", str(hour(tmp_path / "hour.mcap", link.robot)), "--connect", link.connect[0]]
+    args = ["replay", str(write_one_hour(tmp_path / "hour.mcap", link.robot)), "--connect", link.connect[0]]
     with (tmp_path / "said").open("wb") as said:
         child = subprocess.Popen(
             [sys.executable, "-m", "presage", *args], stdin=theirs, stdout=said, stderr=said, cwd=tmp_path,
@@ -67,7 +67,7 @@ def state(bus):
     return bus.ask(PLAYER, PlayerRequest(action="status"), PlayerReply, timeout=WAIT_TIMEOUT_S)
 
 
-def test_keys_steer_it_and_the_terminal_is_as_before(terminal, bus, tmp_path):
+def test_keys_control_the_replay_and_the_terminal_is_restored(terminal, bus, tmp_path):
     child, ours, as_before = terminal
     assert wait_until(lambda: b"q quit" in (tmp_path / "said").read_bytes(), WAIT_TIMEOUT_S)
     assert wait_until(lambda: not as_before(), WAIT_TIMEOUT_S)
@@ -89,7 +89,7 @@ def test_keys_steer_it_and_the_terminal_is_as_before(terminal, bus, tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_cleanly(terminal, bus, tmp_path, number):
+def test_a_signal_ends_the_replay_cleanly(terminal, bus, tmp_path, number):
     child, _, as_before = terminal
     assert wait_until(lambda: not as_before(), WAIT_TIMEOUT_S)
     assert state(bus).duration_s == 3599.0
@@ -99,8 +99,8 @@ def test_a_signal_ends_it_cleanly(terminal, bus, tmp_path, number):
     assert "Traceback" not in (tmp_path / "said").read_text()
 
 
-def test_services_take_a_time_that_goes_back_for_a_session_begun_anew(process, bus, link, tmp_path):
-    """A loop over ten scans along the corridor: after each jump back the belief is right again at once."""
+def test_services_treat_a_jump_back_in_time_as_a_new_session(process, bus, link, tmp_path):
+    """A looping replay of ten scans along the corridor: after each jump back the belief is right at once."""
     world, scanner = load_world("corridor"), SCANNERS["tim571"].with_beams(200)
     writer, truth = RecordingWriter(tmp_path / "loop.mcap"), {}
     for n in range(10):

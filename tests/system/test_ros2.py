@@ -1,4 +1,4 @@
-"""The bridge between real processes: a stand-in robot that speaks as ROS 2 does, estimator and controller of ours."""
+"""The ROS 2 bridge between real processes: a simulated ROS 2 robot, and presage's estimator and controller."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ POSE = "geometry_msgs/msg/PoseStamped"
 GOAL_POSE = "geometry_msgs::msg::dds_::PoseStamped_"
 
 
-def said(robot):
-    """What the stand-in said last."""
+def last_report(robot):
+    """The last state that the simulated robot printed."""
     lines = [line for line in robot.output.splitlines() if line.startswith("{") and line.endswith("}")]
     return json.loads(lines[-1]) if lines else {}
 
 
-def until(robot, condition, what, *others):
-    if not wait_until(lambda: bool(now := said(robot)) and condition(now), WAIT_TIMEOUT_S):
-        pytest.fail(f"{what}: {said(robot)}\n" + "\n".join(each.output[-3000:] for each in (robot, *others)))
+def wait_until_report(robot, condition, what, *others):
+    if not wait_until(lambda: bool(now := last_report(robot)) and condition(now), WAIT_TIMEOUT_S):
+        pytest.fail(f"{what}: {last_report(robot)}\n" + "\n".join(each.output[-3000:] for each in (robot, *others)))
 
 
-def ends_well(robot):
-    """Nothing went wrong where zenoh would swallow it, such as an attachment of which rmw_zenoh dies."""
+def assert_no_errors(robot):
+    """Checks for errors in zenoh callbacks, which zenoh does not report, such as an invalid attachment."""
     assert robot.running
     assert "Error" not in robot.output
-    assert not said(robot)["contact"]
+    assert not last_report(robot)["contact"]
 
 
 def goal_message(x, y):
@@ -43,15 +43,15 @@ def goal_message(x, y):
 
 
 def arrived(now):
-    """It stands at the goal; ROS is told so, and tf makes up for what odometry drifts."""
+    """Whether the robot stands at the goal, with the right pose in ROS and a tf that corrects the odometry's drift."""
     believed, by_tf = now["pose"][:2], se2.compose(now["odom_in_map"], now["odom"])[:2]
     there = math.dist(now["truth"][:2], (4.2, 1.5)) < 0.25 and now["speed"] < 0.01
     return there and math.dist(believed, now["truth"][:2]) < 0.05 and math.dist(by_tf, now["truth"][:2]) < 0.05
 
 
 @pytest.fixture(scope="module")
-def minds(tmp_path_factory):
-    """Estimator and controller, which take seconds to start, on a router of ours; a second router is the robot's."""
+def services(tmp_path_factory):
+    """Estimator and controller, which take seconds to start, on one router; the robot uses a second router."""
     processes = Processes(tmp_path_factory.mktemp("ros2"))
     try:
         port, ros = processes.start_router()[1], processes.start_router()[1]
@@ -70,41 +70,41 @@ def minds(tmp_path_factory):
         processes.close()
 
 
-def test_over_rmw_zenoh_a_robot_is_localised_drives_to_rvizs_goal_and_stands_where_the_bridge_dies(minds):
-    start, _, port, _ = minds
+def test_rmw_zenoh_robot_localises_drives_to_a_goal_and_stops_when_the_bridge_dies(services):
+    start, _, port, _ = services
     bridge = start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{port}")
     robot = start("tests.system.ros2_robot", "--port", str(port))
-    until(robot, lambda now: now["pose"] and now["transforms"] > 3, "no pose and transform", bridge)
+    wait_until_report(robot, lambda now: now["pose"] and now["transforms"] > 3, "no pose and transform", bridge)
     with Ros(port, "rmw_zenoh", "jazzy") as rviz:
         put = rviz.publisher("goal_pose", GOAL_POSE)
         assert wait_until(lambda: bool(rviz.kept[-1].matching_status.matching), WAIT_TIMEOUT_S)
         put(goal_message(4.2, 1.5))
-        until(robot, arrived, "no way", bridge)
+        wait_until_report(robot, arrived, "no way", bridge)
         put(goal_message(12.0, 1.5))
-        until(robot, lambda now: now["speed"] > 0.3, "it does not go on", bridge)
+        wait_until_report(robot, lambda now: now["speed"] > 0.3, "it does not go on", bridge)
     bridge.kill()
-    until(robot, lambda now: now["speed"] < 0.01, "it drives on without the bridge")
-    zeros = said(robot)["zeros"]
+    wait_until_report(robot, lambda now: now["speed"] < 0.01, "it drives on without the bridge")
+    zeros = last_report(robot)["zeros"]
     bridge = start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{port}")
-    until(robot, lambda now: now["speed"] > 0.3, "it does not go on with another bridge", bridge)
+    wait_until_report(robot, lambda now: now["speed"] > 0.3, "it does not go on with another bridge", bridge)
     assert bridge.stop()[0] == 0
-    until(robot, lambda now: now["zeros"] > zeros, "a bridge that ends sends no stop", bridge)
-    ends_well(robot)
+    wait_until_report(robot, lambda now: now["zeros"] > zeros, "a bridge that ends sends no stop", bridge)
+    assert_no_errors(robot)
     robot.stop()
 
 
-def test_over_zenoh_bridge_ros2dds_commands_that_end_are_followed_by_a_stop(minds):
-    start, bus, port, controller = minds
+def test_zenoh_bridge_ros2dds_robot_stops_when_commands_end(services):
+    start, bus, port, controller = services
     bridge = start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{port}", "--flavor", "ros2dds", "--stamped")
     robot = start("tests.system.ros2_robot", "--port", str(port), "--flavor", "ros2dds", "--stamped")
-    until(robot, lambda now: now["pose"] and now["transforms"] > 3, "no pose and transform", bridge)
+    wait_until_report(robot, lambda now: now["pose"] and now["transforms"] > 3, "no pose and transform", bridge)
     assert bus.wait_matching(GOAL, WAIT_TIMEOUT_S)
     bus.put(GOAL, Goal(stamp_ns=0, pose=Pose(x=12.0, y=1.5)).encode())
-    until(robot, lambda now: now["speed"] > 0.3, "it does not go", bridge)
+    wait_until_report(robot, lambda now: now["speed"] > 0.3, "it does not go", bridge)
     controller.kill()
-    until(robot, lambda now: now["zeros"] > 0, "no stop", bridge)
+    wait_until_report(robot, lambda now: now["zeros"] > 0, "no stop", bridge)
     bridge.wait_for("stop: commands have ended")
-    until(robot, lambda now: now["speed"] < 0.01, "it does not stand")
-    ends_well(robot)
+    wait_until_report(robot, lambda now: now["speed"] < 0.01, "it does not stand")
+    assert_no_errors(robot)
     robot.stop()
     assert bridge.stop()[0] == 0

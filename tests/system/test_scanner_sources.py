@@ -1,4 +1,4 @@
-"""What stands in the scanner's place: a recording that is played, or nothing but an ear for a robot elsewhere."""
+"""Replacements of the simulator: a replayed recording, or a process that only waits for a remote robot's scans."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from services.recorder.files.writer import RecordingWriter
 from tests.conftest import wait_for_message
 
 SCANS = 4
-PATIENCE = 30.0
+TIMEOUT_S = 30.0
 
 
 def scan(number):
@@ -29,7 +29,7 @@ def scan(number):
 
 @pytest.fixture
 def recording(tmp_path):
-    """Of another robot; with a command, which must not go out again."""
+    """A recording of another robot, with beliefs, which must not be replayed."""
     folder = tmp_path / "recordings"
     folder.mkdir()
     writer = RecordingWriter(folder / "drive.mcap")
@@ -42,7 +42,7 @@ def recording(tmp_path):
     return folder
 
 
-def test_a_recording_takes_the_simulator_s_place(bus, process, recording, tmp_path):
+def test_a_recording_replaces_the_simulator(bus, process, recording, tmp_path):
     scans, all_else = Inbox(), Inbox()
     bus.subscribe(SCAN, scans, keep_all=True)
     for topic in set(TOPICS) - {SCAN}:
@@ -51,17 +51,17 @@ def test_a_recording_takes_the_simulator_s_place(bus, process, recording, tmp_pa
         "services.recorder.replaying.service", "--directory", str(recording), "--replay", "drive.mcap", "--heartbeat",
         str(tmp_path),
     )  # fmt: skip
-    for _ in range(2):  # again and again
+    for _ in range(2):  # the replay loops
         for number in range(SCANS):
             assert wait_for_message(scans, Scan, lambda message: True).seq == number, running.output
     healthy = lambda: fault_of("replay", read_beats(tmp_path, "replay"), [bus.robot], time.monotonic()) == ""  # noqa: E731
-    assert wait_until(healthy, PATIENCE), read_beats(tmp_path, "replay")
+    assert wait_until(healthy, TIMEOUT_S), read_beats(tmp_path, "replay")
     assert running.stop()[0] == 0
     assert not all_else.received
 
 
 @pytest.mark.parametrize(("name", "said"), [("", "no recording ''"), ("other.mcap", "no recording 'other.mcap'")])
-def test_a_recording_that_is_not_there_is_named_with_those_that_are(process, recording, name, said):
+def test_a_missing_recording_is_reported_with_the_available_ones(process, recording, name, said):
     running = process("services.recorder.replaying.service", "--directory", str(recording), "--replay", name)
     assert running.wait() == 2
     assert f"replay: {said} in {recording}" in running.output
@@ -77,15 +77,15 @@ def test_a_recording_without_scans_is_refused(process, tmp_path):
     assert "no scans in this recording" in running.output
 
 
-def test_one_who_waits_for_a_robot_elsewhere_says_when_its_scans_come_and_stop(bus, process, tmp_path):
+def test_waiting_for_a_remote_robot_reports_when_its_scans_start_and_stop(bus, process, tmp_path):
     running = process("common.containers.remote_robot", "--heartbeat", str(tmp_path))
     fault = lambda: fault_of("remote", read_beats(tmp_path, "remote"), [bus.robot], time.monotonic())  # noqa: E731
     wanted = f"{bus.robot}: no scan was received so far (no scan so far)"
-    assert wait_until(lambda: fault() == wanted, PATIENCE), fault()
-    assert bus.wait_matching(SCAN, PATIENCE)
+    assert wait_until(lambda: fault() == wanted, TIMEOUT_S), fault()
+    assert bus.wait_matching(SCAN, TIMEOUT_S)
     sent = scan(0).encode()
-    assert wait_until(lambda: bus.put(SCAN, sent) or fault() == "", PATIENCE), fault()
+    assert wait_until(lambda: bus.put(SCAN, sent) or fault() == "", TIMEOUT_S), fault()
     running.wait_for("scans come")
     running.wait_for("no scan for 5 s")
-    assert wait_until(lambda: "scan was not received for" in fault(), PATIENCE), fault()
+    assert wait_until(lambda: "scan was not received for" in fault(), TIMEOUT_S), fault()
     assert running.stop()[0] == 0

@@ -1,4 +1,4 @@
-"""A session is re-run from its file alone: the map and the weights in it make the very same estimator."""
+"""A recording alone is enough to run the session's estimator again, with the map and the weights stored in it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SERVICES = {"recorder", "controller", "estimator", "simulator"}
 
 
 def other_weights(folder, file):
-    """Weights that nobody ships, so that whoever falls back on the shipped ones is found out."""
+    """Weights that differ from the shipped ones, so that a fallback to those is detected."""
     folder.mkdir()
     for suffix in ("safetensors", "json"):
         shutil.copy(ROOT / "models" / f"{file}.{suffix}", folder)
@@ -29,7 +29,7 @@ def other_weights(folder, file):
 
 
 def record(process, bus, folder, *estimator):
-    """A second of a session in lockstep, and the file."""
+    """Records one second of a lockstep session. Returns the recording."""
     scans = Inbox()
     bus.subscribe(SCAN, scans, keep_all=True)
     started = [
@@ -48,7 +48,7 @@ def record(process, bus, folder, *estimator):
 
 
 def extract(recording, folder):
-    """The attachments as files, under their names."""
+    """Writes the attachments as files into ``folder`` under their names."""
     for name, data in recording.attachments.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(data)
@@ -56,7 +56,7 @@ def extract(recording, folder):
 
 
 def rerun(process, bus, config, folder, scans):
-    """An estimator with the recorded settings over the recorded scans; its beliefs."""
+    """Runs an estimator with the recorded settings over the recorded scans. Returns its beliefs."""
     kept = {name: config[name] for name in ("estimator", "model", "initial_pose", "seed", "sigma", "prior")}
     kept = {name: value for name, value in kept.items() if value is not None}
     args = [part for name, value in kept.items() for part in (f"--{name.replace('_', '-')}", str(value))]
@@ -76,7 +76,7 @@ def rerun(process, bus, config, folder, scans):
 
 
 @pytest.mark.parametrize(("estimator", "file"), [("precise", "corridor-precise"), ("paper", "corridor-paper-622")])
-def test_the_file_alone_makes_the_same_estimator_again(process, bus, tmp_path, estimator, file):
+def test_a_recording_alone_reproduces_the_estimator(process, bus, tmp_path, estimator, file):
     mine = other_weights(tmp_path / "mine", file)
     recording = record(process, bus, tmp_path / "logs", "--estimator", estimator, "--models", str(mine))
     model = recording.metadata["model"]
@@ -96,7 +96,7 @@ def test_the_file_alone_makes_the_same_estimator_again(process, bus, tmp_path, e
     assert again == [before[scan.stamp_ns] for scan in scans]
 
 
-def test_a_particle_filter_s_file_has_its_map(process, bus, tmp_path):
+def test_a_recording_with_the_particle_filter_contains_the_map(process, bus, tmp_path):
     recording = record(process, bus, tmp_path / "logs", "--estimator", "particle-filter")
     assert recording.metadata["model"] == {
         "estimator": "particle-filter", "card": "", "file": "", "weights": "none: nothing was learned",
@@ -105,7 +105,7 @@ def test_a_particle_filter_s_file_has_its_map(process, bus, tmp_path):
     assert not any(name.endswith(".safetensors") for name in recording.attachments)
 
 
-def test_a_service_started_anew_with_other_settings_is_asked_again(process, bus, tmp_path):
+def test_a_restarted_service_is_queried_for_its_new_settings(process, bus, tmp_path):
     recorder = process("recorder", "--directory", str(tmp_path), "--file", "session")
     recorder.wait_for("ready")
     active = tmp_path / "session.mcap.active"
@@ -113,7 +113,7 @@ def test_a_service_started_anew_with_other_settings_is_asked_again(process, bus,
         known, told = len(active.read_bytes()), f'"gamma": {gamma}'.encode()
         running = process("controller", "--gamma", gamma)
         assert wait_until(lambda at=known, t=told: t in active.read_bytes()[at:], 30), recorder.output
-        running.kill()  # without a farewell: the one who comes next is noticed all the same
+        running.kill()  # without a clean exit; the recorder must notice its successor anyway
     assert recorder.stop()[0] == 0
     config = json.loads(read_recording(tmp_path / "session.mcap").metadata["config:controller"]["config"])
     assert config["gamma"] == 0.41

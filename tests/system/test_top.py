@@ -13,7 +13,7 @@ NAMES = ("simulator", "estimator", "controller")
 
 
 def words(text: str) -> str:
-    """Without the table's lines, so that what was wrapped reads on."""
+    """The text without the table's lines, so that wrapped words are joined."""
     return " ".join("".join(" " if c in "│┃─━┏┓┗┛└┘├┤┡┩╇╋┳┬┴┻┼" else c for c in text).split())
 
 
@@ -21,7 +21,7 @@ def row_of(output: str, service: str) -> str:
     return next(words(line) for line in output.splitlines() if words(line).startswith(service))
 
 
-def test_a_whole_session_is_well(process, bus):
+def test_healthy_session(process, bus):
     for name in NAMES:
         process(name, *(("--initial-pose", "3,1.5") if name == "estimator" else ()))
     assert wait_until(lambda: set(NAMES) <= bus.alive(), 60)
@@ -34,7 +34,7 @@ def test_a_whole_session_is_well(process, bus):
         tables.append(top.output)
         return status == 0 and "ms" in row_of(top.output, "controller")
 
-    assert wait_until(well, 60), tables[-1]  # the first scans take their time
+    assert wait_until(well, 60), tables[-1]  # the first scans take longer
     output = tables[-1]
     assert f"robot {bus.robot}" in output
     for name, sends in zip(NAMES, ("scan", "belief", "cmd_vel"), strict=True):
@@ -46,7 +46,7 @@ def test_a_whole_session_is_well(process, bus):
     assert "Traceback" not in output
 
 
-def test_who_is_missing_is_said_with_what_starts_it(process, bus, link):
+def test_missing_services_are_listed_with_their_start_commands(process, bus, link):
     controller = process("controller")
     assert wait_until(lambda: "controller" in bus.alive(), 60)
     top = process("presage.__main__", "top", "--once")
@@ -58,7 +58,7 @@ def test_who_is_missing_is_said_with_what_starts_it(process, bus, link):
     assert controller.running
 
 
-def test_several_robots_have_a_table_each(process, bus):
+def test_each_robot_has_its_own_table(process, bus):
     process("controller")
     assert wait_until(lambda: "controller" in bus.alive(), 60)
     top = process("presage.__main__", "top", "--once", "--robot", bus.robot, "--robot", "nobody")
@@ -69,7 +69,7 @@ def test_several_robots_have_a_table_each(process, bus):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_live_it_follows_and_ends_cleanly(process, bus, number):
+def test_live_table_updates_and_ends_cleanly(process, bus, number):
     top = process("presage.__main__", "top", env={"FORCE_COLOR": "1", "COLUMNS": "160", "LINES": "40"})
     top.wait_for("missing")
     controller = process("controller")
@@ -80,11 +80,11 @@ def test_live_it_follows_and_ends_cleanly(process, bus, number):
     assert status == 0
     assert seconds < 5
     assert "\x1b[?1049h" in top.output
-    assert top.output.rstrip().endswith(("\x1b[?25h", "\x1b[?1049l"))  # the terminal is given back
+    assert top.output.rstrip().endswith(("\x1b[?25h", "\x1b[?1049l"))  # the terminal is restored
     assert "Traceback" not in top.output
 
 
-def test_no_session_is_one_line(process):
+def test_missing_session_is_reported_in_one_line(process):
     top = process("presage.__main__", "top", "--connect", "tcp/127.0.0.1:9")
     assert top.wait(60) == 2
     assert "start a session with `presage up`" in top.output

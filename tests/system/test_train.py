@@ -1,4 +1,4 @@
-"""`presage train`: samples from the scanner on the bus, or a simulator of its own; resumed; used by the estimator."""
+"""`presage train`: samples from the running scanner or from its own simulator, resuming, and use of the weights."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def train(process, tmp_path, *args):
 @pytest.mark.parametrize(
     ("preset", "stem", "more"), [("precise", "closet-precise", ()), ("paper", "closet-paper-61", (*PAPER, "3"))]
 )
-def test_a_world_of_one_s_own_from_nothing_to_beliefs(process, bus, tmp_path, preset, stem, more):
+def test_training_for_a_custom_world_gives_beliefs(process, bus, tmp_path, preset, stem, more):
     (tmp_path / "w.yaml").write_text(WORLD)
     folder = str(tmp_path / "m")
     estimator = ("estimator", "--world", str(tmp_path / "w.yaml"), "--models", folder, "--estimator", preset)
@@ -55,7 +55,7 @@ def test_a_world_of_one_s_own_from_nothing_to_beliefs(process, bus, tmp_path, pr
     assert Belief.decode(sample.payload).estimator == preset
 
 
-def test_the_scanner_on_the_bus_is_asked(process, bus, tmp_path):
+def test_a_running_scanner_provides_the_samples(process, bus, tmp_path):
     (tmp_path / "w.yaml").write_text(WORLD)
     process("simulator", "--world", str(tmp_path / "w.yaml"))
     assert wait_until(lambda: "simulator" in bus.alive(), 60)
@@ -64,7 +64,7 @@ def test_the_scanner_on_the_bus_is_asked(process, bus, tmp_path):
     assert "samples come from the running scanner tim571 in closet" in training.output
 
 
-def test_an_interrupted_training_is_taken_up_and_ends_in_the_same_weights(process, tmp_path):
+def test_an_interrupted_training_continues_and_gives_the_same_weights(process, tmp_path):
     (tmp_path / "w.yaml").write_text(WORLD)
     whole = train(process, tmp_path, *PAPER, "15")
     assert whole.wait(150) == 0, whole.output

@@ -1,4 +1,4 @@
-"""A visitor plays with the whole running system: each action, answered by real services; a recording is scrubbed."""
+"""All actions of the live page against a whole running system, and playback of a recording."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ROBOT = "played"
 
 
 class System:
-    """Everything but a viewer, for all tests."""
+    """All services but the viewer, shared by the tests."""
 
     def __init__(self, folder):
         self.processes, self.folder = Processes(folder), folder / "recordings"
@@ -54,7 +54,7 @@ def system(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def where(system):
-    """A viewer's link."""
+    """The address of a viewer's page."""
     return system.start_viewer()[0]
 
 
@@ -66,7 +66,7 @@ def state_of(header):
     return header["status"] and header["status"]["state"]
 
 
-def test_a_visitor_drives_the_robot_about(where):
+def test_goals_teleports_and_localisation_from_the_page(where):
     with Page(where) as page:
         assert page.told("world")["world"]["name"] == "corridor"
         frame = page.frame(lambda h: h["belief"] and h["belief"]["state"] == "tracking" and h["error"] is not None)
@@ -93,7 +93,7 @@ def test_a_visitor_drives_the_robot_about(where):
         page.done("cancel")
         page.frame(lambda h: h["status"] and h["status"]["goal"] is None)
 
-        page.done("teleport", x=9.0, y=1.5, yaw=1.57)  # carried off, it finds itself
+        page.done("teleport", x=9.0, y=1.5, yaw=1.57)  # after a kidnapping it localises again
         page.frame(there(9.0, 1.5))
         page.frame(lambda h: h["error"] is not None and h["error"] < 0.1 and there(9.0, 1.5)(h))
         answer = page.ask("teleport", x=0.05, y=0.05)
@@ -104,12 +104,12 @@ def test_a_visitor_drives_the_robot_about(where):
         page.done("localise", x=9.0, y=1.5, yaw=1.57)
 
 
-def test_a_visitor_furnishes_and_winds_the_clock(where):
+def test_obstacles_and_simulation_time_from_the_page(where):
     with Page(where) as page, Page(where) as other:
         page.told("world")
         other.told("world")
         page.done("obstacle", action="add", name="crate", obstacle=BOX)
-        for visitor in (page, other):  # who only looks on sees it too
+        for visitor in (page, other):  # a second browser also gets the change
             world = visitor.told("world")["world"]
             assert "crate" in [o["name"] for o in world["obstacles"]]
         page.done("obstacle", action="move", name="crate", obstacle={"box": {"center": [7, 1.5], "size": [0.4, 0.4]}})
@@ -120,10 +120,10 @@ def test_a_visitor_furnishes_and_winds_the_clock(where):
         assert not answer["ok"]
         assert "crate" in answer["reason"]
 
-        assert not page.ask("step")["ok"]  # it runs
+        assert not page.ask("step")["ok"]  # refused while the simulation runs
         page.done("pause")
-        time.sleep(0.2)  # what was on its way has come
-        with Page(where) as late:  # who comes now sees where it stands
+        time.sleep(0.2)  # for frames that are under way
+        with Page(where) as late:  # a browser that connects now gets the current frame
             first = late.frame().header["stamp_ns"]
             page.done("step")
             stepped = late.frame(lambda h: h["stamp_ns"] > first).header
@@ -139,7 +139,7 @@ def test_a_visitor_furnishes_and_winds_the_clock(where):
         assert max(page.last["history"]["samples"]["t"], default=0) < stepped["t"]
 
 
-def test_a_visitor_drives_by_hand(where):
+def test_manual_driving_from_the_page(where):
     with Page(where) as page:
         page.done("cancel")
         before = page.frame(lambda h: h["truth"] and h["belief"]).header["truth"]
@@ -156,7 +156,7 @@ def test_a_visitor_drives_by_hand(where):
 
 
 def record(page):
-    """Two seconds; the row of the file."""
+    """Records two seconds from the page. Returns the file's row in the list of recordings."""
     page.frame(lambda h: h["belief"])
     assert page.done("recordings")["files"] == []
     started = page.done("record", action="start")
@@ -172,7 +172,7 @@ def record(page):
     return file
 
 
-def test_a_recording_is_made_opened_and_scrubbed(system):
+def test_a_recording_is_made_opened_and_played_from_the_page(system):
     where, running = system.start_viewer()
     ghost = f"{ROBOT}-replay"
     with Page(where) as page, Page(where) as other:
@@ -189,10 +189,10 @@ def test_a_recording_is_made_opened_and_scrubbed(system):
         assert page.last["world"]["world"]["name"] == "corridor"
         assert page.last["world"]["scanner"]["beams"] == 622
         other.by_now("hello", lambda m: ghost in m["robots"] and m["robot"] == ROBOT)
-        assert other.frame().header["robot"] == ROBOT  # nobody else is dragged along
+        assert other.frame().header["robot"] == ROBOT  # the other browser keeps its robot
 
         page.done("player", action="seek", value=1.5)
-        # Under load a moment may be shown before it is whole, and then again.
+        # Under load a frame may be sent before all its messages have arrived, and then again.
         whole = lambda h: h["belief"] and h["belief"]["stamp_ns"] == h["stamp_ns"]  # noqa: E731
         frame = page.frame(lambda h: h["stamp_ns"] > first["stamp_ns"] + 1e9 and whole(h)).header
         page.done("player", action="step")
@@ -203,7 +203,7 @@ def test_a_recording_is_made_opened_and_scrubbed(system):
         page.done("player", action="resume")
         page.frame(lambda h: h["stamp_ns"] > back["stamp_ns"] + 1e9)
         page.told("player", lambda m: m["paused"] and m["position_s"] == pytest.approx(m["duration_s"]))  # it stays
-        page.done("player", action="resume")  # and begins anew
+        page.done("player", action="resume")  # and starts from the beginning
         page.frame(lambda h: h["stamp_ns"] < first["stamp_ns"] + 5e8)
         answer = page.ask("goal", x=5, y=1.5)
         assert not answer["ok"]
@@ -219,7 +219,7 @@ def test_a_recording_is_made_opened_and_scrubbed(system):
         assert wait_until(lambda: not child.is_running(), 10)
 
 
-def test_a_recording_that_is_none_is_refused_and_a_replay_that_dies_is_told(process, bus, tmp_path):
+def test_an_invalid_recording_is_refused_and_a_dead_replay_is_reported(process, bus, tmp_path):
     (tmp_path / "broken.mcap").write_bytes(b"no recording at all, but long enough to be looked at twice")
     recorded.write(tmp_path / "hall.mcap")
     running = process("viewer", "--port", "0", "--recordings", str(tmp_path))

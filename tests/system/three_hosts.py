@@ -1,4 +1,4 @@
-"""Run the blocks of docs/deployment.md on hosts of their own; ends with the status of `presage goal`. A script.
+"""Runs the shell blocks of docs/deployment.md on three hosts; exits with the status of `presage goal`.
 
 python tests/system/three_hosts.py PAGE FOLDER
 """
@@ -18,8 +18,8 @@ from lab.fault_injection.hosts import Network, enter_own_namespaces
 GOAL = ["-m", "presage", "goal", "15.5", "1.5", "--wait", "--connect", "tcp/10.77.0.1:7447"]
 
 
-def blocks(page: str) -> list[str]:
-    """What is to be typed on each host."""
+def shell_blocks(page: str) -> list[str]:
+    """The commands for each host, from the page's section on several hosts."""
     section = page[page.index("## Several hosts") :]
     return re.findall(r"```sh\n(.*?)```", section, re.DOTALL)
 
@@ -32,8 +32,8 @@ def main(page: Path, folder: Path) -> int:
     with Network() as network:
         entering = [[], network.add("robot").entering, network.add("brain").entering]
         try:
-            for prefix, block in zip(entering, blocks(page.read_text()), strict=True):
-                # `wait` keeps the shell, and so its children's parent, until it is told to end.
+            for prefix, block in zip(entering, shell_blocks(page.read_text()), strict=True):
+                # `wait` keeps the shell alive until it gets SIGTERM.
                 script = "trap 'kill $(jobs -p); wait' TERM\n" + block + "\nwait"
                 started.append(
                     subprocess.Popen(
@@ -43,7 +43,7 @@ def main(page: Path, folder: Path) -> int:
                         preexec_fn=end_with_this_process(),  # noqa: PLW1509 - one call, before any thread of the child
                     )
                 )
-            return patient(GOAL, environment, folder)
+            return retry_goal(GOAL, environment, folder)
         finally:
             for shell in started:
                 shell.terminate()
@@ -51,13 +51,13 @@ def main(page: Path, folder: Path) -> int:
                 shell.wait(30)
 
 
-def patient(goal: list[str], environment: dict[str, str], folder: Path) -> int:
-    """Its status, once there is a controller to speak to."""
+def retry_goal(goal: list[str], environment: dict[str, str], folder: Path) -> int:
+    """Repeats the goal command until it succeeds or 120 s have passed. Returns its last exit status."""
     deadline = time.monotonic() + 120
     while True:
-        asked = subprocess.run([sys.executable, *goal], env=environment, cwd=folder)
-        if asked.returncode == 0 or time.monotonic() > deadline:
-            return asked.returncode
+        attempt = subprocess.run([sys.executable, *goal], env=environment, cwd=folder)
+        if attempt.returncode == 0 or time.monotonic() > deadline:
+            return attempt.returncode
 
 
 if __name__ == "__main__":
