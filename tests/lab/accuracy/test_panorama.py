@@ -1,4 +1,4 @@
-"""Networks behind the generative model's interface: they learn, their derivatives are theirs, a seed repeats them."""
+"""Panorama networks as generative models: training, derivatives and reproducibility."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from services.estimator.paper.estimator import PaperScans
 from tests.estimator.models import HEADING, ROOM, SCANNER, normalisation
 
 ANGLES = np.deg2rad(np.linspace(-135, 135, 91))
-use_one_core()  # threads that wait for one another on a busy machine take minutes over what one does in seconds
+use_one_core()  # on a busy machine, several threads that wait for one another take minutes instead of seconds
 SMALL = {"bins": 120, "width": 64, "layers": 2, "frequencies": 16}
 
 
@@ -29,14 +29,14 @@ def trained(steps=150, seed=0, **shape):
 
 
 @pytest.mark.parametrize("shape", [{}, {"inputs": "grid"}, {"activation": "relu", "loss": "l1"}])
-def test_it_learns(shape):
+def test_training_reduces_the_error(shape):
     poses = lasers(100, 1)
     exact = ROOM.ray_distances(poses, ANGLES)
     error = np.abs(trained(**shape).expect(poses, ANGLES).ranges - exact)
     assert error.mean() < 0.6 * np.abs(exact - np.median(exact)).mean()
 
 
-def test_its_precision_is_learned():
+def test_the_predicted_precision_is_learned():
     poses = lasers(100, 1)
     expected = trained(400).expect(poses, ANGLES)
     error = np.abs(expected.ranges - ROOM.ray_distances(poses, ANGLES))
@@ -44,28 +44,28 @@ def test_its_precision_is_learned():
     assert error[~surer].mean() > 1.5 * error[surer].mean()
 
 
-def test_a_seed_repeats_it():
+def test_training_is_reproducible_with_a_seed():
     poses = lasers(5, 2)
     first, again, other = (trained(20, seed).expect(poses, ANGLES).ranges for seed in (0, 0, 1))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
 
 
-def test_its_derivatives_are_those_of_its_ranges():
+def test_derivatives_agree_with_finite_differences():
     model = trained(100)
     pose = lasers(1, 3)[0]
     found = model.expect(pose[None], ANGLES).jacobian[0]
-    for axis, step in enumerate((2e-3, 2e-3, 2 * np.pi / 120)):  # by yaw it is that of whole directions
+    for axis, step in enumerate((2e-3, 2e-3, 2 * np.pi / 120)):  # the derivative by yaw is over whole bins
         offset = step * np.eye(3)[axis]
         ahead, back = model.expect(np.array([pose + offset, pose - offset]), ANGLES).ranges
         assert found[:, axis] == pytest.approx((ahead - back) / (2 * step), rel=1e-2, abs=1e-2)
 
 
-def test_the_papers_decoder_behind_the_same_interface():
+def test_the_papers_decoder_has_the_same_interface():
     torch.manual_seed(0)
     model = PaperModel(Decoder(PaperShape(SCANNER.beams, 16, 4)).double(), normalisation())
     scans = PaperScans(model, SCANNER, HEADING, 0.3)
-    laser = np.array([[2.0, 1.5, HEADING + 1.0]])  # another heading is ignored: it knows one
+    laser = np.array([[2.0, 1.5, HEADING + 1.0]])  # the heading is ignored, because the decoder is trained for one only
     expected = scans.expect(laser, SCANNER.angles())
     base = np.array([2.0, 1.5, 0.0]) - [*(np.array([np.cos(HEADING + 1), np.sin(HEADING + 1)]) * SCANNER.mount[0]), 0]
     ranges, jacobian = model.predict(np.array([*base[:2], HEADING]))

@@ -1,4 +1,4 @@
-"""The search for how many robots are served, and the load that is played."""
+"""The search for the largest number of robots served, and the load of scans."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lab.benchmarks.fleet_load import CLEARANCE, RADIUS, Load
 
 
 @pytest.mark.parametrize("limit", [0, 1, 2, 3, 7, 8, 9, 15, 16, 31, 32])
-def test_the_most_that_is_served_is_found_in_few_tries(limit):
+def test_the_largest_number_served_is_found_in_few_tries(limit):
     tried = []
 
     def served(count):
@@ -29,7 +29,7 @@ def test_the_most_that_is_served_is_found_in_few_tries(limit):
     assert all(1 <= count <= 32 for count in tried)
 
 
-def test_robots_stay_clear_of_walls_and_send_their_scans_evenly(bus):
+def test_robots_keep_clear_of_walls_and_send_scans_at_regular_stamps(bus):
     world = load_world("corridor")
     load = Load(bus, world, 16, 15.0, 3, 1)
     inbox = Inbox()
@@ -45,20 +45,20 @@ def test_robots_stay_clear_of_walls_and_send_their_scans_evenly(bus):
     assert window.percentile(50) is None
     stamps = {}
 
-    def heard():
+    def all_received():
         while isinstance(sample := inbox.get(0), Sample):
             stamps.setdefault(sample.key.split("/")[1], []).append(SCAN.message.decode(sample.payload).stamp_ns)
         return sum(map(len, stamps.values())) == 6
 
-    assert wait_until(heard, 10)
+    assert wait_until(all_received, 10)
     load.play(2, 0.1)
-    assert wait_until(lambda: heard() or sum(map(len, stamps.values())) > 6, 10)
+    assert wait_until(lambda: all_received() or sum(map(len, stamps.values())) > 6, 10)
     for of_one in stamps.values():
         assert np.diff(of_one).tolist() == pytest.approx([1e9 / 15] * (len(of_one) - 1), abs=2)
 
 
-def test_an_answer_is_counted_once_and_only_where_its_scan_was_sent(bus, link):
-    """Somebody answers every scan of the first robot twice, and once with a stamp that nobody sent."""
+def test_an_answer_counts_once_and_only_for_a_scan_that_was_sent(bus, link):
+    """A peer answers every scan of the first robot twice, and once with an unknown stamp."""
     load = Load(bus, load_world("corridor"), 16, 15.0, 2, 1)
     with open_bus(link) as other:
         answering = other.for_robot(load.robots[0].name)

@@ -1,4 +1,4 @@
-"""A short made-up session with something on every topic, whose exports can be worked out by hand."""
+"""A short artificial session with messages on every topic, whose exports can be computed by hand."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from tests.recorder.sessions import SCANNER, WORLD
 STEPS = 12
 PERIOD_NS = 100_000_000
 BEGAN_NS = 1_700_000_000_000_000_000
-ODOM_BEGAN = np.array([5.0, -2.0, 0.7])  # where odom thinks it began; in map that is (1, 1, 0)
+ODOM_BEGAN = np.array([5.0, -2.0, 0.7])  # start pose in odom; in map it is (1, 1, 0)
 SENSED_NS, BELIEVED_NS = 1_000_000, 9_000_000  # after the truth of the same stamp
 COVARIANCE = np.diag([0.04, 0.01, 0.0025])
 GOAL_AT = 4  # after this step
@@ -59,12 +59,12 @@ PREFERRED = Preference(
 
 
 def true(i):
-    """Drives 0.1 m a step along y = 1, turning."""
+    """True pose: 0.1 m per step along y = 1, turning."""
     return np.array([1.0 + 0.1 * i, 1.0, 0.05 * i])
 
 
 def believed(i):
-    """0.03 m and 0.04 m off, 0.01 rad."""
+    """Believed pose, with errors of 0.03 m, 0.04 m and 0.01 rad."""
     return true(i) + np.array([0.03, 0.04, 0.01])
 
 
@@ -85,7 +85,7 @@ def belief(i):
 
 
 def events(robot="rob"):
-    """Topic, key, message, reception in ns."""
+    """Yields topic, key, message and reception time in ns."""
     for i in range(STEPS):
         stamp, at = i * PERIOD_NS, BEGAN_NS + i * PERIOD_NS
         twist = Twist(vx=1.0, wz=0.5)
@@ -121,7 +121,10 @@ def events(robot="rob"):
 
 
 def write(path, *leave_out, robot="rob", world=True, finish=True, also=()):
-    """The session as a recording without some topics; unfinished: its name ends in .active."""
+    """Writes the session as a recording, without the topics ``leave_out``.
+
+    With ``finish`` False the recording stays incomplete and its name ends in .active.
+    """
     writer = RecordingWriter(path)
     writer.metadata("presage", {"robot": robot, "commit": "abc"})
     if world:

@@ -1,4 +1,4 @@
-"""Navigation round walls: shortest ways, the least time, what is measured, and a small run through real processes."""
+"""The navigation experiment: shortest paths, minimum times, measurements, and a small run with real processes."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def block(*boxes, boundary=HALL.boundary, name="block"):
     return World(name=name, boundary=boundary, obstacles=obstacles)
 
 
-def test_where_nothing_stands_between_the_way_is_straight():
+def test_the_path_is_straight_without_obstacles():
     path = ShortestPaths(HALL, 0.3).path(np.array([1.0, 1.0]), np.array([9.0, 5.0]))
     assert path.tolist() == [[1.0, 1.0], [9.0, 5.0]]
 
 
-def test_round_a_box_two_tangents_and_two_quarters_of_a_circle():
-    """A box from (4, 0) to (6, 3), start and goal as high as its top: up along a tangent, round, along, down."""
+def test_the_path_around_a_box_consists_of_tangents_and_arcs():
+    """A box from (4, 0) to (6, 3), with start and goal at the height of its top."""
     r = 0.4
     paths = ShortestPaths(block((5.0, 1.5, 2.0, 3.0)), r)
     start, goal = np.array([1.0, 3.0]), np.array([9.0, 3.0])
@@ -62,13 +62,13 @@ def test_round_a_box_two_tangents_and_two_quarters_of_a_circle():
     assert length(paths.path(start, goal)) == pytest.approx(expected, abs=2e-3)
 
 
-def test_of_two_ways_round_it_takes_the_shorter():
+def test_the_shorter_way_around_an_obstacle_is_taken():
     paths = ShortestPaths(block((5.0, 2.5, 0.2, 3.0)), 0.3)  # from 1 to 4 of 6
     assert paths.path(np.array([2.0, 2.0]), np.array([8.0, 2.0]))[1:-1, 1].max() < 1.01
     assert paths.path(np.array([2.0, 3.0]), np.array([8.0, 3.0]))[1:-1, 1].min() > 3.99
 
 
-def test_a_door_too_narrow_is_none():
+def test_a_narrow_door_is_impassable():
     start, goal = np.array([1.0, 3.0]), np.array([9.0, 3.0])
     wall = block((5.0, 1.2, 0.2, 2.4), (5.0, 4.5, 0.2, 3.0))  # 0.6 m between
     assert len(ShortestPaths(wall, 0.29).path(start, goal)) >= 3
@@ -77,7 +77,7 @@ def test_a_door_too_narrow_is_none():
 
 @given(st.integers(0, 10_000))
 @settings(max_examples=20, deadline=None)
-def test_a_shortest_way_keeps_its_clearance_and_there_is_no_short_cut(seed):
+def test_shortest_paths_keep_clearance_and_have_no_shortcut(seed):
     world, paths = load_shortest_paths("maze")
     rng = np.random.default_rng(seed)
     start, middle, goal = world.sample_free(3, rng, ROBOT.radius + shortest.START_GOAL_MARGIN)
@@ -87,15 +87,15 @@ def test_a_shortest_way_keeps_its_clearance_and_there_is_no_short_cut(seed):
     assert length(path) >= np.hypot(*(goal - start)) - 1e-9
     assert length(path) == pytest.approx(length(paths.path(goal, start)))
     assert length(path) <= length(paths.path(start, middle)) + length(paths.path(middle, goal)) + 1e-9
-    # Pulled tight: nothing is gained by leaving out a corner.
+    # Leaving out a corner gains nothing.
     for k in range(1, len(path) - 1):
         direct = shapely.LineString(path[[k - 1, k + 1]])
         if shapely.covers(paths.room, direct):
             assert direct.length == pytest.approx(length(path[k - 1 : k + 2]), abs=1e-6)
 
 
-def test_shortest_ways_are_no_longer_than_those_over_a_fine_grid():
-    """An entirely different computation: 16 neighbours on a grid of 5 cm are never shorter."""
+def test_shortest_paths_are_not_longer_than_grid_paths():
+    """Compares with an independent computation: paths on a 5 cm grid with 16 neighbours are never shorter."""
     from services.controller.policies.free_space import FreeSpace  # noqa: PLC0415
     from services.controller.policies.geodesic_field import FreeSpaceGraph  # noqa: PLC0415
 
@@ -105,11 +105,11 @@ def test_shortest_ways_are_no_longer_than_those_over_a_fine_grid():
         field = graph.cost_field(goal)
         exact, grid = length(paths.path(start, goal)), length(field.path(start))
         assert exact <= grid + 1e-6
-        assert grid < 1.25 * exact + 0.1  # it costs what is near walls more, and so goes round them farther
+        assert grid < 1.25 * exact + 0.1  # cells near walls cost more, so grid paths keep farther away from walls
 
 
 @pytest.mark.parametrize("world", ["maze", "office", "twins"])
-def test_a_trip_fits_is_long_enough_and_the_same_for_every_drive(world):
+def test_trips_are_valid_and_the_same_for_every_drive(world):
     known, _ = load_shortest_paths(world)
     trips = [draw_trip(world, np.random.default_rng((1, k)), ROBOT) for k in range(25)]
     for k, trip in enumerate(trips):
@@ -124,7 +124,7 @@ def test_a_trip_fits_is_long_enough_and_the_same_for_every_drive(world):
     assert np.ptp([trip.start[2] for trip in trips]) > 4  # any heading
 
 
-def test_where_the_robot_cannot_drive_far_it_is_said(tmp_path):
+def test_a_world_too_small_for_a_trip_is_refused(tmp_path):
     cell = tmp_path / "cell.yaml"
     cell.write_text(save_world(World(name="cell", boundary=[(0, 0), (1.5, 0), (1.5, 1.5), (0, 1.5)])))
     with pytest.raises(UserError, match="no two places 2 m apart"):
@@ -133,8 +133,8 @@ def test_where_the_robot_cannot_drive_far_it_is_said(tmp_path):
 
 @given(st.floats(0.3, np.pi), st.floats(0.5, 4.0), st.floats(0.5, 6.0))
 @settings(max_examples=12, deadline=None)
-def test_no_base_within_its_limits_turns_sooner(angle, speed, acceleration):
-    """By the simulator's own ramp, braking as late as possible, until it stands."""
+def test_no_turn_is_faster_than_the_minimum_time(angle, speed, acceleration):
+    """Simulates the turn with the simulator's acceleration limits, braking as late as possible."""
     robot, dt = Robot(max_turn=speed, turn_acceleration=acceleration), 4e-3
     v, turned, seconds = np.zeros(3), 0.0, 0.0
     while seconds == 0 or v[2] > 0:
@@ -145,7 +145,7 @@ def test_no_base_within_its_limits_turns_sooner(angle, speed, acceleration):
     assert seconds == pytest.approx(least_turn(-angle, robot), abs=6 * dt)
 
 
-def test_the_least_time_known_cases():
+def test_minimum_time_in_known_cases():
     path = [(0.0, 0.0), (0.0, 4.0), (3.0, 4.0)]
     robot = Robot(max_speed=1.0, acceleration=1.0, max_turn=2.0, turn_acceleration=3.0)
     turning = robot.model_copy(update={"drive": "differential"})
@@ -179,7 +179,7 @@ def a_trace(last="reached", ends_at=4.9):
     truths = [
         truth(0, 1.0),
         truth(1, 2.0, 0.5, people=people, stopped=True),
-        truth(2, 3.0, 0.0, contact=True, people=people),  # it stands now, for it drove into something
+        truth(2, 3.0, 0.0, contact=True, people=people),  # standing, after driving into an obstacle
         truth(3, 3.0, contact=True),
         truth(4, ends_at, 0.4),
     ]
@@ -197,7 +197,7 @@ def a_trace(last="reached", ends_at=4.9):
     return RunTrace(truths, beliefs, {each.stamp_ns: each for each in states}, [0, 0, 3], health)
 
 
-def test_what_is_measured():
+def test_measurements_of_a_drive():
     found = driven.measure(a_trace(), TRIP, HALL, ROBOT)
     assert found["outcome"] == "reached"
     assert found["driven_m"] == pytest.approx(3.9)
@@ -218,10 +218,10 @@ def test_what_is_measured():
     assert found["state_s"] == {"exploring": 0.1, "navigating": 0.1, "blocked": 0.2}
     assert found["reason_s"]["blocked: waiting: something that moves"] == 0.2
     assert (found["step_mean_ms"], found["step_max_ms"]) == (2.0, 5.0)
-    assert len(found["events"]) == 4  # another distance is no other reason
+    assert len(found["events"]) == 4  # a different distance is not a new reason
 
 
-def test_errors_of_what_is_claimed_are_told_from_those_of_a_belief_that_is_lost():
+def test_errors_while_tracking_are_separate_from_errors_while_lost():
     trace = a_trace()
     trace.beliefs[3] = belief(3, 7.0, "localising")
     found = driven.measure(trace, TRIP, HALL, ROBOT)
@@ -232,7 +232,7 @@ def test_errors_of_what_is_claimed_are_told_from_those_of_a_belief_that_is_lost(
     assert never["tracking_s"] is never["error_max_m"] is None
 
 
-def test_reasons_differ_in_what_not_in_where():
+def test_reasons_are_compared_without_places():
     for place in ("", ", 0.8 m away at (1.2, -3.4)", " at (-1.0, 2.0)"):
         assert (
             driven.strip_numbers(f"waiting: something{place}: until it clears") == "waiting: something: until it clears"
@@ -242,13 +242,13 @@ def test_reasons_differ_in_what_not_in_where():
     )
 
 
-def test_a_path_past_a_corner_is_as_near_as_its_straight_pieces():
+def test_clearance_is_measured_between_scans():
     world = block((5.0, 3.0, 0.2, 0.2))
     path = np.array([[4.0, 3.5, 0.0], [6.0, 3.5, 0.0]])  # no scan was taken beside the box
     assert driven._clearance(world, path).min() == pytest.approx(0.4)
 
 
-def test_what_is_claimed_refused_late_or_broken_is_not_reached():
+def test_wrong_refused_late_and_failed_drives_are_not_reached():
     far = driven.measure(a_trace(ends_at=4.69), TRIP, HALL, ROBOT)
     assert far["outcome"] == "claimed elsewhere"
     assert not far["reached"]
@@ -267,7 +267,7 @@ def test_what_is_claimed_refused_late_or_broken_is_not_reached():
     assert driven.measure(trace, TRIP, HALL, ROBOT)["step_mean_ms"] is None
 
 
-def test_summary_tells_reached_from_safe_and_names_the_worst():
+def test_the_summary_lists_the_worst_trials():
     rows = []
     for number, trace in enumerate([a_trace(), a_trace(ends_at=4.0), a_trace()]):
         rows.append({"trial": number, **driven.measure(trace, TRIP, HALL, ROBOT)})
@@ -289,10 +289,10 @@ def test_summary_tells_reached_from_safe_and_names_the_worst():
     assert "–" in driving.table({"x": none})
 
 
-def test_the_drive_ends_when_the_controller_says_so_and_that_scan_is_its_last():
+def test_the_drive_ends_with_the_scan_at_which_the_controller_reports_the_goal():
     lockstep_run = LockstepRun(Journey((1.0, 1.0), (5.0, 1.0)), 0.0, "maze", 101, 0, (), 100, ends_with_status=True)
     trace, end = RunTrace(), None
-    # As they may come: another process's messages of the next scan before the status of this one.
+    # A possible order: another process's messages about the next scan arrive before this scan's status.
     order = [truth(0, 1.0), status(0, "navigating"), belief(0, 1.0), truth(1, 5.0), belief(1, 5.0), truth(2, 5.0),
              status(1, "reached"), belief(2, 5.0), status(2, "reached")]  # fmt: skip
     for message in order:
@@ -308,7 +308,7 @@ def test_the_drive_ends_when_the_controller_says_so_and_that_scan_is_its_last():
     assert not _is_final(status(0, "reached", goal_seq=0), RunTrace(), lockstep_run)
 
 
-def test_a_name_for_each_question():
+def test_result_names_depend_on_the_options():
     job = driving.Job(0, 1)
     assert driving.result_name(job, driving.WORLDS, driving.DRIVES) == "navigation"
     assert driving.result_name(replace(job, seed=7, limit=9.0), driving.WORLDS, driving.DRIVES) == "navigation"
@@ -320,7 +320,7 @@ def test_a_name_for_each_question():
     )
 
 
-def test_the_services_are_told_what_was_asked_for():
+def test_services_get_the_jobs_options():
     job = driving.Job(3, 2, "office", "differential", "unknown", 4, 0.5, "particle-filter", "odometry", epistemic=False)
     lockstep_run = job.lockstep_run(Journey((1.0, 1.0), (5.0, 1.0)), 0.5)
     assert lockstep_run.controller == ("--preset", "geodesic", "--drive", "differential", "--no-epistemic")
@@ -342,7 +342,7 @@ def test_the_services_are_told_what_was_asked_for():
         (("--prior", "command"), "--prior 'command'"),
     ],
 )
-def test_bad_arguments_are_refused_in_one_line(args, says):
+def test_invalid_options_are_refused_in_one_line(args, says):
     from typer.testing import CliRunner  # noqa: PLC0415
 
     from lab.cli import experiment as cli_experiment  # noqa: PLC0415
@@ -353,7 +353,7 @@ def test_bad_arguments_are_refused_in_one_line(args, says):
     assert "\n" not in str(result.exception)
 
 
-def test_from_anywhere_through_real_processes_the_same_again_and_all_files(tmp_path):
+def test_a_small_run_writes_all_files_and_is_reproducible(tmp_path):
     job = driving.Job(0, 1, beams=101, limit=30.0)
     result = driving.run(job, 1, tmp_path, 2, QUIET, worlds=("maze",))
     assert {path.name for path in tmp_path.iterdir()} == {
@@ -382,14 +382,14 @@ def test_from_anywhere_through_real_processes_the_same_again_and_all_files(tmp_p
     assert "| maze, differential | 1 of 1 | 0 | 0; 0 |" in text
 
 
-def test_a_run_cut_short_goes_on_and_nobody_is_left(process, tmp_path):
+def test_an_interrupted_run_continues_and_leaves_no_process(process, tmp_path):
     args = ("presage.__main__", "experiment", "navigation", "--worlds", "maze", "--drives", "holonomic",
             "--beams", "101", "--trials", "3", "--workers", "1", "--out", str(tmp_path))  # fmt: skip
     store = tmp_path / ".navigation-maze-holonomic-beams101.unfinished.jsonl"
     run = process(*args)
     assert wait_until(lambda: store.exists() and len(store.read_text().splitlines()) > 1, 90), run.output
     run.send(signal.SIGINT)
-    # Python forgets an interrupt that comes while it forks; then one presses it again.
+    # Python ignores an interrupt while it forks, so send it again if necessary.
     wait_until(lambda: not run.running, 5)
     if run.running and "are kept" not in run.output:
         run.send(signal.SIGINT)
@@ -403,14 +403,14 @@ def test_a_run_cut_short_goes_on_and_nobody_is_left(process, tmp_path):
     assert [json.loads(row)["trial"] for row in rows] == [0, 1, 2]
 
 
-def test_the_page_has_the_numbers_of_the_results_beside_it():
+def test_the_page_agrees_with_the_stored_results():
     docs = Path(__file__).resolve().parents[3] / "docs"
     text = (docs / "navigation.md").read_text(encoding="utf-8")
     assert page.fill_tables(text, docs / "experiments") == text
     assert "<!-- table navigation -->" in text
 
 
-def test_worlds_with_rooms_are_there():
+def test_trips_start_and_end_in_the_defined_rooms():
     for name, rooms in shortest.ROOMS.items():
         free = load_world(name).free_space
         for room in rooms:

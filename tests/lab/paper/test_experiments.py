@@ -1,4 +1,4 @@
-"""The experiments' trials, results and page, and E1 and E2 at a small size."""
+"""Trials, results and the results page of the experiments, and small runs of E1 and E2."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Count:
 
 
 def count(job):
-    """Leaves a trace of having run; may fail."""
+    """A trial that records its execution in a file, and may fail."""
     if job.index == job.fails_at and not (Path(job.folder) / "mended").exists():
         raise ValueError("as asked")
     with (Path(job.folder) / "ran").open("a") as file:
@@ -50,14 +50,14 @@ def jobs(folder, **more):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_results_come_in_the_order_of_the_jobs_and_nothing_is_left(tmp_path, workers):
+def test_results_are_in_the_order_of_the_jobs(tmp_path, workers):
     rows = run_trials("count", count, jobs(tmp_path), tmp_path, workers, QUIET)
     assert [row["square"] for row in rows] == [0, 1, 4, 9, 16, 25]
     assert sorted((tmp_path / "ran").read_text().split()) == list("012345")
     assert [path.name for path in tmp_path.iterdir()] == ["ran"]
 
 
-def test_a_run_cut_short_is_taken_up_where_it_was(tmp_path):
+def test_an_interrupted_run_continues(tmp_path):
     with pytest.raises(ValueError, match="as asked"):
         run_trials("count", count, jobs(tmp_path, fails_at=4), tmp_path, 1, QUIET)
     ran = set((tmp_path / "ran").read_text().split())
@@ -72,14 +72,14 @@ def test_a_run_cut_short_is_taken_up_where_it_was(tmp_path):
     assert again == set(range(6)) - set(kept)
 
 
-def test_results_of_other_jobs_are_not_taken(tmp_path):
+def test_results_of_other_jobs_are_ignored(tmp_path):
     path = tmp_path / "store"
     Store(path, jobs(tmp_path)).add(0, {"square": 99})
     assert Store(path, jobs(tmp_path, fails_at=3)).read() == {}
     assert not path.exists()
 
 
-def test_a_last_line_cut_short_is_left_out(tmp_path):
+def test_an_incomplete_last_line_is_ignored(tmp_path):
     path = tmp_path / "store"
     store = Store(path, jobs(tmp_path))
     store.add(0, {"square": 0})
@@ -101,7 +101,7 @@ def test_a_trial_depends_on_its_job_alone():
     assert localisation.trial(small(2))["pose"] != alone["pose"]
 
 
-def test_precise_finds_in_one_scan_what_the_papers_descent_approaches():
+def test_precise_needs_one_scan_where_the_papers_descent_converges_slowly():
     for index in range(3):
         errors = localisation.trial(replace(small(index), iterations=30, descent=PAPER_DESCENT))["error_m"]
         assert errors["precise"][0] < 0.01
@@ -109,7 +109,7 @@ def test_precise_finds_in_one_scan_what_the_papers_descent_approaches():
         assert errors["paper"][-1] < errors["paper"][0]
 
 
-def test_summary_counts_and_places():
+def test_e1_summary():
     def row(errors, claim, *, front):
         limit = np.diag([3e-2, 4e-2, 0.1]) ** 2  # 5 cm
         return {"error_m": {"x": errors}, "claim": {"x": claim}, "in_front": front, "bound": limit.tolist()}
@@ -127,7 +127,7 @@ def test_summary_counts_and_places():
     assert two["final_rms_over_bound"] == pytest.approx(0.1 / (0.05 / np.sqrt(3)))
 
 
-def test_the_crossing_is_free_and_straight():
+def test_the_crossing_path_is_free_and_straight():
     scene = ExperimentWorld().scene(3, 4)
     path = crossing.path_of(scene, 1.0, 0.05)
     assert (scene.world.clearance(path[:, :2]) > 0.37).all()
@@ -142,7 +142,7 @@ def test_a_world_without_a_free_line_is_refused():
         crossing.path_of(scene, 0.0, 0.05)
 
 
-def test_crossing_is_followed_by_precise_and_known_to_those_with_odometry():
+def test_precise_follows_the_crossing_with_and_without_odometry():
     job = crossing.Job(0, 2, 0.2, ("precise", "precise, odometry"))
     found = crossing.trial(job)
     assert found == crossing.trial(job)
@@ -150,7 +150,7 @@ def test_crossing_is_followed_by_precise_and_known_to_those_with_odometry():
     assert np.median(found["error_m"]["precise"]) < 0.005
 
 
-def test_best_step_size_is_that_of_most_places():
+def test_the_best_step_size_finds_the_most_places():
     rows = {
         "a": {"steps_a_scan": 1, "alpha_m2": 1.0, "found_within_0.2_m": 3, "final_error_median_m": 0.1},
         "b": {"steps_a_scan": 1, "alpha_m2": 2.0, "found_within_0.2_m": 4, "final_error_median_m": 0.2},
@@ -160,13 +160,13 @@ def test_best_step_size_is_that_of_most_places():
     assert step_size.best(rows, 1) == 3.0
 
 
-def test_names_are_those_of_the_tables():
+def test_estimator_names_are_parsed():
     assert parse_estimators("paper,particle-filter heading known") == ("paper", "particle-filter, heading known")
     with pytest.raises(UserError, match="no estimator 'kalman'"):
         parse_estimators("paper,kalman")
 
 
-def test_a_page_is_filled_from_results_and_missing_ones_are_named(tmp_path):
+def test_a_page_is_filled_from_results_and_missing_results_are_reported(tmp_path):
     result = results.Result("e2", "t", 0, {}, {"precise": crossing.summarise(
         [{"error_m": {"precise": [0.001, 0.003]}, "lost": {"precise": False}, "bound_m": {"one scan": [0.001, 0.001]}}],
         "precise")}, notes=["a remark"])  # fmt: skip
@@ -182,14 +182,14 @@ def test_a_page_is_filled_from_results_and_missing_ones_are_named(tmp_path):
         page.fill_tables(text.replace("e2", "e1"), tmp_path)
 
 
-def test_the_page_has_the_numbers_of_the_results_beside_it():
+def test_the_page_agrees_with_the_stored_results():
     docs = Path(__file__).resolve().parents[3] / "docs"
     text = (docs / "experiments.md").read_text(encoding="utf-8")
     assert page.fill_tables(text, docs / "experiments") == text
     assert "<!-- table e1 -->" in text
 
 
-def test_command_writes_all_files_and_repeats_itself(process, tmp_path):
+def test_the_command_writes_all_files_and_is_reproducible(process, tmp_path):
     summaries = []
     for folder, workers in (("a", "1"), ("b", "2")):
         run = process(
@@ -222,7 +222,7 @@ def test_a_killed_run_leaves_no_workers(process, tmp_path):
     assert not alive
 
 
-def test_ctrl_c_ends_it_and_the_same_command_goes_on(process, tmp_path):
+def test_the_same_command_continues_after_ctrl_c(process, tmp_path):
     args = ("presage.__main__", "experiment", "e1", "--trials", "40", "--iterations", "20", "--estimators",
             "particle-filter", "--out", str(tmp_path), "--workers", "2")  # fmt: skip
     run, store = process(*args), tmp_path / ".e1.unfinished.jsonl"
@@ -239,7 +239,7 @@ def test_ctrl_c_ends_it_and_the_same_command_goes_on(process, tmp_path):
     assert run.wait(30) == 130, run.output
 
 
-def test_all_goes_on_only_where_the_results_still_are_what_it_wrote(tmp_path):
+def test_all_repeats_experiments_whose_results_have_changed(tmp_path):
     path = tmp_path / ".all.unfinished.json"
     (tmp_path / "e1.json").write_text("{}")
     (tmp_path / "e2.json").write_text("{}")
@@ -259,7 +259,7 @@ def test_all_goes_on_only_where_the_results_still_are_what_it_wrote(tmp_path):
 
 
 @pytest.mark.parametrize("args", [("alpha", "--alphas", "nan"), ("samples", "--sizes", "0"), ("e1", "--trials", "0")])
-def test_wrong_arguments_are_refused_before_anything_runs(process, tmp_path, args):
+def test_invalid_arguments_are_refused_before_anything_runs(process, tmp_path, args):
     run = process("presage.__main__", "experiment", *args, "--out", str(tmp_path / "out"))
     assert run.wait(60) == 2, run.output
     assert "Traceback" not in run.output

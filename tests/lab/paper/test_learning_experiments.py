@@ -1,4 +1,4 @@
-"""Samples, aliasing, prediction: the experiments that learn or judge generative models, at a small size."""
+"""Small runs of the experiments on generative models: samples, aliasing and prediction."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def timeless(row):
 
 
 @pytest.mark.parametrize("name", samples.ESTIMATORS)
-def test_samples_same_seed_same_numbers_whatever_ran_before(name):
+def test_samples_trials_are_reproducible(name):
     job = replace(SMALL, estimator=name, samples=80)
     first = samples.trial(job)
     samples.trial(replace(SMALL, estimator="paper", samples=40))
@@ -35,14 +35,14 @@ def test_samples_same_seed_same_numbers_whatever_ran_before(name):
     assert timeless(samples.trial(replace(job, seed=4))) != timeless(first)
 
 
-def test_more_samples_smaller_error_and_as_many_gradient_steps():
+def test_more_samples_give_a_smaller_error_with_the_same_number_of_steps():
     job = replace(SMALL, seed=4, steps=260, held_out=200, field=ExperimentWorld("corridor", 30))
     few, many = (samples.trial(replace(job, samples=size)) for size in (20, 1000))
     assert few["gradient_steps"] == many["gradient_steps"] == 260
     assert many["range_error_mean_m"] < 0.8 * few["range_error_mean_m"]
 
 
-def test_a_field_of_more_scans_is_the_better_one():
+def test_a_field_trained_on_more_scans_is_better():
     job = replace(SMALL, estimator="precise", held_out=200)
     few, many = (samples.trial(replace(job, samples=size)) for size in (30, 600))
     assert many["range_error_median_m"] < 0.6 * few["range_error_median_m"]
@@ -50,7 +50,7 @@ def test_a_field_of_more_scans_is_the_better_one():
     assert many["bound_median_m"] == few["bound_median_m"]  # judged at the same places
 
 
-def test_samples_leaves_its_files_and_a_row_for_each(tmp_path):
+def test_samples_writes_all_files_and_rows(tmp_path):
     result = samples.run(SMALL, tmp_path, 1, QUIET, (40, 80))
     data = json.loads((tmp_path / "samples.json").read_text())
     assert list(data["summary"]) == ["paper, 40", "paper, 80", "precise, 40", "precise, 80"]
@@ -59,7 +59,7 @@ def test_samples_leaves_its_files_and_a_row_for_each(tmp_path):
     assert (tmp_path / "samples.png").stat().st_size > 10_000
 
 
-def test_a_decoder_is_judged_on_scans_without_noise_that_it_has_not_seen():
+def test_the_decoders_error_is_measured_on_unseen_noise_free_scans():
     scene = Scene.of(load_world("corridor"), 40, 5)
     decoder = learning.train_paper(scene, 1.0, 200, 5, 0)
     fresh = learning.sample_scans(Scene.of(load_world("corridor"), 40, 6), 500, 1.0, noise=False)
@@ -68,7 +68,7 @@ def test_a_decoder_is_judged_on_scans_without_noise_that_it_has_not_seen():
     assert decoder.card.heading == 1.0
 
 
-def test_twins_stand_where_both_rooms_give_the_same_scan_and_in_both():
+def test_places_in_the_twin_world_have_identical_scans_in_both_rooms():
     scene = aliasing.scene_of(replace(FEW, world="twins"), aliasing.PLACES_SEED)
     poses = aliasing.sample_places(scene, 40)
     assert poses.shape == (40, 3)
@@ -105,7 +105,7 @@ def belief(state, *places):
         (belief("tracking", (1.0, 1.0), (1.0 + TWIN_OFFSET, 1.0)), 0, 0),
     ],
 )
-def test_what_counts_as_confident_and_wrong_and_as_both_kept(posterior, wrong, kept):
+def test_wrong_claims_and_kept_ambiguity(posterior, wrong, kept):
     row = aliasing._row(np.array([1.0, 1.0, 0.0]), [posterior], twins=True)
     assert (row["wrong"], row["both_kept"]) == ([wrong], kept)
 
@@ -114,7 +114,7 @@ def test_aliasing_at_a_small_size(tmp_path):
     result = aliasing.run(FEW, tmp_path, 1, QUIET, ("alike", "twins"))
     summary = result.summary
     assert list(summary) == [f"{world}, {name}" for world in ("alike", "twins") for name in aliasing.ESTIMATORS]
-    assert summary["alike, precise"]["within_0.2_m_after_1"] == 2  # the end walls tell the boxes apart
+    assert summary["alike, precise"]["within_0.2_m_after_1"] == 2  # the end walls distinguish the boxes
     assert summary["twins, precise"]["at_either_within_0.2_m"] == 2
     assert summary["twins, precise"]["tracking_but_wrong_ever"] == 0
     assert summary["twins, paper"]["both_kept"] == 0  # one belief cannot
@@ -124,13 +124,13 @@ def test_aliasing_at_a_small_size(tmp_path):
     assert again == next(r for r in result.trials if (r["world"], r["estimator"]) == ("twins", "particle-filter"))
 
 
-def test_stated_precision_is_true_and_the_sample_is_not_chosen(tmp_path):
+def test_the_predicted_precision_is_calibrated(tmp_path):
     job = prediction.Job(2, scans=25)
     result = prediction.run(job, tmp_path, 1, QUIET)
     precise, row = result.summary["precise"], result.trials[0]
     for k, (low, high) in {1: (0.65, 0.72), 2: (0.93, 0.97), 3: (0.98, 0.999)}.items():
         assert low < precise[f"within_{k}_sigma"] < high
-    # Where it says it is less sure, it is: the scanner's noise alone would claim too much.
+    # Beams predicted as less precise are less precise: the scanner's noise alone would be too optimistic.
     assert precise["unsure_within_1_sigma"] > precise["unsure_within_noise_alone_1_sigma"] + 0.1
     shares = list(row["models"]["precise"]["within"].values())
     assert shares == sorted(shares)
@@ -143,6 +143,6 @@ def test_stated_precision_is_true_and_the_sample_is_not_chosen(tmp_path):
     assert "Gaussian" in prediction.table(result.summary)
 
 
-def test_prediction_without_weights_says_what_makes_them(tmp_path):
+def test_prediction_without_weights_names_the_training_command(tmp_path):
     with pytest.raises(UserError, match="presage train"):
         prediction.run(prediction.Job(1, field=ExperimentWorld("maze")), tmp_path, 1, QUIET)

@@ -1,4 +1,4 @@
-"""E3 and the step sizes: journeys, the least time, the real processes at a small size, the paper's literal loop."""
+"""E3 and the step sizes: journeys, minimum times, small runs with real processes, and the paper's literal algorithm."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CORRIDOR = load_world("corridor")
 
 @given(st.integers(0, 10_000), st.floats(2.0, 14.0))
 @settings(max_examples=30)
-def test_a_journey_is_far_enough_free_and_the_same_for_a_seed(seed, apart):
+def test_journeys_are_valid_and_reproducible(seed, apart):
     journey = draw_journey(CORRIDOR, np.random.default_rng(seed), ROBOT, apart)
     assert journey.straight >= apart
     along = np.linspace(journey.start, journey.goal, 200)
@@ -41,22 +41,22 @@ def test_a_journey_is_far_enough_free_and_the_same_for_a_seed(seed, apart):
     assert [float(repr(v)) for v in journey.start] == [round(v, 3) for v in journey.start]
 
 
-def test_pairs_drawn_again_are_counted():
+def test_rejected_pairs_are_counted():
     drawn = [draw_journey(CORRIDOR, np.random.default_rng(k), ROBOT) for k in range(60)]
     assert sum(each.obstructed for each in drawn) > 5
     assert sum(each.too_near for each in drawn) > sum(each.obstructed for each in drawn)
     assert len({each.start for each in drawn}) == 60
 
 
-def test_where_there_is_no_such_journey_it_is_said():
+def test_a_world_without_such_a_journey_is_refused():
     with pytest.raises(UserError, match=r"no two places 12 m apart"):
         draw_journey(World(name="cell", boundary=[(0, 0), (3, 0), (3, 3), (0, 3)]), np.random.default_rng(0), ROBOT)
 
 
 @given(st.floats(0.81, 30.0), st.floats(0.2, 3.0), st.floats(0.2, 3.0))
 @settings(max_examples=12)
-def test_no_robot_within_its_limits_is_sooner_there_than_the_least_time(distance, speed, acceleration):
-    """Full acceleration, by the simulator's own ramp, integrated finely."""
+def test_no_drive_is_faster_than_the_minimum_time(distance, speed, acceleration):
+    """Simulates full acceleration with the simulator's limits in small steps."""
     robot, dt = Robot(max_speed=speed, acceleration=acceleration), 5e-3
     v, way, seconds = np.zeros(3), 0.0, 0.0
     while distance - way > ARRIVAL_DISTANCE:
@@ -73,7 +73,7 @@ def test_least_time_known_cases():
 
 
 @given(st.lists(st.tuples(st.floats(-5, 5), st.floats(-5, 5)), min_size=2, max_size=20))
-def test_no_path_is_shorter_than_straight(points):
+def test_no_path_is_shorter_than_the_straight_line(points):
     path = np.array(points)
     assert path_ratio(path) >= 1 - 1e-9
     if np.hypot(*(path[-1] - path[0])) > 1e-3:
@@ -91,7 +91,7 @@ def belief(number, x):
     )
 
 
-def test_what_is_measured():
+def test_measurements_of_a_journey():
     trace = RunTrace([truth(0, 1.0), truth(1, 2.0, contact=True), truth(2, 14.3)], [belief(k, 2.0) for k in range(3)])
     found = navigation.measure(trace, Journey((1.0, 1.0), (15.0, 1.0)))
     assert found["reached"]
@@ -107,7 +107,7 @@ def test_what_is_measured():
     assert navigation.summarise([away], "precise")["seconds_median"] is None
 
 
-def test_a_missing_message_is_not_passed_over():
+def test_a_missing_message_is_an_error():
     kept = [truth(0, 1.0), truth(1, 1.0)]
     assert _is_next(kept, truth(2, 1.0))
     assert not _is_next(kept, truth(1, 1.0))  # sent again
@@ -117,7 +117,7 @@ def test_a_missing_message_is_not_passed_over():
         _is_next([], truth(1, 1.0))
 
 
-def test_what_no_service_offers_is_refused(tmp_path):
+def test_estimators_without_a_service_are_refused(tmp_path):
     job = navigation.Job(0, 1, estimators=("particle-filter, heading known",))
     with pytest.raises(UserError, match="heading known"):
         navigation.run(job, 1, tmp_path, 1, QUIET)
@@ -135,14 +135,14 @@ def test_e3_through_the_real_processes_and_a_trial_does_not_depend_on_others(tmp
     assert {path.suffix for path in tmp_path.iterdir()} >= {".json", ".csv", ".pdf", ".png"}
     assert "| precise | 2 of 2 | 0 |" in navigation.table(result.summary)
 
-    monkeypatch.setenv("PRESAGE_GAMMA", "0.01")  # somebody's own settings are none of the experiment's
+    monkeypatch.setenv("PRESAGE_GAMMA", "0.01")  # the user's own settings must not affect the experiment
     other = replace(job, index=1, estimators=("particle-filter", "precise"))  # after another estimator, not trial 0
     assert navigation.trial(other)["estimators"]["precise"] == result.trials[1]["estimators"]["precise"]
     assert not [each for each in psutil.Process().children() if "services" in " ".join(each.cmdline())]
 
 
 class Linear:
-    """A world in which a scan is the position itself, many times over: everything can be worked out by hand."""
+    """A model whose scan is the position itself, repeated many times, so that results can be computed by hand."""
 
     beams = 50
     norm = Normalisation((0.0, 0.0), (9.0, 9.0), 1.0)
@@ -159,8 +159,11 @@ def linear_travel(steps, start=(2.0, 2.0), goal=(15.0, 2.5), limit=200):
     return teleports.travel(Journey(start, goal), steps, model, lambda pose: model.predict(pose)[0], room, 0.0, limit)
 
 
-def test_a_fifth_an_iteration_makes_the_papers_number():
-    """Belief half way (beta 1) at once, the robot a share of the way to it: distance times 0.8 each iteration."""
+def test_closing_a_fifth_of_the_distance_per_iteration_gives_the_papers_number():
+    """The belief moves half way to the goal at once (beta 1), the robot part of the way to the belief.
+
+    Each iteration reduces the distance to 80 %.
+    """
     stiff = Linear.beams
     outcome = linear_travel(teleports.Steps(alpha=0.5 / stiff, beta=1.0, gamma=0.4 / stiff))
     ratios = outcome.distance[1:] / outcome.distance[:-1]
@@ -169,7 +172,7 @@ def test_a_fifth_an_iteration_makes_the_papers_number():
     assert outcome.iterations == int(np.ceil(np.log(outcome.distance[0] / ARRIVAL_DISTANCE) / -np.log(0.8)))
 
 
-def test_the_summed_action_does_not_die_away_and_passes_the_goal():
+def test_the_summed_action_does_not_decay():
     stiff = Linear.beams
     steps = teleports.Steps(alpha=0.5 / stiff, beta=1.0, gamma=0.02 / stiff, form="sum")
     summed = linear_travel(steps)
@@ -178,7 +181,7 @@ def test_the_summed_action_does_not_die_away_and_passes_the_goal():
     assert speed[-1] > 3 * speed[0]  # fastest where it should slow down
 
 
-def test_the_printed_signs_drive_the_belief_away():
+def test_the_printed_signs_make_the_belief_diverge():
     stiff = Linear.beams
     steps = teleports.Steps(alpha=0.1 / stiff, beta=1.0, gamma=0.05 / stiff, form="printed")
     printed = linear_travel(steps, limit=8)

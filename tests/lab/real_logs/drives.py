@@ -1,4 +1,4 @@
-"""A drive such as a real robot records, made here: moved furniture, people, beams lost, poses a little off."""
+"""An artificial drive like a real robot's: moved furniture, people, lost beams and inaccurate reference poses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SHORT, LONG, NONE = 0.08, 0.03, 0.02  # shares of the beams
 
 
 def drive(count: int, seed: int = 0, period: float = 0.25) -> Drive:
-    """Round the room: the first half before the box was moved, the second after; and odometry that drifts."""
+    """A drive around the room with drifting odometry; between its halves the box is moved."""
     rng = np.random.default_rng(seed)
     turn = 2 * np.pi * np.arange(count) * 0.45 * period / 10.0
     true = np.stack([3.0 + 1.6 * np.cos(turn), 3.0 + 1.3 * np.sin(turn)], -1)
@@ -45,14 +45,14 @@ def drive(count: int, seed: int = 0, period: float = 0.25) -> Drive:
 
 
 def disturbed(ranges: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Some beams ended early, some anywhere, some not at all."""
+    """Ranges in which some beams are shortened, some random and some without return."""
     kind = rng.choice(4, ranges.shape, p=[1 - SHORT - LONG - NONE, SHORT, LONG, NONE])
     early, anywhere = rng.uniform(0, ranges), rng.uniform(0, RANGE_MAX, ranges.shape)
     return np.select([kind == 1, kind == 2, kind == 3], [early, anywhere, np.inf], ranges)
 
 
 def save(path, made: Drive, *, reference: bool = True) -> None:
-    """As an .npz that `presage import` and `presage train --from` read."""
+    """Saves a drive as an .npz file for `presage import` and `presage train --from`."""
     poses = {"reference": made.poses} if reference else {}
     np.savez(
         path, ranges=made.ranges, angles=made.angles, range_max=made.range_max, stamps=made.stamps, odom=made.odom,

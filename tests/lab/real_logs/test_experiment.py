@@ -1,4 +1,4 @@
-"""`presage train --from` and `presage experiment real`, on a small drive that is made here."""
+"""`presage train --from` and `presage experiment real` on a small artificial drive."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ HERE = Reading(mount=np.zeros(3))
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The log, the map of its first half, and what was learned from that half."""
+    """A folder with the log, the map of its first half, and the weights trained on that half."""
     made = tmp_path_factory.mktemp("drive")
     real_drive.save(made / "drive.npz", real_drive.drive(200))
     (made / "before.yaml").write_text(save_world(real_drive.BEFORE), encoding="utf-8")
@@ -51,7 +51,7 @@ def folder(tmp_path_factory):
     return made
 
 
-def test_the_card_says_where_the_model_comes_from_and_how_good_it_is(folder):
+def test_the_card_has_the_models_origin_and_errors(folder):
     _, places, card = weights.load(folder / "before-precise.safetensors")
     assert card.source == "100 posed scans of drive.npz; elsewhere 100 simulated scans in map before"
     assert card.calibration is not None
@@ -63,7 +63,7 @@ def test_the_card_says_where_the_model_comes_from_and_how_good_it_is(folder):
     assert raw["calibration"]["log_likelihood"] == pytest.approx(card.calibration.log_likelihood)
 
 
-def test_without_reference_poses_there_is_nothing_to_learn_from(tmp_path):
+def test_logs_without_enough_reference_poses_are_refused(tmp_path):
     real_drive.save(tmp_path / "bare.npz", real_drive.drive(60), reference=False)
     with pytest.raises(UserError, match="no reference poses"):
         train_from_drive(Training(tmp_path / "bare.npz", out=tmp_path, reading=HERE), Console(quiet=True))
@@ -73,7 +73,7 @@ def test_without_reference_poses_there_is_nothing_to_learn_from(tmp_path):
 
 
 @pytest.mark.parametrize("estimator", ["precise", "particle-filter"])
-def test_a_robot_that_is_carried_off_finds_itself(folder, estimator):
+def test_a_kidnapped_robot_is_localised_again(folder, estimator):
     job = Job(
         str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), estimator, KIDNAPPED, 100, to=155,
         model=str(folder / "before-precise.safetensors"),
@@ -92,7 +92,7 @@ def test_a_robot_that_is_carried_off_finds_itself(folder, estimator):
 
 
 def test_tuning_uses_the_second_quarter_in_a_map_of_the_first(folder, tmp_path, monkeypatch):
-    """What is evaluated later must not decide the settings, and the map must lack rooms as it does later."""
+    """The half evaluated later must not affect the settings, and the map must lack rooms, as it does later."""
     tried = []
 
     def fake(job):
@@ -104,7 +104,7 @@ def test_tuning_uses_the_second_quarter_in_a_map_of_the_first(folder, tmp_path, 
     job = Job(str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "particle-filter", LASER, 0)
     tuned = real_tuning.tune(job, 100, starting_point(MotionNoise()), tmp_path, lambda *_: None)
     for each in (tuned.odometry, tuned.laser):
-        assert dict(each).get("keep_initial_pose", 1.0) == 1.0  # recovery was tried, and lost
+        assert dict(each).get("keep_initial_pose", 1.0) == 1.0  # recovery was tried and rejected
     assert dict(tuned.finding)["keep_initial_pose"] == 0.0
     assert any(dict(each.particles).get("keep_initial_pose") == 0.0 for each in tried if each.task == LASER)
     for each in tried:
@@ -116,12 +116,12 @@ def test_tuning_uses_the_second_quarter_in_a_map_of_the_first(folder, tmp_path, 
     assert (mapped.clearance(poses) > 0).mean() > 0.9
 
 
-def test_amcl_follows_a_base_that_moves_sideways(folder):
+def test_amcl_uses_the_omnidirectional_motion_model(folder):
     job = Job(str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "amcl-defaults", LASER, 100)
     assert create_estimator(job).settings == ParticleSettings(robot_model_type="omni")
 
 
-def test_odometry_does_not_tell_of_being_carried_off():
+def test_odometry_does_not_reveal_a_kidnapping():
     rng = np.random.default_rng(0)
     odom = np.cumsum(rng.normal(0, 0.1, (20, 3)), axis=0)
     told = hide_kidnapping(odom, 12)
@@ -130,7 +130,7 @@ def test_odometry_does_not_tell_of_being_carried_off():
     assert se2.between(told[12], told[15]) == pytest.approx(se2.between(odom[12], odom[15]))
 
 
-def test_time_goes_on_while_a_robot_is_carried_back(folder):
+def test_time_increases_when_a_robot_is_moved_to_an_earlier_scan(folder):
     job = Job(
         str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "precise", KIDNAPPED, 155, to=100,
         model=str(folder / "before-precise.safetensors"),
@@ -149,7 +149,7 @@ def test_halves_are_disjoint_and_complete(count):
 
 
 @pytest.mark.parametrize("count", [20, 21])
-def test_halves_exchanged_are_a_drive_whose_time_goes_on(count):
+def test_time_increases_in_a_drive_with_exchanged_halves(count):
     drive = real_drive.drive(count)
     first, second = split(drive)
     turned = exchange_halves(drive)
@@ -162,7 +162,7 @@ def test_halves_exchanged_are_a_drive_whose_time_goes_on(count):
 
 @pytest.mark.parametrize("count", [100, 101])
 @pytest.mark.parametrize("exchanged", [False, True])
-def test_no_scan_is_both_learned_and_localised(tmp_path, count, exchanged):
+def test_no_scan_is_used_for_both_training_and_localisation(tmp_path, count, exchanged):
     log = tmp_path / "drive.npz"
     real_drive.save(log, real_drive.drive(count))
     first, second = split(drive_at(str(log), None))
@@ -195,7 +195,7 @@ def row(task, error, state, stamps=None):
     }  # fmt: skip
 
 
-def test_wrong_claims_are_counted_while_they_last():
+def test_wrong_claims_and_their_durations():
     t, lost = "tracking", "lost"
     found = real.summarise([row("odometry", [0, 9, 9, 9, 9, 0, 9], [t, t, t, t, lost, t, t])])
     assert found["wrong_claim_longest_s"] == pytest.approx(1.0)  # from the second to the fourth scan
@@ -206,7 +206,7 @@ def test_wrong_claims_are_counted_while_they_last():
     assert searched["scans_until_found_median"] == 4
 
 
-def test_its_table_is_one_of_the_page(tmp_path):
+def test_the_table_of_the_page(tmp_path):
     assert page.MODULES["real"] == "lab.real_logs.experiment"
     summary = {"a: tracking with odometry, precise": real.summarise([row("odometry", [0.01, 0.02], ["tracking"] * 2)])}
     table = real.table(summary)
