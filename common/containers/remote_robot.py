@@ -10,15 +10,15 @@ from common.messages.topics import SCAN, Topic
 from common.runtime.config import ServiceSettings
 from common.runtime.service import Service, main
 
-SILENT = 5.0  # s without a scan, then it is said
+SCAN_TIMEOUT_S = 5.0
 
 
 class RemoteSettings(ServiceSettings):
-    """Waits for the scans of a robot that is elsewhere, and logs when they come and when they stop. It sends none.
+    """Logs when scans of a robot outside compose arrive and when they stop. It publishes no scans itself.
 
     Examples:
       python -m common.containers.remote_robot
-      PRESAGE_SCANNER=none docker compose up         and the robot connects to the router's port
+      PRESAGE_SCANNER=none docker compose up         the robot then connects to the router's port
 
     """
 
@@ -27,30 +27,30 @@ class RemoteSettings(ServiceSettings):
 
 
 class RemoteService(Service):
-    """Hears scans, answers nothing."""
+    """Watches the scans of one robot."""
 
     name: ClassVar[str] = "remote"
     inputs: ClassVar[tuple[Topic, ...]] = (SCAN,)
 
     def __init__(self, settings: RemoteSettings) -> None:
-        """Nothing has come yet."""
+        """Start in the state that no scan has arrived."""
         super().__init__(settings)
         self.note = "no scan so far"
-        self._at: float | None = None  # of the last scan, while they come
+        self._last_scan: float | None = None  # s, monotonic clock; None while no scans arrive
 
-    def on_sample(self, sample: Sample) -> None:  # noqa: ARG002 - that one came is all
-        """It is there."""
-        if self._at is None:
-            self.log.info("scans come", robot=self.loop.bus.robot)
-        self._at, self.note = time.monotonic(), ""
+    def on_sample(self, sample: Sample) -> None:  # noqa: ARG002 - the contents do not matter
+        """Record the time, and log the first scan."""
+        if self._last_scan is None:
+            self.log.info("scans are arriving", robot=self.loop.bus.robot)
+        self._last_scan, self.note = time.monotonic(), ""
 
     def due(self) -> float | None:
-        """Until the silence is worth a word."""
-        return None if self._at is None else self._at + SILENT - time.monotonic()
+        """Seconds until scans count as stopped, or None if none arrive."""
+        return None if self._last_scan is None else self._last_scan + SCAN_TIMEOUT_S - time.monotonic()
 
     def on_timer(self) -> None:
-        """They stopped."""
-        self._at, self.note = None, f"no scan for {SILENT:g} s"
+        """Log that scans have stopped."""
+        self._last_scan, self.note = None, f"no scan for {SCAN_TIMEOUT_S:g} s"
         self.log.warning(self.note, robot=self.loop.bus.robot)
 
 

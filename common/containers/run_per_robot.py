@@ -17,34 +17,35 @@ from common.processes import end_with_this_process
 
 HELP = """usage: python -m common.containers.run_per_robot each|together|once MODULE [ARGUMENT ...]
 
-Runs `python -m MODULE ARGUMENT ...` for the robots that the environment names: PRESAGE_FLEET=3 are robot-1, robot-2 and
-robot-3, or with PRESAGE_ROBOT=truck truck-1, ...; without it, or with 1, there is one, named as PRESAGE_ROBOT says.
+Runs `python -m MODULE ARGUMENT ...` for each robot. PRESAGE_FLEET is the number of robots: with 3 they are robot-1,
+robot-2 and robot-3, or with PRESAGE_ROBOT=truck truck-1, truck-2 and truck-3. If it is 1 or not set, the only robot has
+the name PRESAGE_ROBOT.
 
-  each      a process for each robot, its name in PRESAGE_ROBOT; one that ends is started again
-  once      the same, but nothing is started again: ends when all have, with the worst of their statuses
-  together  one process for all: PRESAGE_ROBOTS has the names, comma-separated, PRESAGE_ROBOT the first
+  each      one process for each robot, with its name in PRESAGE_ROBOT; a process that ends is started again
+  once      like each, but no process is started again: ends when all have ended, with the highest of their statuses
+  together  one process for all robots: PRESAGE_ROBOTS has their names, comma-separated, PRESAGE_ROBOT the first
 
 examples:
   PRESAGE_FLEET=3 python -m common.containers.run_per_robot each services.simulator --beams 622
   PRESAGE_FLEET=3 python -m common.containers.run_per_robot once presage goal 15 1.5 --wait"""
 MODES = ("each", "together", "once")
-MOST = 100  # robots of one container
-FIRST_WAIT, LONGEST_WAIT = 0.5, 10.0  # s before a process is started again, doubled each time
-STEADY = 30.0  # s that a process ran, after which the wait is the first again
-LOOK = 0.1  # s between two looks at the processes
-GRACE = 12.0  # s between asking and killing; compose kills us after 15
+MAX_ROBOTS = 100  # in one container
+MIN_RESTART_DELAY_S, MAX_RESTART_DELAY_S = 0.5, 10.0  # doubled at each restart
+STABLE_RUN_S = 30.0  # a process that ran for longer is restarted with the minimum delay
+POLL_PERIOD_S = 0.1
+STOP_TIMEOUT_S = 12.0  # between SIGTERM and SIGKILL; compose kills this process after 15 s
 
 
 def robot_names(environment: Mapping[str, str]) -> list[str]:
-    """The robots; raises ValueError where their number is none."""
+    """Names of the container's robots; raises ValueError if PRESAGE_FLEET is not a valid number."""
     base, text = environment.get("PRESAGE_ROBOT") or "robot", environment.get("PRESAGE_FLEET") or "1"
-    if not re.fullmatch(r"[0-9]{1,3}", text) or not 1 <= int(text) <= MOST:
-        raise ValueError(f"PRESAGE_FLEET={text!r}: how many robots, 1 to {MOST}")
+    if not re.fullmatch(r"[0-9]{1,3}", text) or not 1 <= int(text) <= MAX_ROBOTS:
+        raise ValueError(f"PRESAGE_FLEET={text!r}: expected the number of robots, 1 to {MAX_ROBOTS}")
     return [base] if int(text) == 1 else [f"{base}-{number}" for number in range(1, int(text) + 1)]
 
 
 def main(argv: list[str]) -> int:
-    """Run, and the status to end with: 2 where the words make no sense."""
+    """Run the program and return the exit status, which is 2 for invalid arguments."""
     if not argv or argv[0] in {"-h", "--help"}:
         print(HELP)
         return 0
@@ -54,104 +55,106 @@ def main(argv: list[str]) -> int:
     except ValueError as error:
         return _refuse(str(error))
     if mode not in MODES or not module:
-        return _refuse(f"{' '.join(argv)!r}: say each, together or once, and a module; --help has examples")
+        return _refuse(f"{' '.join(argv)!r}: give each, together or once, and a module; see --help for examples")
     command = [sys.executable, "-m", *module]
     if mode == "together" or len(robots) == 1:
         environment = {**os.environ, "PRESAGE_ROBOT": robots[0]}
         if mode == "together" and len(robots) > 1:
             environment["PRESAGE_ROBOTS"] = ",".join(robots)
-        os.execve(sys.executable, command, environment)  # noqa: S606 - becomes it: signals and status are its own
-    return Fleet(command, robots, again=mode == "each").run()
+        os.execve(sys.executable, command, environment)  # noqa: S606 - replaces this process, so signals reach it
+    return ProcessGroup(command, robots, restart=mode == "each").run()
 
 
 @dataclass
-class Member:
-    """A robot's process."""
+class RobotProcess:
+    """The process of one robot. Times are s of the monotonic clock."""
 
     robot: str
     child: subprocess.Popen[str] | None = None
-    passing: threading.Thread | None = None  # its output on
-    began: float = 0.0  # s, monotonic
-    wait: float = FIRST_WAIT  # s, before it is started again
-    due: float | None = 0.0  # s, monotonic: when it is started; None: no more
+    output: threading.Thread | None = None  # prints what the child writes
+    started: float = 0.0
+    restart_delay: float = MIN_RESTART_DELAY_S  # s
+    next_start: float | None = 0.0  # None if it is not started again
 
 
-class Fleet:
-    """One process a robot."""
+class ProcessGroup:
+    """Runs one process for each robot."""
 
-    def __init__(self, command: list[str], robots: list[str], *, again: bool) -> None:
-        """``again``: whether one that ends is started again."""
-        self.command, self.again = command, again
-        self.members = [Member(robot) for robot in robots]
-        self.worst = 0
-        self._asked = False  # an Event's wait may hold the lock that its set, in a signal handler, waits for
+    def __init__(self, command: list[str], robots: list[str], *, restart: bool) -> None:
+        """With ``restart``, a process that ends is started again."""
+        self.command, self.restart = command, restart
+        self.processes = [RobotProcess(robot) for robot in robots]
+        self.worst_status = 0
+        # Not a threading.Event: its set() in a signal handler would block while the interrupted wait() holds its lock.
+        self._stop_requested = False
 
     def run(self) -> int:
-        """Until told to end, or, where nothing is started again, until all have ended; the status."""
+        """Run until a signal arrives or, without ``restart``, until all processes have ended; returns the status."""
         for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._ask)
+            signal.signal(number, self._request_stop)
         try:
-            while not self._asked:
-                for member in self.members:
-                    self._tend(member, time.monotonic())
-                if all(member.child is None and member.due is None for member in self.members):
+            while not self._stop_requested:
+                for process in self.processes:
+                    self._supervise(process, time.monotonic())
+                if all(process.child is None and process.next_start is None for process in self.processes):
                     break
-                time.sleep(LOOK)
+                time.sleep(POLL_PERIOD_S)
         finally:
-            self._end()
-        return 0 if self._asked else self.worst
+            self._stop_all()
+        return 0 if self._stop_requested else self.worst_status
 
-    def _ask(self, _signal: int, _frame: FrameType | None) -> None:
-        self._asked = True
+    def _request_stop(self, _signal: int, _frame: FrameType | None) -> None:
+        self._stop_requested = True
 
-    def _tend(self, member: Member, now: float) -> None:
-        """Start it where that is due; note its end."""
-        if member.child is None:
-            if member.due is not None and now >= member.due:
-                self._start(member, now)
+    def _supervise(self, process: RobotProcess, now: float) -> None:
+        """Start a process when it is time to, and handle its end."""
+        if process.child is None:
+            if process.next_start is not None and now >= process.next_start:
+                self._start(process, now)
             return
-        status = member.child.poll()
+        status = process.child.poll()
         if status is None:
             return
-        member.child, member.due = None, None
-        self.worst = max(self.worst, status if status >= 0 else 128 - status)
-        if not self.again:
+        process.child, process.next_start = None, None
+        self.worst_status = max(self.worst_status, status if status >= 0 else 128 - status)
+        if not self.restart:
             return
-        member.wait = FIRST_WAIT if now - member.began > STEADY else min(2 * member.wait, LONGEST_WAIT)
-        member.due = now + member.wait
-        _say(member.robot, f"ended with status {status}; started again in {member.wait:g} s")
+        stable = now - process.started > STABLE_RUN_S
+        process.restart_delay = MIN_RESTART_DELAY_S if stable else min(2 * process.restart_delay, MAX_RESTART_DELAY_S)
+        process.next_start = now + process.restart_delay
+        _print_line(process.robot, f"ended with status {status}; started again in {process.restart_delay:g} s")
 
-    def _start(self, member: Member, now: float) -> None:
-        member.child = subprocess.Popen(  # noqa: S603 - the words we were given
+    def _start(self, process: RobotProcess, now: float) -> None:
+        process.child = subprocess.Popen(  # noqa: S603 - the command is this program's own argument
             self.command,
-            env={**os.environ, "PRESAGE_ROBOT": member.robot},
+            env={**os.environ, "PRESAGE_ROBOT": process.robot},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
             errors="replace",
-            start_new_session=True,  # a terminal's Ctrl-C is ours to pass on
+            start_new_session=True,  # this process forwards a terminal's Ctrl-C
             preexec_fn=end_with_this_process(),  # noqa: PLW1509 - one call, before any thread of the child
         )
-        member.began, member.due = now, None
-        member.passing = threading.Thread(target=_pass_on, args=(member.robot, member.child), daemon=True)
-        member.passing.start()
+        process.started, process.next_start = now, None
+        process.output = threading.Thread(target=_print_output, args=(process.robot, process.child), daemon=True)
+        process.output.start()
 
-    def _end(self) -> None:
-        """Ask all, then kill those that do not listen."""
-        children = [member.child for member in self.members if member.child is not None]
+    def _stop_all(self) -> None:
+        """Terminate all processes, and kill those that do not end in time."""
+        children = [process.child for process in self.processes if process.child is not None]
         for child in children:
             child.terminate()
-        deadline = time.monotonic() + GRACE
+        deadline = time.monotonic() + STOP_TIMEOUT_S
         for child in children:
             try:
                 child.wait(max(0.0, deadline - time.monotonic()))
             except subprocess.TimeoutExpired:
                 child.kill()
                 child.wait()
-        for member in self.members:
-            if member.passing is not None:  # their last words; a grandchild may hold the pipe open for ever
-                member.passing.join(LOOK)
+        for process in self.processes:
+            if process.output is not None:  # print the last lines, but a grandchild may keep the pipe open for ever
+                process.output.join(POLL_PERIOD_S)
 
 
 def _refuse(why: str) -> int:
@@ -159,14 +162,14 @@ def _refuse(why: str) -> int:
     return 2
 
 
-def _pass_on(robot: str, child: subprocess.Popen[str]) -> None:
-    assert child.stdout is not None  # noqa: S101 - asked for above
+def _print_output(robot: str, child: subprocess.Popen[str]) -> None:
+    assert child.stdout is not None  # noqa: S101 - Popen was called with stdout=PIPE
     with child.stdout:
         for line in child.stdout:
-            _say(robot, line.rstrip())
+            _print_line(robot, line.rstrip())
 
 
-def _say(robot: str, line: str) -> None:
+def _print_line(robot: str, line: str) -> None:
     print(f"{robot} | {line}", flush=True)
 
 

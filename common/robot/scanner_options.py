@@ -16,9 +16,14 @@ from common.limits import Coordinate
 from common.robot.scanner import SCANNERS, Scanner
 
 UNITS = {
-    "fov_deg": "degrees", "first_deg": "degrees", "rate": "Hz", "range_min": "m", "range_max": "m", "sigma": "m",
+    "fov_deg": "degrees",
+    "first_deg": "degrees",
+    "rate": "Hz",
+    "range_min": "m",
+    "range_max": "m",
+    "sigma": "m",
     "mount": "m, and yaw_deg in degrees",
-}  # fmt: skip
+}
 
 
 class _Mount(BaseModel):

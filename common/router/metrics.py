@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class RouterMetrics(Collector):
-    """Who is linked, and since when there is a router to link to."""
+    """Uptime of the router, and number of sessions connected to it."""
 
     def __init__(self, bus: Bus) -> None:
         """``bus`` is the router's own session."""
@@ -24,7 +24,7 @@ class RouterMetrics(Collector):
         self.registry = new_registry(self)
 
     def collect(self) -> Iterator[Metric]:
-        """At a scrape."""
+        """Yield the metrics for a scrape."""
         yield build_info("", "router")
         yield family("presage_router_uptime_seconds", [((), time.monotonic() - self._began)])
         yield family("presage_router_sessions", [((), self._bus.count_links())])

@@ -1,8 +1,8 @@
 """Counts and logs connections that the router refused, read from zenoh's log.
 
-Tells apart what zenoh 1.10 tells apart. Messages are named with the certificate's name, key and kind; a wrong password
-with the name on the certificate shown last; who shows no good certificate has no name. What a session does not even
-send, because nobody listens to it, is seen by nobody.
+The reasons are those that the log of zenoh 1.10 distinguishes. A refused message is reported with the certificate's
+name, its key and its kind; a wrong password with the name of the last certificate that was presented; a connection
+without a valid certificate has no name. Messages without subscribers are not sent to the router and cannot be reported.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from common.log import Logger, LogRateLimiter
 from common.messages.topics import QUERIES, TOPICS
 
-# Level error, as everywhere, and those lines that tell of refusals.
+# Errors, as in every session, and the lines from which refusals are read.
 LOG_FILTER = (
     "error,zenoh::api::session=off,zenoh::net::protocol::gossip=off,zenoh::net::routing::hat=off,"
     "zenoh::net::routing::interceptor::access_control=trace,"
@@ -30,9 +30,9 @@ DENIED = re.compile(
     r"(?P<zid>[0-9a-f]+)(?: on \S+)? is unauthorized to (?P<what>.+?) \((?P<flow>\w+)\) on (?P<key>\S+)"
 )
 SHOWN = re.compile(r"Accepted TLS connection on \S+: (?P<address>\S+)\. Common Name: (?P<name>.+)\.$")
-LET_IN = re.compile(r"New transport link accepted from (?P<zid>[0-9a-f]+) to .*?dst: tls/(?P<address>[^,]+),")
-PLANNED = 9  # lines in which zenoh works out a new key's rights in one direction, before any message
-HANDSHAKES = (  # of zenoh's and rustls' words
+ACCEPTED = re.compile(r"New transport link accepted from (?P<zid>[0-9a-f]+) to .*?dst: tls/(?P<address>[^,]+),")
+CACHING_LINES = 9  # log lines in which zenoh computes the rights for a new key in one direction, without any message
+HANDSHAKE_FAULTS = (  # text in the log of zenoh or rustls, reason of the refusal
     ("Invalid password", "wrong password"),
     ("UsrPwd extension", "no password"),
     ("peer sent no certificates", "no certificate"),
@@ -41,28 +41,28 @@ HANDSHAKES = (  # of zenoh's and rustls' words
     ("Timeout during TLS handshake", "no TLS handshake in time"),
 )
 NAMES = frozenset(topic.name for topic in TOPICS) | frozenset(query.name for query in QUERIES)
-MOST_NAMES = 1000  # a stranger who comes again and again must not fill memory
+MAX_NAMES = 1000  # repeated connections from new addresses must not fill memory
 
 
 @dataclass(frozen=True)
 class Refusal:
-    """One thing that was not let through."""
+    """A message or connection that the router refused."""
 
-    why: str  # what it is counted under
+    why: str  # reason, under which it is counted
     who: str = ""  # name on the certificate
     key: str = ""
 
 
 @dataclass
 class ZenohLogParser:
-    """Makes sense of zenoh's log, line by line."""
+    """Finds refusals in zenoh's log, line by line."""
 
-    _names: dict[str, str] = field(default_factory=dict)  # by address, then by zenoh's id
-    _last: str = ""
-    _planned: dict[str, int] = field(default_factory=dict)  # by thread, lines that are no refusals yet to come
+    _names: dict[str, str] = field(default_factory=dict)  # certificate names, by address, then by session id
+    _last_name: str = ""  # on the certificate presented last
+    _caching: dict[str, int] = field(default_factory=dict)  # by thread: remaining lines that are not refusals
 
     def read(self, line: str) -> Refusal | str | None:
-        """A refusal; what zenoh has to say besides; or None."""
+        """Returns a refusal, or the text of another error or warning, or None for other lines."""
         plain = COLOUR.sub("", line).rstrip()
         match = LINE.match(plain)
         if match is None:
@@ -72,21 +72,21 @@ class ZenohLogParser:
             return self._access(thread, text)
         if (shown := SHOWN.match(text)) is not None:
             self._remember(shown["address"], shown["name"])
-            self._last = shown["name"]
-        elif (let_in := LET_IN.match(text)) is not None:
-            self._remember(let_in["zid"], self._names.pop(let_in["address"], ""))
-        elif why := next((why for words, why in HANDSHAKES if words in text), ""):
-            return Refusal(why, self._last if "password" in why else "")
-        elif match["level"] in {"ERROR", "WARN"} and "handshake eof" not in text:  # somebody looked whether we listen
+            self._last_name = shown["name"]
+        elif (accepted := ACCEPTED.match(text)) is not None:
+            self._remember(accepted["zid"], self._names.pop(accepted["address"], ""))
+        elif why := next((why for words, why in HANDSHAKE_FAULTS if words in text), ""):
+            return Refusal(why, self._last_name if "password" in why else "")
+        elif match["level"] in {"ERROR", "WARN"} and "handshake eof" not in text:  # eof: only a check of the port
             return plain
         return None
 
     def _access(self, thread: str, text: str) -> Refusal | None:
         if "caching permissions" in text:
-            self._planned[thread] = PLANNED
+            self._caching[thread] = CACHING_LINES
             return None
-        if not text.startswith("Using cached result") and self._planned.get(thread, 0):
-            self._planned[thread] -= 1
+        if not text.startswith("Using cached result") and self._caching.get(thread, 0):
+            self._caching[thread] -= 1
             return None
         denied = DENIED.search(text)
         if denied is None or denied["flow"] != "ingress":
@@ -94,29 +94,28 @@ class ZenohLogParser:
         return Refusal(denied["what"].lower(), self._names.get(denied["zid"], ""), denied["key"])
 
     def _remember(self, what: str, name: str) -> None:
-        if len(self._names) >= MOST_NAMES:
+        if len(self._names) >= MAX_NAMES:
             self._names.clear()
         self._names[what] = name
 
 
 class Refusals:
-    """Counts, and a line a second at most of each kind, name and topic."""
+    """Counts refusals by reason, and logs each combination of reason, name and topic at most once a second."""
 
     def __init__(self, log: Logger) -> None:
-        """Nothing yet."""
-        self.counts: Counter[str] = Counter()  # by why
-        self._log, self._may_log, self._reader = log, LogRateLimiter(), ZenohLogParser()
+        """Log to ``log``."""
+        self.counts: Counter[str] = Counter()  # by reason
+        self._log, self._may_log, self._parser = log, LogRateLimiter(), ZenohLogParser()
 
     def take(self, line: str) -> None:
-        """One line of zenoh's log."""
-        found = self._reader.read(line)
+        """Process one line of zenoh's log."""
+        found = self._parser.read(line)
         if isinstance(found, str):
             self._log.warning("zenoh", said=found)
         elif found is not None:
             self.counts[found.why] += 1
-            topic = next(
-                (name for name in found.key.split("/")[2:3] if name in NAMES), ""
-            )  # keys are anybody's to invent
+            # Only known topics, because a peer may invent keys.
+            topic = next((name for name in found.key.split("/")[2:3] if name in NAMES), "")
             if self._may_log(f"{found.why} {found.who} {topic}"):
                 named = {name: value for name, value in (("who", found.who), ("key", found.key)) if value}
                 self._log.warning("refused", why=found.why, **named, so_far=self.counts[found.why])
@@ -124,10 +123,13 @@ class Refusals:
 
 @contextmanager
 def listening_to_zenoh(refusals: Refusals) -> Iterator[None]:
-    """Zenoh logs to standard output: for the block it is ours to read. The process must not print."""
+    """Pass zenoh's log, which it writes to standard output, to ``refusals`` for the block.
+
+    The process must not print meanwhile.
+    """
     if os.environ.pop("RUST_LOG", None):
-        refusals._log.warning("RUST_LOG is not heeded: zenoh's log is where refusals are read")  # noqa: SLF001
-    kept, (reading, writing) = os.dup(1), os.pipe()
+        refusals._log.warning("RUST_LOG is ignored, because refusals are read from zenoh's log")  # noqa: SLF001
+    original_stdout, (reading, writing) = os.dup(1), os.pipe()
     os.dup2(writing, 1)
     os.close(writing)
 
@@ -141,6 +143,6 @@ def listening_to_zenoh(refusals: Refusals) -> Iterator[None]:
     try:
         yield
     finally:
-        os.dup2(kept, 1)  # the last writing end: the thread reads what is left, and ends
-        os.close(kept)
+        os.dup2(original_stdout, 1)  # closes the pipe's last writing end, so the thread reads the rest and ends
+        os.close(original_stdout)
         thread.join(timeout=5)

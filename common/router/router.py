@@ -1,7 +1,7 @@
 """Runs the router until a signal ends it.
 
-Data flows directly between services once they know each other through the router, and outlives it. In secure mode all
-data flows through it, and it decides what each may send.
+Services discover each other through the router; after that they exchange data directly, even if the router ends. In
+secure mode all data flows through the router, which decides what each session may send.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from common.log import Logger, begin_logging, logger, report_failure, set_up_log
 from common.router.refusals import LOG_FILTER, Refusals, listening_to_zenoh
 from common.runtime.config import ServiceSettings, load_settings, split_endpoints
 
-ENDING = (signal.SIGTERM, signal.SIGINT)
+STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 class RouterSettings(ServiceSettings):
-    """Zenoh router that services find one another through.
+    """Zenoh router through which services discover each other.
 
-    PRESAGE_CONNECT and PRESAGE_LISTEN are meant for services and mean nothing here: a router beside them
-    would connect to itself. Its own are PRESAGE_ROUTER_CONNECT and PRESAGE_ROUTER_LISTEN.
+    PRESAGE_CONNECT and PRESAGE_LISTEN apply to services and are ignored here, because with them a router on the
+    same machine would connect to itself. Use PRESAGE_ROUTER_CONNECT and PRESAGE_ROUTER_LISTEN instead.
 
     Examples:
       python -m common.router                                          for services on this machine
-      python -m common.router --listen tls/0.0.0.0:7447 --security DIR for other machines too: whom DIR names
-      python -m common.router --listen tcp/0.0.0.0:7447 --insecure     for anybody on a network that is private
-      python -m common.router --connect tcp/192.168.0.10:7447          joined to a router elsewhere
+      python -m common.router --listen tls/0.0.0.0:7447 --security DIR for other machines with credentials
+      python -m common.router --listen tcp/0.0.0.0:7447 --insecure     for all machines on a private network
+      python -m common.router --connect tcp/192.168.0.10:7447          connected to a router on another machine
 
     """
 
@@ -41,28 +41,38 @@ class RouterSettings(ServiceSettings):
     program: ClassVar[str] = "python -m common.router"
     private: ClassVar[frozenset[str]] = frozenset({"connect", "listen"})
 
-    robot: CliSuppress[str] = "robot"  # a router serves all of them
-    connect: Annotated[str, Field(description="other routers to join, comma-separated")] = ""
+    robot: CliSuppress[str] = "robot"  # unused: a router serves all robots
+    connect: Annotated[str, Field(description="other routers to connect to, comma-separated")] = ""
     listen: Annotated[str, Field(min_length=1, description="endpoints to listen on, comma-separated")] = (
         DEFAULT_ENDPOINT
     )
 
     def link(self) -> Link:
-        """A session in router mode."""
+        """Parameters of a session in router mode; raises UserError if the credentials are not a router's."""
         connect, listen = split_endpoints(self.connect), split_endpoints(self.listen)
         security = self.credentials()
         if security is not None and security.member.role != self.service:
-            raise UserError(f"{security.folder}: role {security.member.role!r} cannot route: it takes {self.service!r}")
+            raise UserError(
+                f"{security.folder}: role {security.member.role!r} cannot be used by a router, only {self.service!r}"
+            )
         return Link(
-            self.robot, connect, listen, router=True, multicast=self.multicast, security=security,
+            self.robot,
+            connect,
+            listen,
+            router=True,
+            multicast=self.multicast,
+            security=security,
             insecure=self.insecure,
-        )  # fmt: skip
+        )
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Route until SIGTERM or Ctrl-C; status 0 then, 2 and one line where the endpoints cannot be used."""
-    # Blocked from the first line on, so that a signal is kept until sigwait takes it, however early it comes.
-    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    """Run a router until SIGTERM or Ctrl-C.
+
+    Exits with status 2 and a one-line message if the settings or endpoints cannot be used.
+    """
+    # Blocked from the start, so that a signal that arrives early stays pending until sigwait.
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     begin_logging(RouterSettings.service, argv)
     try:
         settings = load_settings(RouterSettings, argv)
@@ -75,7 +85,7 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def route(link: Link, log: Logger, metrics: str = "") -> None:
-    """Until a signal ends it; ``metrics``: where Prometheus may ask, empty: nowhere."""
+    """Run a router until a signal arrives; ``metrics`` is the address of the metrics endpoint, or empty for none."""
     refusals, facts = Refusals(log), {}
     with ExitStack() as stack:
         if link.security is None:
@@ -90,7 +100,7 @@ def route(link: Link, log: Logger, metrics: str = "") -> None:
 
             log.info("metrics", address=stack.enter_context(serve(RouterMetrics(bus).registry, metrics)))
         log.info("router listens", endpoints=", ".join(link.listen), **facts)
-        signal.sigwait(ENDING)
+        signal.sigwait(STOP_SIGNALS)
     log.info("ended", **({"refused": dict(refusals.counts)} if link.security is not None else {}))
 
 

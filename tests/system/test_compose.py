@@ -197,7 +197,7 @@ def test_a_frozen_service_is_unhealthy_until_it_continues(compose):
     send_signal(project, "STOP")
     project.becomes("estimator", "unhealthy")
     said = project.state("estimator")["Health"]["Log"][-1]["Output"]
-    assert "its loop has not turned for" in said
+    assert "no heartbeat for" in said
     assert project.health("simulator") == "healthy"
     send_signal(project, "CONT")
     project.becomes("estimator", "healthy")

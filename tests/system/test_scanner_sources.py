@@ -85,7 +85,7 @@ def test_waiting_for_a_remote_robot_reports_when_its_scans_start_and_stop(bus, p
     assert bus.wait_matching(SCAN, TIMEOUT_S)
     sent = scan(0).encode()
     assert wait_until(lambda: bus.put(SCAN, sent) or fault() == "", TIMEOUT_S), fault()
-    running.wait_for("scans come")
+    running.wait_for("scans are arriving")
     running.wait_for("no scan for 5 s")
     assert wait_until(lambda: "scan was not received for" in fault(), TIMEOUT_S), fault()
     assert running.stop()[0] == 0

@@ -40,8 +40,12 @@ def beat(age=0.5, *, linked=True, note="", **ages):
         ("simulator", beat(scan__published=30, note="paused"), ""),
         ("simulator", beat(scan__published=30, note="waits for estimator"), ""),
         ("simulator", {}, "robot: no heartbeat"),
-        ("simulator", beat(9, scan__published=0.5), "robot: its loop has not turned for 9 s"),
-        ("simulator", beat(scan__published=0.5, linked=False), "robot: it reaches nobody; is the router there?"),
+        ("simulator", beat(9, scan__published=0.5), "robot: no heartbeat for 9 s"),
+        (
+            "simulator",
+            beat(scan__published=0.5, linked=False),
+            "robot: not connected to any session; is the router running?",
+        ),
         ("remote", beat(scan__received=0.5), ""),
         ("remote", beat(scan__received=7), "robot: scan was not received for 7 s"),
         ("estimator", beat(scan__received=0.5, belief__published=0.5), ""),
@@ -63,7 +67,7 @@ def test_a_service_is_healthy_where_its_work_comes_out(service, beats, fault):
 
 def test_every_robot_of_a_container_counts():
     both = {"robot-1": Beat(NOW, linked=True), "robot-2": Beat(NOW - 9, linked=True)}
-    assert fault_of("estimator", both, list(both), NOW) == "robot-2: its loop has not turned for 9 s"
+    assert fault_of("estimator", both, list(both), NOW) == "robot-2: no heartbeat for 9 s"
     assert fault_of("estimator", {"robot-1": both["robot-1"]}, list(both), NOW) == "robot-2: no heartbeat"
     assert fault_of("viewer", {"robot-1": both["robot-1"]}, list(both), NOW) == ""  # one process for both
 
@@ -113,7 +117,7 @@ def test_a_real_service_that_is_frozen_is_unhealthy_until_it_goes_on(bus, proces
     try:
         frozen = lambda: check("small", tmp_path, PRESAGE_ROBOT=bus.robot)  # noqa: E731
         assert wait_until(lambda: frozen()[0] == 1, 30, period=0.5)
-        assert "its loop has not turned for" in frozen()[1]
+        assert "no heartbeat for" in frozen()[1]
     finally:
         running.send(signal.SIGCONT)
     assert wait_until(lambda: check("small", tmp_path, PRESAGE_ROBOT=bus.robot)[0] == 0, 30, period=0.5)

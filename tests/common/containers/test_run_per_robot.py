@@ -55,14 +55,14 @@ def test_names_of_robots():
 
 @pytest.mark.parametrize("text", ["0", "-1", "three", "1000", "101", "1.5"])
 def test_a_number_that_is_none_is_refused(text):
-    with pytest.raises(ValueError, match="how many robots, 1 to 100"):
+    with pytest.raises(ValueError, match="expected the number of robots, 1 to 100"):
         robot_names({"PRESAGE_FLEET": text})
 
 
 @pytest.mark.parametrize("argv", [["every", "child"], ["each"]])
 def test_words_that_make_no_sense_are_refused(argv, capsys):
     assert main(argv) == 2
-    assert "say each, together or once" in capsys.readouterr().err
+    assert "give each, together or once" in capsys.readouterr().err
 
 
 def test_one_that_dies_is_started_again_and_the_others_stay(fleet, tmp_path):
