@@ -24,7 +24,7 @@ PRELOADED_MODULES = (
     "common.router", "presage.cli.main", "services.controller.service", "services.estimator.service",
     "services.recorder.service", "services.simulator.service", "services.viewer.service",
 )  # fmt: skip
-PROJECT_PACKAGES = {"common", "presage", "services", "worlds", "models"}
+PROJECT_PACKAGES = {"common", "lab", "models", "presage", "services", "worlds"}
 LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 
 

@@ -336,7 +336,7 @@ def test_services_get_the_jobs_options():
         (("--worlds", "moon"), "no world 'moon'"),
         (("--worlds", ""), "--worlds ''"),
         (("--drives", "legs"), "--drives 'legs': choose from holonomic, differential"),
-        (("--drives", "holonomic,holonomic"), "give each once"),
+        (("--drives", "holonomic,holonomic"), "each only once"),
         (("--start", "maybe"), "--start 'maybe': choose from known, unknown"),
         (("--estimator", "paper"), "--estimator 'paper': choose from precise, particle-filter"),
         (("--prior", "command"), "--prior 'command'"),
