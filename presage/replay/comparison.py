@@ -12,13 +12,13 @@ from common.geometry import se2
 from common.messages.definitions import Belief, CmdVel, Stamped
 from services.recorder.files.message_counts import Sequence
 
-BIT_FOR_BIT = "state, pose, covariance, free energy"
-# Beliefs that both call tracking, where equality is not required:
+COMPARED_FIELDS = "state, pose, covariance, free energy"
+# Maximum difference of beliefs that are both in state tracking, if equality is not required:
 TOLERANCE_M, TOLERANCE_RAD = 0.01, 0.01
 
 
 def same_belief(a: Belief, b: Belief) -> bool:
-    """Whether pose, covariance and free energy are the same to the last bit."""
+    """Whether state, pose, covariance and free energy are identical to the last bit."""
     covariances = [None if c is None else c.tobytes() for c in (a.covariance, b.covariance)]
     return (
         a.pose == b.pose
@@ -29,97 +29,101 @@ def same_belief(a: Belief, b: Belief) -> bool:
 
 
 @dataclass
-class Pairs:
-    """Recorded and new messages of one kind; the k-th of a stamp belongs to the k-th of that stamp."""
+class MessagePairs:
+    """Compares recorded and new messages of one type; the k-th of a stamp is paired with the k-th of the same stamp."""
 
     compared: int = 0
     equal: int = 0
-    position_m: list[float] = field(default_factory=list)  # differences, of beliefs
+    position_m: list[float] = field(default_factory=list)  # differences between beliefs
     heading_rad: list[float] = field(default_factory=list)
-    tracking: list[bool] = field(default_factory=list)  # both say so
-    new_tracking: int = 0  # beliefs of now that say so
-    speed_most: float = 0.0  # m/s and rad/s, of commands
-    _waiting: dict[int, deque[tuple[bool, Stamped]]] = field(default_factory=lambda: defaultdict(deque))
+    tracking: list[bool] = field(default_factory=list)  # whether both beliefs are in state tracking
+    new_tracking: int = 0  # number of new beliefs in state tracking
+    max_speed_difference: float = 0.0  # m/s or rad/s, between commands
+    # Messages without their counterpart, by stamp: (whether new, message).
+    _unpaired: dict[int, deque[tuple[bool, Stamped]]] = field(default_factory=lambda: defaultdict(deque))
 
-    def recorded(self, message: Stamped) -> None:
-        """One of the recording."""
+    def add_recorded(self, message: Stamped) -> None:
+        """Adds a message of the recording."""
         self._match(message, new=False)
 
-    def new(self, message: Stamped) -> None:
-        """One of now."""
+    def add_new(self, message: Stamped) -> None:
+        """Adds a new message."""
         self.new_tracking += isinstance(message, Belief) and message.state == "tracking"
         self._match(message, new=True)
 
     def unmatched(self) -> Counter[str]:
-        """How many wait for their other half: ``recorded`` without a new one, ``new`` without a recorded one."""
-        left = [new for queue in self._waiting.values() for new, _ in queue]
+        """Number of messages without a counterpart: ``recorded`` without a new one, ``new`` without a recorded one."""
+        left = [new for queue in self._unpaired.values() for new, _ in queue]
         return Counter({"recorded": left.count(False), "new": left.count(True)})
 
     def _match(self, message: Stamped, *, new: bool) -> None:
-        queue = self._waiting[message.stamp_ns]
+        queue = self._unpaired[message.stamp_ns]
         if not queue or queue[0][0] == new:
             queue.append((new, message))
             return
         _, other = queue.popleft()
         if not queue:
-            del self._waiting[message.stamp_ns]
+            del self._unpaired[message.stamp_ns]
         self.compared += 1
         if isinstance(message, Belief) and isinstance(other, Belief):
-            self._beliefs(message, other)
+            self._compare_beliefs(message, other)
         elif isinstance(message, CmdVel) and isinstance(other, CmdVel):
             self.equal += message.twist == other.twist
-            self.speed_most = max(self.speed_most, float(np.abs(message.twist.array() - other.twist.array()).max()))
+            difference = float(np.abs(message.twist.array() - other.twist.array()).max())
+            self.max_speed_difference = max(self.max_speed_difference, difference)
 
-    def _beliefs(self, a: Belief, b: Belief) -> None:
+    def _compare_beliefs(self, a: Belief, b: Belief) -> None:
         self.equal += same_belief(a, b)
-        away = a.pose.array() - b.pose.array()
-        self.position_m.append(float(np.hypot(*away[:2])))
-        self.heading_rad.append(abs(float(se2.wrap(away[2]))))
+        difference = a.pose.array() - b.pose.array()
+        self.position_m.append(float(np.hypot(*difference[:2])))
+        self.heading_rad.append(abs(float(se2.wrap(difference[2]))))
         self.tracking.append(a.state == b.state == "tracking")
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain names, units in them; None where nothing was compared."""
+        """The results by names that contain their unit; None if nothing was compared."""
         both = np.array(self.tracking, bool)
-        where, turned = np.array(self.position_m), np.array(self.heading_rad)
+        position, heading = np.array(self.position_m), np.array(self.heading_rad)
 
-        def of(statistic: Any, values: Any) -> float | None:
+        def reduce(statistic: Any, values: Any) -> float | None:
             return float(statistic(values)) if len(values) else None
 
         left = self.unmatched()
         return {
             "compared": self.compared, "equal": self.equal,
             "recorded_without_new": left["recorded"], "new_without_recorded": left["new"],
-            "position_difference_median_m": of(np.median, where), "position_difference_max_m": of(np.max, where),
-            "heading_difference_max_rad": of(np.max, turned),
+            "position_difference_median_m": reduce(np.median, position),
+            "position_difference_max_m": reduce(np.max, position),
+            "heading_difference_max_rad": reduce(np.max, heading),
             "both_tracking": int(both.sum()),
-            "position_difference_tracking_max_m": of(np.max, where[both] if len(both) else where),
-            "heading_difference_tracking_max_rad": of(np.max, turned[both] if len(both) else turned),
+            "position_difference_tracking_max_m": reduce(np.max, position[both] if len(both) else position),
+            "heading_difference_tracking_max_rad": reduce(np.max, heading[both] if len(both) else heading),
         }  # fmt: skip
 
 
 @dataclass
-class Outcome:
-    """What it came to."""
+class ReplayOutcome:
+    """Result of running services on recorded inputs."""
 
-    imported: bool = field(default=False, kw_only=True)  # from a log, which holds no beliefs to compare with
-    lockstep: bool  # the session ran so, and runs so again: equality is required
-    why: str = ""  # it is not
-    beliefs: Pairs = field(default_factory=Pairs)
-    commands: Pairs = field(default_factory=Pairs)
+    imported: bool = field(default=False, kw_only=True)  # from a log, which contains no beliefs to compare with
+    lockstep: bool  # the session and the replay ran in lockstep, so that equality is required
+    why: str = ""  # why equality is not required
+    beliefs: MessagePairs = field(default_factory=MessagePairs)
+    commands: MessagePairs = field(default_factory=MessagePairs)
     scans: int = 0  # in the recording
-    numbers: Sequence = field(default_factory=Sequence)  # of all recorded scans
-    given: int = 0
-    left_out: int = 0  # never answered live
-    unanswered: int = 0  # now
-    goals_placed: bool = True  # between the beliefs where the controller took them
+    numbers: Sequence = field(default_factory=Sequence)  # sequence numbers of all recorded scans
+    given: int = 0  # scans sent to the services
+    left_out: int = 0  # scans without a recorded belief, which were not sent
+    unanswered: int = 0  # scans sent, but without a new belief
+    goals_placed: bool = True  # whether each goal was sent after the belief after which it was accepted live
     notes: list[str] = field(default_factory=list)
-    damaged: str = ""  # what kept the recording from being read to its end
+    damaged: str = ""  # why the recording could not be read to its end
 
     @property
     def good(self) -> bool:
-        """Equal bit for bit; where the session did not run in lockstep, within the tolerance once tracking.
+        """Whether the results agree.
 
-        Of an imported log: every scan was answered.
+        They must be identical; without lockstep, within the tolerance while tracking. For an imported log, every scan
+        must have been answered.
         """
         pairs, left = self.beliefs, self.beliefs.unmatched()["recorded"]
         if self.damaged:
@@ -127,16 +131,15 @@ class Outcome:
         if self.imported:
             return self.given > self.unanswered == 0
         if self.lockstep:
-            driven = self.commands.compared == self.commands.equal or not self.goals_placed
-            return 0 < pairs.compared == pairs.equal and not left and driven
+            commands_agree = self.commands.compared == self.commands.equal or not self.goals_placed
+            return 0 < pairs.compared == pairs.equal and not left and commands_agree
         numbers = pairs.as_dict()
-        most_m, most_rad = (
-            numbers[f"{what}_difference_tracking_max_{unit}"] for what, unit in (("position", "m"), ("heading", "rad"))
-        )
-        return pairs.compared > 0 and (most_m or 0.0) <= TOLERANCE_M and (most_rad or 0.0) <= TOLERANCE_RAD
+        position_m = numbers["position_difference_tracking_max_m"] or 0.0
+        heading_rad = numbers["heading_difference_tracking_max_rad"] or 0.0
+        return bool(pairs.compared > 0 and position_m <= TOLERANCE_M and heading_rad <= TOLERANCE_RAD)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values."""
+        """The results as values that JSON can hold."""
         return {
             "imported": self.imported, "tracking": self.beliefs.new_tracking,
             "lockstep": self.lockstep, "why_not": self.why, "good": self.good, "damaged": self.damaged,
@@ -144,7 +147,7 @@ class Outcome:
             "scans_unanswered": self.unanswered, "beliefs": self.beliefs.as_dict(),
             "commands": {
                 "compared": self.commands.compared, "equal": self.commands.equal,
-                "difference_max_m_s": self.commands.speed_most,
+                "difference_max_m_s": self.commands.max_speed_difference,
             },
             "tolerance_m": 0.0 if self.lockstep else TOLERANCE_M,
             "tolerance_rad": 0.0 if self.lockstep else TOLERANCE_RAD,

@@ -8,20 +8,20 @@ from collections.abc import Iterable
 from common.messages.definitions import CmdVel, Stamped, Status
 
 
-class Goals:
-    """Gathers statuses and commands of one controller, in order.
+class GoalTimes:
+    """Infers from the statuses and commands of a controller when it accepted each goal.
 
-    A belief is answered by a status and a command of its stamp, a goal by a status alone, of the last belief's stamp.
+    For a belief, the controller publishes a status and a command with its stamp; for a goal, only a status, with the
+    stamp of the last belief. A status without a command therefore is an accepted goal.
     """
 
     def __init__(self) -> None:
-        """Nothing seen."""
-        self._surplus: Counter[int] = Counter()  # statuses less commands, by stamp
+        self._surplus: Counter[int] = Counter()  # number of statuses minus commands, by stamp
         self._first: Status | None = None
-        self._last = 0
+        self._last = 0  # stamp of the last status
 
-    def see(self, messages: Iterable[Stamped]) -> None:
-        """All of a recording's."""
+    def add(self, messages: Iterable[Stamped]) -> None:
+        """Adds statuses and commands in their recorded order."""
         for message in messages:
             if isinstance(message, Status):
                 self._first = self._first or message
@@ -30,16 +30,16 @@ class Goals:
             elif isinstance(message, CmdVel):
                 self._surplus[message.stamp_ns] -= 1
 
-    def taken(self, count: int) -> Counter[int | None] | None:
-        """How many of ``count`` goals were taken after the belief of each stamp (None: before the first of all).
+    def accepted(self, count: int) -> Counter[int | None] | None:
+        """How many of ``count`` goals were accepted after the belief of each stamp; key None is before the first.
 
-        None where statuses and goals do not add up: a message is missing, or the recording began in between.
+        Returns None if statuses and goals do not match: a message is missing, or the recording began later.
         """
-        found: Counter[int | None] = Counter({stamp: n for stamp, n in self._surplus.items() if n > 0})
-        if sum(found.values()) == count + 1 and found[self._last]:  # the recording ended between the two
-            found[self._last] -= 1
-        if sum(found.values()) != count or self._first is None:
+        accepted: Counter[int | None] = Counter({stamp: n for stamp, n in self._surplus.items() if n > 0})
+        if sum(accepted.values()) == count + 1 and accepted[self._last]:  # the recording ended before the last command
+            accepted[self._last] -= 1
+        if sum(accepted.values()) != count or self._first is None:
             return None
         if self._first.goal is not None and self._first.distance is None:
-            found[None] = found.pop(self._first.stamp_ns, 0)
-        return found
+            accepted[None] = accepted.pop(self._first.stamp_ns, 0)
+        return accepted

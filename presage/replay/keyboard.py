@@ -14,16 +14,16 @@ from contextlib import contextmanager
 from common.messages.requests import PlayerReply, PlayerRequest
 from services.recorder.replaying.replay import ReplayControl
 
-HELP = "space pause/go on, . one scan, left/right or h/l 5 s back/on, down/up slower/faster, q quit"
-JUMP = 5.0  # s
+HELP = "space: pause/resume, .: one scan, left/right or h/l: 5 s back/forward, down/up: slower/faster, q: quit"
+JUMP_S = 5.0
 QUIT = "q"
-# What a terminal sends for the arrows, in both of its modes.
+# Escape sequences of the arrow keys, in both modes of a terminal.
 ARROWS = {b"\x1b[A": "up", b"\x1b[B": "down", b"\x1b[C": "l", b"\x1b[D": "h"}
 ARROWS |= {code.replace(b"[", b"O"): key for code, key in ARROWS.items()}
 
 
 def pressed(data: bytes) -> list[str]:
-    """The keys in what a terminal sent; what is none of them is a key by its own letter."""
+    """Parses the bytes sent by a terminal as keys; arrows get a name, all others are their character."""
     keys: list[str] = []
     while data:
         if data[:3] in ARROWS:
@@ -36,14 +36,14 @@ def pressed(data: bytes) -> list[str]:
 
 
 def request_of(key: str, state: PlayerReply) -> PlayerRequest | None:
-    """What a key asks of a replay in this state; None: nothing."""
+    """The request for a replay in the given state; None if the key has no function."""
     if key == " ":
         return PlayerRequest(action="resume" if state.paused else "pause")
     if key == ".":
         return PlayerRequest(action="step")
     if key in {"h", "l"}:
-        place = state.position_s + (JUMP if key == "l" else -JUMP)
-        return PlayerRequest(action="seek", value=place)
+        position_s = state.position_s + (JUMP_S if key == "l" else -JUMP_S)
+        return PlayerRequest(action="seek", value=position_s)
     if key in {"up", "down"}:
         return PlayerRequest(action="rate", value=(state.rate or 1.0) * (2.0 if key == "up" else 0.5))
     return None
@@ -51,24 +51,24 @@ def request_of(key: str, state: PlayerReply) -> PlayerRequest | None:
 
 @contextmanager
 def keyboard(remote: ReplayControl) -> Iterator[bool]:
-    """Keys of the terminal on standard input, if it is one, steer the replay; whether it is."""
+    """Controls the replay with the keyboard in the block; yields False if standard input is not a usable terminal."""
     try:
         terminal = sys.stdin.fileno()
-        before = termios.tcgetattr(terminal)
-    except (OSError, ValueError, termios.error):  # a pipe, a file, nothing
+        attributes = termios.tcgetattr(terminal)
+    except (OSError, ValueError, termios.error):  # standard input is a pipe, a file or closed
         yield False
         return
-    if os.tcgetpgrp(terminal) != os.getpgrp():  # in the background, where reading would stop us
+    if os.tcgetpgrp(terminal) != os.getpgrp():  # reading in a background process would stop it
         yield False
         return
     wake, waker = os.pipe()
     thread = threading.Thread(target=_listen, args=(terminal, wake, remote), name="keyboard", daemon=True)
     try:
-        tty.setcbreak(terminal)  # Ctrl-C stays what it is
+        tty.setcbreak(terminal)  # keys come without Enter; Ctrl-C still raises KeyboardInterrupt
         thread.start()
         yield True
     finally:
-        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+        termios.tcsetattr(terminal, termios.TCSADRAIN, attributes)
         os.close(waker)
         if thread.ident is not None:
             thread.join(1.0)
@@ -79,7 +79,7 @@ def _listen(terminal: int, wake: int, remote: ReplayControl) -> None:
     while True:
         ready, _, _ = select.select([terminal, wake], [], [])
         data = b"" if wake in ready else os.read(terminal, 64)
-        if not data:  # the end of the replay, or of the terminal
+        if not data:  # the replay has ended, or the terminal was closed
             return
         for key in pressed(data):
             if key == QUIT:

@@ -36,13 +36,13 @@ COLUMNS = (
     "stamp", "x", "y", "yaw", "cov_xx", "cov_xy", "cov_xyaw", "cov_yy", "cov_yyaw", "cov_yawyaw",
     "free_energy", "state", "update_ms",
 )  # fmt: skip
-STAMP_ROUNDING_S = 1e-6  # a double cannot hold a stamp of 2020 more precisely
-UPPER = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+STAMP_ROUNDING_S = 1e-6  # precision of a double for a stamp of the year 2020
+UPPER_TRIANGLE = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
 
 
 @dataclass(frozen=True)
 class LocalizeOptions:
-    """What to localise, how, and where the result goes."""
+    """Options of `presage localize`."""
 
     file: Path
     choice: Choice
@@ -50,24 +50,35 @@ class LocalizeOptions:
     fresh: bool = False
     odometry: bool = True
     frame: Literal["base_link", "laser"] = "base_link"
-    reading: Reading = Reading()  # noqa: RUF009 - frozen; what is said about a log
-    out: Path | None = None
-    start: float | None = None  # s from the first scan; None: from it on
-    end: float | None = None  # s from the first scan, negative: from the last; None: to it
-    every: int = 1  # of the scans between these, each N-th
+    reading: Reading = Reading()  # noqa: RUF009 - frozen
+    out: Path | None = None  # CSV or JSON; defaults to CSV on standard output
+    start: float | None = None  # s after the first scan; defaults to the first scan
+    end: float | None = None  # s after the first scan, or if negative, from the last; defaults to the last scan
+    every: int = 1  # use every N-th scan between these
 
     @classmethod
     def of(
-        cls, file: Path, choice: Choice, mode: str, frame: str, reading: Reading, *, fresh: bool, odometry: bool,
-        out: Path | None, start: float | None = None, end: float | None = None, every: int = 1,
-    ) -> LocalizeOptions:  # fmt: skip
-        """From the command line's words; raises UserError on one that is not known."""
+        cls,
+        file: Path,
+        choice: Choice,
+        mode: str,
+        frame: str,
+        reading: Reading,
+        *,
+        fresh: bool,
+        odometry: bool,
+        out: Path | None,
+        start: float | None = None,
+        end: float | None = None,
+        every: int = 1,
+    ) -> LocalizeOptions:
+        """Checks the options of the command line; raises UserError if a value is unknown."""
         if mode not in ("global", "track"):
             raise UserError(f"no mode {mode!r}: choose global or track")
         if frame not in ("base_link", "laser"):
             raise UserError(f"no frame {frame!r}: choose base_link or laser")
         if out is not None and out.suffix not in (".csv", ".json"):
-            raise UserError(f"{out}: the result is written as .csv or .json")
+            raise UserError(f"{out}: the name of the result must end with .csv or .json")
         return cls(file, choice, mode, fresh, odometry, frame, reading, out, start, end, every)  # type: ignore[arg-type]
 
 
@@ -81,40 +92,44 @@ def choice_of(
     seed: int,
     initial_pose: str,
 ) -> Choice:
-    """From the command line's words; the world is the recording's where none is named."""
+    """The estimator chosen on the command line; the world defaults to that of the recording.
+
+    Raises UserError if the estimator is unknown or there is no world.
+    """
     if estimator not in get_args(Name):
         raise UserError(f"no estimator {estimator!r}: choose one of {', '.join(get_args(Name))}")
     pose = pose_of_text(initial_pose, "--initial-pose") if initial_pose else None
     if not world:
         if kind_of(file) != "recording":
-            raise UserError(f"{file}: a log does not say which world it is of: name it with --world")
+            raise UserError(f"{file}: a log does not state its world: give it with --world")
         recorded = read_recording(file).world()
         if recorded is None:
-            raise UserError(f"{file}: no world was recorded: name it with --world")
+            raise UserError(f"{file}: no world was recorded: give one with --world")
         return Choice(recorded, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
     return Choice(world, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
 
 
 def localize(job: LocalizeOptions, console: Console) -> list[dict[str, Any]]:
-    """A row for each scan, written as it is computed; raises UserError in one line.
+    """Localises each scan; writes the rows as they are computed, prints a summary and returns the rows.
 
-    Ctrl-C prints what was done, then raises KeyboardInterrupt.
+    After Ctrl-C, prints the summary of the scans so far and raises KeyboardInterrupt.
     """
     check_file(job.out, "--out")
     if job.choice.initial_pose is not None:
         if job.mode == "global":
-            raise UserError("--initial-pose is where mode track begins: add --mode track, or leave it out")
+            raise UserError("--initial-pose is for mode track only: add --mode track, or leave it out")
         world = job.choice.world
         check_start(job.choice, load_world(world) if isinstance(world, str) else world)
     laser, kind = job.frame == "laser", kind_of(job.file)
     with working(f"preparing {job.choice.estimator} for {job.choice.world_argument}", console):
         make = prepare(replace(job.choice, initial_pose=None))
     with working(f"reading {job.file.name}", console):
-        # An .npz's poses are the laser's where that is asked for; of every other file it is known where the laser sits.
-        itself = laser and kind == "npz"
-        read = read_scans(job.file, np.zeros(3) if itself else None, job.reading)
-    read.print_notes(console)
-    scans = chosen(job, read)
+        # With --frame laser, the poses in an .npz file are those of the laser, as if its mount were zero. For other
+        # files, base_link is localised and the result transformed.
+        mount = np.zeros(3) if laser and kind == "npz" else None
+        all_scans = read_scans(job.file, mount, job.reading)
+    all_scans.print_notes(console)
+    scans = select_scans(job, all_scans)
     start, count = _start(job, scans), len(scans.ranges)
     estimator = make(scans.geometry)
     rows: list[dict[str, Any]] = []
@@ -126,26 +141,27 @@ def localize(job: LocalizeOptions, console: Console) -> list[dict[str, Any]]:
                 if job.fresh and k:
                     estimator.restart(start)
                 observation = scans.observation(k, odometry=job.odometry)
-                began = time.perf_counter()
+                started = time.perf_counter()
                 posterior = estimator.update(observation)
-                row = _row(scans, k, posterior, (time.perf_counter() - began) * 1e3, laser=laser)
+                row = _row(scans, k, posterior, (time.perf_counter() - started) * 1e3, laser=laser)
                 write(row)
                 rows.append(row)
     except KeyboardInterrupt:
         with ignoring_interrupts():
-            _summarise(scans, rows, len(read.ranges), console, laser=laser)
-            place = "" if job.out is None else f"; {job.out} holds their rows"
-            console.print(f"interrupted after {len(rows)} of {count} scans{place}", highlight=False, soft_wrap=True)
+            _summarise(scans, rows, len(all_scans.ranges), console, laser=laser)
+            where = "" if job.out is None else f"; their rows are in {job.out}"
+            console.print(f"interrupted after {len(rows)} of {count} scans{where}", highlight=False, soft_wrap=True)
         raise
-    _summarise(scans, rows, len(read.ranges), console, laser=laser)
+    _summarise(scans, rows, len(all_scans.ranges), console, laser=laser)
     return rows
 
 
-def chosen(job: LocalizeOptions, scans: Scans) -> Scans:
-    """The scans of --start, --end and --every; UserError where there are none."""
+def select_scans(job: LocalizeOptions, scans: Scans) -> Scans:
+    """The scans selected by --start, --end and --every; raises UserError if there are none."""
     if job.start is None and job.end is None and job.every == 1:
         return scans
-    if scans.stamps is None:  # without them an estimator takes each scan for the next of a scanner's usual rate
+    # Without stamps, an estimator assumes that each scan follows the one before at a usual rate.
+    if scans.stamps is None:
         raise UserError(f"{job.file}: its scans have no stamps, which --start, --end and --every need")
     since = scans.stamps - scans.stamps[0]
     first, last = span(float(since[-1]), job.start, job.end)
@@ -156,7 +172,7 @@ def chosen(job: LocalizeOptions, scans: Scans) -> Scans:
 
 
 def _numbers(job: LocalizeOptions, count: int, console: Console) -> Generator[int]:
-    """0 to count - 1 with progress shown, but on a terminal where the rows themselves appear."""
+    """Yields 0 to count - 1 and shows the progress, unless the rows themselves are printed to the same terminal."""
     if job.out is None and sys.stdout.isatty() and console.is_terminal:
         yield from range(count)
         return
@@ -164,7 +180,7 @@ def _numbers(job: LocalizeOptions, count: int, console: Console) -> Generator[in
 
 
 def _start(job: LocalizeOptions, scans: Scans) -> Array | None:
-    """Mode track: the pose given on the command line, in the file, or the truth of a recording."""
+    """The start pose (3,) for mode track, from the command line, the file, or its reference; None for mode global."""
     if job.mode == "global":
         return None
     if job.choice.initial_pose is not None:
@@ -174,19 +190,19 @@ def _start(job: LocalizeOptions, scans: Scans) -> Array | None:
     if scans.truth is not None and np.isfinite(scans.truth[0]).all():
         return np.asarray(scans.truth[0])
     raise UserError(
-        f"{job.file}: mode track needs the pose of the first scan: --initial-pose x,y,deg, or a reference in the file "
-        "(its initial_pose only counts without --start)"
+        f"{job.file}: mode track needs the pose of the first scan: give --initial-pose x,y,deg, or a file with a "
+        "reference (its initial_pose is used only without --start)"
     )
 
 
 def _row(scans: Scans, k: int, posterior: Posterior, update_ms: float, *, laser: bool) -> dict[str, Any]:
     pose, covariance = posterior.pose, posterior.covariance
     mount = scans.geometry.mount
-    if laser and mount.any():  # a recording: inference is about base_link
+    if laser and mount.any():  # the estimator localises base_link
         by_pose, _ = se2.compose_jacobians(pose, mount)
         pose = se2.compose(pose, mount)
         covariance = None if covariance is None else by_pose @ covariance @ by_pose.T
-    values = [None if covariance is None else float(covariance[i, j]) for i, j in UPPER]
+    values = [None if covariance is None else float(covariance[i, j]) for i, j in UPPER_TRIANGLE]
     stamp = None if scans.stamps is None else float(scans.stamps[k])
     numbers = [stamp, *map(float, pose), *values, posterior.free_energy, posterior.state, round(update_ms, 3)]
     return dict(zip(COLUMNS, numbers, strict=True))
@@ -194,7 +210,7 @@ def _row(scans: Scans, k: int, posterior: Posterior, update_ms: float, *, laser:
 
 @contextmanager
 def _output(job: LocalizeOptions, count: int) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """The function that writes a row: CSV at once; JSON at the end, also of an interrupted run."""
+    """Yields the function that writes a row: at once for CSV; at the end for JSON, also after an interruption."""
     if job.out is not None and job.out.suffix == ".json":
         rows: list[dict[str, Any]] = []
         try:
@@ -210,7 +226,7 @@ def _output(job: LocalizeOptions, count: int) -> Iterator[Callable[[dict[str, An
 
         def write(row: dict[str, Any]) -> None:
             writer.writerow(row)
-            stream.flush()  # whatever ends the run, and however, the rows so far are in the file
+            stream.flush()  # so that the rows so far are in the file however the run ends
 
         yield write
     finally:
@@ -229,17 +245,16 @@ def _write_json(job: LocalizeOptions, out: Path, rows: list[dict[str, Any]], *, 
 
 
 def _summarise(scans: Scans, rows: list[dict[str, Any]], in_file: int, console: Console, *, laser: bool) -> None:
-    """A line or two for a human, beside the table; nothing without rows."""
+    """Prints states, computing time and errors of the rows; nothing if there are no rows."""
     if not rows:
         return
     states: dict[str, int] = {}
     for row in rows:
         states[row["state"]] = states.get(row["state"], 0) + 1
     scans_done = f"{len(rows)} scans" if len(rows) == in_file else f"{len(rows)} of {in_file} scans"
-    console.print(
-        f"{scans_done}: " + ", ".join(f"{count} {state}" for state, count in states.items())
-        + f"; update {np.median([row['update_ms'] for row in rows]):.2f} ms median"
-    )  # fmt: skip
+    counts = ", ".join(f"{count} {state}" for state, count in states.items())
+    update_ms = np.median([row["update_ms"] for row in rows])
+    console.print(f"{scans_done}: {counts}; update {update_ms:.2f} ms median")
     if scans.truth is None:
         return
     truth = scans.truth[: len(rows)]
@@ -249,5 +264,5 @@ def _summarise(scans: Scans, rows: list[dict[str, Any]], in_file: int, console: 
     if len(error):
         console.print(
             f"against {scans.truth_is}: {np.median(error) * 1e3:.1f} mm median, "
-            f"{np.sqrt(np.mean(error**2)) * 1e3:.1f} mm RMS, {error.max() * 1e3:.1f} mm at most"
+            f"{np.sqrt(np.mean(error**2)) * 1e3:.1f} mm RMS, {error.max() * 1e3:.1f} mm maximum"
         )

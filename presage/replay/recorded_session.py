@@ -19,45 +19,48 @@ from services.estimator.settings import EstimatorSettings
 from services.recorder.reader import Recording
 
 SETTINGS: dict[str, type[ServiceSettings]] = {"estimator": EstimatorSettings, "controller": ControllerSettings}
-OWN = frozenset({"config", "print_config", *ServiceSettings.model_fields})  # of the process, not of the method
-FILE = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*\.safetensors")  # a name, never a path
+# Settings of the process such as endpoints, which must not be taken from a recording.
+PROCESS_SETTINGS = frozenset({"config", "print_config", *ServiceSettings.model_fields})
+WEIGHTS_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*\.safetensors")  # a file name, never a path
 
 
 @dataclass(frozen=True)
-class Unpacked:
-    """Settings of one service that lead to what was recorded, and what is worth saying about them."""
+class RecordedSettings:
+    """Settings of one service as recorded, with notes for the user."""
 
-    values: dict[str, Any]  # plain types, by the names of the settings
+    values: dict[str, Any]  # by name of the setting
     notes: tuple[str, ...] = ()
 
 
 def robot_of(recording: Recording) -> str:
-    """Whose session it is; of several robots the one it was recorded for."""
+    """The robot of the session; of several robots, the one for which the recording was made."""
     there = dict.fromkeys(key.split("/")[1] for key in recording.counts() if key.startswith(f"{ROOT}/"))
     named = recording.metadata.get("presage", {}).get("robot", "")
     return named if named in there or not there else next(iter(there))
 
 
-def recorded_settings(recording: Recording, service: str) -> Unpacked | None:
-    """As the service said of itself, less what is about its process; None where it was not recorded."""
+def recorded_settings(recording: Recording, service: str) -> RecordedSettings | None:
+    """The recorded settings of a service, without those of its process; None if they were not recorded."""
     try:
         config = json.loads(recording.metadata[f"config:{service}"]["config"])
         known = SETTINGS[service].model_fields
-        values = {name: value for name, value in dict(config).items() if name not in OWN}
+        values = {name: value for name, value in dict(config).items() if name not in PROCESS_SETTINGS}
     except KeyError:
         return None
     except (ValueError, TypeError):
-        raise UserError(f"{recording.path}: the recorded configuration of the {service} is no JSON map") from None
-    strange = sorted(values.keys() - known.keys())
-    notes = (f"settings of the {service} that this version does not know: {', '.join(strange)}",) if strange else ()
-    return Unpacked({name: value for name, value in values.items() if name in known}, notes)
+        raise UserError(f"{recording.path}: the recorded configuration of the {service} is not a JSON object") from None
+    unknown = sorted(values.keys() - known.keys())
+    notes = (f"settings of the {service} that this version does not know: {', '.join(unknown)}",) if unknown else ()
+    return RecordedSettings({name: value for name, value in values.items() if name in known}, notes)
 
 
-def estimator_settings(recording: Recording, folder: Path, values: dict[str, Any], *, weights: bool = True) -> Unpacked:
-    """``values`` with world and (``weights``) model as recorded, written into ``folder`` where they are in the file.
+def estimator_settings(
+    recording: Recording, folder: Path, values: dict[str, Any], *, weights: bool = True
+) -> RecordedSettings:
+    """``values`` with the recorded world and, with ``weights``, the recorded model, written as files into ``folder``.
 
-    Weights that are not in the file are looked for where they lay, then among the shipped ones, and taken only if
-    their card, and their digest where it was recorded, are the recorded ones; else UserError.
+    Weights that are not in the recording are searched in their recorded folder, then among the shipped weights. Raises
+    UserError unless their card, and their digest if it was recorded, are the recorded ones.
     """
     values = dict(values)
     if (world := world_file(recording, folder)) is not None:
@@ -66,20 +69,22 @@ def estimator_settings(recording: Recording, folder: Path, values: dict[str, Any
         values.get("estimator", "precise") == "precise" and values.get("model", "learned") != "exact"
     )
     if not learned or not weights:
-        return Unpacked(values)
+        return RecordedSettings(values)
     model = recording.metadata.get("model", {})
     if not model.get("file") or model.get("estimator") != values.get("estimator", "precise"):
-        return Unpacked(values, ("the recording does not say which weights were used: those of this world here are",))
-    if not FILE.fullmatch(model["file"]):
-        raise UserError(f"{recording.path}: weights are named {model['file']!r}, which is no file name")
-    found = _from_file(recording, folder, model) or _from_disk(recording, values, model)
-    values |= {"models": str(found.parent), "model": "learned"}
-    return Unpacked(values)
+        return RecordedSettings(
+            values, ("the recording does not state which weights were used: using those of this world",)
+        )
+    if not WEIGHTS_NAME.fullmatch(model["file"]):
+        raise UserError(f"{recording.path}: weights are named {model['file']!r}, which is not a file name")
+    weights_file = _extract_weights(recording, folder, model) or _find_weights(recording, values, model)
+    values |= {"models": str(weights_file.parent), "model": "learned"}
+    return RecordedSettings(values)
 
 
 def check_mount(recording: Recording, settings: EstimatorSettings) -> None:
-    """Raises UserError where a recording's mount is only assumed and the weights were trained with another."""
-    from presage.logs.scan_files import mount_assumed  # noqa: PLC0415 - numba takes its time
+    """Raises UserError if the recording's mount is only assumed and the weights were trained with another mount."""
+    from presage.logs.scan_files import mount_assumed  # noqa: PLC0415 - slow import of numba
     from services.estimator.factory import Geometry  # noqa: PLC0415
     from services.estimator.service import Models  # noqa: PLC0415
 
@@ -89,7 +94,7 @@ def check_mount(recording: Recording, settings: EstimatorSettings) -> None:
 
 
 def world_file(recording: Recording, folder: Path) -> Path | None:
-    """The estimator's map, else the world of the session, as a file; None where neither was recorded."""
+    """Writes the estimator's map, else the world of the session, to a file; None if neither was recorded."""
     text = recording.attachments.get("model/world.yaml", recording.attachments.get("world.yaml"))
     if text is None:
         return None
@@ -98,17 +103,19 @@ def world_file(recording: Recording, folder: Path) -> Path | None:
 
 
 def other_versions(recording: Recording, service: str) -> dict[str, tuple[str, str]]:
-    """Of packages (and the commit): recorded and here, where they differ."""
-    said = recording.metadata.get(f"config:{service}", {})
-    return {name: (said[name], here) for name, here in versions().items() if name in said and said[name] != here}
+    """Packages (and the commit) whose version differs: {name: (recorded version, version here)}."""
+    recorded = recording.metadata.get(f"config:{service}", {})
+    return {
+        name: (recorded[name], here) for name, here in versions().items() if name in recorded and recorded[name] != here
+    }
 
 
-def _from_file(recording: Recording, folder: Path, model: dict[str, str]) -> Path | None:
+def _extract_weights(recording: Recording, folder: Path, model: dict[str, str]) -> Path | None:
     data = recording.attachments.get(f"model/{model['file']}")
     if data is None:
         return None
     if model.get("sha256") and hashlib.sha256(data).hexdigest() != model["sha256"]:
-        raise UserError(f"{recording.path}: the weights in it are damaged: their digest is not the recorded one")
+        raise UserError(f"{recording.path}: the weights in it are damaged: their digest differs from the recorded one")
     (folder / "models").mkdir(exist_ok=True)
     path = folder / "models" / model["file"]
     path.write_bytes(data)
@@ -117,28 +124,28 @@ def _from_file(recording: Recording, folder: Path, model: dict[str, str]) -> Pat
     return path
 
 
-def _from_disk(recording: Recording, values: dict[str, Any], model: dict[str, str]) -> Path:
-    """Those of the recorded folder or the shipped ones, if they are the recorded ones."""
-    from services.estimator.precise.learning.weights import FOLDER  # noqa: PLC0415 - numba takes its time
+def _find_weights(recording: Recording, values: dict[str, Any], model: dict[str, str]) -> Path:
+    """The recorded weights in the recorded folder or among the shipped ones; raises UserError if they are not there."""
+    from services.estimator.precise.learning.weights import FOLDER  # noqa: PLC0415 - slow import of numba
 
     folders = [Path(values["models"])] if values.get("models") else []
-    asked = Path(str(values.get("model", "")))
-    candidates = [asked] if asked.suffix == ".safetensors" else []
+    recorded_file = Path(str(values.get("model", "")))
+    candidates = [recorded_file] if recorded_file.suffix == ".safetensors" else []
     candidates += [folder / model["file"] for folder in (*folders, FOLDER)]
     for path in candidates:
-        if path.name == model["file"] and _same(path, model):
+        if path.name == model["file"] and _are_recorded_weights(path, model):
             return path
     raise UserError(
-        f"{recording.path}: the weights {model['file']} are not in it, and none here are the recorded ones (looked at "
-        f"{', '.join(map(str, candidates))}); put them there, or choose a model with `presage rerun --model`"
+        f"{recording.path}: the weights {model['file']} are not in it, and none here are the recorded ones (searched "
+        f"{', '.join(map(str, candidates))}); copy them there, or choose a model with `presage rerun --model`"
     )
 
 
-def _same(path: Path, model: dict[str, str]) -> bool:
+def _are_recorded_weights(path: Path, model: dict[str, str]) -> bool:
     try:
         cards = [json.loads(text) for text in (path.with_suffix(".json").read_text(encoding="utf-8"), model["card"])]
         for card in cards:
-            card.pop("weights_sha256", None)  # the same weights had a card without it before it existed
+            card.pop("weights_sha256", None)  # older cards of the same weights lack it
         digest = hashlib.sha256(path.read_bytes()).hexdigest() if model.get("sha256") else ""
         return bool(cards[0] == cards[1]) and digest == model.get("sha256", "")
     except (OSError, ValueError, KeyError, AttributeError):

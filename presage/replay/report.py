@@ -18,13 +18,13 @@ from common.geometry.se2 import Array
 from common.messages.definitions import Belief, Truth
 from presage.plotting.style import COLOURS, figure_of, legend_below, log_metres
 
-OLD = "#444444"
-SMALLEST = 1e-4  # m, the least a logarithmic axis shows
+RECORDED_COLOUR = "#444444"
+MIN_LOG_VALUE = 1e-4  # m, lower limit of the logarithmic axis
 
 
 @dataclass
-class Series:
-    """Beliefs of one estimator, as they came."""
+class BeliefSeries:
+    """The beliefs of one estimator, in the order in which they came."""
 
     name: str = ""
     stamps: list[int] = field(default_factory=list)
@@ -32,187 +32,193 @@ class Series:
     poses: list[Array] = field(default_factory=list)
     covariances: list[Array | None] = field(default_factory=list)
     states: list[str] = field(default_factory=list)
-    took_ms: list[float] = field(default_factory=list)
+    update_ms: list[float] = field(default_factory=list)
 
-    def add(self, belief: Belief, logged_ns: int, took_ms: float) -> None:
-        """One more, and the time it took."""
+    def add(self, belief: Belief, logged_ns: int, update_ms: float) -> None:
+        """Adds a belief and the time that it took to compute."""
         self.name = self.name or belief.estimator or "recorded"
         self.stamps.append(belief.stamp_ns)
         self.logged.append(logged_ns)
         self.poses.append(belief.pose.array())
         self.covariances.append(belief.covariance)
         self.states.append(belief.state)
-        self.took_ms.append(took_ms)
+        self.update_ms.append(update_ms)
 
     def index(self) -> dict[tuple[int, int], int]:
-        """Place of the k-th belief of each stamp: a session begun anew uses stamps again."""
-        seen: dict[int, int] = defaultdict(int)
-        found = {}
-        for place, stamp in enumerate(self.stamps):
-            found[stamp, seen[stamp]] = place
-            seen[stamp] += 1
-        return found
+        """Index of each belief by (stamp, k), the k-th of that stamp: a restarted simulation uses stamps again."""
+        counts: dict[int, int] = defaultdict(int)
+        result = {}
+        for index, stamp in enumerate(self.stamps):
+            result[stamp, counts[stamp]] = index
+            counts[stamp] += 1
+        return result
 
 
 @dataclass
-class Track:
-    """What a pass over a recording gathers: some hundred bytes a scan."""
+class ComparisonBuilder:
+    """Collects beliefs and truth in a pass over a recording; needs some hundred bytes for each scan."""
 
-    old: Series
-    new: Series
-    scanned_ns: int = 0  # when the last scan was published
+    old: BeliefSeries
+    new: BeliefSeries
+    last_scan_ns: int = 0  # time of publication of the last scan
+    # By stamp: (time of logging in ns, pose).
     _truths: dict[int, list[tuple[int, Array]]] = field(default_factory=lambda: defaultdict(list))
 
-    def true(self, truth: Truth, logged_ns: int) -> None:
-        """Where the robot was."""
+    def add_truth(self, truth: Truth, logged_ns: int) -> None:
+        """Adds a true pose."""
         self._truths[truth.stamp_ns].append((logged_ns, truth.pose.array()))
 
     def compare(self) -> Comparison:
-        """On the scans both answered; on all where there are no old answers."""
+        """Compares the beliefs of the scans that both answered; of all scans if there are no recorded beliefs."""
         old, new = self.old.index(), self.new.index()
         both = [key for key in new if key in old] if old else list(new)
         rows = [new[key] for key in both]
         stamps = np.array([self.new.stamps[row] for row in rows], np.int64)
         return Comparison(
             stamps,
-            self._part(self.old, [old[key] for key in both] if old else []),
-            self._part(self.new, rows),
+            self._evaluate(self.old, [old[key] for key in both] if old else []),
+            self._evaluate(self.new, rows),
             {"recorded": len(self.old.stamps), "new": len(self.new.stamps)},
         )
 
-    def _part(self, series: Series, rows: list[int]) -> Part:
+    def _evaluate(self, series: BeliefSeries, rows: list[int]) -> EstimatorResult:
         poses = np.array([series.poses[row] for row in rows]).reshape(-1, 3)
         true = np.array([self._true_pose(series, row) for row in rows]).reshape(-1, 3)
         errors = poses - true
         errors[:, 2] = se2.wrap(errors[:, 2])
-        return Part(
-            series.name, poses, errors, [series.covariances[row] for row in rows],
+        return EstimatorResult(
+            series.name,
+            poses,
+            errors,
+            [series.covariances[row] for row in rows],
             np.array([series.states[row] == "tracking" for row in rows], bool),
-            np.array([series.took_ms[row] for row in rows]),
-        )  # fmt: skip
+            np.array([series.update_ms[row] for row in rows]),
+        )
 
-    def _true_pose(self, series: Series, row: int) -> Array:
-        found = self._truths.get(series.stamps[row])
-        if not found:
+    def _true_pose(self, series: BeliefSeries, row: int) -> Array:
+        truths = self._truths.get(series.stamps[row])
+        if not truths:
             return np.full(3, np.nan)
-        return min(found, key=lambda entry: abs(entry[0] - series.logged[row]))[1]
+        return min(truths, key=lambda entry: abs(entry[0] - series.logged[row]))[1]
 
 
 @dataclass
-class Part:
-    """One of the two."""
+class EstimatorResult:
+    """The beliefs of one estimator on the compared scans."""
 
     name: str
     poses: Array  # (N, 3)
-    errors: Array  # (N, 3) m, m, rad from the truth; NaN where none was recorded
+    errors: Array  # (N, 3) m, m, rad against the truth; NaN where none was recorded
     covariances: list[Array | None]
     tracking: np.ndarray[Any, np.dtype[np.bool_]]  # (N,)
-    took_ms: Array  # (N,)
+    update_ms: Array  # (N,)
 
     @property
     def beliefs(self) -> int:
-        """How many."""
+        """Number of beliefs."""
         return len(self.poses)
 
     @property
     def position(self) -> Array:
-        """(N,) m from the truth."""
+        """Position errors (N,) m."""
         return np.asarray(np.hypot(self.errors[:, 0], self.errors[:, 1]), float)
 
     def nees(self) -> Array:
-        """(M,) normalised estimation error squared of those tracking; 3 on average where covariances are right."""
-        found = []
+        """Normalised estimation errors squared (M,) while tracking; the mean is 3 if the covariances are correct."""
+        values = []
         for error, covariance, tracking in zip(self.errors, self.covariances, self.tracking, strict=True):
             if tracking and covariance is not None and np.isfinite(error).all():
-                found.append(float(error @ np.linalg.lstsq(covariance, error, rcond=None)[0]))
-        return np.array(found)
+                values.append(float(error @ np.linalg.lstsq(covariance, error, rcond=None)[0]))
+        return np.array(values)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain names, units in them; None where nothing can be said. Errors of those that say tracking."""
+        """Statistics by names that contain their unit; None if unknown. Errors are those of beliefs while tracking."""
         position, heading, nees = self.position[self.tracking], np.abs(self.errors[self.tracking, 2]), self.nees()
         return {
             "estimator": self.name,
             "beliefs": self.beliefs,
-            "share_tracking": _of(np.mean, self.tracking.astype(float)),
-            "position_error_median_m": _of(np.median, position),
-            "position_error_rms_m": _of(lambda e: np.sqrt(np.mean(np.square(e))), position),
-            "position_error_max_m": _of(np.max, position),
-            "position_error_all_median_m": _of(np.median, self.position),
-            "heading_error_median_rad": _of(np.median, heading),
-            "nees_mean": _of(np.mean, nees),
-            "update_ms_median": _of(np.median, self.took_ms),
-            "update_ms_p95": _of(lambda t: np.quantile(t, 0.95), self.took_ms),
+            "share_tracking": _reduce(np.mean, self.tracking.astype(float)),
+            "position_error_median_m": _reduce(np.median, position),
+            "position_error_rms_m": _reduce(lambda e: np.sqrt(np.mean(np.square(e))), position),
+            "position_error_max_m": _reduce(np.max, position),
+            "position_error_all_median_m": _reduce(np.median, self.position),
+            "heading_error_median_rad": _reduce(np.median, heading),
+            "nees_mean": _reduce(np.mean, nees),
+            "update_ms_median": _reduce(np.median, self.update_ms),
+            "update_ms_p95": _reduce(lambda t: np.quantile(t, 0.95), self.update_ms),
         }
 
 
 @dataclass
 class Comparison:
-    """Old and new on the same scans."""
+    """Recorded and new beliefs on the same scans."""
 
     stamps: np.ndarray[Any, np.dtype[np.int64]]  # (N,) ns
-    old: Part  # nothing in it where no belief was recorded
-    new: Part
-    answered: dict[str, int]  # scans, by whom
+    old: EstimatorResult  # empty if no belief was recorded
+    new: EstimatorResult
+    answered: dict[str, int]  # number of all beliefs, "recorded" and "new"
 
     def difference(self) -> Array:
-        """(N, 3) absolute; empty where there is nothing to compare with."""
+        """Absolute differences (N, 3) in m, m, rad; (0, 3) if no belief was recorded."""
         if not self.old.beliefs:
             return np.zeros((0, 3))
-        away = self.new.poses - self.old.poses
-        away[:, 2] = se2.wrap(away[:, 2])
-        return np.abs(away)
+        difference = self.new.poses - self.old.poses
+        difference[:, 2] = se2.wrap(difference[:, 2])
+        return np.abs(difference)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        away = self.difference()
-        where = np.hypot(away[:, 0], away[:, 1])
+        """The comparison as values that JSON can hold."""
+        difference = self.difference()
+        position = np.hypot(difference[:, 0], difference[:, 1])
         return {
             "scans_answered": self.answered, "scans_compared": len(self.stamps),
             "recorded": self.old.as_dict(), "new": self.new.as_dict(),
             "difference": {
-                "position_median_m": _of(np.median, where), "position_max_m": _of(np.max, where),
-                "heading_max_rad": _of(np.max, away[:, 2]),
+                "position_median_m": _reduce(np.median, position), "position_max_m": _reduce(np.max, position),
+                "heading_max_rad": _reduce(np.max, difference[:, 2]),
             },
         }  # fmt: skip
 
 
 def table(comparison: Comparison) -> Table:
-    """For a terminal."""
+    """The comparison as a table for the terminal."""
     numbers = comparison.as_dict()
-    old, new, away = numbers["recorded"], numbers["new"], numbers["difference"]
-    made = Table(title=f"on the {numbers['scans_compared']} scans compared", title_justify="left")
-    made.add_column("")
-    made.add_column(f"recorded: {old['estimator'] or 'nothing'}", justify="right")
-    made.add_column(f"new: {new['estimator']}", justify="right")
+    old, new, difference = numbers["recorded"], numbers["new"], numbers["difference"]
+    result = Table(title=f"on the {numbers['scans_compared']} scans compared", title_justify="left")
+    result.add_column("")
+    result.add_column(f"recorded: {old['estimator'] or 'nothing'}", justify="right")
+    result.add_column(f"new: {new['estimator']}", justify="right")
     answered = numbers["scans_answered"]
-    made.add_row("scans answered in all", str(answered["recorded"]), str(answered["new"]))
-    for words, name, factor, unit in (
-        ("share tracking", "share_tracking", 100, "%"),
-        ("position error once tracking, median", "position_error_median_m", 1e3, "mm"),
+    result.add_row("scans answered in total", str(answered["recorded"]), str(answered["new"]))
+    for title, name, factor, unit in (
+        ("share of scans in state tracking", "share_tracking", 100, "%"),
+        ("position error while tracking, median", "position_error_median_m", 1e3, "mm"),
         ("  RMS", "position_error_rms_m", 1e3, "mm"),
-        ("  at most", "position_error_max_m", 1e3, "mm"),
-        ("position error of all, median", "position_error_all_median_m", 1e3, "mm"),
-        ("heading error once tracking, median", "heading_error_median_rad", 180 / np.pi, "deg"),
-        ("NEES (3 where covariances are right)", "nees_mean", 1, ""),
-        ("time, median (recorded: scan to belief)", "update_ms_median", 1, "ms"),
+        ("  maximum", "position_error_max_m", 1e3, "mm"),
+        ("position error of all scans, median", "position_error_all_median_m", 1e3, "mm"),
+        ("heading error while tracking, median", "heading_error_median_rad", 180 / np.pi, "deg"),
+        ("NEES (3 if covariances are correct)", "nees_mean", 1, ""),
+        ("time, median (recorded: from scan to belief)", "update_ms_median", 1, "ms"),
         ("  95 %", "update_ms_p95", 1, "ms"),
     ):
-        made.add_row(words, _words(old[name], factor, unit), _words(new[name], factor, unit))
-    apart = (
-        f"{_words(away['position_median_m'], 1e3, 'mm')} median, {_words(away['position_max_m'], 1e3, 'mm')} at most"
-    )
-    made.add_row("difference between the two", "", apart if comparison.old.beliefs else "-")
-    return made
+        result.add_row(title, _format(old[name], factor, unit), _format(new[name], factor, unit))
+    median, maximum = (_format(difference[name], 1e3, "mm") for name in ("position_median_m", "position_max_m"))
+    summary = f"{median} median, {maximum} maximum"
+    result.add_row("difference between the two", "", summary if comparison.old.beliefs else "-")
+    return result
 
 
 def draw(comparison: Comparison, out: Path) -> list[Path]:
-    """Beside the recording ``out``: errors over time as PNG and PDF, their data as CSV; UserError where that fails."""
+    """Writes the errors over time beside the recording ``out``, as PNG, PDF and CSV; returns the files.
+
+    Raises UserError if they cannot be written.
+    """
     columns = curves(comparison)
     files = [out.with_suffix(suffix) for suffix in (".png", ".pdf", ".csv")]
     figure = figure_of_curves(columns, comparison, out.stem)
     try:
         figure.savefig(files[0], dpi=150)
-        figure.savefig(files[1], metadata={"CreationDate": None})  # the same data, the same bytes
+        figure.savefig(files[1], metadata={"CreationDate": None})  # without a date, so that equal data give equal bytes
         with files[2].open("w", newline="", encoding="utf-8") as stream:
             writer = csv.writer(stream, lineterminator="\n")
             writer.writerow(columns)
@@ -223,33 +229,33 @@ def draw(comparison: Comparison, out: Path) -> list[Path]:
 
 
 def curves(comparison: Comparison) -> dict[str, Array]:
-    """Columns of equal length (N,); NaN where nothing is known."""
+    """The columns of the CSV file, each (N,); NaN for unknown values."""
     stamps, count = comparison.stamps, len(comparison.stamps)
-    nothing, away = np.full(count, np.nan), comparison.difference()
-    there = bool(comparison.old.beliefs)
+    unknown, difference = np.full(count, np.nan), comparison.difference()
+    has_recorded = bool(comparison.old.beliefs)
     return {
         "time_s": (stamps - (stamps[0] if count else 0)) * 1e-9,
-        "recorded_error_m": comparison.old.position if there else nothing,
+        "recorded_error_m": comparison.old.position if has_recorded else unknown,
         "new_error_m": comparison.new.position,
-        "difference_m": np.hypot(away[:, 0], away[:, 1]) if there else nothing,
-        "recorded_tracking": comparison.old.tracking.astype(float) if there else nothing,
+        "difference_m": np.hypot(difference[:, 0], difference[:, 1]) if has_recorded else unknown,
+        "recorded_tracking": comparison.old.tracking.astype(float) if has_recorded else unknown,
         "new_tracking": comparison.new.tracking.astype(float),
     }
 
 
 def figure_of_curves(columns: dict[str, Array], comparison: Comparison, title: str) -> Figure:
-    """Errors over time, and the difference where there is no truth to compare with."""
+    """Draws the errors over time, or the difference between the two if there is no truth."""
     figure, (axes,) = figure_of(width=9.0)
     shown = [
-        ("recorded_error_m", f"recorded: {comparison.old.name}", OLD, 1.1),
+        ("recorded_error_m", f"recorded: {comparison.old.name}", RECORDED_COLOUR, 1.1),
         ("new_error_m", f"new: {comparison.new.name}", COLOURS.get(comparison.new.name, "#0072B2"), 1.5),
     ]
     if not any(np.isfinite(columns[name]).any() for name, *_ in shown):
-        shown = [("difference_m", "between the two", "#0072B2", 1.5)]
+        shown = [("difference_m", "difference between the two", "#0072B2", 1.5)]
     for name, label, colour, width in shown:
         if np.isfinite(columns[name]).any():
             axes.plot(
-                columns["time_s"], np.maximum(columns[name], SMALLEST), color=colour, linewidth=width, label=label
+                columns["time_s"], np.maximum(columns[name], MIN_LOG_VALUE), color=colour, linewidth=width, label=label
             )
     log_metres(axes)
     axes.set(xlabel="time (s)", ylabel="position error (m)" if len(shown) > 1 else "difference (m)", title=title)
@@ -258,11 +264,11 @@ def figure_of_curves(columns: dict[str, Array], comparison: Comparison, title: s
     return figure
 
 
-def _words(value: float | None, factor: float, unit: str) -> str:
+def _format(value: float | None, factor: float, unit: str) -> str:
     return "-" if value is None else f"{value * factor:.3g} {unit}".rstrip()
 
 
-def _of(statistic: Any, values: Array) -> float | None:
-    """Of those that are known."""
+def _reduce(statistic: Any, values: Array) -> float | None:
+    """The statistic of all finite values; None if there are none."""
     known = values[np.isfinite(values)]
     return float(statistic(known)) if len(known) else None

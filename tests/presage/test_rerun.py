@@ -19,12 +19,12 @@ from common.geometry import se2
 from common.messages.definitions import Belief, CmdVel, Pose, Status, Truth, Twist
 from common.messages.topics import BELIEF, PREDICTION, SCAN, TRUTH
 from presage.replay import rerun as shell
-from presage.replay.comparison import Outcome, Pairs
-from presage.replay.goal_times import Goals
+from presage.replay.comparison import MessagePairs, ReplayOutcome
+from presage.replay.goal_times import GoalTimes
 from presage.replay.recorded_session import estimator_settings, recorded_settings, robot_of
-from presage.replay.report import Series, Track
-from presage.replay.rerun import RerunOptions, another_name, rerun_command
-from presage.replay.service_replay import words
+from presage.replay.report import BeliefSeries, ComparisonBuilder
+from presage.replay.rerun import RerunOptions, rerun_command, unused_robot_name
+from presage.replay.service_replay import describe
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.reader import read_recording
 from tests.recorder import sessions as made
@@ -111,14 +111,14 @@ def test_table_figure_and_data_are_written(run):
 
 
 def test_a_rerun_of_a_rerun_has_a_name_of_its_own(run):
-    assert another_name(read_recording(run[0]), "robot") == "robot-rerun2"
+    assert unused_robot_name(read_recording(run[0]), "robot") == "robot-rerun2"
 
 
 def test_nothing_is_left_of_what_was_interrupted(session, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(shell.Offline, "on_message", interrupted)
+    monkeypatch.setattr(shell.OfflineEstimatorService, "on_message", interrupted)
     out = session.with_name("never.mcap")
     with pytest.raises(KeyboardInterrupt):
         rerun_command(RerunOptions(session, EXACT, out), None, Console(file=io.StringIO()))
@@ -127,15 +127,15 @@ def test_nothing_is_left_of_what_was_interrupted(session, monkeypatch):
 
 def test_what_cannot_be_is_said(session, tmp_path, run):
     console = Console(file=io.StringIO())
-    with pytest.raises(UserError, match=r"new\.mcap: is there already; choose another name with --out"):
+    with pytest.raises(UserError, match=r"new\.mcap: exists already; choose another name with --out"):
         rerun_command(RerunOptions(session, EXACT, run[0]), None, console)
-    with pytest.raises(UserError, match="a recording is named"):
+    with pytest.raises(UserError, match=r"must end with \.mcap"):
         rerun_command(RerunOptions(session, EXACT, tmp_path / "new.bag"), None, console)
     blind = made.write(tmp_path / "blind.mcap", SCAN)
     with pytest.raises(UserError, match=r"blind\.mcap: no scan in it"):
         rerun_command(RerunOptions(blind, EXACT), None, console)
     lost = made.write(tmp_path / "lost.mcap", world=False)
-    with pytest.raises(UserError, match="no world was recorded: name it with --world"):
+    with pytest.raises(UserError, match="no world was recorded: give one with --world"):
         rerun_command(RerunOptions(lost, EXACT), None, console)
 
 
@@ -184,13 +184,13 @@ def test_other_weights_do_not(tmp_path):
         settings_from(holding(tmp_path / "r.mcap", weights=False, card=card, digest=False), tmp_path)
     recording = holding(tmp_path / "d.mcap")
     recording.attachments["model/corridor-precise.safetensors"] += b"x"
-    with pytest.raises(UserError, match="their digest is not the recorded one"):
+    with pytest.raises(UserError, match="their digest differs from the recorded one"):
         settings_from(recording, tmp_path)
 
 
 @pytest.mark.parametrize("file", ["../evil.safetensors", "/etc/evil.safetensors", ".safetensors", "model.pt"])
 def test_a_name_that_is_a_path_is_not_written_to(tmp_path, file):
-    with pytest.raises(UserError, match="which is no file name"):
+    with pytest.raises(UserError, match="which is not a file name"):
         settings_from(holding(tmp_path / "r.mcap", file=file), tmp_path)
     assert not list(tmp_path.rglob("*evil*"))
 
@@ -223,9 +223,9 @@ def test_the_kth_of_a_stamp_is_compared_with_the_kth_in_whatever_order_they_come
     while events or ours:
         take = events if events and (not ours or random.random() < 0.5) else ours
         merged.append(take.pop(0))
-    pairs = Pairs()
+    pairs = MessagePairs()
     for mine, stamp, k in merged:
-        (pairs.new if mine else pairs.recorded)(belief(stamp, free_energy=10.0 * k + stamp))
+        (pairs.add_new if mine else pairs.add_recorded)(belief(stamp, free_energy=10.0 * k + stamp))
     expected = sum(min(old.count(stamp), new.count(stamp)) for stamp in set(old))
     assert pairs.compared == pairs.equal == expected
     assert pairs.unmatched()["recorded"] == len(old) - expected
@@ -240,34 +240,34 @@ def test_the_kth_of_a_stamp_is_compared_with_the_kth_in_whatever_order_they_come
     ],
 )  # fmt: skip
 def test_a_bit_is_seen(other):
-    outcome = Outcome(lockstep=True)
-    outcome.beliefs.recorded(belief(1))
-    outcome.beliefs.new(other)
+    outcome = ReplayOutcome(lockstep=True)
+    outcome.beliefs.add_recorded(belief(1))
+    outcome.beliefs.add_new(other)
     assert outcome.beliefs.compared == 1
     assert not outcome.beliefs.equal
     assert not outcome.good
-    assert Outcome(lockstep=False, beliefs=outcome.beliefs).good  # within the tolerance
+    assert ReplayOutcome(lockstep=False, beliefs=outcome.beliefs).good  # within the tolerance
 
 
 def test_nothing_compared_is_not_good():
-    assert not Outcome(lockstep=True).good
-    assert not Outcome(lockstep=False).good
+    assert not ReplayOutcome(lockstep=True).good
+    assert not ReplayOutcome(lockstep=False).good
 
 
 def test_commands_are_compared_by_what_they_say():
-    pairs = Pairs()
-    pairs.recorded(CmdVel(stamp_ns=1, seq=5, twist=Twist(vx=1.0)))
-    pairs.new(CmdVel(stamp_ns=1, seq=9, twist=Twist(vx=1.0)))
-    pairs.recorded(CmdVel(stamp_ns=2, twist=Twist(vx=1.0)))
-    pairs.new(CmdVel(stamp_ns=2, twist=Twist(vx=0.75)))
-    assert (pairs.compared, pairs.equal, pairs.speed_most) == (2, 1, 0.25)
+    pairs = MessagePairs()
+    pairs.add_recorded(CmdVel(stamp_ns=1, seq=5, twist=Twist(vx=1.0)))
+    pairs.add_new(CmdVel(stamp_ns=1, seq=9, twist=Twist(vx=1.0)))
+    pairs.add_recorded(CmdVel(stamp_ns=2, twist=Twist(vx=1.0)))
+    pairs.add_new(CmdVel(stamp_ns=2, twist=Twist(vx=0.75)))
+    assert (pairs.compared, pairs.equal, pairs.max_speed_difference) == (2, 1, 0.25)
 
 
 def test_errors_are_of_the_truth_of_the_same_run_though_stamps_come_again():
-    track = Track(Series(), Series("new"))
+    track = ComparisonBuilder(BeliefSeries(), BeliefSeries("new"))
     for run, x in ((0, 1.0), (1, 5.0)):  # the simulation was begun anew
         at = run * 10**9
-        track.true(Truth(stamp_ns=7, pose=Pose(x=x, y=0.0, yaw=np.pi), twist=Twist()), at)
+        track.add_truth(Truth(stamp_ns=7, pose=Pose(x=x, y=0.0, yaw=np.pi), twist=Twist()), at)
         track.old.add(belief(7, x=x + 0.1, yaw=-np.pi + 0.01), at + 5, 3.0)
         track.new.add(belief(7, x=x + 0.2, yaw=np.pi, covariance=np.diag([0.01, 0.01, 0.01])), at + 5, 2.0)
     numbers = track.compare().as_dict()
@@ -279,9 +279,9 @@ def test_errors_are_of_the_truth_of_the_same_run_though_stamps_come_again():
 
 
 def test_only_scans_both_answered_are_compared():
-    track = Track(Series(), Series("new"))
+    track = ComparisonBuilder(BeliefSeries(), BeliefSeries("new"))
     for stamp in range(10):
-        track.true(Truth(stamp_ns=stamp, pose=Pose(x=0.0, y=0.0), twist=Twist()), stamp)
+        track.add_truth(Truth(stamp_ns=stamp, pose=Pose(x=0.0, y=0.0), twist=Twist()), stamp)
         track.new.add(belief(stamp, x=1.0 if stamp < 5 else 0.5), stamp, 1.0)
         if stamp >= 5:
             track.old.add(belief(stamp), stamp, 1.0)
@@ -295,7 +295,7 @@ def test_only_scans_both_answered_are_compared():
 
 def said(*entries):
     """``g``: a status about a goal just taken; a number: a belief of that stamp is answered, with a goal or without."""
-    goals, last, goal, messages = Goals(), 0, None, []
+    goals, last, goal, messages = GoalTimes(), 0, None, []
     for entry in entries:
         if entry == "g":
             goal = Pose(x=1.0, y=1.0)
@@ -305,33 +305,33 @@ def said(*entries):
             distance = 1.0 if goal else None
             messages.append(Status(stamp_ns=last, state="idle", goal=goal, distance=distance))
             messages.append(CmdVel(stamp_ns=last, twist=Twist()))
-    goals.see(messages)
+    goals.add(messages)
     return goals
 
 
 def test_a_status_without_a_command_is_a_goal_taken():
-    assert said(1, 2, "g", 3, "g", "g", 4).taken(3) == {2: 1, 3: 2}
-    assert said("g", 0, 1).taken(1) == {None: 1}
-    assert said(0, "g", 1).taken(1) == {0: 1}
-    assert said(1, 2).taken(0) == {}
-    assert said(1, "g", 2).taken(2) is None  # a goal nobody took
-    assert Goals().taken(1) is None
+    assert said(1, 2, "g", 3, "g", "g", 4).accepted(3) == {2: 1, 3: 2}
+    assert said("g", 0, 1).accepted(1) == {None: 1}
+    assert said(0, "g", 1).accepted(1) == {0: 1}
+    assert said(1, 2).accepted(0) == {}
+    assert said(1, "g", 2).accepted(2) is None  # a goal nobody took
+    assert GoalTimes().accepted(1) is None
 
 
 def test_the_end_of_a_recording_may_cut_an_answer_in_two():
     goals = said(1, "g", 2)
-    goals.see([Status(stamp_ns=3, state="navigating", goal=Pose(x=1.0, y=1.0), distance=1.0)])
-    assert goals.taken(1) == {1: 1, 3: 0}
+    goals.add([Status(stamp_ns=3, state="navigating", goal=Pose(x=1.0, y=1.0), distance=1.0)])
+    assert goals.accepted(1) == {1: 1, 3: 0}
 
 
 def test_a_damaged_recording_proves_nothing():
-    outcome = Outcome(lockstep=True)
+    outcome = ReplayOutcome(lockstep=True)
     belief = Belief(
         stamp_ns=1, state="tracking", pose=Pose(x=0.0, y=0.0), xi=np.zeros(3, np.float32), free_energy=0.0, accuracy=0.0
     )
-    outcome.beliefs.recorded(belief)
-    outcome.beliefs.new(belief)
+    outcome.beliefs.add_recorded(belief)
+    outcome.beliefs.add_new(belief)
     assert outcome.good
     outcome.damaged = "damaged: a chunk's checksum"
     assert not outcome.good
-    assert "what comes after that was not compared" in words(outcome)[-1]
+    assert "what comes after that was not compared" in describe(outcome)[-1]

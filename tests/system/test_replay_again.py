@@ -57,7 +57,7 @@ def test_a_replayed_lockstep_session_gives_bit_identical_beliefs(process, bus, t
     assert beliefs["position_difference_max_m"] == 0.0
     assert beliefs["recorded_without_new"] == 0
     assert commands["equal"] == commands["compared"] >= SCANS
-    assert "this is what it believed" in output
+    assert "the results are identical" in output
 
     # The same without processes.
     status, output, numbers = command(process, tmp_path / "r.json", "rerun", file, "--out", tmp_path / "new.mcap")
@@ -78,7 +78,7 @@ def test_a_replayed_lockstep_session_gives_bit_identical_beliefs(process, bus, t
     assert status == 1, output
     assert numbers["beliefs"]["equal"] == numbers["beliefs"]["compared"] - 1
     assert 0.5e-9 < numbers["beliefs"]["position_difference_max_m"] < 2e-9
-    assert "should be equal bit for bit, and are not" in output
+    assert "the results should be identical, but are not" in output
 
 
 def test_missing_contents_of_a_recording_are_reported(process, tmp_path):
@@ -113,7 +113,7 @@ def test_every_scan_of_an_imported_log_is_answered(process, tmp_path):
     assert numbers["tracking"] > SCANS_OF_LOG / 2
     assert "presage rerun" in output
     for file, services, why in (
-        ("nowhere", "estimator", "import it with --world"), ("there", "estimator,controller", "no goal"),
+        ("nowhere", "estimator", "import it again with --world"), ("there", "estimator,controller", "no goal"),
     ):  # fmt: skip
         status, output, _ = command(
             process, tmp_path / "b.json", "replay", tmp_path / f"{file}.mcap", "--with", services

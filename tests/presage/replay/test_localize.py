@@ -21,7 +21,7 @@ from common.robot.scanner import SCANNERS
 from presage.logs.importing import ImportOptions, import_command
 from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
-from presage.replay.localize import COLUMNS, LocalizeOptions, choice_of, chosen, localize
+from presage.replay.localize import COLUMNS, LocalizeOptions, choice_of, localize, select_scans
 from presage.replay.rerun import RerunOptions, rerun_command
 from services.estimator.precise.learning.weights import FOLDER
 from tests.conftest import WAIT_TIMEOUT_S
@@ -237,10 +237,10 @@ def test_choices_that_leave_nothing(tmp_path):
         ({"start": 0.21, "end": 0.25}, r"scans.npz: no scan between 0.21 and 0.25 s"),
     ):
         with pytest.raises(UserError, match=why):
-            chosen(job(file, **wrong), scans)
+            select_scans(job(file, **wrong), scans)
     for choice in ({"start": 0.2}, {"end": 0.2}, {"every": 2}):
         with pytest.raises(UserError, match="no stamps, which --start, --end and --every need"):
-            chosen(job(file, **choice), unstamped)
+            select_scans(job(file, **choice), unstamped)
     with pytest.raises(UserError, match="mode track needs the pose of the first scan"):  # initial_pose is of another
         localize(job(file, start=0.2, mode="track"), CONSOLE)
 
@@ -261,7 +261,7 @@ def test_an_interrupted_run_keeps_its_rows(tmp_path, capsys, monkeypatch, suffix
         localize(job(file, out=out), Console(width=500))
     last = capsys.readouterr().out.splitlines()[-2:]
     assert last[0].startswith("4 of 10 scans: 4 tracking")
-    assert last[1] == f"interrupted after 4 of 10 scans; {out} holds their rows"
+    assert last[1] == f"interrupted after 4 of 10 scans; their rows are in {out}"
     if suffix == "json":
         data = json.loads(out.read_text())
         assert not data["complete"]
@@ -285,7 +285,7 @@ def test_ctrl_c_ends_with_a_table_and_status_130(tmp_path, processes):
     lines = running.output.splitlines()
     assert "reading long.npz" in lines
     assert lines[-1].startswith("interrupted after ")
-    assert lines[-1].endswith(f" of 3000 scans; {out} holds their rows")
+    assert lines[-1].endswith(f" of 3000 scans; their rows are in {out}")
     with out.open() as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == int(lines[-1].split()[2])
@@ -313,7 +313,7 @@ def test_a_recording_says_its_world_and_its_truth(tmp_path):
     assert len(scans.stamps) == len(scans.ranges) == len(scans.truth)
     rows = localize(job(file, world="", model="exact"), CONSOLE)
     assert errors(rows, scans.truth).max() < 0.03
-    with pytest.raises(UserError, match="those options are about logs"):
+    with pytest.raises(UserError, match="leave out the options for logs"):
         localize(job(file, world="", model="exact", reading=Reading(mount=np.zeros(3))), CONSOLE)
     with pytest.raises(UserError, match="presage train --world hall"):  # no field was learned of that world
         localize(job(file, world=""), CONSOLE)
