@@ -1,4 +1,4 @@
-"""The small service as of another presage: PROTOCOL and PRESAGE stand in the environment; run by test_compatibility."""
+"""The small service with the protocol and presage version that the environment names; run by test_protocol_check."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ known = common.versions.versions()
 common.versions.PROTOCOL = int(os.environ.get("FOREIGN_PROTOCOL", str(common.versions.PROTOCOL)))
 common.versions.versions = lambda: {**known, "presage": os.environ.get("FOREIGN_PRESAGE", known["presage"])}
 
-from common.runtime.service import main  # noqa: E402 - what it takes from versions is set above
+from common.runtime.service import main  # noqa: E402 - it imports values that are set above
 from tests.common.small_service import Small, SmallSettings  # noqa: E402
 
 
@@ -19,7 +19,7 @@ class Foreign(Small):
 
 
 class ForeignSettings(SmallSettings):
-    """A service of another presage."""
+    """A service of another version."""
 
     service = "foreign"
 

@@ -1,4 +1,4 @@
-"""A process in which everything that can write a line does; run by test_log."""
+"""A process that writes log lines in every possible way; run by test_log."""
 
 from __future__ import annotations
 
@@ -27,6 +27,6 @@ if __name__ == "__main__":
     thread = threading.Thread(target=fail)
     thread.start()
     thread.join()
-    print("printed for who asked", flush=True)
+    print("printed text", flush=True)
     print("from Python to stderr", file=sys.stderr, flush=True)
     raise RuntimeError("uncaught")

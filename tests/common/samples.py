@@ -1,4 +1,4 @@
-"""Any message there is, drawn from the fields themselves, so that a new message is tested without a new strategy."""
+"""Hypothesis strategies for all messages, derived from their fields, so that new messages are tested as well."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ WORLD = World(
         Obstacle(circle=Circle(center=(2, 1), radius=1)),
     ],
 )
-# Their own constraints span fields; these few stand for all of them.
+# Types whose constraints concern several fields: a few examples are used.
 FIXED: dict[type, st.SearchStrategy] = {
     World: st.just(WORLD),
     Obstacle: st.sampled_from([*WORLD.obstacles, Obstacle(name="p", polygon=[(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)])]),
@@ -64,7 +64,7 @@ def _field(field: FieldInfo) -> st.SearchStrategy:
     return _of(field.annotation, tuple(field.metadata))
 
 
-def _of(kind: typing.Any, limits: tuple) -> st.SearchStrategy:  # noqa: PLR0911 - one line a kind
+def _of(kind: typing.Any, limits: tuple) -> st.SearchStrategy:  # noqa: PLR0911 - one return for each kind of type
     origin = typing.get_origin(kind)
     if origin is typing.Annotated:
         inner, *more = typing.get_args(kind)

@@ -1,4 +1,4 @@
-"""A service as small as can be, run as a process by test_service."""
+"""A minimal service, run as a process by test_service."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class SmallSettings(ServiceSettings):
     """A small service."""
 
     service: ClassVar[str] = "small"
-    fail: Annotated[str, Field(description="where to fail")] = ""
-    slow: Annotated[str, Field(description="where to take its time")] = ""
+    fail: Annotated[str, Field(description="where to raise an error")] = ""
+    slow: Annotated[str, Field(description="where to be slow")] = ""
 
 
 class Small(Service):
-    """Answers each scan with a command; what it must fail at stands in the data."""
+    """Publishes a command for each scan, and fails as the data of the messages request it."""
 
     name = "small"
     inputs = (SCAN, GOAL, HEALTH)
@@ -49,7 +49,7 @@ class Small(Service):
             self.counters["scans"] += 1
             self.publish(CMD_VEL, CmdVel(stamp_ns=message.stamp_ns, twist={"vx": 0.5}))
         elif isinstance(message, Goal) and message.cancel:
-            # Of itself: who waited here would wait for ever.
+            # Sent to itself: a blocking request would never return.
             self.request(
                 TELEPORT if message.pose.y == 0 else PREDICT,
                 PoseRequest(pose=message.pose),

@@ -1,4 +1,4 @@
-"""Log lines as JSON: every line of a real process is one object, whoever wrote it."""
+"""JSON logging: every line of a real process is a JSON object."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def objects(text: str) -> list[dict]:
     return found
 
 
-def test_everybody_s_line_is_one_object():
+def test_every_line_is_a_json_object():
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     noisy = Path(__file__).with_name("noisy.py")
     done = subprocess.run([sys.executable, str(noisy)], env=environment, capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
-    assert done.stdout == "printed for who asked\n"
+    assert done.stdout == "printed text\n"
     found = {line["event"]: line for line in objects(done.stderr)}
     numbers = found["numbers"]
     assert (numbers["nan"], numbers["inf"], numbers["text"]) == ("NaN", ["Infinity"], 'two\nlines "quoted"')
@@ -47,7 +47,7 @@ def test_everybody_s_line_is_one_object():
     assert "in fail" in thread["exception"]
 
 
-def test_a_service_s_failed_step_and_zenoh_s_own_lines_are_objects(process, bus):
+def test_exceptions_and_zenohs_lines_are_json_objects(process, bus):
     small = Path(__file__).with_name("small_service.py")
     running = process(small, "--log-json", env={"RUST_LOG": "info"})
     assert wait_until(lambda: "small" in bus.alive(), WAIT_TIMEOUT_S), running.output
@@ -65,7 +65,7 @@ def test_a_service_s_failed_step_and_zenoh_s_own_lines_are_objects(process, bus)
     assert found[-1]["event"] == "ended"
 
 
-def test_the_router_s_lines_are_objects(processes, free_port):
+def test_the_routers_lines_are_json_objects(processes, free_port):
     port = free_port()
     running = processes.start("common.router", "--listen", f"tcp/127.0.0.1:{port}", "--log-json")
     running.wait_for("router listens")
@@ -77,13 +77,13 @@ def test_the_router_s_lines_are_objects(processes, free_port):
     ("args", "says"),
     [(("--listen", "nonsense"), "no session with"), (("--log-level", "loud"), "log_level"), (("--bogus",), "--bogus")],
 )
-def test_what_the_user_can_mend_is_an_object_too(processes, args, says):
+def test_user_errors_are_json_objects(processes, args, says):
     running = processes.start("common.router", *args, env={"PRESAGE_LOG_JSON": "true"})
     assert running.wait() == 2
     assert says in objects(running.output)[-1]["event"]
 
 
-def test_zenoh_s_own_lines_are_taken_apart():
+def test_zenohs_lines_are_parsed():
     zenoh = (
         "\x1b[2m2026-01-02T03:04:05.017181Z\x1b[0m \x1b[33m WARN\x1b[0m net-0 ThreadId(04) "
         "\x1b[2mzenoh::net::runtime\x1b[0m\x1b[2m:\x1b[0m Unable to connect: refused\n"
@@ -93,7 +93,7 @@ def test_zenoh_s_own_lines_are_taken_apart():
     assert parse_line("  \n", "stdout") is None
 
 
-def test_who_started_it_still_reads_what_a_line_says():
+def test_text_output_is_still_readable():
     assert _log_text('{"event": "page: http://x/"}') == "page: http://x/"
     assert _log_text("page: http://x/") == "page: http://x/"
     assert _log_text("[1]") == "[1]"

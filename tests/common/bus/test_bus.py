@@ -1,4 +1,4 @@
-"""The bus over real zenoh: sessions in this process, routers as processes."""
+"""The bus over real zenoh, with sessions in this process and routers as processes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def scan(i: int = 0) -> Scan:
 
 @contextmanager
 def answering(bus, query, answer):
-    """A thread that answers requests as a service's loop would."""
+    """Answer requests in a thread, as a service's loop does."""
     inbox, end = Inbox(), threading.Event()
     bus.serve(query, inbox)
 
@@ -53,7 +53,7 @@ def answering(bus, query, answer):
         thread.join()
 
 
-def test_payloads_arrive_as_they_were_sent_in_order(bus, other):
+def test_payloads_arrive_unchanged_in_order(bus, other):
     inbox = Inbox()
     other.subscribe(SCAN, inbox, keep_all=True)
     assert bus.wait_matching(SCAN, PATIENCE)
@@ -69,7 +69,7 @@ def test_payloads_arrive_as_they_were_sent_in_order(bus, other):
     assert 0 <= first.received_ns - first.published_ns < 60e9
 
 
-def test_who_falls_behind_gets_the_newest_and_the_loss_is_counted(bus, other):
+def test_slow_receivers_get_the_newest_and_count_the_loss(bus, other):
     inbox = Inbox()
     other.subscribe(SCAN, inbox)
     assert bus.wait_matching(SCAN, PATIENCE)
@@ -81,7 +81,7 @@ def test_who_falls_behind_gets_the_newest_and_the_loss_is_counted(bus, other):
     assert inbox.dropped[SCAN.key(bus.robot)] == 499
 
 
-def test_robots_do_not_hear_each_other(bus, other, link):
+def test_robots_are_separate(bus, other, link):
     mine, theirs = Inbox(), Inbox()
     other.subscribe(SCAN, mine)
     with open_bus(replace(link, robot=link.robot + "x")) as neighbour:
@@ -97,7 +97,7 @@ def test_robots_do_not_hear_each_other(bus, other, link):
         assert theirs.get(0).payload == b"theirs"
 
 
-def test_a_per_service_topic_is_heard_from_all(bus, other):
+def test_a_subscription_to_a_per_service_topic_covers_all_services(bus, other):
     inbox = Inbox()
     other.subscribe(HEALTH, inbox)
     for service in ("estimator", "controller"):
@@ -107,7 +107,7 @@ def test_a_per_service_topic_is_heard_from_all(bus, other):
     assert {inbox.get(0).key.rsplit("/", 1)[-1] for _ in range(2)} == {"estimator", "controller"}
 
 
-def test_large_payloads_cross_whole(bus, other):
+def test_large_payloads_arrive_complete(bus, other):
     inbox = Inbox()
     other.subscribe(SCAN, inbox, keep_all=True)
     assert bus.wait_matching(SCAN, PATIENCE)
@@ -119,7 +119,7 @@ def test_large_payloads_cross_whole(bus, other):
     assert inbox.oversized.total() == 1
 
 
-def test_a_question_is_answered(bus, other):
+def test_a_request_is_answered(bus, other):
     asked = []
 
     def answer(call):
@@ -152,12 +152,12 @@ def test_a_refusal_is_a_user_error(bus, other):
         assert wait_until(lambda: _said(bus, "refused: not on a Sunday"), PATIENCE)
 
 
-def test_a_senseless_answer_is_a_user_error(bus, other):
+def test_an_undecodable_reply_is_a_user_error(bus, other):
     with answering(other, TELEPORT, lambda call: call.reply(b"\xc1")):
         assert wait_until(lambda: _said(bus, "the reply cannot be decoded"), PATIENCE)
 
 
-def test_nobody_there_is_said_with_what_to_do(bus):
+def test_the_error_without_a_server_says_what_to_do(bus):
     with pytest.raises(UserError, match=r"no service answers presage/\S+/teleport .* is the simulator running\?"):
         bus.ask(TELEPORT, Request(), Reply, timeout=0.3)
     with pytest.raises(UserError, match="is the estimator running"):
@@ -165,7 +165,7 @@ def test_nobody_there_is_said_with_what_to_do(bus):
 
 
 def _reply_to(bus, number, timeout=PATIENCE, x=1.0):
-    """What a request that waits for nobody comes to: one answer, and no second."""
+    """The reply to a non-blocking request; checks that there is exactly one."""
     inbox = Inbox()
     bus.request(TELEPORT, PoseRequest(pose=Pose(x=x, y=2.0)), number, inbox, timeout)
     assert wait_until(lambda: len(inbox) > 0, PATIENCE)
@@ -175,7 +175,7 @@ def _reply_to(bus, number, timeout=PATIENCE, x=1.0):
     return answer.reply()
 
 
-def test_a_request_is_answered_later_and_meanwhile_nobody_waits(bus, other):
+def test_requests_do_not_block(bus, other):
     may_answer, inbox = threading.Event(), Inbox()
 
     def answer(call):
@@ -187,14 +187,14 @@ def test_a_request_is_answered_later_and_meanwhile_nobody_waits(bus, other):
         assert wait_until(lambda: _reply_to(bus, 1, x=-1.0).reason == "at -1", PATIENCE)
         for number in range(20):
             bus.request(TELEPORT, PoseRequest(pose=Pose(x=float(number), y=0.0)), number, inbox, PATIENCE)
-        assert len(inbox) == 0  # all were asked, and none is answered yet
+        assert len(inbox) == 0  # all requests are sent and none is answered yet
         may_answer.set()
         assert wait_until(lambda: len(inbox) >= 20, PATIENCE)
     answers = [inbox.get(0) for _ in range(len(inbox))]
     assert sorted((a.number, a.reply().reason) for a in answers) == [(n, f"at {n}") for n in range(20)]
 
 
-def test_a_request_that_is_refused_or_answered_senselessly_or_not_at_all_gets_one_answer_too(bus, other):
+def test_every_failed_request_gets_exactly_one_answer(bus, other):
     nobody = _reply_to(bus, 3)
     assert not nobody.ok
     assert "is the simulator running?" in nobody.reason
@@ -216,7 +216,7 @@ def test_a_request_that_is_refused_or_answered_senselessly_or_not_at_all_gets_on
     assert kept
 
 
-def test_an_asker_that_is_gone_harms_nobody(bus, other):
+def test_a_requester_may_disappear(bus, other):
     calls = Inbox()
     other.serve(TELEPORT, calls)
 
@@ -231,7 +231,7 @@ def test_an_asker_that_is_gone_harms_nobody(bus, other):
     assert other.alive() == set()
 
 
-def test_life_and_death_are_seen(bus, link):
+def test_liveliness_is_reported(bus, link):
     changes = []
     bus.watch_alive(lambda service, there: changes.append((service, there)))
     with open_bus(link) as session:
@@ -239,8 +239,8 @@ def test_life_and_death_are_seen(bus, link):
         assert wait_until(lambda: changes == [("estimator", True)], PATIENCE)
         assert wait_until(lambda: bus.alive() == {"estimator"}, PATIENCE)
         late = []
-        bus.watch_alive(lambda service, there: late.append((service, there)))  # one that comes late hears it too
-        # What was there before and what comes may both be told: once or twice, but nothing else.
+        bus.watch_alive(lambda service, there: late.append((service, there)))  # a late watcher is notified too
+        # Existing and new services may be reported once or twice, but no others.
         assert wait_until(lambda: set(late) == {("estimator", True)}, PATIENCE)
     assert wait_until(lambda: changes[-1] == ("estimator", False), PATIENCE)
     assert wait_until(lambda: bus.alive() == set(), PATIENCE)
@@ -263,7 +263,7 @@ def test_a_session_closes_while_other_threads_use_it(link):
         assert ended.wait(PATIENCE)
 
 
-def test_sessions_wait_for_a_late_router_outlive_it_and_greet_its_return(processes, free_port):
+def test_sessions_survive_a_restart_of_the_router(processes, free_port):
     port = free_port()
     link = Link(robot="late", connect=(f"tcp/127.0.0.1:{port}",))
     inbox = Inbox()
@@ -289,7 +289,7 @@ def test_sessions_wait_for_a_late_router_outlive_it_and_greet_its_return(process
     assert [inbox.get(0).payload for _ in range(3)] == [b"with", b"without", b"through the new one"]
 
 
-def test_a_router_ends_cleanly_and_ignores_the_services_settings(processes, free_port):
+def test_a_router_ends_cleanly_and_ignores_settings_of_services(processes, free_port):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     env = {"PRESAGE_CONNECT": endpoint, "PRESAGE_LISTEN": "tcp/127.0.0.1:1"}
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -302,7 +302,7 @@ def test_a_router_ends_cleanly_and_ignores_the_services_settings(processes, free
         assert "Traceback" not in router.output
 
 
-def test_a_taken_port_is_one_line_and_status_2(processes):
+def test_a_port_in_use_ends_the_router_with_status_2(processes):
     _, port = processes.start_router()
     second = processes.start("common.router", "--listen", f"tcp/127.0.0.1:{port}")
     assert second.wait() == 2
@@ -315,7 +315,7 @@ def test_a_taken_port_is_one_line_and_status_2(processes):
 
 
 @pytest.mark.parametrize("endpoint", ["nonsense", "tcp/127.0.0.1:99999", "carrier/pigeon:1", "tcp/127.0.0.1", ""])
-def test_a_bad_endpoint_is_one_line(endpoint):
+def test_an_invalid_endpoint_is_a_one_line_error(endpoint):
     with pytest.raises(UserError) as caught, open_bus(Link(connect=(), listen=(endpoint,))):
         pass
     assert "\n" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""The queue between zenoh's threads and the loop, against a model of it."""
+"""The inbox compared with a simple model of it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def sample(key="a", payload=b"", topic=SCAN) -> Sample:
 
 
 class Model(RuleBasedStateMachine):
-    """A list that does by search what the inbox does by slots."""
+    """Model of the inbox: a list that is searched."""
 
     CAPACITY, BYTES = 4, 100
 
@@ -77,7 +77,7 @@ def test_newest_only_keeps_the_newest_of_each_key():
     assert inbox.received == {"scan": 100, "odom": 100}
 
 
-def test_all_keeps_order_and_loses_nothing():
+def test_policy_all_keeps_every_entry_in_order():
     inbox = Inbox()
     for i in range(1000):
         inbox.put(sample("scan", b"%d" % i))
@@ -85,7 +85,7 @@ def test_all_keeps_order_and_loses_nothing():
     assert not inbox.dropped
 
 
-def test_a_chatty_key_cannot_push_another_out():
+def test_a_busy_key_does_not_displace_another():
     inbox = Inbox(capacity=2)
     inbox.put(sample("goal", b"there"), newest_only=True)
     for _ in range(1000):
@@ -102,7 +102,7 @@ def test_oversized_payloads_are_counted_and_not_queued():
     assert inbox.received == {"scan": 2}
 
 
-def test_a_request_too_many_is_refused_not_forgotten():
+def test_requests_are_refused_if_the_queue_is_full():
     refused: list[str] = []
     inbox = Inbox(capacity=1)
     for _ in range(2):
@@ -111,7 +111,7 @@ def test_a_request_too_many_is_refused_not_forgotten():
     assert refused == ["too many requests are waiting"]
 
 
-def test_a_request_that_is_too_large_is_refused_at_once():
+def test_too_large_requests_are_refused():
     refused: list[str] = []
     inbox = Inbox()
     inbox.put(Call(TELEPORT, bytes(64 * MAX_BYTES + 1), lambda _: None, refused.append))
@@ -119,7 +119,7 @@ def test_a_request_that_is_too_large_is_refused_at_once():
     assert len(refused) == 1
 
 
-def test_an_answer_is_owed_and_comes_even_to_a_full_inbox():
+def test_answers_are_queued_even_if_the_inbox_is_full():
     inbox = Inbox(capacity=1)
     inbox.put(sample())
     inbox.put(Answer(TELEPORT, 7, Reply(reason="here").encode()))
@@ -131,7 +131,7 @@ def test_an_answer_is_owed_and_comes_even_to_a_full_inbox():
     assert large.reply() == Reply(ok=False, reason=f"the reply of {64 * MAX_BYTES + 1} bytes is too large")
 
 
-def test_an_answer_that_makes_no_sense_is_one_that_says_so():
+def test_undecodable_answers_become_failed_replies():
     reply = Answer(TELEPORT, 1, b"\xc1").reply()
     assert not reply.ok
     assert "cannot be decoded" in reply.reason
@@ -147,7 +147,7 @@ def test_invented_keys_do_not_fill_memory():
     assert inbox.received["presage/robot/health/0"] == 2
 
 
-def test_get_waits_for_an_entry_and_no_longer():
+def test_get_returns_when_an_entry_arrives():
     inbox = Inbox()
     began = time.monotonic()
     assert inbox.get(0.05) is None
@@ -190,13 +190,13 @@ for number in range(200):
 """
 
 
-def test_ctrl_c_does_not_leave_it_locked():
-    """Zenoh's threads would wait for it, and the session, which waits for them, would never close."""
+def test_ctrl_c_does_not_leave_the_inbox_locked():
+    """Otherwise zenoh's threads would wait for the lock, and the session could never close."""
     done = subprocess.run([sys.executable, "-c", INTERRUPTED], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
-def test_many_threads_put_and_every_entry_is_accounted_for():
+def test_entries_of_many_threads_are_all_counted():
     inbox = Inbox(capacity=50)
     threads = [
         threading.Thread(target=lambda k=k: [inbox.put(sample(k), newest_only=k == "0") for _ in range(2000)])
@@ -213,7 +213,7 @@ def test_many_threads_put_and_every_entry_is_accounted_for():
     assert got + sum(inbox.dropped.values()) == 8000
 
 
-def test_the_newest_of_one_source_does_not_take_the_place_of_another_s():
+def test_sources_do_not_replace_each_others_samples():
     inbox = Inbox()
     for number in range(3):
         for source in ("robot", "repeater"):

@@ -1,4 +1,4 @@
-"""Several processes of one service: names, who leads, who is heard."""
+"""Several instances of a service: names, leader election and source selection."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ names = st.builds(
 
 
 @given(names)
-def test_a_name_is_one_chunk_of_a_key_and_can_be_read_again(instance):
+def test_names_are_valid_key_chunks_and_can_be_parsed(instance):
     name = instance.name
     assert not set(name) & set("/*$#?@")
     again = Instance.parse(name)
@@ -25,11 +25,11 @@ def test_a_name_is_one_chunk_of_a_key_and_can_be_read_again(instance):
 
 
 @given(names, names)
-def test_names_in_order_are_instances_by_age(one, other):
+def test_names_sort_by_age(one, other):
     assert one.started_ms == other.started_ms or (one.name < other.name) == (one.started_ms < other.started_ms)
 
 
-def test_what_is_no_name_is_said_as_it_is():
+def test_other_names_are_returned_unchanged():
     assert Instance.parse("estimator") is None
     assert describe_instance("estimator") == "estimator"
 
@@ -38,8 +38,8 @@ EVERYBODY = [Instance(k, "host", 1, f"{k}").name for k in range(5)]
 
 
 @given(st.lists(st.tuples(st.sampled_from(EVERYBODY), st.booleans(), st.booleans()), max_size=30))
-def test_of_all_who_see_the_same_at_most_one_takes_the_lead(events):
-    """What each of them sees: everything but itself; those that may lead when nobody does are one."""
+def test_at_most_one_instance_becomes_the_leader(events):
+    """Each instance sees all others; if none leads, exactly one of them may lead."""
     everybody = {name: Instances(name) for name in EVERYBODY}
     leading, waiting = set(), set()
     for name, leads, there in events:
@@ -54,8 +54,8 @@ def test_of_all_who_see_the_same_at_most_one_takes_the_lead(events):
 
 
 @given(names, names)
-def test_what_this_session_said_before_is_nobody_else(me, other):
-    """Zenoh may tell a session of a token of its own that is gone: a robot that came back was never served again."""
+def test_earlier_tokens_of_this_session_are_ignored(me, other):
+    """Zenoh may report an earlier token of the session itself, which must not prevent it from leading again."""
     instances = Instances(me.name)
     instances.update(Instance(other.started_ms, me.host, me.pid, me.zid).name, leads=True, alive=True)
     assert instances.may_lead()
@@ -64,7 +64,7 @@ def test_what_this_session_said_before_is_nobody_else(me, other):
     assert not instances.may_lead()
 
 
-def test_where_nobody_leads_the_first_source_is_heard_until_it_is_silent():
+def test_without_a_leader_the_first_source_is_selected_until_it_is_silent():
     sources = SourceSelector(0.3)
 
     def takes(source, now, robot="robot"):
@@ -74,21 +74,21 @@ def test_where_nobody_leads_the_first_source_is_heard_until_it_is_silent():
     assert not takes("b", 0.1)
     assert takes("b", 0.1, "other")
     assert takes("a", 0.3)
-    assert not takes("b", 0.55)  # what was refused does not count as heard
+    assert not takes("b", 0.55)  # a rejected message does not select its source
     assert takes("b", 0.6)
     assert not takes("a", 0.7)
 
 
-def test_the_instance_that_leads_is_heard_and_nobody_else_however_silent_it_is():
+def test_only_the_leader_is_selected_even_if_it_is_silent():
     sources = SourceSelector(0.3)
     leader = Instance(1, "host", 2, "0123456789ab")
     sources.update("robot", "simulator", leader.name, True)
     assert not sources.accepts("presage/robot/scan", "simulator", "repeater", 0.0)
     assert sources.accepts("presage/robot/scan", "simulator", "0123456789abcdef", 5.0)
     assert not sources.accepts("presage/robot/scan", "simulator", "repeater", 50.0)
-    assert sources.accepts("presage/robot/belief", "estimator", "anybody", 50.0)  # nobody leads there
+    assert sources.accepts("presage/robot/belief", "estimator", "anybody", 50.0)  # the estimator has no leader
     younger = Instance(2, "host", 1, "ba9876543210")
-    sources.update("robot", "simulator", younger.name, True)  # two halves of a network have met
+    sources.update("robot", "simulator", younger.name, True)  # two parts of a network were joined
     assert not sources.accepts("presage/robot/scan", "simulator", "ba9876543210", 50.0)
     sources.update("robot", "simulator", younger.name, False)
     sources.update("robot", "simulator", leader.name, False)

@@ -1,4 +1,4 @@
-"""Who is there, where a query for liveliness tokens leaves some out."""
+"""Liveliness tokens that a query misses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from common.messages.topics import alive_key
 
 
 class Session:
-    """A zenoh session of which queries answer ``answers``, and whose subscribers are told what a test says."""
+    """A fake zenoh session: queries return ``answers``, and the test calls the subscribers."""
 
     def __init__(self):
         self.answers, self.tell = [], []
@@ -41,13 +41,13 @@ def sample(key, kind):
     return SimpleNamespace(key_expr=key, kind=kind)
 
 
-def test_who_was_told_of_is_there_though_a_query_leaves_it_out(session):
+def test_tokens_missed_by_a_query_are_still_found(session):
     presence = Liveliness(session, "robot")
     old, new = (alive_key("robot", "estimator", f"{age:012x}~host~1~ab") for age in (1, 2))
     assert presence.alive() == set()
     session.tell[0](sample(old, zenoh.SampleKind.PUT))
     assert presence.alive() == {"estimator"}
-    session.answers = [new]  # and what was not told of yet, a query knows
+    session.answers = [new]  # the query finds a token that was not reported yet
     assert presence.alive_instances() == {"estimator": [old.split("/")[-1], new.split("/")[-1]]}
     session.answers = []
     session.tell[0](sample(old, zenoh.SampleKind.DELETE))

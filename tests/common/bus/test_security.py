@@ -28,7 +28,7 @@ from presage.session import credentials as secure
 
 
 def included(key: str, expression: str) -> bool:
-    """As zenoh looks at it: whether all that the key means, it may be an expression itself, is allowed."""
+    """Whether an expression includes all keys of ``key``, which may be an expression too, as zenoh decides it."""
     return KeyExpr(expression).includes(KeyExpr(key))
 
 
@@ -40,7 +40,7 @@ def may_send(role: str, message: str, key: str, robots: tuple[str, ...] = ("*",)
     )
 
 
-def test_every_role_of_the_table_is_one_and_every_topic_has_somebody_who_puts_it():
+def test_roles_exist_and_cover_all_topics_and_queries():
     named = {role for topic in TOPICS for role in topic.publisher_roles} | {
         role for query in QUERIES for role in query.requester_roles
     }
@@ -53,13 +53,13 @@ def test_every_role_of_the_table_is_one_and_every_topic_has_somebody_who_puts_it
         assert [role for role in ROLES if may_ask(role, query)], query.name
 
 
-def test_one_role_drives_one_scans():
+def test_only_the_robot_publishes_scans_and_only_the_controller_commands():
     stands_in = {"replay"}
     assert {role for role in ROLES if may_put(role, CMD_VEL)} - stands_in == {"controller"}
     assert {role for role in ROLES if may_put(role, SCAN)} - stands_in == {"simulator", "bridge_ros2"}
 
 
-def test_whatever_moves_the_robot_or_changes_what_runs_takes_control():
+def test_requests_that_change_something_need_a_control_role():
     free = {"sample", "world", "model", "predict", "config"}
     rviz = {"localise": "bridge_ros2"}  # whose "2D Pose Estimate" the bridge passes on
     others = {q.name: set(q.requester_roles) - {rviz.get(q.name)} for q in QUERIES}
@@ -68,7 +68,7 @@ def test_whatever_moves_the_robot_or_changes_what_runs_takes_control():
 
 
 @pytest.mark.parametrize(("role", "topic"), list(product(sorted(set(ROLES) - {ROUTER}), TOPICS)))
-def test_the_rules_say_of_puts_what_the_table_says(role, topic):
+def test_rules_for_publishing_agree_with_the_table(role, topic):
     own = service_of(role) or "nobody"
     key = topic.key("r1", own)
     assert may_send(role, "put", key) == may_put(role, topic)
@@ -77,7 +77,7 @@ def test_the_rules_say_of_puts_what_the_table_says(role, topic):
     assert not may_send(role, "put", "presage/r1/never-heard-of")
 
 
-def test_a_service_speaks_under_its_own_name_alone():
+def test_services_can_only_use_their_own_name():
     assert may_send("estimator", "put", HEALTH.key("r1", "estimator"))
     assert not may_send("estimator", "put", HEALTH.key("r1", "simulator"))
     assert may_send("estimator", "liveliness_token", "presage/r1/alive/estimator")
@@ -87,7 +87,7 @@ def test_a_service_speaks_under_its_own_name_alone():
     assert may_send("viewer-control", "put", HEALTH.key("r1", "viewer"))
 
 
-def test_queries_are_asked_and_answered_by_role():
+def test_queries_and_replies_depend_on_the_role():
     assert may_send("operator", "query", TELEPORT.key("r1"))
     assert not may_send("observer", "query", TELEPORT.key("r1"))
     assert may_send("observer", "query", WORLD.key("r1"))
@@ -96,14 +96,14 @@ def test_queries_are_asked_and_answered_by_role():
     assert not may_send("controller", "reply", WORLD.key("r1"))
 
 
-def test_a_member_for_one_robot_has_nothing_to_do_with_another():
+def test_members_for_one_robot_have_no_rights_for_others():
     for message, key in (("put", "cmd_vel"), ("declare_subscriber", "scan"), ("liveliness_token", "alive/controller")):
         assert may_send("controller", message, f"presage/one/{key}", ("one",))
         assert not may_send("controller", message, f"presage/two/{key}", ("one",))
         assert not may_send("controller", message, f"presage/*/{key}", ("one",))
 
 
-def test_default_is_no_and_only_routers_are_heard_by_others():
+def test_the_default_is_deny_and_clients_accept_only_routers():
     members = [Member(name=role, role=role) for role in ROLES]
     for access in (router_rules(members), client_rules()):
         assert access["enabled"]
@@ -125,14 +125,14 @@ def keys(tmp_path_factory):
     return folder
 
 
-def test_a_robot_s_own_credentials_go_before_the_common_ones(keys):
+def test_credentials_of_the_robot_are_preferred(keys):
     assert credentials(keys, ("controller",), "one").member.robots == ("one",)
     with pytest.raises(UserError, match="no credentials of 'controller', but of controller-one, estimator-one"):
         credentials(keys, ("controller",), "two")
     assert credentials(keys, ("nobody", "observer"), "one").member.name == "observer"
 
 
-def test_what_is_wrong_with_a_folder_is_said(keys, tmp_path):
+def test_invalid_folders_are_explained(keys, tmp_path):
     with pytest.raises(UserError, match=r"no such folder \(--security"):
         credentials(tmp_path / "none", ("observer",))
     secure.init(tmp_path)
@@ -147,12 +147,12 @@ def test_what_is_wrong_with_a_folder_is_said(keys, tmp_path):
         credentials(tmp_path, ("router",))
 
 
-def test_a_password_is_not_in_what_is_printed(keys):
+def test_passwords_are_not_printed(keys):
     mine = credentials(keys, ("observer",))
     assert mine.password not in repr(mine)
 
 
-def test_a_role_s_limits_are_said_before_the_router_is_silent(keys):
+def test_missing_rights_raise_an_error_before_sending(keys):
     mine = credentials(keys, ("controller",), "one")
     mine.check(may_put, CMD_VEL, "one")
     with pytest.raises(UserError, match="'controller-one' is for one, not for robot 'two'"):
@@ -169,13 +169,13 @@ def test_a_role_s_limits_are_said_before_the_router_is_silent(keys):
         ("udp/0.0.0.0:1", False), ("tcp/robot.lan:7447", False), ("tls/:::7447", False),
     ],
 )  # fmt: skip
-def test_what_is_open_to_others_is_refused(endpoint, here):
+def test_exposed_endpoints_are_refused(endpoint, here):
     assert on_loopback(endpoint) == here
     if not here:
         with pytest.raises(UserError, match="--insecure"):
             refuse_exposure(["tcp/127.0.0.1:0", endpoint])
 
 
-def test_nothing_goes_in_the_clear():
+def test_endpoints_use_tls():
     assert over_tls("tcp/host:1") == "tls/host:1"
     assert over_tls("quic/host:1") == "quic/host:1"

@@ -1,4 +1,4 @@
-"""When a container counts as healthy: by heartbeats given, and by those of a real service."""
+"""Health of containers, from given heartbeats and from those of a real service."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NOW = 1000.0
 
 
 def beat(age=0.5, *, linked=True, note="", **ages):
-    """``scan__published=3``: counted last 3 s ago."""
+    """``scan__published=3`` means that the count last increased 3 s ago."""
     last = {}
     for name, ago in ages.items():
         topic, kind = name.split("__")
@@ -61,18 +61,18 @@ def beat(age=0.5, *, linked=True, note="", **ages):
         ("viewer", beat(), ""),
     ],
 )
-def test_a_service_is_healthy_where_its_work_comes_out(service, beats, fault):
+def test_health_follows_from_inputs_and_results(service, beats, fault):
     assert fault_of(service, beats, ["robot"], NOW) == fault
 
 
-def test_every_robot_of_a_container_counts():
+def test_every_robot_of_a_container_must_be_healthy():
     both = {"robot-1": Beat(NOW, linked=True), "robot-2": Beat(NOW - 9, linked=True)}
     assert fault_of("estimator", both, list(both), NOW) == "robot-2: no heartbeat for 9 s"
     assert fault_of("estimator", {"robot-1": both["robot-1"]}, list(both), NOW) == "robot-2: no heartbeat"
     assert fault_of("viewer", {"robot-1": both["robot-1"]}, list(both), NOW) == ""  # one process for both
 
 
-def test_a_count_that_rises_is_dated_anew(tmp_path):
+def test_heartbeats_record_when_counts_increased(tmp_path):
     heart = Heartbeat(tmp_path, "small", "robot")
     heart.beat({"a": {"received": 1}, "b": {"published": 0}}, linked=True)
     first = read_beats(tmp_path, "small")["robot"]
@@ -84,14 +84,14 @@ def test_a_count_that_rises_is_dated_anew(tmp_path):
     assert read_beats(tmp_path, "other") == {}
 
 
-def test_what_is_no_heartbeat_counts_as_none(tmp_path):
+def test_invalid_heartbeat_files_are_ignored(tmp_path):
     for number, text in enumerate(("", "{", "[1]", '{"when": 3}')):
         (tmp_path / f"small@{number}.beat").write_text(text)
     assert read_beats(tmp_path, "small") == {}
 
 
 def check(service, folder=None, **environment):
-    """Status and complaint of the command."""
+    """Exit status and message of the command."""
     clean = {k: v for k, v in os.environ.items() if not k.startswith("PRESAGE_")}
     said = {"PYTHONPATH": str(ROOT), **({"PRESAGE_HEARTBEAT": str(folder)} if folder else {})}
     done = subprocess.run(
@@ -101,7 +101,7 @@ def check(service, folder=None, **environment):
     return done.returncode, done.stderr.strip()
 
 
-def test_a_real_service_that_is_frozen_is_unhealthy_until_it_goes_on(bus, process, link, tmp_path):
+def test_a_frozen_service_is_unhealthy_until_it_continues(bus, process, link, tmp_path):
     running = process(SMALL, "--heartbeat", str(tmp_path))
     beats = lambda: read_beats(tmp_path, "small").get(bus.robot)  # noqa: E731
     assert wait_until(lambda: beats() is not None and beats().linked, 30), running.output
@@ -123,7 +123,7 @@ def test_a_real_service_that_is_frozen_is_unhealthy_until_it_goes_on(bus, proces
     assert wait_until(lambda: check("small", tmp_path, PRESAGE_ROBOT=bus.robot)[0] == 0, 30, period=0.5)
 
 
-def test_a_router_is_healthy_where_a_session_opens(router, free_port):
+def test_a_router_is_healthy_if_a_session_opens(router, free_port):
     assert check("router", PRESAGE_CONNECT=f"tcp/127.0.0.1:{router}") == (0, "")
     status, said = check("router", PRESAGE_CONNECT=f"tcp/127.0.0.1:{free_port()}")
     assert status == 1

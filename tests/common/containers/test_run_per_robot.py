@@ -1,4 +1,4 @@
-"""A process for each robot: real children, told apart by what they write."""
+"""One process for each robot, with real child processes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ time.sleep(600)
 
 @pytest.fixture
 def fleet(process, tmp_path):
-    """Starts the launcher over the child above."""
+    """Starts the launcher with the child program above."""
     (tmp_path / "child.py").write_text(CHILD)
 
     def start(mode, count, *args):
@@ -41,12 +41,12 @@ def fleet(process, tmp_path):
 
 
 def started(folder, robot):
-    """Process ids, one a start."""
+    """Process ids, one for each start."""
     path = folder / robot
     return [int(line) for line in path.read_text().split()] if path.exists() else []
 
 
-def test_names_of_robots():
+def test_robot_names():
     assert robot_names({}) == robot_names({"PRESAGE_FLEET": "1"}) == robot_names({"PRESAGE_FLEET": ""}) == ["robot"]
     assert robot_names({"PRESAGE_FLEET": "3"}) == ["robot-1", "robot-2", "robot-3"]
     assert robot_names({"PRESAGE_FLEET": "2", "PRESAGE_ROBOT": "truck"}) == ["truck-1", "truck-2"]
@@ -54,18 +54,18 @@ def test_names_of_robots():
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "three", "1000", "101", "1.5"])
-def test_a_number_that_is_none_is_refused(text):
+def test_invalid_numbers_of_robots_are_refused(text):
     with pytest.raises(ValueError, match="expected the number of robots, 1 to 100"):
         robot_names({"PRESAGE_FLEET": text})
 
 
 @pytest.mark.parametrize("argv", [["every", "child"], ["each"]])
-def test_words_that_make_no_sense_are_refused(argv, capsys):
+def test_invalid_arguments_are_refused(argv, capsys):
     assert main(argv) == 2
     assert "give each, together or once" in capsys.readouterr().err
 
 
-def test_one_that_dies_is_started_again_and_the_others_stay(fleet, tmp_path):
+def test_a_process_that_ends_is_restarted_alone(fleet, tmp_path):
     running = fleet("each", "3")
     robots = ["robot-1", "robot-2", "robot-3"]
     assert wait_until(lambda: all(started(tmp_path, robot) for robot in robots), PATIENCE), running.output
@@ -79,7 +79,7 @@ def test_one_that_dies_is_started_again_and_the_others_stay(fleet, tmp_path):
     assert not [pid for robot in robots for pid in started(tmp_path, robot) if psutil.pid_exists(pid)]
 
 
-def test_children_end_with_the_launcher_even_where_it_is_killed(fleet, tmp_path):
+def test_children_end_if_the_launcher_is_killed(fleet, tmp_path):
     running = fleet("each", "2")
     running.wait_for("robot-1 | here")
     running.wait_for("robot-2 | here")
@@ -97,7 +97,7 @@ def test_once_ends_with_the_worst_status(fleet, tmp_path):
 @pytest.mark.parametrize(
     ("mode", "count", "told"), [("together", "2", "here robot-1,robot-2"), ("each", "1", "here None")]
 )
-def test_one_process_takes_the_launcher_s_place(fleet, tmp_path, mode, count, told):
+def test_a_single_process_replaces_the_launcher(fleet, tmp_path, mode, count, told):
     running = fleet(mode, count)
     running.wait_for(told)
     assert started(tmp_path, "robot-1" if count == "2" else "robot") == [running.child.pid]

@@ -1,4 +1,4 @@
-"""ROS maps that tests write."""
+"""Writes ROS maps for tests."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ MARKS = {".": FREE, "#": OCCUPIED, "?": UNKNOWN}
 
 
 def values_of(drawing):
-    """(rows, columns), the lowest row first, of lines of text, the highest first."""
+    """(rows, columns) cells, lowest row first, from lines of text with the highest row first."""
     lines = drawing.split()
     return np.array([[MARKS[mark] for mark in line] for line in reversed(lines)], np.uint8)
 
 
 def write_yaml(folder: Path, *, name="map", **keys) -> Path:
-    """map.yaml alone."""
+    """Write map.yaml without an image."""
     path = folder / f"{name}.yaml"
     path.write_text(yaml.safe_dump(KEYS | keys))
     return path

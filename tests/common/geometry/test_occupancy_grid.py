@@ -1,4 +1,4 @@
-"""A map of cells: as data, and its geometry against polygons, brute force and what was counted by hand."""
+"""Occupancy grids as data, and their geometry compared with polygons, brute force and values computed by hand."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def world_of(values, resolution=0.5, origin=(0.0, 0.0, 0.0), **more):
 
 
 def speckled(seed, size=9):
-    """Cells at random: every way in which they can touch."""
+    """Random cells, which touch in every possible way."""
     rng = np.random.default_rng(seed)
     return rng.choice([FREE, OCCUPIED, UNKNOWN], (size, size + 3), p=[0.6, 0.25, 0.15]).astype(np.uint8)
 
 
 def squares(values, kind, world):
-    """The cells of a kind as polygons in map, each by itself."""
+    """The cells with one value as separate polygons in map."""
     row, column = np.nonzero(values == kind)
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     rings = np.column_stack([column, row])[:, None] + corners
@@ -48,7 +48,7 @@ def squares(values, kind, world):
     return shapely.union_all(shapely.polygons([world.grid.to_map(ring * size) for ring in rings]))
 
 
-def test_ranges_known_by_hand():
+def test_ranges_computed_by_hand():
     hut = world_of(HUT)
     here = [[2.75, 1.25, 0.0]]  # in the cell above the door
     ahead = hut.ray_distances(here, [0.0, np.pi / 2, np.pi, -np.pi / 2])
@@ -58,7 +58,7 @@ def test_ranges_known_by_hand():
     assert np.isposinf(hut.ray_distances([[-7.0, 3.25, 0.0]], [np.pi, 1.5])).all()
 
 
-def test_unknown_cells_are_no_place_to_be():
+def test_unknown_cells_are_not_free():
     hut = world_of(HUT)
     clearance = hut.clearance([[2.25, 1.25], [0.25, 0.25], [-3.0, 0.0], [0.75, 0.75], [4.75, 1.75]])
     assert clearance == pytest.approx([0.25, *clearance[1:4], 0.25])
@@ -73,7 +73,7 @@ def test_unknown_cells_are_no_place_to_be():
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([(0.0, 0.0, 0.0), TURNED]))
-def test_every_ray_ends_where_outlines_of_the_cells_are(seed, origin):
+def test_rays_agree_with_the_cells_outlines(seed, origin):
     values = speckled(seed)
     world = world_of(values, origin=origin)
     rng = np.random.default_rng(seed)
@@ -87,7 +87,7 @@ def test_every_ray_ends_where_outlines_of_the_cells_are(seed, origin):
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([(0.0, 0.0, 0.0), TURNED]))
-def test_free_space_and_clearance_are_those_of_the_free_cells(seed, origin):
+def test_free_space_and_clearance_follow_the_free_cells(seed, origin):
     values = speckled(seed)
     world = world_of(values, origin=origin, obstacles=[{"circle": {"center": (2.0, 3.0), "radius": 0.8}}])
     free = squares(values, FREE, world).difference(world.furniture)
@@ -101,7 +101,7 @@ def test_free_space_and_clearance_are_those_of_the_free_cells(seed, origin):
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_distances_on_a_lattice_are_those_of_single_points(seed):
+def test_lattice_distances_agree_with_single_points(seed):
     rng = np.random.default_rng(seed)
     world = world_of(speckled(seed), origin=(1.0, -2.0, 0.0))
     x, y = np.sort(rng.uniform(-1, 11, 12)), np.sort(rng.uniform(-5, 7, 9))
@@ -111,27 +111,27 @@ def test_distances_on_a_lattice_are_those_of_single_points(seed):
     np.testing.assert_allclose(world.surface_distances(x, y, 0.7).ravel(), away, atol=1e-9)
 
 
-def test_a_lattice_over_cells_all_alike():
+def test_lattice_over_uniform_cells():
     x = np.array([-1.5, 0.5])
     assert np.isposinf(signed_distance(np.zeros((2, 2), bool), x, x)).all()
     assert signed_distance(np.ones((2, 2), bool), x, x) == pytest.approx(np.array([[1.5 * 2**0.5, 1.5], [1.5, -0.5]]))
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.1, 1.5))
-def test_roomy_cells_have_their_middle_clear(seed, clearance):
+def test_cells_with_clearance_have_clear_centres(seed, clearance):
     world = world_of(speckled(seed))
     cells = np.argwhere(world.grid.values == FREE)[:, ::-1]
     clear = world.clearance(world.grid.shapes.points_in_cells(cells, 0.5)) >= clearance
     assert world.grid.shapes.cells_with_clearance(clearance).tolist() == cells[clear].tolist()
 
 
-def test_faces_in_line_are_one():
+def test_collinear_edges_are_merged():
     assert sorted(outline(np.ones((3, 5), bool)).tolist()) == [[0, 0, 0, 3], [0, 0, 5, 0], [0, 3, 5, 3], [5, 0, 5, 3]]
     touching = np.array([[True, False], [False, True]])  # two cells that touch with a corner: eight faces
     assert len(outline(touching)) == 8
 
 
-def test_a_large_map_travels_small_and_scans_fast():
+def test_large_maps_are_compressed_and_fast():
     values = rooms(1000)
     world = world_of(values, 0.05, (-25.0, -25.0, 0.0))
     text = world.model_dump_json()
@@ -145,7 +145,7 @@ def test_a_large_map_travels_small_and_scans_fast():
     np.testing.assert_allclose(world.ray_distances(poses, few), brute, atol=1e-9)
 
 
-def test_furniture_on_a_map_hides_and_blocks():
+def test_obstacles_on_a_map_hide_and_block():
     crate = {"name": "crate", "box": {"center": (2.75, 2.25), "size": (0.3, 0.3)}}
     hut, empty = world_of(HUT, obstacles=[crate]), world_of(HUT)
     here = [[2.75, 1.25, np.pi / 2]]
@@ -155,7 +155,7 @@ def test_furniture_on_a_map_hides_and_blocks():
     assert np.array_equal(hut.with_obstacles([]).segments, empty.segments)
 
 
-def test_a_map_is_its_own_file(tmp_path):
+def test_saved_maps_are_loaded_unchanged(tmp_path):
     hut = world_of(
         HUT, origin=TURNED, start={"x": 1.0, "y": 0.0}, obstacles=[{"circle": {"center": (0, 0), "radius": 1}}]
     )
@@ -177,13 +177,13 @@ def test_a_map_is_its_own_file(tmp_path):
         ({"origin": (0, float("nan"), 0)}, "finite"),
     ],
 )
-def test_a_grid_from_the_bus_that_is_none_is_refused(change, why):
+def test_invalid_grids_are_refused(change, why):
     plain = OccupancyGrid.of(HUT, 0.5, (0, 0, 0)).model_dump()
     with pytest.raises(ValidationError, match=why):
         World.model_validate({"name": "bad", "grid": plain | change})
 
 
-def test_cells_have_three_values_and_the_boundary_is_the_edge():
+def test_cells_have_three_values_and_the_boundary_is_the_grids_edge():
     with pytest.raises(ValidationError, match="100 occupied"):
         OccupancyGrid.of(np.full((2, 2), 7, np.uint8), 0.5, (0, 0, 0))
     with pytest.raises(ValidationError, match="leave it out"):

@@ -1,4 +1,4 @@
-"""A world as cells."""
+"""Worlds converted to occupancy grids."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def of_map(**rest):
     return World(name="map", grid=OccupancyGrid.of(PLAN, 0.5, (1.0, -2.0, 0.3)), **rest)
 
 
-def test_a_ros_map_is_its_own():
+def test_a_ros_map_keeps_its_cells():
     assert rasterise(of_map()) is not None
     assert rasterise(of_map()) == of_map().grid
 
 
-def test_furniture_on_a_ros_map_is_in_it():
+def test_obstacles_are_added_to_a_ros_map():
     grid = of_map().grid
     at = grid.to_map(np.array([[1.25, 0.75]]))[0]  # the third cell of the second row from below
     box = Obstacle(circle={"center": tuple(at), "radius": 0.01})
@@ -38,8 +38,8 @@ def test_furniture_on_a_ros_map_is_in_it():
 
 
 @pytest.mark.parametrize("name", ["corridor", "maze", "office"])
-def test_polygons_are_free_where_the_world_is_and_walled_in(name):
-    """Away from edges each cell says what the world says; from no free cell does one step lead into the unknown."""
+def test_polygons_become_free_cells_with_walls(name):
+    """Cells away from edges agree with the world, and no free cell is next to an unknown one."""
     world = load_world(name)
     grid = rasterise(world)
     rng = np.random.default_rng(0)
@@ -56,7 +56,7 @@ def test_polygons_are_free_where_the_world_is_and_walled_in(name):
             assert not ((values == FREE) & (beside == UNKNOWN)).any()
 
 
-def test_a_wall_thinner_than_a_cell_is_not_lost():
+def test_thin_walls_are_not_lost():
     thin = Obstacle(box={"center": (2.013, 1.0), "size": (0.004, 2.0)})
     values = rasterise(World(name="w", boundary=[(0, 0), (4, 0), (4, 2), (0, 2)], obstacles=[thin])).values
     inside = (values == FREE).any(axis=1)

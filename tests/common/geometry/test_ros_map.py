@@ -1,4 +1,4 @@
-"""map.yaml by map_server's rules, written out pixel by pixel; image formats; files that are wrong."""
+"""ROS maps: map_server's rules for single pixels, image formats, and invalid files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ALPHAS = np.random.default_rng(0).choice([0, 1, 128, 254, 255], (16, 16)).astype
 
 
 def expected(shade, alpha, mode, negate, low, high):
-    """One pixel, 0 to 255, as nav2_map_server's map_io.cpp has it: 0 to 100, or -1."""
+    """Occupancy of one pixel (0 to 255) as in nav2_map_server's map_io.cpp: 0 to 100, or -1."""
     level = shade / 255 if mode != "trinary" or alpha is None else (3 * shade + alpha) / 4 / 255
     occupied = level if negate else 1 - level
     if mode == "raw":
@@ -38,7 +38,7 @@ def expected(shade, alpha, mode, negate, low, high):
 @pytest.mark.parametrize("negate", [False, True])
 @pytest.mark.parametrize("alpha", [None, ALPHAS])
 @pytest.mark.parametrize("thresholds", [(0.25, 0.65), (0.196, 0.9)])
-def test_percentages_are_map_servers(mode, negate, alpha, thresholds):
+def test_percentages_agree_with_map_server(mode, negate, alpha, thresholds):
     low, high = thresholds
     described = MapFile(
         image="x", resolution=1, origin=(0, 0, 0), negate=negate, mode=mode, free_thresh=low, occupied_thresh=high
@@ -56,7 +56,7 @@ def cells_of(folder, image, **keys):
     return load_world(str(write_yaml(folder, image=image, **keys))).grid.values
 
 
-def test_what_map_saver_writes_is_read_whatever_its_thresholds(tmp_path):
+def test_maps_of_map_saver_are_read_with_any_thresholds(tmp_path):
     values = values_of("#?. ..# ?.#")
     for low in (0.25, 0.196):
         world = load_world(str(write_map(tmp_path, values, free_thresh=low, origin=[-1, 2.5, 0], resolution=0.1)))
@@ -68,7 +68,7 @@ def test_what_map_saver_writes_is_read_whatever_its_thresholds(tmp_path):
     assert cells_of(tmp_path, "own.png", free_thresh=0.25).tolist() == [[OCCUPIED, FREE, FREE, FREE]]
 
 
-def test_what_is_between_free_and_occupied(tmp_path):
+def test_values_between_free_and_occupied(tmp_path):
     Image.fromarray(np.array([[0, 100, 150, 255]], np.uint8)).save(tmp_path / "m.png")
     assert cells_of(tmp_path, "m.png", mode="scale").tolist() == [[OCCUPIED, UNKNOWN, UNKNOWN, FREE]]
     assert cells_of(tmp_path, "m.png", mode="Trinary", negate=1).tolist() == [[FREE, UNKNOWN, UNKNOWN, OCCUPIED]]
@@ -93,7 +93,7 @@ KINDS = [
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_images_of_every_kind_say_the_same(tmp_path, kind):
+def test_image_formats_give_the_same_cells(tmp_path, kind):
     dark = np.array([[0, 255, 255], [0, 0, 255]], np.uint8)
     path = tmp_path / f"map.{kind.split('.')[-1] if '.' in kind else 'pgm'}"
     if kind.startswith("P2"):
@@ -110,7 +110,7 @@ def test_images_of_every_kind_say_the_same(tmp_path, kind):
     assert cells_of(tmp_path, path.name).tolist() == [[OCCUPIED, OCCUPIED, FREE], [OCCUPIED, FREE, FREE]]
 
 
-def test_keys_left_out_are_map_savers_defaults_and_presages_own_are_taken(tmp_path):
+def test_missing_keys_have_defaults_and_presages_keys_are_read(tmp_path):
     Image.fromarray(np.full((40, 40), 254, np.uint8)).save(tmp_path / "hall.png")
     path = tmp_path / "the hall.yaml"
     plain = {"image": "hall.png", "resolution": 0.1, "origin": [0, 0, 0.5], "somebody": "else's"}
@@ -142,7 +142,7 @@ def test_keys_left_out_are_map_savers_defaults_and_presages_own_are_taken(tmp_pa
         ({"start": {"x": 1}}, "start.y: Field required"),
     ],
 )
-def test_a_wrong_map_says_what_is_wrong(tmp_path, keys, why):
+def test_invalid_maps_are_explained(tmp_path, keys, why):
     path = write_map(tmp_path, values_of("#.? ..."))
     Image.new("1", (5000, 4000)).save(tmp_path / "huge.png")
     Image.fromarray(ALPHAS).save(tmp_path / "cut.png")
@@ -153,13 +153,13 @@ def test_a_wrong_map_says_what_is_wrong(tmp_path, keys, why):
         load_world(str(path))
 
 
-def test_an_image_that_is_a_pipe_is_refused_at_once(tmp_path):
+def test_a_pipe_as_image_is_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe.pgm")
     with pytest.raises(UserError, match=r"map image .*pipe.pgm: not a file but a folder, a pipe or a device"):
         load_world(str(write_yaml(tmp_path, image="pipe.pgm")))
 
 
-def test_the_image_itself_is_no_world(tmp_path):
+def test_an_image_given_as_world_is_explained(tmp_path):
     write_map(tmp_path, values_of("#.? ..."))
     with pytest.raises(UserError, match=r"map.pgm: an image: give the map.yaml that names it, such as .*map.yaml"):
         load_world(str(tmp_path / "map.pgm"))

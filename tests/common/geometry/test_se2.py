@@ -1,4 +1,4 @@
-"""Poses: group laws, wrapping, Jacobians against finite differences."""
+"""Poses: group laws, wrapping, and Jacobians compared with finite differences."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_wrap_stays_in_its_interval_and_keeps_the_direction(angle):
 
 
 @pytest.mark.parametrize("angle", [np.pi, -np.pi, 3 * np.pi, -1e-17, 0.0])
-def test_wrap_at_the_border(angle):
+def test_wrap_at_the_limits(angle):
     assert -np.pi <= float(se2.wrap(angle)) < np.pi
 
 
@@ -61,5 +61,5 @@ def test_batches_broadcast():
 
 
 @given(poses, poses)
-def test_a_point_is_transformed_as_the_pose_that_stands_there(a, b):
+def test_points_transform_like_poses(a, b):
     assert se2.transform(a, b[None, :2])[0] == pytest.approx(se2.compose(a, b)[:2], abs=1e-9)

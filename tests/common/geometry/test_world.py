@@ -1,4 +1,4 @@
-"""Worlds as data: exact rays against hand-computed ranges and shapely, free space, files and their errors."""
+"""Worlds: exact rays compared with ranges computed by hand and by shapely, free space, and files."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def test_known_ranges():
     assert ROOM.ray_distances([[0.5, 2.0, 0.0]], [0.0])[0, 0] == pytest.approx(0.5)
 
 
-def test_outside_looking_away_nothing_is_hit():
+def test_rays_that_hit_nothing_are_infinite():
     assert np.isposinf(ROOM.ray_distances([[20.0, 3.0, 0.0]], [0.0])).all()
 
 
 @given(st.integers(0, 2**32 - 1))
 def test_rays_agree_with_shapely(seed):
-    """Where a ray ends there is a surface, and before it there is none."""
+    """A ray ends at a surface and meets none before."""
     rng = np.random.default_rng(seed)
     (x, y), angle = ROOM.sample_free(1, rng, 0.01)[0], rng.uniform(-np.pi, np.pi)
     distance = float(ROOM.ray_distances([[x, y, 0.0]], [angle])[0, 0])
@@ -50,7 +50,7 @@ def test_rays_agree_with_shapely(seed):
         assert ROOM.free_space.buffer(1e-3).contains(line)
 
 
-def test_many_poses_are_the_same_as_one_by_one():
+def test_batches_of_poses_agree_with_single_poses():
     rng = np.random.default_rng(0)
     poses = np.column_stack([ROOM.sample_free(50, rng), rng.uniform(-3, 3, 50)])
     angles = np.linspace(-2, 2, 811)
@@ -59,7 +59,7 @@ def test_many_poses_are_the_same_as_one_by_one():
     assert ROOM.ray_distances(np.zeros((0, 3)), angles).shape == (0, 811)
 
 
-def test_clearance_is_negative_where_nothing_can_be():
+def test_clearance_is_negative_outside_free_space():
     inside, wall, outside = ROOM.clearance([[5, 4], [3, 4.5], [7, 5.5]])
     assert inside == pytest.approx(1.0)
     assert wall == pytest.approx(-0.6, abs=1e-3)
@@ -73,19 +73,19 @@ def test_samples_are_free_and_seeded(seed, clearance):
     assert np.array_equal(points, ROOM.sample_free(20, np.random.default_rng(seed), clearance))
 
 
-def test_no_room_is_said():
+def test_missing_room_is_an_error():
     with pytest.raises(UserError, match="no place 4 m clear"):
         ROOM.sample_free(1, np.random.default_rng(0), 4)
 
 
-def test_a_world_without_a_start_has_one_near_its_middle():
+def test_the_default_start_is_near_the_centre():
     start = ROOM.start_pose(0.3)
     assert ROOM.clearance(start[:2])[0] >= 0.3 - 1e-9
     assert np.hypot(*(start[:2] - ROOM.center())) < 1
 
 
 @pytest.mark.parametrize("name", known_worlds())
-def test_shipped_worlds_are_one_room_for_the_robot(name):
+def test_shipped_worlds_are_connected_for_the_robot(name):
     world = load_world(name)
     room = shapely.buffer(world.free_space, -(Robot().radius + Robot().margin))
     assert room.geom_type == "Polygon"
@@ -95,7 +95,7 @@ def test_shipped_worlds_are_one_room_for_the_robot(name):
     assert all(not o.shape().disjoint(shapely.Polygon(world.boundary)) for o in world.obstacles)
 
 
-def test_the_corridor_is_the_paper_s():
+def test_the_corridor_has_the_papers_size():
     world = load_world("corridor")
     assert world.bounds == (0, 0, 18, 4.5)
     along = np.column_stack([np.linspace(0.5, 17.5, 100), np.full(100, 1.5)])
@@ -103,8 +103,8 @@ def test_the_corridor_is_the_paper_s():
     assert all(o.shape().bounds[1] > 3 for o in world.obstacles)  # all along one wall
 
 
-def test_the_twins_look_alike_inside_and_their_corridor_tells():
-    """A scan from most of a room is the very scan of its twin; from the doorway on a fifth of the beams differ."""
+def test_twin_rooms_differ_only_at_the_corridor():
+    """Scans of most of a room equal those of its twin; from the doorway on, a fifth of the beams differ."""
     world, scanner, twin = load_world("twins"), SCANNERS["tim571"].with_beams(271), np.array([6.0, 0, 0])
 
     def differ(poses):
@@ -121,7 +121,7 @@ def test_the_twins_look_alike_inside_and_their_corridor_tells():
     assert differ(np.array([[2.95, y, np.pi / 2] for y in (4.5, 4.8, 5.4)])).min() > 0.2
 
 
-def test_what_is_saved_loads(tmp_path):
+def test_saved_worlds_can_be_loaded(tmp_path):
     path = tmp_path / "w.yaml"
     path.write_text(save_world(ROOM))
     assert load_world(str(path)) == ROOM
@@ -144,7 +144,7 @@ def test_what_is_saved_loads(tmp_path):
         ("{name: x, since: 2020-13-45}", "month"),
     ],
 )
-def test_a_bad_file_is_one_line_that_says_where(tmp_path, text, why):
+def test_invalid_files_are_explained_in_one_line(tmp_path, text, why):
     path = tmp_path / "bad.yaml"
     path.write_text(text)
     with pytest.raises(UserError) as error:
@@ -154,7 +154,7 @@ def test_a_bad_file_is_one_line_that_says_where(tmp_path, text, why):
     assert "\n" not in str(error.value)
 
 
-def test_an_unknown_world_names_those_there_are():
+def test_an_unknown_world_lists_the_known_ones():
     with pytest.raises(UserError, match="corridor, maze, office, twins"):
         load_world("nowhere")
 

@@ -1,4 +1,4 @@
-"""The messages' own small methods, and schemas that agree with the bytes."""
+"""Methods of the messages, and JSON schemas compared with encoded messages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ JSON_TYPES = {
 
 
 def allowed(schema: dict, root: dict) -> list[dict]:
-    """The alternatives of a schema, references followed."""
+    """The alternatives of a schema, with references resolved."""
     if "$ref" in schema:
         return allowed(root["$defs"][schema["$ref"].rsplit("/", 1)[-1]], root)
     if "anyOf" in schema:
@@ -30,7 +30,7 @@ def allowed(schema: dict, root: dict) -> list[dict]:
 
 
 def check(value, schema: dict, root: dict, where: str) -> None:
-    """As much of JSON schema as messages use; a bin value is the string of ``contentEncoding: binary``."""
+    """Check the part of JSON schema that messages use; bytes match a string with ``contentEncoding: binary``."""
     kind = JSON_TYPES[type(value)]
     options = allowed(schema, root)
     fitting = [o for o in options if o.get("type") in (kind, None) or (kind == "integer" and o.get("type") == "number")]
@@ -54,12 +54,12 @@ def check(value, schema: dict, root: dict, where: str) -> None:
 
 @settings(max_examples=300)
 @given(all_messages())
-def test_what_goes_on_the_wire_is_what_the_schema_says(message):
+def test_encoded_messages_match_their_schema(message):
     schema = type(message).json_schema()
     check(msgpack.unpackb(message.encode()), schema, schema, type(message).__name__)
 
 
-def test_the_check_above_can_fail():
+def test_the_schema_check_can_fail():
     schema = Scan.json_schema()
     with pytest.raises(AssertionError, match="stamp_ns"):
         check({"stamp_ns": "now"}, {**schema, "required": []}, schema, "Scan")
@@ -68,7 +68,7 @@ def test_the_check_above_can_fail():
 
 
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda c: c.__name__)
-def test_a_schema_knows_every_field_and_how_to_read_its_arrays(cls):
+def test_schemas_describe_all_fields_and_arrays(cls):
     schema = cls.json_schema()
     assert schema["type"] == "object"
     assert schema.get("properties", {}).keys() == cls.model_fields.keys()
@@ -80,12 +80,12 @@ def test_a_schema_knows_every_field_and_how_to_read_its_arrays(cls):
 
 
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda t: t.name)
-def test_a_topic_s_message_begins_with_stamp_and_sequence(topic):
+def test_messages_on_topics_begin_with_stamp_and_sequence(topic):
     assert issubclass(topic.message, Stamped)
     assert list(topic.message.model_fields)[:2] == ["stamp_ns", "seq"]
 
 
-def test_poses_and_twists_are_arrays_and_back():
+def test_poses_and_twists_convert_to_arrays():
     assert Pose.of([1, 2, 3]).array().tolist() == [1.0, 2.0, 3.0]
     assert Twist(vx=1.0, wz=-1.0).array().tolist() == [1.0, 0.0, -1.0]
     with pytest.raises(ValueError, match="finite"):

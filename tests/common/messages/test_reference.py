@@ -1,4 +1,4 @@
-"""The page of messages says what the source says."""
+"""docs/messages.md agrees with the source."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def test_the_page_is_current():
     assert PAGE.read_text(encoding="utf-8") == page(), "run: python -m common.messages.reference > docs/messages.md"
 
 
-def test_every_row_and_field_is_on_it_with_what_the_source_says():
+def test_the_page_lists_all_topics_and_fields():
     text = page()
     for row in (*TOPICS, *QUERIES):
         assert f"| `{row.key('<robot>', '<service>')}` |" in text
@@ -29,7 +29,7 @@ def test_every_row_and_field_is_on_it_with_what_the_source_says():
     assert "the negative gradient of accuracy" in text  # a comment below its field
 
 
-def test_links_lead_somewhere():
+def test_links_have_targets():
     text = page()
     anchors = {line[4:].lower() for line in text.splitlines() if line.startswith("### ")}
     linked = {part.split(")")[0] for part in text.split("](#")[1:]}

@@ -1,4 +1,4 @@
-"""What messages of ROS say."""
+"""Stamps, transforms and mounts from ROS messages."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def placed(x, y, yaw, roll=0.0) -> Transform:
 
 
 @given(METRES, METRES, ANGLES, ANGLES)
-def test_a_transform_is_undone_by_its_inverse(x, y, yaw, roll):
+def test_transforms_have_inverses(x, y, yaw, roll):
     one = placed(x, y, yaw, roll)
     assert one.then(one.inverse()).apart(IDENTITY) < 1e-9
     assert np.linalg.det(one.rotation) == pytest.approx(1)
 
 
 @given(METRES, METRES, ANGLES, METRES, METRES, ANGLES)
-def test_level_transforms_compose_as_poses_in_the_plane(x, y, yaw, u, v, turn):
+def test_level_transforms_compose_like_planar_poses(x, y, yaw, u, v, turn):
     found = placed(x, y, yaw).then(placed(u, v, turn)).planar()
     wanted = se2.compose([x, y, yaw], [u, v, turn])
     np.testing.assert_allclose(found[:2], wanted[:2], atol=1e-9)
@@ -46,20 +46,20 @@ def test_level_transforms_compose_as_poses_in_the_plane(x, y, yaw, u, v, turn):
 
 
 @given(ANGLES, st.booleans(), st.floats(-0.08, 0.08))
-def test_a_scanner_nearly_level_sits_upright_or_upside_down(yaw, hangs, lean):
+def test_nearly_level_scanners_are_upright_or_upside_down(yaw, hangs, lean):
     mount = mount_of(placed(1.0, 2.0, yaw, lean + (np.pi if hangs else 0.0)))
     assert mount.upside_down == hangs
     np.testing.assert_allclose(mount.pose, [1, 2, yaw], atol=1e-9)
 
 
 @pytest.mark.parametrize("lean_deg", [6.0, 90.0, 174.0])
-def test_a_scanner_that_leans_is_none(lean_deg):
+def test_tilted_scanners_are_refused(lean_deg):
     with pytest.raises(ValueError, match=r"inclined by \d+ degrees"):
         mount_of(placed(0, 0, 0, np.deg2rad(lean_deg)))
 
 
 @pytest.mark.parametrize("wrong", [dict.fromkeys("xyzw", 0.0), {**dict.fromkeys("xyz", 0.0), "w": np.nan}])
-def test_what_is_no_rotation_is_refused(wrong):
+def test_invalid_rotations_are_refused(wrong):
     with pytest.raises(ValueError, match="not a rotation"):
         read_rotation(vector(**wrong))
     with pytest.raises(ValueError, match="m is not finite"):

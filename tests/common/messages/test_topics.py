@@ -1,4 +1,4 @@
-"""The table of topics is consistent with itself."""
+"""Consistency of the table of topics."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_names_and_keys_are_unique():
 
 
 @pytest.mark.parametrize("row", [*TOPICS, *QUERIES], ids=lambda row: row.name)
-def test_a_row_is_whole(row):
+def test_rows_are_complete(row):
     assert CHUNK.fullmatch(row.name)
     assert row.name == row.name.lower()
     assert row.about
@@ -39,20 +39,20 @@ def test_topic_of_is_the_inverse_of_key(robot, topic):
 
 
 @given(ROBOTS, st.sampled_from(TOPICS))
-def test_keys_that_only_resemble_one_belong_to_nobody(robot, topic):
+def test_similar_keys_belong_to_no_topic(robot, topic):
     key = topic.key(robot, "simulator")
     for other in (key + "/more", "other" + key, key.rsplit("/", 1)[0], key + "x", "/" + key, ""):
         assert topic_of(other) in (None, *(t for t in TOPICS if t.per_service and other == key + "x"))
 
 
-def test_robot_names_are_those_a_key_can_hold():
+def test_robot_names_are_valid_in_keys():
     pattern = next(m.pattern for m in ServiceSettings.model_fields["robot"].metadata if getattr(m, "pattern", None))
     for bad in ("", "a/b", "*", "**", "a b", "@x", "$*", "x" * 65, "a#b", "a?b"):
         assert not re.search(pattern, bad), bad
     assert re.search(pattern, "pmb2-7.lab_A")
 
 
-def test_commands_and_goals_are_newest_only_and_health_is_not():
+def test_queue_policies():
     policy = {topic.name: topic.queue for topic in TOPICS}
     assert policy["cmd_vel"] == policy["scan"] == policy["belief"] == "newest"
     assert policy["health"] == "all"

@@ -1,4 +1,4 @@
-"""Bytes to messages and back, and whatever else may come."""
+"""Encoding and decoding of messages, including invalid payloads."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CLASSES = list(dict.fromkeys(CLASSES))
 
 
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda c: c.__name__)
-def test_any_message_survives_the_wire(cls):
+def test_messages_are_decoded_as_encoded(cls):
     @settings(max_examples=40)
     @given(message_of(cls))
     def check(message):
@@ -53,7 +53,7 @@ def test_arrays_arrive_bit_for_bit_and_read_only():
             held[0] = 2.0
 
 
-def test_a_message_does_not_change_with_the_array_it_was_made_from():
+def test_messages_copy_their_arrays():
     ranges = np.ones(3, np.float32)
     scan = a_scan(ranges=ranges)
     ranges[:] = 9.0
@@ -150,7 +150,7 @@ BAD_ARRAYS = {
 
 @pytest.mark.parametrize("what", BAD)
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda c: c.__name__)
-def test_nothing_but_a_decode_error_comes_out(cls, what):
+def test_invalid_payloads_raise_only_decode_errors(cls, what):
     said = ""
     try:
         cls.decode(BAD[what])
@@ -160,19 +160,19 @@ def test_nothing_but_a_decode_error_comes_out(cls, what):
 
 
 @pytest.mark.parametrize("what", BAD)
-def test_a_bad_command_is_refused(what):
+def test_invalid_commands_are_refused(what):
     with pytest.raises(DecodeError):
         CmdVel.decode(BAD[what])
 
 
 @pytest.mark.parametrize("what", BAD_ARRAYS)
-def test_bad_arrays_and_values_are_refused(what):
+def test_invalid_arrays_and_values_are_refused(what):
     cls, payload = BAD_ARRAYS[what]
     with pytest.raises(DecodeError):
         cls.decode(payload)
 
 
-def test_values_at_the_limits_are_taken():
+def test_values_at_the_limits_are_accepted():
     far = Pose(x=-MAX_COORDINATE_M, y=MAX_COORDINATE_M, yaw=7.0)
     assert Goal.decode(Goal(stamp_ns=1, pose=far).encode()).pose == far
     ranges = np.full(MAX_BEAMS, MAX_DISTANCE_M, np.float32)
@@ -193,7 +193,7 @@ def test_the_error_names_the_field():
         Goal.decode(BAD_ARRAYS["a goal beyond all maps"][1])
 
 
-def test_a_field_from_the_future_is_ignored_and_one_from_the_past_has_its_default():
+def test_unknown_fields_are_ignored_and_missing_ones_have_defaults():
     assert CmdVel.decode(changed(COMMAND, colour="red")) == COMMAND
     assert Scan.decode(changed(a_scan(), scan_time=..., mount=..., seq=...)) == a_scan()
 
@@ -221,7 +221,7 @@ values = st.recursive(
 
 @settings(max_examples=800)
 @given(all_messages(), st.data())
-def test_any_one_field_replaced_by_anything(message, data):
+def test_one_field_replaced_by_any_value(message, data):
     fields = msgpack.unpackb(message.encode())
     if fields:
         fields[data.draw(st.sampled_from(sorted(fields)))] = data.draw(values)
@@ -234,7 +234,7 @@ def test_any_one_field_replaced_by_anything(message, data):
 
 @settings(max_examples=800)
 @given(all_messages(), st.data())
-def test_cut_or_flipped_bytes(message, data):
+def test_truncated_or_changed_bytes(message, data):
     payload = bytearray(message.encode())
     at = data.draw(st.integers(0, len(payload) - 1))
     if data.draw(st.booleans()):
@@ -246,7 +246,7 @@ def test_cut_or_flipped_bytes(message, data):
             type(message).decode(bytes(payload))
 
 
-def test_equality_is_that_of_the_bytes_and_of_the_class():
+def test_messages_are_equal_if_class_and_bytes_are():
     assert a_scan() == a_scan()
     assert a_scan() != a_scan(seq=1)
     assert Pose(x=0.0, y=0.0) != Twist()
@@ -258,7 +258,7 @@ def test_messages_are_frozen():
         COMMAND.seq = 3
 
 
-def test_empty_arrays_are_messages_too():
+def test_empty_arrays_are_valid():
     reply = SampleReply(ok=False, reason="no")
     assert SampleReply.decode(reply.encode()).ranges.shape == (0,)
     assert Prediction.decode(
@@ -266,6 +266,6 @@ def test_empty_arrays_are_messages_too():
     ).sigma.shape == (0,)
 
 
-def test_every_message_class_is_tested_here():
+def test_every_message_class_is_tested():
     stamped = {c for c in vars(messages).values() if isinstance(c, type) and issubclass(c, messages.Stamped)}
     assert stamped - {messages.Stamped} == {topic.message for topic in TOPICS}

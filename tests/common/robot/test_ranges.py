@@ -1,4 +1,4 @@
-"""The one rule for what a scanner's numbers say."""
+"""Meaning of range values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LIMITS = st.tuples(st.floats(0, 1, width=32), st.floats(1.5, 100, width=32))
 
 
 @given(RANGES, LIMITS)
-def test_each_number_says_one_of_four_things(ranges, limits):
+def test_driver_ranges_have_four_meanings(ranges, limits):
     least, most = limits
     scan = normalise_driver_ranges(ranges, least, most)
     assert scan.dtype == ranges.dtype
@@ -35,17 +35,17 @@ def test_each_number_says_one_of_four_things(ranges, limits):
 
 
 @given(RANGES, LIMITS)
-def test_what_is_read_from_a_scan(ranges, limits):
+def test_surfaces_and_ranges_for_localisation(ranges, limits):
     scan = normalise_driver_ranges(ranges, *limits)
     hit, place = surfaces(scan), ranges_for_localisation(scan)
     assert ((scan[hit] >= limits[0]) & (scan[hit] < limits[1])).all()
     assert not np.isfinite(place[~hit]).any()
     np.testing.assert_array_equal(place[hit], scan[hit])
-    np.testing.assert_array_equal(place == np.inf, scan == np.inf)  # nothing within range_max says something
+    np.testing.assert_array_equal(place == np.inf, scan == np.inf)  # no return is used for localisation
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_longest_range_is_the_same_number_in_either_precision(dtype):
+def test_the_maximum_range_is_recognised_in_both_precisions(dtype):
     for most in (0.7, 8.1, 8.3, 25.0):
         row = np.array([np.float32(most), most, most * 0.999], dtype)
         assert np.isposinf(normalise_driver_ranges(row, 0.0, most)).tolist() == [True, True, False]

@@ -1,4 +1,4 @@
-"""Scanners as data, by name and from files; where their beams point."""
+"""Scanners by name and from files, and their beam directions."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def sweep_of(scanner):
     return Sweep(scanner.angle_min, scanner.angle_increment, scanner.beams)
 
 
-def test_other_beams_look_over_the_same_field_of_view():
+def test_the_number_of_beams_keeps_the_field_of_view():
     few = TIM571.with_beams(91)
     assert len(few.angles()) == 91
     assert few.angles()[[0, -1]] == pytest.approx(TIM571.angles()[[0, -1]])
@@ -43,25 +43,25 @@ def test_other_beams_look_over_the_same_field_of_view():
 
 
 @pytest.mark.parametrize("beams", [-1, 1, 1_000_000])
-def test_an_impossible_number_of_beams_is_one_line(beams):
+def test_invalid_numbers_of_beams_are_explained(beams):
     with pytest.raises(UserError, match=f"tim571 with {beams} beams: beams: Input should be") as error:
         TIM571.with_beams(beams)
     assert "\n" not in str(error.value)
 
 
-def test_all_round_no_two_beams_are_the_same():
+def test_full_circle_scans_have_no_duplicate_beams():
     angles = np.rad2deg(SCANNERS["rplidar-a1"].angles())
     assert angles[[0, -1]] == pytest.approx([-179, 180])
     assert np.diff(angles) == pytest.approx(1)
     assert [name for name, scanner in SCANNERS.items() if sweep_of(scanner).all_round] == ["rplidar-a1"]
 
 
-def test_upside_down_the_beams_run_the_other_way():
+def test_beams_run_clockwise_upside_down():
     scanner = TIM571.with_beams(4).model_copy(update={"first": 0.1, "upside_down": True})
     assert scanner.angles() == pytest.approx(-0.1 - TIM571.with_beams(4).angle_increment * np.arange(4))
 
 
-def test_noise_may_grow_with_the_range():
+def test_noise_can_grow_with_the_range():
     ranges = np.array([1.0, 10.0, np.inf])
     assert SCANNERS["rplidar-a1"].deviation(ranges) == pytest.approx([0.01, 0.1, np.inf], rel=2e-3)
     drawn = SCANNERS["rplidar-a1"].noisy(np.tile(ranges, (4000, 1)), np.random.default_rng(0))
@@ -70,7 +70,7 @@ def test_noise_may_grow_with_the_range():
 
 
 @given(st.floats(-7, 7), st.floats(0.01, 0.2), st.booleans(), st.integers(2, 400))
-def test_each_beam_is_found_by_its_direction(first, step, clockwise, beams):
+def test_beams_are_found_by_direction(first, step, clockwise, beams):
     sweep = Sweep(first, -step if clockwise else step, min(beams, int(2 * np.pi / step)))
     bearings = sweep.first + sweep.increment * np.arange(sweep.beams)
     assert (sweep.beams_at(se2.wrap(bearings)) == np.arange(sweep.beams)).all()
@@ -113,7 +113,7 @@ def test_a_file_describes_a_scanner(tmp_path):
         (("{x: 0.1, yaw_deg: 90}", "3"), r"mount: expected keys with values, such as {x: 1, y: 2}, not '3' \(m"),
     ],
 )
-def test_a_wrong_file_says_what_and_where(tmp_path, change, wrong):
+def test_invalid_files_are_explained(tmp_path, change, wrong):
     file = tmp_path / "mine.yaml"
     file.write_text(FILE.replace(*change))
     with pytest.raises(UserError, match=wrong) as error:
@@ -123,7 +123,7 @@ def test_a_wrong_file_says_what_and_where(tmp_path, change, wrong):
 
 
 @pytest.mark.parametrize("name", ["sonar", "no/such.yaml", ""])
-def test_an_unknown_scanner_names_those_there_are(name):
+def test_an_unknown_scanner_lists_the_known_ones(name):
     with pytest.raises(
         UserError, match=r"choose one of tim571, ust-10lx, lms200, rplidar-a1, or give a file|cannot be"
     ):
@@ -131,19 +131,19 @@ def test_an_unknown_scanner_names_those_there_are(name):
 
 
 @pytest.mark.parametrize("mount", ["1", "a,b", "1,2,3,4"])
-def test_a_mount_that_is_none_is_refused(mount):
+def test_invalid_mounts_are_refused(mount):
     with pytest.raises(UserError, match=r"--mount '.*': give x,y"):
         chosen_scanner("tim571", mount=mount)
 
 
 @pytest.mark.parametrize("noise", [-1.0, -1e-9, float("nan"), float("inf")])
-def test_noise_that_is_none_is_refused(noise):
+def test_invalid_noise_is_refused(noise):
     with pytest.raises(UserError, match=r"tim571 with --noise .*: sigma: Input should be"):
         chosen_scanner("tim571", noise=noise)
     with pytest.raises(UserError, match=r"noise: Input should be .*--noise, PRESAGE_NOISE"):
         load_settings(SimulatorSettings, [f"--noise={noise}"])
 
 
-def test_noise_asked_for_is_the_whole_of_it():
+def test_the_noise_option_replaces_the_scanners_noise():
     scanner = chosen_scanner("rplidar-a1", 30, 0.0)
     assert (scanner.sigma, scanner.sigma_relative, scanner.beams) == (0, 0, 30)

@@ -1,4 +1,4 @@
-"""Where the scanner sees the robot itself: what is cut out, and what is not."""
+"""Beams that hit the robot itself are masked, and no others."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def degrees(found):
     return np.rad2deg(se2.wrap(found.angles()))
 
 
-def test_off_unless_told():
+def test_inactive_by_default():
     for settings in (ControllerSettings(), BridgeRos2Settings()):
         whole = scan()
         assert (
@@ -45,20 +45,20 @@ def test_off_unless_told():
         )
 
 
-def test_a_post_says_nothing():
-    """To either bound, both included; on the bus not measured, in the process no beam."""
+def test_narrow_sectors_are_masked():
+    """Bounds are included; masked beams are 0 in published scans and NaN for planning."""
     cut = blind(ignore_angles="-92:-88,44:46")
     for found, value in ((cut.mask_for_bus(scan()), 0.0), (cut.mask_for_planning(scan()), np.nan)):
         hidden = ~surfaces(found.ranges)
         np.testing.assert_allclose(degrees(found)[hidden], [-92, -91, -90, -89, -88, 44, 45, 46])
         np.testing.assert_array_equal(found.ranges[hidden], np.float32(value))
         np.testing.assert_array_equal(found.ranges[~hidden], scan().ranges[~hidden])
-        assert Sweep.of(found).sector(0.0) == ALL_ROUND  # a post makes nobody blind
+        assert Sweep.of(found).sector(0.0) == ALL_ROUND  # a post does not reduce the field of view
     assert Scan.decode(cut.mask_for_bus(scan()).encode()) == cut.mask_for_bus(scan())
     assert len(safety.scan_points(cut.mask_for_planning(scan()))) == 360 - 8
 
 
-def test_a_blind_radius():
+def test_beams_within_the_radius_are_masked():
     ranges = [-np.inf, 0.1, 0.19, 0.2, 0.25, 3.0, np.inf]
     found = blind(blind_radius=0.2).mask_for_planning(scan(7, ranges=ranges))
     np.testing.assert_array_equal(found.ranges, np.float32([np.nan, np.nan, np.nan, 0.2, 0.25, 3, np.inf]))
@@ -69,8 +69,8 @@ def test_a_blind_radius():
 
 
 @pytest.mark.parametrize("text", ["135:225", "-225:-135", "135:180,-180:-135"])
-def test_a_wide_sector_behind_is_out_of_view(text):
-    """All round, however it is written: the robot is then blind behind, and knows it."""
+def test_wide_sectors_are_removed_from_the_field_of_view(text):
+    """Full-circle scans lose the sector behind the robot, in any notation of its bounds."""
     found = blind(ignore_angles=text).mask_for_planning(scan())
     view = Sweep.of(found).sector(0.0)
     assert view.centre == pytest.approx(0, abs=0.02)
@@ -79,7 +79,7 @@ def test_a_wide_sector_behind_is_out_of_view(text):
     assert [whole[at] for at in degrees(found).round()] == list(found.ranges)
 
 
-def test_a_wide_end_is_out_of_view_and_a_wide_middle_is_silent():
+def test_wide_sectors_are_removed_at_the_ends_and_masked_in_the_middle():
     found = blind(ignore_angles="90:140").mask_for_planning(scan(271, -135))
     assert degrees(found)[[0, -1]] == pytest.approx([-135, 89])
     found = blind(ignore_angles="-25:25").mask_for_planning(scan(271, -135))
@@ -91,8 +91,8 @@ bounds = st.tuples(st.floats(-300, 300), st.floats(0.1, 59)).map(lambda pair: (p
 
 
 @given(st.lists(bounds, max_size=5), st.sampled_from([(360, -180.0, 1.0), (181, 90.0, -1.0), (720, 0.0, 0.5)]))
-def test_no_beam_is_turned_and_none_outside_is_lost(sectors, sweep):
-    """What is left is where it was, and every direction that was not cut out is left."""
+def test_beams_outside_the_sectors_keep_their_directions(sectors, sweep):
+    """Remaining beams keep their directions, and only beams in the sectors are removed or masked."""
     whole = scan(*sweep)
     found = SelfFilter(tuple(tuple(np.deg2rad(each)) for each in sectors)).mask_for_planning(whole)
     before = {round(at, 3) % 360: r for at, r in zip(degrees(whole), whole.ranges, strict=True)}
@@ -107,12 +107,12 @@ def test_no_beam_is_turned_and_none_outside_is_lost(sectors, sweep):
 
 @pytest.mark.parametrize("text", ["10:5", "0:0", "0:400", "-170:0,0:190", "1", "1:2:3", "a:b", "nan:1"])
 @pytest.mark.parametrize("settings", [ControllerSettings, BridgeRos2Settings])
-def test_bounds_that_are_none_are_refused(settings, text):
+def test_invalid_bounds_are_refused(settings, text):
     with pytest.raises(UserError, match=r"ignore.angles"):
         load_settings(settings, [f"--ignore-angles={text}"]).build_self_filter()
 
 
 @pytest.mark.parametrize("radius", ["-1", "nan", "inf", "6"])
-def test_a_radius_that_is_none_is_refused(radius):
+def test_invalid_radii_are_refused(radius):
     with pytest.raises(UserError, match="--blind-radius, PRESAGE_BLIND_RADIUS"):
         load_settings(ControllerSettings, [f"--blind-radius={radius}"])

@@ -1,4 +1,4 @@
-"""What zenoh's log says of refusals; the lines are zenoh 1.10's own."""
+"""Refusals read from zenoh's log; the lines are those of zenoh 1.10."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def read(*lines):
     return [found for line in lines if (found := reader.read(line)) is not None]
 
 
-def test_a_message_is_named_with_the_certificate_it_came_under():
+def test_refused_messages_have_the_certificates_name():
     assert read(SHOWN, LET_IN, denied("Put", "presage/r/cmd_vel")) == [Refusal("put", "observer", "presage/r/cmd_vel")]
     assert read(denied("Put", "presage/r/cmd_vel")) == [Refusal("put", "", "presage/r/cmd_vel")]
 
 
-def test_working_out_rights_is_no_refusal_but_what_comes_after_is():
+def test_lines_about_cached_permissions_are_not_refusals():
     planned = [f"{AT} TRACE  rx-1 ThreadId(09) {ACCESS}: ACL (ingress): caching permissions for `presage/r/goal` ..."]
     subject = "9e87 on Interface(lo)+CertCommonName(observer)+Username(observer)"
     planned += [denied(f"Kind{what}", "presage/r/goal", subject, how="") for what in range(9)]
@@ -38,12 +38,12 @@ def test_working_out_rights_is_no_refusal_but_what_comes_after_is():
     assert read(SHOWN, LET_IN, *planned, asked) == [Refusal("query", "observer", "presage/r/teleport")]
 
 
-def test_what_we_do_not_send_on_is_nobody_s_attempt():
+def test_messages_that_are_not_forwarded_are_not_refusals():
     assert read(denied("Put", "presage/r/goal", flow="egress")) == []
     assert read(denied("Put", "presage/r/goal").replace("unauthorized", "authorized")) == []
 
 
-def test_colours_are_no_hindrance():
+def test_colours_are_removed():
     coloured = denied("Put", "presage/r/goal").replace("TRACE", "\x1b[35mTRACE\x1b[0m")
     assert read(coloured) == [Refusal("put", "", "presage/r/goal")]
 
@@ -66,13 +66,13 @@ def test_handshakes():
     ]  # fmt: skip
 
 
-def test_what_else_zenoh_complains_of_is_passed_on():
+def test_other_errors_of_zenoh_are_passed_on():
     line = f"{AT} ERROR rx-0 ThreadId(12) zenoh::something: went wrong"
     assert read(line) == [line]
     assert read("") == []
 
 
-def test_strangers_do_not_fill_memory():
+def test_repeated_connections_do_not_fill_memory():
     reader = ZenohLogParser()
     for number in range(5000):
         reader.read(SHOWN.replace("10.0.0.2:50998", f"10.0.0.2:{number}"))

@@ -1,4 +1,4 @@
-"""Settings: which source wins, and what is said where one is wrong."""
+"""Settings: precedence of their sources, and messages for invalid ones."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from common.runtime.config import ServiceSettings, load_settings, split_endpoint
 
 
 class Settings(ServiceSettings):
-    """Something to be told.
+    """Settings for tests.
 
     examples:
       python -m services.thing --size 3
@@ -47,7 +47,7 @@ def test_defaults():
     assert settings.link() == Link("robot", (DEFAULT_ENDPOINT,), ("tcp/127.0.0.1:0",), lossless=False)
 
 
-def test_command_line_over_environment_over_file_over_default(file, monkeypatch):
+def test_precedence_of_sources(file, monkeypatch):
     config = ["--config", file("size: 2\nlabel: file\nratio: 0.5\n")]
     assert load_settings(Settings, config).size == 2
     monkeypatch.setenv("PRESAGE_SIZE", "3")
@@ -57,13 +57,13 @@ def test_command_line_over_environment_over_file_over_default(file, monkeypatch)
     assert (settings.label, settings.ratio, settings.log_level) == ("file", 0.5, "info")
 
 
-def test_a_service_s_section_over_shared_lines_and_others_are_not_its_business(file):
+def test_the_services_section_overrides_the_top_level(file):
     text = "size: 2\nlabel: shared\nalpha: 0.1\nthing: {size: 5}\nestimator: {alpha: 1, nonsense: 2}\n"
     settings = load_settings(Settings, ["--config", file(text)])
     assert (settings.size, settings.label) == (5, "shared")
 
 
-def test_one_file_does_not_reach_into_the_next_call(file):
+def test_files_do_not_affect_later_calls(file):
     load_settings(Settings, ["--config", file("size: 2\n")])
     assert load_settings(Settings, []).size == 1
 
@@ -75,29 +75,29 @@ def test_a_value_may_begin_with_a_minus(given):
 
 
 @pytest.mark.parametrize("text", ["3,1.5", "-3,1.5,-90", ".5,-2.", ""])
-def test_poses_are_numbers_with_commas(text):
+def test_pose_texts(text):
     assert re.match(POSE_TEXT, text)
     assert all(np.isfinite(float(part)) for part in text.split(",") if part)
 
 
 @pytest.mark.parametrize("text", ["1.2.3,1", "1", ".,1", "nan,1", "1,2,3,4", "1,,2", "-,1", "1e3,1"])
-def test_what_is_no_pose_is_refused(text):
+def test_invalid_poses_are_refused(text):
     assert not re.match(POSE_TEXT, text)
     with pytest.raises(UserError, match=r"--mount '.*': give x,y\[,yaw_deg\] in m and degrees"):
         pose_of_text(text, "--mount")
 
 
-def test_a_pose_beyond_all_maps_is_refused():
+def test_poses_beyond_the_limits_are_refused():
     with pytest.raises(UserError, match=r"--start '999999999,1': x and y must be within 10000 m of the origin"):
         pose_of_text("999999999,1", "--start")
 
 
-def test_a_pose_is_in_radians_and_may_lack_its_yaw():
+def test_poses_are_converted_to_radians():
     np.testing.assert_allclose(pose_of_text("1,-2.5", "--start"), [1, -2.5, 0])
     np.testing.assert_allclose(pose_of_text("1,2,-90", "--start"), [1, 2, -np.pi / 2])
 
 
-def test_empty_is_a_value_on_the_command_line_and_none_in_the_environment(monkeypatch):
+def test_empty_values_are_ignored_only_in_the_environment(monkeypatch):
     assert load_settings(Settings, ["--label", "", "--connect="]).label == ""
     assert load_settings(Settings, ["--connect", ""]).link().connect == ()
     monkeypatch.setenv("PRESAGE_LABEL", "")
@@ -117,7 +117,7 @@ def test_empty_is_a_value_on_the_command_line_and_none_in_the_environment(monkey
         (["--config", "nowhere.yaml"], ["nowhere.yaml", "cannot be read"]),
     ],
 )
-def test_a_wrong_argument_is_one_line_that_names_it(argv, words, tmp_path, monkeypatch):
+def test_invalid_arguments_are_named(argv, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError) as caught:
         load_settings(Settings, argv)
@@ -138,7 +138,7 @@ def test_a_wrong_argument_is_one_line_that_names_it(argv, words, tmp_path, monke
         ("[" * 20_000, ["settings.yaml: not valid YAML"]),
     ],
 )
-def test_a_wrong_file_is_one_line_that_names_it(file, text, words):
+def test_invalid_files_are_named(file, text, words):
     path = file(text)
     with pytest.raises(UserError) as caught:
         load_settings(Settings, ["--config", path])
@@ -146,14 +146,14 @@ def test_a_wrong_file_is_one_line_that_names_it(file, text, words):
     assert all(word in str(caught.value) for word in words), str(caught.value)
 
 
-def test_bytes_that_are_no_text_are_said_too(tmp_path):
+def test_binary_files_are_refused(tmp_path):
     path = tmp_path / "binary.yaml"
     path.write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(UserError, match=r"binary\.yaml: not valid YAML"):
         load_settings(Settings, ["--config", str(path)])
 
 
-def test_a_wrong_variable_is_one_line_that_names_it(monkeypatch):
+def test_invalid_variables_are_named(monkeypatch):
     monkeypatch.setenv("PRESAGE_SIZE", "-1")
     with pytest.raises(UserError, match="PRESAGE_SIZE") as caught:
         load_settings(Settings, [])
@@ -167,13 +167,13 @@ def test_an_unknown_option_ends_with_status_2(capsys):
     assert "unrecognized arguments: --colour" in capsys.readouterr().err
 
 
-def test_variables_of_others_are_not_its_business(monkeypatch):
+def test_other_variables_are_ignored(monkeypatch):
     monkeypatch.setenv("PRESAGE_ALPHA", "x")
     monkeypatch.setenv("PRESAGE_THING_SIZE", "7")  # only private fields have such names
     assert load_settings(Settings, []).size == 1
 
 
-def test_print_config_prints_what_holds_and_can_be_read_back(file, capsys):
+def test_print_config_prints_the_settings_as_yaml(file, capsys):
     with pytest.raises(SystemExit) as ended:
         load_settings(Settings, ["--size", "4", "--ratio", "0.25", "--print-config"])
     assert ended.value.code == 0
@@ -183,7 +183,7 @@ def test_print_config_prints_what_holds_and_can_be_read_back(file, capsys):
     assert again.effective() == load_settings(Settings, ["--size", "4", "--ratio", "0.25"]).effective()
 
 
-def test_help_names_the_program_each_setting_and_examples(capsys):
+def test_help_shows_program_settings_and_examples(capsys):
     with pytest.raises(SystemExit) as ended:
         load_settings(Settings, ["--help"])
     assert ended.value.code == 0
@@ -205,7 +205,7 @@ def test_endpoints_are_split_at_commas():
     assert split_endpoints("") == ()
 
 
-def test_a_router_is_not_told_by_what_is_meant_for_services(file, monkeypatch):
+def test_a_router_ignores_the_settings_of_services(file, monkeypatch):
     monkeypatch.setenv("PRESAGE_CONNECT", "tcp/127.0.0.1:1")
     monkeypatch.setenv("PRESAGE_LISTEN", "tcp/127.0.0.1:2")
     shared = ["--config", file("listen: tcp/127.0.0.1:3\n")]
@@ -217,7 +217,7 @@ def test_a_router_is_not_told_by_what_is_meant_for_services(file, monkeypatch):
     assert load_settings(RouterSettings, [*own, "--listen", "tcp/127.0.0.1:6"]).listen == "tcp/127.0.0.1:6"
 
 
-def test_a_router_s_errors_and_help_name_its_own_variables(monkeypatch, capsys):
+def test_a_routers_errors_and_help_name_its_variables(monkeypatch, capsys):
     with pytest.raises(UserError, match="PRESAGE_ROUTER_LISTEN"):
         load_settings(RouterSettings, ["--listen", ""])
     with pytest.raises(SystemExit):

@@ -1,4 +1,4 @@
-"""The Prometheus endpoint: of real processes, scraped as Prometheus does, and of a loop that serves several robots."""
+"""Prometheus metrics of real processes, and of a loop that serves several robots."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SAMPLES = {row.sample: row for row in METRICS}
 
 
 def read(text: str) -> dict[tuple[str, frozenset], float]:
-    """Value by sample and labels; the text must be what the table says it is."""
+    """Values by sample and labels; checks help texts and labels against the table of metrics."""
     found = {}
     for metric in text_string_to_metric_families(text):
         if metric.name.startswith(("process_", "python_")):
@@ -44,7 +44,7 @@ def read(text: str) -> dict[tuple[str, frozenset], float]:
 
 
 def value(found, name: str, **labels) -> float | None:
-    """Of the one sample with these labels among its own."""
+    """Value of the only sample that has these labels."""
     fits = [number for (n, own), number in found.items() if n == name and labels.items() <= dict(own).items()]
     assert len(fits) <= 1
     return fits[0] if fits else None
@@ -65,7 +65,7 @@ def scan(stamp: int) -> bytes:
     return Scan(stamp_ns=stamp, angle_min=0, angle_increment=0.1, range_min=0, range_max=9, ranges=ranges).encode()
 
 
-def test_a_service_s_numbers_are_those_of_what_happened(bus, process):
+def test_metrics_of_a_real_service(bus, process):
     running = process(SMALL, "--metrics", "0")
     address = address_of(running)
     assert address.startswith("http://127.0.0.1:")
@@ -103,13 +103,13 @@ def test_a_service_s_numbers_are_those_of_what_happened(bus, process):
     assert "Traceback" not in running.output
 
 
-def test_without_being_asked_the_client_is_not_even_loaded():
+def test_prometheus_is_imported_only_if_it_is_used():
     program = "import sys, common.runtime.service, common.router; print('prometheus_client' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 
 
-def test_a_taken_port_is_one_line(process):
+def test_a_port_in_use_is_explained(process):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -120,7 +120,7 @@ def test_a_taken_port_is_one_line(process):
     assert "choose another port" in line
 
 
-def test_the_router_has_some_too(processes, free_port):
+def test_metrics_of_the_router(processes, free_port):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     running = processes.start("common.router", "--listen", endpoint, "--metrics", "127.0.0.1:0")
     address = address_of(running)
@@ -148,7 +148,7 @@ def numbers(metrics) -> dict:
     return read(generate_latest(metrics.registry).decode())
 
 
-def test_several_robots_of_one_process_are_told_apart(metrics):
+def test_metrics_of_several_robots_in_one_process(metrics):
     for robot, state, energy in (("one", "tracking", 5.5), ("two", "lost", -2.0)):
         metrics.published(BELIEF.key(robot), belief(state, energy))
         metrics.told["published"][BELIEF.key(robot)] = 7
@@ -164,7 +164,7 @@ def test_several_robots_of_one_process_are_told_apart(metrics):
     assert value(found, "presage_step_duration_seconds_count", robot="two", topic="scan") == 1
 
 
-def test_a_controller_s_state_and_a_recorder_s_counters(metrics):
+def test_metrics_of_controller_and_recorder(metrics):
     metrics.published(STATUS.key("robot"), Status(stamp_ns=0, state="blocked"))
     metrics.service = "recorder"
     rows = [TopicHealth(key=SCAN.key("robot"), written=9, missing=2, rate=15.0)]
@@ -180,15 +180,15 @@ def test_a_controller_s_state_and_a_recorder_s_counters(metrics):
     assert value(found, "presage_events_total", event="written_bytes") is None
 
 
-def test_a_failing_step_is_timed_and_keys_that_are_none_of_ours_are_nobody_s(metrics):
+def test_failing_steps_are_timed_and_foreign_keys_have_no_robot(metrics):
     with pytest.raises(ValueError, match="bug"), metrics.step(Sample(GOAL, "odd", b"", 0, 0)):
         raise ValueError("bug")
     found = numbers(metrics)
     assert value(found, "presage_step_duration_seconds_count", robot="", topic="odd") == 1
-    assert value(found, "presage_message_latency_seconds_count", topic="odd") == 0  # nobody said when it was sent
+    assert value(found, "presage_message_latency_seconds_count", topic="odd") == 0  # its time of publication is unknown
 
 
-def test_a_clock_that_is_ahead_makes_no_negative_latency(metrics):
+def test_latency_is_not_negative(metrics):
     with metrics.step(Sample(SCAN, SCAN.key("robot"), b"", time.time_ns() + 10**10, 0)):
         pass
     assert value(numbers(metrics), "presage_message_latency_seconds_sum", topic="scan") == 0
@@ -198,15 +198,15 @@ def test_a_clock_that_is_ahead_makes_no_negative_latency(metrics):
     ("setting", "address"),
     [("9100", ("127.0.0.1", 9100)), ("0.0.0.0:0", ("0.0.0.0", 0)), ("[::1]:9", ("::1", 9)), ("box:80", ("box", 80))],
 )
-def test_an_address_is_a_port_or_a_host_and_a_port(setting, address):
+def test_addresses(setting, address):
     assert split_address(setting) == address
 
 
 @pytest.mark.parametrize("setting", ["70000", "box", "", "-1"])
-def test_what_is_no_address_is_said(setting):
+def test_invalid_addresses_are_refused(setting):
     with pytest.raises(UserError, match="PORT or HOST:PORT"):
         split_address(setting)
 
 
-def test_the_table_of_the_docs_is_the_code_s():
+def test_the_documented_table_is_current():
     assert table() in (ROOT / "docs" / "operations.md").read_text(), "python -m common.runtime.metrics prints it"

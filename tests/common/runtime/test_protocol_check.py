@@ -1,4 +1,4 @@
-"""Services of another protocol or version meet: real processes, whichever comes first."""
+"""Services of different protocols or versions, as real processes."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ def said(name="x", protocol=PROTOCOL, uptime=0.0, **versions) -> ConfigReply:
 
 
 def started_long_ago(small, bus):
-    """Nobody doubts that who comes now came later."""
+    """Wait until the service is so old that a new one is clearly later."""
     assert wait_until(lambda: "small" in bus.alive(), WAIT_TIMEOUT_S), small.output
     pulses = Inbox()
     bus.subscribe(HEALTH, pulses, keep_all=True)
     wait_for_message(pulses, Health, lambda h: h.uptime > 1.5 * SIMULTANEOUS_START_S)
 
 
-def test_a_newcomer_of_another_protocol_ends_and_says_why_in_one_line(process, bus):
+def test_a_later_service_with_another_protocol_does_not_start(process, bus):
     small = process(SMALL)
     started_long_ago(small, bus)
     foreign = process(FOREIGN, env={"FOREIGN_PROTOCOL": str(OTHER), "FOREIGN_PRESAGE": "9.9"})
     assert foreign.wait() == 2
     host = platform.node()
-    *ready, line = foreign.output.splitlines()  # it starts where nobody answers in time, on a busy machine
+    *ready, line = foreign.output.splitlines()  # on a busy machine it may start, because no reply arrives in time
     assert all("ready" in each for each in ready)
     assert line.startswith(f"foreign: protocol {OTHER} here (presage 9.9 on {host}), protocol {PROTOCOL} in the small")
     assert line.endswith(
@@ -63,7 +63,7 @@ def test_a_newcomer_of_another_protocol_ends_and_says_why_in_one_line(process, b
 
 
 class LateBus:
-    """Linked, but the first questions find nobody to ask: the session does not know yet who is there."""
+    """Fake bus with a link, on which the first queries reach no service, as after opening a session."""
 
     def __init__(self, found_nobody, other):
         self.found_nobody, self.other = found_nobody, other
@@ -81,16 +81,16 @@ class LateBus:
         return done
 
 
-def test_a_newcomer_does_not_start_though_it_does_not_know_at_once_who_is_there():
+def test_queries_at_the_start_are_repeated():
     bus = LateBus(2, said("small", OTHER))
     with pytest.raises(UserError, match=f"protocol {OTHER} in the small"):
         ProtocolCheck(bus, "foreign", logger("foreign")).check_at_start(said("foreign"))
 
 
-def test_who_comes_while_the_other_is_too_busy_to_answer_ends_once_it_does(process, bus):
+def test_a_later_service_ends_when_a_busy_one_replies(process, bus):
     small = process(SMALL)
     started_long_ago(small, bus)
-    small.send(signal.SIGSTOP)  # it answers nobody
+    small.send(signal.SIGSTOP)  # it cannot reply
     foreign = process(FOREIGN, env={"FOREIGN_PROTOCOL": str(OTHER)})
     foreign.wait_for("ready")
     small.send(signal.SIGCONT)
@@ -99,7 +99,7 @@ def test_who_comes_while_the_other_is_too_busy_to_answer_ends_once_it_does(proce
     assert small.running
 
 
-def test_who_is_there_names_a_newcomer_that_does_not_look_and_goes_on(process, bus, link):
+def test_an_earlier_service_logs_an_error_and_continues(process, bus, link):
     small = process(SMALL)
     assert wait_until(lambda: "small" in bus.alive(), WAIT_TIMEOUT_S), small.output
     calls = Inbox()
@@ -114,7 +114,7 @@ def test_who_is_there_names_a_newcomer_that_does_not_look_and_goes_on(process, b
     assert small.output.count("careless") == 1
 
 
-def test_another_version_is_one_warning(process, bus):
+def test_other_versions_are_one_warning(process, bus):
     foreign = process(FOREIGN, env={"FOREIGN_PRESAGE": "9.9"})
     assert wait_until(lambda: "foreign" in bus.alive(), WAIT_TIMEOUT_S), foreign.output
     small = process(SMALL)
@@ -131,7 +131,7 @@ def test_another_version_is_one_warning(process, bus):
     assert "presage 9.9 there" not in foreign.output
 
 
-def test_of_two_that_do_not_fit_exactly_one_came_later():
+def test_exactly_one_of_two_services_started_later():
     for apart in (
         0.0,
         SIMULTANEOUS_START_S / 2,
@@ -144,25 +144,25 @@ def test_of_two_that_do_not_fit_exactly_one_came_later():
     assert started_later(said(protocol=2, uptime=1.0), said(protocol=1, uptime=10.0))
 
 
-def test_who_does_not_say_its_protocol_is_no_stranger():
+def test_an_unknown_protocol_is_accepted():
     assert same_protocol(said(), said(protocol=0))
     assert not same_protocol(said(), said(protocol=OTHER))
 
 
-def test_only_what_both_say_is_compared():
+def test_only_versions_that_both_state_are_compared():
     mine = said(presage="1", python="3.11")
     assert not describe_version_differences(mine, said(presage="1", python="3.10"))
     assert not describe_version_differences(mine, said())
     assert describe_version_differences(mine, said(presage="2")) == "presage 1 here, 2 there"
 
 
-def test_a_service_says_what_it_is():
+def test_the_reply_describes_the_service():
     reply = build_config_reply("x", "{}", 3.0)
     assert (reply.protocol, reply.host, reply.uptime) == (PROTOCOL, platform.node(), 3.0)
     assert reply.versions["presage"]
 
 
-def test_the_bus_asks_each_of_two_of_one_name(link, bus):
+def test_ask_each_reaches_both_instances_of_a_service(link, bus):
     with open_bus(link) as one, open_bus(link) as two:
         inboxes = [Inbox(), Inbox()]
         for session, inbox in zip((one, two), inboxes, strict=True):

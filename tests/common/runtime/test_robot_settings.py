@@ -1,4 +1,4 @@
-"""A robot's own limits: the same settings for all that drive or brake, checked before anything moves."""
+"""Limits of the robot: the same settings in all services, checked at the start."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ BURGER = ["--drive=differential", "--radius=0.105", "--max-speed=0.22", "--max-t
 
 
 @pytest.mark.parametrize("settings", ALL)
-def test_unless_told_it_is_the_shipped_robot(settings):
+def test_the_default_robot(settings):
     assert load_settings(settings, []).build_robot() == Robot()
 
 
 @pytest.mark.parametrize("settings", ALL)
-def test_what_is_told_is_the_robots(settings):
+def test_settings_define_the_robot(settings):
     told = load_settings(settings, [*BURGER, "--turn-acceleration=3.2"]).build_robot()
     assert told == Robot(
         drive="differential", radius=0.105, max_speed=0.22, max_turn=2.84, acceleration=0.5, turn_acceleration=3.2
     )
 
 
-def test_the_environment_tells_all_at_once(monkeypatch):
+def test_the_environment_sets_all_services(monkeypatch):
     for name, value in {"RADIUS": "0.105", "MAX_SPEED": "0.22", "MAX_TURN": "2.84", "DRIVE": "differential"}.items():
         monkeypatch.setenv(f"PRESAGE_{name}", value)
     monkeypatch.setenv("PRESAGE_ACCELERATION", "")  # as compose passes what is not set
@@ -40,12 +40,12 @@ def test_the_environment_tells_all_at_once(monkeypatch):
 
 @pytest.mark.parametrize("field", ["radius", "max_speed", "max_turn", "acceleration", "turn_acceleration"])
 @pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "1e9", "quick"])
-def test_what_is_no_limit_is_named(field, value):
+def test_invalid_limits_are_named(field, value):
     with pytest.raises(UserError, match=f"{field}: .*--{field.replace('_', '-')}, PRESAGE_{field.upper()}"):
         load_settings(ControllerSettings, [f"--{field.replace('_', '-')}={value}"])
 
 
-def test_who_could_not_stop_is_refused():
+def test_robots_that_take_long_to_stop_are_refused():
     with pytest.raises(UserError, match=r"--max-speed 1 m/s with --acceleration 0.01 m/s²: .* 100 s to stop"):
         RobotSettings(acceleration=0.01).build_robot()
     with pytest.raises(UserError, match="--turn-acceleration"):

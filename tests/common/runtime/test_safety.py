@@ -1,4 +1,4 @@
-"""Limits and the obstacle stop: what they promise, for any command and any scan."""
+"""Velocity limits and the obstacle stop, for any command and scan."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def test_clipped_commands_are_finite_and_within_limits(twist):
         assert not clipped.any()
 
 
-def test_clipping_keeps_the_direction_and_a_differential_drive_has_no_sideways():
+def test_clipping_keeps_the_direction_and_removes_sideways_motion():
     assert safety.clip_twist(np.array([3.0, 4.0, 0.0]), ROBOT) == pytest.approx([0.6, 0.8, 0.0])
     assert safety.clip_twist(np.array([0.3, 0.4, 0.1]), Robot(drive="differential")) == pytest.approx([0.3, 0, 0.1])
 
 
 @given(twists, twists, st.floats(0, 0.2))
-def test_ramp_respects_acceleration_and_goes_towards(current, wanted, dt):
+def test_ramps_approach_the_target_within_the_acceleration(current, wanted, dt):
     after = safety.ramp(current, wanted, ROBOT, dt)
     assert np.hypot(*(after - current)[:2]) <= ROBOT.acceleration * dt + 1e-9
     assert abs(after[2] - current[2]) <= ROBOT.turn_acceleration * dt + 1e-9
@@ -40,7 +40,7 @@ def test_ramp_respects_acceleration_and_goes_towards(current, wanted, dt):
 
 
 @given(twists, clouds)
-def test_the_limited_speed_can_be_braked_before_any_point(twist, points):
+def test_limited_speeds_allow_stopping_before_obstacles(twist, points):
     limited, held = safety.limit_velocity(twist, points, ROBOT)
     speed = np.hypot(*limited[:2])
     assert speed <= np.hypot(*twist[:2]) + 1e-12
@@ -56,7 +56,7 @@ def test_the_limited_speed_can_be_braked_before_any_point(twist, points):
         assert (gaps[in_front] >= ROBOT.radius - 1e-6).all()
 
 
-def test_away_from_a_wall_that_is_touched_is_free_and_into_it_is_not():
+def test_driving_away_from_a_touched_wall_is_allowed():
     wall = np.column_stack([np.full(21, ROBOT.radius), np.linspace(-1, 1, 21)])
     into, held = safety.limit_velocity(np.array([0.5, 0, 0.3]), wall, ROBOT)
     assert held
@@ -67,13 +67,13 @@ def test_away_from_a_wall_that_is_touched_is_free_and_into_it_is_not():
         assert away == pytest.approx(twist)
 
 
-def test_nothing_ahead_nothing_held():
+def test_free_paths_are_not_limited():
     twist = np.array([1.0, 0, 0])
     assert safety.limit_velocity(twist, np.zeros((0, 2)), ROBOT) == (pytest.approx(twist), False)
     assert safety.limit_velocity(np.array([np.nan, 0, 0]), np.zeros((0, 2)), ROBOT)[1]
 
 
-def test_points_of_a_scan_stand_in_base_link():
+def test_scan_points_are_in_base_link():
     scan = Scan(
         stamp_ns=0, angle_min=-np.pi / 2, angle_increment=np.pi / 2, range_min=0.1, range_max=9.0,
         ranges=[1.0, np.inf, -np.inf], mount=Pose(x=0.2, y=0.0, yaw=np.pi / 2),
@@ -82,7 +82,7 @@ def test_points_of_a_scan_stand_in_base_link():
     assert points == pytest.approx(np.array([[1.2, 0.0], [0.1, 0.0]]))  # no return is no point, too close is one
 
 
-def test_what_was_not_measured_is_nothing_in_the_way():
+def test_unmeasured_beams_are_no_obstacles():
     scan = Scan(
         stamp_ns=0, angle_min=0.0, angle_increment=0.1, range_min=0.1, range_max=9.0, ranges=[0.0, np.inf, 2.0, 0.0]
     )

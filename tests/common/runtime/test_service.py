@@ -1,4 +1,4 @@
-"""The loop every service runs, in a process of its own, over real zenoh."""
+"""The service loop in a real process over real zenoh."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SMALL = Path(__file__).parents[1] / "small_service.py"
 
 
 class Beside:
-    """What a test sees of a running service."""
+    """A running service and its health messages."""
 
     def __init__(self, bus, running):
         self.bus, self.running = bus, running
@@ -36,7 +36,7 @@ class Beside:
         assert self.until(lambda h: True)
 
     def until(self, fits) -> bool:
-        """Whether a pulse that ``fits`` comes."""
+        """Wait for a health message that satisfies ``fits``; returns whether it arrives."""
 
         def look() -> bool:
             while (sample := self.health.get(0)) is not None:
@@ -66,7 +66,7 @@ def scan(stamp: int) -> bytes:
     ).encode()
 
 
-def test_messages_come_in_answers_go_out_numbered_and_health_counts_both(small):
+def test_messages_are_handled_numbered_and_counted(small):
     for i in range(20):
         small.bus.put(SCAN, scan(i))
         assert wait_until(lambda i=i: small.commands.received.total() == i + 1, PATIENCE)
@@ -82,13 +82,13 @@ def test_messages_come_in_answers_go_out_numbered_and_health_counts_both(small):
     assert health.counters["failed"] == 0
 
 
-def test_the_pulse_comes_once_a_second(small):
+def test_health_is_published_once_a_second(small):
     first = small.latest
     assert small.until(lambda h: h.seq >= first.seq + 3)
     assert small.latest.uptime - first.uptime == pytest.approx(small.latest.seq - first.seq, abs=0.9)
 
 
-def test_a_pulse_has_a_rate(small):
+def test_health_has_rates(small):
     for i in range(30):
         small.bus.put(SCAN, scan(i))
         assert wait_until(lambda i=i: small.commands.received.total() == i + 1, PATIENCE)
@@ -97,7 +97,7 @@ def test_a_pulse_has_a_rate(small):
     assert small.until(lambda h: small.row(h, SCAN).rate == 0)
 
 
-def test_what_cannot_be_decoded_is_counted_logged_once_a_second_and_dropped(small):
+def test_undecodable_payloads_are_counted_logged_and_dropped(small):
     # On health, where every payload is kept: on a newest-only key one may take the place of another before it is read.
     key = HEALTH.key(small.bus.robot, "intruder")
     assert small.bus.wait_matching(HEALTH, PATIENCE, key=key)
@@ -113,7 +113,7 @@ def test_what_cannot_be_decoded_is_counted_logged_once_a_second_and_dropped(smal
     assert small.latest.counters["failed"] == 0
 
 
-def test_a_bug_is_counted_logged_with_its_traceback_and_survived(small):
+def test_exceptions_are_counted_and_logged(small):
     small.goal(-1)
     assert small.until(lambda h: h.counters["failed"] == 1)
     assert "a bug in on_message" in small.running.output
@@ -122,7 +122,7 @@ def test_a_bug_is_counted_logged_with_its_traceback_and_survived(small):
     assert wait_until(lambda: len(small.commands) == 1, PATIENCE)
 
 
-def test_a_user_error_in_a_step_ends_it_with_one_line(small):
+def test_a_user_error_in_a_step_ends_the_service(small):
     small.goal(101)
     assert small.running.wait() == 2
     assert "small: the map ends before that" in small.running.output
@@ -130,7 +130,7 @@ def test_a_user_error_in_a_step_ends_it_with_one_line(small):
     assert "closed" in small.running.output
 
 
-def test_a_service_asks_without_waiting_even_itself(small):
+def test_a_service_can_send_requests_to_itself(small):
     asked = [
         (3.0, 0.0, "1 teleport True at 3"),
         (-3.0, 0.0, "2 teleport False inside a wall"),
@@ -143,7 +143,7 @@ def test_a_service_asks_without_waiting_even_itself(small):
         assert text in small.latest.note
 
 
-def test_it_ends_though_an_answer_is_owed(small):
+def test_a_service_ends_while_a_request_is_open(small):
     small.goal(1.0, 1.0, cancel=True)
     status, seconds = small.running.stop()
     assert status == 0, small.running.output
@@ -151,7 +151,7 @@ def test_it_ends_though_an_answer_is_owed(small):
     assert "Traceback" not in small.running.output
 
 
-def test_requests_are_answered_refused_and_survived(small):
+def test_replies_refusals_and_exceptions_of_requests(small):
     def ask(x: float) -> Reply:
         return small.bus.ask(TELEPORT, PoseRequest(pose=Pose(x=x, y=0.0)), Reply)
 
@@ -166,7 +166,7 @@ def test_requests_are_answered_refused_and_survived(small):
     assert ask(4.0).ok
 
 
-def test_its_configuration_can_be_asked_for(small):
+def test_the_settings_can_be_queried(small):
     reply = small.bus.ask(CONFIG, Request(), ConfigReply, service="small")
     config = json.loads(reply.config)
     assert reply.service == "small"
@@ -175,7 +175,7 @@ def test_its_configuration_can_be_asked_for(small):
     assert reply.versions["python"]
 
 
-def test_after_a_long_step_one_pulse_comes_not_all_that_were_missed(small):
+def test_missed_health_messages_are_skipped(small):
     before = small.latest
     small.goal(2.5)
     assert small.until(lambda h: h.uptime > before.uptime + 2.5)
@@ -185,14 +185,14 @@ def test_after_a_long_step_one_pulse_comes_not_all_that_were_missed(small):
     assert small.latest.uptime - first.uptime > 0.5
 
 
-def test_a_timer_that_always_fails_does_not_silence_the_service(bus, process):
+def test_a_failing_timer_does_not_block_the_service(bus, process):
     beside = Beside(bus, process(SMALL, "--fail", "timer"))
     beside.bus.put(SCAN, scan(5))
     assert wait_until(lambda: len(beside.commands) == 1, PATIENCE)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_it_with_status_0(small, number):
+def test_a_signal_ends_the_service_with_status_0(small, number):
     status, seconds = small.running.stop(number)
     assert status == 0, small.running.output
     assert seconds < PATIENCE / 3  # at once, but for a busy machine
@@ -202,7 +202,7 @@ def test_a_signal_ends_it_with_status_0(small, number):
     assert wait_until(lambda: small.bus.alive() == set(), PATIENCE)
 
 
-def test_a_signal_in_the_middle_of_a_step_ends_it_after_that_step(small):
+def test_a_signal_during_a_step_ends_the_service_after_it(small):
     small.goal(1.0)
     began = time.monotonic()
     status, _ = small.running.stop()
@@ -221,7 +221,7 @@ def test_a_signal_before_the_loop_is_not_lost(process, when, says):
     assert "closed" in running.output
 
 
-def test_without_a_router_it_runs_and_ends(process, free_port):
+def test_a_service_runs_without_a_router(process, free_port):
     running = process(SMALL, env={"PRESAGE_CONNECT": f"tcp/127.0.0.1:{free_port()}"})
     running.wait_for("ready")
     status, seconds = running.stop()
@@ -229,13 +229,13 @@ def test_without_a_router_it_runs_and_ends(process, free_port):
     assert seconds < PATIENCE / 3  # at once, but for a busy machine
 
 
-def test_what_the_user_can_mend_in_open_is_one_line_and_status_2(process):
+def test_a_user_error_in_open_ends_the_service_with_status_2(process):
     running = process(SMALL, "--fail", "open")
     assert running.wait() == 2
     assert running.output.splitlines() == ["small: no weights in that folder; train some"]
 
 
-def test_a_taken_port_is_one_line_and_status_2(router, process):
+def test_a_port_in_use_ends_the_service_with_status_2(router, process):
     running = process(SMALL, "--listen", f"tcp/127.0.0.1:{router}")
     assert running.wait() == 2
     assert running.output.splitlines() == [f"small: port in use: tcp/127.0.0.1:{router}; choose another with --listen"]
