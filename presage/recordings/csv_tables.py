@@ -18,22 +18,25 @@ from common.errors import UserError
 from common.messages.reference import comments
 from common.messages.topics import Topic
 from common.messages.wire import Binary, Message
-from presage.recordings.selection import entries, keys_of, refuse_to_overwrite, robot_of, tracked
+from presage.recordings.selection import entries, keys_of, refuse_to_overwrite, robot_of, with_progress
 from presage.terminal.output import make_folder
 from services.recorder.reader import Recording
 
 README = "README.md"
-TIMES = {"log_time_ns": "received by the recorder, wall clock", "publish_time_ns": "sent, wall clock"}
+TIMES = {
+    "log_time_ns": "reception by the recorder, ns of wall time",
+    "publish_time_ns": "publication, ns of wall time",
+}
 AXES = ("x", "y", "yaw")
-# Names of a 3 x 3 matrix' six numbers (it is symmetric) and of a vector's three.
+# Column suffixes and indices of the six independent elements of a symmetric 3 x 3 matrix.
 MATRIX = {f".{AXES[i]}_{AXES[j]}": (i, j) for i in range(3) for j in range(i, 3)}
-VECTORS = {"xi"}  # arrays of a length that the message fixes: three
+VECTORS = {"xi"}  # array fields with three elements
 Value = str | int | float | bool | None
 
 
 @dataclass(frozen=True)
 class Column:
-    """One column: how it is read from a message, and what it means."""
+    """A column of a table: its name, how its value is read from a message, and its meaning."""
 
     name: str
     read: Callable[[Any], Value]
@@ -41,16 +44,21 @@ class Column:
 
 
 def columns_of(model: type[Message], prefix: str = "", read: Callable[[Any], Any] | None = None) -> list[Column]:
-    """Scalars of a message, nested ones as `pose.x`; arrays of free length and lists are left to others."""
+    """Columns for the scalars of a message type, nested ones as `pose.x`, and for arrays of fixed length.
+
+    Leaves out arrays of variable length, lists and dictionaries.
+    """
     found: list[Column] = []
-    of: Callable[[Any], Any] = read or (lambda message: message)
+    parent: Callable[[Any], Any] = read or (lambda message: message)
     for name, kind, about in fields_of(model):
-        get = partial(_field, of, name)
+        get = partial(_field, parent, name)
         label = prefix + name
         if isinstance(kind, Binary):
-            fixed = MATRIX if kind.row == (3,) else {f".{axis}": (i,) for i, axis in enumerate(AXES)}
+            elements = MATRIX if kind.row == (3,) else {f".{axis}": (i,) for i, axis in enumerate(AXES)}
             if kind.row == (3,) or name in VECTORS:
-                found += [Column(label + end, partial(_element, get, at), about) for end, at in fixed.items()]
+                found += [
+                    Column(label + suffix, partial(_element, get, index), about) for suffix, index in elements.items()
+                ]
         elif isinstance(kind, type) and issubclass(kind, Message):
             inner = columns_of(kind, label + ".", get)
             found += [Column(c.name, c.read, "; ".join(filter(None, (c.meaning, about)))) for c in inner]
@@ -60,7 +68,7 @@ def columns_of(model: type[Message], prefix: str = "", read: Callable[[Any], Any
 
 
 def fields_of(model: type[Message]) -> Iterator[tuple[str, Any, str]]:
-    """Name, kind and meaning of each field: a `Binary`, a message, a container of one, or a plain type."""
+    """Yields name, type and meaning of each field; the type is a `Binary`, a message, a container or a plain type."""
     about = comments(model)
     for name, info in model.model_fields.items():
         parts = [info.annotation]
@@ -70,31 +78,31 @@ def fields_of(model: type[Message]) -> Iterator[tuple[str, Any, str]]:
         yield name, binary[0] if binary else parts[0], about.get(name, "")
 
 
-def _field(of: Callable[[Any], Any], name: str, message: Any) -> Any:
-    """A field of what ``of`` finds in a message; None within what is None."""
-    return None if (part := of(message)) is None else getattr(part, name)
+def _field(parent: Callable[[Any], Any], name: str, message: Any) -> Any:
+    """The field ``name`` of ``parent(message)``; None if the parent is None."""
+    return None if (part := parent(message)) is None else getattr(part, name)
 
 
-def _element(get: Callable[[Any], Any], at: tuple[int, ...], message: Any) -> Value:
-    """An element of an array field; None where the array is of another shape."""
+def _element(get: Callable[[Any], Any], index: tuple[int, ...], message: Any) -> Value:
+    """An element of an array field; None if the array has another shape."""
     array = get(message)
     try:
-        return None if array is None else float(array[at])
+        return None if array is None else float(array[index])
     except IndexError:
         return None
 
 
 class Tables:
-    """The CSV files of a folder, opened when their first row comes."""
+    """The CSV files in a folder; each is opened when its first row comes."""
 
     def __init__(self, folder: Path, stack: ExitStack, *, force: bool) -> None:
-        """Into ``folder``; ``stack`` closes the files."""
-        self.folder, self.rows = folder, dict[str, int]()  # rows by file name
+        """The files are written into ``folder`` and closed by ``stack``."""
+        self.folder, self.rows = folder, dict[str, int]()  # number of rows by file name
         self._stack, self._force = stack, force
         self._writers: dict[str, Any] = {}
 
     def add(self, name: str, header: list[str], row: list[Value]) -> None:
-        """One row of NAME.csv; None is an empty cell, true and false are words."""
+        """Adds a row to NAME.csv; None becomes an empty cell, and booleans become true and false."""
         writer = self._writers.get(name)
         if writer is None:
             path = self.folder / f"{name}.csv"
@@ -107,8 +115,8 @@ class Tables:
         self.rows[f"{name}.csv"] += 1
 
 
-class _Layout:
-    """How messages of one topic become rows."""
+class _TopicLayout:
+    """The tables of one topic and how messages become rows of them."""
 
     def __init__(self, topic: Topic) -> None:
         self.name, self.columns = topic.name, columns_of(topic.message)
@@ -119,7 +127,7 @@ class _Layout:
         self.maps = [name for name, kind in kinds if get_origin(kind) is dict]
 
     def write(self, tables: Tables, message: Any, times: list[Value], *, arrays: bool) -> None:
-        """Rows of one message."""
+        """Adds the rows of one message."""
         header = [*TIMES, *(column.name for column in self.columns)]
         tables.add(self.name, header, [*times, *(column.read(message) for column in self.columns)])
         key: list[Value] = [times[0], message.stamp_ns, message.seq]
@@ -136,16 +144,17 @@ class _Layout:
             if not len(values):
                 continue
             head = [*names, *map(str, range(len(values)))]
-            # The length is in the file's name, so that no file is ragged.
+            # The length is part of the file's name, so that all rows of a file have the same length.
             tables.add(f"{self.name}.{name}-{len(values)}", head, [*key, *values.tolist()])
 
 
 def export_csv(
     recording: Recording, folder: Path, robot: str, console: Console, *, arrays: bool, force: bool
 ) -> dict[str, int]:
-    """One file a topic into ``folder``, with a README of columns and units: rows by file name.
+    """Writes one file for each topic into ``folder``, with a README of columns and units.
 
-    Raises UserError where it cannot be written, or something is there already and ``force`` is not given.
+    Returns the number of rows by file name. Raises UserError if nothing can be written, or if the folder is not empty
+    and ``force`` is not given.
     """
     make_folder(folder, "--out")
     refuse_to_overwrite(sorted(folder.iterdir())[:1], force=force)
@@ -153,26 +162,26 @@ def export_csv(
     keys = keys_of(recording, name)
     if not keys:
         raise UserError(f"{recording.path}: no message of presage in it, so there is nothing to export")
-    layouts = {topic.name: _Layout(topic) for topic in dict.fromkeys(keys.values())}
+    layouts = {topic.name: _TopicLayout(topic) for topic in dict.fromkeys(keys.values())}
     counts = recording.counts()
     with ExitStack() as stack:
         tables = Tables(folder, stack, force=force)
-        found = tracked(entries(recording, name), sum(counts[key] for key in keys), "csv", console)
-        for topic, message, raw in found:
+        messages = with_progress(entries(recording, name), sum(counts[key] for key in keys), "csv", console)
+        for topic, message, raw in messages:
             layouts[topic.name].write(tables, message, [raw.logged_ns, raw.published_ns], arrays=arrays)
     (folder / README).write_text(_readme(recording, name, layouts, tables.rows), encoding="utf-8")
     return tables.rows
 
 
-def _readme(recording: Recording, robot: str, layouts: dict[str, _Layout], rows: dict[str, int]) -> str:
-    """What the columns mean."""
+def _readme(recording: Recording, robot: str, layouts: dict[str, _TopicLayout], rows: dict[str, int]) -> str:
+    """Text of the README: the meaning of all columns."""
     lines = [
         f"# {recording.path.name}, robot {robot}", "",
         "Written by `presage export --format csv`. Units are SI; poses are of base_link in map unless said otherwise.",
-        "Empty: not stated. inf: no return, -inf: too close (REP-117); a scan's 0: not measured.",
-        "`stamp_ns` is simulation or sensor time;",
-        "`log_time_ns` and `publish_time_ns` are the wall clock's. Lists and arrays stand in files of their own",
-        "(TOPIC.FIELD.csv; -N is the number of columns of an array), tied to the message by `log_time_ns` and `seq`.",
+        "An empty cell means unknown. Ranges: inf is no return, -inf too close (REP-117), 0 not measured.",
+        "`stamp_ns` is simulation or sensor time; `log_time_ns` and `publish_time_ns` are wall time.",
+        "Lists and arrays have their own files (TOPIC.FIELD.csv; -N is the number of columns of an array), whose rows",
+        "belong to the message with the same `log_time_ns` and `seq`.",
     ]  # fmt: skip
     for layout in layouts.values():
         lines += ["", f"## {layout.name}.csv ({rows.get(f'{layout.name}.csv', 0)} rows)", ""]

@@ -14,46 +14,46 @@ from presage.recordings.selection import stem_of
 from presage.terminal.output import check_file, write_json
 from services.recorder.reader import Recording, read_recording
 
-BESIDE = {"csv": "-csv", "tum": "-tum", "foxglove": "-foxglove.mcap"}
+DEFAULT_SUFFIXES = {"csv": "-csv", "tum": "-tum", "foxglove": "-foxglove.mcap"}
 
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """What is asked for."""
+    """Options of `presage export`."""
 
     file: Path
     format: str  # csv, tum or foxglove
-    out: Path | None = None  # None: beside the recording
-    robot: str = ""  # none: the recording's own
+    out: Path | None = None  # defaults to a name beside the recording
+    robot: str = ""  # defaults to the robot of the recording
     arrays: bool = False
     localised_only: bool = False
     force: bool = False
 
 
 def run_export(job: ExportOptions, json_file: Path | None, console: Console) -> None:
-    """Write it, and print what was written; raises UserError where that cannot be."""
-    if job.format not in BESIDE:
-        raise UserError(f"no format {job.format!r}: choose {', '.join(BESIDE)}")
+    """Exports the recording and prints what was written; raises UserError if that fails."""
+    if job.format not in DEFAULT_SUFFIXES:
+        raise UserError(f"no format {job.format!r}: choose {', '.join(DEFAULT_SUFFIXES)}")
     check_file(json_file, "--json")
-    out = job.out or job.file.with_name(stem_of(job.file) + BESIDE[job.format])
+    out = job.out or job.file.with_name(stem_of(job.file) + DEFAULT_SUFFIXES[job.format])
     recording = read_recording(job.file)
-    began = time.monotonic()
+    start = time.monotonic()
     written = _write(job, recording, out, console)
-    took = time.monotonic() - began
+    seconds = time.monotonic() - start
     if recording.warning:
         print(f"warning: {recording.warning}", file=sys.stderr)
-    if lost := sum(recording.undecodable.values()):
-        print(f"warning: {lost} messages could not be decoded and are left out", file=sys.stderr)
+    if undecodable := sum(recording.undecodable.values()):
+        print(f"warning: {undecodable} messages could not be decoded and are left out", file=sys.stderr)
     unit = "messages" if job.format == "foxglove" else "rows"
     for name, rows in written.items():
         console.print(f"{rows:9d} {unit}  {name}", markup=False, highlight=False)
-    console.print(f"written to {out} in {took:.1f} s", markup=False, highlight=False, soft_wrap=True)
-    numbers = {"file": str(job.file), "format": job.format, "out": str(out), "written": written, "seconds": took}
-    write_json(json_file, {**numbers, "complete": recording.complete, "undecodable": lost})
+    console.print(f"written to {out} in {seconds:.1f} s", markup=False, highlight=False, soft_wrap=True)
+    numbers = {"file": str(job.file), "format": job.format, "out": str(out), "written": written, "seconds": seconds}
+    write_json(json_file, {**numbers, "complete": recording.complete, "undecodable": undecodable})
 
 
 def _write(job: ExportOptions, recording: Recording, out: Path, console: Console) -> dict[str, int]:
-    """With the writer of the format, imported when it is needed."""
+    """Writes the export and returns the number of rows or messages by name; imports only the format's module."""
     if job.format == "csv":
         from presage.recordings.csv_tables import export_csv  # noqa: PLC0415
 
@@ -66,5 +66,5 @@ def _write(job: ExportOptions, recording: Recording, out: Path, console: Console
     try:
         from presage.recordings.foxglove import export_foxglove  # noqa: PLC0415
     except ModuleNotFoundError as error:
-        raise UserError(f"{error.name} is not installed: pip install 'presage[export]' brings it") from None
+        raise UserError(f"{error.name} is not installed: run pip install 'presage[export]'") from None
     return export_foxglove(recording, out, job.robot, console, force=job.force)

@@ -1,8 +1,8 @@
 """An MCAP file for Foxglove and Lichtblick.
 
-Schemas come from foxglove-schemas-protobuf, descriptors in the file from mcap-protobuf-support: both Foxglove's, small,
-kept up. `presage/recordings/foxglove_session.py` says how times and frames are chosen; docs/foxglove-layout.json is a
-layout for the channels written here.
+The schemas come from foxglove-schemas-protobuf and their descriptors in the file from mcap-protobuf-support; both are
+small packages maintained by Foxglove. `presage/recordings/foxglove_session.py` explains the choice of times and frames;
+docs/foxglove-layout.json is a layout for the channels written here.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from common.messages.definitions import Belief, Truth
 from common.messages.topics import BELIEF, TRUTH
 from common.versions import versions
 from presage.recordings import plain_numbers as numbers
-from presage.recordings.foxglove_session import Out, SessionView, driver_of, still_life
-from presage.recordings.selection import entries, keys_of, refuse_to_overwrite, robot_of, tracked
+from presage.recordings.foxglove_session import FoxgloveMessage, SessionConverter, driver_of, static_messages
+from presage.recordings.selection import entries, keys_of, refuse_to_overwrite, robot_of, with_progress
 from services.recorder.reader import Recording
 
 CLOCK = "wall clock of the recording; a stamp's time is when its first sensor message was recorded"
 
 
 class Channels:
-    """Registers a channel when its first message comes."""
+    """Writes messages to the file; registers each channel when its first message comes."""
 
     def __init__(self, writer: Writer) -> None:
         self.counts: Counter[str] = Counter()  # by channel
@@ -40,36 +40,37 @@ class Channels:
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
 
-    def write(self, out: Out) -> None:
-        """One message."""
-        if isinstance(out.content, Protobuf):
-            data = out.content.SerializeToString()
+    def write(self, message: FoxgloveMessage) -> None:
+        """Writes one message."""
+        if isinstance(message.content, Protobuf):
+            data = message.content.SerializeToString()
         else:
-            data = json.dumps(out.content, allow_nan=False).encode()
-        number = self._channels.get(out.topic)
-        if number is None:
-            number = self._channels[out.topic] = self._declare(out)
-        self._writer.add_message(number, out.log_ns, data, out.publish_ns, self.counts[out.topic])
-        self.counts[out.topic] += 1
+            data = json.dumps(message.content, allow_nan=False).encode()
+        channel = self._channels.get(message.topic)
+        if channel is None:
+            channel = self._channels[message.topic] = self._register(message)
+        self._writer.add_message(channel, message.log_ns, data, message.publish_ns, self.counts[message.topic])
+        self.counts[message.topic] += 1
 
-    def _declare(self, out: Out) -> int:
-        if isinstance(out.content, Protobuf):
-            name, encoding = out.content.DESCRIPTOR.full_name, "protobuf"
-            data = build_file_descriptor_set(type(out.content)).SerializeToString()
+    def _register(self, message: FoxgloveMessage) -> int:
+        if isinstance(message.content, Protobuf):
+            name, encoding = message.content.DESCRIPTOR.full_name, "protobuf"
+            data = build_file_descriptor_set(type(message.content)).SerializeToString()
         else:
-            name, schema = numbers.schema_of(out.topic)
+            name, schema = numbers.schema_of(message.topic)
             encoding, data = "jsonschema", json.dumps(schema).encode()
         if name not in self._schemas:
             self._schemas[name] = self._writer.register_schema(name, encoding, data)
         return self._writer.register_channel(
-            out.topic, "protobuf" if encoding == "protobuf" else "json", self._schemas[name]
+            message.topic, "protobuf" if encoding == "protobuf" else "json", self._schemas[name]
         )
 
 
 def export_foxglove(recording: Recording, out: Path, robot: str, console: Console, *, force: bool) -> dict[str, int]:
-    """Write ``out``: messages by channel. What is under that name appears only when it is whole.
+    """Writes the file ``out``; returns the number of messages by channel.
 
-    Raises UserError where nothing can be written or something is there already and ``force`` is not given.
+    The file appears under its name only when it is complete. Raises UserError if it cannot be written, or if it exists
+    and ``force`` is not given.
     """
     name = robot_of(recording, robot)
     refuse_to_overwrite([out], force=force)
@@ -94,7 +95,7 @@ def export_foxglove(recording: Recording, out: Path, robot: str, console: Consol
 
 
 def _write(recording: Recording, robot: str, writer: Writer, console: Console) -> Counter[str]:
-    """All of it, in the order received."""
+    """Writes all messages in the order of reception."""
     keys, counts = keys_of(recording, robot), recording.counts()
     driver = driver_of({topic.name for topic in keys.values()})
     about = {"recording": recording.path.name, "robot": robot, "base_link is driven by": driver, "times": CLOCK}
@@ -106,27 +107,27 @@ def _write(recording: Recording, robot: str, writer: Writer, console: Console) -
             writer.add_attachment(recording.start_ns, recording.start_ns, title, "application/yaml", data)
     channels = Channels(writer)
     believed, true = _paths(recording, robot, console)
-    for out in still_life(recording.world(), recording.robot(), believed, true, recording.start_ns):
-        channels.write(out)
-    view = SessionView(driver)
+    for converted in static_messages(recording.world(), recording.robot(), believed, true, recording.start_ns):
+        channels.write(converted)
+    converter = SessionConverter(driver)
     total = sum(counts[key] for key in keys)
-    for topic, message, raw in tracked(entries(recording, robot), total, "foxglove", console):
-        for out in view.feed(topic, message, raw):
-            channels.write(out)
-    if view.left_out:
-        rows = ", ".join(f"{count} of {name}" for name, count in view.left_out.items())
-        console.print(f"left out, as Foxglove has no form for them here: {rows}", highlight=False, soft_wrap=True)
+    for topic, message, raw in with_progress(entries(recording, robot), total, "foxglove", console):
+        for converted in converter.convert(topic, message, raw):
+            channels.write(converted)
+    if converter.left_out:
+        rows = ", ".join(f"{count} of {name}" for name, count in converter.left_out.items())
+        console.print(f"left out, because this export does not support them: {rows}", highlight=False, soft_wrap=True)
     return channels.counts
 
 
 def _paths(recording: Recording, robot: str, console: Console) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) believed and (M, 3) true poses, read ahead so that the whole path can stand from the beginning."""
+    """Believed poses (N, 3) and true poses (M, 3); the whole paths are shown from the beginning of the file."""
     believed, true = list[np.ndarray](), list[np.ndarray]()
     keys, counts = keys_of(recording, robot, BELIEF, TRUTH), recording.counts()
-    found: Iterator[tuple[object, object, object]] = tracked(
+    messages: Iterator[tuple[object, object, object]] = with_progress(
         entries(recording, robot, BELIEF, TRUTH), sum(counts[key] for key in keys), "paths", console
     )
-    for _, message, _ in found:
+    for _, message, _ in messages:
         if isinstance(message, Belief):
             believed.append(message.pose.array())
         elif isinstance(message, Truth):

@@ -1,7 +1,7 @@
 """Foxglove's poses, scans and shapes.
 
-Built with foxglove-schemas-protobuf: Foxglove's own classes, generated from its .proto files, 0.1 MB and pure Python;
-foxglove-sdk holds the same schemas beside a server of 54 MB.
+Uses foxglove-schemas-protobuf: the classes that Foxglove generates from its .proto files, 0.1 MB of pure Python.
+foxglove-sdk has the same schemas, but comes with a server of 54 MB.
 """
 
 from __future__ import annotations
@@ -35,55 +35,55 @@ from common.geometry.world import World
 from common.messages.definitions import Belief, Hypothesis, Plan, Prediction, Preference, Scan
 from common.robot.ranges import surfaces
 
-TRUTH, BELIEF, GOAL = (0.0, 0.0, 0.0), (0.84, 0.37, 0.0), (0.0, 0.62, 0.45)  # red, green, blue, as in `presage plot`
+TRUTH, BELIEF, GOAL = (0.0, 0.0, 0.0), (0.84, 0.37, 0.0), (0.0, 0.62, 0.45)  # RGB, as in `presage plot`
 WALL, FURNITURE = (0.55, 0.55, 0.55), (0.78, 0.78, 0.78)
 WALL_HEIGHT, WALL_THICKNESS = 0.5, 0.06  # m, as drawn
-NINETY_FIVE = 2.447746830680816  # a Gaussian's 95 % ellipse in the plane: the root of chi² with 2 degrees at 0.95
-AXES = (("x", 0), ("y", 4))  # float32 of a point in the plane, and where it begins
-FREE, OCCUPIED = (245, 245, 245, 255), (70, 70, 70, 255)  # red, green, blue, alpha; outside stays clear
+ELLIPSE_SCALE_95 = 2.447746830680816  # of standard deviations; square root of the 0.95 quantile of chi² with 2 degrees
+POINT_FIELDS = (("x", 0), ("y", 4))  # name and offset in bytes of the float32 values of a point
+FREE, OCCUPIED = (245, 245, 245, 255), (70, 70, 70, 255)  # RGBA; unknown cells are transparent
 
 
 def time_of(ns: int) -> Timestamp:
-    """A time in ns."""
+    """A timestamp from ns."""
     seconds, nanos = divmod(ns, 1_000_000_000)
     return Timestamp(seconds=seconds, nanos=nanos)
 
 
 def color(rgb: Sequence[float], alpha: float = 1.0) -> Color:
-    """Of 0 to 1."""
+    """A colour from RGB values between 0 and 1."""
     return Color(r=rgb[0], g=rgb[1], b=rgb[2], a=alpha)
 
 
-def turn(yaw: float) -> Quaternion:
-    """About z, rad."""
+def quaternion(yaw: float) -> Quaternion:
+    """The rotation by ``yaw`` rad about z."""
     return Quaternion(x=0.0, y=0.0, z=float(np.sin(yaw / 2)), w=float(np.cos(yaw / 2)))
 
 
 def pose(xyyaw: Sequence[float] | Array, z: float = 0.0) -> Pose:
-    """From x m, y m, yaw rad."""
+    """A pose from (x, y, yaw) in m, m, rad."""
     x, y, yaw = map(float, xyyaw)
-    return Pose(position=Vector3(x=x, y=y, z=z), orientation=turn(yaw))
+    return Pose(position=Vector3(x=x, y=y, z=z), orientation=quaternion(yaw))
 
 
 def pose_in(frame: str, xyyaw: Array, ns: int) -> PoseInFrame:
-    """A pose that stands alone."""
+    """A pose with frame and time."""
     return PoseInFrame(timestamp=time_of(ns), frame_id=frame, pose=pose(xyyaw))
 
 
 def transform(parent: str, child: str, xyyaw: Array, ns: int) -> FrameTransform:
-    """The pose of ``child`` in ``parent``."""
+    """The transform that is the pose of ``child`` in ``parent``."""
     x, y, yaw = map(float, xyyaw)
     return FrameTransform(
         timestamp=time_of(ns),
         parent_frame_id=parent,
         child_frame_id=child,
         translation=Vector3(x=x, y=y, z=0.0),
-        rotation=turn(yaw),
+        rotation=quaternion(yaw),
     )
 
 
 def laser_scan(scan: Scan | Prediction, ns: int) -> LaserScan:
-    """Measured or predicted ranges in frame laser; what is no distance (±inf, 0) becomes NaN, which nobody draws."""
+    """Measured or predicted ranges in frame laser; values that are not distances (±inf, 0) become NaN, not drawn."""
     ranges = np.where(surfaces(scan.ranges), scan.ranges, np.nan).astype(float)
     return LaserScan(
         timestamp=time_of(ns),
@@ -95,9 +95,16 @@ def laser_scan(scan: Scan | Prediction, ns: int) -> LaserScan:
     )
 
 
-def line(points: Array, rgb: Sequence[float], alpha: float = 1.0, *, closed: bool = False, z: float = 0.02,
-         thickness: float = 2.0) -> LinePrimitive:  # fmt: skip
-    """Through points (N, 2) m, ``thickness`` pixels on the screen."""
+def line(
+    points: Array,
+    rgb: Sequence[float],
+    alpha: float = 1.0,
+    *,
+    closed: bool = False,
+    z: float = 0.02,
+    thickness: float = 2.0,
+) -> LinePrimitive:
+    """A line through points (N, 2) m; its thickness is in pixels of the screen."""
     return LinePrimitive(
         type=LinePrimitive.LINE_LOOP if closed else LinePrimitive.LINE_STRIP,
         pose=pose((0, 0, 0)),
@@ -109,37 +116,44 @@ def line(points: Array, rgb: Sequence[float], alpha: float = 1.0, *, closed: boo
 
 
 def ellipse(mean: Array, covariance: Array, sides: int = 48) -> Array:
-    """(sides, 2) m, the 95 % ellipse of x and y; mean (3,), covariance (3, 3)."""
+    """Points (sides, 2) m on the 95 % ellipse of x and y, from a mean (3,) and a covariance (3, 3)."""
     values, axes = np.linalg.eigh(np.asarray(covariance, float)[:2, :2])
     angles = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)])
-    return np.asarray((axes * np.sqrt(np.maximum(values, 0.0)) @ circle).T * NINETY_FIVE + mean[:2], float)
+    return np.asarray((axes * np.sqrt(np.maximum(values, 0.0)) @ circle).T * ELLIPSE_SCALE_95 + mean[:2], float)
 
 
 def hypotheses(belief: Belief) -> list[Hypothesis]:
-    """The mixture; of an estimator that gives none, its pose with weight 1."""
+    """The hypotheses of a belief; if it has none, its pose with weight 1."""
     return belief.hypotheses or [Hypothesis(pose=belief.pose, covariance=belief.covariance, weight=1.0)]
 
 
 def belief_entity(belief: Belief, ns: int) -> SceneEntity:
-    """An arrow and a 95 % ellipse for each hypothesis, as solid as its weight."""
+    """An arrow and a 95 % ellipse for each hypothesis, with an opacity that grows with its weight."""
     entity = SceneEntity(timestamp=time_of(ns), frame_id="map", id="belief", frame_locked=True)
     for hypothesis in hypotheses(belief):
         alpha = 0.15 + 0.85 * hypothesis.weight
         at = hypothesis.pose.array()
         entity.arrows.append(
-            ArrowPrimitive(pose=pose(at, 0.05), shaft_length=0.35, shaft_diameter=0.06, head_length=0.15,
-                           head_diameter=0.14, color=color(BELIEF, alpha))
-        )  # fmt: skip
+            ArrowPrimitive(
+                pose=pose(at, 0.05),
+                shaft_length=0.35,
+                shaft_diameter=0.06,
+                head_length=0.15,
+                head_diameter=0.14,
+                color=color(BELIEF, alpha),
+            )
+        )
         if hypothesis.covariance is not None:
             outline = ellipse(at, hypothesis.covariance)
             entity.lines.append(line(outline, BELIEF, alpha, closed=True, z=0.06))
     return entity
 
 
-def disc(frame: str, name: str, at: Array, radius: float, height: float, rgb: Sequence[float], alpha: float,
-         ns: int) -> SceneEntity:  # fmt: skip
-    """A flat cylinder: the robot's body, the goal and its tolerance."""
+def disc(
+    frame: str, name: str, at: Array, radius: float, height: float, rgb: Sequence[float], alpha: float, ns: int
+) -> SceneEntity:
+    """A flat cylinder at the pose ``at`` (3,), for the robot's body, the goal and its tolerance."""
     size = Vector3(x=2 * radius, y=2 * radius, z=height)
     shape = CylinderPrimitive(
         pose=pose(at, height / 2), size=size, bottom_scale=1, top_scale=1, color=color(rgb, alpha)
@@ -148,7 +162,7 @@ def disc(frame: str, name: str, at: Array, radius: float, height: float, rgb: Se
 
 
 def plan_entity(plan: Plan, ns: int) -> SceneEntity:
-    """The way ahead and where the command leads; one plan replaces the last."""
+    """The planned path and the motion that the command leads to; a plan replaces the one before."""
     entity = SceneEntity(timestamp=time_of(ns), frame_id="map", id="plan", frame_locked=True)
     for points, rgb in ((plan.path, GOAL), (plan.motion, BELIEF)):
         if len(points) > 1:
@@ -157,23 +171,23 @@ def plan_entity(plan: Plan, ns: int) -> SceneEntity:
 
 
 def obstacle_points(plan: Plan, ns: int) -> PointCloud:
-    """What the scan sees and the map does not have."""
+    """The obstacles that the scan shows and the map does not contain."""
     return PointCloud(
         timestamp=time_of(ns),
         frame_id="map",
         pose=pose((0, 0, 0), 0.1),
         point_stride=8,
-        fields=[PackedElementField(name=name, offset=at, type=PackedElementField.FLOAT32) for name, at in AXES],
+        fields=[PackedElementField(name=name, offset=at, type=PackedElementField.FLOAT32) for name, at in POINT_FIELDS],
         data=np.asarray(plan.obstacles, "<f4").tobytes(),
     )
 
 
 def preference_grid(preference: Preference, ns: int) -> Grid:
-    """Metres to go of each cell, a float32 named distance; infinite where the goal is out of reach."""
+    """Distance to the goal from each cell, m, as float32 `distance`; infinite if the goal cannot be reached."""
     return Grid(
         timestamp=time_of(ns),
         frame_id="map",
-        pose=pose(preference.origin.array(), -0.005),  # between the map and the rest
+        pose=pose(preference.origin.array(), -0.005),  # above the map and below everything else
         column_count=preference.width,
         cell_size=Vector2(x=preference.resolution, y=preference.resolution),
         row_stride=preference.width * 4,
@@ -184,7 +198,7 @@ def preference_grid(preference: Preference, ns: int) -> Grid:
 
 
 def path_entity(name: str, path: Array, rgb: Sequence[float], ns: int) -> SceneEntity:
-    """A whole path (N, 3) in map, without the points that lie within 1 cm of a straight line."""
+    """A path (N, 3) in map, simplified with a tolerance of 1 cm."""
     points = path[:, :2]
     if len(points) > 2:
         points = shapely.get_coordinates(shapely.simplify(shapely.LineString(points), 0.01))
@@ -193,11 +207,11 @@ def path_entity(name: str, path: Array, rgb: Sequence[float], ns: int) -> SceneE
 
 
 def world_entities(world: World, ns: int) -> list[SceneEntity]:
-    """Walls and furniture in map; their visible faces stand where the world says."""
+    """Walls and furniture in map; the thickness of walls extends away from free space."""
     walls = SceneEntity(timestamp=time_of(ns), frame_id="map", id="walls", frame_locked=True)
     if world.grid is None:
         walls.cubes.extend(_slabs(np.array(world.boundary), WALL, outside=True))
-    else:  # thousands of faces: the top edges, as one shape
+    else:  # a ROS map has thousands of walls: draw only their top edges, as one shape
         edges = line(world.grid.shapes.walls.reshape(-1, 2), WALL, z=WALL_HEIGHT)
         edges.type = LinePrimitive.LINE_LIST
         walls.lines.append(edges)
@@ -226,7 +240,7 @@ def _cube(at: Array, size: Iterable[float], rgb: Sequence[float]) -> CubePrimiti
 
 
 def _slabs(ring: Array, rgb: Sequence[float], *, outside: bool) -> list[CubePrimitive]:
-    """A slab along each edge of a ring (V, 2), on its outer or inner side."""
+    """A thin box along each edge of a ring (V, 2), on its outer or inner side."""
     counter_clockwise = shapely.is_ccw(shapely.LinearRing(ring))
     side = WALL_THICKNESS / 2 * (1 if outside == counter_clockwise else -1)
     found = []
@@ -238,7 +252,7 @@ def _slabs(ring: Array, rgb: Sequence[float], *, outside: bool) -> list[CubePrim
 
 
 def grid(world: World, ns: int) -> Grid:
-    """The map: red, green, blue, alpha and occupancy (0 free, 100 occupied, 255 outside: unknown), a byte each."""
+    """The map, with RGBA and occupancy (0 free, 100 occupied, 255 unknown) as one byte each."""
     (x0, y0), cell, x, y = raster.cell_centres(world)
     free, wall = raster.classify_points(world, x, y, cell)
     columns = x.shape[1]
@@ -249,7 +263,7 @@ def grid(world: World, ns: int) -> Grid:
     return Grid(
         timestamp=time_of(ns),
         frame_id="map",
-        pose=pose((x0, y0, 0.0), -0.01),  # below the rest
+        pose=pose((x0, y0, 0.0), -0.01),  # below everything else
         column_count=columns,
         cell_size=Vector2(x=cell, y=cell),
         row_stride=columns * len(names),

@@ -19,14 +19,14 @@ from presage.recordings.selection import entries, robot_of
 from services.recorder.reader import Recording, read_recording
 
 Stamps = npt.NDArray[np.int64]
-LATE = 256  # scans; a prediction comes sooner
+MAX_WAITING_SCANS = 256  # the prediction of a scan comes before this number of further scans
 
 
-class Track:
-    """Poses with their stamps, as plain numbers; one sent again with the stamp of the last stands once."""
+class StampedRows:
+    """Rows of numbers with their stamps, stored compactly; a repeated message with the same stamp is ignored."""
 
     def __init__(self, width: int = 3) -> None:
-        """``width`` numbers a row, the pose first."""
+        """``width`` is the number of values in a row, of which the first three are the pose."""
         self.width = width
         self._stamps, self._logged, self._rows = array("q"), array("q"), array("d")
 
@@ -34,7 +34,7 @@ class Track:
         return len(self._stamps)
 
     def add(self, stamp_ns: int, logged_ns: int, *row: float) -> bool:
-        """A row; False where it was there already."""
+        """Adds a row; returns False if it repeats the stamp of the last one."""
         if self._stamps and self._stamps[-1] == stamp_ns:
             return False
         self._stamps.append(stamp_ns)
@@ -44,56 +44,56 @@ class Track:
 
     @property
     def stamps_ns(self) -> Stamps:
-        """(N,) ns."""
+        """Stamps (N,) ns."""
         return np.array(self._stamps, np.int64)
 
     @property
     def logged_ns(self) -> Stamps:
-        """(N,) ns, wall clock."""
+        """Times of reception (N,) ns, wall clock."""
         return np.array(self._logged, np.int64)
 
     @property
     def rows(self) -> Array:
-        """(N, width)."""
+        """All rows (N, width)."""
         return np.array(self._rows, float).reshape(-1, self.width)
 
     @property
     def poses(self) -> Array:
-        """(N, 3)."""
+        """Poses (N, 3)."""
         return self.rows[:, :3]
 
 
 @dataclass
-class Session:
-    """A recording's messages by kind, in the order received, of one robot."""
+class RecordedSession:
+    """The messages of one robot in a recording, by type and in the order of reception."""
 
     world: World | None = None
     robot: str = "unknown"
     base: Robot = field(default_factory=Robot)
-    warning: str = ""  # empty: the recording is complete
-    duration_s: float = 0.0  # by reception
+    warning: str = ""  # empty if the recording is complete
+    duration_s: float = 0.0  # from the first to the last reception
     counts: dict[str, int] = field(default_factory=dict)  # by key
     undecodable: int = 0
-    scans: Track = field(default_factory=lambda: Track(0))
+    scans: StampedRows = field(default_factory=lambda: StampedRows(0))
     last_scan: Scan | None = None
-    predicted: tuple[Scan, Prediction] | None = None  # the last scan that was predicted
-    truth: Track = field(default_factory=Track)
-    contacts: int = 0  # truths that touch something
-    belief: Track = field(default_factory=lambda: Track(6))  # pose, free energy, accuracy, complexity
-    states: list[str] = field(default_factory=list)  # beside belief
-    estimator: str = ""  # the last belief's
-    true_poses: Array = field(default_factory=lambda: np.zeros((0, 3)))  # beside belief, of the same stamp; NaN: none
+    predicted: tuple[Scan, Prediction] | None = None  # the last scan with a prediction
+    truth: StampedRows = field(default_factory=StampedRows)
+    contacts: int = 0  # number of truth messages in which the robot touches something
+    belief: StampedRows = field(default_factory=lambda: StampedRows(6))  # pose, free energy, accuracy, complexity
+    states: list[str] = field(default_factory=list)  # of each belief
+    estimator: str = ""  # of the last belief
+    true_poses: Array = field(default_factory=lambda: np.zeros((0, 3)))  # at the stamp of each belief; NaN if unknown
     goals: list[Goal] = field(default_factory=list)
-    goal_times_ns: list[int] = field(default_factory=list)  # beside goals: the session's own time when each came
+    goal_times_ns: list[int] = field(default_factory=list)  # of each goal: stamp of the last scan or truth before it
     reached: list[Status] = field(default_factory=list)  # statuses in state reached
     healths: dict[str, Health] = field(default_factory=dict)  # the last of each service
 
     def energies(self) -> Array:
-        """(N, 3) nats: free energy, accuracy, complexity of each belief."""
+        """Free energy, accuracy and complexity of each belief (N, 3), nats."""
         return self.belief.rows[:, 3:]
 
     def errors(self) -> Array:
-        """(N,) m, distance of each belief from the truth of the same stamp; NaN where there is none."""
+        """Position error of each belief against the truth of the same stamp (N,), m; NaN if there is none."""
         return np.asarray(np.hypot(*(self.belief.poses - self.true_poses)[:, :2].T), float)
 
     def goal(self) -> Goal | None:
@@ -101,11 +101,11 @@ class Session:
         return self.goals[-1] if self.goals and not self.goals[-1].cancel else None
 
     def localised(self) -> int | None:
-        """Index of the first belief that claims to know the place."""
+        """Index of the first belief in state tracking, or None."""
         return self.states.index("tracking") if "tracking" in self.states else None
 
     def reached_ns(self) -> int | None:
-        """Stamp at which the controller said that the last goal was reached."""
+        """Stamp of the status that reports the last goal as reached, or None."""
         goal = self.goal()
         if goal is None:
             return None
@@ -113,50 +113,50 @@ class Session:
         return next((s.stamp_ns for s in self.reached if s.goal == goal.pose and s.stamp_ns >= after), None)
 
 
-def load_session(path: Path) -> Session:
-    """Read a recording; raises UserError where that is impossible."""
-    return session_of(read_recording(path))
+def load_session(path: Path) -> RecordedSession:
+    """Reads a recording; raises UserError if that fails."""
+    return gather_session(read_recording(path))
 
 
-def session_of(recording: Recording) -> Session:
-    """The recording's messages by kind."""
+def gather_session(recording: Recording) -> RecordedSession:
+    """Gathers the messages of the recording's robot."""
     robot = robot_of(recording, "")
-    session = Session(
+    session = RecordedSession(
         world=recording.world(),
         robot=robot or recording.metadata.get("presage", {}).get("robot", "unknown"),
         base=recording.robot(),
         counts=dict(recording.counts()),
         duration_s=(recording.end_ns - recording.start_ns) * 1e-9,
     )
-    gather = _Gathering(session)
+    gatherer = _Gatherer(session)
     for _, message, raw in entries(recording, robot):
-        gather.take(message, raw.logged_ns)
-    session.true_poses = _of_the_same_stamp(session.belief, session.truth)
-    session.warning = recording.warning  # damage is found on the way
+        gatherer.add(message, raw.logged_ns)
+    session.true_poses = _truth_at_beliefs(session.belief, session.truth)
+    session.warning = recording.warning  # damage is only found while reading
     session.undecodable = sum(recording.undecodable.values())
     return session
 
 
-class _Gathering:
-    """Sorts messages into a session."""
+class _Gatherer:
+    """Sorts messages by type into a session."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: RecordedSession) -> None:
         self.session = session
-        self._now = 0  # ns, the session's own time
-        self._waiting: dict[int, Scan] = {}  # for their prediction
-        self._takers: dict[type[Stamped], Callable[[Any, int], None]] = {
+        self._last_stamp_ns = 0  # of scan or truth
+        self._waiting: dict[int, Scan] = {}  # scans whose prediction may still come, by stamp
+        self._handlers: dict[type[Stamped], Callable[[Any, int], None]] = {
             Goal: self._goal, Status: self._status, Health: self._health, Scan: self._scan,
             Prediction: self._prediction, Truth: self._truth, Belief: self._belief,
         }  # fmt: skip
 
-    def take(self, message: Stamped, logged: int) -> None:
-        """One message, with its reception in ns of the wall clock."""
-        if (taker := self._takers.get(type(message))) is not None:
-            taker(message, logged)
+    def add(self, message: Stamped, logged: int) -> None:
+        """Adds a message with the time of its reception, ns of wall time."""
+        if (handler := self._handlers.get(type(message))) is not None:
+            handler(message, logged)
 
     def _goal(self, goal: Goal, _: int) -> None:
         self.session.goals.append(goal)
-        self.session.goal_times_ns.append(self._now)  # its own stamp may be of another clock
+        self.session.goal_times_ns.append(self._last_stamp_ns)  # the goal's own stamp may be of another clock
 
     def _status(self, status: Status, _: int) -> None:
         if status.state == "reached":
@@ -172,7 +172,7 @@ class _Gathering:
     def _truth(self, truth: Truth, logged: int) -> None:
         if self.session.truth.add(truth.stamp_ns, logged, *truth.pose.array()):
             self.session.contacts += truth.contact
-            self._now = truth.stamp_ns
+            self._last_stamp_ns = truth.stamp_ns
 
     def _belief(self, belief: Belief, logged: int) -> None:
         energies = (belief.free_energy, belief.accuracy, belief.complexity)
@@ -182,23 +182,24 @@ class _Gathering:
 
     def _scan(self, scan: Scan, logged: int) -> None:
         if self.session.scans.add(scan.stamp_ns, logged):
-            self._now = scan.stamp_ns
+            self._last_stamp_ns = scan.stamp_ns
             self.session.last_scan = self._waiting[scan.stamp_ns] = scan
-            if len(self._waiting) > LATE:
+            if len(self._waiting) > MAX_WAITING_SCANS:
                 del self._waiting[next(iter(self._waiting))]
 
 
-def _of_the_same_stamp(belief: Track, truth: Track) -> Array:
-    """(N, 3) true pose beside each belief; NaN where there is none.
+def _truth_at_beliefs(belief: StampedRows, truth: StampedRows) -> Array:
+    """The true pose at the stamp of each belief (N, 3); NaN if there is none.
 
-    Of several with one stamp the one received at nearly the same time: a simulation begun anew uses stamps again.
+    A restarted simulation uses stamps again: of several poses with the same stamp, takes the one received closest in
+    time to the belief.
     """
-    found = np.full((len(belief), 3), np.nan)
+    result = np.full((len(belief), 3), np.nan)
     order = np.lexsort((truth.logged_ns, truth.stamps_ns))
     stamps, logged, poses = truth.stamps_ns[order], truth.logged_ns[order], truth.poses[order]
     first = np.searchsorted(stamps, belief.stamps_ns, "left")
-    behind = np.searchsorted(stamps, belief.stamps_ns, "right")
-    for row, (a, b, at) in enumerate(zip(first, behind, belief.logged_ns, strict=True)):
+    end = np.searchsorted(stamps, belief.stamps_ns, "right")
+    for row, (a, b, belief_logged) in enumerate(zip(first, end, belief.logged_ns, strict=True)):
         if b > a:
-            found[row] = poses[a if b == a + 1 else a + np.argmin(np.abs(logged[a:b] - at))]
-    return found
+            result[row] = poses[a if b == a + 1 else a + np.argmin(np.abs(logged[a:b] - belief_logged))]
+    return result

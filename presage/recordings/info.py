@@ -14,34 +14,34 @@ from presage.recordings.selection import robots_of
 from services.recorder.files.message_counts import Ledger, from_metadata, is_numbered
 from services.recorder.reader import Recording
 
-SMALL = 64 << 20  # bytes; up to here a file is read through unasked: a second or two
+MAX_CHECKED_BYTES = 64 << 20  # by default, files up to this size are checked, which takes a second or two
 
 
 @dataclass
 class TopicFacts:
-    """Of one key; None where it was not counted."""
+    """Facts about one key; None for what was not counted."""
 
     key: str
     messages: int
     rate_hz: float | None = None
     bytes: int | None = None
-    gaps: int | None = None  # places where the publisher's numbers jump
-    missing: int | None = None  # numbers that were left out
+    gaps: int | None = None  # places where sequence numbers are missing
+    missing: int | None = None  # missing sequence numbers
     restarts: int | None = None  # of the publisher
     reordered: int | None = None
-    dropped: int | None = None  # by the recorder, whose queue was full
+    dropped: int | None = None  # by the recorder, because its queue was full
     undecodable: int | None = None
-    counters: dict[str, int] = field(default_factory=dict)  # the recorder's own, as it wrote them at the end
+    counters: dict[str, int] = field(default_factory=dict)  # counted by the recorder, from the metadata
 
 
 @dataclass
 class Facts:
-    """Of a file."""
+    """Facts about a recording."""
 
     file: str
     file_bytes: int
     complete: bool
-    checked: bool  # every payload was read, and every checksum compared as far as the file is whole
+    checked: bool  # whether all payloads were read and all checksums verified
     warning: str
     robots: list[str]
     world: str | None
@@ -50,30 +50,30 @@ class Facts:
     messages: int
     topics: list[TopicFacts]
     versions: dict[str, str]
-    metadata: dict[str, list[str]]  # the names in each record
-    attachments: dict[str, int]  # bytes
-    dropped_by_services: dict[str, int] | None  # "service key": by their last counts; None: not looked at
+    metadata: dict[str, list[str]]  # names of the values in each record
+    attachments: dict[str, int]  # size in bytes by name
+    dropped_by_services: dict[str, int] | None  # messages by "service key", from health messages; None if not checked
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values."""
+        """The facts as values that JSON can hold."""
         return asdict(self) | {"missing": self.missing}
 
     @property
     def missing(self) -> int:
-        """Messages that were sent and are not in it: by the publishers' numbers, or dropped by the recorder."""
+        """Number of messages that were sent but are not in the recording."""
         return sum((topic.missing or 0) + (topic.dropped or 0) for topic in self.topics)
 
 
-class _Pass:
-    """One reading of all payloads."""
+class _PayloadCheck:
+    """Reads all payloads of a recording and counts what is in them."""
 
     def __init__(self) -> None:
         self.ledger = Ledger()
         self.bytes: Counter[str] = Counter()
         self.undecodable: Counter[str] = Counter()
-        self.first: dict[str, int] = {}  # ns, wall clock
+        self.first: dict[str, int] = {}  # by key: time of the first message, ns of wall time
         self.last: dict[str, int] = {}
-        self.healths: dict[tuple[str, str], Health] = {}  # by service and instance, the last
+        self.last_health: dict[tuple[str, str], Health] = {}  # by service and instance
 
     def read(self, recording: Recording) -> None:
         for raw in recording.payloads():
@@ -90,24 +90,24 @@ class _Pass:
                 self.undecodable[raw.key] += 1
                 continue
             if isinstance(message, Health):
-                self.healths[message.service, message.instance] = message
+                self.last_health[message.service, message.instance] = message
 
     def dropped(self) -> dict[str, int]:
-        """What services received and did not use, by their last counts."""
+        """Number of messages that services received but dropped, from their last health messages."""
         dropped = Counter[str]()
-        for health in self.healths.values():
+        for health in self.last_health.values():
             for row in health.topics:
                 dropped[f"{health.service} {row.key}"] += row.dropped
         return dict(+dropped)
 
 
 def survey(recording: Recording, check: bool | None = None) -> Facts:
-    """Facts of a recording; ``check`` reads all of it (None: where that is soon done)."""
+    """Collects facts about a recording; ``check`` reads all of it, and defaults to True for small files."""
     size = recording.path.stat().st_size
-    seen = None
-    if check if check is not None else size <= SMALL:
-        seen = _Pass()
-        seen.read(recording)
+    checked = None
+    if check if check is not None else size <= MAX_CHECKED_BYTES:
+        checked = _PayloadCheck()
+        checked.read(recording)
         recording.verify()
     about = recording.metadata.get("presage", {})
     world = recording.world()
@@ -115,23 +115,23 @@ def survey(recording: Recording, check: bool | None = None) -> Facts:
         file=str(recording.path),
         file_bytes=size,
         complete=recording.complete,
-        checked=seen is not None,
+        checked=checked is not None,
         warning=recording.warning,
         robots=robots_of(recording) or ([about["robot"]] if "robot" in about else []),
         world=world.name if world else None,
         started=datetime.fromtimestamp(recording.start_ns * 1e-9, timezone.utc).isoformat(timespec="milliseconds"),
         duration_s=(recording.end_ns - recording.start_ns) * 1e-9,
         messages=recording.counts().total(),
-        topics=_topics(recording, seen),
+        topics=_topic_facts(recording, checked),
         versions={name: text for name, text in about.items() if name not in {"robot", "command"}},
         metadata={name: list(record) for name, record in recording.metadata.items()},
         attachments={name: len(data) for name, data in recording.attachments.items()},
-        dropped_by_services=None if seen is None else seen.dropped(),
+        dropped_by_services=None if checked is None else checked.dropped(),
     )
 
 
-def _topics(recording: Recording, seen: _Pass | None) -> list[TopicFacts]:
-    """By key, with what the recorder counted and what was counted now."""
+def _topic_facts(recording: Recording, checked: _PayloadCheck | None) -> list[TopicFacts]:
+    """Facts by key, from the recorder's counts and, if there was a check, from the payloads."""
     counters = from_metadata(recording.metadata.get("counters", {}))
     dropped = {key: int(n) for key, n in recording.metadata.get("dropped", {}).items() if n.isdecimal()}
     counts, duration = recording.counts(), (recording.end_ns - recording.start_ns) * 1e-9
@@ -144,19 +144,19 @@ def _topics(recording: Recording, seen: _Pass | None) -> list[TopicFacts]:
             facts.reordered, facts.dropped = count.reordered, count.dropped
         elif "dropped" in recording.metadata:
             facts.dropped = dropped.get(key, 0)
-        if seen is not None:
-            _checked(facts, seen)
+        if checked is not None:
+            _replace_by_checked(facts, checked)
         found.append(facts)
     return found
 
 
-def _checked(facts: TopicFacts, seen: _Pass) -> None:
-    """What the payloads themselves say goes before what the recorder wrote."""
+def _replace_by_checked(facts: TopicFacts, checked: _PayloadCheck) -> None:
+    """Replaces the recorder's counts by those from the payloads."""
     key = facts.key
-    facts.bytes, facts.undecodable = seen.bytes[key], seen.undecodable[key]
-    span = (seen.last.get(key, 0) - seen.first.get(key, 0)) * 1e-9
-    facts.rate_hz = (seen.ledger.written[key] - 1) / span if span > 0 else None
+    facts.bytes, facts.undecodable = checked.bytes[key], checked.undecodable[key]
+    span = (checked.last.get(key, 0) - checked.first.get(key, 0)) * 1e-9
+    facts.rate_hz = (checked.ledger.written[key] - 1) / span if span > 0 else None
     if is_numbered(key):
-        numbers = seen.ledger.lost(key)
+        numbers = checked.ledger.lost(key)
         facts.gaps, facts.missing, facts.restarts = numbers.gaps, numbers.missing, numbers.restarts
         facts.reordered = numbers.reordered

@@ -9,7 +9,7 @@ import numpy as np
 from common.geometry.se2 import Array, between
 from common.messages.definitions import Belief, CmdVel, Drive, Health, Status, Truth
 
-# Channel: field: JSON type and meaning. A field that is unknown at the moment is left out.
+# By channel and field: JSON type and meaning. Messages leave out fields whose value is unknown.
 FIELDS: dict[str, dict[str, tuple[str, str]]] = {
     "/belief/numbers": {
         "stamp_s": ("number", "s, the scan's own stamp"),
@@ -82,7 +82,7 @@ HEALTH: dict[str, Any] = {
 
 
 def schema_of(topic: str) -> tuple[str, dict[str, Any]]:
-    """Name and JSON schema of a channel of numbers."""
+    """Name and JSON schema of a channel."""
     if topic.startswith("/health/"):
         return "presage.Health", HEALTH
     properties = {name: {"type": kind, "description": about} for name, (kind, about) in FIELDS[topic].items()}
@@ -91,12 +91,12 @@ def schema_of(topic: str) -> tuple[str, dict[str, Any]]:
 
 
 def _known(values: dict[str, Any]) -> dict[str, Any]:
-    """Without what is unknown, and without what JSON has no number for."""
+    """Without values that are None or not finite, which JSON cannot represent."""
     return {k: v for k, v in values.items() if v is not None and not (isinstance(v, float) and not np.isfinite(v))}
 
 
 def of_belief(belief: Belief) -> dict[str, Any]:
-    """Free energy and how sure the belief is."""
+    """State, free energy and uncertainty of a belief."""
     spread = [None, None, None] if belief.covariance is None else np.sqrt(np.diag(belief.covariance)).tolist()
     weights = [hypothesis.weight for hypothesis in belief.hypotheses]
     return _known(
@@ -114,25 +114,25 @@ def of_belief(belief: Belief) -> dict[str, Any]:
 
 
 def of_error(belief: Belief, truth: Array, goal: Array | None) -> dict[str, Any]:
-    """How far off the belief is; poses (3,) in map."""
-    off = between(truth, belief.pose.array())
+    """Errors of a belief against the true pose (3,), and the distance from that to the goal (3,), in map."""
+    difference = between(truth, belief.pose.array())
     return _known(
         {
             "stamp_s": belief.stamp_ns * 1e-9,
-            "position": float(np.hypot(off[0], off[1])),
-            "heading": float(abs(off[2])),
+            "position": float(np.hypot(difference[0], difference[1])),
+            "heading": float(abs(difference[2])),
             "goal_distance": None if goal is None else float(np.hypot(*(goal - truth)[:2])),
         }
     )
 
 
 def of_truth(truth: Truth) -> dict[str, Any]:
-    """What moves and what touches."""
+    """True velocity, contact and obstacle stop."""
     return {**_twist(truth), "contact": truth.contact, "stopped": truth.stopped}
 
 
 def of_command(command: CmdVel | Drive) -> dict[str, Any]:
-    """The velocity asked for."""
+    """Commanded velocity."""
     return _twist(command)
 
 
@@ -142,7 +142,7 @@ def _twist(message: Truth | CmdVel | Drive) -> dict[str, Any]:
 
 
 def of_status(status: Status) -> dict[str, Any]:
-    """What the controller does."""
+    """State of the controller."""
     return _known(
         {
             "stamp_s": status.stamp_ns * 1e-9,
@@ -154,7 +154,7 @@ def of_status(status: Status) -> dict[str, Any]:
 
 
 def of_health(health: Health) -> dict[str, Any]:
-    """Counters of a service."""
+    """Health of a service with its counters."""
     names = HEALTH["properties"]["topics"]["items"]["properties"]
     return {
         "service": health.service,

@@ -20,42 +20,44 @@ from presage.recordings.info import Facts, survey
 from presage.terminal.output import check_file, write_json
 from services.recorder.reader import Recording, read_recording
 
-MANY = 6  # values of a metadata record; more are counted, not named
+MAX_LISTED_VALUES = 6  # of a metadata record; of a longer one, only their number is printed
 
 
 def info(file: Path, json_file: Path | None, check: bool | None, console: Console) -> int:
-    """Print what is in a recording; 1 where it is not whole."""
+    """Prints facts about a recording; returns 1 if it is incomplete or messages are missing, else 0."""
     check_file(json_file, "--json")
     recording = read_recording(file)
     with console.status("reading"):
         facts = survey(recording, check)
-    _head(facts, recording, console)
+    _print_head(facts, recording, console)
     console.print(_table(facts))
     if facts.dropped_by_services:
-        parts = [f"{count} of {name.split(' ')[1]} by {name.split(' ')[0]}"
-                 for name, count in facts.dropped_by_services.items()]  # fmt: skip
-        console.print(f"services dropped, newest first served: {'; '.join(parts)}", highlight=False)
+        parts = []
+        for name, count in facts.dropped_by_services.items():
+            service, key = name.split(" ")[:2]
+            parts.append(f"{count} of {key} by {service}")
+        console.print(f"dropped by services, which use the newest message: {'; '.join(parts)}", highlight=False)
     for name, keys in facts.metadata.items():
-        there = f"{len(keys)} values" if len(keys) > MANY else ", ".join(keys) or "empty"
-        console.print(f"metadata    {escape(name)}: {escape(there)}", highlight=False, soft_wrap=True)
+        values = f"{len(keys)} values" if len(keys) > MAX_LISTED_VALUES else ", ".join(keys) or "empty"
+        console.print(f"metadata    {escape(name)}: {escape(values)}", highlight=False, soft_wrap=True)
     for name, size in facts.attachments.items():
         console.print(f"attachment  {escape(name)}: {_size(size)}", highlight=False)
     if not facts.checked:
-        console.print("gaps and bytes are counted from the payloads themselves with --check", style="dim")
+        console.print("use --check to count gaps and bytes from the messages themselves", style="dim")
     write_json(json_file, facts.as_dict())
     return 0 if facts.complete and not facts.missing else 1
 
 
-def _head(facts: Facts, recording: Recording, console: Console) -> None:
-    state = f"readable, but {facts.missing} messages are missing" if facts.missing else "whole"
-    state += ", every chunk's checksum right" if facts.checked else ", by its index"
+def _print_head(facts: Facts, recording: Recording, console: Console) -> None:
+    state = f"readable, but {facts.missing} messages are missing" if facts.missing else "complete"
+    state += ", all checksums are correct" if facts.checked else ", according to its index"
     if (recovered := recording.metadata.get("recovered")) is not None:
         state += f", recovered from {recovered.get('from', 'another file')}"
     about = recording.metadata.get("presage", {})
     rows = [
         ("file", f"{facts.file}, {_size(facts.file_bytes)}"),
         ("state", state if facts.complete else "INCOMPLETE"),
-        ("began", f"{facts.started}, {facts.duration_s:.2f} s, {facts.messages} messages"),
+        ("start", f"{facts.started}, {facts.duration_s:.2f} s, {facts.messages} messages"),
         ("robot", ", ".join(facts.robots) or "unknown"),
         ("world", facts.world or "not recorded"),
         ("scanner", str(recording.scanner() or "not recorded")),
@@ -87,7 +89,7 @@ def _table(facts: Facts) -> Table:
 
 
 def _size(count: int) -> str:
-    """Bytes for a reader."""
+    """A number of bytes with a suitable unit."""
     if count < 1000:
         return f"{count} B"
     return f"{count / 1000:.1f} kB" if count < 1_000_000 else f"{count / 1e6:.1f} MB"
@@ -96,7 +98,7 @@ def _size(count: int) -> str:
 def echo_either(
     link: Link, source: str, topic: str | None, count: int, start_s: float, console: Console, *, full: bool
 ) -> int:
-    """Print a topic of the bus, or a recording; raises UserError where ``source`` is neither."""
+    """Prints messages of a topic on the bus, or of a recording; raises UserError if ``source`` is neither."""
     is_file = source.endswith((".mcap", ".mcap.active")) or Path(source).exists()
     if source not in {row.name for row in TOPICS} and is_file:
         return echo_file(Path(source), topic, count, start_s, console, full=full)
@@ -107,10 +109,10 @@ def echo_either(
 
 
 def echo_file(file: Path, name: str | None, count: int, start_s: float, console: Console, *, full: bool) -> int:
-    """Print a recording's messages, one JSON line each, with key and time; 1 where there is none."""
+    """Prints messages of a recording as JSON lines with key and time; returns 1 if there is none, else 0."""
     recording = read_recording(file)
     keys = _keys(recording, name)
-    seen, from_ns = 0, recording.start_ns + round(start_s * 1e9)
+    printed, from_ns = 0, recording.start_ns + round(start_s * 1e9)
     for raw in recording.payloads(keys, start_ns=from_ns):
         topic = topic_of(raw.key)
         head = {"key": raw.key, "time_s": round((raw.logged_ns - recording.start_ns) * 1e-9, 6)}
@@ -120,22 +122,22 @@ def echo_file(file: Path, name: str | None, count: int, start_s: float, console:
             rest = {"undecodable": str(error), "bytes": len(raw.payload)}
         line = json.dumps({**head, **rest})
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-        seen += 1
-        if seen == count:
+        printed += 1
+        if printed == count:
             break
     if recording.warning:
         print(f"warning: {recording.warning}", file=sys.stderr)
-    return 0 if seen else 1
+    return 0 if printed else 1
 
 
 def _keys(recording: Recording, name: str | None) -> Collection[str] | None:
-    """Keys of a topic, or all; raises UserError where the recording has none of it."""
+    """Keys of the topic or key ``name``, None for all; raises UserError if the recording has none of them."""
     if name is None:
         return None
     if name in recording.counts():
         return [name]
     keys = [key for key, topic in recording.topics().items() if topic == topic_named(name)]
     if not keys:
-        there = [topic.name for topic in TOPICS if topic in recording.topics().values()]
-        raise UserError(f"{recording.path}: no {name} in it; it has {', '.join(there) or 'no topic of presage'}")
+        topics = [topic.name for topic in TOPICS if topic in recording.topics().values()]
+        raise UserError(f"{recording.path}: no {name} in it; it has {', '.join(topics) or 'no topic of presage'}")
     return keys

@@ -17,44 +17,44 @@ Entry = tuple[Topic, Stamped, Raw]
 
 
 def robots_of(recording: Recording) -> list[str]:
-    """Names of the robots that have messages in it."""
+    """Names of the robots with messages in the recording."""
     return sorted({key.split("/")[1] for key in recording.topics()})
 
 
 def robot_of(recording: Recording, wanted: str) -> str:
-    """The robot asked for, or the one the recording was made of; raises UserError where it has no such robot."""
-    there = robots_of(recording)
-    if wanted and wanted not in there:
-        raise UserError(f"{recording.path}: no robot {wanted!r} in it; it has {', '.join(there) or 'none'}")
-    of_file = recording.metadata.get("presage", {}).get("robot", "")
-    return wanted or (of_file if of_file in there or not there else there[0])
+    """The robot ``wanted``, or if that is empty, the robot of the recording; raises UserError if it is not in there."""
+    robots = robots_of(recording)
+    if wanted and wanted not in robots:
+        raise UserError(f"{recording.path}: no robot {wanted!r} in it; it has {', '.join(robots) or 'none'}")
+    recorded = recording.metadata.get("presage", {}).get("robot", "")
+    return wanted or (recorded if recorded in robots or not robots else robots[0])
 
 
 def keys_of(recording: Recording, robot: str, *topics: Topic) -> dict[str, Topic]:
-    """Keys of one robot with their rows; of some topics (none: all)."""
-    found = recording.topics().items()
-    return {key: row for key, row in found if key.split("/")[1] == robot and (not topics or row in topics)}
+    """The keys of one robot with their topics; ``topics`` defaults to all."""
+    keys = recording.topics().items()
+    return {key: topic for key, topic in keys if key.split("/")[1] == robot and (not topics or topic in topics)}
 
 
 def entries(recording: Recording, robot: str, *topics: Topic) -> Iterator[Entry]:
-    """Decoded messages of one robot, in the order received."""
+    """Yields the decoded messages of one robot in the order of reception; ``topics`` defaults to all."""
     for topic, message, raw in recording.messages(*topics):
         if raw.key.split("/")[1] == robot:
             yield topic, message, raw
 
 
-def tracked(found: Iterator[Entry], total: int, what: str, console: Console) -> Iterator[Entry]:
-    """The same, with a progress bar on a terminal."""
-    yield from track(found, what, total=total, console=console, transient=True, disable=not console.is_terminal)
+def with_progress(items: Iterator[Entry], total: int, what: str, console: Console) -> Iterator[Entry]:
+    """Yields the items and shows a progress bar if the console is a terminal."""
+    yield from track(items, what, total=total, console=console, transient=True, disable=not console.is_terminal)
 
 
 def stem_of(recording: Path) -> str:
-    """A recording's name without .mcap, .mcap.active, .mcap.torn."""
+    """The name of a recording without .mcap, .mcap.active or .mcap.torn."""
     return recording.name.split(".mcap")[0]
 
 
 def refuse_to_overwrite(paths: list[Path], *, force: bool) -> None:
-    """Raises UserError for the first that is there already."""
+    """Raises UserError if one of the paths exists, unless ``force``."""
     for path in paths:
         if path.exists() and not force:
-            raise UserError(f"{path}: is there already; choose another place with --out, or write over it with --force")
+            raise UserError(f"{path}: exists already; choose another place with --out, or overwrite it with --force")

@@ -20,18 +20,21 @@ from common.messages.definitions import Goal, Scan
 from common.robot.ranges import surfaces
 from common.runtime import safety
 from presage.plotting.maps import draw_walls
-from presage.recordings.gathering import Session, load_session
+from presage.recordings.gathering import RecordedSession, load_session
 from presage.recordings.session_summary import summary_of
 
-# Okabe and Ito: told apart by the colour-blind.
+# Palette of Okabe and Ito, suitable for colour-blind readers.
 TRUTH, BELIEF, MEASURED, GOAL = "#000000", "#D55E00", "#0072B2", "#009E73"
 WALL, FURNITURE, INK = "#8C8C8C", "#C8C8C8", "#555555"
-MOST_TIES = 200  # lines between belief and truth
-SMALLEST = 1e-3  # m, the least error a logarithmic axis shows
+MAX_TIES = 200  # lines between belief and truth
+MIN_LOG_VALUE = 1e-3  # m, smallest error on the logarithmic axis
 
 
 def draw_session(path: Path, png: Path, *, title: str | None = None) -> None:
-    """Draw the recording at ``path`` into ``png``; what is missing is said in its panel. UserError if not writable."""
+    """Draws the recording at ``path`` into ``png``; a panel without data says what is missing.
+
+    Raises UserError if the figure cannot be written.
+    """
     session = load_session(path)
     figure = figure_of(session, title if title is not None else path.stem)
     try:
@@ -40,7 +43,7 @@ def draw_session(path: Path, png: Path, *, title: str | None = None) -> None:
         raise UserError(f"{png}: cannot be written ({error.strerror}); choose another place for the figure") from None
 
 
-def figure_of(session: Session, title: str) -> Figure:
+def figure_of(session: RecordedSession, title: str) -> Figure:
     """The figure, 12 inches wide; its height follows the world's shape."""
     map_height = 4.0
     if session.world is not None:
@@ -59,8 +62,8 @@ def figure_of(session: Session, title: str) -> Figure:
     return figure
 
 
-def _headline(session: Session) -> str:
-    """The session in one line."""
+def _headline(session: RecordedSession) -> str:
+    """The main results of the session in one line."""
     summary = summary_of(session)
     parts = [f"world {summary.world}" if summary.world else "world unknown"]
     if len(session.belief):
@@ -73,8 +76,8 @@ def _headline(session: Session) -> str:
     if summary.position_error_m is not None:
         parts.append(f"position error at the end {summary.position_error_m:.2f} m")
     if summary.goal_reached is not None:
-        away = f", {summary.goal_distance_m:.2f} m away" if summary.goal_distance_m is not None else ""
-        parts.append(("goal reached" if summary.goal_reached else "goal not reached") + away)
+        distance = f", {summary.goal_distance_m:.2f} m away" if summary.goal_distance_m is not None else ""
+        parts.append(("goal reached" if summary.goal_reached else "goal not reached") + distance)
     return "  ·  ".join(parts if summary.complete else [*parts, "recording incomplete"])
 
 
@@ -84,8 +87,8 @@ def _missing(axes: Axes, what: str) -> None:
     axes.spines[:].set_color("#DDDDDD")
 
 
-def _dress(axes: Axes, letter: str, title: str) -> None:
-    """What every panel has."""
+def _style_axes(axes: Axes, letter: str, title: str) -> None:
+    """Adds title and grid to a panel."""
     axes.set_title(f"{letter}  {title}", fontsize=10.5, loc="left")
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(visible=True, which="major", color="#DDDDDD", linewidth=0.6)
@@ -104,7 +107,7 @@ def _draw_world(axes: Axes, world: World) -> None:
     axes.set(xlim=(x0 - 0.3, x1 + 0.3), ylim=(y0 - 0.3, y1 + 0.3))
 
 
-def _draw_map(axes: Axes, session: Session) -> None:
+def _draw_map(axes: Axes, session: RecordedSession) -> None:
     true, believed, goal = session.truth.poses, session.belief.poses, session.goal()
     if session.world is None and not len(true) and not len(believed):
         _missing(axes, "world and no path")
@@ -127,11 +130,11 @@ def _draw_map(axes: Axes, session: Session) -> None:
         (x, y, yaw), radius = true[-1], session.base.radius
         axes.add_patch(Disc((x, y), radius, facecolor="#00000014", edgecolor=TRUTH, linewidth=1.2, zorder=5))
         axes.plot([x, x + radius * np.cos(yaw)], [y, y + radius * np.sin(yaw)], color=TRUTH, linewidth=1.2, zorder=5)
-    _dress(axes, "a", "map")
+    _style_axes(axes, "a", "map")
     axes.grid(visible=False)
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
     below = axes.transAxes + ScaledTranslation(0, -0.45, axes.figure.dpi_scale_trans)
-    if axes.get_legend_handles_labels()[0]:  # of a log without poses there is but the world
+    if axes.get_legend_handles_labels()[0]:  # a log without poses has only the world
         axes.legend(
             loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=below, ncols=9, fontsize=8.5, frameon=False
         )
@@ -143,22 +146,22 @@ def _draw_goal(axes: Axes, goal: Goal) -> None:
     axes.plot(*where, "*", color=GOAL, markersize=11, label="goal and tolerance", zorder=6)
 
 
-def _draw_ties(axes: Axes, session: Session) -> None:
-    """Truth to belief of the same moment: paths that lie on each other may be apart in time.
+def _draw_ties(axes: Axes, session: RecordedSession) -> None:
+    """Draws lines between truth and belief of the same stamp, because paths that coincide may differ in time.
 
-    Once a second, in long sessions less often: some two hundred are as many as can be told apart.
+    One line each second, in long sessions fewer.
     """
     stamps = session.belief.stamps_ns
     known = np.flatnonzero(np.isfinite(session.true_poses[:, 0]))
     if not len(known):
         return
-    every = max(1, round(float(np.ptp(stamps[known])) * 1e-9 / MOST_TIES))  # s
-    chosen, due = list[int](), -np.inf
+    every = max(1, round(float(np.ptp(stamps[known])) * 1e-9 / MAX_TIES))  # s
+    selected, next_s = list[int](), -np.inf
     for row in known:
-        if stamps[row] * 1e-9 >= due - 1e-6:
-            due = stamps[row] * 1e-9 + every
-            chosen.append(int(row))
-    believed, true = session.belief.poses[chosen, :2], session.true_poses[chosen, :2]
+        if stamps[row] * 1e-9 >= next_s - 1e-6:
+            next_s = stamps[row] * 1e-9 + every
+            selected.append(int(row))
+    believed, true = session.belief.poses[selected, :2], session.true_poses[selected, :2]
     ties = np.stack([believed, true, np.full_like(true, np.nan)], axis=1).reshape(-1, 2)
     label = "same moment, each second" if every == 1 else f"same moment, every {every} s"
     axes.plot(*ties.T, color=INK, linewidth=0.9, alpha=0.6, label=label, zorder=3.5)
@@ -171,8 +174,8 @@ def _scan_in_map(scan: Scan, pose: Array) -> Array:
     return compose(pose, np.column_stack([points, np.zeros(len(points))]))[:, :2]
 
 
-def _draw_scan(axes: Axes, session: Session) -> None:
-    """The paper's figure 2c, for the last scan that was predicted."""
+def _draw_scan(axes: Axes, session: RecordedSession) -> None:
+    """Draws the last scan with a prediction, as in figure 2c of the paper."""
     if session.predicted is None:
         _missing(axes, "predicted scan")
         return
@@ -185,13 +188,13 @@ def _draw_scan(axes: Axes, session: Session) -> None:
     if len(prediction.sigma) == len(expected):
         low, high = expected - 2 * prediction.sigma, expected + 2 * prediction.sigma
         axes.fill_between(angles, low, high, color=BELIEF, alpha=0.2, lw=0, label="± 2σ")
-    _dress(axes, "b", f"scan and prediction at {scan.stamp_ns * 1e-9:.1f} s")
+    _style_axes(axes, "b", f"scan and prediction at {scan.stamp_ns * 1e-9:.1f} s")
     axes.set(xlabel="beam angle (deg)", ylabel="range (m)", ylim=(0, None))
     axes.set_xticks([t for t in range(-360, 361, 45) if angles.min() - 5 <= t <= angles.max() + 5])
     axes.legend(fontsize=8.5, frameon=False)
 
 
-def _draw_free_energy(axes: Axes, session: Session) -> None:
+def _draw_free_energy(axes: Axes, session: RecordedSession) -> None:
     if not len(session.belief):
         _missing(axes, "belief")
         return
@@ -207,30 +210,30 @@ def _draw_free_energy(axes: Axes, session: Session) -> None:
     if low > 0 and high > 30 * low:
         axes.set_yscale("log")
     _mark_moments(axes, session)
-    _dress(axes, "c", "free energy")
+    _style_axes(axes, "c", "free energy")
     axes.set(xlabel="time (s)", ylabel="F (nats)")
     axes.legend(fontsize=8.5, frameon=False)
 
 
-def _draw_errors(axes: Axes, session: Session) -> None:
-    """The paper's figure 3: error of the belief, and the distance to the goal in green."""
+def _draw_errors(axes: Axes, session: RecordedSession) -> None:
+    """Draws the error of the belief, and the distance to the goal in green, as in figure 3 of the paper."""
     errors, goal = session.errors(), session.goal()
     known = np.isfinite(errors)
     if not known.any():
         _missing(axes, "truth beside beliefs")
         return
     time = session.belief.stamps_ns * 1e-9
-    axes.semilogy(time[known], np.maximum(errors[known], SMALLEST), color=BELIEF, lw=1.4, label="position error")
+    axes.semilogy(time[known], np.maximum(errors[known], MIN_LOG_VALUE), color=BELIEF, lw=1.4, label="position error")
     if goal is not None:
-        since = session.truth.stamps_ns
-        away = np.hypot(*(session.truth.poses - goal.pose.array())[:, :2].T)
-        asked = since >= session.goal_times_ns[-1]
-        shown = np.maximum(away[asked], SMALLEST)
-        axes.semilogy(since[asked] * 1e-9, shown, color=GOAL, lw=1.4, label="distance to goal")
+        stamps = session.truth.stamps_ns
+        distance = np.hypot(*(session.truth.poses - goal.pose.array())[:, :2].T)
+        navigating = stamps >= session.goal_times_ns[-1]
+        shown = np.maximum(distance[navigating], MIN_LOG_VALUE)
+        axes.semilogy(stamps[navigating] * 1e-9, shown, color=GOAL, lw=1.4, label="distance to goal")
     _mark_moments(axes, session)
-    _dress(axes, "d", "position error and distance to goal")
+    _style_axes(axes, "d", "position error and distance to goal")
     low, high = axes.get_ylim()
-    if high < 2 * low:  # all but constant: an axis of rounding errors says nothing
+    if high < 2 * low:  # the curves are almost constant: avoid an axis that shows rounding errors
         axes.set_ylim(low / 2, 2 * high)
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.grid(visible=True, which="minor", color="#EEEEEE", linewidth=0.4)
@@ -238,8 +241,8 @@ def _draw_errors(axes: Axes, session: Session) -> None:
     axes.legend(fontsize=8.5, frameon=False)
 
 
-def _mark_moments(axes: Axes, session: Session) -> None:
-    """When the belief claimed to know the place, and when the goal was reached."""
+def _mark_moments(axes: Axes, session: RecordedSession) -> None:
+    """Marks the times of the first belief in state tracking and of reaching the goal."""
     first, reached = session.localised(), session.reached_ns()
     if first is not None:
         axes.axvline(session.belief.stamps_ns[first] * 1e-9, color=INK, lw=0.9, ls=":", label="localised")

@@ -1,9 +1,9 @@
 """Trajectories in TUM format, for evo.
 
-Format: one pose a line, `timestamp x y z qx qy qz qw`, s and m, comment lines begin with #
-(https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats). Timestamps are the messages' own stamps, so that
-belief and truth of one scan match exactly. A simulation that was begun anew uses stamps again: from there on lines go
-into NAME-2.tum and so on, for evo refuses stamps that do not ascend.
+Format: one pose per line, `timestamp x y z qx qy qz qw` in s and m; comment lines begin with #
+(https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats). The timestamps are the stamps of the messages, so that
+belief and truth of a scan match exactly. evo requires ascending timestamps: when a restarted simulation uses stamps
+again, the following lines go into NAME-2.tum and so on.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rich.console import Console
 from common.errors import UserError
 from common.messages.definitions import Belief, Odom, Truth
 from common.messages.topics import BELIEF, ODOM, TRUTH
-from presage.recordings.selection import entries, keys_of, refuse_to_overwrite, robot_of, tracked
+from presage.recordings.selection import entries, keys_of, refuse_to_overwrite, robot_of, with_progress
 from presage.terminal.output import make_folder
 from services.recorder.reader import Recording
 
@@ -27,10 +27,10 @@ FRAMES = {"belief": "map", "truth": "map", "odom": "odom"}
 
 
 class Trajectory:
-    """The lines of one topic, in as many files as the stamps begin anew."""
+    """Writes the poses of one topic; starts a new file whenever the stamps go back."""
 
     def __init__(self, folder: Path, name: str, stack: ExitStack) -> None:
-        """Files NAME.tum, NAME-2.tum ... in ``folder``; ``stack`` closes them."""
+        """The files NAME.tum, NAME-2.tum and so on are written into ``folder`` and closed by ``stack``."""
         self.folder, self.name, self.rows = folder, name, dict[str, int]()
         self._stack = stack
         self._stream: TextIO | None = None
@@ -38,9 +38,9 @@ class Trajectory:
         self._last_ns = -1
 
     def add(self, stamp_ns: int, x: float, y: float, yaw: float) -> None:
-        """A pose; one sent again with the same stamp is left out."""
+        """Adds a pose; ignores a repeated message with the same stamp."""
         if self._stream is None or stamp_ns < self._last_ns:
-            self._stream = self._next()
+            self._stream = self._open_next()
         elif stamp_ns == self._last_ns:
             return
         self._last_ns = stamp_ns
@@ -50,7 +50,7 @@ class Trajectory:
         )
         self.rows[self._file] += 1
 
-    def _next(self) -> TextIO:
+    def _open_next(self) -> TextIO:
         number = len(self.rows) + 1
         self._file = f"{self.name}.tum" if number == 1 else f"{self.name}-{number}.tum"
         self.rows[self._file] = 0
@@ -62,10 +62,10 @@ class Trajectory:
 def export_tum(
     recording: Recording, folder: Path, robot: str, console: Console, *, localised_only: bool, force: bool
 ) -> dict[str, int]:
-    """belief.tum, truth.tum and odom.tum into ``folder``: poses by file name.
+    """Writes belief.tum, truth.tum and odom.tum into ``folder``; returns the number of poses by file name.
 
-    ``localised_only`` leaves out beliefs that do not claim to know the place. Raises UserError where there is no pose,
-    nothing can be written, or something is there already and ``force`` is not given.
+    ``localised_only`` leaves out beliefs that are not in state tracking. Raises UserError if there are no poses, if
+    nothing can be written, or if the folder is not empty and ``force`` is not given.
     """
     name = robot_of(recording, robot)
     keys = keys_of(recording, name, *TOPICS)
@@ -76,9 +76,9 @@ def export_tum(
     counts = recording.counts()
     with ExitStack() as stack:
         files = {topic.name: Trajectory(folder, topic.name, stack) for topic in keys.values()}
-        found = tracked(entries(recording, name, *TOPICS), sum(counts[key] for key in keys), "tum", console)
-        for topic, message, _ in found:
-            assert isinstance(message, Belief | Truth | Odom)  # noqa: S101 - the topics' own
+        messages = with_progress(entries(recording, name, *TOPICS), sum(counts[key] for key in keys), "tum", console)
+        for topic, message, _ in messages:
+            assert isinstance(message, Belief | Truth | Odom)  # noqa: S101 - the message types of TOPICS
             if localised_only and isinstance(message, Belief) and message.state != "tracking":
                 continue
             files[topic.name].add(message.stamp_ns, message.pose.x, message.pose.y, message.pose.yaw)

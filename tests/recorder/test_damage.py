@@ -106,7 +106,7 @@ def test_info_of_a_damaged_index_suggests_recover(tmp_path):
         assert info(path, None, None, console) == 1
     assert "INCOMPLETE" in shown.get()
     assert "presage recover" in shown.get()
-    assert "checksum right" not in shown.get()
+    assert "checksums are correct" not in shown.get()
     assert [raw.payload for raw in read_recording(path).payloads()] == [payload for _, payload in SENT]
 
 

@@ -172,7 +172,7 @@ def test_a_folder_with_something_in_it_is_not_written_into(tmp_path):
     (tmp_path / "csv").mkdir()
     (tmp_path / "csv" / "mine.txt").touch()
     for job in (ExportOptions(recording, "csv", tmp_path / "csv"), ExportOptions(recording, "tum", tmp_path / "csv")):
-        with pytest.raises(UserError, match=r"mine.txt: is there already; .* --force"):
+        with pytest.raises(UserError, match=r"mine.txt: exists already; .* --force"):
             run_export(job, None, QUIET)
     assert [path.name for path in (tmp_path / "csv").iterdir()] == ["mine.txt"]
     run_export(ExportOptions(recording, "tum", tmp_path / "csv", force=True), None, QUIET)

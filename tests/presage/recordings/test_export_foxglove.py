@@ -22,8 +22,8 @@ from common.messages.definitions import Goal, Pose, Stamped, Truth, Twist
 from common.messages.topics import BELIEF, GOAL, ODOM, TOPICS, TRUTH, Topic
 from presage.recordings.export import ExportOptions, run_export
 from presage.recordings.foxglove import export_foxglove
-from presage.recordings.foxglove_session import Clock, driver_of
-from presage.recordings.foxglove_shapes import NINETY_FIVE, ellipse, grid, world_entities
+from presage.recordings.foxglove_session import WallClock, driver_of
+from presage.recordings.foxglove_shapes import ELLIPSE_SCALE_95, ellipse, grid, world_entities
 from presage.recordings.plain_numbers import FIELDS
 from services.recorder.reader import read_recording
 from tests.lab.navigation import drives as driven
@@ -173,7 +173,7 @@ def test_beliefs_with_covariance_and_weights(tmp_path):
     assert best.color.a > second.color.a > 0
     (outline,) = entity.lines  # the second hypothesis states no covariance
     points = np.array([(p.x, p.y) for p in outline.points]) - driven.believed(5)[:2]
-    assert np.abs(points).max(axis=0) == pytest.approx(NINETY_FIVE * np.array([0.2, 0.1]), rel=0.01)
+    assert np.abs(points).max(axis=0) == pytest.approx(ELLIPSE_SCALE_95 * np.array([0.2, 0.1]), rel=0.01)
     assert len(found["/hypotheses"][5][1].poses) == 2
     pose = found["/truth"][5][1]
     assert pose.frame_id == "map"
@@ -254,14 +254,14 @@ def test_without_anything_odometry_drives():
 
 
 def test_a_stamp_keeps_its_time_until_the_simulation_begins_anew():
-    clock = Clock()
-    assert clock.see("truth", 5, 100) == 100
-    assert clock.see("scan", 5, 103) == 100
-    assert clock.of(5, 110) == 100
-    assert clock.of(6, 111) == 111  # nothing is known of it
-    assert clock.see("truth", 5, 900) == 900  # again: begun anew
-    assert clock.see("scan", 5, 902) == 900
-    assert clock.of(5, 950) == 900
+    clock = WallClock()
+    assert clock.add_sensor_message("truth", 5, 100) == 100
+    assert clock.add_sensor_message("scan", 5, 103) == 100
+    assert clock.time_of(5, 110) == 100
+    assert clock.time_of(6, 111) == 111  # nothing is known of it
+    assert clock.add_sensor_message("truth", 5, 900) == 900  # again: begun anew
+    assert clock.add_sensor_message("scan", 5, 902) == 900
+    assert clock.time_of(5, 950) == 900
 
 
 def test_the_error_is_that_of_the_run_the_belief_belongs_to(tmp_path):

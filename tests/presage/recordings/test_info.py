@@ -72,7 +72,7 @@ def test_the_index_alone_answers_without_the_payloads(tmp_path):
 
 def test_a_large_file_is_read_through_only_when_asked_to(tmp_path, monkeypatch):
     path = driven.write(tmp_path / "run.mcap")
-    monkeypatch.setattr(information, "SMALL", 1000)
+    monkeypatch.setattr(information, "MAX_CHECKED_BYTES", 1000)
     assert not facts_of(path)[0].checked
     assert facts_of(path, check=True)[0].checked
 
@@ -93,7 +93,7 @@ def test_info_prints_it_and_writes_it(tmp_path):
     assert info(path, tmp_path / "facts.json", None, console) == 0
     text = console.file.getvalue()
     for said in (
-        "whole, every chunk's checksum right",
+        "complete, all checksums are correct",
         "hall",
         "rob",
         SCAN.key("rob"),
