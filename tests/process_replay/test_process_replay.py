@@ -66,7 +66,7 @@ def test_a_step_size_ten_percent_larger_is_noticed_and_reads_well(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "changes", "said"),
+    ("name", "changes", "reported"),
     [
         ("simulator", {"seed": 6}, "scan"),
         ("simulator", {"drive": "differential"}, "truth"),
@@ -76,10 +76,10 @@ def test_a_step_size_ten_percent_larger_is_noticed_and_reads_well(tmp_path):
         ("estimator-paper", {"alpha": 2.2e-3}, "belief"),
     ],
 )
-def test_a_change_is_noticed(name, changes, said, tmp_path):
+def test_a_change_is_noticed(name, changes, reported, tmp_path):
     found = differences(name, SESSIONS[name](tmp_path, **changes))
     assert found
-    assert said in reference.report(name, found, first=1000)
+    assert reported in reference.report(name, found, first=1000)
 
 
 ROWS = [
@@ -104,7 +104,7 @@ def changed(change):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "reported"),
     [
         (
             lambda r: r[1].update(state="tracking"),
@@ -126,9 +126,9 @@ def changed(change):
         (lambda r: r.insert(1, {"event": 0, "topic": "scan"}), "message 1 (scan): new, the reference has none"),
     ],
 )
-def test_any_difference_is_named(change, said):
+def test_any_difference_is_named(change, reported):
     (found,) = reference.compare(ROWS, changed(change))
-    assert said in f"{found}"
+    assert reported in f"{found}"
     assert len(f"{found}") < 250
 
 
@@ -169,29 +169,29 @@ def test_a_covariance_is_scale_and_correlation():
 
 
 def test_bless_says_what_changed_and_writes_that_alone(tmp_path):
-    said = []
-    assert bless("x", ROWS, tmp_path, report=said.append)
-    assert said[0] == "x: no reference yet; 4 messages"
+    reported = []
+    assert bless("x", ROWS, tmp_path, report=reported.append)
+    assert reported[0] == "x: no reference yet; 4 messages"
     path = tmp_path / "x.jsonl"
     first, inode = path.read_text(), path.stat().st_mtime_ns
-    assert not bless("x", changed(lambda r: r[1]["pose"].update(x=9.00001)), tmp_path, report=said.append)
-    assert said[-1] == "x: unchanged"
+    assert not bless("x", changed(lambda r: r[1]["pose"].update(x=9.00001)), tmp_path, report=reported.append)
+    assert reported[-1] == "x: unchanged"
     assert (path.read_text(), path.stat().st_mtime_ns) == (first, inode)
 
     def both(rows):
         rows[0]["pose"]["x"] = 1.000001  # within tolerance: that line stays
         rows[1]["pose"].update(x=9.5, y=2.000001)
 
-    said.clear()
-    assert bless("x", changed(both), tmp_path, write=False, report=said.append)
+    reported.clear()
+    assert bless("x", changed(both), tmp_path, write=False, report=reported.append)
     assert path.read_text() == first
-    assert bless("x", changed(both), tmp_path, report=said.append)
-    assert "pose.x: expected 9, got 9.5" in said[1]
-    assert "1 of 4 lines new" in said[2]
+    assert bless("x", changed(both), tmp_path, report=reported.append)
+    assert "pose.x: expected 9, got 9.5" in reported[1]
+    assert "1 of 4 lines new" in reported[2]
     before, after = first.splitlines(), path.read_text().splitlines()
     assert [a == b for a, b in zip(before, after, strict=True)] == [True, False, True, True]
     assert '"x": 9.5, "y": 2.0}' in after[1]
-    assert not bless("x", changed(both), tmp_path, report=said.append)
+    assert not bless("x", changed(both), tmp_path, report=reported.append)
 
 
 @given(st.lists(st.sampled_from(ROWS), max_size=6), st.lists(st.sampled_from(ROWS), max_size=6))

@@ -35,9 +35,9 @@ def main() -> None:
             answers = list(session.get(key, payload=bytes.fromhex(rest[0]), timeout=1.0))
             print("answers", sum(1 for answer in answers if answer.ok is not None), flush=True)
         else:
-            with session.declare_queryable(key) as asked:
+            with session.declare_queryable(key) as queries:
                 print("serving", flush=True)
-                for query in asked:
+                for query in queries:
                     query.reply(str(query.key_expr), bytes.fromhex(rest[0]))
                     query.drop()
     session.close()

@@ -196,8 +196,8 @@ def test_a_frozen_service_is_unhealthy_until_it_continues(compose):
         project.becomes(service, "healthy")
     send_signal(project, "STOP")
     project.becomes("estimator", "unhealthy")
-    said = project.state("estimator")["Health"]["Log"][-1]["Output"]
-    assert "no heartbeat for" in said
+    output = project.state("estimator")["Health"]["Log"][-1]["Output"]
+    assert "no heartbeat for" in output
     assert project.health("simulator") == "healthy"
     send_signal(project, "CONT")
     project.becomes("estimator", "healthy")

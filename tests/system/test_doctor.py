@@ -28,9 +28,9 @@ from tests.conftest import ROOT, WAIT_TIMEOUT_S
 class Participant:
     """A fake service in its own session with configurable replies and health messages, four times a second."""
 
-    def __init__(self, link, name: str, *, said=None, ahead_s=0.0, scans=False, frozen=False) -> None:
+    def __init__(self, link, name: str, *, reply_fields=None, ahead_s=0.0, scans=False, frozen=False) -> None:
         self.link, self.name, self.ahead_s, self.scans, self.frozen = link, name, ahead_s, scans, frozen
-        self.said = {"uptime": 9.0, **(said or {})}
+        self.reply_fields = {"uptime": 9.0, **(reply_fields or {})}
         self.ready, self.stopping = threading.Event(), threading.Event()
         self.thread = threading.Thread(target=self.run, daemon=True)
         self.thread.start()
@@ -46,7 +46,7 @@ class Participant:
                 if self.frozen:
                     continue
                 if isinstance(call := calls.get(0.25), Call):
-                    call.reply(build_config_reply(self.name, "{}").model_copy(update=self.said).encode())
+                    call.reply(build_config_reply(self.name, "{}").model_copy(update=self.reply_fields).encode())
                 number += 1
                 bus.put(HEALTH, self.health(number).encode(), self.name)
                 if self.scans:
@@ -89,8 +89,8 @@ def find_fault(found: list[dict], code: str, words: str) -> dict:
 def faulty_session(link):
     """Two estimators of other versions with wrong clocks, two simulators, and a frozen viewer."""
     made = [
-        Participant(link, "estimator", said={"protocol": PROTOCOL + 1, "host": "far"}, ahead_s=60.0),
-        Participant(link, "estimator", said={"versions": {"presage": "9.9"}, "host": "near"}, ahead_s=60.0),
+        Participant(link, "estimator", reply_fields={"protocol": PROTOCOL + 1, "host": "far"}, ahead_s=60.0),
+        Participant(link, "estimator", reply_fields={"versions": {"presage": "9.9"}, "host": "near"}, ahead_s=60.0),
         Participant(link, "simulator", scans=True),
         Participant(link, "simulator", scans=True),
         Participant(link, "viewer", frozen=True),
@@ -154,10 +154,10 @@ def test_the_reason_for_a_missing_session_is_given(processes, free_port, tmp_pat
             started.append(run_doctor(processes.start, folder, "--connect", f"tcp/127.0.0.1:{port}"))
         for running in started:
             assert running.wait(120) == 1, running.output
-    said = [read_findings(tmp_path / str(number)) for number in range(3)]
-    assert "TLS" in find_fault(said[0], "no_router", "something listens there")["advice"]
-    assert "firewall" in find_fault(said[1], "blocked", "no answer")["advice"]
-    assert "presage up" in find_fault(said[2], "no_router", "nothing listens there")["advice"]
+    findings = [read_findings(tmp_path / str(number)) for number in range(3)]
+    assert "TLS" in find_fault(findings[0], "no_router", "something listens there")["advice"]
+    assert "firewall" in find_fault(findings[1], "blocked", "no answer")["advice"]
+    assert "presage up" in find_fault(findings[2], "no_router", "nothing listens there")["advice"]
 
 
 def test_a_full_read_only_disk_and_a_world_without_weights(tmp_path, free_port):

@@ -101,7 +101,7 @@ def test_one_estimator_process_serves_three_robots(process, bus, link, names, si
         garbage.put(SCAN, bytes([k % 256]) * (k % 300))
     listeners[2].wait(
         lambda m: isinstance(m, Health) and m.service == "estimator" and m.counters.get("other_sources", 0) > 0,
-        "told of scans that do not come from its simulator",
+        "notified of scans from another source",
     )
     for listener in listeners.values():
         listener.discard_messages()

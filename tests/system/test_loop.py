@@ -104,15 +104,17 @@ def test_demo_localises_navigates_records_and_draws(process, tmp_path):
     assert numbers["scans"] > 100
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {"another.mcap", recording.stem, recording.with_suffix("").with_suffix(".png").name}
-    told = read_recording(recording.with_suffix(""))
+    recording_contents = read_recording(recording.with_suffix(""))
     # No scan is lost. On a slow machine a scan is sent again, and only such repetitions may be dropped.
-    scans, beliefs = ({message.stamp_ns for _, message, _ in told.messages(topic)} for topic in (SCAN, BELIEF))
+    scans, beliefs = (
+        {message.stamp_ns for _, message, _ in recording_contents.messages(topic)} for topic in (SCAN, BELIEF)
+    )
     assert scans - beliefs <= {max(scans)}
-    simulated = [health for _, health, _ in told.messages(HEALTH) if health.service == "simulator"]
+    simulated = [health for _, health, _ in recording_contents.messages(HEALTH) if health.service == "simulator"]
     assert numbers["dropped"] == 0 or simulated[-1].counters.get("scans_sent_again", 0) > 0, numbers["dropped_by_key"]
-    (goal,) = [message for _, message, _ in told.messages(GOAL)]
+    (goal,) = [message for _, message, _ in recording_contents.messages(GOAL)]
     assert goal.seq > 0
-    assert {message.goal_seq for _, message, _ in told.messages(STATUS) if message.goal} == {goal.seq}
+    assert {message.goal_seq for _, message, _ in recording_contents.messages(STATUS) if message.goal} == {goal.seq}
     for word in (
         "page: http://127.0.0.1:",
         "distance to goal",
@@ -173,9 +175,9 @@ def test_up_serves_the_page(process, free_port):
     up.wait_for("all alive", 90)
     (where,) = [line.split()[-1] for line in up.output.splitlines() if line.startswith("page:")]
     with Page(where) as page:
-        assert page.told("world")["world"]["name"] == "corridor"
+        assert page.recording_contents("world")["world"]["name"] == "corridor"
         assert page.frame(lambda h: h["belief"] is not None)
-        assert page.told("services", lambda m: len(m["services"]) == 5)["missing"] == []
+        assert page.recording_contents("services", lambda m: len(m["services"]) == 5)["missing"] == []
         assert page.done("record", action="status")["recording"] is False
     assert up.stop(signal.SIGINT, 20)[0] == 130
 

@@ -50,9 +50,9 @@ def terminal(tmp_path, link):
         fcntl.ioctl(theirs, termios.TIOCSCTTY, 0)
 
     args = ["replay", str(write_one_hour(tmp_path / "hour.mcap", link.robot)), "--connect", link.connect[0]]
-    with (tmp_path / "said").open("wb") as said:
+    with (tmp_path / "output").open("wb") as output:
         child = subprocess.Popen(
-            [sys.executable, "-m", "presage", *args], stdin=theirs, stdout=said, stderr=said, cwd=tmp_path,
+            [sys.executable, "-m", "presage", *args], stdin=theirs, stdout=output, stderr=output, cwd=tmp_path,
             env={**os.environ, "PYTHONPATH": str(ROOT)}, preexec_fn=take_terminal,  # noqa: PLW1509 - no lock in it
         )  # fmt: skip
     yield child, ours, lambda: termios.tcgetattr(theirs) == before
@@ -69,7 +69,7 @@ def state(bus):
 
 def test_keys_control_the_replay_and_the_terminal_is_restored(terminal, bus, tmp_path):
     child, ours, as_before = terminal
-    assert wait_until(lambda: b"q quit" in (tmp_path / "said").read_bytes(), WAIT_TIMEOUT_S)
+    assert wait_until(lambda: b"q: quit" in (tmp_path / "output").read_bytes(), WAIT_TIMEOUT_S)
     assert wait_until(lambda: not as_before(), WAIT_TIMEOUT_S)
     os.write(ours, b" ")
     assert wait_until(lambda: state(bus).paused, WAIT_TIMEOUT_S)
@@ -85,7 +85,7 @@ def test_keys_control_the_replay_and_the_terminal_is_restored(terminal, bus, tmp
     os.write(ours, b" q")
     assert child.wait(WAIT_TIMEOUT_S) == 0
     assert as_before()
-    assert b"replayed presage/" in (tmp_path / "said").read_bytes()
+    assert b"replayed presage/" in (tmp_path / "output").read_bytes()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -96,7 +96,7 @@ def test_a_signal_ends_the_replay_cleanly(terminal, bus, tmp_path, number):
     child.send_signal(number)
     assert child.wait(WAIT_TIMEOUT_S) == 130
     assert as_before()
-    assert "Traceback" not in (tmp_path / "said").read_text()
+    assert "Traceback" not in (tmp_path / "output").read_text()
 
 
 def test_services_treat_a_jump_back_in_time_as_a_new_session(process, bus, link, tmp_path):

@@ -60,11 +60,13 @@ def test_a_recording_replaces_the_simulator(bus, process, recording, tmp_path):
     assert not all_else.received
 
 
-@pytest.mark.parametrize(("name", "said"), [("", "no recording ''"), ("other.mcap", "no recording 'other.mcap'")])
-def test_a_missing_recording_is_reported_with_the_available_ones(process, recording, name, said):
+@pytest.mark.parametrize(
+    ("name", "expected_text"), [("", "no recording ''"), ("other.mcap", "no recording 'other.mcap'")]
+)
+def test_a_missing_recording_is_reported_with_the_available_ones(process, recording, name, expected_text):
     running = process("services.recorder.replaying.service", "--directory", str(recording), "--replay", name)
     assert running.wait() == 2
-    assert f"replay: {said} in {recording}" in running.output
+    assert f"replay: {expected_text} in {recording}" in running.output
     assert "there are drive.mcap" in running.output
 
 

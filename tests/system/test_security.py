@@ -124,7 +124,7 @@ def other_authority(secure_router):
 
 
 @pytest.mark.parametrize(
-    ("settings_of", "said"),
+    ("settings_of", "expected_text"),
     [
         (plain_tcp, "no TLS"),
         (no_certificate, "no certificate"),
@@ -133,9 +133,9 @@ def other_authority(secure_router):
         (other_authority, "certificate of another authority"),
     ],
 )
-def test_clients_with_invalid_credentials_are_refused_and_logged(secure_router, settings_of, said):
+def test_clients_with_invalid_credentials_are_refused_and_logged(secure_router, settings_of, expected_text):
     assert "not let in" in secure_router.intrude({**settings_of(secure_router), "connect/timeout_ms": 1000})
-    secure_router.router.wait_for(f"why='{said}")
+    secure_router.router.wait_for(f"why='{expected_text}")
 
 
 def test_the_same_client_with_valid_credentials_is_accepted(secure_router):
@@ -176,7 +176,7 @@ def stamps_until_own(controller, inbox_of_victim):
 def test_an_observer_may_not_command_set_goals_or_teleport(secure_router):
     command = CmdVel(stamp_ns=1, twist=Twist(vx=1.0, vy=0.0, wz=0.0)).encode().hex()
     goal = Goal(stamp_ns=1, pose=Pose(x=1.0, y=1.0, yaw=0.0)).encode().hex()
-    asked = PoseRequest(pose=Pose(x=1.0, y=1.0, yaw=0.0)).encode().hex()
+    request = PoseRequest(pose=Pose(x=1.0, y=1.0, yaw=0.0)).encode().hex()
     inbox_of_victim, goals, calls = Inbox(), Inbox(), Inbox()
     with secure_router.session("simulator") as simulator, secure_router.session("controller") as controller:
         simulator.subscribe(CMD_VEL, inbox_of_victim, keep_all=True)
@@ -188,8 +188,8 @@ def test_an_observer_may_not_command_set_goals_or_teleport(secure_router):
             ["put", "presage/*/cmd_vel", command],
             ["put", "presage/**", command],
             ["put", f"{KEY_PREFIX}/goal", goal],
-            ["get", f"{KEY_PREFIX}/teleport", asked],
-            ["get", "presage/**", asked],
+            ["get", f"{KEY_PREFIX}/teleport", request],
+            ["get", "presage/**", request],
         )
         assert "done" in output
         assert output.count("answers 0") == 2, output

@@ -110,9 +110,9 @@ def test_a_restarted_service_is_queried_for_its_new_settings(process, bus, tmp_p
     recorder.wait_for("ready")
     active = tmp_path / "session.mcap.active"
     for gamma in ("0.41", "0.42", "0.41"):
-        known, told = len(active.read_bytes()), f'"gamma": {gamma}'.encode()
+        known, setting = len(active.read_bytes()), f'"gamma": {gamma}'.encode()
         running = process("controller", "--gamma", gamma)
-        assert wait_until(lambda at=known, t=told: t in active.read_bytes()[at:], 30), recorder.output
+        assert wait_until(lambda at=known, t=setting: t in active.read_bytes()[at:], 30), recorder.output
         running.kill()  # without a clean exit; the recorder must notice its successor anyway
     assert recorder.stop()[0] == 0
     config = json.loads(read_recording(tmp_path / "session.mcap").metadata["config:controller"]["config"])
