@@ -29,12 +29,12 @@ TOOLS = """[...document.querySelectorAll("#toolbar button, #toolbar .speed")].ma
     const { left, right, bottom, height } = tool.getBoundingClientRect(), label = tool.querySelector("span");
     return { left, right, bottom, height, text: label.checkVisibility() ? label.innerText : "" };
 })"""
-LEFT_EDGE = """((canvas, copy) => {
+COLOURS_AT_LEFT = """((canvas, copy) => {
     Object.assign(copy, { width: 1, height: canvas.height });
     const context = copy.getContext("2d", { willReadFrequently: true });
     context.drawImage(canvas, 0, 0);
     return new Set(new Uint32Array(context.getImageData(0, 0, 1, copy.height).data.buffer)).size;
-})(document.getElementById(arg), document.createElement("canvas"))"""  # colours of the leftmost pixels: 1, nothing is drawn there
+})(document.getElementById(arg), document.createElement("canvas"))"""  # 1: nothing is drawn there
 LARGE_NUMBERS = """(() => {
     for (const name of ["free_energy", "complexity", "speed"]) store.history[name].fill(-123456.5);
     store.frame.ranges[0] = 12345;
@@ -211,7 +211,7 @@ def test_axis_labels_are_not_cut_off(look):
     seen.wait("performance.now() - store.arrivals.at(-1) > 500")
     seen.see(LARGE_NUMBERS)
     for name in ("c-energy", "c-complexity", "c-speed", "c-scan", "map"):
-        seen.wait(f"{LEFT_EDGE} === 1", 10, name)
+        seen.wait(f"{COLOURS_AT_LEFT} === 1", 10, name)
 
 
 class Fingers:
