@@ -24,7 +24,7 @@ PRELOADED = (
     "common.router", "presage.cli.main", "services.controller.service", "services.estimator.service",
     "services.recorder.service", "services.simulator.service", "services.viewer.service",
 )  # fmt: skip
-OURS = {"common", "presage", "services", "worlds", "models"}
+OURS = {"common", "lab", "presage", "services", "worlds", "models"}
 LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
 
 

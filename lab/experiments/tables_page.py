@@ -14,11 +14,18 @@ from lab.experiments.estimators import STEPS
 from lab.experiments.results import mean_std, number
 
 # Experiments in the order of the page, and the modules that run them.
-MODULES = {
-    "e1": "localisation", "e2": "crossing", "e3": "navigation", "alpha": "step_size", "steps": "stepping",
-    "samples": "samples", "aliasing": "aliasing", "prediction": "prediction", "navigation": "driving",
-    "real": "real",
-}  # fmt: skip
+MODULES = {  # imported by name, since they import the shared parts of this package
+    "e1": "lab.paper.e1_localisation",
+    "e2": "lab.paper.e2_crossing",
+    "e3": "lab.paper.e3_navigation",
+    "alpha": "lab.paper.alpha_sweep",
+    "steps": "lab.paper.step_sizes",
+    "samples": "lab.paper.samples",
+    "aliasing": "lab.paper.aliasing",
+    "prediction": "lab.paper.prediction",
+    "navigation": "lab.navigation.experiment",
+    "real": "lab.real_logs.experiment",
+}
 MARKED = re.compile(r"(<!-- table (?P<name>[\w/.-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 Summary = dict[str, dict[str, Any]]
 
@@ -30,7 +37,7 @@ def table_of(name: str, folder: Path) -> str:
     kind = name.rsplit("/", maxsplit=1)[-1].partition("-")[0]  # navigation-unknown is one of navigation's
     if kind not in MODULES:
         raise UserError(f"no experiment {kind!r}: choose from {', '.join(MODULES)}")
-    table: Callable[[Summary], str] = import_module(f"presage.experiments.{MODULES[kind]}").table
+    table: Callable[[Summary], str] = import_module(MODULES[kind]).table
     result = results.read(folder / f"{name}.json")
     return "\n\n".join([table(result["summary"]), *(f"{note[0].upper()}{note[1:]}" for note in result["notes"])])
 

@@ -101,7 +101,7 @@ def test_a_mount_that_is_only_assumed_must_be_that_of_the_weights(tmp_path):
     stated = Reading(mount=np.zeros(3))
     assert errors(localize(job(file, models=folder, reading=stated), CONSOLE)).max() < 0.02
     out = tmp_path / "imported.mcap"
-    import_command(Import(file, out, world="corridor"), None, CONSOLE)
+    import_command(Import(file, out, world="corridor"), None, CONSOLE, CONSOLE)
     again = {"models": str(folder), "model": "learned"}
     with pytest.raises(UserError, match="import its log again with --mount"):
         localize(job(out, models=folder), CONSOLE)

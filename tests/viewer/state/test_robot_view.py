@@ -360,7 +360,7 @@ def test_the_journal_has_a_row_for_each_change_of_mind():
         (9.0, 0.25, 0.1, True),
         (1.0, 0.4, 0.1, False),
         (1.0, 3.0, 0.1, True),  # turned on the spot by hand
-        (1e308, 0.25, 0.1, True),
+        (10_000.0, 0.25, 0.1, True),
     ],
 )
 def test_a_robot_carried_off_is_an_event(x, yaw, seconds, carried):
