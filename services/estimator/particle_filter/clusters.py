@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 NEGLIGIBLE = 1e-3  # this part of the weight, carried by the lightest particles, joins no cluster
 MOST = 8  # clusters reported
+# m, m, rad, squared: a cloud that collapsed onto one particle has no spread, but its pose is not known exactly.
+RESOLUTION = np.diag([1e-3, 1e-3, 1e-3]) ** 2
 # Half of the 26 neighbours in x, y, heading, (13, 3, 1): each pair once.
 NEIGHBOURS = np.array([n for n in product((-1, 0, 1), repeat=3) if n > (0, 0, 0)])[..., None]
 
@@ -64,5 +66,5 @@ def hypotheses(poses: Array, weights: Array) -> tuple[Hypothesis, ...]:
     found = []
     for name in heaviest:
         mean, covariance = moments(poses[of_pose == name], weights[of_pose == name])
-        found.append(Hypothesis(mean, covariance, float(mass[name]) / total))
+        found.append(Hypothesis(mean, covariance + RESOLUTION, float(mass[name]) / total))
     return tuple(found)
