@@ -197,6 +197,11 @@ def test_hypotheses_are_clusters_by_weight():
         assert np.allclose(h.covariance, 0.0025 * np.eye(3), atol=6e-4)
 
 
+def test_covariance_of_one_particle_can_be_inverted():
+    found = hypotheses(np.array([[1.0, 2.0, 0.5]]), np.ones(1))
+    assert np.linalg.eigvalsh(found[0].covariance).min() > 0
+
+
 def test_moments_average_headings_on_the_circle():
     mean, covariance = moments(np.array([[0, 0, np.pi - 0.1], [2.0, 0, -np.pi + 0.1]]), np.array([0.5, 0.5]))
     assert abs(mean[2]) == pytest.approx(np.pi)

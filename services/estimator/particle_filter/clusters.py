@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 NEGLIGIBLE_WEIGHT = 1e-3  # the lightest particles, with this share of the total weight, are left out
 MAX_CLUSTERS = 8  # reported
+# m, m, rad, squared: a cloud that collapsed onto one particle has no spread, but its pose is not known exactly.
+MIN_COVARIANCE = np.diag([1e-3, 1e-3, 1e-3]) ** 2
 # Half of the 26 neighbours in x, y, heading, (13, 3, 1), so that each pair occurs once.
 NEIGHBOURS = np.array([n for n in product((-1, 0, 1), repeat=3) if n > (0, 0, 0)])[..., None]
 
@@ -67,5 +69,5 @@ def hypotheses(poses: Array, weights: Array) -> tuple[Hypothesis, ...]:
     found = []
     for name in heaviest:
         mean, covariance = moments(poses[of_pose == name], weights[of_pose == name])
-        found.append(Hypothesis(mean, covariance, float(mass[name]) / total))
+        found.append(Hypothesis(mean, covariance + MIN_COVARIANCE, float(mass[name]) / total))
     return tuple(found)
