@@ -4,8 +4,7 @@ The prior is a mixture of motions, here called candidates:
 
 - With odometry: dead reckoning with its noise.
 - Without odometry: the robot stands still, or it keeps its velocity (or follows the velocity command), within the
-limits
-  of its acceleration.
+  limits of its acceleration.
 - Always, with a small probability: any motion the robot is capable of.
 
 The evidence of the scan selects the candidate. So the scans of a standing robot are averaged, and the belief of a
