@@ -15,17 +15,17 @@ from services.estimator.precise.learning.weights import FieldCard
 
 
 def draw_learned(model: FieldModel, card: FieldCard, png: Path) -> None:
-    """Write ``png``."""
+    """Draws the learned distance field and the calibration of its model into ``png``."""
     figure = Figure(figsize=(12, 4.8), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
-    _field(left, model, card.world.name)
+    _draw_field(left, model, card.world.name)
     if card.calibration is not None:
         calibration_curve(right, card.calibration)
     figure.savefig(png, dpi=120)
 
 
-def _field(axes: Axes, model: FieldModel, name: str) -> None:
+def _draw_field(axes: Axes, model: FieldModel, name: str) -> None:
     field = model.field
     ny, nx = field.phi.shape
     x0, y0, h = *field.origin, field.resolution
@@ -35,18 +35,18 @@ def _field(axes: Axes, model: FieldModel, name: str) -> None:
     axes.contour(x0 + h * np.arange(nx), y0 + h * np.arange(ny), field.phi, levels=[0.0], colors="#D55E00")
     axes.set(
         xlabel="x (m)", ylabel="y (m)", aspect="equal",
-        title=f"{name}: learned distance (m), its zero, white: not looked into",
+        title=f"{name}: learned distance (m) and its zero; white: not observed",
     )  # fmt: skip
     axes.figure.colorbar(image, ax=axes, shrink=0.8)
 
 
-def calibration_curve(axes: Axes, found: Calibration) -> None:
-    """Ranges held out below the quantiles stated of them."""
-    stated, observed = np.array(found.coverage).T
-    axes.plot((0, 1), (0, 1), "--", color="#444444", linewidth=1, label="honest")
-    axes.plot(stated, observed, "o-", color="#0072B2", markersize=4, label=f"{found.scans} scans held out")
+def calibration_curve(axes: Axes, calibration: Calibration) -> None:
+    """Draws the share of held-out ranges below the predicted quantiles, over the probability of the quantiles."""
+    predicted, observed = np.array(calibration.coverage).T
+    axes.plot((0, 1), (0, 1), "--", color="#444444", linewidth=1, label="perfect calibration")
+    axes.plot(predicted, observed, "o-", color="#0072B2", markersize=4, label=f"{calibration.scans} held-out scans")
     axes.set(
-        xlabel="probability stated", ylabel="share of ranges below that quantile", xlim=(0, 1), ylim=(0, 1),
-        title=f"{found.log_likelihood:.2f} nats a beam", aspect="equal",
+        xlabel="predicted probability", ylabel="share of ranges below that quantile", xlim=(0, 1), ylim=(0, 1),
+        title=f"{calibration.log_likelihood:.2f} nats per beam", aspect="equal",
     )  # fmt: skip
     axes.legend(frameon=False)

@@ -10,16 +10,22 @@ import yaml
 
 from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN, Cells
 
-KEYS = {"resolution": 0.05, "origin": [0.0, 0.0, 0.0], "negate": 0, "occupied_thresh": 0.65, "free_thresh": 0.196}
-ROOM, DOOR = 6.0, 1.2  # m wide
+DEFAULT_KEYS = {
+    "resolution": 0.05,
+    "origin": [0.0, 0.0, 0.0],
+    "negate": 0,
+    "occupied_thresh": 0.65,
+    "free_thresh": 0.196,
+}
+ROOM_WIDTH_M, DOOR_WIDTH_M = 6.0, 1.2
 
 
 def rooms(size: int, seed: int = 0, cell: float = 0.05) -> Cells:
-    """(size, size) of square rooms with doors, and of boxes that stand about; unknown around them."""
+    """A random grid (size, size) of square rooms with doors and boxes, surrounded by unknown cells; ``cell`` in m."""
     rng = np.random.default_rng(seed)
     values = np.full((size, size), UNKNOWN, np.uint8)
-    edge, wide, door = size // 50, round(ROOM / cell), round(DOOR / cell)
-    lines = range(edge, size - edge + 1, wide)
+    edge, room, door = size // 50, round(ROOM_WIDTH_M / cell), round(DOOR_WIDTH_M / cell)
+    lines = range(edge, size - edge + 1, room)
     last = lines[-1]
     values[edge:last, edge:last] = FREE
     for line in lines:
@@ -27,7 +33,7 @@ def rooms(size: int, seed: int = 0, cell: float = 0.05) -> Cells:
     for line in lines[1:-1]:
         for begin in lines[:-1]:
             for walls in (values, values.T):
-                gap = begin + rng.integers(door, wide - 2 * door)
+                gap = begin + rng.integers(door, room - 2 * door)
                 walls[line - 2 : line + 2, gap : gap + door] = FREE
     for _ in range(size**2 // 2000):
         (x, y), (w, h) = rng.integers(edge + 8, last - 8, 2), rng.integers(1, 10, 2)
@@ -36,11 +42,14 @@ def rooms(size: int, seed: int = 0, cell: float = 0.05) -> Cells:
 
 
 def write_map(folder: Path, values: Cells, *, name: str = "map", image: str = "map.pgm", **keys: Any) -> Path:
-    """map.yaml and its image as map_saver writes them, (rows, columns), the lowest row first; the path of map.yaml."""
-    from PIL import Image  # noqa: PLC0415 - only who writes one needs it
+    """Writes map.yaml and its image as ROS map_saver does; returns the path of map.yaml.
+
+    ``values`` has the shape (rows, columns), with the lowest row first; ``keys`` replace the defaults in map.yaml.
+    """
+    from PIL import Image  # noqa: PLC0415 - needed only to write a map
 
     grey = np.select([values == FREE, values == OCCUPIED], [254, 0], 205)
     Image.fromarray(grey[::-1].astype(np.uint8)).save(folder / image)
     path = folder / f"{name}.yaml"
-    path.write_text(yaml.safe_dump({"image": image, **KEYS, **keys}), encoding="utf-8")
+    path.write_text(yaml.safe_dump({"image": image, **DEFAULT_KEYS, **keys}), encoding="utf-8")
     return path

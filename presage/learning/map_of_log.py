@@ -1,7 +1,8 @@
 """`presage map`: a ROS map from a drive with known poses.
 
-A cell is occupied where at least `LEAST` scans ended and at least `SHARE` of the scans that looked at it; else free
-where one went through, else unknown. What moves was mostly looked through. Beams without return say nothing.
+A cell is occupied if beams of at least `MIN_HITS` scans ended in it, and of at least `MIN_HIT_SHARE` of the scans that
+observed it; otherwise it is free if a beam passed through it, and unknown if not. Beams mostly pass through the places
+of moving objects, which therefore become free. Beams without return are not used.
 """
 
 from __future__ import annotations
@@ -27,34 +28,35 @@ from presage.terminal.output import make_folder
 from services.estimator.precise.learning.calibration import Drive
 from services.estimator.precise.learning.surfaces import Beams, has_neighbours
 
-LEAST, SHARE = 2, 0.6  # less, and noise lets walls grow towards the scanner; more, and corners wear away
-MARGIN = 0.5  # m around what was seen
+# With a smaller share, noise makes walls grow towards the scanner; with a larger one, corners disappear.
+MIN_HITS, MIN_HIT_SHARE = 2, 0.6
+MARGIN_M = 0.5  # around the observed area
 
 
 @dataclass(frozen=True)
 class MapOptions:
-    """What to map."""
+    """Options of `presage map`."""
 
     log: Path
     out: Path  # NAME.yaml
-    half: str = ""  # first or second; none: the whole drive
+    half: str = ""  # first or second; defaults to the whole drive
     cell: float = 0.05  # m
     reading: Reading | None = None
 
 
 def map_command(job: MapOptions, console: Console, progress: Console) -> Path:
-    """Write map.yaml and its image; raises UserError in one line."""
+    """Writes the map and its image, and returns its path; raises UserError if that fails."""
     if job.half not in ("", "first", "second"):
         raise UserError(f"no half {job.half!r}: choose first or second, or leave out --half")
     if job.out.suffix != ".yaml":
         raise UserError(f"--out {job.out}: give NAME.yaml; the image is written beside it")
     image = job.out.with_suffix(".pgm")
-    if there := next((path for path in (job.out, image) if path.exists()), None):
-        raise UserError(f"{there} is there already: --out another name, or remove it")
+    if existing := next((path for path in (job.out, image) if path.exists()), None):
+        raise UserError(f"{existing} exists already: choose another name with --out, or remove it")
     make_folder(job.out.parent, "--out")
     scans = read_scans(job.log, reading=job.reading)
     scans.print_notes(progress)
-    if scans.stamps is None:  # a map needs none
+    if scans.stamps is None:  # not needed for a map, but for a drive
         scans = replace(scans, stamps=np.arange(len(scans.ranges), dtype=np.float64))
     drive = drive_of(scans, job.log)
     if job.half:
@@ -72,41 +74,48 @@ def map_command(job: MapOptions, console: Console, progress: Console) -> Path:
 
 
 def cells_of(drive: Drive, cell: float, progress: Console | None = None) -> tuple[Cells, tuple[float, float]]:
-    """(rows, columns), the lowest row first, and x, y m of the lower left corner; raises UserError."""
+    """Cells (rows, columns) of edge length ``cell`` m, lowest row first, and x, y m of the lower left corner.
+
+    Raises UserError if there are too many cells.
+    """
     beams = Beams.of(drive.poses, drive.mount, drive.angles, drive.ranges)
     ends = beams.ends()
     seen = np.concatenate([ends[has_neighbours(ends)], drive.poses[:, :2]])
-    corner = np.floor((seen.min(axis=0) - MARGIN) / cell) * cell
-    columns, rows = (int(n) for n in np.ceil((seen.max(axis=0) + MARGIN - corner) / cell))
+    corner = np.floor((seen.min(axis=0) - MARGIN_M) / cell) * cell
+    columns, rows = (int(n) for n in np.ceil((seen.max(axis=0) + MARGIN_M - corner) / cell))
     if columns * rows > MAX_CELLS:
-        raise UserError(f"{columns} x {rows} cells are more than {MAX_CELLS}: a larger --cell than {cell:g} m")
-    ended, through = np.zeros(rows * columns, np.int64), np.zeros(rows * columns, np.int64)
+        raise UserError(
+            f"{columns} x {rows} cells are more than the maximum of {MAX_CELLS}: use a larger --cell than {cell:g} m"
+        )
+    hits, passes = np.zeros(rows * columns, np.int64), np.zeros(rows * columns, np.int64)
     lasers = se2.compose(drive.poses, drive.mount)
     for laser, ranges in track(
         list(zip(lasers, drive.ranges, strict=True)), "mapping", console=progress, transient=True,
         disable=progress is None,
     ):  # fmt: skip
-        hit, passed = (_index(points, corner, cell, rows, columns) for points in _looked(laser, ranges, drive, cell))
-        ended[hit] += 1
-        through[np.setdiff1d(passed, hit, assume_unique=True)] += 1
-    occupied = (ended >= LEAST) & (ended >= SHARE * (ended + through))
-    values = np.where(occupied, OCCUPIED, np.where(through > 0, FREE, UNKNOWN)).astype(np.uint8)
+        hit, passed = (
+            _cell_indices(points, corner, cell, rows, columns) for points in _beam_points(laser, ranges, drive, cell)
+        )
+        hits[hit] += 1
+        passes[np.setdiff1d(passed, hit, assume_unique=True)] += 1
+    occupied = (hits >= MIN_HITS) & (hits >= MIN_HIT_SHARE * (hits + passes))
+    values = np.where(occupied, OCCUPIED, np.where(passes > 0, FREE, UNKNOWN)).astype(np.uint8)
     return values.reshape(rows, columns), (float(corner[0]), float(corner[1]))
 
 
-def _looked(laser: Array, ranges: Array, drive: Drive, cell: float) -> tuple[Array, Array]:
-    """Points (K, 2) m in map where beams ended, and points (L, 2) all along them."""
+def _beam_points(laser: Array, ranges: Array, drive: Drive, cell: float) -> tuple[Array, Array]:
+    """Ends of the beams (K, 2) m in map, and points (L, 2) along them, half a cell apart."""
     hit = surfaces(ranges) & (ranges < drive.range_max)
     ranges = ranges[hit]
     angles = laser[2] + drive.angles[hit]
     unit = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    along = np.arange(0.0, ranges.max(initial=0.0), cell / 2)
-    beam, step = np.nonzero(along < ranges[:, None])
-    return laser[:2] + ranges[:, None] * unit, laser[:2] + along[step, None] * unit[beam]
+    distances = np.arange(0.0, ranges.max(initial=0.0), cell / 2)
+    beam, step = np.nonzero(distances < ranges[:, None])
+    return laser[:2] + ranges[:, None] * unit, laser[:2] + distances[step, None] * unit[beam]
 
 
-def _index(points: Array, corner: Array, cell: float, rows: int, columns: int) -> npt.NDArray[np.int64]:
-    """Each cell (of rows * columns) in which points (K, 2) m lie, once."""
+def _cell_indices(points: Array, corner: Array, cell: float, rows: int, columns: int) -> npt.NDArray[np.int64]:
+    """Flat indices of the cells that contain points (K, 2) m, each once."""
     column, row = np.floor((points - corner) / cell).astype(np.int64).T
     inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
     return np.unique(row[inside] * columns + column[inside])

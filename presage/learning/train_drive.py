@@ -29,66 +29,69 @@ from services.estimator.precise.learning.field_learning import Recipe
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import RayCaster
 
-MARGIN = 1.0  # m around what the drive has seen: the world of a drive without a map is a rectangle
+MARGIN_M = 1.0  # around the ends of the beams; the world of a drive without a map is a rectangle
 
 
 @dataclass(frozen=True)
 class TrainDriveOptions:
-    """What to learn from."""
+    """Options of `presage train --from`."""
 
     log: Path
-    world: str = ""  # a map of the place, whose simulated scans fill in where it has not looked; none: the drive alone
+    world: str = ""  # a map, in which scans are simulated for the places that the drive did not observe
     out: Path = weights.FOLDER
-    samples: int = 2000  # simulated scans in the map
+    samples: int = 2000  # number of simulated scans in the map
     recipe: Recipe = Recipe(resolution=0.05)  # noqa: RUF009 - frozen
-    share: float = 1.0  # of the drive, from its beginning
-    reading: Reading | None = None  # what the log does not say itself
+    share: float = 1.0  # of the drive to use, from its beginning
+    reading: Reading | None = None  # properties of the log that the file does not state
 
 
 def train_from_drive(job: TrainDriveOptions, console: Console) -> Path:
-    """The weights' path; raises UserError in one line."""
+    """Trains a model on the drive, saves and draws it, and returns the path of the weights.
+
+    Raises UserError if the log cannot be used or the weights cannot be saved.
+    """
     scans = read_scans(job.log, reading=job.reading)
     scans.print_notes(console)
     drive = drive_of(scans, job.log)
     drive, _ = split(drive, job.share)
     if len(drive.ranges) < MIN_SCANS:
         raise UserError(
-            f"{job.log}: {len(drive.ranges)} scans with a reference pose; {MIN_SCANS} are the least to learn from"
+            f"{job.log}: {len(drive.ranges)} scans with a reference pose; at least {MIN_SCANS} are needed for training"
         )
     world = load_world(job.world) if job.world else rectangle(drive, job.log)
     path = weights.path_of(job.out, world.name)
     weights.refuse_to_overwrite(path, world)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    began = time.monotonic()
+    start = time.monotonic()
     with Progress(*columns, console=console) as bar:
-        task = bar.add_task("learning", total=1.0)
+        task = bar.add_task("training", total=1.0)
 
         def report(title: str, done: float) -> None:
-            bar.update(task, description=f"learning: {title}", completed=done)
+            bar.update(task, description=f"training: {title}", completed=done)
 
         simulated = simulated_beams(world, drive, job.samples, job.recipe.seed) if job.world else None
         learned = learn_drive(drive, job.recipe, simulated, report)
-    card = card_of(job, world, drive, learned, time.monotonic() - began)
+    card = card_of(job, world, drive, learned, time.monotonic() - start)
     weights.save(path, learned.model, learned.places, card)
     draw_learned(weights.load(path)[0], card, path.with_suffix(".png"))
-    console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB, learned in {card.learning_s:.0f} s from {card.source}")
+    console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB, trained in {card.learning_s:.0f} s on {card.source}")
     for line in summary(card):
         console.print(line)
     return path
 
 
 def drive_of(scans: Scans, log: Path) -> Drive:
-    """The scans that have a reference pose; raises UserError where there are none, or no stamps."""
+    """The scans with a reference pose; raises UserError if there are none, or if they have no stamps."""
     if scans.truth is None or not np.isfinite(scans.truth).all(axis=1).any():
         raise UserError(
-            f"{log}: no reference poses; to learn from a drive each scan needs its pose in the map: an .npz with "
-            "`reference`, a recording with the topic truth, a log corrected by a mapping program"
+            f"{log}: no reference poses, but training on a drive needs the pose of each scan in the map: use an .npz "
+            "file with `reference`, a recording with the topic truth, or a log corrected by a mapping program"
         )
     if scans.stamps is None:
-        raise UserError(f"{log}: no stamps; without them nobody knows how fast the robot moved")
+        raise UserError(f"{log}: no stamps, but they are needed to compute the velocity of the robot")
     use = np.flatnonzero(np.isfinite(scans.truth).all(axis=1))
     if not surfaces(scans.ranges[use]).any():
-        raise UserError(f"{log}: no beam of the scans with a reference pose ended anywhere")
+        raise UserError(f"{log}: no beam of the scans with a reference pose hit a surface")
     odom = None if scans.odom is None or not np.isfinite(scans.odom[use]).all() else scans.odom
     whole = Drive(
         scans.stamps, scans.truth, scans.ranges, scans.geometry.angles, scans.geometry.mount,
@@ -98,9 +101,9 @@ def drive_of(scans: Scans, log: Path) -> Drive:
 
 
 def split(drive: Drive, share: float = 0.5) -> tuple[Drive, Drive]:
-    """The first ``share`` of the scans, rounded down, and all others: of an odd number the second half has one more.
+    """The first ``share`` of the scans, rounded down, and the rest.
 
-    Every command that learns from one part of a drive and tests with the other takes both from here.
+    All commands that train on one part of a drive and test on the other use this function, so that their parts agree.
     """
     numbers = np.arange(len(drive.ranges))
     first = numbers < int(share * len(numbers))
@@ -108,16 +111,16 @@ def split(drive: Drive, share: float = 0.5) -> tuple[Drive, Drive]:
 
 
 def rectangle(drive: Drive, log: Path) -> World:
-    """A world named after the log: all that is known of a place without a map is how far the scans reach."""
+    """A rectangular world around the ends of the beams, named after the log, for a drive without a map."""
     ends = Beams.of(drive.poses, drive.mount, drive.angles, drive.ranges).ends()
-    (x0, y0), (x1, y1) = np.quantile(ends, (0.001, 0.999), axis=0) + MARGIN * np.array([[-1], [1]])
+    (x0, y0), (x1, y1) = np.quantile(ends, (0.001, 0.999), axis=0) + MARGIN_M * np.array([[-1], [1]])
     corners = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
     name = re.sub(r"[^\w.-]", "-", log.stem) or "drive"
     return World(name=name, boundary=[(round(float(x), 3), round(float(y), 3)) for x, y in corners])
 
 
 def simulated_beams(world: World, drive: Drive, samples: int, seed: int) -> Beams:
-    """Scans with the drive's scanner from random free places of a map, without noise."""
+    """Simulated scans of the drive's scanner at random free poses in a map, without noise."""
     rng = np.random.default_rng(seed)
     places = world.sample_free(samples, rng, Robot().radius)
     poses = np.column_stack([places, rng.uniform(-np.pi, np.pi, samples)])
@@ -126,7 +129,7 @@ def simulated_beams(world: World, drive: Drive, samples: int, seed: int) -> Beam
 
 
 def scanner_of(drive: Drive, sigma: float, name: str) -> Scanner:
-    """As a card describes it."""
+    """The scanner of a drive, for the model card; ``sigma`` is its range noise in m."""
     angles = drive.angles
     fov = float(abs(angles[-1] - angles[0]))
     x, y, yaw = map(float, drive.mount)
@@ -138,42 +141,53 @@ def scanner_of(drive: Drive, sigma: float, name: str) -> Scanner:
 
 
 def card_of(job: TrainDriveOptions, world: World, drive: Drive, learned: Learned, seconds: float) -> weights.FieldCard:
-    """Where the model comes from, and what its calibration found."""
-    found, errors = learned.calibration, learned.errors
+    """The model card: the origin of the model and the results of its calibration."""
+    calibration, errors = learned.calibration, learned.errors
     source = f"{len(drive.ranges)} posed scans of {job.log.name}"
     if job.world:
         source = f"{source}; elsewhere {job.samples} simulated scans in map {world.name}"
     return weights.FieldCard(
-        world=world, scanner=scanner_of(drive, found.likelihood.sigma, job.log.stem), samples=len(drive.ranges),
-        seed=job.recipe.seed, resolution=job.recipe.resolution, origin=learned.model.field.origin,
-        sweeps=job.recipe.sweeps, ripple=learned.model.ripple, inflation=found.inflation, test_samples=found.scans,
-        test_range_error_median_m=float(np.median(errors)), test_range_error_mean_m=float(errors.mean()),
+        world=world,
+        scanner=scanner_of(drive, calibration.likelihood.sigma, job.log.stem),
+        samples=len(drive.ranges),
+        seed=job.recipe.seed,
+        resolution=job.recipe.resolution,
+        origin=learned.model.field.origin,
+        sweeps=job.recipe.sweeps,
+        ripple=learned.model.ripple,
+        inflation=calibration.inflation,
+        test_samples=calibration.scans,
+        test_range_error_median_m=float(np.median(errors)),
+        test_range_error_mean_m=float(errors.mean()),
         test_share_above_5_cm=float((errors > 0.05).mean()),
-        test_position_error_rms_m=float(np.hypot(found.floor_position, found.floor_position)),
-        learning_s=round(seconds, 1), source=source, calibration=found, commit=commit(),
-        command="presage " + " ".join(sys.argv[1:]), versions=versions(),
-    )  # fmt: skip
+        test_position_error_rms_m=float(np.hypot(calibration.floor_position, calibration.floor_position)),
+        learning_s=round(seconds, 1),
+        source=source,
+        calibration=calibration,
+        commit=commit(),
+        command="presage " + " ".join(sys.argv[1:]),
+        versions=versions(),
+    )
 
 
 def summary(card: weights.FieldCard) -> list[str]:
-    """The calibration for people."""
-    found = card.calibration
-    if found is None:
+    """The results of the calibration as lines for the terminal."""
+    calibration = card.calibration
+    if calibration is None:
         return []
-    shares = found.likelihood
+    likelihood = calibration.likelihood
     return [
         (
-            f"held out: {found.scans} scans, {found.log_likelihood:.3f} nats a beam; range error median "
+            f"held out: {calibration.scans} scans, {calibration.log_likelihood:.3f} nats per beam; range error median "
             f"{card.test_range_error_median_m * 1e3:.1f} mm, {card.test_share_above_5_cm:.1%} above 5 cm"
         ),
         (
-            f"of the beams {shares.short:.1%} end early, {shares.random:.1%} anywhere, {shares.unseen:.1%} do not "
-            f"return; noise {shares.sigma * 1e3:.1f} mm; a scan usually explained to {found.usual:.0%}"
+            f"beams: {likelihood.short:.1%} too short, {likelihood.random:.1%} random, {likelihood.unseen:.1%} without "
+            f"return; noise {likelihood.sigma * 1e3:.1f} mm; usually {calibration.usual:.0%} of a scan is explained"
         ),
         (
-            f"pose from one scan against the reference: {found.floor_position * 1e3:.0f} mm and "
-            f"{np.rad2deg(found.floor_heading):.2f} deg beyond the scan's own covariance, which is taken "
-            f"{found.inflation:.1f} times; NEES then {found.nees_median:.2f} median (honest 2.37), "
-            f"{found.nees_mean:.2f} mean (3)"
+            f"pose from one scan against the reference: error floor {calibration.floor_position * 1e3:.0f} mm and "
+            f"{np.rad2deg(calibration.floor_heading):.2f} deg, covariance scaled by {calibration.inflation:.1f}; NEES "
+            f"then {calibration.nees_median:.2f} median (ideal: 2.37), {calibration.nees_mean:.2f} mean (ideal: 3)"
         ),
     ]

@@ -39,63 +39,68 @@ TEST_SAMPLES = 500
 
 @dataclass(frozen=True)
 class TrainPreciseOptions:
-    """What to learn."""
+    """Options of `presage train` for preset precise."""
 
     world: str
     scanner: Scanner = SCANNERS["tim571"]
-    asked: tuple[str, ...] = ()  # the simulator's options for it
+    simulator_arguments: tuple[str, ...] = ()  # that select the scanner
     out: Path = weights.FOLDER
     samples: int = 5000
     recipe: Recipe = Recipe()  # noqa: RUF009 - frozen
 
 
 def train_precise(job: TrainPreciseOptions, link: Link, console: Console) -> Path:
-    """The weights' path; raises UserError in one line."""
+    """Trains the distance field of a world, saves and draws it, and returns the path of the weights.
+
+    Raises UserError if the scanner cannot be sampled or the weights cannot be saved.
+    """
     world, scanner = load_world(job.world), job.scanner
     path = weights.path_of(job.out, world.name)
     weights.refuse_to_overwrite(path, world)
     rng = np.random.default_rng(job.recipe.seed)
-    poses = {name: _poses(world, count, rng) for name, count in (("train", job.samples), ("test", TEST_SAMPLES))}
+    poses = {name: _random_poses(world, count, rng) for name, count in (("train", job.samples), ("test", TEST_SAMPLES))}
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as bar:
-        with scanner_on_bus(link, job.world, job.asked, world, scanner, console) as bus:
-            train = collect(bus, poses["train"], scanner, job.recipe.seed, bar, "scans to learn from")
-            test = collect(bus, poses["test"], scanner, None, bar, "scans to test with")
-        began = time.monotonic()
-        model, quality = _learn(job, scanner, poses, {"train": train, "test": test}, bar)
-    seconds = time.monotonic() - began
+        with scanner_on_bus(link, job.world, job.simulator_arguments, world, scanner, console) as bus:
+            train = collect(bus, poses["train"], scanner, job.recipe.seed, bar, "training scans")
+            test = collect(bus, poses["test"], scanner, None, bar, "test scans")
+        start = time.monotonic()
+        model, quality = _train(job, scanner, poses, {"train": train, "test": test}, bar)
+    seconds = time.monotonic() - start
     visited = se2.compose(poses["train"], np.array(scanner.mount))[:, :2]
     places = thin_places(np.concatenate([visited, reachable(model.field, visited)]), SEED_SPACING_M)
     card = _card(job, world, scanner, model, quality, seconds)
     weights.save(path, model, places, card)
     _draw(weights.load(path)[0], card, path.with_suffix(".png"))
     console.print(
-        f"{path}: {path.stat().st_size / 1e6:.2f} MB, learned in {seconds:.0f} s; range error median "
+        f"{path}: {path.stat().st_size / 1e6:.2f} MB, trained in {seconds:.0f} s; range error median "
         f"{quality.range_error_median * 1e3:.2f} mm, {quality.share_above_5_cm:.2%} above 5 cm; "
-        f"position error that the model leaves {quality.position_error_rms * 1e3:.2f} mm RMS"
+        f"position error from scans without noise {quality.position_error_rms * 1e3:.2f} mm RMS"
     )
     return path
 
 
-def _poses(world: World, count: int, rng: np.random.Generator) -> se2.Array:
-    places = world.sample_free(count, rng, Robot().radius)
-    return np.column_stack([places, rng.uniform(-np.pi, np.pi, count)])
+def _random_poses(world: World, count: int, rng: np.random.Generator) -> se2.Array:
+    positions = world.sample_free(count, rng, Robot().radius)
+    return np.column_stack([positions, rng.uniform(-np.pi, np.pi, count)])
 
 
-def _learn(
+def _train(
     job: TrainPreciseOptions, scanner: Scanner, poses: dict[str, se2.Array], scans: dict[str, se2.Array], bar: Progress
 ) -> tuple[FieldModel, Quality]:
     mount, angles = np.array(scanner.mount), scanner.angles()
-    task: TaskID = bar.add_task("learning", total=1.0)
+    task: TaskID = bar.add_task("training", total=1.0)
 
     def report(title: str, done: float) -> None:
-        bar.update(task, description=f"learning: {title}", completed=0.9 * done)
+        bar.update(task, description=f"training: {title}", completed=0.9 * done)
 
     field = learn_field(Beams.of(poses["train"], mount, angles, scans["train"]), job.recipe, report)
-    # As it will be read, in half precision.
+    # The weights are stored in half precision, so that the model is evaluated with the same precision.
     field = replace(field, phi=field.phi.astype(np.float16).astype(np.float32))
     report("precision", 1.0)
-    half = TEST_SAMPLES // 2  # precision from one half of the test scans, figures from the other
+    half = (
+        TEST_SAMPLES // 2
+    )  # the precision is learned from one half of the test scans, the errors are computed from the other
     scales = learn_scales(field, poses["test"][:half], mount, angles, scans["test"][:half], 0.0)
     ripple = learn_ripple(field, se2.compose(poses["test"][:half], mount), angles)
     model = FieldModel(field, scales, ripple)
@@ -109,7 +114,7 @@ def _learn(
         max(scanner.sigma, MIN_SIGMA_M),
         scanner.sigma_relative,
     )
-    bar.update(task, description="learned", completed=1.0)
+    bar.update(task, description="trained", completed=1.0)
     return model, quality
 
 
@@ -141,7 +146,7 @@ def _draw(model: FieldModel, card: weights.FieldCard, png: Path) -> None:
     )
     axes.set(
         xlabel="x (m)", ylabel="y (m)", aspect="equal",
-        title=f"{card.world.name}: learned distance (m) to what the scanner sees, and its zero",
+        title=f"{card.world.name}: learned distance (m) to the nearest surface, and its zero",
     )  # fmt: skip
     figure.colorbar(image, ax=axes, shrink=0.8)
     figure.savefig(png, dpi=120)

@@ -32,17 +32,17 @@ from services.estimator.paper.training import Data, Recipe, Trainer, usable_rang
 from services.estimator.precise.learning.weights import same_walls
 
 TEST_SAMPLES = 1000
-BLOCK = 500  # poses a request
+POSES_PER_REQUEST = 500
 
 
 @dataclass(frozen=True)
 class TrainPaperOptions:
-    """What to train."""
+    """Options of `presage train` for preset paper."""
 
     world: str
     preset: str
     scanner: Scanner
-    asked: tuple[str, ...]  # the simulator's options for it
+    simulator_arguments: tuple[str, ...]  # that select the scanner
     out: Path
     samples: int
     recipe: Recipe
@@ -51,7 +51,10 @@ class TrainPaperOptions:
 
 
 def train(job: TrainPaperOptions, link: Link, console: Console) -> Path:
-    """The weights' path; raises UserError in one line."""
+    """Trains the decoder of preset paper, saves it, and returns the path of the weights.
+
+    An interrupted training with the same options is resumed. Raises UserError if the scanner cannot be sampled.
+    """
     world, scanner = load_world(job.world), job.scanner
     path = weights.path_of(job.out, world.name, job.preset, scanner.beams)
     described = {"world": world.model_dump(mode="json"), "scanner": scanner.model_dump(mode="json"), "n": job.samples}
@@ -64,16 +67,16 @@ def train(job: TrainPaperOptions, link: Link, console: Console) -> Path:
         data = {}
         for name, count in (("train", job.samples), ("test", TEST_SAMPLES)):
             poses = np.column_stack([world.sample_free(count, rng, Robot().radius), np.full(count, heading)])
-            kept = checkpoint.samples(name)
-            if kept is None:
-                with scanner_on_bus(link, job.world, job.asked, world, scanner, console) as bus:
-                    noise_seed = job.recipe.seed if name == "train" else None  # test against what is, not noise
+            samples = checkpoint.samples(name)
+            if samples is None:
+                with scanner_on_bus(link, job.world, job.simulator_arguments, world, scanner, console) as bus:
+                    noise_seed = job.recipe.seed if name == "train" else None  # test scans have no noise
                     ranges = collect(bus, poses, scanner, noise_seed, bar, f"{name} samples")
-                kept = Data(poses, usable_ranges(ranges, scanner.range_max))
-                checkpoint.keep_samples(name, kept)
-            data[name] = kept
+                samples = Data(poses, usable_ranges(ranges, scanner.range_max))
+                checkpoint.keep_samples(name, samples)
+            data[name] = samples
         trainer, seconds = _fit(job, world, scanner, data, checkpoint, bar)
-    _write(job, world, scanner, heading, data, trainer, seconds, path)
+    _save(job, world, scanner, heading, data, trainer, seconds, path)
     checkpoint.finish()
     _warn_if_nothing_learned(data, trainer, console)
     card = weights.load(path)[1]
@@ -86,33 +89,41 @@ def train(job: TrainPaperOptions, link: Link, console: Console) -> Path:
 
 @contextmanager
 def scanner_on_bus(
-    link: Link, world_name: str, asked: tuple[str, ...], world: World, scanner: Scanner, console: Console
+    link: Link,
+    world_name: str,
+    simulator_arguments: tuple[str, ...],
+    world: World,
+    scanner: Scanner,
+    console: Console,
 ) -> Iterator[Bus]:
-    """A bus on which this scanner in this world answers `sample`: the one that is there, or a simulator of our own."""
+    """Opens a bus on which this scanner in this world answers the query `sample`.
+
+    Uses the running session if it has this scanner and world, otherwise starts a simulator.
+    """
     with open_bus(link, patience=3.0) as bus:
-        if wait_until(bus.linked, 1.0) and _answers(bus, world, scanner, console):
+        if wait_until(bus.linked, 1.0) and _is_suitable(bus, world, scanner, console):
             yield bus
             return
     with Stack("training", quiet=True) as stack:
         stack.start_router()
-        stack.start("simulator", "--world", world_name, *asked, "--pace", "realtime")
+        stack.start("simulator", "--world", world_name, *simulator_arguments, "--pace", "realtime")
         with open_bus(stack.link()) as bus:
             stack.wait_alive(bus)
             yield bus
 
 
-def _answers(bus: Bus, world: World, scanner: Scanner, console: Console) -> bool:
-    """Whether the scanner on the bus is the one asked for, in the same world; says so where not."""
+def _is_suitable(bus: Bus, world: World, scanner: Scanner, console: Console) -> bool:
+    """Whether the session has the wanted scanner and world; prints the result if there is a session."""
     try:
-        here = bus.ask(WORLD, Request(), WorldReply, timeout=1.0)
+        session = bus.ask(WORLD, Request(), WorldReply, timeout=1.0)
     except UserError:
         return False
-    if here.world is not None and same_walls(here.world, world) and here.scanner is not None:
-        other = {"beams", "rate"}  # it is asked for so many beams, and time plays no part
-        if here.scanner.model_dump(exclude=other) == scanner.model_dump(exclude=other):
-            console.print(f"samples come from the running scanner {here.scanner.name} in {world.name}")
+    if session.world is not None and same_walls(session.world, world) and session.scanner is not None:
+        ignored = {"beams", "rate"}  # the number of beams is part of the request, and the rate does not matter
+        if session.scanner.model_dump(exclude=ignored) == scanner.model_dump(exclude=ignored):
+            console.print(f"samples come from the running scanner {session.scanner.name} in {world.name}")
             return True
-    console.print("the running session has another world or scanner; a simulator of our own is started")
+    console.print("the running session has another world or scanner: starting a simulator for the training")
     return False
 
 
@@ -124,17 +135,20 @@ def collect(
     bar: Progress,
     title: str,
 ) -> Array:
-    """Ranges (N, B) m from ``poses`` (N, 3), in blocks; with noise of ``seed``, or none. +inf no return, -inf close."""
+    """Ranges (N, B) m at ``poses`` (N, 3); +inf for no return, -inf for too close.
+
+    The scans have noise with the random seed ``seed``, or none if it is None. Raises UserError if the scanner refuses.
+    """
     task = bar.add_task(title, total=len(poses))
     rows = []
-    for number, start in enumerate(range(0, len(poses), BLOCK)):
-        block = poses[start : start + BLOCK]
+    for number, start in enumerate(range(0, len(poses), POSES_PER_REQUEST)):
+        block = poses[start : start + POSES_PER_REQUEST]
         request = SampleRequest(
             poses=block, beams=scanner.beams, noise=seed is not None, seed=(seed or 0) * 100_003 + number
         )
         reply = bus.ask(SAMPLE, request, SampleReply, timeout=60.0)
         if not reply.ok or reply.scanner is None:
-            raise UserError(f"the scanner refuses to be sampled: {reply.reason or 'it does not describe itself'}")
+            raise UserError(f"the scanner refuses the request: {reply.reason or 'it sends no description of itself'}")
         if len(reply.ranges) != len(block) * scanner.beams:
             raise UserError(f"the scanner answered {len(reply.ranges)} ranges for {len(block)} x {scanner.beams}")
         rows.append(reply.ranges.reshape(len(block), -1).astype(np.float64))
@@ -149,9 +163,9 @@ def _fit(
     shape = Shape(scanner.beams, job.shape_hidden, job.shape_channels)
     trainer = Trainer(shape, norm, job.recipe, data["train"], data["test"])
     if checkpoint.restore(trainer):
-        bar.console.print(f"going on after epoch {trainer.progress.epoch} of an interrupted run")
+        bar.console.print(f"resuming an interrupted run after epoch {trainer.progress.epoch}")
     task = bar.add_task("epochs", total=job.recipe.epochs, completed=trainer.progress.epoch)
-    began = time.monotonic()
+    start = time.monotonic()
 
     def report(progress: training.Progress) -> None:
         checkpoint.save(trainer)
@@ -159,20 +173,20 @@ def _fit(
         bar.update(task, completed=progress.epoch, description=f"epochs, test error {test:.3f} m")
 
     trainer.run(report)
-    return trainer, time.monotonic() - began
+    return trainer, time.monotonic() - start
 
 
 def _warn_if_nothing_learned(data: dict[str, Data], trainer: Trainer, console: Console) -> None:
-    """A network whose ReLUs have all died predicts one scan for everywhere."""
+    """Prints a warning if the network predicts the same scan everywhere, as with ReLUs that are never active."""
     constant = float(np.abs(data["test"].ranges - np.median(data["train"].ranges, axis=0)).mean())
     if trainer.progress.test_l1[-1] > 0.9 * constant:
         console.print(
-            f"[bold red]nothing was learned[/]: one and the same scan for every place is as good ({constant:.3f} m). "
-            "Try another --seed, a smaller --learning-rate or more --epochs."
+            "[bold red]nothing was learned[/]: predicting the same scan everywhere is as accurate "
+            f"({constant:.3f} m). Try another --seed, a smaller --learning-rate or more --epochs."
         )
 
 
-def _write(
+def _save(
     job: TrainPaperOptions,
     world: World,
     scanner: Scanner,
@@ -182,7 +196,7 @@ def _write(
     seconds: float,
     path: Path,
 ) -> None:
-    """Errors are measured on the weights as they will be read, in half precision."""
+    """Saves the weights in half precision, with a model card and a figure; the errors are those in half precision."""
     model_state = {name: tensor.half().float() for name, tensor in trainer.decoder.state_dict().items()}
     trainer.decoder.load_state_dict(model_state)
     predicted = PaperModel(trainer.decoder, trainer.norm).ranges(data["test"].poses)

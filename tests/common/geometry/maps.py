@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 
 from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN
-from presage.learning.grid_map import KEYS, rooms, write_map
+from presage.learning.grid_map import DEFAULT_KEYS, rooms, write_map
 
 __all__ = ["rooms", "values_of", "write_map", "write_yaml"]
 
@@ -24,5 +24,5 @@ def values_of(drawing):
 def write_yaml(folder: Path, *, name="map", **keys) -> Path:
     """Write map.yaml without an image."""
     path = folder / f"{name}.yaml"
-    path.write_text(yaml.safe_dump(KEYS | keys))
+    path.write_text(yaml.safe_dump(DEFAULT_KEYS | keys))
     return path

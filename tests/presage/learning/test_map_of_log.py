@@ -75,7 +75,7 @@ def test_what_cannot_be_is_said(log, tmp_path):
     with pytest.raises(UserError, match=r"give NAME\.yaml"):
         map_command(MapOptions(log, tmp_path / "a.png", reading=HERE), QUIET, QUIET)
     (tmp_path / "a.pgm").write_bytes(b"mine")
-    with pytest.raises(UserError, match=r"a\.pgm is there already"):
+    with pytest.raises(UserError, match=r"a\.pgm exists already"):
         map_command(MapOptions(log, tmp_path / "a.yaml", reading=HERE), QUIET, QUIET)
     bare = tmp_path / "bare.npz"
     real_drive.save(bare, real_drive.drive(20), reference=False)
@@ -88,7 +88,7 @@ def test_what_cannot_be_is_said(log, tmp_path):
 
 def test_a_recording_says_itself_where_its_laser_sits(tmp_path):
     recorded.write(tmp_path / "run.mcap")
-    with pytest.raises(UserError, match="says itself what its scanner is"):
+    with pytest.raises(UserError, match="contains the description of its scanner"):
         map_command(MapOptions(tmp_path / "run.mcap", tmp_path / "r.yaml", reading=HERE), QUIET, QUIET)
 
 
