@@ -13,7 +13,7 @@ from presage.terminal.options import Connect, Json, RobotName, console, link_of
 app = typer.Typer()
 
 
-@app.command()
+@app.command(rich_help_panel="Record", short_help="Contents of a recording, and whether it is complete.")
 def info(
     file: Annotated[Path, typer.Argument(help="A recording, finished or not (.mcap, .mcap.active).")],
     check: Annotated[
@@ -38,7 +38,7 @@ def info(
     raise typer.Exit(show(file, json_file, check, console))
 
 
-@app.command()
+@app.command(rich_help_panel="Diagnose", short_help="Print messages of a topic or a recording as JSON.")
 def echo(
     source: Annotated[str, typer.Argument(help="A topic on the bus, or a recording.", metavar="TOPIC|FILE")],
     topic: Annotated[
@@ -69,7 +69,7 @@ def echo(
     raise typer.Exit(echo_either(link, source, topic, count, start, console, full=full))
 
 
-@app.command()
+@app.command(rich_help_panel="Record", short_help="Draw a recording and summarise it.")
 def plot(
     file: Annotated[Path, typer.Argument(help="A recording, finished or not.")],
     out: Annotated[
@@ -87,7 +87,7 @@ def plot(
     plot_command(file, out or file.with_name(stem_of(file) + ".png"), json_file, console)
 
 
-@app.command()
+@app.command(rich_help_panel="Record", short_help="Export to Foxglove, CSV or TUM.")
 def export(
     file: Annotated[Path, typer.Argument(help="A recording, finished or not.")],
     to: Annotated[str, typer.Option("--format", help="Output format: csv, tum or foxglove.")],

@@ -71,7 +71,7 @@ app = typer.Typer(
 )
 
 
-@app.command()
+@app.command(rich_help_panel="Run", short_help="All services and the live page on this machine, until Ctrl-C.")
 def up(
     world: WorldName = "corridor",
     beams: Beams = None,
@@ -144,7 +144,7 @@ def up(
     )
 
 
-@app.command()
+@app.command(rich_help_panel="Run", short_help="The whole loop once: localise, drive, record, draw, summarise.")
 def demo(
     world: WorldName = "corridor",
     goal: Annotated[
@@ -181,7 +181,7 @@ def demo(
     raise typer.Exit(demo_command(options, json_file, quiet=quiet))
 
 
-@app.command()
+@app.command(rich_help_panel="Learn", short_help="Train the model of a world, or of a recorded drive.")
 def train(
     world: Annotated[
         str,

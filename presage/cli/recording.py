@@ -13,7 +13,7 @@ from presage.terminal.options import Connect, RobotName, console, invocation
 app = typer.Typer()
 
 
-@app.command()
+@app.command(rich_help_panel="Record", short_help="Record a session into an MCAP file, until Ctrl-C.")
 def record(
     out: Annotated[Path, typer.Option(help="Folder for the recording.")] = Path("recordings"),
     topics: Annotated[str, typer.Option(help="Topics to record, separated by commas. Defaults to all topics.")] = "",
@@ -48,7 +48,7 @@ def record(
     serve(RecorderSettings, make, args)
 
 
-@app.command()
+@app.command(rich_help_panel="Record", short_help="Repair an unfinished or damaged recording.")
 def recover(
     file: Annotated[
         Path, typer.Argument(help="NAME.mcap.active, left by a recorder that was killed, or a damaged recording.")

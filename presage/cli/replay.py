@@ -14,7 +14,7 @@ from presage.terminal.options import Connect, Json, console, link_of
 app = typer.Typer()
 
 
-@app.command()
+@app.command(rich_help_panel="Record", short_help="Publish a recording again, or compare services on it.")
 def replay(
     file: Annotated[Path, typer.Argument(help="Recording to replay.")],
     only: Annotated[
@@ -91,7 +91,7 @@ def replay(
     raise typer.Exit(service_replay_command(options, json_file, console))
 
 
-@app.command()
+@app.command(rich_help_panel="Offline", short_help="Run another estimator over a recording and compare.")
 def rerun(
     file: Annotated[Path, typer.Argument(help="Recording with the scans.")],
     estimator: Annotated[

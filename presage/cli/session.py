@@ -26,7 +26,11 @@ app = typer.Typer()
 ALLOW_NEGATIVE_NUMBERS = {"ignore_unknown_options": True}
 
 
-@app.command(context_settings=ALLOW_NEGATIVE_NUMBERS)
+@app.command(
+    context_settings=ALLOW_NEGATIVE_NUMBERS,
+    rich_help_panel="Drive",
+    short_help="Send the robot to a goal, or cancel it.",
+)
 def goal(
     x: Annotated[float | None, typer.Argument(help="x of the goal in the map, m.")] = None,
     y: Annotated[float | None, typer.Argument(help="y of the goal in the map, m.")] = None,
@@ -62,7 +66,9 @@ def goal(
     raise typer.Exit(send_goal(link_of(connect, robot), request, console, wait=wait))
 
 
-@app.command(context_settings=ALLOW_NEGATIVE_NUMBERS)
+@app.command(
+    context_settings=ALLOW_NEGATIVE_NUMBERS, rich_help_panel="Drive", short_help="Move the simulated robot elsewhere."
+)
 def teleport(
     x: Annotated[float, typer.Argument(help="x in the map, m.")],
     y: Annotated[float, typer.Argument(help="y in the map, m.")],
@@ -80,7 +86,11 @@ def teleport(
     run(link_of(connect, robot), _pose(x, y, yaw), console)
 
 
-@app.command(context_settings=ALLOW_NEGATIVE_NUMBERS)
+@app.command(
+    context_settings=ALLOW_NEGATIVE_NUMBERS,
+    rich_help_panel="Drive",
+    short_help="Restart localisation, near a position or globally.",
+)
 def localise(
     x: Annotated[
         float | None, typer.Argument(help="x in the map, m. Defaults to the estimator's initial pose.")
@@ -113,7 +123,7 @@ def _pose(x: float, y: float, yaw: float = 0.0) -> Pose:
     return Pose(x=x, y=y, yaw=float(se2.wrap(np.deg2rad(yaw))))
 
 
-@app.command()
+@app.command(rich_help_panel="Diagnose", short_help="Print the table of topics and queryables.")
 def topics(robot: RobotName = "robot") -> None:
     """Print the table of topics and queryables.
 
@@ -124,7 +134,7 @@ def topics(robot: RobotName = "robot") -> None:
     list_topics(robot, console)
 
 
-@app.command()
+@app.command(rich_help_panel="Diagnose", short_help="Measure message rates on the bus.")
 def hz(
     topic: Annotated[str | None, typer.Argument(help="Topic to measure. Defaults to all topics.")] = None,
     seconds: Annotated[float, typer.Option(min=0.1, help="Duration of the measurement, s.")] = 3.0,
@@ -140,7 +150,7 @@ def hz(
     raise typer.Exit(show_rates(link_of(connect, robot), topic, seconds, console))
 
 
-@app.command()
+@app.command(rich_help_panel="Diagnose", short_help="Health of every service, until Ctrl-C.")
 def top(
     robot: Annotated[
         list[str], typer.Option(envvar="PRESAGE_ROBOT", help="Robot name; may be given several times.")
@@ -159,7 +169,7 @@ def top(
     raise typer.Exit(run_top(link_of(connect, robot[0]), list(dict.fromkeys(robot)), console, once=once))
 
 
-@app.command()
+@app.command(rich_help_panel="Diagnose", short_help="Find problems of the installation and the session.")
 def doctor(
     seconds: Annotated[
         float,

@@ -1,4 +1,4 @@
-"""Health messages as rows."""
+"""Health messages as rows of a table."""
 
 from __future__ import annotations
 

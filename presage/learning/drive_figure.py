@@ -1,4 +1,4 @@
-"""The figure beside a model trained on a drive."""
+"""Draws a model trained on a drive and its calibration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`presage map`: a ROS map from a drive with known poses.
+"""`presage map`: builds a ROS map from a drive with known poses.
 
 A cell is occupied if beams of at least `MIN_HITS` scans ended in it, and of at least `MIN_HIT_SHARE` of the scans that
 observed it; otherwise it is free if a beam passed through it, and unknown if not. Beams mostly pass through the places

@@ -1,4 +1,4 @@
-"""Trains the distance field from such scans."""
+"""`presage train`: trains the distance field of preset precise on simulated scans."""
 
 from __future__ import annotations
 

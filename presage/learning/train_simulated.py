@@ -1,4 +1,4 @@
-"""`presage train`: scans from random poses of a simulator, then training."""
+"""`presage train`: collects simulated scans, and trains the decoder of preset paper."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`presage import`: a log as a recording."""
+"""`presage import`: converts a log to a recording."""
 
 from __future__ import annotations
 

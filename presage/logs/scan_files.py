@@ -1,4 +1,4 @@
-"""All scans of a log or recording in memory."""
+"""Reads all scans of a log or recording into memory."""
 
 from __future__ import annotations
 

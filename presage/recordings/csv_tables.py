@@ -1,4 +1,4 @@
-"""CSV, one file for each topic."""
+"""CSV export, one file for each topic."""
 
 from __future__ import annotations
 

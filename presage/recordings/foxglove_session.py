@@ -1,4 +1,4 @@
-"""A session as Foxglove messages.
+"""Converts a session to Foxglove messages.
 
 Time: Foxglove plays a file by log time, which is the wall time of the recording. The stamps of presage are simulation
 or sensor time. Each stamp is therefore converted to the wall time at which the first sensor message (scan, odom, truth)

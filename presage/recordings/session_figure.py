@@ -1,4 +1,4 @@
-"""The picture of a recorded session."""
+"""Draws a recorded session."""
 
 from __future__ import annotations
 

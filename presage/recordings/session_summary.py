@@ -1,4 +1,4 @@
-"""Numbers of a recorded session."""
+"""Summarises a recorded session."""
 
 from __future__ import annotations
 

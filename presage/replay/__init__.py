@@ -1,1 +1,1 @@
-"""Recorded data through services and estimators again."""
+"""Runs services and estimators on recorded data again."""

@@ -1,4 +1,4 @@
-"""`presage replay`: a recording onto the bus, steered by keys."""
+"""`presage replay`: publishes a recording on the bus, controlled by keys."""
 
 from __future__ import annotations
 

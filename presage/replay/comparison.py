@@ -1,4 +1,4 @@
-"""Compares two sets of answers to the same scans."""
+"""Compares recorded and new outputs for the same scans."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Between which beliefs each goal was accepted."""
+"""Infers after which belief each goal was accepted."""
 
 from __future__ import annotations
 

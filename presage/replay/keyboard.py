@@ -1,4 +1,4 @@
-"""Keys that steer a replay."""
+"""Keys that control a replay."""
 
 from __future__ import annotations
 

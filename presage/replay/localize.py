@@ -1,4 +1,4 @@
-"""`presage localize`: an estimator over a recording or log."""
+"""`presage localize`: runs an estimator over a recording or log."""
 
 from __future__ import annotations
 

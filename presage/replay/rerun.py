@@ -1,4 +1,4 @@
-"""`presage rerun`: another estimator over a recording, in process.
+"""`presage rerun`: runs another estimator over a recording, in process.
 
 The new recording contains all messages, metadata and attachments of the old one, unchanged, and the new beliefs and
 predictions under another robot name: presage/ROBOT-rerun/belief. In a replay of it, subscribers of ROBOT therefore

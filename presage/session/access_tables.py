@@ -1,4 +1,4 @@
-"""Who may do what, as tables."""
+"""Tables of the members and of the rights of each role."""
 
 from __future__ import annotations
 

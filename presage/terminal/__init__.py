@@ -1,1 +1,1 @@
-"""What commands share."""
+"""Options, output and progress shared by the commands."""
