@@ -55,7 +55,7 @@ Reference = Annotated[
     bool | None,
     typer.Option(
         rich_help_panel=PANEL,
-        help="Whether to read reference poses. Defaults to reading them if the log states that they are; --reference"
+        help="Whether to read reference poses. Defaults to reading those that the log marks as such; --reference"
         " also takes the poses of corrected CARMEN scans.",
     ),
 ]
@@ -107,7 +107,7 @@ def reads_logs(command: Callable[..., Any]) -> Callable[..., Any]:
     return with_options(run, command, READING_OPTIONS, without="reading")
 
 
-@app.command()
+@app.command(rich_help_panel="Offline", short_help="Localise a recording or log of any robot in a map.")
 @reads_logs
 def localize(
     file: Annotated[
@@ -184,7 +184,7 @@ def localize(
     run(job, err_console)
 
 
-@app.command("import")
+@app.command("import", rich_help_panel="Offline", short_help="Convert a log to a recording.")
 @reads_logs
 def import_(
     file: Annotated[Path, typer.Argument(help="A CARMEN log, a ROS 1 or 2 bag (file or folder), or an .npz file.")],
@@ -234,7 +234,7 @@ def import_(
     import_command(job, json_file, console, err_console)
 
 
-@app.command("map")
+@app.command("map", rich_help_panel="Learn", short_help="Build a ROS map from a drive with known poses.")
 @reads_logs
 def map_(
     log: Annotated[Path, typer.Argument(help="A recording or log with reference poses (docs/logs.md).")],

@@ -71,6 +71,23 @@ app = typer.Typer(
 )
 
 
+def _print_version(requested: bool) -> None:
+    if requested:
+        from common.versions import versions  # noqa: PLC0415
+
+        console.print(", ".join(f"{name} {version}" for name, version in versions().items()), soft_wrap=True)
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print versions and exit.")
+    ] = False,
+) -> None:
+    """A robot that localises itself and navigates by predicting what its laser will see."""
+
+
 @app.command(rich_help_panel="Run", short_help="All services and the live page on this machine, until Ctrl-C.")
 def up(
     world: WorldName = "corridor",
@@ -301,15 +318,27 @@ def _train_from_drive(
     train_from_drive(TrainDriveOptions(drive, world, out, samples, recipe, share, reading), console)
 
 
+app.add_typer(cli_tools.app)
 app.add_typer(cli_recording.app)
 app.add_typer(cli_replay.app)
 app.add_typer(cli_inspect.app)
 app.add_typer(cli_logs.app)
-app.add_typer(cli_tools.app)
-app.add_typer(cli_bench.app, name="bench")
-app.add_typer(cli_experiment.app, name="experiment")
-app.add_typer(cli_secure.app, name="secure")
-app.add_typer(cli_obstacle.app, name="obstacle")
+app.add_typer(
+    cli_bench.app, name="bench", rich_help_panel="Lab", short_help="Benchmarks against a baseline or a limit."
+)
+app.add_typer(
+    cli_experiment.app, name="experiment", rich_help_panel="Lab",
+    short_help="The paper's experiments, navigation, and real logs.",
+)  # fmt: skip
+app.add_typer(
+    cli_secure.app,
+    name="secure",
+    rich_help_panel="Diagnose",
+    short_help="Certificates and access rights of secure mode.",
+)
+app.add_typer(
+    cli_obstacle.app, name="obstacle", rich_help_panel="Drive", short_help="Add, move and remove simulated obstacles."
+)
 cli_secure.with_security(app, cli_recording.app, cli_replay.app, cli_inspect.app, cli_tools.app, cli_obstacle.app)
 
 

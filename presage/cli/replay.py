@@ -66,7 +66,7 @@ def replay(
     world and model, sends them their recorded inputs, and compares their outputs with the recording. Each scan waits
     for the belief of the scan before (unless `--rate` is given). If the session ran in lockstep, the outputs must be
     identical; otherwise they must agree within 0.01 m and 0.01 rad while tracking, because a recording does not contain
-    requests (`presage localise`), restarts, or what happened before it began. Exits with status 1 if they differ.
+    requests (`presage relocalise`), restarts, or what happened before it began. Exits with status 1 if they differ.
 
     Examples: `presage replay run.mcap --only scan,odom` (with `python -m services.estimator` beside it);
     `presage replay run.mcap --rate 4 --start 10 --end -5 --loop`; `presage replay run.mcap --except belief,prediction`;

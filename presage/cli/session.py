@@ -91,7 +91,7 @@ def teleport(
     rich_help_panel="Drive",
     short_help="Restart localisation, near a position or globally.",
 )
-def localise(
+def relocalise(
     x: Annotated[
         float | None, typer.Argument(help="x in the map, m. Defaults to the estimator's initial pose.")
     ] = None,
@@ -101,9 +101,9 @@ def localise(
 ) -> None:
     """Reset the estimator and localise again, near a given position or globally.
 
-    Examples: `presage localise`; `presage localise 3 1.5`.
+    Examples: `presage relocalise`; `presage relocalise 3 1.5`.
     """
-    from presage.live.commands import localise as run  # noqa: PLC0415
+    from presage.live.commands import relocalise as run  # noqa: PLC0415
 
     if (x is None) != (y is None):
         raise UserError("a position is two numbers, X Y in m")

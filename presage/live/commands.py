@@ -209,7 +209,7 @@ def echo(link: Link, name: str, count: int, console: Console, *, full: bool) -> 
     return 0
 
 
-def localise(link: Link, pose: Pose | None, console: Console) -> None:
+def relocalise(link: Link, pose: Pose | None, console: Console) -> None:
     """Resets the estimator's belief; raises UserError with the reason if the estimator refuses."""
     with session(link) as bus:
         reply = bus.ask(LOCALISE, LocaliseRequest(pose=pose), Reply)

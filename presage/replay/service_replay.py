@@ -3,7 +3,7 @@
 By default the replay runs in lockstep: a scan is sent when the outputs for the one before have come, so that nothing is
 dropped. Only the scans that the live estimator answered are sent, unless `every_scan` is set: a scan that it skipped,
 because a newer one had come or because it was not running yet, had no influence on its beliefs. A recording does not
-contain requests (`presage localise`), restarts of the estimator, and what happened before the recording began; these
+contain requests (`presage relocalise`), restarts of the estimator, and what happened before the recording began; these
 are not repeated.
 """
 

@@ -38,9 +38,9 @@ INVALID_COMMANDS = [
     (("teleport", "-1", "-1.5", "-90", *NO_SESSION), "start a session"),
     (("obstacle", "add", "crate", "-1", "2", "--radius", "-1"), "the obstacle: circle.radius"),
     (("obstacle", "add", "crate", "1", "2", *NO_SESSION), "start a session"),
-    (("localise", "nan", "1"), "a place is finite numbers"),
-    (("localise", "-1", "-.5", *NO_SESSION), "start a session"),
-    (("localise", "1"), "a position is two numbers"),
+    (("relocalise", "nan", "1"), "a place is finite numbers"),
+    (("relocalise", "-1", "-.5", *NO_SESSION), "start a session"),
+    (("relocalise", "1"), "a position is two numbers"),
     (("demo", "--goal", "nan", "1"), "two finite numbers"),
     (("demo", "--out", "/dev/null/x"), "/dev/null/x: cannot be written to"),
     (("demo", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
@@ -112,7 +112,7 @@ def test_help_has_examples_for_every_command(process):
         "demo",
         "goal",
         "teleport",
-        "localise",
+        "relocalise",
         "record",
         "replay",
         "plot",
@@ -157,7 +157,7 @@ def test_tools_on_a_running_session(process, bus, link):
     status, text = run("goal", "0.1", "0.1")
     assert status == 2
     assert "the nearest place that can be reached is" in text
-    assert run("localise", "3.5", "1.5")[0] == 0
+    assert run("relocalise", "3.5", "1.5")[0] == 0
     assert run("goal", "4", "1.5", "--wait")[0] == 0
     assert run("goal", "--cancel")[0] == 0
     status, text = run("doctor")

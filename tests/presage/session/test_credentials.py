@@ -115,7 +115,7 @@ def test_the_commands_end_to_end(tmp_path):
 
 def test_every_command_with_a_session_takes_security_and_role():
     for words in (["goal"], ["teleport"], ["echo"], ["hz"], ["top"], ["doctor"], ["record"], ["replay"], ["train"],
-                  ["up"], ["demo"], ["localise"], ["bench", "latency"]):  # fmt: skip
+                  ["up"], ["demo"], ["relocalise"], ["bench", "latency"]):  # fmt: skip
         helped = run.invoke(app, [*words, "--help"], env={"COLUMNS": "200", "TERMINAL_WIDTH": "200"})
         assert "--security" in helped.output, words
         assert "--role" in helped.output, words
