@@ -49,8 +49,8 @@ class ServiceSettings(BaseSettings):
     )
     service: ClassVar[str] = "service"
     program: ClassVar[str] = ""  # shown in --help; if empty, python -m services.NAME
-    # Fields that PRESAGE_<FIELD> and the top level of the file do not set, only PRESAGE_<SERVICE>_<FIELD> and the
-    # section of the service.
+    # Fields that are set only by PRESAGE_<SERVICE>_<FIELD> and the service's section of the file, not by
+    # PRESAGE_<FIELD> and the file's top level.
     private: ClassVar[frozenset[str]] = frozenset()
 
     robot: Annotated[
@@ -140,7 +140,7 @@ def split_endpoints(text: str) -> tuple[str, ...]:
 
 
 def join_negative_values(argv: list[str]) -> list[str]:
-    """Write ``--start -3,1`` as ``--start=-3,1``, because argparse takes values that begin with a minus for options."""
+    """Write ``--start -3,1`` as ``--start=-3,1``: argparse takes a word that begins with a minus as an option."""
     joined: list[str] = []
     for argument in argv:
         if re.match(r"-[.\d]", argument) and joined and re.fullmatch(r"--[a-z][a-z-]*", joined[-1]):
@@ -151,7 +151,7 @@ def join_negative_values(argv: list[str]) -> list[str]:
 
 
 def load_settings(cls: type[S], argv: list[str] | None = None) -> S:
-    """Settings of a service from all sources.
+    """Returns the settings of a service from all sources.
 
     ``argv`` defaults to the arguments of the process. With ``--print-config``, prints the settings and exits. Raises
     UserError for an invalid setting or file.
@@ -197,7 +197,7 @@ class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
 
 
 def _read_file(cls: type[ServiceSettings], path: Path) -> dict[str, Any]:
-    """Settings of one service: top-level keys apply to all services, the section named after the service only to it."""
+    """Returns one service's settings: top-level keys apply to all services, the section of a service only to it."""
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     except OSError as error:

@@ -14,7 +14,7 @@ from common.robot.self_filter import SelfFilter
 from common.runtime.config import ServiceSettings
 
 ANGLE_BOUNDS_PATTERN = rf"{NUMBER}:{NUMBER}"
-MAX_STOPPING_TIME_S = 10.0  # a robot that takes longer to stop cannot be kept from obstacles by its scanner
+MAX_STOPPING_TIME_S = 10.0  # beyond this, the scanner sees obstacles too late to brake for them
 
 
 class RobotSettings(ServiceSettings):
@@ -56,18 +56,19 @@ class RobotSettings(ServiceSettings):
     ] = 3.0
 
     def build_robot(self) -> Robot:
-        """Robot with these limits; raises UserError if it would take too long to stop."""
+        """Returns a robot with these limits; raises UserError if it would take too long to stop."""
         for speed_name, acceleration_name, unit in (
             ("max_speed", "acceleration", "m/s"),
             ("max_turn", "turn_acceleration", "rad/s"),
         ):
             speed, acceleration = getattr(self, speed_name), getattr(self, acceleration_name)
             if speed / acceleration > MAX_STOPPING_TIME_S:
-                first, second = (f"--{name.replace('_', '-')}" for name in (speed_name, acceleration_name))
+                names = (speed_name, acceleration_name)
+                speed_option, acceleration_option = (f"--{name.replace('_', '-')}" for name in names)
                 raise UserError(
-                    f"{first} {speed:g} {unit} with {second} {acceleration:g} {unit}²: the robot would take "
-                    f"{speed / acceleration:.0f} s to stop, more than {MAX_STOPPING_TIME_S:g} s; "
-                    f"lower {first} or raise {second}"
+                    f"{speed_option} {speed:g} {unit} with {acceleration_option} {acceleration:g} {unit}²: the robot "
+                    f"would take {speed / acceleration:.0f} s to stop, more than {MAX_STOPPING_TIME_S:g} s; "
+                    f"lower {speed_option} or raise {acceleration_option}"
                 )
         return Robot(
             drive=self.drive,
