@@ -79,7 +79,10 @@ class Bus(Liveliness):
             return self._publishers[key]
 
     def wait_matching(self, topic: Topic, timeout: float, service: str = "*", key: str | None = None) -> bool:
-        """Whether the topic has a subscriber within ``timeout`` s; what is published before may be lost."""
+        """Wait until the topic has a subscriber; returns False if it has none within ``timeout`` s.
+
+        Messages that are published earlier may be lost.
+        """
         publisher: Any = self.publisher(topic, service, key)  # zenoh's stub declares the wrong type of the status
         return wait_until(lambda: bool(publisher.matching_status.matching), timeout)
 
@@ -92,25 +95,25 @@ class Bus(Liveliness):
         """
         newest = topic.queue == "newest" and not keep_all
 
-        def move(sample: zenoh.Sample) -> None:
+        def on_sample(sample: zenoh.Sample) -> None:
             published = published_ns(sample)
             source = _source(sample)
             entry = Sample(topic, str(sample.key_expr), sample.payload.to_bytes(), published, time.time_ns(), source)
             inbox.put(entry, newest_only=newest)
 
-        subscriber = self._session.declare_subscriber(topic.key(robot or self.robot), move)
+        subscriber = self._session.declare_subscriber(topic.key(robot or self.robot), on_sample)
         self._declared.append(subscriber)
 
-        def end() -> None:
+        def unsubscribe() -> None:
             self._declared.remove(subscriber)
             subscriber.undeclare()  # type: ignore[no-untyped-call]
 
-        return end
+        return unsubscribe
 
     def serve(self, query: Query, inbox: Inbox, service: str = "*") -> None:
         """Put requests into ``inbox``, as `Call`s that have to be answered."""
 
-        def move(call: zenoh.Query) -> None:
+        def on_query(call: zenoh.Query) -> None:
             payload = call.payload.to_bytes() if call.payload is not None else b""
             key = query.key(self.robot, service)
 
@@ -126,7 +129,7 @@ class Bus(Liveliness):
 
             inbox.put(Call(query, payload, reply, refuse))
 
-        self._declared.append(self._session.declare_queryable(query.key(self.robot, service), move, complete=True))
+        self._declared.append(self._session.declare_queryable(query.key(self.robot, service), on_query, complete=True))
 
     def ask(
         self,
@@ -154,7 +157,7 @@ class Bus(Liveliness):
                     raise UserError(f"{key}: refused: {why}")
             if answers:
                 break
-            # A session that has just opened does not know the queryables yet; the request was sent to none of them.
+            # A session that has just opened does not know the queryables yet, so the request was not sent: try again.
             time.sleep(0.02)
         server = service if service != "*" else query.server
         raise UserError(
@@ -175,16 +178,16 @@ class Bus(Liveliness):
             if unanswered.acquire(blocking=False):  # never released, so only the first answer is used
                 inbox.put(Answer(query, number, payload, refusal))
 
-        def move(answer: zenoh.Reply) -> None:
+        def on_reply(answer: zenoh.Reply) -> None:
             if answer.ok is not None:
                 settle(answer.ok.payload.to_bytes())
             elif answer.err is not None and (why := answer.err.payload.to_string()) != "Timeout":
                 settle(b"", f"{key}: refused: {why}")
 
-        def end() -> None:
+        def on_end() -> None:
             settle(b"", f"no service answers {key}: is the {service if service != '*' else query.server} running?")
 
-        handler = zenoh.handlers.Callback(move, end)
+        handler = zenoh.handlers.Callback(on_reply, on_end)
         self._session.get(key, handler, payload=request.encode(), encoding=ENCODING, timeout=timeout)
 
     def ask_each(
@@ -202,13 +205,13 @@ class Bus(Liveliness):
         """
         done, number = threading.Event(), itertools.count()
 
-        def move(answer: zenoh.Reply) -> None:
+        def on_reply(answer: zenoh.Reply) -> None:
             if answer.ok is not None:
                 inbox.put(Answer(query, next(number), answer.ok.payload.to_bytes(), session=str(answer.replier_id)))
 
         self._session.get(
             query.key(robot or self.robot, service),
-            zenoh.handlers.Callback(move, done.set),
+            zenoh.handlers.Callback(on_reply, done.set),
             payload=request.encode(),
             encoding=ENCODING,
             timeout=timeout,
@@ -240,11 +243,11 @@ def open_bus(
     give_up: Callable[[], bool] = lambda: False,
     log_filter: str = LOG_FILTER,
 ) -> Iterator[Bus]:
-    """Open a session for the block.
+    """Open a session, and close it at the end of the ``with`` block.
 
     With credentials, waits until a router accepts them: for ``patience`` s, then raises UserError, or without limit if
-    it is None. Exits the process when ``give_up()`` becomes true meanwhile. Raises UserError if the endpoints cannot be
-    used, or if a session without credentials would be reachable from other machines.
+    it is None. Exits the process if ``give_up()`` returns true while waiting. Raises UserError if the endpoints cannot
+    be used, or if a session without credentials would be reachable from other machines.
     """
     if link.security is None and not link.insecure:
         refuse_exposure(link.listen)

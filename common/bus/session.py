@@ -15,12 +15,12 @@ from common.bus.security import Credentials
 from common.errors import UserError
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-# A router in secure mode handles at most ten failed handshakes per second, and a connection waits behind them: with 32
-# clients that fail all the time it waits for 6 s. An attempt that ends earlier starts again at the end of the queue.
-# Zenoh cannot be interrupted while it waits, so this is also how long ending a service may take.
+# A router in secure mode handles at most ten failed handshakes per second, and a new connection waits in a queue behind
+# them: about 6 s if 32 clients keep failing. An attempt that ends earlier starts again at the end of the queue.
+# Zenoh cannot be interrupted while it connects, so a service may take this long to end.
 JOIN_TIMEOUT_S = 8.0
 # The first two modules log an error for every message that arrives while a session opens or closes. The third one logs
-# at every message that a host's clock is ahead, which `presage doctor` reports once.
+# an error for every message from a host whose clock is ahead, which `presage doctor` reports once.
 LOG_FILTER = (
     "error,zenoh::api::session=off,zenoh::net::protocol::gossip=off,zenoh::net::routing::dispatcher::pubsub=off"
 )
@@ -95,7 +95,7 @@ def open_session(link: Link, join_timeout: float = JOIN_TIMEOUT_S) -> zenoh.Sess
 
 
 def wait_until(condition: Callable[[], bool], timeout: float, period: float = 0.02) -> bool:
-    """Wait until ``condition()`` is true; returns False if it is not within ``timeout`` s."""
+    """Wait until ``condition()`` is true; returns False if it is still false after ``timeout`` s."""
     deadline = time.monotonic() + timeout
     while not condition():
         if time.monotonic() > deadline:
