@@ -20,7 +20,7 @@ class Transform:
     rotation: Array  # (3, 3)
 
     def then(self, child: Transform) -> Transform:
-        """Compose with the pose of a frame in the child: returns its pose in this transform's parent."""
+        """Pose in this parent frame of a frame whose pose in this child frame is ``child``."""
         return Transform(self.translation + self.rotation @ child.translation, self.rotation @ child.rotation)
 
     def inverse(self) -> Transform:
@@ -32,7 +32,7 @@ class Transform:
         return np.array([*self.translation[:2], np.arctan2(self.rotation[1, 0], self.rotation[0, 0])])
 
     def apart(self, other: Transform) -> float:
-        """Largest difference of the translations in m and of the rotation matrices' elements (about rad)."""
+        """Largest difference between the translations (m) or elements of the rotation matrices (about rad)."""
         moved, turned = np.abs(self.translation - other.translation), np.abs(self.rotation - other.rotation)
         return float(max(moved.max(), turned.max()))
 
