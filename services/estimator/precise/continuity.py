@@ -1,7 +1,7 @@
 """Uses scan matching to tell a changed scene from a kidnapping.
 
-A scan that matches the scans just before it was taken near them, so the robot was not carried away, however little the
-model explains of the scan. Beams that end behind the walls that the model expects are evidence against this
+If a scan matches the scans just before it, it was taken near them. The robot was then not carried away, however little
+the model explains of the scan. Beams that end behind the walls that the model expects are evidence against this
 (`MAX_LATE_SHARE`).
 """
 
@@ -23,22 +23,27 @@ if TYPE_CHECKING:
     from services.estimator.precise.settings import Settings
     from services.estimator.shared.asking import Conversation
 
-# Least share of a scan's points that were seen before, for the first scan that is held by matching, and for later ones.
+# Minimum share of a scan's points that match recent scans, for matching to hold the pose: at the first scan, and at the
+# scans that follow it.
 MIN_SHARE_TO_BEGIN, MIN_SHARE_TO_CONTINUE = 0.75, 0.45
-CLEAR_SHARE = 0.8  # a match with less is tried again from other headings
+CLEAR_SHARE = 0.8  # if the share is smaller, matching is repeated from other headings
 EXTRA_HEADINGS_RAD = np.array([-0.3, -0.15, 0.15, 0.3])
 MAX_REACH_M = 0.3  # if the robot can drive farther between two scans, a match does not exclude a kidnapping
 MIN_PROVEN_SCANS = 3  # scans that the model explained, needed before any scan is held by matching
 DRIFT_PER_SCAN = np.array([0.02, 0.02, 0.005])  # m, m, rad: standard deviation that each added scan contributes
 MAX_LATE_SHARE, LATE_MEMORY = 0.35, 0.95  # limit and decay of the average share of beams behind the expected surface
-# A model that explains only part of a scan has this weight, times a power of its share of a good inlier ratio.
+# Weight of the model's evidence where it explains only part of a scan:
+# PARTIAL_WEIGHT * (inlier ratio / good_inlier_ratio) ** PARTIAL_EXPONENT.
 PARTIAL_WEIGHT, PARTIAL_EXPONENT = 0.1, 4
 MAX_SQUARED_DISTANCE = 16.0  # squared standard deviations within which two poses are consistent
 MODEL_POSE_SIGMAS = np.array([0.3, 0.3, 0.3])  # m, m, rad: standard deviation assumed for a pose found by the model
 
 
 class Continuity:
-    """The scans since the pose was certain, in a local frame that the model's evidence moves as a whole."""
+    """The scans since the pose became certain, in a local frame.
+
+    Evidence from the model moves this frame in the map, and all scans with it.
+    """
 
     def __init__(self, mount: Array) -> None:
         """``mount`` (3,) is the laser in base_link."""
@@ -53,12 +58,12 @@ class Continuity:
         self._late, self._proven_scans = 0.0, MIN_PROVEN_SCANS * pose_given
         self._matched_pose: Array | None = None  # (3,) of the present scan, in the local frame
         self._holds = False  # the last scan was held by matching
-        self._scans_frequent = True  # compared with the robot's speed
+        self._scans_frequent = True  # the robot can drive at most MAX_REACH_M between two scans
 
     def add(self, pose: Array, covariance: Array, points: Array, *, explained: bool) -> None:
-        """Adds the present scan, points (K, 2) m in the laser frame, taken at ``pose`` (3,) within ``covariance``.
+        """Adds the present scan, points (K, 2) m in the laser frame, taken at ``pose`` (3,) with ``covariance``.
 
-        ``explained`` tells that the model explains the scan.
+        ``explained`` is whether the model explains the scan.
         """
         if self._scans.empty:
             self._frame = np.array(pose)
@@ -72,13 +77,13 @@ class Continuity:
             self._proven_scans += explained
 
     def begin_scan(self, reach: float) -> None:
-        """Announces the next scan; the robot can have driven ``reach`` m since the last one."""
+        """Prepares for the next scan; the robot can have driven up to ``reach`` m since the last one."""
         self._matched_pose, self._scans_frequent = None, reach <= MAX_REACH_M
 
     def match(self, options: list[Candidate], start: Array, points: Array, late: float) -> Candidate | None:
         """Returns the pose at which the present scan continues the stored ones; None if it does not.
 
-        ``options`` are the motion candidates, the widest last. ``start`` (3,) is a further start of the descent.
+        ``options`` are the motion candidates, the widest last. ``start`` (3,) is an additional start of the descent.
         ``points`` (K, 2) m are in the laser frame. ``late`` is the share of beams behind the expected surface.
         """
         if self._proven_scans < MIN_PROVEN_SCANS or not self._scans_frequent:
@@ -111,8 +116,9 @@ class Continuity:
 def refine_in_changed_scene(view: View, held: Candidate, settings: Settings) -> Conversation[tuple[Array, Evidence]]:
     """Returns a pose (1, 3) near ``held`` and the model's evidence there, where the scene changed or was not learned.
 
-    Something that was moved moves many beams alike, so this evidence gets a low weight. If the model explains next to
-    nothing, its matches are chance: the pose is then ``held``, and the evidence gets no weight.
+    One moved object shifts many beams in the same way, so this evidence gets a low weight. If the model explains almost
+    nothing of the scan, the beams that it does explain are coincidences: the pose is then ``held``, and the evidence
+    has weight 0.
     """
     starts = held.mean + _sigma_points(held.covariance)
     starts[:, 2] = se2.wrap(starts[:, 2])

@@ -35,7 +35,7 @@ class FieldCard(BaseModel):
     seed: int
     resolution: float  # m
     origin: tuple[float, float]  # m
-    sweeps: int
+    sweeps: int  # descent steps on samples of the beams
     ripple: float  # rad, see GenerativeModel
     inflation: float  # factor on the covariance, because errors of the model are correlated between beams
     test_samples: int
@@ -81,7 +81,7 @@ def save(path: Path, model: FieldModel, places: Array, card: FieldCard) -> None:
 
 
 def load(path: Path) -> tuple[FieldModel, Array, FieldCard]:
-    """Returns the model, places (S, 2) in free space where the laser can be, and the card.
+    """Returns the model, positions (S, 2) m in free space where the laser can be, and the card.
 
     Raises UserError if a file is missing, damaged or inconsistent.
     """
