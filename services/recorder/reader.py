@@ -184,7 +184,7 @@ class Recording:
 
 
 def read_recording(path: Path) -> Recording:
-    """Opens a recording. Of an unfinished file the complete chunks are readable.
+    """Opens a recording. The complete chunks of an unfinished file can be read.
 
     Raises UserError if the file is missing or is not a recording.
     """

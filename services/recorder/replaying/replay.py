@@ -35,8 +35,8 @@ from services.recorder.replaying.player import (
 )
 
 NAME = "replay"  # service name of the liveliness token
-SUBSCRIBER_TIMEOUT_S = 2.0  # wait for subscribers, because messages before that are lost
-DISCOVERY_TIME_S = 0.5  # in which a new session learns which services are alive
+SUBSCRIBER_TIMEOUT_S = 2.0  # how long to wait for subscribers, because messages sent before are lost
+DISCOVERY_TIME_S = 0.5  # time for a new session to learn which services are alive
 POLL_PERIOD_S = 0.1  # longest wait before checking whether to stop
 
 
@@ -108,7 +108,7 @@ class Replay:
         alive = self._alive()
         if not self.choice.force and (why := find_conflicts(self._published(), alive)):
             raise UserError(why)
-        for key, topic in self._published().items():  # all before the first wait, so that discovery runs in parallel
+        for key, topic in self._published().items():  # all declared before the first wait: parallel discovery
             self.bus.publisher(topic, key=key)
         if WORLD.server not in alive.get(self.bus.robot, set()):  # a live simulator answers this query itself
             self.bus.serve(WORLD, self.inbox)
@@ -208,11 +208,11 @@ class Replay:
 
     def _alive(self) -> dict[str, set[str]]:
         """Live services by robot. Waits for the discovery time, or until a conflict is found."""
-        names = robots_of_keys(self._published())
-        alive: dict[str, set[str]] = {robot: set() for robot in names}
+        robots = robots_of_keys(self._published())
+        alive: dict[str, set[str]] = {robot: set() for robot in robots}
 
         def has_conflicts() -> bool:
-            for robot in names:
+            for robot in robots:
                 alive[robot] |= self.bus.alive(timeout=DISCOVERY_TIME_S, robot=robot)
             return bool(find_conflicts(self._published(), alive))
 
