@@ -1,7 +1,7 @@
 """The process: messages in, frames out to the web server's thread.
 
 The service's thread encodes frames and passes the bytes to the hub, which runs in the web server's thread and knows
-which robots are watched. Of a robot without visitors only the messages for the charts and the log are decoded.
+which robots are watched. For a robot that no visitor watches, only the messages for the charts and the log are decoded.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from services.viewer.state.roster import Roster
 from services.viewer.visitors import Hub, Visitor
 
 TICK_PERIOD_S = 1.0
-SCAN_TIMEOUT_S = 2.0  # since the last scan; after this no scanner is running
-UNWATCHED_TIMEOUT_S = 600.0  # other robots are unsubscribed after this time without a visitor
+SCAN_TIMEOUT_S = 2.0  # after this time without a scan, the scanner counts as missing
+UNWATCHED_TIMEOUT_S = 600.0  # a robot is unsubscribed after this time without a visitor, except the configured one
 
 
 @dataclass
@@ -43,7 +43,7 @@ class FollowedRobot:
 
     view: RobotView
     health: HealthHistory = field(default_factory=HealthHistory)
-    unread: dict[Topic, Sample] = field(default_factory=dict)  # the newest of each topic, until a visitor watches
+    unread: dict[Topic, Sample] = field(default_factory=dict)  # newest of each topic, not decoded yet
     scan_at: float = -1e9  # monotonic time of the last scan, s
     watched_at: float = field(default_factory=time.monotonic)  # monotonic time at which a visitor last watched, s
     unsubscribe: list[Callable[[], None]] = field(default_factory=list)
@@ -65,7 +65,8 @@ class ViewerService(Service):
         self.robots: dict[str, FollowedRobot] = {}
         self._reopened: set[str] = set()  # robots of replays that now show another recording
         self._changed: deque[str] = deque()  # robots whose services came or went
-        self._connect = "" if settings.connect == DEFAULT_ENDPOINT else settings.connect  # for the advice to visitors
+        # For the start commands that the page shows; empty if they do not need --connect.
+        self._connect = "" if settings.connect == DEFAULT_ENDPOINT else settings.connect
         self._tick_at = 0.0
         self._web: WebServer | None = None
 
@@ -159,7 +160,7 @@ class ViewerService(Service):
     # ---- periodic work
 
     def due(self) -> float | None:
-        """Seconds until `on_timer` is needed: for new visitors, a frame whose wait ends, or the next tick."""
+        """Seconds until `on_timer` is needed: for a new visitor, a delayed frame, or the next tick."""
         if self.hub.newcomers or self._changed or self._reopened:
             return 0.0
         now = time.monotonic()
@@ -242,8 +243,8 @@ class ViewerService(Service):
             live = "replay" not in self.roster.services(robot)
             followed = self.robots[robot] = FollowedRobot(RobotView(robot, live=live))
             for topic in TOPICS:
-                # A replay publishes the messages of one step at once. All are kept, because the newest of each topic
-                # may belong to different stamps.
+                # A replay publishes the messages of one step at once. All are kept, because the newest messages
+                # of different topics may have different stamps.
                 end = self.loop.bus.subscribe(topic, self.loop.inbox, keep_all=not live, robot=robot)
                 followed.unsubscribe.append(end)
         return self.robots[robot]

@@ -68,5 +68,5 @@ class ViewerSettings(ServiceSettings):
         return self.allow_control or self.on_loopback
 
     def effective(self) -> dict[str, Any]:
-        """All settings in effect. The token is masked, because recordings store them."""
+        """All settings in effect. The token is masked, because recordings store the settings."""
         return {**super().effective(), "token": "set" if self.token else ""}
