@@ -30,7 +30,7 @@ def same_belief(a: Belief, b: Belief) -> bool:
 
 @dataclass
 class MessagePairs:
-    """Compares recorded and new messages of one type; the k-th of a stamp is paired with the k-th of the same stamp."""
+    """Compares recorded and new messages of one type. Messages with the same stamp are paired in their order."""
 
     compared: int = 0
     equal: int = 0
@@ -80,7 +80,7 @@ class MessagePairs:
         self.tracking.append(a.state == b.state == "tracking")
 
     def as_dict(self) -> dict[str, Any]:
-        """The results by names that contain their unit; None if nothing was compared."""
+        """The results by names that contain their unit. A statistic is None if nothing was compared."""
         both = np.array(self.tracking, bool)
         position, heading = np.array(self.position_m), np.array(self.heading_rad)
 
@@ -104,7 +104,7 @@ class MessagePairs:
 class ReplayOutcome:
     """Result of running services on recorded inputs."""
 
-    imported: bool = field(default=False, kw_only=True)  # from a log, which contains no beliefs to compare with
+    imported: bool = field(default=False, kw_only=True)  # from a log, so without recorded beliefs to compare
     lockstep: bool  # the session and the replay ran in lockstep, so that equality is required
     why: str = ""  # why equality is not required
     beliefs: MessagePairs = field(default_factory=MessagePairs)
@@ -114,7 +114,7 @@ class ReplayOutcome:
     given: int = 0  # scans sent to the services
     left_out: int = 0  # scans without a recorded belief, which were not sent
     unanswered: int = 0  # scans sent, but without a new belief
-    goals_placed: bool = True  # whether each goal was sent after the belief after which it was accepted live
+    goals_placed: bool = True  # whether each goal was sent after the same belief as in the session
     notes: list[str] = field(default_factory=list)
     damaged: str = ""  # why the recording could not be read to its end
 
@@ -122,8 +122,8 @@ class ReplayOutcome:
     def good(self) -> bool:
         """Whether the results agree.
 
-        They must be identical; without lockstep, within the tolerance while tracking. For an imported log, every scan
-        must have been answered.
+        In lockstep they must be identical; otherwise they may differ by the tolerance while tracking. For an imported
+        log, every scan must have been answered.
         """
         pairs, left = self.beliefs, self.beliefs.unmatched()["recorded"]
         if self.damaged:
@@ -133,9 +133,9 @@ class ReplayOutcome:
         if self.lockstep:
             commands_agree = self.commands.compared == self.commands.equal or not self.goals_placed
             return 0 < pairs.compared == pairs.equal and not left and commands_agree
-        numbers = pairs.as_dict()
-        position_m = numbers["position_difference_tracking_max_m"] or 0.0
-        heading_rad = numbers["heading_difference_tracking_max_rad"] or 0.0
+        differences = pairs.as_dict()
+        position_m = differences["position_difference_tracking_max_m"] or 0.0
+        heading_rad = differences["heading_difference_tracking_max_rad"] or 0.0
         return bool(pairs.compared > 0 and position_m <= TOLERANCE_M and heading_rad <= TOLERANCE_RAD)
 
     def as_dict(self) -> dict[str, Any]:

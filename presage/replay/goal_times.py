@@ -31,15 +31,15 @@ class GoalTimes:
                 self._surplus[message.stamp_ns] -= 1
 
     def accepted(self, count: int) -> Counter[int | None] | None:
-        """How many of ``count`` goals were accepted after the belief of each stamp; key None is before the first.
+        """Returns how many of ``count`` goals were accepted after each belief, by its stamp (None before the first).
 
-        Returns None if statuses and goals do not match: a message is missing, or the recording began later.
+        Returns None if statuses and goals do not match, because a message is missing or the recording began later.
         """
         accepted: Counter[int | None] = Counter({stamp: n for stamp, n in self._surplus.items() if n > 0})
         if sum(accepted.values()) == count + 1 and accepted[self._last]:  # the recording ended before the last command
             accepted[self._last] -= 1
         if sum(accepted.values()) != count or self._first is None:
             return None
-        if self._first.goal is not None and self._first.distance is None:
+        if self._first.goal is not None and self._first.distance is None:  # no distance: there was no belief yet
             accepted[None] = accepted.pop(self._first.stamp_ns, 0)
         return accepted
