@@ -24,7 +24,7 @@ from services.estimator.shared.interface import Estimator, Observation
 
 MAX_SEARCH_SCANS = 40
 SCANS_BEFORE_KIDNAPPING = 10  # scans for which the robot is tracked before it is kidnapped
-START_COVARIANCE = np.diag([0.01, 0.01, 0.0025])  # m², m², rad²; of a given start
+START_COVARIANCE = np.diag([0.01, 0.01, 0.0025])  # m², m², rad²; of the given start pose
 TRACKED_DISTANCE = 0.5  # m; a scan with a smaller error counts as tracked
 # AMCL's default motion model is differential and cannot follow every base, so its omnidirectional model is used.
 AMCL_SETTINGS = ParticleSettings(robot_model_type="omni")
@@ -33,7 +33,7 @@ ODOMETRY, LASER, GLOBAL, KIDNAPPED = "odometry", "laser", "global", "kidnapped"
 
 @dataclass(frozen=True)
 class Job:
-    """One estimator on one stretch of a drive; all values are plain, so that jobs can be compared and sent."""
+    """One estimator on one stretch of a drive; all values are plain, so that jobs can be compared and pickled."""
 
     log: str
     map: str
@@ -93,7 +93,7 @@ def trial(job: Job) -> dict[str, Any]:
         numbers = np.concatenate([np.arange(job.first, job.first + SCANS_BEFORE_KIDNAPPING), after])
     clock = drive.stamps[numbers]
     odom = None if drive.odom is None or job.task == LASER else drive.odom[numbers]
-    if job.task == KIDNAPPED:  # to the sensors, the kidnapping takes no time
+    if job.task == KIDNAPPED:  # the stamps have no gap at the kidnapping
         clock[SCANS_BEFORE_KIDNAPPING:] += (
             drive.stamps[job.first + SCANS_BEFORE_KIDNAPPING] - clock[SCANS_BEFORE_KIDNAPPING]
         )
@@ -122,7 +122,7 @@ def _nees(error: Array, covariance: Array | None) -> float | None:
 
 
 def hide_kidnapping(odom: Array, carried: int) -> Array:
-    """Odometry (N, 3) without the motion before scan ``carried``, as if the robot were lifted with its wheels still."""
+    """Odometry (N, 3) without the motion just before scan ``carried``, as if the robot had been lifted."""
     moved = odom.copy()
     moved[carried:] = se2.compose(odom[carried - 1], se2.between(odom[carried], odom[carried:]))
     return np.asarray(moved)

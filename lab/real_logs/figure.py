@@ -20,7 +20,7 @@ def draw(calibration: Calibration | None, rows: Sequence[dict[str, Any]], titles
     """Cumulative distribution of the errors, calibration, and errors over time with and without odometry."""
     figure = drawing.empty_figure(14, 9)
     panels = figure.subplots(2, 2, width_ratios=(1.6, 1))
-    shares = drawing.style_axes(panels[0, 0])
+    cumulative = drawing.style_axes(panels[0, 0])
     for axes, task, style in zip(panels[1], (ODOMETRY, LASER), ("-", "--"), strict=True):
         drawing.style_axes(axes)
         for row in (row for row in rows if row["task"] == task):
@@ -29,13 +29,15 @@ def draw(calibration: Calibration | None, rows: Sequence[dict[str, Any]], titles
             stamps = np.array(row["stamp_s"]) - row["stamp_s"][0]
             axes.plot(stamps, error, linewidth=0.9, color=colour, label=name)
             share = np.arange(1, len(error) + 1) / len(error)
-            shares.plot(np.sort(error), share, style, color=colour, label=f"{name}, {titles[task][3:]}")
+            cumulative.plot(np.sort(error), share, style, color=colour, label=f"{name}, {titles[task][3:]}")
         drawing.log_metres(axes)
         axes.axhline(TRACKED_DISTANCE, color=drawing.BOUND, linestyle=":", linewidth=1)
         axes.set(xlabel="time (s)", ylabel="position error (m)", title=titles[task])
-    drawing.log_metres(shares, "x")
-    shares.set(xlabel="position error (m)", ylabel="share of scans with less", ylim=(0, 1), title="the half localised")
-    shares.legend(frameon=False, fontsize=9)
+    drawing.log_metres(cumulative, "x")
+    cumulative.set(
+        xlabel="position error (m)", ylabel="share of scans with less", ylim=(0, 1), title="the half localised"
+    )
+    cumulative.legend(frameon=False, fontsize=9)
     if calibration is not None:
         calibration_curve(drawing.style_axes(panels[0, 1]), calibration)
     drawing.legend_below(figure, panels[1, 1])
