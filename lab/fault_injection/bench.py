@@ -52,12 +52,12 @@ def bench_chaos(
         enter_own_namespaces(["-m", "presage", *sys.argv[1:]])
     outcomes: list[FaultOutcome] = []
     skipped: dict[str, str] = {}
-    clean = {name: value for name, value in os.environ.items() if not name.startswith("PRESAGE_")}
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PRESAGE_")}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="presage-chaos-")))
         network = None if missing else stack.enter_context(Network())
         with console.status("starting the system"):
-            system = stack.enter_context(System(folder, network, clean, quiet=quiet))
+            system = stack.enter_context(System(folder, network, environment, quiet=quiet))
         for fault in faults:
             unavailable = (
                 f"needs several hosts: {missing}" if fault.needs_hosts and missing else ""
@@ -66,8 +66,8 @@ def bench_chaos(
                 skipped[fault.name] = unavailable
                 console.print(f"[yellow]not tried[/] {fault.name}: {unavailable}", highlight=False)
                 continue
-            for number in range(repeats):
-                with console.status(f"{fault.name} ({number + 1} of {repeats}): {fault.about}"):
+            for repeat in range(repeats):
+                with console.status(f"{fault.name} ({repeat + 1} of {repeats}): {fault.about}"):
                     outcomes.append(measure(system, fault))
                 problem = outcomes[-1].why
                 console.print(f"{'[red]no[/]' if problem else '[green]ok[/]'} {fault.name} {problem}", highlight=False)
@@ -98,11 +98,11 @@ def rows_of(outcomes: Sequence[FaultOutcome]) -> list[tuple[str, ...]]:
             known = [value for row in rows if (value := getattr(row, what)) is not None]
             return f"{max(known):.2f} s" if known else ""
 
-        slow = [row.least_speed for row in rows if row.least_speed is not None]
-        good = sum(not row.why for row in rows)
-        speed = f"{min(slow):.2f} m/s" if slow else ""
+        speeds = [row.least_speed for row in rows if row.least_speed is not None]
+        as_expected = sum(not row.why for row in rows)
+        speed = f"{min(speeds):.2f} m/s" if speeds else ""
         times = [worst(what) for what in ("detected_s", "stopped_s", "start_s", "again_s")]
-        table_rows.append((name, *times, speed, f"{good} of {len(rows)}"))
+        table_rows.append((name, *times, speed, f"{as_expected} of {len(rows)}"))
     return table_rows
 
 

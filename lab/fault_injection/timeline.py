@@ -38,13 +38,13 @@ class Timeline:
     def wait(self, since: float, wanted: Callable[[Row], bool], timeout: float, what: str) -> Row:
         """Waits for the first event at or after ``since`` (s) for which ``wanted`` is true, and returns it.
 
-        Raises UserError that ``what`` did not happen if there is none within ``timeout`` s.
+        Raises UserError if there is none within ``timeout`` s; ``what`` names the event in the message.
         """
         deadline = time.monotonic() + timeout
-        at = 0
+        next_index = 0
         while True:
             with self._lock:
-                new, at = self.rows[at:], len(self.rows)
+                new, next_index = self.rows[next_index:], len(self.rows)
                 for row in new:
                     if row["t"] >= since and wanted(row):
                         return row
