@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
 
 ENERGY_TOLERANCE_NATS = 1e-9  # expected free energies closer than this count as equal
-MIN_BEAM_OVERLAP = 1e-6  # lower limit of a beam's coefficient, so that a product of fifty does not underflow
+MIN_BEAM_OVERLAP = 1e-6  # lower limit of one beam's BC, so that a product of 50 beams does not underflow
 SAME_PLACE_M = 0.5  # a hypothesis moves less than this between two beliefs; closer destinations count as one
 HEADING_WEIGHT_M_PER_RAD = 0.5  # weight of a difference in heading when two poses are compared
 MAX_TRIED_DESTINATIONS = 20
@@ -36,14 +36,14 @@ class PredictionTrust:
     A beam is an outlier with probability e = ``outliers``; every range is then equally likely:
     p(o) = (1 - e) N(o; r, s²) + e / R.
 
-    Outliers are correlated: a person, or an edge predicted slightly beside its true place, spoils a sector of the scan
+    Outliers are correlated: a person, or an edge predicted slightly off its true place, spoils a sector of the scan
     rather than one beam. B beams therefore count as at most ``sectors`` independent ones. With the defaults, and 0.69
     nats between two equally likely places, 3 clearly different beams of 61 gain 0.2 nats, 8 beams 0.4, and 20 beams
     0.65.
     """
 
     outliers: float = 0.25  # the share of beams that the estimator's likelihood expects to end early
-    blur: float = 0.05  # m, added to sigma in quadrature, because the robot arrives slightly beside the destination
+    blur: float = 0.05  # m, added to sigma in quadrature, because the robot does not stop exactly at the destination
     sectors: int = 8
 
 
@@ -117,9 +117,9 @@ def expected_free_energy(gain: Array, length: Array, nats_per_metre: float) -> A
 
 
 def best_index(energy: Array, length: Array) -> int | None:
-    """Index of the least expected free energy (M,); of equal ones the shortest path, then the first.
+    """Index of the least expected free energy (M,), or None if none is finite.
 
-    Returns None if no energy is finite.
+    Among equal ones, the shortest path is preferred, then the first.
     """
     energy, length = np.asarray(energy, float), np.asarray(length, float)
     if not np.isfinite(energy).any():
@@ -177,13 +177,13 @@ class DestinationSelector:
         self._tried: list[Array] = []  # places (K, 3) of destinations that did not resolve the ambiguity
 
     def reset(self) -> None:
-        """Forget the destination and all that were tried. Call it when the pose is known, or the goal has changed."""
+        """Forget the destination and the tried ones. Call it when the pose is known, or the goal has changed."""
         self.__post_init__()
 
     def choose(
         self, stamp_ns: int, motions: CandidateMotions, ranges: Array, sigma: Array, range_max: float
     ) -> Array | None:
-        """The destination (3,) in map under the first hypothesis. None if no motion is worth it.
+        """The destination (3,) in map under the first hypothesis. None if no motion gains enough.
 
         ``ranges`` and ``sigma`` (K, M, B) m are the predictions for `CandidateMotions.poses`. The previous destination
         is kept unless another one is better by ``switch_margin`` or its gain has dropped.
@@ -193,7 +193,7 @@ class DestinationSelector:
         energy = expected_free_energy(gain, motions.lengths, self.nats_per_metre)
         energy = np.where(gain < self.min_gain, np.inf, energy)
         untried = np.where(self._was_tried(places[0]), np.inf, energy)
-        if not np.isfinite(untried).any():  # try all of them again: a person may have stood there
+        if not np.isfinite(untried).any():  # try all of them again: a person may have blocked the view
             self._tried, untried = [], energy
         index, kept = best_index(untried, motions.lengths), self._index_of_chosen(places[0], gain, motions)
         if kept is not None and (index is None or untried[index] > energy[kept] - self.switch_margin):
@@ -215,19 +215,19 @@ class DestinationSelector:
             return None
         timed_out = stamp_ns - chosen.stamp_ns > self.timeout * 1e9
         distance = _pose_distance(chosen.hypotheses[:, None, :], hypotheses[None, :, :])  # (chosen, present)
-        own = int(distance[:, 0].argmin())
+        matching = int(distance[:, 0].argmin())  # the hypothesis that is first now
         was_reset = stamp_ns < chosen.stamp_ns  # the simulation started again
-        hypothesis_jumped = distance[own, 0] > SAME_PLACE_M
+        hypothesis_jumped = distance[matching, 0] > SAME_PLACE_M
         if timed_out or was_reset or hypothesis_jumped or entropy(weights) < self.min_gain_ratio * chosen.gain:
             self._drop(tried=timed_out)
             return None
         near = distance.min(axis=1) < SAME_PLACE_M
         moved = np.where(near[:, None], hypotheses[distance.argmin(axis=1)], chosen.hypotheses)
         self.chosen = replace(chosen, hypotheses=moved)
-        if np.hypot(*(chosen.places[own] - hypotheses[0])[:2]) < self.arrival_radius:
+        if np.hypot(*(chosen.places[matching] - hypotheses[0])[:2]) < self.arrival_radius:
             self._drop(tried=True)
             return None
-        return np.array(chosen.places[own])
+        return np.array(chosen.places[matching])
 
     def displacement(self, hypothesis: Array) -> Array | None:
         """The kept destination (3,) in base_link of a hypothesis (3,), as a candidate for the next `choose`.
@@ -236,8 +236,8 @@ class DestinationSelector:
         """
         if self.chosen is None:
             return None
-        own = int(_pose_distance(self.chosen.hypotheses, hypothesis).argmin())
-        return se2.between(hypothesis, self.chosen.places[own])
+        matching = int(_pose_distance(self.chosen.hypotheses, hypothesis).argmin())
+        return se2.between(hypothesis, self.chosen.places[matching])
 
     def _drop(self, *, tried: bool) -> None:
         if tried and self.chosen is not None:
@@ -249,8 +249,8 @@ class DestinationSelector:
         chosen = self.chosen
         if chosen is None or not len(places):
             return None
-        own = int(_pose_distance(chosen.hypotheses, np.asarray(motions.hypotheses, float)[0]).argmin())
-        distance = np.hypot(*(places - chosen.places[own])[:, :2].T)
+        matching = int(_pose_distance(chosen.hypotheses, np.asarray(motions.hypotheses, float)[0]).argmin())
+        distance = np.hypot(*(places - chosen.places[matching])[:, :2].T)
         nearest = int(distance.argmin())
         available = distance[nearest] < SAME_PLACE_M and np.isfinite(motions.lengths[nearest])
         return nearest if available and gain[nearest] >= self.min_gain_ratio * chosen.gain else None

@@ -1,7 +1,7 @@
 """Preset `paper`: action by descent on the free energy (equation 4).
 
-docs/method.md derives it. A belief contains its pose, the prediction error xi at that pose, weighted by its precision
-and mapped to the pose's coordinates, and the curvature H of the free energy F. The generative model itself is therefore
+docs/method.md derives it. A belief contains its pose, the prediction error xi at that pose (weighted by its precision
+and mapped to the pose's coordinates) and the curvature H of the free energy F. The generative model itself is therefore
 not needed here: to first order, the prediction error at another pose x' is xi - H (x' - pose).
 """
 
@@ -27,13 +27,13 @@ class ActionParameters:
     gamma: float = 0.3  # action step size per scan
     horizon: float = 1.0  # s, d(pose)/d(action): how long a velocity is assumed to be held
     reach: float = 2.0  # m, upper limit of the goal's attraction
-    action_precision: float = 1.0  # s²/m² relative to the pose's 1/m²; a prior on standing still that damps the sum
+    action_precision: float = 1.0  # s²/m², if the pose's is 1/m²; prior on zero velocity, which damps the motion
 
 
 def observed_position(pose: Array, xi: Array, curvature: Array | None) -> Array:
     """Position (2,) m according to the scan: the belief plus its natural-gradient step H^-1 xi.
 
-    Directions about which the scan has little information (H nearly singular) keep the belief's value.
+    Along directions about which the scan has little information (H nearly singular), it stays that of the belief.
     """
     if curvature is None:
         return np.array(pose[:2])
@@ -52,7 +52,7 @@ def preferred_position(observed: Array, goal: Array, reach: float) -> Array:
 def action_free_energy(
     action: Array, observed: Array, preferred: Array, yaw: float, parameters: ActionParameters
 ) -> float:
-    """F(a) in units of the pose's precision: the misfit of outcome and preferred position, and the effort."""
+    """F(a) in units of the pose's precision: half the squared distance to the preferred position, and effort."""
     outcome = observed + parameters.horizon * se2.rotate(yaw, action)
     misfit, effort = outcome - preferred, parameters.action_precision * parameters.horizon**2
     return float(0.5 * misfit @ misfit + 0.5 * effort * action @ action)
