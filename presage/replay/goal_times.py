@@ -40,6 +40,6 @@ class GoalTimes:
             accepted[self._last] -= 1
         if sum(accepted.values()) != count or self._first is None:
             return None
-        if self._first.goal is not None and self._first.distance is None:  # no distance: there was no belief yet
+        if self._first.goal is not None and self._first.distance is None:  # it answers a goal, not a belief
             accepted[None] = accepted.pop(self._first.stamp_ns, 0)
         return accepted
