@@ -23,10 +23,9 @@ LIVELINESS_TIMEOUT_S = 5.0  # for the router's list of tokens; it answers at onc
 MIN_OBSERVATION_S, MAX_OBSERVATION_S = 1.5, 4.0  # for a single table
 COLOURS = {"alive": "green", "starting": "cyan", "silent": "red", "gone": "red", "missing": "bold red", "off": "dim"}
 COLUMNS = (
-    "service", "state", "last seen", "up", "publishes, Hz", "receives, Hz", "dropped", "undecodable", "failed",
-    "latency", "note",
+    "service", "state", "age", "up", "sends, Hz", "gets, Hz", "dropped", "invalid", "failed", "latency", "note",
 )  # fmt: skip
-LEFT_ALIGNED = {"service", "state", "publishes, Hz", "receives, Hz", "note"}
+LEFT_ALIGNED = {"service", "state", "sends, Hz", "gets, Hz", "note"}
 
 
 def run_top(link: Link, robots: list[str], console: Console, *, once: bool) -> int:

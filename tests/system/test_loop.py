@@ -175,9 +175,9 @@ def test_up_serves_the_page(process, free_port):
     up.wait_for("all alive", 90)
     (where,) = [line.split()[-1] for line in up.output.splitlines() if line.startswith("page:")]
     with Page(where) as page:
-        assert page.recording_contents("world")["world"]["name"] == "corridor"
+        assert page.told("world")["world"]["name"] == "corridor"
         assert page.frame(lambda h: h["belief"] is not None)
-        assert page.recording_contents("services", lambda m: len(m["services"]) == 5)["missing"] == []
+        assert page.told("services", lambda m: len(m["services"]) == 5)["missing"] == []
         assert page.done("record", action="status")["recording"] is False
     assert up.stop(signal.SIGINT, 20)[0] == 130
 
