@@ -9,7 +9,7 @@ import safetensors.torch
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from common.errors import UserError
+from common.errors import UserError, first_fault
 from common.geometry.world import World
 from common.robot.scanner import Scanner
 from services.estimator.paper.decoder import Decoder, Normalisation, PaperModel, Shape
@@ -105,9 +105,7 @@ def load(path: Path) -> tuple[PaperModel, ModelCard]:
     except OSError as error:
         raise UserError(f"weights {path}: cannot be read ({error})") from None
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(map(str, first["loc"]))
-        raise UserError(f"model card {path.with_suffix('.json')}: {where}: {first['msg']}") from None
+        raise UserError(f"model card {path.with_suffix('.json')}: {first_fault(error)}") from None
     except (safetensors.SafetensorError, RuntimeError, ValueError) as error:
         raise UserError(
             f"weights {path}: this is not a file of weights of this network ({' '.join(str(error).split())[:200]})"

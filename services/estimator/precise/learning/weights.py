@@ -9,7 +9,7 @@ import numpy as np
 import safetensors.numpy
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from common.errors import UserError
+from common.errors import UserError, first_fault
 from common.geometry.world import World
 from common.robot.scanner import Scanner
 from services.estimator.precise.field import CLASSES, DistanceField, FieldModel, Seen
@@ -94,9 +94,7 @@ def load(path: Path) -> tuple[FieldModel, Array, FieldCard]:
     except OSError as error:
         raise UserError(f"weights {path}: cannot be read ({error})") from None
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(map(str, first["loc"]))
-        raise UserError(f"model card {path.with_suffix('.json')}: {where}: {first['msg']}") from None
+        raise UserError(f"model card {path.with_suffix('.json')}: {first_fault(error)}") from None
     except (safetensors.SafetensorError, KeyError, ValueError) as error:
         raise UserError(
             f"weights {path}: this is not a file of field weights ({' '.join(str(error).split())[:200]})"
