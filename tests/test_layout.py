@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests import file_list
+
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("common", "services", "presage", "lab")
 # Each layer imports only those before it; what shares a line imports nothing of one another.
@@ -222,14 +224,8 @@ def test_no_pickle():
 
 
 def test_architecture_page_lists_every_file():
-    page = (ROOT / "docs" / "architecture.md").read_text()
-    listed = {line.split("`")[1] for line in page.splitlines() if line.startswith("| `")}
-    files = {name(p) for p in SOURCES if p.name not in {"__init__.py", "__main__.py"}}
-    assert {entry for entry in listed if entry.endswith(".py")} == files
-    for path in SOURCES:
-        if name(path) in files:
-            summary = ast.get_docstring(ast.parse(path.read_text())).splitlines()[0]
-            assert f"| `{name(path)}` | {summary} |" in page, f"{name(path)}: the page has another summary"
+    page = file_list.PAGE.read_text(encoding="utf-8")
+    assert file_list.fill(page) == page, "run: python -m tests.file_list"
 
 
 def test_imports_are_read_from_source(tmp_path):

@@ -23,7 +23,7 @@ class Stamped(Message):
     """Base of all messages on topics."""
 
     stamp_ns: Count  # ns, time of the measurement that this message is about (simulation or sensor time, not wall time)
-    seq: Count = 0  # number of this message among those of its publisher on this key, from 0; a gap means loss
+    seq: Count = 0  # the publisher's counter for this key, from 0; a gap means loss
 
 
 class Scan(Stamped):
@@ -71,7 +71,7 @@ class Hypothesis(Message):
 
     pose: Pose  # base_link in map
     covariance: Matrix3 | None = None  # (3, 3) of x, y, yaw in map; nil if the estimator computes none
-    weight: Annotated[float, Field(ge=0, le=1)]  # in the mixture; the weights sum to 1
+    weight: Annotated[float, Field(ge=0, le=1)]  # share of the mixture; the weights sum to 1
 
     @model_validator(mode="after")
     def _shape(self) -> Hypothesis:
@@ -123,7 +123,7 @@ class Goal(Stamped):
 
     pose: Pose  # base_link in map
     tolerance: PositiveDistance = 0.2  # m, the goal is reached within this distance
-    yaw_tolerance: PositiveAngle | None = None  # rad, of the final heading; nil accepts any heading
+    yaw_tolerance: PositiveAngle | None = None  # rad, tolerance of the final heading; nil accepts any heading
     cancel: bool = False  # drop the goal and stop
 
 
@@ -147,7 +147,7 @@ class Status(Stamped):
     reason: Text = ""
     refused: bool = False  # blocked permanently, as the goal cannot be reached; if false, the way may become free
     goal: Pose | None = None  # base_link in map
-    goal_seq: Count = 0  # seq of the goal that this is about
+    goal_seq: Count = 0  # seq of the goal
     distance: Distance | None = None  # m, from the believed pose to the goal
 
 

@@ -85,7 +85,7 @@ def bench_chaos(
     return 1 if any(outcome.why for outcome in outcomes) else 0
 
 
-HEAD = ("fault", "detected", "robot stands", "new process", "at work again", "least speed meanwhile", "as expected")
+HEAD = ("fault", "detected", "robot stopped", "restarted", "recovered", "lowest speed", "as expected")
 
 
 def rows_of(outcomes: Sequence[FaultOutcome]) -> list[tuple[str, ...]]:
@@ -102,7 +102,7 @@ def rows_of(outcomes: Sequence[FaultOutcome]) -> list[tuple[str, ...]]:
         as_expected = sum(not row.why for row in rows)
         speed = f"{min(speeds):.2f} m/s" if speeds else ""
         times = [worst(what) for what in ("detected_s", "stopped_s", "start_s", "again_s")]
-        table_rows.append((name, *times, speed, f"{as_expected} of {len(rows)}"))
+        table_rows.append((name, *times, speed, f"{as_expected}/{len(rows)}"))
     return table_rows
 
 

@@ -173,20 +173,20 @@ def test_a_page_is_filled_from_results_and_missing_results_are_reported(tmp_path
     result.write(tmp_path, None)
     text = "before\n<!-- table e2 -->\nold\n<!-- end -->\nafter\n"
     fill_tables = page.fill_tables(text, tmp_path)
-    assert "0.0020 ± 0.0010" in fill_tables
     assert "| 2.24 | 2.2 | one scan |" in fill_tables
-    assert "\n\nA remark\n" in fill_tables
+    assert "a remark" not in fill_tables.lower()
     assert "old" not in fill_tables
     assert page.fill_tables(fill_tables, tmp_path) == fill_tables
     with pytest.raises(UserError, match="presage experiment e1"):
         page.fill_tables(text.replace("e2", "e1"), tmp_path)
 
 
-def test_the_page_agrees_with_the_stored_results():
+@pytest.mark.parametrize("name", ["experiments", "real_logs", "navigation"])
+def test_tables_of_a_page(name):
     docs = Path(__file__).resolve().parents[3] / "docs"
-    text = (docs / "experiments.md").read_text(encoding="utf-8")
+    text = (docs / f"{name}.md").read_text(encoding="utf-8")
+    assert "<!-- table " in text
     assert page.fill_tables(text, docs / "experiments") == text
-    assert "<!-- table e1 -->" in text
 
 
 def test_the_command_writes_all_files_and_is_reproducible(process, tmp_path):

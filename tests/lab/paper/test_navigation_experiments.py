@@ -133,7 +133,7 @@ def test_e3_through_the_real_processes_and_a_trial_does_not_depend_on_others(tmp
     assert summary["error_max_m"] < 0.2
     assert result.trials[0]["start"] != result.trials[1]["start"]
     assert {path.suffix for path in tmp_path.iterdir()} >= {".json", ".csv", ".pdf", ".png"}
-    assert "| precise | 2 of 2 | 0 |" in navigation.table(result.summary)
+    assert "| precise | 2/2 | 0 |" in navigation.table(result.summary)
 
     monkeypatch.setenv("PRESAGE_GAMMA", "0.01")  # the user's own settings must not affect the experiment
     other = replace(job, index=1, estimators=("particle-filter", "precise"))  # after another estimator, not trial 0
