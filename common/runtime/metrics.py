@@ -1,6 +1,6 @@
 """A service's Prometheus metrics.
 
-`python -m common.runtime.metrics` prints the table of docs/operations.md.
+`python -m common.runtime.metrics` prints the table of all metrics.
 """
 
 from __future__ import annotations
@@ -284,7 +284,7 @@ def _is_key(name: str) -> bool:
 
 
 def table() -> str:
-    """The table of metrics in docs/operations.md, as Markdown."""
+    """The table of all metrics, as Markdown."""
     head = ["| metric | kind | labels | of | what |", "|---|---|---|---|---|"]
     rows = [
         f"| `{m.sample}` | {m.kind} | {', '.join(m.labels) or '-'} | {m.exported_by} | {m.about} |" for m in METRICS

@@ -85,7 +85,7 @@ def bench_chaos(
     return 1 if any(outcome.why for outcome in outcomes) else 0
 
 
-HEAD = ("fault", "detected", "robot stopped", "restarted", "recovered", "lowest speed", "as expected")
+HEAD = ("fault", "detected (s)", "stopped (s)", "restarted (s)", "recovered (s)", "lowest speed (m/s)", "as expected")
 
 
 def rows_of(outcomes: Sequence[FaultOutcome]) -> list[tuple[str, ...]]:
@@ -96,11 +96,11 @@ def rows_of(outcomes: Sequence[FaultOutcome]) -> list[tuple[str, ...]]:
 
         def worst(what: str, rows: Sequence[FaultOutcome] = rows) -> str:
             known = [value for row in rows if (value := getattr(row, what)) is not None]
-            return f"{max(known):.2f} s" if known else ""
+            return f"{max(known):.2f}" if known else ""
 
         speeds = [row.least_speed for row in rows if row.least_speed is not None]
         as_expected = sum(not row.why for row in rows)
-        speed = f"{min(speeds):.2f} m/s" if speeds else ""
+        speed = f"{min(speeds):.2f}" if speeds else ""
         times = [worst(what) for what in ("detected_s", "stopped_s", "start_s", "again_s")]
         table_rows.append((name, *times, speed, f"{as_expected}/{len(rows)}"))
     return table_rows

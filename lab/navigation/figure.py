@@ -98,13 +98,12 @@ def _distribution(axes: Axes, by_group: Mapping[str, Rows], quantity: str, label
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
-    """The Markdown table of docs/navigation.md."""
+    """The Markdown table of docs/navigation.md. Pairs are median; maximum, of the step time mean; maximum."""
     number, mm = results.number, results.millimetres
     people = any(row["min_clearance_to_people_m"] is not None for row in summary.values())
     heads = [
-        "world, drive", "reached", "reported elsewhere", "trials with contact, moving; standing",
-        "path / shortest, median; max", "time / least, median; max", "gap to walls (m)",
-        *(["to people (m)"] if people else []), "error, median; max (mm)", "controller step (ms), mean; max",
+        "world, drive", "reached", "reported elsewhere", "contacts moving; standing", "path / shortest", "time / least",
+        "gap (m)", *(["to people (m)"] if people else []), "error (mm)", "step (ms)",
     ]  # fmt: skip
     rows = [
         [

@@ -19,7 +19,7 @@ from common.bus.inbox import Inbox, Sample
 from common.errors import UserError
 from common.messages.definitions import Belief, Health, Pose, Scan, Status, TopicHealth
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, SCAN, STATUS
-from common.runtime.metrics import METRICS, ServiceMetrics, table
+from common.runtime.metrics import METRICS, ServiceMetrics
 from common.runtime.metrics_server import split_address
 from tests.conftest import ROOT, WAIT_TIMEOUT_S
 
@@ -206,7 +206,3 @@ def test_addresses(setting, address):
 def test_invalid_addresses_are_refused(setting):
     with pytest.raises(UserError, match="PORT or HOST:PORT"):
         split_address(setting)
-
-
-def test_the_documented_table_is_current():
-    assert table() in (ROOT / "docs" / "operations.md").read_text(), "python -m common.runtime.metrics prints it"
