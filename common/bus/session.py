@@ -39,6 +39,11 @@ class Link:
     security: Credentials | None = None  # with credentials, only a router listens
     insecure: bool = False  # may listen on other addresses than loopback without credentials
 
+    @property
+    def connect_option(self) -> str:
+        """Value of ``--connect`` for other programs of the session; empty if they do not need it."""
+        return "" if self.connect == (DEFAULT_ENDPOINT,) else ",".join(self.connect)
+
 
 def _config(link: Link, join_timeout: float = JOIN_TIMEOUT_S) -> zenoh.Config:
     config: zenoh.Config = zenoh.Config()

@@ -93,7 +93,7 @@ class ReplayHeartbeat:
         if self._bus is None or self._remote is None or (now := time.monotonic()) < self._next_at:
             return
         counts = {key: {"published": count} for key, count in self._remote.counts.items()}
-        self._heart.beat(counts, linked=self._bus.linked(), note="paused" if state.paused else "")
+        self._heart.beat(counts, linked=self._bus.linked(), note="paused" if state.paused else "", idle=state.paused)
         self._next_at = now + HEARTBEAT_PERIOD_S
 
 
