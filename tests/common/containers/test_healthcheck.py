@@ -94,7 +94,7 @@ def test_a_router_is_healthy_if_a_session_opens(router, free_port, monkeypatch):
     healthcheck.main("router")
     monkeypatch.setenv("PRESAGE_CONNECT", f"tcp/127.0.0.1:{free_port()}")
     monkeypatch.setattr(healthcheck, "CONNECT_TIMEOUT_S", 0.3)
-    with pytest.raises(ValueError, match="no session through tcp/127.0.0.1:"):
+    with pytest.raises(ValueError, match="no session through tcp/127"):
         healthcheck.main("router")
 
 
