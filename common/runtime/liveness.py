@@ -44,7 +44,7 @@ State = Literal["alive", "late", "absent"]
 class Report:
     """What a service last reported about itself, in a health message or a heartbeat file."""
 
-    at: float  # time of the report
+    time: float  # when it was made
     linked: bool = True  # connected to at least one other session
     note: str = ""
     idle: bool = False  # publishes no results on purpose
@@ -79,7 +79,7 @@ def find_problem(service: str, robot: str, report: Report, now: float, never: fl
 
     ``never`` is the time from which the age of a result is counted that was not seen yet.
     """
-    if (age := now - report.at) > REPORT_TIMEOUT_S:
+    if (age := now - report.time) > REPORT_TIMEOUT_S:
         return f"no sign of life for {age:.0f} s: it is stopped, hangs, or gets no processor time"
     if not report.linked:
         return "not connected to any session; is the router running?"
@@ -145,7 +145,7 @@ class _Service:
 
     def present(self, now: float) -> bool:
         """Whether it is connected. A recent report is enough: tokens disappear while a link is re-established."""
-        return self.has_token or now - self.report.at <= REPORT_TIMEOUT_S
+        return self.has_token or now - self.report.time <= REPORT_TIMEOUT_S
 
 
 class RobotLiveness:
@@ -163,7 +163,7 @@ class RobotLiveness:
                 service.has_token, service.token_at = True, now
         for name, service in list(self._services.items()):
             service.has_token = name in names
-            if not service.has_token and now - max(service.token_at, service.report.at) > FORGET_AFTER_S:
+            if not service.has_token and now - max(service.token_at, service.report.time) > FORGET_AFTER_S:
                 del self._services[name]
 
     def add_health(self, health: Health, now: float) -> None:
@@ -216,11 +216,11 @@ class RobotLiveness:
             return ServiceLiveness(name, "absent", "not running" if self._is_needed(name, now) else "")
         # The token of a replay is all that is known about it.
         health, report = service.health, Report(now, idle=True) if name == REPLAY else service.report
-        age = now - report.at if health is not None else None
+        age = now - report.time if health is not None else None
         if not service.present(now):
-            since = max(service.token_at, service.report.at)
+            since = max(service.token_at, service.report.time)
             return ServiceLiveness(name, "absent", f"gone for {now - since:.0f} s", since, health, age)
         problem = find_problem(name, self.robot, report, now, never=service.began)
-        if now - report.at > REPORT_TIMEOUT_S:
-            return ServiceLiveness(name, "late", problem, report.at + REPORT_TIMEOUT_S, health, age)
+        if now - report.time > REPORT_TIMEOUT_S:
+            return ServiceLiveness(name, "late", problem, report.time + REPORT_TIMEOUT_S, health, age)
         return ServiceLiveness(name, "alive", problem, service.began, health, age)

@@ -146,12 +146,12 @@ class Loop:
         self.bus.request(query, request, self._request_number, self.inbox, timeout)
         return self._request_number
 
-    def reject(self, key: str, why: str) -> None:
+    def reject(self, key: str, reason: str) -> None:
         """Count a payload that could not be used, and log it at most once a second."""
         name = self.inbox.counted_as(key)
         self.undecodable[name] += 1
         if self._may_log(name):
-            self.service.log.warning("payload dropped", key=key, why=why, so_far=self.undecodable[name])
+            self.service.log.warning("payload dropped", key=key, reason=reason, so_far=self.undecodable[name])
 
     def _step(self) -> None:
         due = self.service.due()

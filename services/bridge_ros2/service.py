@@ -245,7 +245,7 @@ class BridgeRos2Service(Service):
     def on_reply(self, query: Query, number: int, reply: Reply) -> None:  # noqa: ARG002
         """Logs if the estimator did not accept the initial pose."""
         if not reply.ok:
-            self.log.warning("the estimator did not accept the initial pose", why=reply.reason)
+            self.log.warning("the estimator did not accept the initial pose", reason=reply.reason)
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
         """Publishes a belief or a command to ROS."""

@@ -134,8 +134,8 @@ class ViewerService(Service):
         if view.time_restarted:
             view.time_restarted = False
             self._tell(robot, "history", _history(view))
-        if view.log_changed:
-            view.log_changed = False
+        if view.journal_changed:
+            view.journal_changed = False
             self._tell(robot, "journal", _journal(view))
 
     def _show(self, robot: str, view: RobotView, frame: bytes | None) -> None:

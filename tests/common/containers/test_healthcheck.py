@@ -44,9 +44,9 @@ def test_heartbeats_record_when_counts_increased(tmp_path):
     first = read_beats(tmp_path, "small")["robot"]
     heart.beat({"a": {"received": 1}, "b": {"published": 2}}, linked=False, note="n", idle=True)
     second = read_beats(tmp_path, "small")["robot"]
-    assert first.last == {"a": {"received": first.at}}
-    assert second == Report(second.at, False, "n", True, {**first.last, "b": {"published": second.at}})
-    assert second.at >= first.at
+    assert first.last == {"a": {"received": first.time}}
+    assert second == Report(second.time, False, "n", True, {**first.last, "b": {"published": second.time}})
+    assert second.time >= first.time
     assert read_beats(tmp_path, "other") == {}
 
 
@@ -72,13 +72,13 @@ def test_a_frozen_service_is_unhealthy_until_it_continues(bus, process, link, tm
     beats = lambda: read_beats(tmp_path, "small").get(bus.robot)  # noqa: E731
     assert wait_until(lambda: beats() is not None and beats().linked, 30), running.output
     assert bus.wait_matching(SCAN, 30)
-    before = beats().at
+    before = beats().time
     assert check("small", tmp_path, PRESAGE_ROBOT=bus.robot) == (0, "")
     sent = Scan(
         stamp_ns=1, ranges=np.ones(5, np.float32), angle_min=-1.0, angle_increment=0.5, range_min=0.05, range_max=25.0
     )
     assert wait_until(lambda: bus.put(SCAN, sent.encode()) or SCAN.key(bus.robot) in beats().last, 30)
-    assert beats().at > before
+    assert beats().time > before
     running.send(signal.SIGSTOP)
     try:
         frozen = lambda: check("small", tmp_path, PRESAGE_ROBOT=bus.robot)  # noqa: E731

@@ -330,7 +330,7 @@ def test_the_journal_has_a_row_for_each_change_of_mind():
 
     def say(stamp, state, reason=""):
         view.add(STATUS, at(stamp)[STATUS].model_copy(update={"state": state, "reason": reason}), stamp)
-        grew, view.log_changed = view.log_changed, False
+        grew, view.journal_changed = view.journal_changed, False
         return grew
 
     assert say(1.0, "navigating")
