@@ -62,7 +62,7 @@ class ViewerService(Service):
         self.pool = ThreadPoolExecutor(16, "action")
         self.robots: dict[str, FollowedRobot] = {}
         self._reopened: set[str] = set()  # robots of replays that now show another recording
-        self._changed: deque[str] = deque()  # robots whose services came or went
+        self._changed: deque[str] = deque()  # robots whose services started or ended
         self._connect = settings.link().connect_option
         self._tick_at = 0.0
         self._web: WebServer | None = None
@@ -72,7 +72,7 @@ class ViewerService(Service):
         options = self.options
         listener = listen(options)
         self._follow(options.robot)
-        self.loop.bus.watch_robots(self._came_or_went)
+        self.loop.bus.watch_robots(self._on_liveliness)
         lookup = RobotLookup(self._status, self._stamp_ns)
         context = DeskContext(
             hub=self.hub,
@@ -149,8 +149,8 @@ class ViewerService(Service):
         if robot in self.hub.watched:
             self.hub.call_soon(partial(self.hub.queue_text, robot, kind, text))
 
-    def _came_or_went(self, robot: str, service: str, there: bool) -> None:  # noqa: FBT001 - zenoh's thread
-        self.roster.change(robot, service, there)
+    def _on_liveliness(self, robot: str, service: str, alive: bool) -> None:  # noqa: FBT001 - zenoh's thread
+        self.roster.change(robot, service, alive)
         self._changed.append(robot)
         self._wake()
 
@@ -165,7 +165,7 @@ class ViewerService(Service):
         return max(0.0, min([self._tick_at - now, *waits]))
 
     def on_timer(self) -> None:
-        """Sends what is due; see `due`."""
+        """Sends delayed frames, welcomes new visitors, and updates the list of services once a second."""
         now = time.monotonic()
         while self._reopened:
             if (followed := self.robots.get(robot := self._reopened.pop())) is not None:
