@@ -200,3 +200,4 @@ class Health(Stamped):
     counters: dict[str, Count] = {}  # noqa: RUF012 - pydantic copies defaults
     note: Text = ""  # what the service waits for, or its last problem
     instance: Name = ""  # name of the process; each process numbers its own messages
+    idle: bool = False  # publishes no results on purpose: paused, or waiting for something that the note names

@@ -58,7 +58,7 @@ class BridgeRos2Service(Service):
         self.motion = MountAndOdometry(settings.base_frame, settings.odom_frame, settings.build_mount())
         self.gate = CommandGate(settings.build_robot(), obstacle_stop=settings.obstacle_stop)
         self.self_filter = settings.build_self_filter()
-        self.note = f"waits for the zenoh router at {settings.ros_connect}"
+        self.note, self.idle = f"waiting for the zenoh router at {settings.ros_connect}", True
         self._ros: RosSession | None = None
         self._publishers: dict[str, RosPublisher] = {}  # by the option's topic name
         # Subscribed ROS topics by the name of their row: message type and handler.
@@ -69,7 +69,7 @@ class BridgeRos2Service(Service):
         self._clock: tuple[int, float] | None = None  # the last scan's stamp, and its monotonic reception time
         self._warned_waiting = False
         self._warned_unconnected_frame = False
-        self._reckoned = False  # the last scan came with odometry
+        self._with_odometry = False  # the last scan had odometry for its stamp
         self._map: Any = None  # the map message
         self._map_at = 0.0  # when the map is published next
         self._problem = ""  # why the last scan could not be used
@@ -152,6 +152,8 @@ class BridgeRos2Service(Service):
             self._connect()
             self._check_at = time.monotonic() + CHECK_PERIOD_S
         before = self.note
+        linked = self._ros is not None and self._ros.linked()
+        self.idle = not linked
         if self._ros is not None:
             self._publish_map(now)
             static = self.options.topic(self.options.tf_topic + "_static")
@@ -162,10 +164,10 @@ class BridgeRos2Service(Service):
                 self.options,
                 self.graph,
                 self._problem,
-                linked=self._ros.linked(),
-                quiet=now - since,
-                heard=self._scan_at is not None,
-                reckoned=self._reckoned,
+                linked=linked,
+                scan_age=now - since,
+                received=self._scan_at is not None,
+                with_odometry=self._with_odometry,
             )
             self._warn_about_unconnected_frame(now)
         if self.note and self.note != before:
@@ -220,7 +222,7 @@ class BridgeRos2Service(Service):
         scan = scan_of(message, mount, stamp_ns)
         self._clock = (stamp_ns, now)
         odometry = self.motion.at(stamp_ns)
-        self._reckoned = odometry is not None
+        self._with_odometry = odometry is not None
         if odometry is not None:
             self.publish(ODOM, odom_of(odometry))
         else:
@@ -243,7 +245,7 @@ class BridgeRos2Service(Service):
     def on_reply(self, query: Query, number: int, reply: Reply) -> None:  # noqa: ARG002
         """Logs if the estimator did not accept the initial pose."""
         if not reply.ok:
-            self.log.warning("the estimator did not accept the initial pose", why=reply.reason)
+            self.log.warning("the estimator did not accept the initial pose", reason=reply.reason)
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
         """Publishes a belief or a command to ROS."""

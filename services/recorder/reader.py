@@ -66,14 +66,14 @@ class Recording:
         """One line for the user if the file is incomplete, else an empty string."""
         if self.complete:
             return ""
-        why = (
+        consequence = (
             "the recorder is still writing it, or was killed"
             if self.path.suffix == ".active"
             else "it is cut short or damaged"
         )
         readable = "the messages" if self._finished else f"the {sum(self._counts.values())} messages"
         return (
-            f"{self.path}: incomplete ({self.problem}): {why}; {readable} before that can be used, and "
+            f"{self.path}: incomplete ({self.problem}): {consequence}; {readable} before that can be used, and "
             "`presage recover` writes a complete file from the readable part"
         )
 

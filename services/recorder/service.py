@@ -78,11 +78,11 @@ class RecorderService(Service):
         state = self._state()
         if request.action == "start":
             if self.recording is not None:
-                return state.model_copy(update={"ok": False, "reason": f"records already, into {state.file}"})
+                return state.model_copy(update={"ok": False, "reason": f"already recording, into {state.file}"})
             self._begin(numbered=True)
         elif request.action == "stop":
             if self.recording is None:
-                return state.model_copy(update={"ok": False, "reason": "records nothing: start first"})
+                return state.model_copy(update={"ok": False, "reason": "not recording"})
             self._write_answers()
             self._end()
         return self._state()
@@ -187,7 +187,8 @@ class RecorderService(Service):
 
     def _update_note(self) -> None:
         """Sets the note in the health message."""
-        self.note = self._no_link_note or ("" if self.recording is not None else "records nothing until told")
+        self.idle = self.recording is None
+        self.note = self._no_link_note or ("not recording until a request starts it" if self.idle else "")
 
     def _write_answers(self) -> None:
         if self.describer is None:

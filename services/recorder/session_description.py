@@ -100,7 +100,7 @@ class DescriptionCollector:
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="describer", daemon=True)
         self._thread.start()
-        bus.watch_alive(lambda service, there: self._events.put((service, there)))
+        bus.watch_alive(lambda service, alive: self._events.put((service, alive)))
 
     def answers(self) -> Iterator[tuple[str, DescriptionReply]]:
         """Yields service and reply for each reply since the last call."""
@@ -139,7 +139,7 @@ class DescriptionCollector:
         except UserError as error:
             delay, attempts = RETRY_DELAY_S if attempts + 1 < MAX_ATTEMPTS else None, attempts + 1
             if not self._stopping.is_set():
-                self._log.warning("a service did not describe itself", service=service, why=str(error))
+                self._log.warning("a service did not describe itself", service=service, reason=str(error))
         if delay is not None:
             self._scheduled[service, query.name] = (time.monotonic() + delay, attempts)
 
@@ -189,7 +189,7 @@ class DescriptionCollector:
             if self._weights and 0 < reply.size <= MAX_WEIGHTS_BYTES:
                 with_weights = self._bus.ask(MODEL, ModelRequest(weights=True), ModelReply, ANSWER_TIMEOUT_S)
                 if not with_weights.ok:
-                    self._log.warning("the weights are not stored", why=with_weights.reason)
+                    self._log.warning("the weights are not stored", reason=with_weights.reason)
                     with_weights = reply
             self._last[service, MODEL.name] = reply
             self._answers.put((service, with_weights))

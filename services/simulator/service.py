@@ -234,6 +234,7 @@ class SimulatorService(Service):
         waits = f"waits for {', '.join(sorted(self._required_services))}" if self._required_services else ""
         speed = f"runs at {self.speed:g} x real time" if self.speed != 1 else ""
         self.note = "paused" if self.paused else waits or speed
+        self.idle = self.paused or bool(waits)
 
     def _step(self) -> Reply:
         """Advances by one scan while paused. In lockstep the present scan must have its command first."""

@@ -235,8 +235,8 @@ def test_it_says_what_it_waits_for_and_what_is_wrong(processes, router):
     bridge = processes.start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{port}", env=wrong)
     with Ros(port, "rmw_zenoh", "jazzy") as node:
         node.publisher("scan_raw", LASER)
-        nowhere.wait_for("waits for the zenoh router at tcp/127.0.0.1:1")
-        bridge.wait_for("nobody publishes it; sensor_msgs/msg/LaserScan is on /scan_raw: --scan-topic")
+        nowhere.wait_for("waiting for the zenoh router at tcp/127.0.0.1:1")
+        bridge.wait_for("no node publishes it; set --scan-topic: sensor_msgs/msg/LaserScan is published on /scan_raw")
         put, last = node.publisher("scan", LASER), [0.0]
 
         def complains_about_tf():
@@ -247,7 +247,7 @@ def test_it_says_what_it_waits_for_and_what_is_wrong(processes, router):
 
         assert wait_until(complains_about_tf, WAIT_TIMEOUT_S), bridge.output
     theirs.kill()
-    bridge.wait_for("it is gone")
+    bridge.wait_for("the connection is lost")
     assert nowhere.stop()[0] == bridge.stop()[0] == 0
 
 
@@ -262,9 +262,9 @@ def test_it_says_which_distro_and_flavor_fit_and_that_nobody_is_there(processes,
         node.publisher("scan", LASER)
         humble, dds = bridge("humble", port, "--distro", "humble"), bridge("dds", port, "--flavor", "ros2dds")
         far, alone = bridge("far", port, "--domain", "7"), bridge("alone", empty)
-        humble.wait_for("the types of /robot have hashes, as from Iron on: --distro jazzy")
-        dds.wait_for("it is rmw_zenoh that speaks, not zenoh-bridge-ros2dds: --flavor rmw_zenoh")
-        far.wait_for("nobody is seen in ROS domain 7, but in 0: --domain 0")
-        alone.wait_for(f"nothing of ROS is heard at tcp/127.0.0.1:{empty}: is that the robot's")
+        humble.wait_for("types of /robot have hashes, as since Iron; set --distro jazzy")
+        dds.wait_for("the robot uses rmw_zenoh, not zenoh-bridge-ros2dds; set --flavor rmw_zenoh")
+        far.wait_for("there are no nodes in ROS domain 7, but in 0; set --domain 0")
+        alone.wait_for(f"there are no ROS nodes at tcp/127.0.0.1:{empty}")
     for each in (humble, dds, far, alone):
         assert each.stop()[0] == 0

@@ -112,7 +112,7 @@ def test_what_cannot_be_is_refused_with_the_reason(recorder, bus, tell, tmp_path
     recorder("--idle", "--file", "run")
     refused = tell("stop")
     assert not refused.ok
-    assert "records nothing" in refused.reason
+    assert "not recording" in refused.reason
     assert tell("start").file.endswith("run.mcap")
     refused = tell("start")
     assert not refused.ok
@@ -177,7 +177,7 @@ def test_health_counts_all_files_and_says_when_none_is_written(recorder, bus, te
     assert wait_until(lambda: shown((3, 3, 2), ""), 20)
     tell("stop")
     send(bus, [5])
-    assert wait_until(lambda: shown((4, 3, 2), "records nothing until told"), 20)
+    assert wait_until(lambda: shown((4, 3, 2), "not recording until a request starts it"), 20)
     tell("start")
     send(bus, [6, 8])
     assert wait_until(lambda: shown((6, 5, 3), ""), 20)

@@ -113,7 +113,7 @@ def test_all_faults_of_a_session_are_found(process, bus, faulty_session, tmp_pat
     assert find_fault(found, "protocol", f"protocol {PROTOCOL + 1}")["where"] == "estimator on far"
     assert find_fault(found, "versions", "presage")["where"] == "estimator on near"
     assert "ahead of" in find_fault(found, "clocks", "estimator on far, near: its clock is 60.0 s")["what"]
-    assert find_fault(found, "frozen", "no health message came")["where"] == "viewer"
+    assert find_fault(found, "frozen", "no sign of life")["where"] == "viewer"
     assert "python -m services.controller" in find_fault(found, "missing", "controller")["advice"]
     find_fault(found, "rate", "scan: ")
     find_fault(found, "rate", "cmd_vel: 0.0 of 15 Hz")
@@ -178,4 +178,4 @@ def test_a_full_read_only_disk_and_a_world_without_weights(tmp_path, free_port):
     found = read_findings(tmp_path)
     assert "Read-only file system" in find_fault(found, "not_writable", "recordings cannot be written to")["what"]
     assert find_fault(found, "disk", "MB free")["where"] == str(disk)
-    assert f"presage train --world {world}" in find_fault(found, "weights", "no field of world 'shed'")["advice"]
+    assert f"presage train --world {world}" in find_fault(found, "weights", "no field of world 'shed'")["what"]

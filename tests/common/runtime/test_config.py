@@ -55,17 +55,14 @@ def test_precedence_of_sources(file, monkeypatch):
     assert load_settings(Settings, [*config, "--size", "4"]).size == 4
     settings = load_settings(Settings, [*config, "--size", "4"])
     assert (settings.label, settings.ratio, settings.log_level) == ("file", 0.5, "info")
+    monkeypatch.delenv("PRESAGE_SIZE")
+    assert load_settings(Settings, []).size == 1  # files do not affect later calls
 
 
 def test_the_services_section_overrides_the_top_level(file):
     text = "size: 2\nlabel: shared\nalpha: 0.1\nthing: {size: 5}\nestimator: {alpha: 1, nonsense: 2}\n"
     settings = load_settings(Settings, ["--config", file(text)])
     assert (settings.size, settings.label) == (5, "shared")
-
-
-def test_files_do_not_affect_later_calls(file):
-    load_settings(Settings, ["--config", file("size: 2\n")])
-    assert load_settings(Settings, []).size == 1
 
 
 @pytest.mark.parametrize("given", [["--label", "-3,1.5"], ["--label=-3,1.5"]])
@@ -87,14 +84,11 @@ def test_invalid_poses_are_refused(text):
         pose_of_text(text, "--mount")
 
 
-def test_poses_beyond_the_limits_are_refused():
-    with pytest.raises(UserError, match=r"--start '999999999,1': x and y must be within 10000 m of the origin"):
-        pose_of_text("999999999,1", "--start")
-
-
 def test_poses_are_converted_to_radians():
     np.testing.assert_allclose(pose_of_text("1,-2.5", "--start"), [1, -2.5, 0])
     np.testing.assert_allclose(pose_of_text("1,2,-90", "--start"), [1, 2, -np.pi / 2])
+    with pytest.raises(UserError, match=r"--start '999999999,1': x and y must be within 10000 m of the origin"):
+        pose_of_text("999999999,1", "--start")
 
 
 def test_empty_values_are_ignored_only_in_the_environment(monkeypatch):
@@ -104,6 +98,13 @@ def test_empty_values_are_ignored_only_in_the_environment(monkeypatch):
     monkeypatch.setenv("PRESAGE_SIZE", "")
     assert load_settings(Settings, []).label == "plain"
     assert load_settings(Settings, []).size == 1
+
+
+def error_of(argv, settings=Settings) -> str:
+    with pytest.raises(UserError) as caught:
+        load_settings(settings, argv)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -117,47 +118,38 @@ def test_empty_values_are_ignored_only_in_the_environment(monkeypatch):
         (["--config", "nowhere.yaml"], ["nowhere.yaml", "cannot be read"]),
     ],
 )
-def test_invalid_arguments_are_named(argv, words, tmp_path, monkeypatch):
+def test_invalid_arguments(argv, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError) as caught:
-        load_settings(Settings, argv)
-    assert "\n" not in str(caught.value)
-    assert all(word in str(caught.value) for word in words), str(caught.value)
+    assert all(word in error_of(argv) for word in words), error_of(argv)
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("content", "words"),
     [
-        ("size: [", ["not valid YAML"]),
-        ("- 1\n- 2\n", ["a mapping of settings"]),
-        ("thing: 7\n", ["thing", "a mapping of settings"]),
-        ("thing: {colour: red}\n", ["colour", "settings.yaml"]),
-        ("size: 1000\n", ["size", "settings.yaml"]),
-        ("\xff\xfe", ["settings.yaml"]),
-        ("label: 2020-13-45\n", ["settings.yaml: not valid YAML", "month"]),
-        ("[" * 20_000, ["settings.yaml: not valid YAML"]),
+        (b"size: [", "not valid YAML"),
+        (b"- 1\n- 2\n", "a mapping of settings"),
+        (b"thing: 7\n", "a mapping of settings"),
+        (b"thing: {colour: red}\n", "colour"),
+        (b"size: 1000\n", "size"),
+        (b"\xff\xfe\x00\x80", "not valid YAML"),
+        (b"label: 2020-13-45\n", "month"),
+        (b"[" * 20_000, "not valid YAML"),
     ],
 )
-def test_invalid_files_are_named(file, text, words):
-    path = file(text)
-    with pytest.raises(UserError) as caught:
-        load_settings(Settings, ["--config", path])
-    assert "\n" not in str(caught.value)
-    assert all(word in str(caught.value) for word in words), str(caught.value)
+def test_invalid_files(tmp_path, content, words):
+    path = tmp_path / "settings.yaml"
+    path.write_bytes(content)
+    error = error_of(["--config", str(path)])
+    assert words in error
+    assert "settings.yaml" in error
 
 
-def test_binary_files_are_refused(tmp_path):
-    path = tmp_path / "binary.yaml"
-    path.write_bytes(b"\xff\xfe\x00\x80")
-    with pytest.raises(UserError, match=r"binary\.yaml: not valid YAML"):
-        load_settings(Settings, ["--config", str(path)])
-
-
-def test_invalid_variables_are_named(monkeypatch):
+def test_variables(monkeypatch):
+    monkeypatch.setenv("PRESAGE_ALPHA", "x")
+    monkeypatch.setenv("PRESAGE_THING_SIZE", "7")  # only private fields have such names
+    assert load_settings(Settings, []).size == 1
     monkeypatch.setenv("PRESAGE_SIZE", "-1")
-    with pytest.raises(UserError, match="PRESAGE_SIZE") as caught:
-        load_settings(Settings, [])
-    assert "\n" not in str(caught.value)
+    assert "PRESAGE_SIZE" in error_of([])
 
 
 def test_an_unknown_option_ends_with_status_2(capsys):
@@ -165,12 +157,6 @@ def test_an_unknown_option_ends_with_status_2(capsys):
         load_settings(Settings, ["--colour", "red"])
     assert ended.value.code == 2
     assert "unrecognized arguments: --colour" in capsys.readouterr().err
-
-
-def test_other_variables_are_ignored(monkeypatch):
-    monkeypatch.setenv("PRESAGE_ALPHA", "x")
-    monkeypatch.setenv("PRESAGE_THING_SIZE", "7")  # only private fields have such names
-    assert load_settings(Settings, []).size == 1
 
 
 def test_print_config_prints_the_settings_as_yaml(file, capsys):
@@ -195,11 +181,6 @@ def test_help_shows_program_settings_and_examples(capsys):
         assert f"--{name.replace('_', '-')}" in text
 
 
-def test_settings_are_frozen():
-    with pytest.raises(ValueError, match="frozen"):
-        load_settings(Settings, []).size = 3
-
-
 def test_endpoints_are_split_at_commas():
     assert split_endpoints(" tcp/a:1, tcp/b:2,, ") == ("tcp/a:1", "tcp/b:2")
     assert split_endpoints("") == ()
@@ -217,9 +198,8 @@ def test_a_router_ignores_the_settings_of_services(file, monkeypatch):
     assert load_settings(RouterSettings, [*own, "--listen", "tcp/127.0.0.1:6"]).listen == "tcp/127.0.0.1:6"
 
 
-def test_a_routers_errors_and_help_name_its_variables(monkeypatch, capsys):
-    with pytest.raises(UserError, match="PRESAGE_ROUTER_LISTEN"):
-        load_settings(RouterSettings, ["--listen", ""])
+def test_a_routers_errors_and_help_name_its_variables(capsys):
+    assert "PRESAGE_ROUTER_LISTEN" in error_of(["--listen", ""], RouterSettings)
     with pytest.raises(SystemExit):
         load_settings(RouterSettings, ["--help"])
     text = capsys.readouterr().out
