@@ -263,10 +263,13 @@ class ServiceMetrics(Collector):
     def _states(self) -> Iterator[Metric]:
         """Metrics of the last belief and the last controller status."""
         last = dict(self._last)
-        beliefs = {robot: message for robot, message in last.items() if isinstance(message, Belief)}
-        if beliefs:
-            values = [((robot, self.service), belief.free_energy) for robot, belief in beliefs.items()]
-            yield family("presage_free_energy_nats", values)
+        energies = [
+            ((robot, self.service), message.free_energy)
+            for robot, message in last.items()
+            if isinstance(message, Belief) and message.free_energy is not None
+        ]
+        if energies:
+            yield family("presage_free_energy_nats", energies)
         for name, kind in (("presage_estimator_state", Belief), ("presage_controller_state", Status)):
             states: list[tuple[tuple[str, ...], float]] = [
                 ((robot, self.service, state), float(state == message.state))
