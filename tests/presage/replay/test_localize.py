@@ -247,16 +247,16 @@ def test_choices_that_leave_nothing(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["csv", "json"])
 def test_an_interrupted_run_keeps_its_rows(tmp_path, capsys, monkeypatch, suffix):
-    file, out, given = npz(tmp_path), tmp_path / f"poses.{suffix}", Scans.observation
+    file, out, given = npz(tmp_path), tmp_path / f"poses.{suffix}", Scans.__getitem__
 
-    def interrupted_at_the_fifth(scans, k, **how):
+    def interrupted_at_the_fifth(scans, k):
         if k < 4:
-            return given(scans, k, **how)
+            return given(scans, k)
         if suffix == "csv":  # also of a run that is killed
             assert len(out.read_text().splitlines()) == 1 + 4
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Scans, "observation", interrupted_at_the_fifth)
+    monkeypatch.setattr(Scans, "__getitem__", interrupted_at_the_fifth)
     with pytest.raises(KeyboardInterrupt):
         localize(job(file, out=out), Console(width=500))
     last = capsys.readouterr().out.splitlines()[-2:]
