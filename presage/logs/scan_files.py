@@ -172,7 +172,7 @@ def _read_recording(path: Path) -> Scans:
     commands, goals = [], []  # of each scan
     command = goal = unknown = np.full(3, np.nan)
     key_of = _StampCounter()
-    for _, message, _ in entries(recording, robot_of(recording, ""), SCAN, ODOM, TRUTH, CMD_VEL, GOAL):
+    for _, message, _ in entries(recording, robot_of(recording), SCAN, ODOM, TRUTH, CMD_VEL, GOAL):
         if isinstance(message, Scan) and (not scans or message.stamp_ns != scans[-1].stamp_ns):
             scans.append(message)
             keys.append(key_of(message))

@@ -121,7 +121,7 @@ def load_session(path: Path) -> RecordedSession:
 
 def gather_session(recording: Recording) -> RecordedSession:
     """Gathers the messages of the recording's robot."""
-    robot = robot_of(recording, "")
+    robot = robot_of(recording)
     session = RecordedSession(
         world=recording.world(),
         robot=robot or recording.metadata.get("presage", {}).get("robot", "unknown"),

@@ -18,10 +18,11 @@ from common.errors import UserError
 from common.geometry import se2
 from common.messages.definitions import Belief, CmdVel, Pose, Status, Truth, Twist
 from common.messages.topics import BELIEF, PREDICTION, SCAN, TRUTH
+from presage.recordings.selection import robot_of
 from presage.replay import rerun as shell
 from presage.replay.comparison import MessagePairs, ReplayOutcome
 from presage.replay.goal_times import GoalTimes
-from presage.replay.recorded_session import estimator_settings, recorded_settings, robot_of
+from presage.replay.recorded_session import estimator_settings, recorded_settings
 from presage.replay.report import BeliefSeries, ComparisonBuilder
 from presage.replay.rerun import RerunOptions, rerun_command, unused_robot_name
 from presage.replay.service_replay import describe
