@@ -60,7 +60,7 @@ class ScanFeed:
             self._process(raw, answered_stamps)
         outcome = self.outcome
         outcome.unanswered = max(0, outcome.given - self._answers)
-        if outcome.unanswered == outcome.given:
+        if outcome.unanswered == outcome.given > 0:
             raise UserError(f"the estimator answered no scan: {self.services.notes or 'the log above says why'}")
 
     def _process(self, raw: Raw, answered_stamps: Counter[int]) -> None:
