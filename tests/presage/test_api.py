@@ -63,7 +63,7 @@ def test_examples_of_a_page(page, ranges, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     for block in blocks:
-        exec(block, names)  # noqa: S102 - the page's own code
+        exec(block, names)
         np.testing.assert_allclose(names["belief"].pose, POSE, atol=0.02)
 
 
