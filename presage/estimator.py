@@ -63,12 +63,11 @@ class Estimator:
             descent: parameters of preset "paper".
 
         """
-        named = isinstance(model, str | Path)
         choice = Choice(
             world if isinstance(world, World) else str(world),
             preset,
-            model=str(model) if named else "",
-            generative_model=None if named else model,
+            model=str(model) if isinstance(model, str | Path) else "",
+            generative_model=None if isinstance(model, str | Path) else model,
             likelihood=likelihood,
             models=models,
             sigma=sigma,

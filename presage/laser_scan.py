@@ -29,7 +29,8 @@ class LaserScan(Observation):
     reference: Array | None = None  # (3,) true or reference pose, base_link in map; estimators do not use it
 
     def __post_init__(self) -> None:
-        ranges, angles = np.asarray(self.ranges, np.float64), np.asarray(self.angles, np.float64)
+        ranges: Array = np.asarray(self.ranges, float)
+        angles: Array = np.asarray(self.angles, float)
         if ranges.ndim != 1 or ranges.shape != angles.shape:
             raise UserError(f"a scan needs as many ranges as angles, not shapes {ranges.shape} and {angles.shape}")
         stored = {
