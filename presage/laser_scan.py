@@ -29,12 +29,12 @@ class LaserScan(Observation):
     reference: Array | None = None  # (3,) true or reference pose, base_link in map; estimators do not use it
 
     def __post_init__(self) -> None:
-        ranges: Array = np.asarray(self.ranges, float)
-        angles: Array = np.asarray(self.angles, float)
+        ranges, angles = np.asarray(self.ranges, float), np.asarray(self.angles, float)
         if ranges.ndim != 1 or ranges.shape != angles.shape:
             raise UserError(f"a scan needs as many ranges as angles, not shapes {ranges.shape} and {angles.shape}")
+        ranges = normalise_driver_ranges(ranges, 0.0, self.range_max)
         stored = {
-            "ranges": ranges_for_localisation(normalise_driver_ranges(ranges, 0.0, self.range_max)),
+            "ranges": ranges_for_localisation(ranges),
             "angles": angles,
             **{name: self._pose(name) for name in ("mount", "odom", "command", "goal", "reference")},
         }

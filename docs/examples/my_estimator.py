@@ -4,10 +4,12 @@ Run it beside the other services: presage up --no-estimator; python my_estimator
 The base class connects, receives, sends health once a second, and ends at Ctrl-C.
 """
 
+from typing import Any
+
 from common.geometry import se2
 from common.geometry.pose_text import pose_of_text
-from common.messages.definitions import Belief, Odom, Pose, Scan
-from common.messages.topics import BELIEF, ODOM, SCAN
+from common.messages.definitions import Belief, Pose
+from common.messages.topics import BELIEF, ODOM, SCAN, Topic
 from common.runtime.config import ServiceSettings
 from common.runtime.service import Service, main
 
@@ -25,14 +27,16 @@ class MyEstimator(Service):
     name = "estimator"
     inputs = (ODOM, SCAN)
 
-    def open(self):
+    def open(self) -> None:
+        """Reads the settings."""
         self.start, self.first, self.odom = pose_of_text(self.settings.start, "--start"), None, None
 
-    def on_message(self, topic, message):
-        if isinstance(message, Odom):
+    def on_message(self, topic: Topic, message: Any) -> None:
+        """Stores odometry, and answers scans."""
+        if topic is ODOM:
             self.odom = message.pose.array()
             self.first = self.odom if self.first is None else self.first
-        elif isinstance(message, Scan) and self.odom is not None:
+        elif self.odom is not None:
             pose = se2.compose(self.start, se2.between(self.first, self.odom))
             self.publish(BELIEF, Belief(stamp_ns=message.stamp_ns, state="tracking", pose=Pose.of(pose)))
 
