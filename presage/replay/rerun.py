@@ -81,6 +81,8 @@ def rerun_command(job: RerunOptions, json_file: Path | None, console: Console) -
         localised = run(prepare(choice, console), scans, start=choice.initial_pose)
         with closing(progress(localised, "localising", len(scans), console)) as shown:
             old, new = write_recording(recording, robot, settings, scans, shown, out)
+    if foreign := sum(count for key, count in recording.counts().items() if topic_of(key) is None):
+        console.print(f"{foreign} messages on keys that do not belong to presage are not copied")
     comparison = compare(old, new, scans.truth)
     console.print(table(comparison))
     for path in (out, *draw(comparison, out)):
