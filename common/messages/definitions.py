@@ -81,17 +81,20 @@ class Hypothesis(Message):
 
 
 class Belief(Stamped):
-    """The estimator's posterior of the pose: one for each scan, with the stamp of the scan."""
+    """The estimator's posterior of the pose: one for each scan, with the stamp of the scan.
+
+    Any estimator can publish it: what it does not compute stays nil.
+    """
 
     state: Literal["localising", "tracking", "ambiguous", "lost"]
     pose: Pose  # base_link in map
     covariance: Matrix3 | None = None  # (3, 3) of x, y, yaw in map; nil if the estimator computes none
-    xi: Annotated[Floats, Field(description="prediction error in pose space")]
-    # (3,) xi = dg' Pi (o - g), the negative gradient of accuracy in map: 1/m, 1/m, 1/rad (nats)
+    xi: Floats | None = None  # (3,) prediction error in pose space, xi = dg' Pi (o - g),
+    # the negative gradient of accuracy in map: 1/m, 1/m, 1/rad (nats)
     curvature: Matrix3 | None = None  # (3, 3) dg' Pi dg, Gauss-Newton Hessian of F at the pose, map
-    free_energy: Finite  # nats, accuracy + complexity
-    accuracy: Finite  # nats, -ln p(o | pose)
-    complexity: Finite = 0.0  # nats, divergence of the posterior from the prior
+    free_energy: Finite | None = None  # nats, accuracy + complexity
+    accuracy: Finite | None = None  # nats, -ln p(o | pose)
+    complexity: Finite | None = None  # nats, divergence of the posterior from the prior
     hypotheses: Annotated[list[Hypothesis], Field(max_length=64)] = []  # noqa: RUF012
     # best first; the first one is at `pose`
     estimator: Name = ""
@@ -99,7 +102,7 @@ class Belief(Stamped):
 
     @model_validator(mode="after")
     def _shapes(self) -> Belief:
-        if self.xi.shape != (3,):
+        if self.xi is not None and self.xi.shape != (3,):
             raise ValueError(f"xi has shape {self.xi.shape}, not (3,)")
         for name in ("covariance", "curvature"):
             matrix = getattr(self, name)

@@ -224,7 +224,7 @@ class ServiceMetrics(Collector):
         elif isinstance(message, Belief | Status):
             for state in STATES[type(message)]:
                 self._states[type(message)].labels(robot, self.service, state).set(state == message.state)
-            if isinstance(message, Belief):
+            if isinstance(message, Belief) and message.free_energy is not None:
                 self._free_energy.labels(robot, self.service).set(message.free_energy)
 
     def collect(self) -> Iterator[Metric]:

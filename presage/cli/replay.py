@@ -80,14 +80,14 @@ def replay(
             raise UserError("--json and --every-scan go with --with: a plain replay compares nothing")
         run_replay(file, link_of(connect, "robot", "replay"), choice, console)
         return
-    if only or leave_out or robot or force or loop or paused or stay or start is not None or end is not None:
+    chosen = (rate, start, end)
+    if only or leave_out or robot or force or loop or paused or stay or any(value is not None for value in chosen):
         raise UserError(
-            "--with replays all recorded inputs of the services: of the options that choose what to replay, only --rate"
-            " can be combined with it"
+            "--with sends all recorded inputs as fast as possible: leave out the options that choose what to replay"
         )
     from presage.replay.service_replay import ServiceReplayOptions, service_replay_command  # noqa: PLC0415
 
-    options = ServiceReplayOptions(file, with_services, rate, every_scan=every_scan)
+    options = ServiceReplayOptions(file, with_services, every_scan)
     raise typer.Exit(service_replay_command(options, json_file, console))
 
 

@@ -106,7 +106,8 @@ def open_rosbag(path: Path, kind: Literal["ros1", "ros2"], reading: Reading) -> 
         raise UserError(f"{path}: the stated maximum range is {log.range_max:g} m: give it with --range-max")
     log.odometry, odom = poses.odometry(topics.odom, base, notes)
     log.reference, reference = poses.reference(topics.reference, base, reading, notes)
-    log.read = lambda: _read_scans(bag, log, odom, reference, by_logger=by_logger, flipped=mount.upside_down)
+    topic, flipped = topics.scan[0].topic, mount.upside_down
+    log.read = lambda: _read_scans(bag, log, topic, odom, reference, by_logger=by_logger, flipped=flipped)
     return log
 
 
@@ -174,9 +175,9 @@ def _angles(scan: Any, *, flipped: bool) -> tuple[Array, bool]:
 
 
 def _read_scans(
-    bag: Bag, log: Log, odom: Lookup, reference: Lookup, *, by_logger: bool, flipped: bool
+    bag: Bag, log: Log, topic: str, odom: Lookup, reference: Lookup, *, by_logger: bool, flipped: bool
 ) -> Iterator[LoggedScan]:
-    topic, resampled_scans = log.format.split("(")[1].rstrip(")"), 0
+    resampled_scans = 0
     with bag.open() as reader:
         connections = [c for c in reader.connections if c.topic == topic and c.msgtype == SCAN]
         for _, logged_ns, scan in bag.messages(reader, connections):

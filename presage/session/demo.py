@@ -136,7 +136,8 @@ def _localise(watch: Watch, stack: Stack, console: Console) -> bool:
                     if isinstance(truth, Truth)
                     else "truth unknown"
                 )
-                line.update(f"localising: scan {belief.seq}, F = {belief.free_energy:.0f} nats, {error}")
+                energy = "" if belief.free_energy is None else f"F = {belief.free_energy:.0f} nats, "
+                line.update(f"localising: scan {belief.seq}, {energy}{error}")
                 if belief.state == "tracking":
                     console.print(f"localised after {belief.seq + 1} scans, {error}")
                     return True

@@ -152,7 +152,7 @@ class EstimatorService(Service):
 
     def conclude(self, scan: Scan, posterior: Posterior, estimator: str) -> None:
         """Publishes the belief and the prediction after a scan."""
-        belief, prediction = _belief(scan, posterior, estimator), _prediction(scan, posterior)
+        belief, prediction = belief_message(scan, posterior, estimator), prediction_message(scan, posterior)
         self.last = (scan.stamp_ns, belief, prediction)
         self._answer(belief, prediction)
 
@@ -202,7 +202,8 @@ class EstimatorService(Service):
         )
 
 
-def _belief(scan: Scan, posterior: Posterior, estimator: str) -> Belief:
+def belief_message(scan: Scan, posterior: Posterior, estimator: str) -> Belief:
+    """The posterior after a scan as a message."""
     return Belief(
         stamp_ns=scan.stamp_ns,
         state=posterior.state,
@@ -221,7 +222,8 @@ def _belief(scan: Scan, posterior: Posterior, estimator: str) -> Belief:
     )
 
 
-def _prediction(scan: Scan, posterior: Posterior) -> Prediction:
+def prediction_message(scan: Scan, posterior: Posterior) -> Prediction:
+    """The scan expected at the posterior's pose as a message."""
     return Prediction(
         stamp_ns=scan.stamp_ns,
         angle_min=scan.angle_min,

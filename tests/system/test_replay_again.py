@@ -86,7 +86,7 @@ def test_missing_contents_of_a_recording_are_reported(process, tmp_path):
     started = {
         "the estimator's configuration was not recorded": ("replay", str(file), "--with", "estimator"),
         "give estimator, or estimator,controller": ("replay", str(file), "--with", "simulator"),
-        "only --rate can be combined with it": ("replay", str(file), "--with", "estimator", "--loop"),
+        "leave out the options that choose what to replay": ("replay", str(file), "--with", "estimator", "--loop"),
         "go with --with": ("replay", str(file), "--every-scan"),
         "--robot 'a/b'": ("replay", str(file), "--robot", "a/b"),
     }

@@ -62,7 +62,7 @@ class StraightLinePolicy:
         if self._goal is None:
             return Decision()
         pose = belief.pose.array()
-        observed = observed_position(pose, belief.xi.astype(np.float64), belief.curvature)
+        observed = observed_position(pose, belief.xi, belief.curvature)
         preferred = preferred_position(observed, self._goal, self.parameters.reach)
         self._action = next_action(self._action, observed, preferred, float(pose[2]), self.parameters)
         return Decision(np.array([self._action[0], self._action[1], 0.0]))

@@ -70,6 +70,7 @@ def test_scan_corrects_the_belief_to_first_order():
 def test_belief_is_kept_without_curvature_or_information():
     pose = np.array([1.0, 2.0, 0.0])
     assert observed_position(pose, np.array([100.0, 0, 0]), None) == pytest.approx(pose[:2])
+    assert observed_position(pose, None, np.eye(3)) == pytest.approx(pose[:2])
     blind = np.diag([400.0, 0.0, 0.0])  # a bare corridor has no information along y
     found = observed_position(pose, np.array([40.0, 0.0, 0.0]), blind)
     assert found == pytest.approx([1.1, 2.0], abs=1e-3)
