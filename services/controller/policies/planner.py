@@ -17,6 +17,7 @@ from services.controller.policies.active_localisation import ActiveLocaliser
 from services.controller.policies.decision import Decision
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import WALL_COST_RANGE_M, CostField, FreeSpaceGraph
+from services.controller.policies.goal_check import refusal_text, wall_refusal
 from services.controller.policies.motion_model import is_moving, turn_to_attractor
 from services.controller.policies.obstacles import TemporaryObstacles
 from services.controller.policies.policy import Surroundings, choose, least_distance
@@ -69,24 +70,17 @@ class GeodesicPolicy:
 
     def refusal(self, goal: Array) -> str | None:
         """Why a goal (2,) m cannot be reached by the map, with the nearest place that can. None if it can."""
-        component = self._component
-        cell = self.graph.nearest_free(goal, self.robot.radius, map_only=True)
-        clearance = float(self.world.clearance(goal)[0])
-        reachable = cell is not None and component in (None, self.graph.component[cell])
-        if clearance >= self.robot.radius and reachable:
-            return None
-        if clearance < 0:
-            why = "is inside something, or off the map"
-        elif clearance < self.robot.radius or cell is None:
-            why = f"is {clearance:.2f} m from a wall"
-        else:
-            why = "cannot be reached from here"
-        nearest = self.graph.nearest_free(goal, component=component, map_only=True)
-        alternative = ""
-        if nearest is not None:
-            x, y = self.free.grid.centres([nearest])[0]
-            alternative = f"; the nearest place that can be reached is ({x:.2f}, {y:.2f})"
-        return f"goal refused: ({goal[0]:.2f}, {goal[1]:.2f}) in {self.world.name} {why}{alternative}"
+        refusal = wall_refusal(self.world, goal, self.robot.radius)
+        if refusal is None:
+            cell = self.graph.nearest_free(goal, self.robot.radius, map_only=True)
+            if cell is not None and self._component in (None, self.graph.component[cell]):
+                return None
+            refusal = refusal_text(self.world, goal, "cannot be reached from here")
+        nearest = self.graph.nearest_free(goal, component=self._component, map_only=True)
+        if nearest is None:
+            return refusal
+        x, y = self.free.grid.centres([nearest])[0]
+        return f"{refusal}; the nearest place that can be reached is ({x:.2f}, {y:.2f})"
 
     def set_goal(self, goal: Array | None) -> None:
         """Set the goal (2,) m in map, or none."""
