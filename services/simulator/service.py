@@ -1,4 +1,4 @@
-"""The process: pace, topics and requests around Simulation."""
+"""The simulator service: commands in; scans, odometry and truth out, at the chosen pace."""
 
 from __future__ import annotations
 

@@ -141,7 +141,7 @@ def test_stops_without_a_belief_and_keeps_the_goal():
 def test_refused_goal_keeps_its_reason_without_a_belief():
     navigator = Navigator(world=ROOM)
     navigator.on_goal(goal(8.5, -3))
-    refusal = navigator.status(5, None)
+    refusal = navigator.goal_state.status(5, None)
     assert (refusal.state, refusal.refused) == ("blocked", True)
     assert navigator.stop_without_belief(5, "no belief")[1] == refusal
 

@@ -9,6 +9,7 @@ from common.geometry.world import Obstacle, World, load_world
 from common.messages.definitions import Belief, Goal, Pose
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
+from services.controller.goal_state import Phase
 from services.controller.navigator import Navigator
 from services.controller.policies.planner import GeodesicPolicy
 from services.simulator.simulation import Setup, Simulation
@@ -154,9 +155,9 @@ def test_refusal_names_the_nearest_reachable_place():
     world = World(name="two", boundary=[(0, 0), (10, 0), (10, 5), (0, 5)], obstacles=walls)
     navigator = Navigator(world=world, preset=GeodesicPolicy(Robot(), world))
     navigator.on_goal(Goal(stamp_ns=0, pose=Pose(x=5.0, y=2.5)))
-    assert (navigator.state, "is inside something" in navigator.reason) == ("blocked", True)
+    assert (navigator.goal_state.phase, "is inside something" in navigator.goal_state.reason) == (Phase.REFUSED, True)
     navigator.on_goal(Goal(stamp_ns=0, pose=Pose(x=0.2, y=2.5)))
-    assert "is 0.20 m from a wall; the nearest place that can be reached is (0.35, 2." in navigator.reason
+    assert "is 0.20 m from a wall; the nearest place that can be reached is (0.35, 2." in navigator.goal_state.reason
     # In the other room: refused as soon as it is known in which room the robot is.
     navigator.on_goal(Goal(stamp_ns=0, pose=Pose(x=8.0, y=2.5)))
     simulation = Simulation(Setup(world, SCANNER, Robot(), (2.0, 2.5, 0.0)))
