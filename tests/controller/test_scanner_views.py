@@ -12,12 +12,12 @@ from common.robot.base import Robot
 from common.robot.scan_geometry import ALL_ROUND, Sector, Sweep
 from common.robot.scanner import SCANNERS
 from services.controller.navigator import Navigator
+from services.controller.policies.action_selection import VIEW_MARGIN_RAD, Surroundings, select_action
 from services.controller.policies.active_localisation import ActiveLocaliser
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.motion_model import turn_to_attractor
 from services.controller.policies.obstacles import TemporaryObstacles
 from services.controller.policies.planner import BLIND_AHEAD, GeodesicPolicy
-from services.controller.policies.policy import VIEW_MARGIN_RAD, Surroundings, choose
 from services.simulator.simulation import Setup, Simulation
 from tests.controller.policies.test_planner import belief_at
 
@@ -77,7 +77,7 @@ def test_actions_stay_within_the_view(centre, half_deg):
     view = Sector(centre, np.deg2rad(half_deg))
     for goal in np.arange(0, 2 * np.pi, 0.5):
         attractor = 3 * np.array([np.cos(goal), np.sin(goal)])
-        action = choose(np.zeros(3), attractor, around(view), Robot()).action
+        action = select_action(np.zeros(3), attractor, around(view), Robot()).action
         if np.hypot(*action[:2]) > 0.02:
             off = abs(float(se2.wrap(np.arctan2(action[1], action[0]) - centre)))
             assert off <= max(view.half - VIEW_MARGIN_RAD, view.half / 3) + 1e-6

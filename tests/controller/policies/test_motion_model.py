@@ -11,6 +11,7 @@ from common.geometry import se2
 from common.robot.base import Robot
 from common.robot.scan_geometry import Sector
 from common.runtime import safety
+from services.controller.policies.action_selection import Surroundings, select_action, to_go
 from services.controller.policies.motion_model import (
     HOLD_S,
     braking_speed,
@@ -19,7 +20,6 @@ from services.controller.policies.motion_model import (
     turn_rate,
     turn_to_attractor,
 )
-from services.controller.policies.policy import Surroundings, choose, to_go
 
 DRIVES = [Robot(), Robot(drive="differential")]
 PERIOD = 1 / 15
@@ -78,7 +78,7 @@ def test_turn_is_braked_in_time(angle):
 @given(x=st.floats(-4, 4), y=st.floats(-4, 4), v=speeds, w=speeds)
 def test_choice_never_increases_the_distance(robot, x, y, v, w):
     current, goal = np.array([v, 0.0, w]), np.array([x, y])
-    choice = choose(current, goal, around(), robot)
+    choice = select_action(current, goal, around(), robot)
     poses, _, _ = rollouts(current, np.zeros((1, 3)), robot)
     assert to_go(choice.motion[-1], goal, robot) <= to_go(poses[0, -1], goal, robot) + 1e-9
     assert np.hypot(*choice.action[:2]) <= robot.max_speed + 1e-9
@@ -93,7 +93,7 @@ def test_speed_is_kept_up_to_the_goal(robot):
     pose, velocity, taken = np.zeros(3), np.zeros(3), 0
     goal = np.array([4.0, 0.0])
     while np.hypot(*(goal - pose[:2])) > 0.05 and taken < 200:
-        choice = choose(velocity, se2.rotate(-pose[2], goal - pose[:2]), around(), robot)
+        choice = select_action(velocity, se2.rotate(-pose[2], goal - pose[:2]), around(), robot)
         velocity = safety.ramp(velocity, choice.action, robot, PERIOD)
         pose, taken = se2.compose(pose, velocity * PERIOD), taken + 1
     least = 4.0 / robot.max_speed + robot.max_speed / robot.acceleration  # accelerate, cruise, brake
@@ -107,7 +107,7 @@ def test_chosen_motion_is_free_until_standstill(robot, points, seed):
     points = [p for p in points if np.hypot(*p) > 0.35]
     v, w = np.random.default_rng(seed).uniform([0, -1], [0.5, 1])
     here = around(points, [False] * len(points))
-    choice = choose(np.array([v, 0, w]), np.array([1.5, 0.7]), here, robot)
+    choice = select_action(np.array([v, 0, w]), np.array([1.5, 0.7]), here, robot)
     if choice.action.any():
         gaps = here.gaps(choice.motion[None], np.zeros(len(choice.motion)))
         assert gaps.min() >= -1e-3
@@ -115,29 +115,29 @@ def test_chosen_motion_is_free_until_standstill(robot, points, seed):
 
 def test_moving_obstacle_slows_the_robot_and_static_one_does_not():
     robot, current, goal = Robot(), np.array([0.6, 0.0, 0.0]), np.array([3.0, 0.0])
-    still = choose(current, goal, around([(1.6, 0.0)], [False]), robot)
-    walking = choose(current, goal, around([(1.6, 0.0)], [True]), robot)
+    still = select_action(current, goal, around([(1.6, 0.0)], [False]), robot)
+    walking = select_action(current, goal, around([(1.6, 0.0)], [True]), robot)
     assert np.hypot(*still.action[:2]) > 0.6
     assert np.hypot(*walking.action[:2]) < 0.6  # driving at them it must be able to stop before they arrive
     assert walking.hindered
     assert not still.hindered
-    beside = choose(current, goal, around([(0.0, 0.5)], [False]), robot)
+    beside = select_action(current, goal, around([(0.0, 0.5)], [False]), robot)
     assert beside.action[0] > 0.6
 
 
 def test_stops_before_a_wall_across_the_path():
     wall = [(0.4, y) for y in np.linspace(-2, 2, 81)]
-    choice = choose(np.zeros(3), np.array([3.0, 0.0]), around(wall, [False] * 81), Robot(drive="differential"))
+    choice = select_action(np.zeros(3), np.array([3.0, 0.0]), around(wall, [False] * 81), Robot(drive="differential"))
     assert choice.hindered
     assert choice.motion[-1, 0] < 0.4 - 0.33 + 1e-3
 
 
 def test_turns_or_slows_towards_unseen_directions():
     behind, view = np.array([-3.0, 0.0]), Sector(0.0, np.deg2rad(135))
-    choice = choose(np.zeros(3), behind, around(view=view), Robot())
+    choice = select_action(np.zeros(3), behind, around(view=view), Robot())
     assert abs(np.arctan2(choice.action[1], choice.action[0])) <= np.pi / 2 + 1e-9  # the body is wide
     assert abs(turn_to_attractor(choice.action, behind, Robot(), may_turn=True)[2]) > 1.0
-    kept = choose(np.zeros(3), behind, around(view=view, may_turn=False), Robot())
+    kept = select_action(np.zeros(3), behind, around(view=view, may_turn=False), Robot())
     assert 0 < np.hypot(*kept.action[:2]) <= 0.25 + 1e-9
 
 
