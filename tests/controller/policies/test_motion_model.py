@@ -15,7 +15,6 @@ from services.controller.policies.action_selection import Surroundings, select_a
 from services.controller.policies.motion_model import (
     HOLD_S,
     braking_speed,
-    candidate_actions,
     rollouts,
     turn_rate,
     turn_to_attractor,
@@ -120,13 +119,6 @@ def test_moving_obstacle_slows_the_robot_and_static_one_does_not(point, moving, 
     assert (np.hypot(*selected.action[:2]) < 0.6) == hindered
 
 
-def test_stops_before_a_wall_across_the_path():
-    wall = [(0.4, y) for y in np.linspace(-2, 2, 81)]
-    selected = select_action(np.zeros(3), np.array([3.0, 0.0]), around(wall), Robot(drive="differential"))
-    assert selected.hindered
-    assert selected.motion[-1, 0] < 0.4 - 0.33 + 1e-3
-
-
 def test_turns_or_slows_towards_unseen_directions():
     behind, view = np.array([-3.0, 0.0]), Sector(0.0, np.deg2rad(135))
     action = select_action(np.zeros(3), behind, around(view=view), ROBOT).action
@@ -134,10 +126,3 @@ def test_turns_or_slows_towards_unseen_directions():
     assert abs(turn_to_attractor(action, behind, ROBOT, may_turn=True)[2]) > 1.0
     kept = select_action(np.zeros(3), behind, around(view=view, may_turn=False), ROBOT).action
     assert 0 < np.hypot(*kept[:2]) <= 0.25 + 1e-9
-
-
-@both_drives
-def test_candidates_contain_standing_and_the_current_velocity(robot):
-    actions = candidate_actions(np.array([0.3, 0.0, 0.1]), np.array([1.0, 0.2]), robot)
-    np.testing.assert_array_equal(actions[:2], [[0, 0, 0], [0.3, 0, 0.1]])
-    assert len(actions) < 130
