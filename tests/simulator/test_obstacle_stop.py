@@ -60,7 +60,7 @@ def test_no_contact_at_1_m_s(make, world):
 
 def test_no_contact_among_furniture_for_random_commands(make):
     simulation, rng = make("office"), np.random.default_rng(0)
-    for _ in range(25):
+    for _ in range(15):
         # Mostly into the field of view: forward and sideways.
         twist = Twist(vx=abs(rng.uniform(-0.7, 0.7)), vy=rng.uniform(-0.7, 0.7))
         assert not contacts(drive(simulation, twist, 1.0) + drive(simulation, Twist(wz=2.0), 0.5))

@@ -76,13 +76,12 @@ def test_contact_with_a_standing_person(make):
     assert [distance(first), distance(truths[-1])] == pytest.approx([TOUCH, TOUCH], abs=0.02)
 
 
-@pytest.mark.parametrize("offset", [-0.25, 0.0])
-def test_obstacle_stop_before_standing_people(make, offset):
-    """Drive at 1 m/s straight at one person after the other, head on or grazing."""
-    simulation = make(HALL, people=9, people_speed=0.0, seed=1)
+def test_obstacle_stop_before_standing_people(make):
+    """Drive at 1 m/s straight at one person after the other, head on and grazing in turn."""
+    simulation = make(HALL, people=12, people_speed=0.0, seed=1)
     stopped, fastest = 0, 0.0
-    for place in simulation.people.places.copy():
-        pose = np.array([*(place - [2.2, offset]), 0.0])
+    for number, place in enumerate(simulation.people.places.copy()):
+        pose = np.array([*(place - [2.2, 0.25 * (number % 2)]), 0.0])
         if simulation.placement_error(pose) or np.hypot(*(simulation.people.places - pose[:2]).T).min() < 0.9:
             continue
         simulation.teleport(pose)
@@ -99,13 +98,13 @@ def test_obstacle_stop_among_walking_people(make, kind):
     """Drive at 1 m/s among ten people, turning on the spot when stopped."""
     simulation, rng = make("office", people=10, seed=1, robot=Robot(drive=kind)), np.random.default_rng(0)
     turn, driven = 0.0, 0.0
-    for _ in range(20 * 15):
+    for _ in range(15 * 15):
         (truth,) = drive(simulation, Twist(vx=1.0, wz=turn), 1 / 15)
         assert not truth.contact
         driven += truth.twist.vx / 15
         held = truth.stopped and truth.twist.vx < 0.05
         turn = (turn or float(rng.choice([-1.5, 1.5]))) if held else 0.0
-    assert driven > 5
+    assert driven > 4
 
 
 def test_teleport_onto_a_person_moves_them(make):
