@@ -138,11 +138,15 @@ class World(Model):
             return self._free_area.signed(points)
         return self._limit_by_obstacles(points, 0.0 - self.grid.shapes.distance(FREE, points))
 
-    def why_no_room(self, place: Array, radius: float) -> str | None:
-        """Explanation why a robot of ``radius`` m cannot stand at a point (2,) or pose (3,), or None if it can."""
-        clearance = float(self.clearance(place[:2])[0])
-        if clearance >= radius:
+    def has_room(self, place: Array, radius: float) -> bool:
+        """Whether a robot of ``radius`` m can stand at a point (2,) or pose (3,)."""
+        return bool(self.clearance(place[:2])[0] >= radius)
+
+    def placement_error(self, place: Array, radius: float) -> str | None:
+        """Why a robot of ``radius`` m cannot stand at a point (2,) or pose (3,). None if it can."""
+        if self.has_room(place, radius):
             return None
+        clearance = float(self.clearance(place[:2])[0])
         what = "is inside a wall or outside" if clearance < 0 else f"is {clearance:.2f} m from a wall of"
         return f"({place[0]:.2f}, {place[1]:.2f}) {what} {self.name!r}; the robot needs {radius:g} m around it"
 

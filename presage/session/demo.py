@@ -107,10 +107,8 @@ def _choose_goal(demo: DemoOptions, world: World) -> tuple[float, float]:
         aligned = free[np.abs(free[:, 1] - start[1]) < 0.1 * (y1 - y0)]  # preset paper drives in a straight line
         farthest = aligned[np.argmax(np.abs(aligned[:, 0] - start[0]))] if len(aligned) else free[0]
         return (15.5, float(start[1])) if world.name == "corridor" else (float(farthest[0]), float(farthest[1]))
-    if (clearance := float(world.clearance(demo.goal)[0])) < robot.radius:
-        raise UserError(
-            f"goal {demo.goal}: {clearance:.2f} m from a wall of {world.name!r}, the robot's radius is {robot.radius} m"
-        )
+    if (error := world.placement_error(np.array(demo.goal), robot.radius)) is not None:
+        raise UserError(f"goal {error} (--goal)")
     return demo.goal
 
 
@@ -186,7 +184,8 @@ def _navigate(bus: Bus, watch: Watch, stack: Stack, place: tuple[float, float], 
             if status.state == "reached":
                 break
             passed = (status.stamp_ns - stamp) * 1e-9
-            if status.refused or (status.state == "lost" and passed > 5 and "standing" not in status.reason):
+            no_belief = status.state == "lost" and status.distance is None
+            if status.refused or (no_belief and passed > 5):
                 console.print(f"[bold]{status.state}: {status.reason}[/]")
                 return False
             if passed > ARRIVAL_TIMEOUT_S or time.monotonic() - start_s > WALL_TIMEOUT_S:

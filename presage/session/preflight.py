@@ -31,6 +31,6 @@ def check_services(
         settings.build_scanner()
         radius, start = settings.build_robot().radius, settings.start_pose()
         pose = loaded_world.start_pose(radius) if start is None else np.array(start)
-        if (why := loaded_world.why_no_room(pose, radius)) is not None:
-            raise UserError(f"start {why} (--start, --radius)")
+        if (error := loaded_world.placement_error(pose, radius)) is not None:
+            raise UserError(f"start {error} (--start, --radius)")
     check(choice_of(estimator_settings), loaded_world)

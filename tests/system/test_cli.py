@@ -25,7 +25,7 @@ INVALID_COMMANDS = [
     ),
     (("demo", "--model", "exakt", "--out", "{tmp}/m"), "presage: no model 'exakt': give learned, exact"),
     (("demo", "--world", "{tmp}/no.yaml"), "give a file or one of"),
-    (("demo", "--goal", "6.8", "3.95"), "from a wall of 'corridor'"),
+    (("demo", "--goal", "6.8", "3.95"), "goal (6.80, 3.95) is inside a wall or outside 'corridor'"),
     (("up", "--world", "maze", "--estimator", "paper", "--port", "0"), "presage train --world maze"),
     (("goal", "1", "1", *NO_SESSION), "start a session with `presage up`"),
     (("goal",), "X Y in m"),
