@@ -22,7 +22,7 @@ def test_free_space_matches_the_cells(origin):
     free = FreeSpace.of(world)
     centres = free.grid.centres()
     inner = np.abs(free.clearance.ravel()) > 1e-6  # exactly at an edge the sign is undefined
-    assert np.array_equal((free.clearance.ravel() > 0)[inner], (world.grid.at(centres) == FREE)[inner])
+    assert np.array_equal((free.clearance.ravel() > 0)[inner], (world.grid.values_at(centres) == FREE)[inner])
     np.testing.assert_allclose(free.clearance.ravel(), world.clearance(centres), atol=1e-9)
 
 
