@@ -82,7 +82,7 @@ class RecorderService(Service):
             self._begin(numbered=True)
         elif request.action == "stop":
             if self.recording is None:
-                return state.model_copy(update={"ok": False, "reason": "records nothing: start first"})
+                return state.model_copy(update={"ok": False, "reason": "records nothing: start it first"})
             self._write_answers()
             self._end()
         return self._state()
@@ -187,7 +187,9 @@ class RecorderService(Service):
 
     def _update_note(self) -> None:
         """Sets the note in the health message."""
-        self.note = self._no_link_note or ("" if self.recording is not None else "records nothing until told")
+        self.note = self._no_link_note or (
+            "" if self.recording is not None else "records nothing until a request starts it"
+        )
 
     def _write_answers(self) -> None:
         if self.describer is None:

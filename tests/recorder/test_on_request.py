@@ -177,7 +177,7 @@ def test_health_counts_all_files_and_says_when_none_is_written(recorder, bus, te
     assert wait_until(lambda: shown((3, 3, 2), ""), 20)
     tell("stop")
     send(bus, [5])
-    assert wait_until(lambda: shown((4, 3, 2), "records nothing until told"), 20)
+    assert wait_until(lambda: shown((4, 3, 2), "records nothing until a request starts it"), 20)
     tell("start")
     send(bus, [6, 8])
     assert wait_until(lambda: shown((6, 5, 3), ""), 20)

@@ -36,21 +36,21 @@ class Player:
             return self._position
         return min(self.end, self._position + max(0.0, now - self._since) * self.rate)
 
-    def wait(self, at: float, now: float) -> float:
-        """Seconds until a message at position ``at`` is due. 0 if it is due now, infinity while paused."""
+    def wait(self, position: float, now: float) -> float:
+        """Seconds until a message at ``position`` is due. 0 if it is due now, infinity while paused."""
         if self._steps:
             return 0.0
         if self.paused:
             return math.inf
         if self.rate == 0:
             return 0.0
-        return max(0.0, (at - self._position) / self.rate - (now - self._since))
+        return max(0.0, (position - self._position) / self.rate - (now - self._since))
 
-    def sent(self, at: float, now: float, *, whole: bool) -> None:
-        """Records that the message at position ``at`` was published. ``whole``: it completes a step."""
-        ahead = self.position(now) - at
+    def sent(self, position: float, now: float, *, whole: bool) -> None:
+        """Records that the message at ``position`` was published. ``whole``: it completes a step."""
+        ahead = self.position(now) - position
         if self.paused or self.rate == 0 or ahead > MAX_LAG_S * self.rate:
-            self._anchor(at, now)
+            self._anchor(position, now)
         if self._steps and whole:
             self._steps -= 1
 

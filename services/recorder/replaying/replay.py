@@ -106,8 +106,8 @@ class Replay:
         Raises UserError if a live service publishes the same keys, unless forced.
         """
         alive = self._alive()
-        if not self.choice.force and (why := find_conflicts(self._published(), alive)):
-            raise UserError(why)
+        if not self.choice.force and (conflict := find_conflicts(self._published(), alive)):
+            raise UserError(conflict)
         for key, topic in self._published().items():  # all declared before the first wait: parallel discovery
             self.bus.publisher(topic, key=key)
         if WORLD.server not in alive.get(self.bus.robot, set()):  # a live simulator answers this query itself
@@ -129,12 +129,12 @@ class Replay:
         player = self.player
         player.seek(player.begin, time.monotonic())
         player.paused = self.choice.paused
-        while (position := player.take_seek_target()) is not None:
-            for raw in self.recording.payloads(self.topics.keys(), *self._window(position)):
-                at = (raw.logged_ns - self.recording.start_ns) * 1e-9
-                if not self._wait_until_due(at, on_progress, stop):
+        while (start := player.take_seek_target()) is not None:
+            for raw in self.recording.payloads(self.topics.keys(), *self._window(start)):
+                position = (raw.logged_ns - self.recording.start_ns) * 1e-9
+                if not self._wait_until_due(position, on_progress, stop):
                     break
-                self._send(raw, at)
+                self._send(raw, position)
                 on_progress(player.state(time.monotonic()))
             if stop.is_set() or self.remote.quitting:
                 break
@@ -151,10 +151,12 @@ class Replay:
         start, has_end = self.recording.start_ns, self.choice.end is not None
         return start + round(position * 1e9), start + round(self.player.end * 1e9) if has_end else None
 
-    def _wait_until_due(self, at: float, on_progress: Callable[[PlayerReply], None], stop: threading.Event) -> bool:
+    def _wait_until_due(
+        self, position: float, on_progress: Callable[[PlayerReply], None], stop: threading.Event
+    ) -> bool:
         """Waits until a message is due and answers requests meanwhile. Returns False if it must not be published."""
         while True:
-            wait = self.player.wait(at, time.monotonic())
+            wait = self.player.wait(position, time.monotonic())
             entry = self.inbox.get(min(wait, POLL_PERIOD_S))
             if isinstance(entry, Call):
                 self._answer(entry)
@@ -162,7 +164,7 @@ class Replay:
                 on_progress(self.player.state(time.monotonic()))
             if stop.is_set() or self.remote.quitting or self.player.seek_pending:
                 return False
-            if entry is None and self.player.wait(at, time.monotonic()) <= 0:
+            if entry is None and self.player.wait(position, time.monotonic()) <= 0:
                 return True
 
     def _wait_at_end(self, on_progress: Callable[[PlayerReply], None], stop: threading.Event) -> None:
@@ -173,11 +175,11 @@ class Replay:
             if isinstance(entry := self.inbox.get(POLL_PERIOD_S), Call):
                 self._answer(entry)
 
-    def _send(self, raw: Raw, at: float) -> None:
+    def _send(self, raw: Raw, position: float) -> None:
         topic, key = self.topics[raw.key], self.keys[raw.key]
         self.bus.put(topic, raw.payload, key=key)
         self.counts[key] += 1
-        self.player.sent(at, time.monotonic(), whole=self._stepwise in (None, topic))
+        self.player.sent(position, time.monotonic(), whole=self._stepwise in (None, topic))
 
     def _answer(self, call: Call) -> None:
         if call.query is CONFIG:
