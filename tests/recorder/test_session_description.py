@@ -227,9 +227,10 @@ def test_late_and_changed_model(bus, collect):
 
 
 @pytest.mark.parametrize(
-    ("wanted", "limit", "answers"), [(False, 300, True), (True, 299, True), (True, 300, False)],
+    ("wanted", "limit", "answers"),
+    [(False, 300, True), (True, 299, True), (True, 300, False)],
     ids=["not wanted", "too large", "refused"],
-)  # fmt: skip
+)
 def test_model_without_weights(bus, collect, monkeypatch, wanted, limit, answers):
     monkeypatch.setattr(session_description, "MAX_WEIGHTS_BYTES", limit)
 
