@@ -202,12 +202,12 @@ def test_heavy_packages_stay_where_they_are_used():
 @pytest.mark.parametrize(
     ("module", "absent"),
     [
-        ("services.controller.service", ["torch", "pybullet", "mcap"]),
-        ("services.recorder.service", ["torch", "pybullet"]),
-        ("services.simulator.service", ["torch", "mcap"]),
+        ("services.controller.service", ["torch", "pybullet", "mcap", "numba"]),
+        ("services.recorder.service", ["torch", "pybullet", "numba"]),
+        ("services.simulator.service", ["torch", "mcap", "numba"]),
         ("services.estimator.service", ["pybullet", "mcap"]),
         ("services.estimator.__main__", ["torch"]),  # --help answers at once
-        ("presage.cli.main", ["torch", "pybullet"]),
+        ("presage.cli.main", ["torch", "pybullet", "numba"]),
         ("common.messages.reference", ["torch", "pybullet", "mcap"]),
     ],
 )

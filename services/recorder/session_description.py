@@ -1,4 +1,4 @@
-"""Asks each service for its configuration, world and model."""
+"""Queries each service for its configuration, world and model."""
 
 from __future__ import annotations
 
@@ -83,12 +83,12 @@ def _records_of_model(reply: ModelReply) -> Iterator[MetadataRecord | Attachment
 class DescriptionCollector:
     """Queries services for their descriptions in a thread, so that a slow service does not hold up the recording."""
 
-    def __init__(self, bus: Bus, me: str, log: Logger, *, weights: bool = True) -> None:
-        """Starts the thread. The service ``me`` is not queried.
+    def __init__(self, bus: Bus, own_name: str, log: Logger, *, weights: bool = True) -> None:
+        """Starts the thread. The service ``own_name`` is not queried.
 
         With ``weights``, also fetches the model's weights, up to `MAX_WEIGHTS_BYTES`.
         """
-        self._bus, self._me, self._log, self._weights = bus, me, log, weights
+        self._bus, self._own_name, self._log, self._weights = bus, own_name, log, weights
         # Services that came (True) or went (False), from zenoh's thread; None wakes the thread.
         self._events: queue.SimpleQueue[tuple[str, bool] | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[tuple[str, DescriptionReply]] = queue.SimpleQueue()
@@ -150,7 +150,7 @@ class DescriptionCollector:
             event = self._events.get(timeout=None if due is None else max(0.0, due - time.monotonic()))
         except queue.Empty:
             return
-        if event is None or event[0] == self._me:
+        if event is None or event[0] == self._own_name:
             return
         service, alive = event
         if service == ALL_SERVICES:

@@ -12,7 +12,6 @@ from services.estimator.particle_filter.clusters import hypotheses
 from services.estimator.particle_filter.recovery import Recovery
 from services.estimator.particle_filter.sensor import Sensor
 from services.estimator.particle_filter.settings import Settings
-from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.interface import Observation, Posterior, Predicted, State
 
 if TYPE_CHECKING:
@@ -108,7 +107,7 @@ class ParticleFilter:
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
         """Predicts scans (see Estimator) by exact rays in the map; sigma is that of a hit while tracking."""
-        ranges = RayCaster(self.world).expect(se2.compose(poses, self.mount), angles).ranges
+        ranges = self.world.ray_distances(se2.compose(poses, self.mount), angles)
         return Predicted(ranges, np.full(ranges.shape, self.settings.sigma_hit))
 
     def _anywhere(self, count: int, places: Array | None = None) -> Array:

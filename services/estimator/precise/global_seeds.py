@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
-from services.estimator.shared import kernels
+from services.estimator.precise import beam_sums
 from services.estimator.shared.asking import without_pause
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ class Ranking:
             if begin:
                 yield
             part = slice(begin, begin + rows)
-            kernels.rank_places(seeds.panoramas[part], bins, measured, tolerance, range_max, costs[part])
+            beam_sums.rank_places(seeds.panoramas[part], bins, measured, tolerance, range_max, costs[part])
         place, heading = _least_costs(costs, self.count)
         lasers = np.column_stack([seeds.places[place], se2.wrap(heading * (2 * np.pi / self.headings))])
         return se2.compose(lasers, se2.inverse(self.view.mount))

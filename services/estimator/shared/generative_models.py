@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from services.estimator.shared import grid_ray_kernels as cell_kernels
-from services.estimator.shared import kernels
+from common.geometry.ray_casting import cast_rays_with_jacobian
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -78,17 +77,8 @@ class RayCaster:
 
     def expect(self, lasers: Array, angles: Array) -> Expected:
         """Predicts scans; see GenerativeModel."""
-        lasers, angles = np.asarray(lasers, float).reshape(-1, 3), np.asarray(angles, float)
-        shape = (len(lasers), len(angles))
-        ranges, jacobian = np.empty(shape), np.empty((*shape, 3))
-        world = self.world
-        kernels.cast(world.outlines, world.circles, lasers, angles, ranges, jacobian)
-        if (grid := world.grid) is not None:
-            rays, size = grid.shapes.rays, grid.resolution
-            corner = grid.to_map(np.array([-size, -size]))  # the ray caster has a border of empty cells around the map
-            frame = np.array([*corner, grid.origin[2], size])
-            cell_kernels.cast_cells(rays.occupied, rays.clear, frame, lasers, angles, ranges, jacobian)
-        return Expected(ranges, np.full(shape, max(EXACT_SCALE_M, map_error(world))), jacobian)
+        ranges, jacobian = cast_rays_with_jacobian(self.world, lasers, angles)
+        return Expected(ranges, np.full(ranges.shape, max(EXACT_SCALE_M, map_error(self.world))), jacobian)
 
 
 @dataclass(frozen=True)

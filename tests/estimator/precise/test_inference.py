@@ -8,13 +8,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from common.geometry import se2
+from common.geometry.ray_casting import MIN_COSINE
 from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View, descend, difference, polish
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import Mode, select_distinct, weigh
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import Candidate, MotionNoise, fuse, predict_motion
 from services.estimator.shared.generative_models import Expected, RayCaster
-from services.estimator.shared.kernels import FACING
 from tests.estimator.models import ROOM
 
 MOUNT = np.array([0.2, 0.05, 0.3])
@@ -92,7 +92,7 @@ def smooth_beams(ranges, pose, step):
     offsets = step * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     seen = RayCaster(ROOM).expect(se2.compose(pose + offsets, MOUNT), ANGLES)
     here, above, below = seen.ranges[0], seen.ranges[1:4], seen.ranges[4:]
-    grazes = np.hypot(*seen.jacobian[0, :, :2].T) > 0.999 / FACING
+    grazes = np.hypot(*seen.jacobian[0, :, :2].T) > 0.999 / MIN_COSINE
     jumps = (np.abs(above - 2 * here + below) > 1e-3 * step).any(axis=0)
     crosses = ((ranges < seen.ranges) != (ranges < here)).any(axis=0)
     return ~(grazes | jumps | crosses)
@@ -120,7 +120,7 @@ def test_the_derivative_of_a_grazing_beam_is_limited():
     tangent = np.array([4.5 - 2.0, 3 - 0.4 + 1e-7, 0.0])
     expected = RayCaster(ROOM).expect(tangent[None], np.zeros(1))
     assert expected.ranges[0, 0] == pytest.approx(2, abs=1e-3)
-    assert np.hypot(*expected.jacobian[0, 0, :2]) == pytest.approx(1 / FACING)
+    assert np.hypot(*expected.jacobian[0, 0, :2]) == pytest.approx(1 / MIN_COSINE)
 
 
 @given(st.integers(0, 10_000))
