@@ -65,7 +65,6 @@ class ServiceSettings(BaseSettings):
     listen: Annotated[
         str, Field(description="zenoh endpoints to listen on, comma-separated; by default only on loopback")
     ] = "tcp/127.0.0.1:0"
-    multicast: Annotated[bool, Field(description="also discover other sessions by multicast")] = False
     lossless: Annotated[
         bool,
         Field(description="wait for slow subscribers instead of dropping messages; for replays, not for a robot"),
@@ -103,7 +102,6 @@ class ServiceSettings(BaseSettings):
             self.robot,
             split_endpoints(self.connect),
             split_endpoints(self.listen),
-            multicast=self.multicast,
             lossless=self.lossless,
             security=self.credentials(),
             insecure=self.insecure,

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from common.robot.scanner import SCANNERS
-from lab.cli.options import CORES, Trials
+from lab.cli.options import Trials, worker_count
 from presage.terminal.options import Json, WorldName, console
 
 app = typer.Typer(help="Benchmarks. Each compares with a baseline or a limit in the same run.", no_args_is_help=True)
@@ -122,7 +122,7 @@ def bench_accuracy(
     from lab.accuracy.report import bench_accuracy as run  # noqa: PLC0415
 
     code = run(
-        worlds, "", estimators, tasks, trials, minutes, seed, min(2, CORES), json_file, figure,
+        worlds, "", estimators, tasks, trials, minutes, seed, min(2, worker_count()), json_file, figure,
         console, markdown=markdown, scanner=scanner,
     )  # fmt: skip
     raise typer.Exit(code)

@@ -12,7 +12,6 @@ import typer
 from common.errors import UserError
 from lab.cli.navigation import navigate
 from lab.cli.options import (
-    CORES,
     OUT,
     Alpha,
     Estimators,
@@ -20,6 +19,7 @@ from lab.cli.options import (
     Out,
     Trials,
     show,
+    worker_count,
 )
 from presage.terminal.options import console
 from presage.terminal.output import make_folder
@@ -51,7 +51,7 @@ def e1(
     job = localisation.Job(0, seed, iterations)
     job = replace(job, descent=replace(PAPER_DESCENT, alpha=alpha)) if alpha is not None else job
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
-    show(localisation, lambda: localisation.run(job, trials, out, CORES, console), out)
+    show(localisation, lambda: localisation.run(job, trials, out, worker_count(), console), out)
 
 
 @app.command("e2")
@@ -70,7 +70,7 @@ def e2(
 
     job = crossing.Job(0, seed)
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
-    show(crossing, lambda: crossing.run(job, trials, out, CORES, console), out)
+    show(crossing, lambda: crossing.run(job, trials, out, worker_count(), console), out)
 
 
 @app.command("e3")
@@ -93,7 +93,7 @@ def e3(
 
     job = navigation.Job(0, seed, free=free)
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
-    show(navigation, lambda: navigation.run(job, trials, out, CORES, console), out)
+    show(navigation, lambda: navigation.run(job, trials, out, worker_count(), console), out)
 
 
 @app.command("alpha")
@@ -109,7 +109,7 @@ def alpha_sweep(
     from lab.paper import alpha_sweep as step_size  # noqa: PLC0415
     from lab.paper import e1_localisation as localisation  # noqa: PLC0415
 
-    show(step_size, lambda: step_size.run(localisation.Job(0, seed, 50), trials, out, CORES, console), out)
+    show(step_size, lambda: step_size.run(localisation.Job(0, seed, 50), trials, out, worker_count(), console), out)
 
 
 @app.command("steps")
@@ -120,7 +120,7 @@ def step_sizes(trials: Trials = 10, seed: ExperimentSeed = 1, out: Out = OUT) ->
     """
     from lab.paper import step_sizes as stepping  # noqa: PLC0415
 
-    show(stepping, lambda: stepping.run(stepping.Job(0, seed), trials, out, CORES, console), out)
+    show(stepping, lambda: stepping.run(stepping.Job(0, seed), trials, out, worker_count(), console), out)
 
 
 @app.command("samples")
@@ -134,7 +134,7 @@ def samples_needed(
     """
     from lab.paper import samples  # noqa: PLC0415
 
-    show(samples, lambda: samples.run(samples.Job(seed), out, CORES, console), out)
+    show(samples, lambda: samples.run(samples.Job(seed), out, worker_count(), console), out)
 
 
 @app.command("aliasing")
@@ -149,7 +149,7 @@ def similar_objects(
     """
     from lab.paper import aliasing  # noqa: PLC0415
 
-    show(aliasing, lambda: aliasing.run(aliasing.Job(seed, places=trials), out, CORES, console), out)
+    show(aliasing, lambda: aliasing.run(aliasing.Job(seed, places=trials), out, worker_count(), console), out)
 
 
 @app.command("prediction")
@@ -169,7 +169,7 @@ def predicted(
 @app.command("real")
 def real_drive(
     log: Annotated[Path, typer.Option(help="Recording or log with reference poses (docs/logs.md).")],
-    world: Annotated[str, typer.Option("--world", "--map", help="World file or ROS map.yaml of the training half.")],
+    world: Annotated[str, typer.Option(help="World file or ROS map.yaml of the training half.")],
     name: Annotated[str, typer.Option(help="Results are named real-NAME. Default: the log's name.")] = "",
     mount: Annotated[
         str, typer.Option(help="Pose of the laser in base_link, x,y[,yaw_deg] (m, deg). Default: as in the log.")
@@ -200,7 +200,7 @@ def real_drive(
         raise UserError(f"--name {name!r}: use only letters, digits, '.', '_' and '-', as it becomes a file name")
     laser_pose: Any = tuple(pose_of_text(mount, "--mount").tolist()) if mount else None
     job = real.Job(log, world, laser_pose, every, quick, seed, name, exchange)
-    show(real, lambda: real.run(job, out, CORES, console), out)
+    show(real, lambda: real.run(job, out, worker_count(), console), out)
 
 
 @app.command("all")
@@ -219,7 +219,7 @@ def all_experiments(
     from lab.paper.suite import run_all  # noqa: PLC0415
 
     make_folder(out, "--out")
-    run_all(trials, seed, out, CORES, console)
+    run_all(trials, seed, out, worker_count(), console)
 
 
 @app.command("tables")

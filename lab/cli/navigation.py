@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lab.cli.options import CORES, OUT, ExperimentSeed, Out, Trials, show
+from lab.cli.options import OUT, ExperimentSeed, Out, Trials, show, worker_count
 from presage.terminal.options import console
+
+if TYPE_CHECKING:
+    from lab.experiments.results import Result
 
 
 def navigate(
@@ -44,6 +47,8 @@ def navigate(
         tuple(part.strip() for part in text.split(",") if part.strip()) for text in (worlds, drives)
     )
     driving.check(job, world_names, drive_names)
-    show(
-        driving, lambda: driving.run(job, trials, out, CORES + 1, console, worlds=world_names, drives=drive_names), out
-    )
+
+    def run() -> Result:
+        return driving.run(job, trials, out, worker_count(1), console, worlds=world_names, drives=drive_names)
+
+    show(driving, run, out)

@@ -34,7 +34,11 @@ Alpha = Annotated[
     typer.Option(min=1e-8, max=1.0, help="Step size of estimator paper in m². Default: the best value of the sweep."),
 ]
 OUT = Path("experiments")
-CORES = int(os.environ.get("PRESAGE_WORKERS") or os.cpu_count() or 1)  # number of worker processes
+
+
+def worker_count(extra: int = 0) -> int:
+    """Number of worker processes: PRESAGE_WORKERS, by default one for each core and ``extra`` ones."""
+    return int(os.environ.get("PRESAGE_WORKERS") or (os.cpu_count() or 1) + extra)
 
 
 def show(experiment: ModuleType, run: Callable[[], Result], out: Path) -> None:

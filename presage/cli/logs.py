@@ -113,9 +113,6 @@ def import_(
     ] = None,
     world: Annotated[str, typer.Option("--world", help=WORLD_OF_LOG)] = "",
     mount: MountText = "",
-    scan_topic: Annotated[
-        str, typer.Option(help="Scan topic, if there are several; in a CARMEN log the type of line, such as RLASER.")
-    ] = "",
     config: Config = None,
     json_file: Json = None,
 ) -> None:
@@ -126,14 +123,14 @@ def import_(
     --config states what the log does not (docs/logs.md). Reference poses become the topic truth.
 
     Examples: `presage import fr079.log.gz -o fr079.mcap --world fr079.yaml`;
-    `presage import drive.bag --scan-topic /scan_front`; `presage import bag_folder --mount 0.2,0,0`;
+    `presage import drive.bag`; `presage import bag_folder --mount 0.2,0,0`;
     `presage import gfs.log --config gfs.yaml`, which contains `log: {reference: true}`.
     """
     from common.runtime.config import load_section  # noqa: PLC0415
     from presage.logs.importing import ImportOptions, import_command  # noqa: PLC0415
     from presage.logs.options import LogSettings  # noqa: PLC0415
 
-    log = load_section(LogSettings, config, "log", mount=mount, scan_topic=scan_topic)
+    log = load_section(LogSettings, config, "log", mount=mount)
     target = out or Path(f"{file.resolve().name.split('.')[0]}.mcap")
     laser = log.frame == "laser"
     job = ImportOptions(file, target, log.reading(), world, laser=laser, rate=log.rate, sigma=log.sigma)

@@ -1,4 +1,4 @@
-"""The command `presage`: up, demo, train, and the groups of commands."""
+"""The command `presage`: up, demo, and the groups of commands."""
 
 from __future__ import annotations
 

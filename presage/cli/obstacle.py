@@ -74,7 +74,7 @@ def list_(robot: RobotName = "", connect: Connect = "") -> None:
     Example: `presage obstacle list`.
     """
     for obstacle in _obstacles(connect, robot):
-        shape = obstacle.model_dump(exclude={"name"}, exclude_none=True)
+        shape = obstacle.model_dump_json(exclude={"name"}, exclude_none=True)
         console.print(f"{obstacle.name}: {shape}", markup=False, highlight=False, soft_wrap=True)
 
 

@@ -47,7 +47,7 @@ MountText = Annotated[str, typer.Option("--mount", help="Pose of the laser in ba
 Config = Annotated[
     Path | None, typer.Option(help="YAML file of settings that have no option of their own (docs/settings.yaml).")
 ]
-Seed = Annotated[int | None, typer.Option(min=0, help="Random seed. Defaults to 0.")]
+Seed = Annotated[int | None, typer.Option(min=0, max=2**31, help="Random seed. Defaults to 0.")]
 Json = Annotated[Path | None, typer.Option("--json", help="Also write the results to this JSON file.")]
 OpenPage = Annotated[bool, typer.Option("--open", help="Open the live page in a browser, if there is one.")]
 

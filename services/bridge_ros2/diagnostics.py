@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from services.bridge_ros2.graph import join_names
 from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, TWIST_STAMPED
+from services.bridge_ros2.settings import MAP_TOPIC
 
 if TYPE_CHECKING:
     from services.bridge_ros2.graph import Graph
@@ -44,9 +45,9 @@ def _with_scans(options: BridgeRos2Settings, graph: Graph, *, reckoned: bool) ->
         return (
             f"no odometry of the scans' moments {where}, so no transform from map to odom: --odom-topic, --tf map-base"
         )
-    map_topic = options.topic(options.map_topic)
+    map_topic = options.topic(MAP_TOPIC)
     if options.publish_map and (other := graph.publishers(map_topic)):
-        return f"{map_topic}: {other} publishes a map there as well: leave out --publish-map, or --map-topic"
+        return f"{map_topic}: {other} publishes a map there as well: leave out --publish-map"
     command = options.topic(options.cmd_topic)
     wanted = graph.expected_twist_type(command) if options.commands else ""
     if wanted and (wanted == TWIST_STAMPED) != options.stamped:

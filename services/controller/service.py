@@ -98,7 +98,7 @@ class ControllerService(Service):
 
             keep_heading = options.heading == "keep"
             self.geodesic = GeodesicPolicy(robot, world, keep_heading=keep_heading, epistemic=options.epistemic)
-        parameters = ActionParameters(gamma=options.gamma, reach=options.reach)
+        parameters = ActionParameters(gamma=options.gamma)
         self.navigator = Navigator(robot, parameters, world, self.geodesic)
         # Declare the publishers now: the first message on a key that was just declared may be lost.
         for topic in (STATUS, CMD_VEL, PLAN, PREFERENCE):
@@ -107,7 +107,7 @@ class ControllerService(Service):
     def on_restored(self, last: dict[Topic, Stamped]) -> None:
         """Resume the goal of the previous controller instance, if it was still under way."""
         goal, status = last.get(GOAL), last.get(STATUS)
-        if not self.options.resume or not isinstance(goal, Goal) or not isinstance(status, Status) or goal.cancel:
+        if not isinstance(goal, Goal) or not isinstance(status, Status) or goal.cancel:
             return
         if self.navigator.goal is not None:
             return  # a new goal has arrived already

@@ -42,7 +42,6 @@ from common.messages.topics import (
     Topic,
 )
 from common.runtime.service import Service
-from services.simulator.odometry import Drift
 from services.simulator.settings import SimulatorSettings
 from services.simulator.simulation import Setup, Simulation
 
@@ -87,7 +86,6 @@ class SimulatorService(Service):
     def open(self) -> None:
         """Build the world and the robot. Time begins when the required services are running."""
         options = self.options
-        drift = Drift(options.turn_by_turn, options.turn_by_path, options.path_by_path, options.path_by_turn)
         robot = options.build_robot()
         self.log.info("loading the world", world=options.world)
         scanner = options.build_scanner()
@@ -97,7 +95,6 @@ class SimulatorService(Service):
             robot=robot,
             start=options.start_pose(),
             seed=options.seed,
-            drift=drift,
             obstacle_stop=options.obstacle_stop,
             people=options.people,
             people_speed=options.people_speed,

@@ -76,7 +76,7 @@ def test_ranges_as_rep_117_has_them(tmp_path):
 
 def test_the_longest_range_may_be_said(tmp_path):
     path = write_bag(tmp_path, Bag(scan={"range_max": np.inf}))
-    with pytest.raises(UserError, match="--range-max"):
+    with pytest.raises(UserError, match="range_max"):
         read(path)
     assert read(path, range_max=3.0)[1][0].ranges.max() == np.inf
 
@@ -107,7 +107,7 @@ def test_odometry_of_a_frame_that_tf_does_not_know_is_said_once(tmp_path):
     (note,) = log.notes
     assert note.startswith("/odom has poses of wheels, and tf does not connect wheels and base_link")
     close([scan.odom for scan in scans], odom(STAMPS))
-    with pytest.raises(UserError, match="--odom-topic /odm: no topic of that name and type; it has /odom"):
+    with pytest.raises(UserError, match="odom_topic /odm: no topic of that name and type; it has /odom"):
         read(tmp_path / "drive", odom_topic="/odm")
 
 
@@ -120,11 +120,11 @@ def test_without_tf_the_mount_must_be_said(tmp_path):
 
 def test_several_scanners_and_odometries(tmp_path):
     path = write_bag(tmp_path, Bag(more=("scan2", "ground_truth")))
-    with pytest.raises(UserError, match="--scan-topic: /scan, /scan2"):
+    with pytest.raises(UserError, match=r"scan_topic .*: /scan, /scan2"):
         read(path)
-    with pytest.raises(UserError, match="--odom-topic: /ground_truth, /odom"):
+    with pytest.raises(UserError, match=r"odom_topic .*: /ground_truth, /odom"):
         read(path, scan_topic="/scan")
-    with pytest.raises(UserError, match="--scan-topic /lidar: no topic"):
+    with pytest.raises(UserError, match="scan_topic /lidar: no topic"):
         read(path, scan_topic="/lidar")
     assert len(read(path, scan_topic="/scan2", odom_topic="/odom")[1]) == SCANS
 
