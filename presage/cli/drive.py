@@ -20,6 +20,13 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise typer.BadParameter(f"{text} is neither a number nor an option") from None
+
+
 @app.command(
     context_settings=ALLOW_NEGATIVE_NUMBERS,
     rich_help_panel="Drive",
@@ -28,7 +35,9 @@ app = typer.Typer()
 def goal(
     x: Annotated[float | None, typer.Argument(help="x of the goal in the map, m.")] = None,
     y: Annotated[float | None, typer.Argument(help="y of the goal in the map, m.")] = None,
-    yaw: Annotated[float | None, typer.Argument(help="Heading at the goal, deg. Defaults to any heading.")] = None,
+    yaw: Annotated[
+        float | None, typer.Argument(parser=_number, help="Heading at the goal, deg. Defaults to any heading.")
+    ] = None,
     yaw_option: Annotated[float | None, typer.Option("--yaw", hidden=True)] = None,
     tolerance: Annotated[float, typer.Option(min=0.01, help="Distance at which the goal counts as reached, m.")] = 0.2,
     wait: Annotated[
@@ -68,7 +77,9 @@ def goal(
 def teleport(
     x: Annotated[float, typer.Argument(help="x in the map, m.")],
     y: Annotated[float, typer.Argument(help="y in the map, m.")],
-    yaw: Annotated[float, typer.Argument(help="Heading, deg, counter-clockwise from the x axis.")] = 90.0,
+    yaw: Annotated[
+        float, typer.Argument(parser=_number, help="Heading, deg, counter-clockwise from the x axis.")
+    ] = 90.0,
     robot: RobotName = "",
     connect: Connect = "",
 ) -> None:
@@ -92,7 +103,7 @@ def relocalise(
         float | None, typer.Argument(help="x in the map, m. Defaults to the estimator's initial pose.")
     ] = None,
     y: Annotated[float | None, typer.Argument(help="y in the map, m.")] = None,
-    yaw: Annotated[float, typer.Argument(help="Heading, deg.")] = 0.0,
+    yaw: Annotated[float, typer.Argument(parser=_number, help="Heading, deg.")] = 0.0,
     robot: RobotName = "",
     connect: Connect = "",
 ) -> None:
