@@ -66,7 +66,6 @@ def doctor(
     seconds: Annotated[
         float,
         typer.Option(
-            metavar="X",
             min=0.5,
             help="How long to observe the bus, s. Detecting a frozen service takes at least 2.5 s.",
         ),

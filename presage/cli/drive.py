@@ -35,9 +35,7 @@ def _number(text: str) -> float:
 def goal(
     x: Annotated[float | None, typer.Argument(help="x of the goal in the map, m.")] = None,
     y: Annotated[float | None, typer.Argument(help="y of the goal in the map, m.")] = None,
-    yaw: Annotated[
-        float | None, typer.Argument(parser=_number, help="Heading at the goal, deg. Defaults to any heading.")
-    ] = None,
+    yaw: Annotated[float | None, typer.Argument(parser=_number, help="Heading at the goal, deg. Default: any.")] = None,
     yaw_option: Annotated[float | None, typer.Option("--yaw", hidden=True)] = None,
     tolerance: Annotated[float, typer.Option(min=0.01, help="Distance at which the goal counts as reached, m.")] = 0.2,
     wait: Annotated[
@@ -77,9 +75,7 @@ def goal(
 def teleport(
     x: Annotated[float, typer.Argument(help="x in the map, m.")],
     y: Annotated[float, typer.Argument(help="y in the map, m.")],
-    yaw: Annotated[
-        float, typer.Argument(parser=_number, help="Heading, deg, counter-clockwise from the x axis.")
-    ] = 90.0,
+    yaw: Annotated[float, typer.Argument(parser=_number, help="Heading, deg, counter-clockwise from x.")] = 90.0,
     robot: RobotName = "",
     connect: Connect = "",
 ) -> None:

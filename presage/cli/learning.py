@@ -41,7 +41,6 @@ def train(
     samples: Annotated[
         int | None,
         typer.Option(
-            metavar="N",
             min=10,
             help="Simulated scans. Defaults to 5000 (precise), 13000 (paper) or 2000 (with --from).",
         ),

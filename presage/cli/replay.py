@@ -35,7 +35,6 @@ def replay(
     rate: Annotated[
         float | None,
         typer.Option(
-            metavar="X",
             min=0.0,
             help="Replay speed: 1 keeps the original timing, 2 is twice as fast, 0 as fast as possible.",
         ),
