@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 from pydantic import ValidationError
 
@@ -91,12 +92,10 @@ def _obstacles(connect: str, robot: str) -> list[Obstacle]:
 
 
 def _moved(obstacle: Obstacle, x: float, y: float) -> Obstacle:
-    """The obstacle with its centre at (x, y) m."""
+    """The obstacle with its centre at (x, y) m; a polygon's is the mean of its corners."""
     if obstacle.polygon is not None:
-        centre = obstacle.shape().centroid
-        return obstacle.model_copy(
-            update={"polygon": [(px + x - centre.x, py + y - centre.y) for px, py in obstacle.polygon]}
-        )
+        by_x, by_y = np.subtract((x, y), np.mean(obstacle.polygon, axis=0))
+        return obstacle.model_copy(update={"polygon": [(px + by_x, py + by_y) for px, py in obstacle.polygon]})
     kind, shape = ("circle", obstacle.circle) if obstacle.circle is not None else ("box", obstacle.box)
     assert shape is not None  # noqa: S101 - an obstacle has exactly one shape
     return obstacle.model_copy(update={kind: shape.model_copy(update={"center": (x, y)})})
