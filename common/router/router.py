@@ -60,7 +60,6 @@ class RouterSettings(ServiceSettings):
             connect,
             listen,
             router=True,
-            multicast=self.multicast,
             security=security,
             insecure=self.insecure,
         )

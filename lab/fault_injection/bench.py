@@ -12,7 +12,6 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 from common.errors import UserError
 from common.versions import commit, versions
@@ -39,7 +38,6 @@ def bench_chaos(
     *,
     one_host: bool = False,
     quiet: bool = True,
-    in_markdown: bool = False,
 ) -> int:
     """Inject the faults, print the table and write it to ``json_file`` if given.
 
@@ -71,10 +69,7 @@ def bench_chaos(
                     outcomes.append(measure(system, fault))
                 problem = outcomes[-1].why
                 console.print(f"{'[red]no[/]' if problem else '[green]ok[/]'} {fault.name} {problem}", highlight=False)
-    if in_markdown:
-        print(markdown(outcomes))
-    else:
-        console.print(table(outcomes))
+    print(markdown(outcomes))
     data = {
         "command": "presage bench chaos", "arguments": {"faults": list(names), "repeats": repeats},
         "hosts": not missing, "rows": [outcome.row() for outcome in outcomes], "skipped": skipped,
@@ -104,14 +99,6 @@ def rows_of(outcomes: Sequence[FaultOutcome]) -> list[tuple[str, ...]]:
         times = [worst(what) for what in ("detected_s", "stopped_s", "start_s", "again_s")]
         table_rows.append((name, *times, speed, f"{as_expected}/{len(rows)}"))
     return table_rows
-
-
-def table(outcomes: Sequence[FaultOutcome]) -> Table:
-    """The table for a terminal."""
-    terminal_table = Table(*HEAD)
-    for row in rows_of(outcomes):
-        terminal_table.add_row(*row)
-    return terminal_table
 
 
 def markdown(outcomes: Sequence[FaultOutcome]) -> str:

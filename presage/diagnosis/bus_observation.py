@@ -83,7 +83,7 @@ def observe_bus(link: Link, seconds: float) -> BusObservation | list[Finding]:
 
 
 def _no_zenoh(where: str) -> Finding:
-    advice = "another program may use that port, or the router requires TLS or a password: use --security"
+    advice = "another program may use that port, or the router requires TLS or a password: set PRESAGE_SECURITY"
     return Finding(
         "no_router", False, f"no session at {where}: something listens there, but no zenoh answers", where, advice
     )

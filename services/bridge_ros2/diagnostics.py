@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from services.bridge_ros2.graph import join_names
 from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, TWIST_STAMPED
+from services.bridge_ros2.settings import MAP_TOPIC
 
 if TYPE_CHECKING:
     from services.bridge_ros2.graph import Graph
@@ -55,9 +56,9 @@ def _diagnose_other(options: BridgeRos2Settings, graph: Graph, *, with_odometry:
             f"no odometry for the times of the scans {where}, so the transform from map to odom is not published; "
             "set --odom-topic, or --tf map-base for a robot without odometry"
         )
-    map_topic = options.topic(options.map_topic)
+    map_topic = options.topic(MAP_TOPIC)
     if options.publish_map and (other := graph.publishers(map_topic)):
-        return f"{other} also publishes a map on {map_topic}; leave out --publish-map, or set another --map-topic"
+        return f"{other} also publishes a map on {map_topic}; leave out --publish-map"
     command = options.topic(options.cmd_topic)
     expected = graph.expected_twist_type(command) if options.commands else ""
     if expected and (expected == TWIST_STAMPED) != options.stamped:

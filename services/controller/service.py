@@ -86,7 +86,7 @@ class ControllerService(Service):
 
             keep_heading = settings.heading == "keep"
             self.geodesic = GeodesicPolicy(robot, world, keep_heading=keep_heading, epistemic=settings.epistemic)
-        parameters = ActionParameters(gamma=settings.gamma, reach=settings.reach)
+        parameters = ActionParameters(gamma=settings.gamma)
         self.navigator = Navigator(robot, parameters, world, self.geodesic)
         # Declare the publishers now: the first message on a key that was just declared may be lost.
         for topic in (STATUS, CMD_VEL, PLAN, PREFERENCE):
@@ -95,7 +95,7 @@ class ControllerService(Service):
     def on_restored(self, last: dict[Topic, Stamped]) -> None:
         """Resume the goal of the previous controller instance, if it was still under way."""
         goal, status = last.get(GOAL), last.get(STATUS)
-        if not self.settings.resume or not isinstance(goal, Goal) or not isinstance(status, Status) or goal.cancel:
+        if not isinstance(goal, Goal) or not isinstance(status, Status) or goal.cancel:
             return
         if self.navigator.goal_state.goal is not None:
             return  # a new goal has arrived already

@@ -39,7 +39,7 @@ def choice_of(settings: EstimatorSettings) -> Choice:
     return Choice(
         settings.world, settings.estimator, settings.model, settings.models, settings.sigma, settings.seed,
         initial_pose=pose_of_text(settings.initial_pose, "--initial-pose") if settings.initial_pose else None,
-        descent=Descent(alpha=settings.alpha, beta=settings.beta, iterations=settings.iterations),
+        descent=Descent(alpha=settings.alpha, iterations=settings.iterations),
     )  # fmt: skip
 
 

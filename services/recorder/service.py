@@ -19,6 +19,7 @@ from services.recorder.session_description import DescriptionCollector, Descript
 from services.recorder.settings import RecorderSettings
 
 LINK_WARNING_DELAY_S = 3.0  # the recorder may start before the router, but then warns that it is waiting
+INBOX_CAPACITY = 20_000  # messages that wait to be written
 
 
 class RecorderService(Service):
@@ -50,7 +51,7 @@ class RecorderService(Service):
     def open(self) -> None:
         """Begins to record, unless idle, and starts to collect the services' descriptions."""
         options = self.options
-        self.loop.inbox.capacity = options.capacity
+        self.loop.inbox.capacity = INBOX_CAPACITY
         warn_about_unfinished(options.directory, self.log)
         if not options.idle:
             self._begin(numbered=False)

@@ -42,7 +42,6 @@ from common.messages.topics import (
     Topic,
 )
 from common.runtime.service import Service
-from services.simulator.odometry import Drift
 from services.simulator.settings import SimulatorSettings
 from services.simulator.simulation import Setup, Simulation
 
@@ -88,7 +87,6 @@ class SimulatorService(Service):
     def open(self) -> None:
         """Build the world and the robot. Time begins when the required services are running."""
         settings = self.settings
-        drift = Drift(settings.turn_by_turn, settings.turn_by_path, settings.path_by_path, settings.path_by_turn)
         robot = settings.build_robot()
         self.log.info("loading the world", world=settings.world)
         scanner = settings.build_scanner()
@@ -98,7 +96,6 @@ class SimulatorService(Service):
             robot=robot,
             start=settings.start_pose(),
             seed=settings.seed,
-            drift=drift,
             obstacle_stop=settings.obstacle_stop,
             people=settings.people,
             people_speed=settings.people_speed,

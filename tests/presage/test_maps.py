@@ -62,9 +62,7 @@ def test_foxglove_gets_the_cells_and_the_edges_of_walls():
 
 def test_the_bench_measures_and_keeps_what_it_made(tmp_path):
     out, numbers = tmp_path / "made", tmp_path / "map.json"
-    run = CliRunner().invoke(
-        app, ["bench", "map", "--size", "300", "--beams", "30", "--out", str(out), "--json", str(numbers)]
-    )
+    run = CliRunner().invoke(app, ["bench", "map", "--size", "300", "--out", str(out), "--json", str(numbers)])
     assert run.exit_code == 0, run.output
     assert load_world(str(out / "map.yaml")).grid.width == 300
     rows = {row["name"]: row for row in json.loads(numbers.read_text())["rows"]}

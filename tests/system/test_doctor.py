@@ -168,9 +168,9 @@ def test_a_full_read_only_disk_and_a_world_without_weights(tmp_path, free_port):
     world.write_text("name: shed\nboundary: [[0, 0], [4, 0], [4, 3], [0, 3]]\nstart: {x: 2, y: 1, yaw_deg: 0}\n")
     command = (
         f"mount -t tmpfs -o size=1m,ro tmpfs {disk} && exec {sys.executable} -m presage doctor --seconds 1 "
-        f"--recordings {disk} --world {world} --json {tmp_path}/found.json --connect tcp/127.0.0.1:{free_port()}"
+        f"--world {world} --json {tmp_path}/found.json --connect tcp/127.0.0.1:{free_port()}"
     )
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PRESAGE_DIRECTORY": str(disk)}
     done = subprocess.run(
         ["unshare", "-m", "sh", "-c", command], env=environment, capture_output=True, text=True, timeout=120
     )

@@ -157,9 +157,8 @@ def test_invalid_robot_options_are_refused_in_one_line(process, arguments, words
 
 def test_up_with_two_robots(process, free_port):
     port = free_port()
-    up = process(
-        "presage.__main__", "up", "--robots", "2", "--robot", "r", "--beams", "64", "--no-viewer", "--port", str(port)
-    )
+    settings = {"PRESAGE_ROBOT": "r", "PRESAGE_BEAMS": "64"}
+    up = process("presage.__main__", "up", "--robots", "2", "--no-viewer", "--port", str(port), env=settings)
     up.wait_for("all alive", 120)
     with open_bus(Link(robot="r-1", connect=(f"tcp/127.0.0.1:{port}",))) as bus:
         for robot in ("r-1", "r-2"):

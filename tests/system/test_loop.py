@@ -84,12 +84,11 @@ def test_demo_localises_navigates_records_and_draws(process, tmp_path):
     demo = process(
         "presage.__main__",
         "demo",
-        "--pace",
-        "lockstep",
         "--out",
         str(tmp_path / "out"),
         "--json",
         str(tmp_path / "d.json"),
+        env={"PRESAGE_PACE": "lockstep"},
     )
     recording = wait_for_one(demo, tmp_path / "out", "*.mcap.active")
     made.write(tmp_path / "out" / "another.mcap")  # a file of another program, written during the demo
@@ -130,7 +129,10 @@ def test_demo_localises_navigates_records_and_draws(process, tmp_path):
 
 def test_demo_at_full_speed_starts_when_all_services_are_alive(process, tmp_path):
     numbers = tmp_path / "d.json"
-    demo = process("presage.__main__", "demo", "--pace", "fast", "--out", str(tmp_path), "--json", str(numbers))
+    config = tmp_path / "fast.yaml"
+    config.write_text("simulator: {pace: fast}")
+    args = ("--config", str(config), "--out", str(tmp_path), "--json", str(numbers))
+    demo = process("presage.__main__", "demo", *args)
     assert demo.wait(170) in {0, 1}, demo.output  # on a slow machine commands may be late
     assert "localised after" in demo.output
     recording = read_recording(next(tmp_path.glob("*.mcap")))
@@ -139,9 +141,8 @@ def test_demo_at_full_speed_starts_when_all_services_are_alive(process, tmp_path
 
 
 def test_demo_without_a_belief_reports_the_reason(process, tmp_path):
-    demo = process(
-        "presage.__main__", "demo", "--beams", "100", "--estimator", "paper", "--out", str(tmp_path), "--quiet"
-    )
+    args = ("--estimator", "paper", "--out", str(tmp_path), "--quiet")
+    demo = process("presage.__main__", "demo", *args, env={"PRESAGE_BEAMS": "100"})
     assert demo.wait(60) == 2, demo.output
     (line,) = demo.output.splitlines()
     assert line.startswith("presage: the estimator publishes no belief; its health reports: the scan does not fit the")
@@ -149,9 +150,17 @@ def test_demo_without_a_belief_reports_the_reason(process, tmp_path):
     assert "--beams 100" in line
 
 
+BACKGROUND = """
+import runpy, signal
+signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell does for a script's background commands
+runpy.run_module("presage", run_name="__main__")
+"""
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_no_process_outlives_presage_up(process, free_port, number):
-    up = process("presage.__main__", "up", "--port", str(free_port()))
+def test_no_process_outlives_presage_up(process, free_port, number, tmp_path):
+    (tmp_path / "background.py").write_text(BACKGROUND)
+    up = process(tmp_path / "background.py", "up", "--port", str(free_port()))
     up.wait_for("all alive", 90)
     children = psutil.Process(up.child.pid).children(recursive=True)
     assert len(children) == 6  # router, simulator, estimator, controller, viewer and an idle recorder

@@ -19,19 +19,17 @@ obstacles:
 start: {x: 1.5, y: 1.5, yaw_deg: 90}
 """
 SMALL = ("--beams", "61", "--samples", "300")
-PAPER = ("--preset", "paper", "--batch", "50", "--epochs")
 
 
-def train(process, tmp_path, *args):
-    return process(
-        "presage.__main__", "train", "--world", str(tmp_path / "w.yaml"), "--out", str(tmp_path / "m"), *SMALL, *args
-    )
+def train(process, tmp_path, preset, epochs=1):
+    config = tmp_path / "train.yaml"
+    config.write_text(f"train: {{batch: 50, epochs: {epochs}}}")
+    where = ("--world", str(tmp_path / "w.yaml"), "--out", str(tmp_path / "m"), "--config", str(config))
+    return process("presage.__main__", "train", "--preset", preset, *where, *SMALL)
 
 
-@pytest.mark.parametrize(
-    ("preset", "stem", "more"), [("precise", "closet-precise", ()), ("paper", "closet-paper-61", (*PAPER, "3"))]
-)
-def test_training_for_a_custom_world_gives_beliefs(process, bus, tmp_path, preset, stem, more):
+@pytest.mark.parametrize(("preset", "stem"), [("precise", "closet-precise"), ("paper", "closet-paper-61")])
+def test_training_for_a_custom_world_gives_beliefs(process, bus, tmp_path, preset, stem):
     (tmp_path / "w.yaml").write_text(WORLD)
     folder = str(tmp_path / "m")
     estimator = ("estimator", "--world", str(tmp_path / "w.yaml"), "--models", folder, "--estimator", preset)
@@ -39,7 +37,7 @@ def test_training_for_a_custom_world_gives_beliefs(process, bus, tmp_path, prese
     assert without.wait(60) == 2
     assert f"presage train --world {tmp_path / 'w.yaml'}" in without.output
 
-    training = train(process, tmp_path, *more)
+    training = train(process, tmp_path, preset, 3)
     assert training.wait(120) == 0, training.output
     assert sorted(p.name for p in (tmp_path / "m").iterdir()) == [
         f"{stem}.json", f"{stem}.png", f"{stem}.safetensors",
@@ -59,27 +57,27 @@ def test_a_running_scanner_provides_the_samples(process, bus, tmp_path):
     (tmp_path / "w.yaml").write_text(WORLD)
     process("simulator", "--world", str(tmp_path / "w.yaml"))
     assert wait_until(lambda: "simulator" in bus.alive(), 60)
-    training = train(process, tmp_path, *PAPER, "1", "--robot", bus.robot)
+    training = train(process, tmp_path, "paper")
     assert training.wait(120) == 0, training.output
     assert "samples come from the running scanner tim571 in closet" in training.output
 
 
 def test_an_interrupted_training_continues_and_gives_the_same_weights(process, tmp_path):
     (tmp_path / "w.yaml").write_text(WORLD)
-    whole = train(process, tmp_path, *PAPER, "15")
+    whole = train(process, tmp_path, "paper", 15)
     assert whole.wait(150) == 0, whole.output
     weights = tmp_path / "m" / "closet-paper-61.safetensors"
     first = weights.read_bytes()
     weights.unlink()
 
-    cut = train(process, tmp_path, *PAPER, "15")
+    cut = train(process, tmp_path, "paper", 15)
     state = tmp_path / "m" / ".closet-paper-61.unfinished" / "state.safetensors"
     assert wait_until(lambda: state.exists() or not cut.running, 60)
     cut.send(signal.SIGINT)
     assert cut.wait(30) == 130, cut.output
     assert not weights.exists()
 
-    again = train(process, tmp_path, *PAPER, "15")
+    again = train(process, tmp_path, "paper", 15)
     assert again.wait(150) == 0, again.output
     assert "an interrupted run" in again.output
     assert weights.read_bytes() == first

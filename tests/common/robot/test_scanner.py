@@ -11,7 +11,7 @@ from common.errors import UserError
 from common.geometry import se2
 from common.robot.scan_geometry import ALL_ROUND, Sweep
 from common.robot.scanner import SCANNERS
-from common.robot.scanner_options import chosen_scanner, load_scanner, scanner_arguments
+from common.robot.scanner_options import chosen_scanner, load_scanner
 from common.runtime.config import load_settings
 from services.simulator.settings import SimulatorSettings
 
@@ -93,9 +93,6 @@ def test_a_file_describes_a_scanner(tmp_path):
     other = chosen_scanner(str(file), 100, 0.05, "0,-0.2,180", upside_down=False)
     assert (other.beams, other.sigma, other.upside_down) == (100, 0.05, False)
     assert other.mount == pytest.approx((0, -0.2, np.pi))
-    assert scanner_arguments(str(file), None, "0,1", upside_down=True) == (
-        "--scanner", str(file), "--mount=0,1", "--upside-down",
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,10 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import load_world
 from common.messages.topics import ODOM, SCAN, TRUTH
+from common.runtime.config import load_section
 from presage.logs.importing import ImportOptions, import_command
 from presage.logs.log import Reading
-from presage.logs.options import reading_of
+from presage.logs.options import LogSettings
 from presage.logs.scan_files import read_scans
 from presage.recordings.info import survey
 from presage.recordings.session_figure import draw_session
@@ -141,7 +142,7 @@ def test_upside_down_scanner(tmp_path):
 
 def test_log_without_stamps(tmp_path):
     file = npz(tmp_path, stamps=None)
-    with pytest.raises(UserError, match="rate"):
+    with pytest.raises(UserError, match="with rate in section log"):
         imported(file)
     np.testing.assert_allclose(read_scans(imported(file, rate=5.0)[0]).stamps, np.arange(SCANS) / 5)
 
@@ -180,16 +181,18 @@ def test_names_of_files(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("said", "why"),
+    ("section", "why"),
     [
-        ({"mount": "1"}, "--mount '1'"), ({"angles": "90"}, "--angles '90'"), ({"angles": "90,-90"}, "to the left"),
-        ({"clock": "wall"}, "no clock 'wall'"),
+        ("mount: '1'", "mount"),
+        ("angles: '90'", "angles '90'"),
+        ("angles: 90,-90", "to the left"),
+        ("clock: wall", "clock"),
     ],
-)  # fmt: skip
-def test_option_refusals(said, why):
-    usual = dict.fromkeys(("mount", "scan_topic", "odom_topic", "reference_topic", "base_frame", "angles"), "")
+)
+def test_invalid_log_settings(tmp_path, section, why):
+    (tmp_path / "c.yaml").write_text(f"log:\n  {section}\n")
     with pytest.raises(UserError, match=why):
-        reading_of(**{**usual, "clock": "sensor", **said}, reference=None, range_max=None, upside_down=None)
+        load_section(LogSettings, tmp_path / "c.yaml", "log").reading()
 
 
 def test_figure_without_poses(tmp_path):

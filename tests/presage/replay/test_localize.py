@@ -255,7 +255,7 @@ def test_ctrl_c_ends_with_status_130(tmp_path, processes):
     many = {name: np.tile(data[name], (300, 1)) for name in ("ranges", "odom")}
     np.savez(tmp_path / "long.npz", **{**data, **many, "stamps": np.arange(3000) / 10})
     out = tmp_path / "poses.csv"
-    arguments = ["localize", str(tmp_path / "long.npz"), "--world", "corridor", "--fresh", "--out", str(out)]
+    arguments = ["localize", str(tmp_path / "long.npz"), "--world", "corridor", "--mode", "single", "--out", str(out)]
     running = processes.start("presage.__main__", *arguments)
     assert wait_until(lambda: out.exists() and len(out.read_text().splitlines()) > 3, 4 * WAIT_TIMEOUT_S)
     assert running.stop(signal.SIGINT)[0] == 130
