@@ -107,7 +107,7 @@ def rerun_command(job: RerunOptions, json_file: Path | None, console: Console) -
     files = draw(comparison, out)
     for path in (out, *files):
         console.print(f"wrote {path}", highlight=False, soft_wrap=True)
-    about = {"file": str(job.file), "out": str(out), "robot": robot, "settings": service.options.effective()}
+    about = {"file": str(job.file), "out": str(out), "robot": robot, "settings": service.settings.effective()}
     meta = {"commit": commit(), "versions": versions(), "arguments": sys.argv[1:]}
     write_json(json_file, {**about, **comparison.as_dict(), **meta})
 
@@ -145,7 +145,7 @@ def write_recording(
         copier = _Copier(service, robot, alias, writer)
         columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
         with Progress(*columns, console=console, transient=True) as bar:
-            task = bar.add_task(f"{service.options.estimator}", total=recording.counts()[SCAN.key(robot)])
+            task = bar.add_task(f"{service.settings.estimator}", total=recording.counts()[SCAN.key(robot)])
             for raw in recording.payloads():
                 if copier.process(raw):
                     bar.advance(task)
@@ -171,7 +171,7 @@ def _describe(recording: Recording, service: OfflineEstimatorService, alias: str
         writer.metadata(name, values)
     for name, data in recording.attachments.items():
         writer.attachment(name, data, "application/octet-stream", recording.start_ns)
-    facts = {"config": json.dumps(service.options.effective()), "file": recording.path.name, **versions()}
+    facts = {"config": json.dumps(service.settings.effective()), "file": recording.path.name, **versions()}
     writer.metadata(f"rerun:{alias}", facts)
 
 
@@ -181,7 +181,7 @@ class _Copier:
     def __init__(self, service: OfflineEstimatorService, robot: str, alias: str, writer: RecordingWriter) -> None:
         self.service, self.robot, self.alias, self.writer = service, robot, alias, writer
         self.inputs = {topic.key(robot): topic for topic in service.inputs}
-        self.builder = ComparisonBuilder(BeliefSeries(), BeliefSeries(service.options.estimator))
+        self.builder = ComparisonBuilder(BeliefSeries(), BeliefSeries(service.settings.estimator))
         self.foreign = 0  # messages on unknown keys
         # Outputs that are not yet written: (time of logging of the scan, topic, message).
         self._pending: list[tuple[int, Topic, Stamped]] = []

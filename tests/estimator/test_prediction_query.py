@@ -17,7 +17,7 @@ from common.messages.requests import PredictReply, PredictRequest
 from common.messages.topics import PREDICT, SCAN
 from common.robot.scanner import SCANNERS
 from common.runtime.service import Loop
-from services.estimator import prediction_query as predicting
+from services.estimator.prediction_query import answer_prediction
 from services.estimator.shared.interface import Predicted
 from tests.estimator.test_service import SCANNER, TRUTH, a_scan, opened
 
@@ -235,9 +235,9 @@ def test_a_scanner_of_very_many_beams_is_not_predicted_a_thousand_times():
             return Predicted(np.ones((len(poses), len(angles))), np.ones((len(poses), len(angles))))
 
     angles = np.linspace(-2, 2, 2000)
-    assert predicting.answer(Model(), PredictRequest(poses=np.zeros((500, 3))), angles, 25.0).ok
+    assert answer_prediction(Model(), PredictRequest(poses=np.zeros((500, 3))), angles, 25.0).ok
     with pytest.raises(UserError, match="1000 poses of 2000 beams are too many ranges"):
-        predicting.answer(Model(), PredictRequest(poses=np.zeros((1000, 3))), angles, 25.0)
+        answer_prediction(Model(), PredictRequest(poses=np.zeros((1000, 3))), angles, 25.0)
 
 
 def test_before_the_first_scan_there_is_no_scanner_to_predict():

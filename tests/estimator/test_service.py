@@ -184,7 +184,7 @@ def an_odom(stamp) -> Odom:
 
 
 def test_with_odometry_a_scan_waits_for_the_odometry_of_its_stamp(precise):
-    precise.options = EstimatorSettings(prior="odometry")
+    precise.settings = EstimatorSettings(prior="odometry")
     precise.on_message(ODOM, an_odom(1))
     precise.on_message(SCAN, a_scan(1, TRUTH))
     assert len(precise.sent) == 2
@@ -201,7 +201,7 @@ def test_with_odometry_a_scan_waits_for_the_odometry_of_its_stamp(precise):
 def test_a_command_is_a_prior_only_when_told(precise):
     precise.on_message(CMD_VEL, CmdVel(stamp_ns=1, twist=Twist(vx=0.5)))
     assert precise._observation(a_scan(2)).command is None
-    precise.options = EstimatorSettings(prior="command")
+    precise.settings = EstimatorSettings(prior="command")
     assert precise._observation(a_scan(2)).command.tolist() == [0.5, 0, 0]
 
 

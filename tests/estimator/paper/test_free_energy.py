@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.estimator.paper.free_energy import accuracy, attraction, gradient
+from services.estimator.paper.free_energy import FreeEnergy, accuracy, attraction
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -36,7 +36,7 @@ def free_energy(g, o, precision, x, goal, beta):
 @given(seeds, st.floats(0.01, 2.0))
 def test_descent_is_minus_the_gradient_of_f(seed, beta):
     g, dg, o, precision, belief, goal = scene(seed)
-    found = gradient(o, g(belief), dg(belief), precision, g(goal), beta)
+    found = FreeEnergy(o, g(belief), dg(belief), precision, g(goal), beta)
     h = 1e-6
     for axis in range(3):
         step = h * np.eye(3)[axis]
@@ -47,7 +47,7 @@ def test_descent_is_minus_the_gradient_of_f(seed, beta):
 @given(seeds, st.floats(0.01, 2.0))
 def test_a_short_step_along_the_descent_lowers_f(seed, beta):
     g, dg, o, precision, belief, goal = scene(seed)
-    found = gradient(o, g(belief), dg(belief), precision, g(goal), beta)
+    found = FreeEnergy(o, g(belief), dg(belief), precision, g(goal), beta)
     length = 1e-4 / max(np.linalg.norm(found.descent), 1e-9)
     if np.linalg.norm(found.descent) < 1e-3:
         return  # at a stationary point there is nothing to descend
@@ -58,7 +58,7 @@ def test_a_short_step_along_the_descent_lowers_f(seed, beta):
 @given(seeds)
 def test_curvature_is_the_gauss_newton_hessian(seed):
     g, dg, o, precision, belief, _ = scene(seed)
-    found = gradient(g(belief), g(belief), dg(belief), precision)  # without misfit the Gauss-Newton Hessian is exact
+    found = FreeEnergy(g(belief), g(belief), dg(belief), precision)  # without misfit the Gauss-Newton Hessian is exact
     h = 1e-4
     for i in range(3):
         for j in range(3):
@@ -85,5 +85,5 @@ def test_the_printed_goal_term_points_away_from_the_goal(seed):
     goal = belief + 1e-3 * np.random.default_rng(seed).normal(size=3)
     o = g(belief)
     printed = (dg(belief).T * precision) @ (o - g(goal))
-    ours = gradient(o, g(belief), dg(belief), precision, g(goal), 1.0).xi_goal
+    ours = FreeEnergy(o, g(belief), dg(belief), precision, g(goal), 1.0).xi_goal
     assert printed @ (goal - belief) < 0 < ours @ (goal - belief)

@@ -26,7 +26,7 @@ def test_a_near_belief_descends_to_the_truth_and_tracks():
     found = estimator((3.15, 1.4), alpha=2e-3, iterations=1)
     estimates = [found.update(scan(truth, rng)) for _ in range(60)]
     assert np.hypot(*(estimates[-1].pose[:2] - truth)) < 0.01
-    assert estimates[-1].gradient.accuracy < estimates[0].gradient.accuracy
+    assert estimates[-1].free_energy.accuracy < estimates[0].free_energy.accuracy
     assert [e.state for e in estimates[:3]] == ["localising"] * 3
     assert estimates[-1].state == "tracking"
 
@@ -62,7 +62,7 @@ def test_the_goal_draws_the_belief_only_where_beta_says_so():
         a, b = plain.update(o, goal), drawn.update(o, goal)
     assert np.hypot(*(a.pose[:2] - truth)) < 0.02
     assert np.hypot(*(b.pose - goal)[:2]) < np.hypot(*(a.pose - goal)[:2]) - 0.05
-    assert b.gradient.attraction > 0 == a.gradient.attraction
+    assert b.free_energy.attraction > 0 == a.free_energy.attraction
 
 
 def test_beams_that_say_nothing_are_as_if_they_were_not_there():
@@ -77,7 +77,7 @@ def test_beams_that_say_nothing_are_as_if_they_were_not_there():
     assert found.state == "tracking"
     assert np.hypot(*(found.pose[:2] - truth)) < 0.01 < np.hypot(*(plain.pose[:2] - truth))
     assert stays.pose.tolist() == [3.15, 1.4, HEADING]
-    assert (stays.state, stays.gradient.accuracy) == ("localising", 0.0)
+    assert (stays.state, stays.free_energy.accuracy) == ("localising", 0.0)
 
 
 def test_restart_forgets():

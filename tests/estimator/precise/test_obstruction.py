@@ -49,7 +49,7 @@ def test_where_no_return_is_expected_nothing_contradicts():
     for measured in (np.inf, 2.0, -np.inf):
         view = view_of(made, scene, np.full(count, measured))
         assert obstruction.is_only_blocked(view, nothing, 0.02)
-        assert obstruction.late_ratio(view, nothing) == obstruction.contradicting_ratio(view, nothing) == 0
+        assert obstruction.behind_ratio(view, nothing) == obstruction.contradicting_ratio(view, nothing) == 0
     unknown = Expected(nothing.ranges, np.full((1, count), np.inf), nothing.jacobian)
     assert not obstruction.is_only_blocked(view_of(made, scene, np.full(count, np.inf)), unknown, 0.02)
 
