@@ -29,7 +29,7 @@ def hall():
 
 @settings(max_examples=10)
 @given(st.integers(0, 2**32 - 1))
-def test_compiled_rays_are_those_of_the_world(seed):
+def test_rays_and_derivatives(seed):
     rng = np.random.default_rng(seed)
     values = rng.choice([FREE, OCCUPIED, UNKNOWN], (20, 30), p=[0.8, 0.15, 0.05]).astype(np.uint8)
     world = World(name="x", grid=OccupancyGrid.of(values, 0.5, (1.0, -2.0, 0.7)), obstacles=[CRATE])
@@ -52,7 +52,7 @@ def test_compiled_rays_are_those_of_the_world(seed):
         assert fine[np.isfinite(expected.ranges)].mean() > 0.5
 
 
-def test_tables_of_the_particle_filter(hall):
+def test_particle_filter_tables(hall):
     field = DistanceField(hall)
     places = hall.sample_free(300, np.random.default_rng(0), 0.1)
     exact = hall.grid.shapes.distance(OCCUPIED, places)
@@ -63,7 +63,7 @@ def test_tables_of_the_particle_filter(hall):
     assert table.ranges(middles, angles) == pytest.approx(hall.ray_distances(middles, angles), abs=1e-5)
 
 
-def test_the_robot_finds_itself_on_a_map(hall):
+def test_global_search(hall):
     rng = np.random.default_rng(3)
     geometry = Geometry(SCANNER.angles(), np.array(SCANNER.mount), SCANNER.range_max)
     make = prepare(Choice(world=hall, model="exact"))
@@ -75,7 +75,7 @@ def test_the_robot_finds_itself_on_a_map(hall):
         assert np.hypot(*(found.pose[:2] - place)) < 0.02
 
 
-def test_stated_deviation_covers_the_error_of_the_cells():
+def test_covariance_of_cell_errors():
     """A slanted room mapped with cells of 5 cm: the error of its walls, up to a cell, is the same at every scan."""
     corners = se2.rotate(0.3, np.array([(0.0, 0), (7, 0), (7, 5), (4, 5), (4, 3.5), (0, 3.5)]))
     room = World(name="room", boundary=corners.tolist())
