@@ -33,12 +33,12 @@ def poses_in(world: World, count: int, seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("world", [ROOM, BOX, ANALYTIC_WORLD])
-def test_the_ray_caster_is_exact(world):
+def test_ray_caster(world):
     poses = poses_in(world, 50, 0)
     assert RayCaster(world).expect(poses, ANGLES).ranges == pytest.approx(world.ray_distances(poses, ANGLES), abs=1e-9)
 
 
-def test_a_field_predicts_what_exact_rays_do():
+def test_field():
     poses = poses_in(ANALYTIC_WORLD, 100, 1)
     found = analytic().trace(poses, ANGLES)
     error = np.abs(found.ranges - ANALYTIC_WORLD.ray_distances(poses, ANGLES))
@@ -60,7 +60,7 @@ def _differences(model, pose, angles, step):
 
 @given(st.integers(0, 10_000))
 @settings(max_examples=40, deadline=None)
-def test_derivatives_are_those_of_the_ranges(seed):
+def test_derivatives(seed):
     pose = poses_in(ANALYTIC_WORLD, 1, seed)[0]
     for model, step, tolerance in (
         (RayCaster(ANALYTIC_WORLD), 1e-6, 1e-4),
@@ -75,12 +75,12 @@ def test_derivatives_are_those_of_the_ranges(seed):
         assert np.quantile(error, 0.9) < tolerance
 
 
-def test_outside_the_grid_nothing_is_met():
+def test_no_surface():
     open_field = DistanceField(np.full((20, 20), 1.0, np.float32), (0.0, 0.0), 0.1)
     found = open_field.trace(np.array([[1.0, 1.0, 0.0], [9.0, 9.0, 0.0]]), ANGLES)
     assert np.isinf(found.ranges).all()
     assert not found.jacobian.any()
 
 
-def test_inside_a_surface_the_range_is_zero():
+def test_inside_a_surface():
     assert analytic().trace(np.array([[4.5, 3.0, 0.0]]), ANGLES).ranges.max() == 0
