@@ -38,7 +38,7 @@ SHELL = {"__main__.py", "service.py", "settings.py"}
 ALSO_SHELL = {
     "services/estimator/factory.py",  # opens the files that settings name
     "services/estimator/model_card.py",
-    "services/estimator/multi_robot_service.py",
+    "services/estimator/multi_robot.py",
     "services/estimator/paper/checkpoint.py",
     "services/estimator/paper/weights.py",
     "services/estimator/precise/learning/weights.py",

@@ -85,9 +85,9 @@ class RangeTable:
         ij = np.clip(np.floor((poses[:, :2] - self.origin) / self.resolution).astype(int), 0, self._limit)
         cells = ij[:, 0] * (self._limit[1] + 1) + ij[:, 1]
         self._cast(np.unique(cells[self._row[cells] < 0]))
-        at = ((poses[:, 2:3] + angles) % (2 * np.pi)) * (HEADINGS / (2 * np.pi))
-        low = np.floor(at).astype(int)
-        rows, part = self._row[cells][:, None], at - low
+        direction = ((poses[:, 2:3] + angles) % (2 * np.pi)) * (HEADINGS / (2 * np.pi))
+        low = np.floor(direction).astype(int)
+        rows, part = self._row[cells][:, None], direction - low
         a, b = self._ranges[rows, low % HEADINGS], self._ranges[rows, (low + 1) % HEADINGS]
         # At a silhouette the nearer heading is used, because interpolated ranges would end in free space.
         with np.errstate(invalid="ignore"):

@@ -211,9 +211,9 @@ class ParticleFilter:
         """Draws as many particles as the belief needs; a share at random places if scans no longer fit."""
         s, rng = self.settings, self._rng
         share = self._recovery.random_share if self._recovers else 0.0
-        at = resampling.bins(self.particles)
-        trial = self._upper_bound(len(np.unique(at)), share)
-        drawn = at[rng.permutation(resampling.low_variance(self.weights, trial, rng))]
+        bins = resampling.bins(self.particles)
+        trial = self._upper_bound(len(np.unique(bins)), share)
+        drawn = bins[rng.permutation(resampling.low_variance(self.weights, trial, rng))]
         random_poses = self._anywhere(int(rng.binomial(trial, share))) if share > 0 else np.zeros((0, 3))
         if len(random_poses):
             drawn[rng.permutation(trial)[: len(random_poses)]] = resampling.bins(random_poses)

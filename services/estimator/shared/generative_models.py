@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -13,7 +12,6 @@ from common.geometry.ray_casting import cast_rays_with_jacobian
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import World
-    from services.estimator.shared.asking import Pieces
 
 CORNER_ANGLE_RAD = 0.3  # a surface tilted by more is a corner, and not a ripple caused by learning
 EXACT_SCALE_M = 1e-4  # stated error of exact rays, for rounding
@@ -30,15 +28,6 @@ class Expected:
     def part(self, rows: slice) -> Expected:
         """Returns the scans at some of the poses."""
         return Expected(self.ranges[rows], self.scale[rows], self.jacobian[rows])
-
-    @classmethod
-    def joined(cls, parts: Sequence[Expected]) -> Expected:
-        """Concatenates the scans of several parts."""
-        return cls(
-            np.concatenate([part.ranges for part in parts]),
-            np.concatenate([part.scale for part in parts]),
-            np.concatenate([part.jacobian for part in parts]),
-        )
 
 
 class GenerativeModel(Protocol):
@@ -79,42 +68,3 @@ class RayCaster:
         """Predicts scans; see GenerativeModel."""
         ranges, jacobian = cast_rays_with_jacobian(self.world, lasers, angles)
         return Expected(ranges, np.full(ranges.shape, max(EXACT_SCALE_M, map_error(self.world))), jacobian)
-
-
-@dataclass(frozen=True)
-class Expect:
-    """`GenerativeModel.expect` as a question (see `services.estimator.shared.asking`)."""
-
-    model: GenerativeModel
-    lasers: Array  # (N, 3)
-    angles: Array  # (B,)
-
-    @property
-    def alike(self) -> Hashable:
-        """Questions to one model about the same beams can be answered together."""
-        return id(self.model), self.angles.tobytes()
-
-    @property
-    def beams(self) -> int:
-        """Number of beams to predict."""
-        return len(self.lasers) * len(self.angles)
-
-    def answer(self) -> Expected:
-        """Returns the predicted scans."""
-        return self.model.expect(self.lasers, self.angles)
-
-    def answer_all(self, questions: Sequence[Expect]) -> list[Expected]:
-        """Answers several questions with one call of the model."""
-        expected = self.model.expect(np.concatenate([question.lasers for question in questions]), self.angles)
-        ends = np.cumsum([len(question.lasers) for question in questions])
-        return [expected.part(slice(end - len(q.lasers), end)) for q, end in zip(questions, ends, strict=True)]
-
-    def in_pieces(self, beams: int) -> Pieces[Expected]:
-        """Predicts a few poses at a time."""
-        rows = max(1, beams // max(1, len(self.angles)))
-        parts = []
-        for begin in range(0, len(self.lasers), rows):
-            if begin:
-                yield
-            parts.append(self.model.expect(self.lasers[begin : begin + rows], self.angles))
-        return Expected.joined(parts)

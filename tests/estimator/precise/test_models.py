@@ -54,7 +54,7 @@ def test_derivatives(seed):
     assert np.quantile(error, 0.9) < 0.05
 
 
-def test_nothing_outside_the_grid():
+def test_no_surface():
     open_field = DistanceField(np.full((20, 20), 1.0, np.float32), (0.0, 0.0), 0.1)
     found = open_field.trace(np.array([[1.0, 1.0, 0.0], [9.0, 9.0, 0.0]]), ANGLES)
     assert np.isinf(found.ranges).all()
