@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from presage.laser_scan import LaserScan
     from presage.logs.log import Reading
     from presage.logs.scan_files import Scans, read_scans
+    from services.estimator.precise.gauss_newton import GaussNewton, Optimiser
     from services.estimator.precise.likelihood import Evidence, Likelihood
     from services.estimator.shared.generative_models import Expected, GenerativeModel, RayCaster
     from services.estimator.shared.interface import Hypothesis, Posterior, Predicted
@@ -28,6 +29,7 @@ _MODULES = {
     "presage.laser_scan": ("LaserScan",),
     "presage.logs.log": ("Reading",),
     "presage.logs.scan_files": ("Scans", "read_scans"),
+    "services.estimator.precise.gauss_newton": ("GaussNewton", "Optimiser"),
     "services.estimator.precise.likelihood": ("Evidence", "Likelihood"),
     "services.estimator.shared.generative_models": ("Expected", "GenerativeModel", "RayCaster"),
     "services.estimator.shared.interface": ("Hypothesis", "Posterior", "Predicted"),
@@ -35,9 +37,9 @@ _MODULES = {
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = [
-    "SCANNERS", "Estimator", "Evidence", "Expected", "GenerativeModel", "Hypothesis", "LaserScan", "Likelihood",
-    "Posterior", "Predicted", "RayCaster", "Reading", "Scanner", "Scans", "UserError", "World", "load_world",
-    "read_scans",
+    "SCANNERS", "Estimator", "Evidence", "Expected", "GaussNewton", "GenerativeModel", "Hypothesis", "LaserScan",
+    "Likelihood", "Optimiser", "Posterior", "Predicted", "RayCaster", "Reading", "Scanner", "Scans", "UserError",
+    "World", "load_world", "read_scans",
 ]  # fmt: skip
 
 

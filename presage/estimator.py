@@ -15,6 +15,7 @@ from common.robot.scanner import SCANNERS, Scanner
 from presage.laser_scan import LaserScan
 from services.estimator.factory import Choice, Geometry, Name, prepare
 from services.estimator.paper.perception import Descent
+from services.estimator.precise.gauss_newton import Optimiser
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.shared.generative_models import GenerativeModel
 from services.estimator.shared.interface import Estimator as EstimatorCore
@@ -40,6 +41,7 @@ class Estimator:
         model: str | Path | GenerativeModel = "learned",
         models: Path | None = None,
         likelihood: Likelihood | None = None,
+        optimiser: Optimiser | None = None,
         sigma: float | None = None,
         initial_pose: Numbers | None = None,
         seed: int = 0,
@@ -57,6 +59,7 @@ class Estimator:
                 with the methods of GenerativeModel.
             models: folder of weights; defaults to the shipped ones.
             likelihood: for preset "precise": density of a range; defaults to the calibrated one of the model.
+            optimiser: for preset "precise": finds poses of least free energy; defaults to GaussNewton().
             sigma: noise of the scanner in m; defaults to what the scans state, else 0.02.
             initial_pose: (3,) pose at the first scan; by default the whole world is searched.
             seed: random seed.
@@ -69,6 +72,7 @@ class Estimator:
             model=str(model) if isinstance(model, str | Path) else "",
             generative_model=None if isinstance(model, str | Path) else model,
             likelihood=likelihood,
+            optimiser=optimiser,
             models=models,
             sigma=sigma,
             seed=seed,

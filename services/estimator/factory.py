@@ -21,7 +21,7 @@ from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.sensor import Sensor
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
 from services.estimator.precise.estimator import PreciseEstimator
-from services.estimator.precise.gauss_newton import View, polish
+from services.estimator.precise.gauss_newton import Optimiser, View, polish
 from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_places
 from services.estimator.precise.learning import weights
 from services.estimator.precise.likelihood import Likelihood
@@ -50,6 +50,7 @@ class Choice:
     descent: Descent = Descent()  # noqa: RUF009 - frozen; for paper
     generative_model: GenerativeModel | None = None  # for precise: used instead of `model`
     likelihood: Likelihood | None = None  # for precise; None: of the weights' calibration, or of the scanner's noise
+    optimiser: Optimiser | None = None  # for precise; None: Gauss-Newton
 
     @property
     def world_argument(self) -> str:
@@ -161,7 +162,9 @@ def _precise(choice: Choice, world: World) -> Factory:
         else:
             likelihood = geometry.likelihood(choice.sigma)
         rng = np.random.default_rng(choice.seed)
-        made = PreciseEstimator(model, seeds, geometry.mount, likelihood, settings, rng, bounds)
+        made = PreciseEstimator(
+            model, seeds, geometry.mount, likelihood, settings, rng, bounds, optimiser=choice.optimiser
+        )
         if choice.initial_pose is not None:
             made.restart(choice.initial_pose)
         return made

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
-from services.estimator.precise.gauss_newton import FINE_SIGMA_M, MEDIUM_SIGMA_M, Prior, View, descend, polish
+from services.estimator.precise.gauss_newton import FINE_SIGMA_M, MEDIUM_SIGMA_M, Prior, View
 from services.estimator.precise.motion_model import Candidate
 from services.estimator.precise.scan_memory import Match, RecentScans
 
@@ -124,8 +124,8 @@ def refine_in_changed_scene(view: View, matched: Candidate, settings: Settings) 
     starts[:, 2] = se2.wrap(starts[:, 2])
     prior = Prior.repeated(len(starts), matched.mean, matched.covariance)
     for extra_sigma in (MEDIUM_SIGMA_M, FINE_SIGMA_M):
-        starts, _ = descend(view, starts, prior, extra_sigma, 4)
-    poses, evidence = polish(view, starts, prior)
+        starts, _ = view.descend(starts, prior, extra_sigma, 4)
+    poses, evidence = view.polish(starts, prior)
     best = int(np.argmin(evidence.accuracy + prior.energy(poses)))
     poses, evidence = poses[best : best + 1], evidence.part(np.array([best]))
     share = float(evidence.inlier_ratio[0]) / settings.good_inlier_ratio

@@ -10,7 +10,7 @@ import numpy as np
 from common.geometry import se2
 from services.estimator.precise import continuity, obstruction
 from services.estimator.precise.continuity import Continuity
-from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, Prior, View, polish
+from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton, Optimiser, Prior, View
 from services.estimator.precise.hypotheses import (
     SAME_POSITION_M,
     Mode,
@@ -62,6 +62,7 @@ class PreciseEstimator:
         settings: Settings | None = None,
         rng: np.random.Generator | None = None,
         bounds: tuple[float, float, float, float] | None = None,
+        optimiser: Optimiser | None = None,
     ) -> None:
         """``mount`` (3,) is the laser in base_link; ``rng`` places the starts of a search near a given pose.
 
@@ -71,6 +72,7 @@ class PreciseEstimator:
         self.likelihood, self.settings = likelihood or Likelihood(), settings or Settings()
         self.bounds = bounds or (-np.inf, -np.inf, np.inf, np.inf)
         self._rng = rng or np.random.default_rng(0)
+        self._optimiser = optimiser or GaussNewton()
         self.restart()
 
     def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:
@@ -98,7 +100,13 @@ class PreciseEstimator:
     def track(self, observation: Observation) -> Posterior | None:
         """Returns the posterior after one more scan, or None if the scan cannot be explained without a `search`."""
         view = View(
-            self.model, self.likelihood, self.mount, observation.angles, observation.ranges, observation.range_max
+            self.model,
+            self.likelihood,
+            self.mount,
+            observation.angles,
+            observation.ranges,
+            observation.range_max,
+            self._optimiser,
         ).thinned(TARGET_BEAMS)
         period = self._period(observation.stamp)
         self._continuity.begin_scan(self.settings.motion.speed * period)
@@ -152,7 +160,7 @@ class PreciseEstimator:
             np.array([motions[-1].mean for motions in candidates]),
             np.array([np.linalg.inv(motions[-1].covariance) for motions in candidates]),
         )
-        poses, evidence = polish(view, starts, widest)
+        poses, evidence = view.polish(starts, widest)
         if evidence.inlier_ratio[0] < self._mean_inlier_ratio - self.settings.inlier_ratio_drop:
             extra_starts = np.zeros((0, 3))
             if odom is None:

@@ -6,9 +6,9 @@ information of the density), D its diagonal. A step that does not lower F is und
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -31,9 +31,40 @@ COARSE_SIGMA_M, MEDIUM_SIGMA_M, FINE_SIGMA_M = ANNEALING_SCHEDULE_M = (0.3, 0.1,
 DAMPING = np.diag([1.0, 1.0, 1.0]) * 1e-6  # 1/m², 1/rad²: no step along directions without information
 
 
+class Optimiser(Protocol):
+    """Finds poses at which a scan has little free energy. F is ``evidence.accuracy``, plus ``prior.energy(poses)``."""
+
+    def descend(
+        self, view: View, poses: Array, prior: Prior | None, extra_sigma: float, iterations: int
+    ) -> tuple[Array, Evidence]:
+        """Returns poses (N, 3) with less F than ``poses`` (N, 3), and ``view.evidence(poses, extra_sigma)`` there.
+
+        Used from seeds up to a metre away. May evaluate each pose about ``iterations`` times.
+        """
+        ...
+
+    def polish(self, view: View, poses: Array, prior: Prior | None, iterations: int) -> tuple[Array, Evidence]:
+        """Returns the minima of F next to ``poses`` (N, 3) to a fraction of a millimetre, and the evidence there."""
+        ...
+
+
+class GaussNewton:
+    """The default optimiser: the functions `descend` and `polish` of this module."""
+
+    def descend(
+        self, view: View, poses: Array, prior: Prior | None, extra_sigma: float, iterations: int
+    ) -> tuple[Array, Evidence]:
+        """See Optimiser."""
+        return descend(view, poses, prior, extra_sigma, iterations)
+
+    def polish(self, view: View, poses: Array, prior: Prior | None, iterations: int) -> tuple[Array, Evidence]:
+        """See Optimiser."""
+        return polish(view, poses, prior, iterations)
+
+
 @dataclass(frozen=True)
 class View:
-    """One scan, with the model and the likelihood by which poses are compared with it."""
+    """One scan, with the model, the likelihood and the optimiser by which poses are compared with it."""
 
     model: GenerativeModel
     likelihood: Likelihood
@@ -41,13 +72,24 @@ class View:
     angles: Array  # (B,) rad in laser
     ranges: Array  # (B,) m
     range_max: float  # m
+    optimiser: Optimiser = field(default_factory=GaussNewton)
 
     def thinned(self, beams: int) -> View:
         """Returns a view with every k-th beam, so that about ``beams`` are left."""
         k = max(1, len(self.angles) // beams)
         # numba would compile every loop once more for strided arrays, so these are contiguous.
         angles, ranges = np.ascontiguousarray(self.angles[::k]), np.ascontiguousarray(self.ranges[::k])
-        return View(self.model, self.likelihood, self.mount, angles, ranges, self.range_max)
+        return replace(self, angles=angles, ranges=ranges)
+
+    def descend(
+        self, poses: Array, prior: Prior | None = None, extra_sigma: float = 0.0, iterations: int = 10
+    ) -> tuple[Array, Evidence]:
+        """Returns poses (N, 3) after the descent from ``poses``, and the evidence there."""
+        return self.optimiser.descend(self, poses, prior, extra_sigma, iterations)
+
+    def polish(self, poses: Array, prior: Prior | None = None, iterations: int = 5) -> tuple[Array, Evidence]:
+        """Returns the minima next to ``poses`` (N, 3), and the evidence there."""
+        return self.optimiser.polish(self, poses, prior, iterations)
 
     @cached_property
     def points(self) -> Array:

@@ -13,8 +13,6 @@ from services.estimator.precise.gauss_newton import (
     MEDIUM_SIGMA_M,
     Prior,
     View,
-    descend,
-    polish,
 )
 from services.estimator.precise.hypotheses import Mode, mode_from_search, select_distinct, weigh
 
@@ -58,8 +56,8 @@ def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) 
     starts = np.concatenate([starts, extra_starts])
     repeated_prior = Prior(prior.mean[hypothesis], prior.information[hypothesis])
     for extra_sigma in ANNEALING_SCHEDULE_M:
-        starts, _ = descend(view, starts, repeated_prior, extra_sigma, 5)
-    poses, evidence = polish(view, starts, repeated_prior)
+        starts, _ = view.descend(starts, repeated_prior, extra_sigma, 5)
+    poses, evidence = view.polish(starts, repeated_prior)
     own = np.flatnonzero(hypothesis == 0)
     keep = np.array([own[np.argmin(evidence.accuracy[own] + repeated_prior.energy(poses)[own])], *range(1, count)])
     return poses[keep], evidence.part(keep)
@@ -68,12 +66,12 @@ def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) 
 def _refine(view: View, starts: Array, prior: Prior | None, seeds: Seeds, settings: Settings) -> list[Mode]:
     """Descends from all starts with few beams and wide deviations, then from the best ones with all beams."""
     few = view.thinned(settings.search_beams)
-    poses, evidence = descend(few, starts, prior, COARSE_SIGMA_M, 5)
-    poses, evidence = descend(few, poses, prior, MEDIUM_SIGMA_M, 4)
+    poses, evidence = few.descend(starts, prior, COARSE_SIGMA_M, 5)
+    poses, evidence = few.descend(poses, prior, MEDIUM_SIGMA_M, 4)
     keep = select_distinct(poses, evidence.accuracy, 2 * settings.max_hypotheses)
     part = Prior(prior.mean[keep], prior.information[keep]) if prior else None
-    poses, evidence = descend(view, poses[keep], part, FINE_SIGMA_M, 4)
-    poses, evidence = polish(view, poses, part)
+    poses, evidence = view.descend(poses[keep], part, FINE_SIGMA_M, 4)
+    poses, evidence = view.polish(poses, part)
     keep = select_distinct(poses, evidence.accuracy, settings.max_hypotheses)
     modes = [mode_from_search(poses[k], evidence, k, part, seeds.volume, seeds.spread, view.model.ripple) for k in keep]
     return weigh(modes, settings.evidence_error_nats, settings.max_hypotheses)
