@@ -1,18 +1,18 @@
-# An image a service, each with the packages that are its own: `docker compose build` makes those compose uses,
-# `make images` all of them, and says what they weigh.
+# One image for each service, with only its own packages. `docker compose build` builds the images that compose uses;
+# `make images` builds all of them and prints their sizes.
 FROM python:3.11-slim AS base
-# Where else pip may look, such as PyTorch's index of small CPU builds; empty: the default index alone.
+# URL of an additional package index, such as PyTorch's index of CPU builds, which are much smaller.
 ARG WHEEL_INDEX=""
 ENV PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore
 WORKDIR /install
 COPY docker/install.py pyproject.toml constraints.txt ./
-# Packages first: a change of code does not fetch them again.
-RUN python install.py
-# What follows needs no writable place but /tmp: the root file system may be read-only.
+# Packages are installed before the code is copied, so that a change of code does not install them again.
+RUN python install.py router
+# Only /tmp has to be writable: the root file system may be read-only.
 RUN useradd --uid 1000 --no-create-home presage && mkdir -m 1777 /recordings && chown presage /recordings
 ENV PYTHONPATH=/app PATH=/app/bin:$PATH HOME=/tmp MPLCONFIGDIR=/tmp PRESAGE_HEARTBEAT=/tmp
 
-# The program, compiled: on a read-only file system nothing can be compiled later.
+# The program with its compiled modules, because a read-only file system cannot store them later.
 FROM base AS program
 COPY pyproject.toml README.md ./
 COPY common common
@@ -30,12 +30,12 @@ USER presage
 HEALTHCHECK --interval=10s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "router"]
 CMD ["python", "-m", "common.router", "--listen", "tcp/0.0.0.0:7447"]
 
-# Where the robot is elsewhere: waits for its scans.
+# Instead of the simulator, for a robot that is elsewhere: waits for its scans.
 FROM router AS none
 HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "remote"]
 CMD ["python", "-m", "common.containers.run_per_robot", "each", "common.containers.remote_robot"]
 
-# A robot in ROS 2 in the simulator's place.
+# Instead of the simulator, for a robot in ROS 2.
 FROM base AS bridge_ros2
 RUN python install.py bridge_ros2
 COPY --from=program /app /app
@@ -54,7 +54,7 @@ USER presage
 HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "recorder"]
 CMD ["python", "-m", "common.containers.run_per_robot", "each", "services.recorder", "--directory", "/recordings"]
 
-# A recording in the scanner's place.
+# Instead of the simulator: plays a recording.
 FROM recorder AS replay
 HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "replay"]
 CMD ["python", "-m", "common.containers.run_per_robot", "each", "services.recorder.replaying.service", "--directory", "/recordings"]
@@ -62,7 +62,7 @@ CMD ["python", "-m", "common.containers.run_per_robot", "each", "services.record
 FROM recorder-packages AS terminal-packages
 RUN python install.py terminal
 
-# A recording that a visitor opens is played by the command line.
+# The viewer plays recordings with the command line.
 FROM terminal-packages AS viewer
 RUN python install.py viewer
 COPY --from=program /app /app
@@ -89,8 +89,11 @@ USER presage
 HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "controller"]
 CMD ["python", "-m", "common.containers.run_per_robot", "each", "services.controller"]
 
+# Debug symbols are 126 of the 134 MB of pybullet's library.
 FROM controller-packages AS simulator
-RUN python install.py simulator
+RUN apt-get update && apt-get install --yes --no-install-recommends binutils \
+    && python install.py simulator && find /usr/local/lib -name 'pybullet*.so' -exec strip --strip-debug {} + \
+    && apt-get purge --yes --auto-remove binutils && rm -rf /var/lib/apt/lists/*
 COPY --from=program /app /app
 WORKDIR /tmp
 USER presage
@@ -98,14 +101,17 @@ HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", 
 CMD ["python", "-m", "common.containers.run_per_robot", "each", "services.simulator"]
 
 FROM base AS estimator
-ARG WHEEL_INDEX=""
 RUN python install.py estimator
 COPY --from=program /app /app
-# The compiled loops are kept in the image; on another processor they are compiled again. Numba insists on a folder it
-# can write to: each container takes a copy.
+# Numba's compiled code is stored in the image; on another type of processor it is compiled again. Numba needs a
+# writable cache, so each container starts with a copy.
 RUN NUMBA_CACHE_DIR=/numba python -c \
     'from services.estimator.factory import *; [prepare(Choice(model=m)) for m in ("learned", "exact")]'
 ENV NUMBA_CACHE_DIR=/tmp/numba
+# Only preset paper needs PyTorch.
+ARG ESTIMATOR=precise
+ARG WHEEL_INDEX=""
+RUN if [ "$ESTIMATOR" = paper ]; then python /install/install.py paper; fi
 WORKDIR /tmp
 USER presage
 HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "estimator"]

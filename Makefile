@@ -1,52 +1,65 @@
-# `make` lists what there is. Needs GNU make, a POSIX shell and Python >= 3.10; everything else goes into .venv.
+# `make` lists the targets. Needs GNU make, a POSIX shell and Python 3.10 or later, or uv; the rest is installed in .venv.
 
 PYTHON ?=
 WHEEL_INDEX ?=
+TORCH_BACKEND ?= cpu
 ARGS ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
+DEMO_STAMP := $(VENV)/.installed-demo
+# uv chooses PyTorch's index itself; another index is left to pip.
+UV ?= $(if $(WHEEL_INDEX),,$(shell command -v uv 2>/dev/null))
 
-.PHONY: help install demo test bless check bench chaos screenshots images clean FORCE
+.PHONY: help install demo test bless check bench chaos screenshots images lock platforms clean FORCE
 .DELETE_ON_ERROR:
 
 help: ## this list
 	@echo 'make TARGET [PYTHON=python3.11] [WHEEL_INDEX=URL] [ARGS="..."]'
 	@sed -n 's/^\([a-z]*\):[^#]*## /  \1	/p' $(firstword $(MAKEFILE_LIST)) | expand -t 16
-	@echo 'PyTorch without gigabytes of CUDA: WHEEL_INDEX is the URL of its index of CPU wheels (see pytorch.org)'
+	@echo 'With uv, PyTorch is the CPU build (TORCH_BACKEND=auto: for your GPU). With pip, WHEEL_INDEX is the URL of an'
+	@echo 'index of CPU builds (see pytorch.org); without it, pip downloads gigabytes of CUDA on Linux.'
 
-install: $(STAMP) ## make .venv with everything in it; does nothing where nothing changed
+install: $(STAMP) ## create .venv with everything, including PyTorch and development tools
 
-# The stamp is written last, so an install that was interrupted is done again.
+# Each stamp is written last, so that an interrupted installation is repeated.
 $(STAMP): pyproject.toml constraints.txt
 	@rm -f $@
 	@$(find_venv)
-	$(PIP) --upgrade 'pip>=24'
-	$(PIP) $(if $(WHEEL_INDEX),--extra-index-url '$(WHEEL_INDEX)') -c constraints.txt -e '.[dev]'
+	$(call install,.[dev])
+	@touch $(DEMO_STAMP) $@
+
+$(DEMO_STAMP): pyproject.toml constraints.txt
+	@rm -f $@
+	@$(find_venv)
+	$(call install,.)
 	@touch $@
 
-# A Python that is asked for is taken, though the files are older than the stamp.
+define install
+$(if $(UV),'$(UV)' pip install --quiet --python $(BIN)/python --torch-backend $(TORCH_BACKEND),\
+$(BIN)/python -m pip install --disable-pip-version-check --quiet \
+$(if $(WHEEL_INDEX),--extra-index-url '$(WHEEL_INDEX)')) -c constraints.txt -e '$(1)'
+endef
+
+# Another Python that was asked for replaces the one in .venv.
 ifneq ($(PYTHON),)
 ifneq ($(shell $(BIN)/python --version 2>&1),$(shell '$(PYTHON)' --version 2>&1))
-$(STAMP): FORCE
+$(STAMP) $(DEMO_STAMP): FORCE
 endif
 endif
 
-# A name on the path may be a stub that fails (pyenv), and Debian ships Python without venv: each is tried, not believed.
-# PyBullet has wheels for 3.10 and 3.11 alone, so these come first.
+# A name on the path may be a stub that fails (pyenv), and Debian ships Python without venv, so each is tried.
+# pybullet has wheels for 3.10 and 3.11 only, so these come first.
 define find_venv
 if $(BIN)/python -m pip --version >/dev/null 2>&1 \
   && { test -z '$(PYTHON)' || test "$$($(BIN)/python --version)" = "$$('$(PYTHON)' --version 2>&1)"; }; then exit 0; fi; \
-if test -n '$(PYTHON)'; then names='$(PYTHON)'; else names='python3.11 python3.10 python3 python3.12 python3.13 python'; fi; \
+if test -n '$(PYTHON)'; then names='$(PYTHON)'; else names='python3.11 python3.10 python3 python3.14 python3.13 python3.12 python'; fi; \
 for name in $$names; do \
   $$name -c 'import sys; sys.exit(sys.version_info < (3, 10))' >/dev/null 2>&1 || continue; \
-  $$name -c 'import sys; sys.exit(sys.version_info >= (3, 12))' \
-    || echo "make: PyBullet has no wheel for this Python and is compiled: minutes, and it needs a C++ compiler"; \
   echo "make: $(VENV) from $$name ($$($$name --version 2>&1))"; \
   rm -rf $(VENV); \
-  if $$name -m venv $(VENV); then exit 0; fi; \
+  if $(if $(UV),'$(UV)' venv --quiet --seed --python $$name $(VENV),$$name -m venv $(VENV)); then exit 0; fi; \
   rm -rf $(VENV); \
   echo "make: $$name cannot make a virtual environment; on Debian and Ubuntu: apt-get install $${name##*/}-venv"; \
 done; \
@@ -55,15 +68,15 @@ echo "make: install Python 3.11 (Debian: apt-get install python3.11 python3.11-v
 exit 1
 endef
 
-demo: install ## localise and drive in the corridor: every service, a live page, a recording, a picture
+demo: $(DEMO_STAMP) ## localise and drive in the corridor: every service, a live page, a recording, a picture
 	$(BIN)/presage demo --open $(ARGS)
 
 test: install ## all tests, the fast ones first
-	@# Hundreds of processes are started: each would compile all modules anew where Python is told to write none (PYTHONDONTWRITEBYTECODE).
+	@# Tests start hundreds of processes; with PYTHONDONTWRITEBYTECODE each would compile all modules again.
 	@$(BIN)/python -m compileall -q common services presage lab worlds models tests
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
-bless: install ## show what services answer differently than their references, and accept it
+bless: install ## show how services differ from the stored references, and accept it
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.process_replay.bless $(ARGS)
 
 check: install ## style, format and types
@@ -80,14 +93,22 @@ chaos: install ## inject faults into a system on three hosts: times of detection
 screenshots: install ## docs/page.png and docs/page.webp of the live page; needs Chromium
 	$(BIN)/python -m tests.viewer.screenshots $(ARGS)
 
-images: ## build every container image, and say what each adds to its base, python:3.11-slim
+images: ## build every container image, and print what each adds to its base, python:3.11-slim
 	docker compose build $(if $(WHEEL_INDEX),--build-arg WHEEL_INDEX='$(WHEEL_INDEX)')
 	for scanner in replay none bridge_ros2; do PRESAGE_SCANNER=$$scanner docker compose build simulator || exit 1; done
+	PRESAGE_ESTIMATOR=paper docker compose build $(if $(WHEEL_INDEX),--build-arg WHEEL_INDEX='$(WHEEL_INDEX)') estimator
 	@base=$$(docker image inspect --format '{{.Size}}' python:3.11-slim); \
-	for name in router none bridge_ros2 recorder replay controller simulator viewer cli estimator; do \
+	for name in router none bridge_ros2 recorder replay controller simulator viewer cli estimator-precise estimator-paper; do \
 	  size=$$(docker image inspect --format '{{.Size}}' presage-$$name) || exit 1; \
 	  echo "presage-$$name: $$(( ($$size - $$base) / 1000000 )) MB"; \
 	done
+
+lock: install ## pin every dependency in constraints.txt, for all platforms; ARGS=--upgrade takes newer versions
+	$(BIN)/uv pip compile --quiet --universal --all-extras --python-version 3.10 --no-annotate \
+	  --custom-compile-command 'make lock' -o constraints.txt pyproject.toml $(ARGS)
+
+platforms: install ## check that every dependency has a wheel for each platform and Python; print the size of the download
+	$(BIN)/python -m tests.platforms
 
 clean: ## remove .venv and what tools leave behind; recordings stay
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import hypothesis
@@ -17,12 +18,21 @@ import pytest
 
 from common.bus.bus import Link, open_bus, wait_until
 from common.bus.inbox import Sample
+from common.errors import UserError
 from tests.fork_server import Child, ForkServer, end_with_parent
 
 ROOT = Path(__file__).resolve().parent.parent
 WAIT_TIMEOUT_S = 30.0  # for events that take well under a second on an idle machine
 numbers = itertools.count(1)
 fork_servers: list[ForkServer] = []  # at most one in each of xdist's workers, started when it is needed
+
+# Tests of what is not installed: PyTorch for preset paper, and pybullet for the simulator's physics.
+TESTS_OF = {
+    "torch": ("estimator/paper", "lab/paper", "lab/accuracy/test_panorama.py", "estimator/test_weights_files.py"),
+    "pybullet": ("simulator/test_rays.py", "simulator/test_kinematics.py"),
+}
+MISSING = [package for package in TESTS_OF if find_spec(package) is None]
+collect_ignore = [path for package in MISSING for path in TESTS_OF[package]]
 
 # Without a database, so that nothing is written into the checkout. In CI the examples are the same every time.
 # `pytest --hypothesis-profile thorough` tries more examples than a normal run has time for.
@@ -33,6 +43,30 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.register_profile("thorough", deadline=None, database=None, max_examples=1000)
 hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "local")
+
+
+def pytest_report_header():
+    return [f"not installed: {package}; left out: {', '.join(TESTS_OF[package])}" for package in MISSING]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup():
+    return (yield from skip_without_package())
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call():
+    return (yield from skip_without_package())
+
+
+def skip_without_package():
+    """Skips a test that fails because one of the optional packages is missing."""
+    try:
+        return (yield)
+    except (ModuleNotFoundError, UserError) as error:
+        if any(text in str(error) for name in MISSING for text in (f"No module named '{name}", f"package {name} is")):
+            pytest.skip(str(error))
+        raise
 
 
 def pytest_collection_modifyitems(items):

@@ -16,7 +16,7 @@ PACKAGES = ("common", "services", "presage", "lab")
 # Each layer imports only those before it; what shares a line imports nothing of one another.
 LAYERS = (
     ("common.errors", "common.limits", "common.versions", "common.processes", "common.log_capture"),
-    ("common.log",),
+    ("common.log", "common.packages"),
     ("common.geometry",),
     ("common.robot",),
     ("common.messages",),
@@ -42,6 +42,7 @@ ALSO_SHELL = {
     "services/estimator/paper/checkpoint.py",
     "services/estimator/paper/weights.py",
     "services/estimator/precise/learning/weights.py",
+    "services/estimator/shared/model_folder.py",
     "services/viewer/control.py",
     "services/viewer/desk.py",
     "services/viewer/playback.py",

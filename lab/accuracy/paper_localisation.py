@@ -18,6 +18,7 @@ from services.estimator.paper import weights
 from services.estimator.paper.decoder import use_one_core
 from services.estimator.paper.perception import PaperEstimator
 from services.estimator.paper.training import usable_ranges
+from services.estimator.shared.model_folder import SHIPPED
 
 FOUND_DISTANCE = 1.0  # m; an error below it counts as found
 
@@ -28,7 +29,7 @@ def localisation(world: str, beams: int, trials: int, scans: int, seed: int, con
     The scans are exact rays with fresh noise; the estimator starts at the map's centre.
     """
     use_one_core()
-    model, card = weights.load(weights.find(weights.FOLDER, world, "paper", beams))
+    model, card = weights.load(weights.find(SHIPPED, world, "paper", beams))
     rng, scanner = np.random.default_rng(seed), card.scanner
     places = card.world.sample_free(trials, rng, Robot().radius)
     errors, is_tracking = [], []

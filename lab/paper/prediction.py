@@ -28,6 +28,7 @@ from services.estimator.paper import weights as paper_weights
 from services.estimator.paper.decoder import use_one_core
 from services.estimator.paper.training import usable_ranges
 from services.estimator.precise.learning import weights as precise_weights
+from services.estimator.shared.model_folder import SHIPPED
 
 EXPERIMENT_ID = 6  # part of the random seeds
 SAMPLE_SEED, TEST_SEED = 0, 1  # parts of the random seeds
@@ -97,10 +98,10 @@ def in_front(field: ExperimentWorld, scene: Scene) -> Array:
 def _expected(name: str, field: ExperimentWorld, scene: Scene, poses: Array) -> tuple[Array, Array]:
     """Ranges (N, B), m, predicted with the shipped weights, and the predicted deviations of the measurements, m."""
     if name == "paper":
-        path = paper_weights.find(paper_weights.FOLDER, scene.world.name, "paper", scene.scanner.beams)
+        path = paper_weights.find(SHIPPED, scene.world.name, "paper", scene.scanner.beams)
         ranges = paper_weights.load(path)[0].ranges(poses)
         return ranges, np.full(ranges.shape, PAPER_SIGMA)
-    model = precise_weights.load(precise_weights.find(precise_weights.FOLDER, scene.world, field.world))[0]
+    model = precise_weights.load(precise_weights.find(SHIPPED, scene.world, field.world))[0]
     expected = model.expect(se2.compose(poses, np.array(scene.scanner.mount)), scene.scanner.angles())
     ranges = usable_ranges(expected.ranges, scene.scanner.range_max)
     return ranges, np.sqrt(expected.scale**2 + scene.scanner.sigma**2)

@@ -39,6 +39,7 @@ from services.estimator.paper.estimator import PaperPerception
 from services.estimator.paper.perception import Descent
 from services.estimator.paper.training import usable_ranges
 from services.estimator.shared.interface import Observation
+from services.estimator.shared.model_folder import SHIPPED
 
 EXPERIMENT_ID = 5  # part of the random seeds; the journeys are those of E3
 PAPER_ITERATIONS = 12.5  # iterations, the paper's mean over 50 trials
@@ -101,7 +102,7 @@ def trial(job: Job) -> dict[str, Any]:
 @functools.lru_cache(maxsize=2)
 def _model(field: ExperimentWorld) -> tuple[PaperModel, weights.ModelCard]:
     use_one_core()
-    return weights.load(weights.find(weights.FOLDER, field.world, "paper", field.beams))
+    return weights.load(weights.find(SHIPPED, field.world, "paper", field.beams))
 
 
 def _run_displacement(job: Job, world: World, journey: Journey) -> dict[str, Any]:

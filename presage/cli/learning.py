@@ -68,21 +68,19 @@ def train(
     """
     from common.runtime.config import load_section, load_settings  # noqa: PLC0415
     from presage.learning import train_precise as precise  # noqa: PLC0415
-    from presage.learning import train_simulated as paper  # noqa: PLC0415
     from presage.learning.options import TrainSettings  # noqa: PLC0415
     from presage.learning.train_drive import TrainDriveOptions, train_from_drive  # noqa: PLC0415
     from presage.logs.options import LogSettings  # noqa: PLC0415
     from presage.session.running import link_of  # noqa: PLC0415
-    from services.estimator.paper.training import Recipe as PaperRecipe  # noqa: PLC0415
     from services.estimator.precise.learning.field_learning import Recipe  # noqa: PLC0415
-    from services.estimator.precise.learning.weights import FOLDER  # noqa: PLC0415
+    from services.estimator.shared.model_folder import training_folder  # noqa: PLC0415
     from services.simulator.settings import SimulatorSettings  # noqa: PLC0415
 
     if preset not in ("precise", "paper"):
         raise UserError(f"no preset {preset!r}: choose precise or paper")
     if drive is not None and preset != "precise":
         raise UserError("--from trains preset precise only: the paper's decoder needs scans taken at one heading")
-    folder, seed = out or FOLDER, seed or 0
+    folder, seed = out or training_folder(), seed or 0
     tuning = load_section(TrainSettings, config, "train")
     if drive is not None:
         make_folder(folder, "--out")
@@ -101,6 +99,9 @@ def train(
         job = precise.TrainPreciseOptions(world, chosen, tuple(simulator), folder, samples or 5000, recipe)
         precise.train_precise(job, link, console)
     else:
+        from presage.learning import train_paper as paper  # noqa: PLC0415 - torch, which need not be installed
+        from services.estimator.paper.training import Recipe as PaperRecipe  # noqa: PLC0415
+
         descent = PaperRecipe(tuning.epochs, tuning.batch, tuning.learning_rate, seed)
         options = paper.TrainPaperOptions(world, preset, chosen, tuple(simulator), folder, samples or 13_000, descent)
         paper.train(options, link, console)

@@ -11,6 +11,7 @@ import typer
 from pydantic import ValidationError
 
 from common.errors import UserError, first_fault
+from common.packages import explain_missing_packages
 from lab.cli import bench as cli_bench
 from lab.cli import experiment as cli_experiment
 from presage.cli import diagnosis as cli_diagnosis
@@ -186,7 +187,7 @@ def main() -> None:
     """Runs the command line; errors that a user can correct become one line and status 2, Ctrl-C status 130."""
     os.environ.setdefault("PYTHONWARNINGS", "default")
     try:
-        with interruptible():
+        with interruptible(), explain_missing_packages():
             app()
     except (UserError, ValidationError, OSError) as error:
         print(f"presage: {_in_one_line(error)}", file=sys.stderr)

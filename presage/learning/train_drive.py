@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ from services.estimator.precise.learning.drive_learning import MIN_SCANS, Learne
 from services.estimator.precise.learning.field_learning import Recipe
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import RayCaster
+from services.estimator.shared.model_folder import training_folder
 
 MARGIN_M = 1.0  # around the ends of the beams; the world of a drive without a map is a rectangle
 
@@ -38,7 +39,7 @@ class TrainDriveOptions:
 
     log: Path
     world: str = ""  # a map, in which scans are simulated for the places that the drive did not observe
-    out: Path = weights.FOLDER
+    out: Path = field(default_factory=training_folder)
     samples: int = 2000  # number of simulated scans in the map
     recipe: Recipe = Recipe(resolution=0.05)  # noqa: RUF009 - frozen
     share: float = 1.0  # of the drive to use, from its beginning

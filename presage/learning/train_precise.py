@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from common.geometry.world import World, load_world
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS, Scanner
 from common.versions import commit, versions
-from presage.learning.train_simulated import collect, scanner_on_bus
+from presage.learning.simulated_scans import collect, scanner_on_bus
 from services.estimator.factory import MIN_SIGMA_M
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.global_seeds import SEED_SPACING_M, thin_places
@@ -33,6 +33,7 @@ from services.estimator.precise.learning.field_learning import (
     reachable,
 )
 from services.estimator.precise.learning.surfaces import Beams
+from services.estimator.shared.model_folder import training_folder
 
 TEST_SAMPLES = 500
 
@@ -44,7 +45,7 @@ class TrainPreciseOptions:
     world: str
     scanner: Scanner = SCANNERS["tim571"]
     simulator_arguments: tuple[str, ...] = ()  # that select the scanner
-    out: Path = weights.FOLDER
+    out: Path = field(default_factory=training_folder)
     samples: int = 5000
     recipe: Recipe = Recipe()  # noqa: RUF009 - frozen
 

@@ -63,8 +63,6 @@ def _write(job: ExportOptions, recording: Recording, out: Path, console: Console
 
         only = job.localised_only
         return export_tum(recording, out, job.robot, console, localised_only=only, force=job.force)
-    try:
-        from presage.recordings.foxglove import export_foxglove  # noqa: PLC0415
-    except ModuleNotFoundError as error:
-        raise UserError(f"{error.name} is not installed: run pip install 'presage[export]'") from None
+    from presage.recordings.foxglove import export_foxglove  # noqa: PLC0415
+
     return export_foxglove(recording, out, job.robot, console, force=job.force)

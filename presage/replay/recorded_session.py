@@ -18,6 +18,7 @@ from common.runtime.config import ServiceSettings
 from common.versions import versions
 from services.controller.settings import ControllerSettings
 from services.estimator.settings import EstimatorSettings
+from services.estimator.shared.model_folder import SHIPPED, training_folder
 from services.recorder.reader import Recording
 
 S = TypeVar("S", bound=ServiceSettings)
@@ -134,12 +135,10 @@ def _extract_weights(recording: Recording, folder: Path, model: dict[str, str]) 
 
 def _find_weights(recording: Recording, values: dict[str, Any], model: dict[str, str]) -> Path:
     """The recorded weights in the recorded folder or among the shipped ones; raises UserError if they are not there."""
-    from services.estimator.precise.learning.weights import FOLDER  # noqa: PLC0415 - slow import of numba
-
     folders = [Path(values["models"])] if values.get("models") else []
     recorded_file = Path(str(values.get("model", "")))
     candidates = [recorded_file] if recorded_file.suffix == ".safetensors" else []
-    candidates += [folder / model["file"] for folder in (*folders, FOLDER)]
+    candidates += [folder / model["file"] for folder in (*folders, training_folder(), SHIPPED)]
     for path in candidates:
         if path.name == model["file"] and _are_recorded_weights(path, model):
             return path

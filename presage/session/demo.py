@@ -23,7 +23,7 @@ from common.versions import commit
 from presage.live.bus_watch import Watch
 from presage.recordings.session_figure import draw_session
 from presage.recordings.session_summary import SessionSummary, summarise
-from presage.session.page import show_page_link, start_page
+from presage.session.page import show_page_link
 from presage.session.preflight import plan_session
 from presage.session.running import announced, credentials_for
 from presage.session.stack import Stack
@@ -70,7 +70,8 @@ def run_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple[Path, b
     stack.start_router()
     with open_bus(stack.link()) as bus:
         watch = Watch(bus, TRUTH, BELIEF, STATUS, HEALTH)
-        page = not demo.quiet and start_page(stack, [*plan.config, *arguments(recordings=demo.out)], console)
+        if not demo.quiet:
+            stack.start("viewer", *plan.config, *arguments(recordings=demo.out))
         stack.start("recorder", *plan.config, *arguments(directory=demo.out, file=recording.name))
         stack.start("controller", *plan.controller)
         stack.start("estimator", *plan.estimator)
@@ -79,7 +80,7 @@ def run_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple[Path, b
         stack.start("simulator", *simulator)
         with console.status("starting simulator, estimator, controller, recorder"):
             stack.wait_alive(bus)
-        if page:
+        if not demo.quiet:
             show_page_link(stack, console, open_it=demo.open_page)
         with announced(stack.endpoint, [stack.robot], stack.security):
             reached = _localise(watch, stack, console) and _navigate(bus, watch, stack, goal, console)

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from common.bus.bus import open_bus
 from common.errors import UserError
-from presage.session.page import show_page_link, start_page
+from presage.session.page import show_page_link
 from presage.session.preflight import Plan, plan_session
 from presage.session.running import announced, credentials_for
 from presage.session.stack import Stack
@@ -53,7 +53,9 @@ def run_up(options: UpOptions, console: Console) -> None:
     with Stack(robots[0], options.port or None, security=credentials_for(robots[0])) as stack:
         stack.start_router()
         viewer = [*plan.config, *arguments(recordings=options.record)]
-        page = "viewer" not in options.without and start_page(stack, viewer, console)
+        page = "viewer" not in options.without
+        if page:
+            stack.start("viewer", *viewer)
         _start_services(stack, options, plan, robots, page=page)
         with open_bus(stack.link()) as bus:
             stack.wait_alive(bus)

@@ -15,6 +15,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.geometry.world import World, known_worlds, load_world
 from common.messages.definitions import Scan
+from common.packages import explain_missing_packages
 from common.robot.scanner import SCANNERS, Scanner
 from services.estimator.paper.perception import Descent
 from services.estimator.particle_filter.filter import ParticleFilter
@@ -28,6 +29,7 @@ from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.settings import Settings
 from services.estimator.shared.generative_models import GenerativeModel, RayCaster, map_error
 from services.estimator.shared.interface import Estimator
+from services.estimator.shared.model_folder import find_folder
 
 DEFAULT_SIGMA_M = 0.02  # noise of a scanner whose scans state none
 MOUNT_TOLERANCE = 1e-3  # m and rad
@@ -183,7 +185,7 @@ def load_model(choice: Choice, world: World) -> tuple[GenerativeModel, Array, we
 def field_path(choice: Choice, world: World) -> Path:
     """The weights file of the learned field. Raises UserError if there is none."""
     if choice.model == "learned":
-        return weights.find(choice.models or weights.FOLDER, world, choice.world_argument)
+        return weights.find(choice.models or find_folder(world.name, "precise"), world, choice.world_argument)
     if (path := Path(choice.model)).suffix != ".safetensors":
         raise UserError(f"no model {choice.model!r}: give learned, exact, or a file of weights (.safetensors)")
     if not path.exists():
@@ -238,6 +240,7 @@ def _compile(model: GenerativeModel, seeds: Seeds, likelihood: Likelihood) -> No
     polish(view, seeds.rank(view, 2), iterations=1)
 
 
+@explain_missing_packages()
 def _paper(choice: Choice, world: World) -> Factory:
     # Imported only here, because torch takes a second to import and the other estimators do not need it.
     from services.estimator.paper import weights as paper_weights  # noqa: PLC0415
@@ -267,6 +270,7 @@ def _paper(choice: Choice, world: World) -> Factory:
     return make
 
 
+@explain_missing_packages()
 def _paper_weights(choice: Choice, world: World) -> tuple[Path, dict[int, Path], str]:
     """Returns the folder, its files by number of beams, and the command that trains them.
 
@@ -274,7 +278,7 @@ def _paper_weights(choice: Choice, world: World) -> tuple[Path, dict[int, Path],
     """
     from services.estimator.paper import weights as paper_weights  # noqa: PLC0415 - torch, as above
 
-    folder = choice.models or paper_weights.FOLDER
+    folder = choice.models or find_folder(world.name, "paper")
     files = paper_weights.available(folder, world.name, "paper")
     remedy = paper_weights.train_command(choice.world_argument, "paper")
     if not files:

@@ -14,6 +14,7 @@ from common.geometry.world import World, load_world
 from common.messages.requests import ModelReply
 from services.estimator.factory import Choice, field_path
 from services.estimator.precise.learning import weights as precise_weights
+from services.estimator.shared.model_folder import find_folder
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def model_in_use(choice: Choice, beams: int | None) -> ModelInUse:
         # Imported only here, because torch takes a second to import and the other estimators do not need it.
         from services.estimator.paper import weights as paper_weights  # noqa: PLC0415
 
-        path = paper_weights.nearest(choice.models or paper_weights.FOLDER, world.name, "paper", beams)
+        path = paper_weights.nearest(choice.models or find_folder(world.name, "paper"), world.name, "paper", beams)
         return _learned(choice.estimator, world, path, path.name)
     return ModelInUse(choice.estimator, world)
 

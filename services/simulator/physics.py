@@ -6,6 +6,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Literal, Protocol
 
 from common.errors import UserError
+from common.packages import install_command
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -63,5 +64,6 @@ def choose_engine(wanted: Literal["auto", "pybullet", "kinematic"]) -> Engine:
         return wanted
     installed = find_spec("pybullet") is not None
     if wanted == "pybullet" and not installed:
-        raise UserError("physics: pybullet is not installed; `pip install pybullet`, or set physics to kinematic")
+        command = install_command("pybullet")
+        raise UserError(f"physics: pybullet is not installed; install it with: {command}; or set physics to kinematic")
     return "pybullet" if installed else "kinematic"

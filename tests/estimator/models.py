@@ -1,4 +1,4 @@
-"""Generative models and scans for tests: the exact ray caster, and a small decoder trained on it in seconds."""
+"""For tests: the exact ray caster as a generative model, and changed weights."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ import safetensors.numpy
 from common.geometry import se2
 from common.geometry.world import World
 from common.robot.scanner import SCANNERS
-from services.estimator.paper.decoder import Normalisation
-from services.estimator.paper.training import Data
 from services.estimator.shared.digest import sha256
 
 ROOM = World(
@@ -51,15 +49,3 @@ class ExactModel:
         offsets = self.step * np.eye(3)
         seen = self.ranges(np.concatenate([pose[None], pose + offsets, pose - offsets]))
         return seen[0], ((seen[1:4] - seen[4:]) / (2 * self.step)).T
-
-
-def posed_scans(count: int, seed: int, world: World = ROOM) -> Data:
-    """Scans from random places at one heading."""
-    places = world.sample_free(count, np.random.default_rng(seed), 0.3)
-    poses = np.column_stack([places, np.full(count, HEADING)])
-    return Data(poses, ExactModel(world).ranges(poses))
-
-
-def normalisation(world: World = ROOM) -> Normalisation:
-    x0, y0, x1, y1 = world.bounds
-    return Normalisation(((x0 + x1) / 2, (y0 + y1) / 2), ((x1 - x0) / 2, (y1 - y0) / 2), 6.0)

@@ -13,7 +13,7 @@ from common.errors import UserError
 from common.geometry.world import load_world, save_world
 from common.messages.requests import ModelRequest
 from common.messages.topics import MODEL, SCAN
-from services.estimator.paper import weights
+from services.estimator.shared.model_folder import SHIPPED
 from tests.estimator.models import change_weights
 from tests.estimator.test_service import TRUTH, a_scan, opened
 
@@ -34,7 +34,7 @@ def extracted(reply, folder):
 @pytest.fixture
 def shipped(tmp_path):
     """A copy of the shipped weights, which a test may damage."""
-    return Path(shutil.copytree(weights.FOLDER, tmp_path / "mine", ignore=shutil.ignore_patterns("*.png")))
+    return Path(shutil.copytree(SHIPPED, tmp_path / "mine", ignore=shutil.ignore_patterns("*.png")))
 
 
 def beliefs(service):

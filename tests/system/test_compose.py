@@ -23,7 +23,8 @@ pytestmark = [pytest.mark.docker, pytest.mark.timeout(1500)]
 HEAVY = ("pybullet", "torch", "numba", "scipy", "mcap", "starlette", "typer", "matplotlib", "rosbags")
 HOLDS = {
     "router": set(), "none": set(), "recorder": {"mcap"}, "replay": {"mcap"}, "controller": {"scipy"},
-    "bridge_ros2": {"rosbags"}, "simulator": {"pybullet", "scipy"}, "estimator": {"torch", "numba", "scipy"},
+    "bridge_ros2": {"rosbags"}, "simulator": {"pybullet", "scipy"}, "estimator-precise": {"numba", "scipy"},
+    "estimator-paper": {"torch", "numba", "scipy"},
     "viewer": {"mcap", "starlette", "typer"}, "cli": {"mcap", "typer", "matplotlib", "rosbags"},
 }  # fmt: skip
 
@@ -39,9 +40,10 @@ def image(tmp_path_factory):
         builder.do("build", timeout=1200)
         for scanner in ("replay", "none", "bridge_ros2"):
             builder.do("build", "simulator", timeout=300, PRESAGE_SCANNER=scanner)
+        builder.do("build", "estimator", timeout=900, PRESAGE_ESTIMATOR="paper")
         yield tag
     finally:
-        docker("image", "rm", "--force", *(f"{tag}-{target}" for target in HOLDS))
+        docker("image", "rm", "--force", *(f"{tag}-{target}" for target in (*HOLDS, "estimator-particle-filter")))
 
 
 @pytest.fixture

@@ -15,8 +15,6 @@ from common.robot.scanner import Scanner
 from services.estimator.paper.decoder import Decoder, Normalisation, PaperModel, Shape
 from services.estimator.shared.digest import check_digest, sha256
 
-FOLDER = Path(__file__).resolve().parents[3] / "models"
-
 
 class ModelCard(BaseModel):
     """Model card of a decoder: how it was made, and its errors on test scans."""

@@ -13,7 +13,7 @@ from common.errors import UserError
 from services.estimator.paper.checkpoint import Checkpoint
 from services.estimator.paper.decoder import Shape
 from services.estimator.paper.training import Recipe, Trainer
-from tests.estimator.models import normalisation, posed_scans
+from tests.estimator.paper.training_scans import normalisation, posed_scans
 
 DATA = posed_scans(60, 1)
 RECIPE = {"epochs": 3, "world": "room"}

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from services.estimator.paper.decoder import Decoder, PaperModel, Shape
 from services.estimator.paper.training import Recipe, Trainer, usable_ranges
-from tests.estimator.models import normalisation, posed_scans
+from tests.estimator.paper.training_scans import normalisation, posed_scans
 
 TRAIN, TEST = posed_scans(400, 1), posed_scans(100, 2)
 SHAPE = Shape(64, hidden=32, channels=4)

@@ -10,6 +10,7 @@ from common.errors import UserError
 from services.estimator.paper import weights
 from services.estimator.paper.decoder import Decoder
 from services.estimator.shared.digest import sha256
+from services.estimator.shared.model_folder import SHIPPED
 from tests.estimator.models import ROOM, SCANNER
 
 
@@ -52,7 +53,7 @@ def test_find(tmp_path):
 
 @pytest.mark.parametrize("beams", [622, 811])
 def test_shipped_weights(beams):
-    path = weights.find(weights.FOLDER, "corridor", "paper", beams)
+    path = weights.find(SHIPPED, "corridor", "paper", beams)
     model, read = weights.load(path)
     assert path.stat().st_size < 4e6
     assert read.samples == 13_000

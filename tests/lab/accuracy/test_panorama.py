@@ -11,7 +11,8 @@ from lab.accuracy.panorama import Shape, train_panorama
 from services.estimator.paper.decoder import Decoder, PaperModel, use_one_core
 from services.estimator.paper.decoder import Shape as PaperShape
 from services.estimator.paper.estimator import PaperScans
-from tests.estimator.models import HEADING, ROOM, SCANNER, normalisation
+from tests.estimator.models import HEADING, ROOM, SCANNER
+from tests.estimator.paper.training_scans import normalisation
 
 ANGLES = np.deg2rad(np.linspace(-135, 135, 91))
 use_one_core()  # on a busy machine, several threads that wait for one another take minutes instead of seconds

@@ -25,7 +25,7 @@ from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
 from presage.replay.localize import COLUMNS, LocalizeOptions, choice_of, localize, select_scans
 from presage.replay.rerun import RerunOptions, rerun_command
-from services.estimator.precise.learning.weights import FOLDER
+from services.estimator.shared.model_folder import SHIPPED
 from services.recorder.files.writer import RecordingWriter
 from tests.conftest import WAIT_TIMEOUT_S
 from tests.recorder.sessions import write
@@ -92,7 +92,7 @@ def test_laser_frame(tmp_path):
 
 def test_assumed_mount_must_fit_weights(tmp_path):
     """A forgotten --mount would put every pose off by 0.2 m."""
-    folder = shutil.copytree(FOLDER, tmp_path / "models", ignore=lambda _, names: set(names) - set(CORRIDOR))
+    folder = shutil.copytree(SHIPPED, tmp_path / "models", ignore=lambda _, names: set(names) - set(CORRIDOR))
     card = json.loads((folder / CORRIDOR[0]).read_text())
     card["scanner"]["mount"] = [0.0, 0.0, 0.0]
     (folder / CORRIDOR[0]).write_text(json.dumps(card))

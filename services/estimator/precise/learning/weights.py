@@ -15,11 +15,11 @@ from common.robot.scanner import Scanner
 from services.estimator.precise.field import CLASSES, DistanceField, FieldModel, Seen
 from services.estimator.precise.learning.calibration import Calibration
 from services.estimator.shared.digest import check_digest, sha256
+from services.estimator.shared.model_folder import SHIPPED, training_folder
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
 
-FOLDER = Path(__file__).resolve().parents[4] / "models"
 PRESET = "precise"
 
 
@@ -118,9 +118,9 @@ def _seen(tensors: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]],
     return Seen(cells.astype(bool), (float(x), float(y)))
 
 
-def train_command(world: str, folder: Path = FOLDER) -> str:
+def train_command(world: str, folder: Path = SHIPPED) -> str:
     """The command that trains the field of a world."""
-    out = "" if folder == FOLDER else f" --out {folder}"
+    out = "" if folder in (SHIPPED, training_folder()) else f" --out {folder}"
     return f"presage train --world {world} --preset {PRESET}{out}"
 
 
