@@ -29,7 +29,7 @@ fork_servers: list[ForkServer] = []  # at most one in each of xdist's workers, s
 # Tests of what is not installed: PyTorch for preset paper, and pybullet for the simulator's physics.
 TESTS_OF = {
     "torch": ("estimator/paper", "lab/paper", "lab/accuracy/test_panorama.py", "estimator/test_weights_files.py"),
-    "pybullet": ("simulator/test_rays.py", "simulator/test_kinematics.py"),
+    "pybullet": ("simulator/test_rays.py", "simulator/test_kinematics.py", "process_replay"),
 }
 MISSING = [package for package in TESTS_OF if find_spec(package) is None]
 collect_ignore = [path for package in MISSING for path in TESTS_OF[package]]
