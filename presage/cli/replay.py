@@ -76,11 +76,11 @@ def replay(
     Keys in a terminal: space pauses, `.` steps one scan, left and right (or h and l) jump 5 s, up and down change the
     speed, q quits. The queryable presage/ROBOT/player offers the same over the bus.
 
-    `--with estimator` needs only the file. It starts a router and the named services with the recorded configuration,
-    world and model, sends them their recorded inputs, and compares their outputs with the recording. Each scan waits
-    for the belief of the scan before (unless `--rate` is given). If the session ran in lockstep, the outputs must be
-    identical; otherwise they must agree within 0.01 m and 0.01 rad while tracking, because a recording does not contain
-    requests (`presage relocalise`), restarts, or what happened before it began. Exits with status 1 if they differ.
+    `--with estimator` needs only the file. It runs the named services in this process with the recorded configuration,
+    world and model, on their recorded inputs, and compares their outputs with the recording. If the session ran in
+    lockstep, the outputs must be identical; otherwise they must agree within 0.01 m and 0.01 rad while tracking,
+    because a recording does not contain requests (`presage relocalise`), restarts, or what happened before it began.
+    Exits with status 1 if they differ.
 
     Examples: `presage replay run.mcap --only scan,odom` (with `python -m services.estimator` beside it);
     `presage replay run.mcap --rate 4 --start 10 --end -5 --loop`; `presage replay run.mcap --except belief,prediction`;

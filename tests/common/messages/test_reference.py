@@ -25,7 +25,7 @@ def test_the_page_lists_all_topics_and_fields():
         assert all(f"\n{name}: " in section for name in cls.model_fields.keys() - Stamped.model_fields.keys())
     assert "\nmount: Pose = " in text  # a type and a default
     assert "+inf is nothing within range_max" in text  # a comment beside its field
-    assert "the negative gradient of accuracy" in text  # a comment below its field
+    assert "gradient of accuracy in map" in text  # a comment below its field
 
 
 def test_links_have_targets():
