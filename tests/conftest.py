@@ -17,12 +17,12 @@ import pytest
 
 from common.bus.bus import Link, open_bus, wait_until
 from common.bus.inbox import Sample
-from tests.fork_server import Child, ForkServer, end_with_parent
+from common.processes import end_with_this_process
+from tests.fork_server import Child
 
 ROOT = Path(__file__).resolve().parent.parent
 WAIT_TIMEOUT_S = 30.0  # for events that take well under a second on an idle machine
 numbers = itertools.count(1)
-fork_servers: list[ForkServer] = []  # at most one in each of xdist's workers, started when it is needed
 
 # Without a database, so that nothing is written into the checkout. In CI the examples are the same every time.
 # `pytest --hypothesis-profile thorough` tries more examples than a normal run has time for.
@@ -48,10 +48,10 @@ def pytest_collection_modifyitems(items):
 def _nothing_left_behind():
     """Fails if a test run leaves a process behind. Set up first and so torn down last, in each of xdist's workers."""
     yield
-    while fork_servers:
-        fork_servers.pop().close()
-    # Python's resource tracker, which runs once a process pool was used, ends with this process.
-    left = [c for c in psutil.Process().children(recursive=True) if "resource_tracker" not in " ".join(c.cmdline())]
+    # The fork server and the resource tracker of multiprocessing end with this process; their children must be gone.
+    own = psutil.Process().children()
+    helpers = [child for child in own if "from multiprocessing." in " ".join(child.cmdline())]
+    left = [child for child in own if child not in helpers] + [c for h in helpers for c in h.children(recursive=True)]
     for child in left:
         print(f"\nleft behind: {child}", file=sys.stderr)
         child.kill()
@@ -165,15 +165,17 @@ class Processes:
 
     def _child(self, what: list[str], environment: dict[str, str], log: Path, *, fresh: bool):
         if not fresh and sys.platform == "linux":
-            if not fork_servers:
-                fork_servers.append(ForkServer())
-            return fork_servers[0].start(what, environment, log, self.folder)
-        parent = os.getpid()  # pytest-timeout ends this process without a teardown
+            return Child(what, environment, log, self.folder)
         with log.open("wb") as file:
             return subprocess.Popen(
-                [sys.executable, *what], env=environment, cwd=self.folder, stdin=subprocess.DEVNULL, stdout=file,
-                stderr=subprocess.STDOUT, preexec_fn=lambda: end_with_parent(parent),  # noqa: PLW1509 - as in the server
-            )  # fmt: skip
+                [sys.executable, *what],
+                env=environment,
+                cwd=self.folder,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                preexec_fn=end_with_this_process(signal.SIGKILL),  # pytest-timeout ends this process without a teardown
+            )
 
     def start_router(self) -> tuple[Running, int]:
         """Starts a router. Returns it and its port; tries another port if a process has just taken the first one."""
