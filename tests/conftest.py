@@ -249,3 +249,17 @@ def processes(tmp_path):
         yield started
     finally:
         started.close()
+
+
+@pytest.fixture
+def presage(monkeypatch, capsys):
+    """A function that runs a command of the command line in this process. Returns its exit status and its output."""
+    from presage.cli.main import main  # noqa: PLC0415 - most tests do not need its many imports
+
+    def run(*args):
+        monkeypatch.setattr(sys, "argv", ["presage", *args])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return end.value.code or 0, "".join(capsys.readouterr())
+
+    return run

@@ -17,9 +17,10 @@ from pathlib import Path
 from common.processes import end_with_parent
 
 CONTEXT = multiprocessing.get_context("forkserver")
+# Of presage only what it imports: its console reads the environment, which is another one in each child.
 CONTEXT.set_forkserver_preload([
-    "common.router", "presage.cli.main", "services.controller.service", "services.estimator.service",
-    "services.recorder.service", "services.simulator.service", "services.viewer.service",
+    "common.router", "rich.live", "rich.progress", "services.controller.service", "services.estimator.service",
+    "services.recorder.service", "services.simulator.service", "services.viewer.service", "typer",
 ])  # fmt: skip
 
 

@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
+import re
 import socket
-import sys
 
 import pytest
 import typer
 
 from common.bus.bus import wait_until
-from presage.cli.main import app, main
+from presage.cli.main import app
 from tests.recorder import sessions as made
+from tests.system.test_diagnosis import row_of
 
 NO_SESSION = ("--connect", "tcp/127.0.0.1:9")  # the discard port, on which nothing listens
-
-
-@pytest.fixture
-def run(monkeypatch, capsys):
-    """A function that runs a command in this process. Returns its exit status and its output."""
-
-    def call(*args):
-        monkeypatch.setattr(sys, "argv", ["presage", *args])
-        try:
-            main()
-        except SystemExit as end:
-            return end.code or 0, "".join(capsys.readouterr())
-        raise AssertionError("a command ends with sys.exit")
-
-    return call
 
 
 @pytest.mark.parametrize(
@@ -78,33 +64,33 @@ def run(monkeypatch, capsys):
     ],
     ids=lambda value: " ".join(value)[:40] if isinstance(value, tuple) else "",
 )
-def test_invalid_input(run, tmp_path, args, says):
+def test_invalid_input(presage, tmp_path, args, says):
     (tmp_path / "bad.yaml").write_text("since: 2020-13-45")
     if "{tmp}/run.mcap" in args:
         made.write(tmp_path / "run.mcap")
-    status, output = run(*[arg.format(tmp=tmp_path) for arg in args])
+    status, output = presage(*[arg.format(tmp=tmp_path) for arg in args])
     assert status == 2
     assert [line for line in output.splitlines() if says in line], output
     assert "Usage" in output or len(output.splitlines()) == 1
 
 
-def test_port_in_use(run):
+def test_port_in_use(presage):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        status, output = run("up", "--port", str(taken.getsockname()[1]))
+        status, output = presage("up", "--port", str(taken.getsockname()[1]))
     assert (status, "cannot be used" in output, "--port" in output) == (2, True, True)
 
 
 @pytest.mark.parametrize(
     "name", [name for name, c in typer.main.get_command(app).commands.items() if not hasattr(c, "commands")]
 )
-def test_help_with_an_example(run, name):
-    status, output = run(name, "--help")
+def test_help_with_an_example(presage, name):
+    status, output = presage(name, "--help")
     assert (status, "Example" in output, f"presage {name}" in output) == (0, True, True), output
 
 
-def test_tools_beside_a_session(run, process, bus, link, monkeypatch):
+def test_tools_beside_a_session(presage, process, bus, link, monkeypatch):
     monkeypatch.setenv("PRESAGE_CONNECT", link.connect[0])
     monkeypatch.setenv("PRESAGE_ROBOT", link.robot)
     names = ("simulator", "estimator", "controller")
@@ -126,9 +112,22 @@ def test_tools_beside_a_session(run, process, bus, link, monkeypatch):
         ("goal --cancel", 0, ""),
         (f"topics --robot {link.robot}", 0, link.robot),
     ):
-        found, output = run(*command.split())
+        found, output = presage(*command.split())
         assert (found, says in output) == (status, True), (command, output)
-    status, output = run("doctor")
+    outputs = []
+
+    def healthy():
+        status, output = presage("top", "--once")
+        outputs.append(output)
+        return status == 0 and "ms" in row_of(output, "controller")
+
+    assert wait_until(healthy, 60), outputs[-1]  # the first scans take longer
+    assert f"robot {link.robot}" in outputs[-1]
+    for name, sends in zip(names, ("scan", "belief", "cmd_vel"), strict=True):
+        assert re.search(rf"^{name} alive.* {sends} [0-9.]*[1-9]", row_of(outputs[-1], name)), outputs[-1]
+    assert "ms" in row_of(outputs[-1], "estimator")
+    assert "not running" in row_of(outputs[-1], "recorder")
+    status, output = presage("doctor")
     faults = [line for line in output.splitlines() if line.split()[:1] == ["no"]]
     assert all(" Hz" in line for line in faults), output  # a machine under load may be slow
     assert status == (1 if faults else 0)
