@@ -139,48 +139,29 @@ def test_faulty_session(process, bus, stopped_recorder, faulty_session, tmp_path
     assert "install the same version of presage" in " ".join(running.output.split())
 
 
-def no_answer():
-    """A listener whose full queue drops further connections, as a firewall does."""
-    listener, fillers = socket.socket(), [socket.socket(), socket.socket()]
-    listener.bind(("127.0.0.1", 0))
-    listener.listen(0)
-    for filler in fillers:
-        filler.setblocking(False)
-        filler.connect_ex(listener.getsockname())
-    return [listener, *fillers]
-
-
-def no_zenoh():
-    listener = socket.socket()
-    listener.bind(("127.0.0.1", 0))
-    listener.listen()
-    return [listener]
-
-
-def no_listener():
-    free = socket.socket()
-    free.bind(("127.0.0.1", 0))
-    return [free]
-
-
 def test_no_session():
-    """Three endpoints at once, because zenoh waits for each."""
+    """At three endpoints at once, because zenoh waits for each."""
     with ExitStack() as stack:
-        listeners = [[stack.enter_context(each) for each in make()][0] for make in (no_zenoh, no_answer, no_listener)]
-        links = [Link(connect=(f"tcp/127.0.0.1:{each.getsockname()[1]}",)) for each in listeners]
+        sockets = [stack.enter_context(socket.socket()) for _ in range(5)]
+        silent, full, closed, *fillers = sockets
+        for listener, queue in ((silent, 5), (full, 0), (closed, None)):
+            listener.bind(("127.0.0.1", 0))
+            if queue is not None:
+                listener.listen(queue)
+        for filler in fillers:  # a full queue drops further connections, as a firewall does
+            filler.setblocking(False)
+            filler.connect_ex(full.getsockname())
+        links = [Link(connect=(f"tcp/127.0.0.1:{each.getsockname()[1]}",)) for each in sockets[:3]]
         with ThreadPoolExecutor(3) as pool:
-            found = [finding for findings in pool.map(partial(observe_bus, seconds=0.1), links) for finding in findings]
-    assert [(finding.code, finding.ok) for finding in found] == [
-        ("no_router", False),
-        ("blocked", False),
-        ("no_router", False),
-    ]
-    for finding, what, advice in zip(
+            found = [finding for (finding,) in pool.map(partial(observe_bus, seconds=0.1), links)]
+    for finding, code, what, advice in zip(
         found,
+        ("no_router", "blocked", "no_router"),
         ("something listens there", "no answer", "nothing listens there"),
         ("TLS", "firewall", "presage up"),
         strict=True,
     ):
+        assert (finding.code, finding.ok) == (code, False)
         assert what in finding.what
         assert advice in finding.advice
 
