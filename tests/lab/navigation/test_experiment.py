@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import shapely
 from hypothesis import given, settings
@@ -353,9 +354,9 @@ def test_invalid_options_are_refused_in_one_line(args, says):
     assert "\n" not in str(result.exception)
 
 
-def test_a_small_run_writes_all_files_and_is_reproducible(tmp_path):
+def test_small_run(tmp_path, monkeypatch):
     job = driving.Job(0, 1, beams=101, limit=30.0)
-    result = driving.run(job, 1, tmp_path, 2, QUIET, worlds=("maze",))
+    result = driving.run(job, 1, tmp_path, 1, QUIET, worlds=("maze",))
     assert {path.name for path in tmp_path.iterdir()} == {
         f"navigation-maze-beams101{suffix}" for suffix in (".json", ".csv", ".trials.jsonl", ".pdf", ".png")
     }
@@ -372,6 +373,7 @@ def test_a_small_run_writes_all_files_and_is_reproducible(tmp_path):
     holonomic, differential = result.trials
     assert holonomic["goal"] == differential["goal"]
     assert holonomic["x_m"] != differential["x_m"]
+    monkeypatch.setenv("PRESAGE_GAMMA", "0.01")  # the user's own settings must not change a trial
     again = driving.trial(replace(job, drive="differential"))
     timing = ("step_mean_ms", "step_max_ms")
     assert {k: v for k, v in again.items() if k not in timing} == {
@@ -382,11 +384,12 @@ def test_a_small_run_writes_all_files_and_is_reproducible(tmp_path):
     assert "| maze, differential | 1 of 1 | 0 | 0; 0 |" in text
 
 
-def test_an_interrupted_run_continues_and_leaves_no_process(process, tmp_path):
+def test_interrupted_and_killed_runs(process, tmp_path):
+    """After Ctrl-C the same command continues; a killed one leaves neither workers nor services."""
     args = ("presage.__main__", "experiment", "navigation", "--worlds", "maze", "--drives", "holonomic",
-            "--beams", "101", "--trials", "3", "--workers", "1", "--out", str(tmp_path))  # fmt: skip
+            "--beams", "101", "--trials", "9", "--out", str(tmp_path), "--workers")  # fmt: skip
     store = tmp_path / ".navigation-maze-holonomic-beams101.unfinished.jsonl"
-    run = process(*args)
+    run = process(*args, "1")
     assert wait_until(lambda: store.exists() and len(store.read_text().splitlines()) > 1, 90), run.output
     run.send(signal.SIGINT)
     # Python ignores an interrupt while it forks, so send it again if necessary.
@@ -395,12 +398,21 @@ def test_an_interrupted_run_continues_and_leaves_no_process(process, tmp_path):
         run.send(signal.SIGINT)
     assert run.wait(30) == 130, run.output
     done = len(store.read_text().splitlines()) - 1
-    assert done < 3
-    run = process(*args)
-    assert run.wait(120) == 0, run.output
-    assert f"going on after {done} of 3" in run.output
-    rows = (tmp_path / "navigation-maze-holonomic-beams101.trials.jsonl").read_text().splitlines()
-    assert [json.loads(row)["trial"] for row in rows] == [0, 1, 2]
+    run = process(*args, "2")
+    run.wait_for(f"going on after {done} of 9", 90)
+
+    def services():
+        return [
+            c for c in psutil.Process(run.child.pid).children(recursive=True) if "services" in " ".join(c.cmdline())
+        ]
+
+    assert wait_until(services, 90), run.output
+    children = psutil.Process(run.child.pid).children(recursive=True)
+    run.kill()
+    _, alive = psutil.wait_procs(children, 20)
+    for left in alive:
+        left.kill()
+    assert not alive
 
 
 def test_the_page_agrees_with_the_stored_results():
