@@ -36,12 +36,15 @@ hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "local")
 
 
 def pytest_collection_modifyitems(items):
-    """Runs fast tests first. Tests in tests/system, which start processes, come last and get the marker `system`."""
+    """Marks tests/system. Runs files that start processes first, those that need Docker before all others.
+
+    They take longest and wait much, so that in the end short files without waits fill the gaps.
+    """
     for item in items:
         if (ROOT / "tests" / "system") in item.path.parents:
             item.add_marker(pytest.mark.system)
-    # Among the system tests, those that need Docker come first: they take longest, but little processor time.
-    items.sort(key=lambda item: ("system" in item.keywords, item.get_closest_marker("docker") is None))
+    waiting = {item.path for item in items if {"processes", "router", "browser"} & set(item.fixturenames)}
+    items.sort(key=lambda item: (item.get_closest_marker("docker") is None, item.path not in waiting))
 
 
 @pytest.fixture(scope="session", autouse=True)

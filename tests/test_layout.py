@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -74,6 +75,12 @@ def module(path: Path) -> str:
     return name(path).removesuffix(".py").removesuffix("/__init__").replace("/", ".")
 
 
+@cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
 def imports(path: Path) -> set[str]:
     """Modules a file imports when it runs; those under TYPE_CHECKING are no dependency of the program."""
     found: set[str] = set()
@@ -90,7 +97,7 @@ def imports(path: Path) -> set[str]:
         for child in ast.iter_child_nodes(node):
             walk(child)
 
-    walk(ast.parse(path.read_text()))
+    walk(tree(path))
     return found
 
 
@@ -136,11 +143,7 @@ def test_there_is_something_to_check():
 @pytest.mark.parametrize("path", cores(), ids=name)
 def test_core_uses_no_bus_clock_or_files(path):
     assert not reaches(path, *INPUT_AND_OUTPUT)
-    calls = [
-        n.func.id
-        for n in ast.walk(ast.parse(path.read_text()))
-        if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)
-    ]
+    calls = [n.func.id for n in ast.walk(tree(path)) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]
     assert "open" not in calls
 
 
@@ -228,7 +231,7 @@ def test_architecture_page_lists_every_file():
     assert {entry for entry in listed if entry.endswith(".py")} == files
     for path in SOURCES:
         if name(path) in files:
-            summary = ast.get_docstring(ast.parse(path.read_text())).splitlines()[0]
+            summary = ast.get_docstring(tree(path)).splitlines()[0]
             assert f"| `{name(path)}` | {summary} |" in page, f"{name(path)}: the page has another summary"
 
 
