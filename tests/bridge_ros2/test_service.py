@@ -249,22 +249,3 @@ def test_it_says_what_it_waits_for_and_what_is_wrong(processes, router):
     theirs.kill()
     bridge.wait_for("it is gone")
     assert nowhere.stop()[0] == bridge.stop()[0] == 0
-
-
-def test_it_says_which_distro_and_flavor_fit_and_that_nobody_is_there(processes, router):
-    (_, port), (_, empty) = processes.start_router(), processes.start_router()
-
-    def bridge(name, at, *args):
-        ours = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{router}", "PRESAGE_ROBOT": name}
-        return processes.start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{at}", *args, env=ours)
-
-    with Ros(port, "rmw_zenoh", "jazzy") as node:
-        node.publisher("scan", LASER)
-        humble, dds = bridge("humble", port, "--distro", "humble"), bridge("dds", port, "--flavor", "ros2dds")
-        far, alone = bridge("far", port, "--domain", "7"), bridge("alone", empty)
-        humble.wait_for("the types of /robot have hashes, as from Iron on: --distro jazzy")
-        dds.wait_for("it is rmw_zenoh that speaks, not zenoh-bridge-ros2dds: --flavor rmw_zenoh")
-        far.wait_for("nobody is seen in ROS domain 7, but in 0: --domain 0")
-        alone.wait_for(f"nothing of ROS is heard at tcp/127.0.0.1:{empty}: is that the robot's")
-    for each in (humble, dds, far, alone):
-        assert each.stop()[0] == 0

@@ -46,14 +46,14 @@ def jobs(folder, **more):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_results_are_in_the_order_of_the_jobs(tmp_path, workers):
+def test_order_of_results(tmp_path, workers):
     rows = run_trials("count", count, jobs(tmp_path), tmp_path, workers, QUIET)
     assert [row["square"] for row in rows] == [0, 1, 4, 9, 16, 25]
     assert sorted((tmp_path / "ran").read_text().split()) == list("012345")
     assert [path.name for path in tmp_path.iterdir()] == ["ran"]
 
 
-def test_an_interrupted_run_continues(tmp_path):
+def test_interrupted_run(tmp_path):
     with pytest.raises(ValueError, match="as asked"):
         run_trials("count", count, jobs(tmp_path, fails_at=4), tmp_path, 1, QUIET)
     ran = set((tmp_path / "ran").read_text().split())
@@ -68,14 +68,14 @@ def test_an_interrupted_run_continues(tmp_path):
     assert again == set(range(6)) - set(kept)
 
 
-def test_results_of_other_jobs_are_ignored(tmp_path):
+def test_results_of_other_jobs(tmp_path):
     path = tmp_path / "store"
     Store(path, jobs(tmp_path)).add(0, {"square": 99})
     assert Store(path, jobs(tmp_path, fails_at=3)).read() == {}
     assert not path.exists()
 
 
-def test_an_incomplete_last_line_is_ignored(tmp_path):
+def test_incomplete_last_line(tmp_path):
     path = tmp_path / "store"
     store = Store(path, jobs(tmp_path))
     store.add(0, {"square": 0})
@@ -90,14 +90,14 @@ def small(index, **more):
     return localisation.Job(index, 5, 4, ("paper", "precise"), **more)
 
 
-def test_a_trial_depends_on_its_job_alone():
+def test_reproducible_trials():
     alone = localisation.trial(small(1))
     localisation.trial(small(0))
     assert localisation.trial(small(1)) == alone
     assert localisation.trial(small(2))["pose"] != alone["pose"]
 
 
-def test_precise_needs_one_scan_where_the_papers_descent_converges_slowly():
+def test_paper_descent_is_slow():
     for index in range(3):
         errors = localisation.trial(replace(small(index), iterations=30, descent=PAPER_DESCENT))["error_m"]
         assert errors["precise"][0] < 0.01
@@ -123,7 +123,7 @@ def test_e1_summary():
     assert two["final_rms_over_bound"] == pytest.approx(0.1 / (0.05 / np.sqrt(3)))
 
 
-def test_the_crossing_path_is_free_and_straight():
+def test_crossing_path():
     scene = ExperimentWorld().scene(3, 4)
     path = crossing.path_of(scene, 1.0, 0.05)
     assert (scene.world.clearance(path[:, :2]) > 0.37).all()
@@ -131,14 +131,14 @@ def test_the_crossing_path_is_free_and_straight():
     assert path[-1, 0] - path[0, 0] > 16
 
 
-def test_a_world_without_a_free_line_is_refused():
+def test_world_without_a_free_line():
     scene = Scene.of(ExperimentWorld("maze").scene(0).world, 622, 0)
     assert shapely.area(scene.world.free_space) > 0
     with pytest.raises(UserError, match="no free straight line"):
         crossing.path_of(scene, 0.0, 0.05)
 
 
-def test_precise_follows_the_crossing_with_and_without_odometry():
+def test_crossing_with_precise():
     job = crossing.Job(0, 2, 0.2, ("precise", "precise, odometry"))
     found = crossing.trial(job)
     assert found == crossing.trial(job)
@@ -146,7 +146,7 @@ def test_precise_follows_the_crossing_with_and_without_odometry():
     assert np.median(found["error_m"]["precise"]) < 0.005
 
 
-def test_the_best_step_size_finds_the_most_places():
+def test_best_step_size():
     rows = {
         "a": {"steps_a_scan": 1, "alpha_m2": 1.0, "found_within_0.2_m": 3, "final_error_median_m": 0.1},
         "b": {"steps_a_scan": 1, "alpha_m2": 2.0, "found_within_0.2_m": 4, "final_error_median_m": 0.2},
@@ -156,13 +156,13 @@ def test_the_best_step_size_finds_the_most_places():
     assert step_size.best(rows, 1) == 3.0
 
 
-def test_estimator_names_are_parsed():
+def test_estimator_names():
     assert parse_estimators("paper,particle-filter heading known") == ("paper", "particle-filter, heading known")
     with pytest.raises(UserError, match="no estimator 'kalman'"):
         parse_estimators("paper,kalman")
 
 
-def test_a_page_is_filled_from_results_and_missing_results_are_reported(tmp_path):
+def test_page_from_results(tmp_path):
     result = results.Result("e2", "t", 0, {}, {"precise": crossing.summarise(
         [{"error_m": {"precise": [0.001, 0.003]}, "lost": {"precise": False}, "bound_m": {"one scan": [0.001, 0.001]}}],
         "precise")}, notes=["a remark"])  # fmt: skip
@@ -196,7 +196,7 @@ def test_files_of_e1(presage, tmp_path):
     assert found["summary"]["precise"]["found_within_0.5_m"] == 2
 
 
-def test_all_repeats_experiments_whose_results_have_changed(tmp_path):
+def test_finished_experiments(tmp_path):
     path = tmp_path / ".all.unfinished.json"
     (tmp_path / "e1.json").write_text("{}")
     (tmp_path / "e2.json").write_text("{}")
