@@ -133,7 +133,7 @@ def module_edges() -> dict[str, set[str]]:
     return {own: (imports(path) & files.keys()) - {own} for own, path in files.items()}
 
 
-def test_there_is_something_to_check():
+def test_sources_found():
     assert set(SERVICES) >= {"simulator", "estimator", "controller", "recorder"}
     assert len(cores()) >= 5
     assert {"zenoh", "common.messages.topics.Topic"} <= imports(ROOT / "common" / "bus" / "bus.py")
@@ -191,7 +191,7 @@ def test_zenoh_stays_in_the_bus():
     ]
 
 
-def test_heavy_packages_stay_where_they_are_used():
+def test_heavy_packages():
     for path in SOURCES:
         package = path.relative_to(ROOT).parts[:2]
         if package[0] != "lab":
@@ -212,7 +212,7 @@ def test_heavy_packages_stay_where_they_are_used():
         ("common.messages.reference", ["torch", "pybullet", "mcap"]),
     ],
 )
-def test_process_loads_only_its_own_packages(module, absent):
+def test_packages_of_a_process(module, absent):
     program = f"import sys, {module}; print(sorted(set({absent}) & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
@@ -224,7 +224,7 @@ def test_no_pickle():
         assert "allow_pickle=True" not in path.read_text(), name(path)
 
 
-def test_architecture_page_lists_every_file():
+def test_architecture_page():
     page = (ROOT / "docs" / "architecture.md").read_text()
     listed = {line.split("`")[1] for line in page.splitlines() if line.startswith("| `")}
     files = {name(p) for p in SOURCES if p.name not in {"__init__.py", "__main__.py"}}
@@ -235,7 +235,7 @@ def test_architecture_page_lists_every_file():
             assert f"| `{name(path)}` | {summary} |" in page, f"{name(path)}: the page has another summary"
 
 
-def test_imports_are_read_from_source(tmp_path):
+def test_imports(tmp_path):
     path = tmp_path / "x.py"
     path.write_text(
         "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torch\n"

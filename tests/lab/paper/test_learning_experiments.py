@@ -27,7 +27,7 @@ def timeless(row):
 
 
 @pytest.mark.parametrize("name", samples.ESTIMATORS)
-def test_samples_trials_are_reproducible(name):
+def test_reproducible_samples(name):
     job = replace(SMALL, estimator=name, samples=80)
     first, fewer = samples.trial(job), samples.trial(replace(job, samples=40))
     assert timeless(samples.trial(job)) == timeless(first)
@@ -35,7 +35,7 @@ def test_samples_trials_are_reproducible(name):
     assert fewer.get("gradient_steps") == first.get("gradient_steps")
 
 
-def test_a_field_trained_on_more_scans_is_better():
+def test_more_scans_are_better():
     job = replace(SMALL, estimator="precise", held_out=200)
     few, many = (samples.trial(replace(job, samples=size)) for size in (30, 600))
     assert many["range_error_median_m"] < 0.6 * few["range_error_median_m"]
@@ -43,7 +43,7 @@ def test_a_field_trained_on_more_scans_is_better():
     assert many["bound_median_m"] == few["bound_median_m"]  # judged at the same places
 
 
-def test_samples_writes_all_files_and_rows(tmp_path):
+def test_files_of_samples(tmp_path):
     result = samples.run(SMALL, tmp_path, 1, QUIET, (40, 80))
     data = json.loads((tmp_path / "samples.json").read_text())
     assert list(data["summary"]) == ["paper, 40", "paper, 80", "precise, 40", "precise, 80"]
@@ -52,7 +52,7 @@ def test_samples_writes_all_files_and_rows(tmp_path):
     assert (tmp_path / "samples.png").stat().st_size > 10_000
 
 
-def test_the_decoders_error_is_measured_on_unseen_noise_free_scans():
+def test_error_of_the_decoder():
     scene = Scene.of(load_world("corridor"), 40, 5)
     decoder = learning.train_paper(scene, 1.0, 200, 5, 0)
     fresh = learning.sample_scans(Scene.of(load_world("corridor"), 40, 6), 500, 1.0, noise=False)
@@ -61,7 +61,7 @@ def test_the_decoders_error_is_measured_on_unseen_noise_free_scans():
     assert decoder.card.heading == 1.0
 
 
-def test_places_in_the_twin_world_have_identical_scans_in_both_rooms():
+def test_twin_scans():
     scene = aliasing.scene_of(replace(FEW, world="twins"), aliasing.PLACES_SEED)
     poses = aliasing.sample_places(scene, 40)
     assert poses.shape == (40, 3)
@@ -98,12 +98,12 @@ def belief(state, *places):
         (belief("tracking", (1.0, 1.0), (1.0 + TWIN_OFFSET, 1.0)), 0, 0),
     ],
 )
-def test_wrong_claims_and_kept_ambiguity(posterior, wrong, kept):
+def test_wrong_claims(posterior, wrong, kept):
     row = aliasing._row(np.array([1.0, 1.0, 0.0]), [posterior], twins=True)
     assert (row["wrong"], row["both_kept"]) == ([wrong], kept)
 
 
-def test_aliasing_at_a_small_size(tmp_path):
+def test_small_aliasing(tmp_path):
     result = aliasing.run(FEW, tmp_path, 1, QUIET, ("twins",))
     summary = result.summary
     assert list(summary) == [f"twins, {name}" for name in aliasing.ESTIMATORS]
@@ -116,7 +116,7 @@ def test_aliasing_at_a_small_size(tmp_path):
     assert again == next(r for r in result.trials if (r["world"], r["estimator"]) == ("twins", "particle-filter"))
 
 
-def test_the_predicted_precision_is_calibrated(tmp_path):
+def test_calibrated_precision(tmp_path):
     job = prediction.Job(2, scans=25)
     result = prediction.run(job, tmp_path, 1, QUIET)
     precise, row = result.summary["precise"], result.trials[0]
@@ -135,6 +135,6 @@ def test_the_predicted_precision_is_calibrated(tmp_path):
     assert "Gaussian" in prediction.table(result.summary)
 
 
-def test_prediction_without_weights_names_the_training_command(tmp_path):
+def test_prediction_without_weights(tmp_path):
     with pytest.raises(UserError, match="presage train"):
         prediction.run(prediction.Job(1, field=ExperimentWorld("maze")), tmp_path, 1, QUIET)
