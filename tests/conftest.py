@@ -105,6 +105,14 @@ def wait_for_message(inbox, kind, condition, timeout=60.0):
     return matches[0]
 
 
+def ended(process: psutil.Process) -> bool:
+    """Whether a process that is no child of this one has ended; some machines reap such processes late."""
+    try:
+        return process.status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
+
+
 class Running:
     """A child process and the file with its output."""
 

@@ -15,6 +15,7 @@ from common.messages.topics import BELIEF, GOAL, HEALTH, SCAN, STATUS, TRUTH
 from presage.live.bus_watch import Watch
 from presage.session.demo import FIRST_BELIEF_TIMEOUT_S, _check_estimator
 from services.recorder.reader import read_recording
+from tests.conftest import ended
 from tests.recorder import sessions as made
 from tests.viewer.client import Page
 
@@ -83,10 +84,6 @@ def up(process, free_port):
     return start
 
 
-def gone(children):
-    return all(not child.is_running() or child.status() == psutil.STATUS_ZOMBIE for child in children)
-
-
 def test_up_with_page_and_dead_service(up):
     running, children, _ = up()
     assert len(children) == 6  # router, simulator, estimator, controller, viewer and an idle recorder
@@ -99,9 +96,9 @@ def test_up_with_page_and_dead_service(up):
     next(child for child in children if "services.estimator" in child.cmdline()).kill()
     running.wait_for("estimator ended with status -9", 20)
     assert "python -m services.estimator" in running.output
-    assert sum(child.status() != psutil.STATUS_ZOMBIE for child in children if child.is_running()) == 5
+    assert [ended(child) for child in children].count(False) == 5
     assert running.stop(signal.SIGINT, 20)[0] == 130
-    assert wait_until(lambda: gone(children), 10)
+    assert wait_until(lambda: all(map(ended, children)), 10)
 
 
 def test_up_with_two_robots(up):
@@ -117,10 +114,10 @@ def test_up_with_two_robots(up):
             assert abs(belief.pose.x - truth.pose.x) < 0.3
             assert bus.alive() == {"estimator", "simulator", "controller"}
     assert running.stop(signal.SIGTERM, 60)[0] == 130
-    assert wait_until(lambda: gone(children), 10)
+    assert wait_until(lambda: all(map(ended, children)), 10)
 
 
 def test_killed_up_leaves_no_process(up):
     running, children, _ = up("--no-viewer")
     running.kill()
-    assert wait_until(lambda: gone(children), 10)
+    assert wait_until(lambda: all(map(ended, children)), 10)

@@ -8,6 +8,7 @@ import psutil
 import pytest
 
 from common.bus.bus import wait_until
+from tests.conftest import ended
 from tests.recorder import sessions as recorded
 from tests.viewer.client import Page, page_of
 
@@ -17,10 +18,6 @@ def viewer(process, tmp_path):
     (tmp_path / "broken.mcap").write_bytes(b"no recording at all, but long enough to be looked at twice")
     recorded.write(tmp_path / "hall.mcap")  # 10 s, 10 scans a second
     return process("viewer", "--port", "0", "--recordings", str(tmp_path))
-
-
-def gone(child):
-    return not child.is_running() or child.status() == psutil.STATUS_ZOMBIE
 
 
 def test_recording_of_one_visitor(viewer, bus):
@@ -78,4 +75,4 @@ def test_death_of_replay_and_viewer(viewer, bus):
         page.by_now("hello", lambda m: m["robots"] == [bus.robot])
         child = open_recording(page)
         viewer.send(signal.SIGKILL)
-        assert wait_until(lambda: gone(child), 20)
+        assert wait_until(lambda: ended(child), 20)

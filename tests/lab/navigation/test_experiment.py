@@ -36,6 +36,7 @@ from lab.navigation.shortest_path import (
     length,
     load_shortest_paths,
 )
+from tests.conftest import ended
 
 QUIET = Console(quiet=True)
 ROBOT, TURNING = Robot(), Robot(drive="differential")
@@ -409,10 +410,7 @@ def test_interrupted_and_killed_runs(process, tmp_path):
     assert wait_until(services, 90), run.output
     children = psutil.Process(run.child.pid).children(recursive=True)
     run.kill()
-    _, alive = psutil.wait_procs(children, 20)
-    for left in alive:
-        left.kill()
-    assert not alive
+    assert wait_until(lambda: all(map(ended, children)), 20)
 
 
 def test_the_page_agrees_with_the_stored_results():
