@@ -75,7 +75,7 @@ check: install ## style, format and types
 bench: install ## latency from scan to command beside the raw zenoh round trip
 	$(BIN)/presage bench latency $(ARGS)
 
-chaos: install ## every fault into a driving system on three hosts of its own: detected, stands, at work again
+chaos: install ## inject faults into a system on three hosts: times of detection, stop and recovery
 	$(BIN)/presage bench chaos $(ARGS)
 
 screenshots: install ## docs/page.png and docs/page.webp of the live page; needs Chromium

@@ -62,9 +62,10 @@ def _nothing_left_behind():
 
 
 @pytest.fixture(autouse=True)
-def _no_settings_from_outside(monkeypatch):
+def _no_settings_from_outside(monkeypatch, tmp_path):
     for name in [name for name in os.environ if name.startswith("PRESAGE_")]:
         monkeypatch.delenv(name)
+    monkeypatch.setenv("PRESAGE_RUNTIME_DIR", str(tmp_path / "sessions"))
 
 
 def free_tcp_port() -> int:
@@ -168,7 +169,8 @@ class Processes:
         # The child imports the checkout's modules although it runs in another folder.
         path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
         clean = {k: v for k, v in os.environ.items() if not k.startswith("PRESAGE_")}
-        environment = {**clean, "PYTHONUNBUFFERED": "1", "PYTHONPATH": path, **(env or {})}
+        environment = {**clean, "PYTHONUNBUFFERED": "1", "PYTHONPATH": path}
+        environment |= {"PRESAGE_RUNTIME_DIR": str(self.folder / "sessions"), **(env or {})}
         log = self.folder / f"{len(self.started)}-{Path(str(name)).name}.log"
         running = Running(str(name), self._child([*what, *args], environment, log, fresh=fresh), log)
         self.started.append(running)

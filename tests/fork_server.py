@@ -6,6 +6,7 @@ interpreter, such as those that look at a command line, use ``fresh=True`` in co
 
 from __future__ import annotations
 
+import atexit
 import multiprocessing
 import os
 import runpy
@@ -63,9 +64,12 @@ def _run(what: list[str], environment: dict[str, str], log: str, cwd: str) -> No
     os.chdir(cwd)
     os.environ.clear()
     os.environ.update(environment)
-    if what[0] == "-m":
-        sys.argv[1:], sys.path[0] = what[2:], cwd
-        runpy.run_module(what[1], run_name="__main__", alter_sys=True)
-    else:
-        sys.argv, sys.path[0] = what, str(Path(what[0]).parent)
-        runpy.run_path(what[0], run_name="__main__")
+    try:
+        if what[0] == "-m":
+            sys.argv[1:], sys.path[0] = what[2:], cwd
+            runpy.run_module(what[1], run_name="__main__", alter_sys=True)
+        else:
+            sys.argv, sys.path[0] = what, str(Path(what[0]).parent)
+            runpy.run_path(what[0], run_name="__main__")
+    finally:
+        atexit._run_exitfuncs()  # which multiprocessing skips; captured output is written to the log there

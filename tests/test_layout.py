@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests import file_list
+
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("common", "services", "presage", "lab")
 # Each layer imports only those before it; what shares a line imports nothing of one another.
@@ -37,7 +39,7 @@ SHELL = {"__main__.py", "service.py", "settings.py"}
 ALSO_SHELL = {
     "services/estimator/factory.py",  # opens the files that settings name
     "services/estimator/model_card.py",
-    "services/estimator/multi_robot_service.py",
+    "services/estimator/multi_robot.py",
     "services/estimator/paper/checkpoint.py",
     "services/estimator/paper/weights.py",
     "services/estimator/precise/learning/weights.py",
@@ -203,12 +205,12 @@ def test_heavy_packages():
 @pytest.mark.parametrize(
     ("module", "absent"),
     [
-        ("services.controller.service", ["torch", "pybullet", "mcap"]),
-        ("services.recorder.service", ["torch", "pybullet"]),
-        ("services.simulator.service", ["torch", "mcap"]),
+        ("services.controller.service", ["torch", "pybullet", "mcap", "numba"]),
+        ("services.recorder.service", ["torch", "pybullet", "numba"]),
+        ("services.simulator.service", ["torch", "mcap", "numba"]),
         ("services.estimator.service", ["pybullet", "mcap"]),
         ("services.estimator.__main__", ["torch"]),  # --help answers at once
-        ("presage.cli.main", ["torch", "pybullet"]),
+        ("presage.cli.main", ["torch", "pybullet", "numba"]),
         ("common.messages.reference", ["torch", "pybullet", "mcap"]),
     ],
 )
@@ -225,14 +227,8 @@ def test_no_pickle():
 
 
 def test_architecture_page():
-    page = (ROOT / "docs" / "architecture.md").read_text()
-    listed = {line.split("`")[1] for line in page.splitlines() if line.startswith("| `")}
-    files = {name(p) for p in SOURCES if p.name not in {"__init__.py", "__main__.py"}}
-    assert {entry for entry in listed if entry.endswith(".py")} == files
-    for path in SOURCES:
-        if name(path) in files:
-            summary = ast.get_docstring(tree(path)).splitlines()[0]
-            assert f"| `{name(path)}` | {summary} |" in page, f"{name(path)}: the page has another summary"
+    page = file_list.PAGE.read_text(encoding="utf-8")
+    assert file_list.fill(page) == page, "run: python -m tests.file_list"
 
 
 def test_imports(tmp_path):

@@ -122,9 +122,9 @@ class Bus(Liveliness):
                     call.reply(key, answer, encoding=zenoh.Encoding(ENCODING).with_schema(query.reply.__name__))
                 call.drop()  # type: ignore[no-untyped-call]
 
-            def refuse(why: str) -> None:
+            def refuse(reason: str) -> None:
                 with suppress(zenoh.ZError):
-                    call.reply_err(why.encode())
+                    call.reply_err(reason.encode())
                 call.drop()  # type: ignore[no-untyped-call]
 
             inbox.put(Call(query, payload, reply, refuse))
@@ -153,8 +153,8 @@ class Bus(Liveliness):
             for answer in answers:
                 if answer.ok is not None:
                     return _decode_reply(key, reply, answer.ok.payload.to_bytes())
-                if answer.err is not None and (why := answer.err.payload.to_string()) != "Timeout":
-                    raise UserError(f"{key}: refused: {why}")
+                if answer.err is not None and (error := answer.err.payload.to_string()) != "Timeout":
+                    raise UserError(f"{key}: refused: {error}")
             if answers:
                 break
             # A session that has just opened does not know the queryables yet, so the request was not sent: try again.
@@ -181,8 +181,8 @@ class Bus(Liveliness):
         def on_reply(answer: zenoh.Reply) -> None:
             if answer.ok is not None:
                 settle(answer.ok.payload.to_bytes())
-            elif answer.err is not None and (why := answer.err.payload.to_string()) != "Timeout":
-                settle(b"", f"{key}: refused: {why}")
+            elif answer.err is not None and (error := answer.err.payload.to_string()) != "Timeout":
+                settle(b"", f"{key}: refused: {error}")
 
         def on_end() -> None:
             settle(b"", f"no service answers {key}: is the {service if service != '*' else query.server} running?")
@@ -256,13 +256,13 @@ def open_bus(
     join_timeout = JOIN_TIMEOUT_S if patience is None else min(patience, JOIN_TIMEOUT_S)
     while (session := open_session(link, join_timeout)) is None:
         assert link.security is not None  # noqa: S101 - open_session returns None only with credentials
-        why = explain_rejection(link.security.member.name, link.connect)
+        rejection = explain_rejection(link.security.member.name, link.connect)
         if give_up():
             raise SystemExit(0)
         if patience is not None and time.monotonic() - began > patience:
-            raise UserError(why)
+            raise UserError(rejection)
         if patience is None and not waiting:
-            logging.getLogger(__name__).warning("%s; waiting", why)
+            logging.getLogger(__name__).warning("%s; waiting", rejection)
         waiting = True
         time.sleep(JOIN_PAUSE_S)
     with closing(session):  # zenoh's own __exit__ fails while another thread is in a call of the session

@@ -39,6 +39,11 @@ class Link:
     security: Credentials | None = None  # with credentials, only a router listens
     insecure: bool = False  # may listen on other addresses than loopback without credentials
 
+    @property
+    def connect_option(self) -> str:
+        """Value of ``--connect`` for other programs of the session; empty if they do not need it."""
+        return "" if self.connect == (DEFAULT_ENDPOINT,) else ",".join(self.connect)
+
 
 def _config(link: Link, join_timeout: float = JOIN_TIMEOUT_S) -> zenoh.Config:
     config: zenoh.Config = zenoh.Config()
@@ -89,9 +94,9 @@ def open_session(link: Link, join_timeout: float = JOIN_TIMEOUT_S) -> zenoh.Sess
         if "in use" in text:
             raise UserError(f"port in use: {' '.join(link.listen)}; choose another with --listen") from None
         # Zenoh appends its source line, and wraps some messages in the name of a Rust enum.
-        why = " ".join(text.split(" at /", maxsplit=1)[0].split()).removeprefix('Json5Err(Message { msg: "')
+        reason = " ".join(text.split(" at /", maxsplit=1)[0].split()).removeprefix('Json5Err(Message { msg: "')
         endpoints = f"connect {', '.join(link.connect) or 'none'}, listen {', '.join(link.listen) or 'none'}"
-        raise UserError(f"no session with {endpoints}: {why}; an endpoint is written like {DEFAULT_ENDPOINT}") from None
+        raise UserError(f"no session with {endpoints}: {reason}; an endpoint looks like {DEFAULT_ENDPOINT}") from None
 
 
 def wait_until(condition: Callable[[], bool], timeout: float, period: float = 0.02) -> bool:

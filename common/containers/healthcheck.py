@@ -19,26 +19,12 @@ from collections.abc import Collection
 from pathlib import Path
 
 from common.containers.run_per_robot import robot_names
-from common.runtime.heartbeat import Beat, read_beats
+from common.runtime.heartbeat import read_beats
+from common.runtime.liveness import Report, find_problem
 
-MAX_HEARTBEAT_AGE_S = 4.0  # heartbeats are written each second
-MAX_INPUT_AGE_S = 2.0  # inputs newer than this count as arriving
-MAX_RESULT_AGE_S = 5.0  # while inputs arrive
 CONNECT_TIMEOUT_S = 4.0  # for the router or the page
 PAGE = ("127.0.0.1", 8080)
-# Input (or None) and result of each service: topic, and kind of count in the heartbeat.
-DUTIES = {
-    "simulator": (None, ("scan", "published")),
-    "bridge_ros2": (None, ("scan", "published")),
-    "replay": (None, ("scan", "published")),
-    "remote": (None, ("scan", "received")),
-    "estimator": (("scan", "received"), ("belief", "published")),
-    "controller": (("belief", "received"), ("status", "published")),
-    "recorder": (("*", "received"), ("*", "written")),
-}
 SINGLE_PROCESS = {"viewer"}  # one process for all robots, whose heartbeat has the first robot's name
-# Notes that begin like this explain why a service publishes nothing, which is then not a fault.
-IDLE_NOTES = ("paused", "waits for", "records nothing", "standing by")
 
 
 def main(service: str) -> None:
@@ -54,7 +40,7 @@ def main(service: str) -> None:
         _check_page()
 
 
-def fault_of(service: str, beats: dict[str, Beat], robots: Collection[str], now: float) -> str:
+def fault_of(service: str, beats: dict[str, Report], robots: Collection[str], now: float) -> str:
     """What is wrong with a service at ``now`` s (monotonic clock), by its heartbeats; empty if nothing is.
 
     ``beats`` are by the name of the robot, one for each process.
@@ -63,31 +49,9 @@ def fault_of(service: str, beats: dict[str, Beat], robots: Collection[str], now:
         beat = beats.get(next(iter(robots)) if service in SINGLE_PROCESS else robot)
         if beat is None:
             return f"{robot}: no heartbeat"
-        if (age := now - beat.at) > MAX_HEARTBEAT_AGE_S:
-            return f"{robot}: no heartbeat for {age:.0f} s"
-        if not beat.linked:
-            return f"{robot}: not connected to any session; is the router running?"
-        if fault := _missing_result(service, beat, robot, now):
-            return f"{robot}: {fault}" + (f" ({beat.note})" if beat.note else "")
+        if problem := find_problem(service, robot, beat, now):
+            return f"{robot}: {problem}" + (f" ({beat.note})" if beat.note else "")
     return ""
-
-
-def _missing_result(service: str, beat: Beat, robot: str, now: float) -> str:
-    """Description of the result that is missing although the service's input arrives; empty if none is."""
-    if service not in DUTIES or beat.note.startswith(IDLE_NOTES):
-        return ""
-    needed, result = DUTIES[service]
-    last_input = now if needed is None else _last(beat, robot, *needed)
-    if now - last_input > MAX_INPUT_AGE_S or (age := now - _last(beat, robot, *result)) <= MAX_RESULT_AGE_S:
-        return ""
-    return f"{result[0]} was not {result[1]} for {age:.0f} s" if age < now else f"no {result[0]} was {result[1]} so far"
-
-
-def _last(beat: Beat, robot: str, topic: str, kind: str) -> float:
-    """Time in s at which the count of a topic last increased; 0 if it never did."""
-    stem = f"presage/{robot}/"
-    rows = [row for key, row in beat.last.items() if key.startswith(stem) and topic in ("*", key.removeprefix(stem))]
-    return max((row.get(kind, 0.0) for row in rows), default=0.0)
 
 
 def _check_page() -> None:

@@ -157,8 +157,8 @@ class ProcessGroup:
                 process.output.join(POLL_PERIOD_S)
 
 
-def _refuse(why: str) -> int:
-    print(f"fleet: {why}", file=sys.stderr)
+def _refuse(error: str) -> int:
+    print(f"fleet: {error}", file=sys.stderr)
     return 2
 
 

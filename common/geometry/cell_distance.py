@@ -2,6 +2,8 @@
 
 The squared distance to a union of grid cells is separable (Felzenszwalb and Huttenlocher, Distance Transforms of
 Sampled Functions, 2012): it is computed along each column first and then minimised over the columns.
+
+scipy.ndimage.distance_transform_edt does not give it: it measures between cell centres, not from any node to an edge.
 """
 
 from __future__ import annotations

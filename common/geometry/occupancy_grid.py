@@ -19,7 +19,6 @@ import shapely
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from common.geometry.cell_distance import inner_distance, signed_distance
-from common.geometry.cell_rays import CellRays
 from common.geometry.se2 import rotate
 from common.limits import Angle, Coordinate
 
@@ -92,7 +91,7 @@ class OccupancyGrid(BaseModel):
         moved = np.asarray(points, float) - np.array([x, y])
         return rotate(-yaw, moved) if yaw else moved
 
-    def at(self, points: Array) -> Cells:
+    def values_at(self, points: Array) -> Cells:
         """(N,) values of the cells at points (N, 2) in m in map; UNKNOWN outside the grid."""
         column, row = np.floor(self.from_map(points) / self.resolution).astype(int).T
         inside = (column >= 0) & (column < self.width) & (row >= 0) & (row < self.height)
@@ -141,25 +140,12 @@ class GridShapes:
         faces = shapely.get_parts(shapely.polygonize(_lines(outline(free).astype(float))))
         column, row = np.floor(shapely.get_coordinates(shapely.point_on_surface(faces))).astype(int).T.reshape(2, -1)
         local = shapely.multipolygons(faces[free[row, column]])
-        in_map: shapely.Geometry = shapely.transform(local, lambda at: self.grid.to_map(at * self.grid.resolution))
+        in_map: shapely.Geometry = shapely.transform(local, lambda xy: self.grid.to_map(xy * self.grid.resolution))
         return in_map
-
-    @functools.cached_property
-    def rays(self) -> CellRays:
-        """Ray caster against the occupied cells."""
-        return CellRays(self.grid.values == OCCUPIED)
-
-    def ray_distances(self, poses: Array, angles: Array) -> Array:
-        """(N, B) distances in m from poses (N, 3) in map along ``angles`` (B,) to occupied cells, or +inf."""
-        grid = self.grid
-        x, y = np.repeat(grid.from_map(poses[:, :2]) / grid.resolution, len(angles), axis=0).T
-        heading = (poses[:, 2:3] + angles - grid.origin[2]).ravel()
-        found = self.rays.distances(x, y, np.cos(heading), np.sin(heading))
-        return (found * grid.resolution).reshape(len(poses), len(angles))
 
     def distance(self, kind: int, points: Array) -> Array:
         """(N,) distances in m from points (N, 2) in map to the edge of the cells of value ``kind``; negative inside."""
-        inside = self.grid.at(points) == kind
+        inside = self.grid.values_at(points) == kind
         if kind not in self._trees:
             self._trees[kind] = shapely.STRtree(_lines(self._in_map(outline(self.grid.values == kind))))
         away = np.full(len(points), np.inf)

@@ -22,7 +22,7 @@ def classify_points(
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
     """Masks (rows, columns) of the points x, y in m: those that are free, and those drawn as walls or furniture."""
     if world.grid is not None:
-        values = world.grid.at(np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(x.shape)
+        values = world.grid.values_at(np.stack([x, y], axis=-1).reshape(-1, 2)).reshape(x.shape)
         covered = shapely.contains_xy(world.furniture, x, y)
         return (values == FREE) & ~covered, (values == OCCUPIED) | covered
     free = shapely.contains_xy(world.free_space, x, y)

@@ -14,7 +14,6 @@ from pydantic import Field, ValidationError, model_validator
 
 from common.errors import UserError
 from common.geometry import ros_map as map_file
-from common.geometry import segment_rays
 from common.geometry.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from common.geometry.shapes import Box, Circle, Degrees, Model, Obstacle, Ring, check_ring
 from common.geometry.yaml_text import TooLargeError, parse_yaml
@@ -138,11 +137,15 @@ class World(Model):
             return self._free_area.signed(points)
         return self._limit_by_obstacles(points, 0.0 - self.grid.shapes.distance(FREE, points))
 
-    def why_no_room(self, place: Array, radius: float) -> str | None:
-        """Explanation why a robot of ``radius`` m cannot stand at a point (2,) or pose (3,), or None if it can."""
-        clearance = float(self.clearance(place[:2])[0])
-        if clearance >= radius:
+    def has_room(self, place: Array, radius: float) -> bool:
+        """Whether a robot of ``radius`` m can stand at a point (2,) or pose (3,)."""
+        return bool(self.clearance(place[:2])[0] >= radius)
+
+    def placement_error(self, place: Array, radius: float) -> str | None:
+        """Why a robot of ``radius`` m cannot stand at a point (2,) or pose (3,). None if it can."""
+        if self.has_room(place, radius):
             return None
+        clearance = float(self.clearance(place[:2])[0])
         what = "is inside a wall or outside" if clearance < 0 else f"is {clearance:.2f} m from a wall of"
         return f"({place[0]:.2f}, {place[1]:.2f}) {what} {self.name!r}; the robot needs {radius:g} m around it"
 
@@ -165,7 +168,7 @@ class World(Model):
             distance = self.grid.shapes.lattice_distances(OCCUPIED, x, y, max_distance).ravel()
             distance = self._limit_by_obstacles(nodes, distance)
             return np.clip(distance, -max_distance, max_distance).reshape(len(y), len(x))
-        columns = [self._free_area.signed(np.column_stack([np.full(len(y), at), y])) for at in x]
+        columns = [self._free_area.signed(np.column_stack([np.full(len(y), x_k), y])) for x_k in x]
         return np.clip(np.stack(columns, axis=1), -max_distance, max_distance)
 
     def _limit_by_obstacles(self, points: Array, distance: Array) -> Array:
@@ -232,13 +235,13 @@ class World(Model):
         return room
 
     def ray_distances(self, poses: npt.ArrayLike, angles: npt.ArrayLike) -> Array:
-        """(N, B) distances in m from scanner poses (N, 3) in map along ``angles`` (B,) in laser.
+        """(N, B) exact distances in m from scanner poses (N, 3) in map along ``angles`` (B,) in laser.
 
-        They are exact, from intersections with segments, circles and the cells of a grid, and +inf if nothing is hit.
+        They are +inf if nothing is hit.
         """
-        poses, angles = np.asarray(poses, float).reshape(-1, 3), np.asarray(angles, float)
-        found = segment_rays.distances(self.outlines, self.circles, poses, angles)
-        return found if self.grid is None else np.minimum(found, self.grid.shapes.ray_distances(poses, angles))
+        from common.geometry.ray_casting import cast_rays  # noqa: PLC0415 - numba, which most services do not need
+
+        return cast_rays(self, poses, angles)
 
 
 class _Area:

@@ -23,7 +23,7 @@ class Stamped(Message):
     """Base of all messages on topics."""
 
     stamp_ns: Count  # ns, time of the measurement that this message is about (simulation or sensor time, not wall time)
-    seq: Count = 0  # number of this message among those of its publisher on this key, from 0; a gap means loss
+    seq: Count = 0  # the publisher's counter for this key, from 0; a gap means loss
 
 
 class Scan(Stamped):
@@ -71,7 +71,7 @@ class Hypothesis(Message):
 
     pose: Pose  # base_link in map
     covariance: Matrix3 | None = None  # (3, 3) of x, y, yaw in map; nil if the estimator computes none
-    weight: Annotated[float, Field(ge=0, le=1)]  # in the mixture; the weights sum to 1
+    weight: Annotated[float, Field(ge=0, le=1)]  # share of the mixture; the weights sum to 1
 
     @model_validator(mode="after")
     def _shape(self) -> Hypothesis:
@@ -81,17 +81,20 @@ class Hypothesis(Message):
 
 
 class Belief(Stamped):
-    """The estimator's posterior of the pose: one for each scan, with the stamp of the scan."""
+    """The estimator's posterior of the pose: one for each scan, with the stamp of the scan.
+
+    Any estimator can publish it: what it does not compute stays nil.
+    """
 
     state: Literal["localising", "tracking", "ambiguous", "lost"]
     pose: Pose  # base_link in map
     covariance: Matrix3 | None = None  # (3, 3) of x, y, yaw in map; nil if the estimator computes none
-    xi: Annotated[Floats, Field(description="prediction error in pose space")]
-    # (3,) xi = dg' Pi (o - g), the negative gradient of accuracy in map: 1/m, 1/m, 1/rad (nats)
+    xi: Floats | None = None  # (3,) prediction error in pose space, xi = dg' Pi (o - g),
+    # the negative gradient of accuracy in map: 1/m, 1/m, 1/rad (nats)
     curvature: Matrix3 | None = None  # (3, 3) dg' Pi dg, Gauss-Newton Hessian of F at the pose, map
-    free_energy: Finite  # nats, accuracy + complexity
-    accuracy: Finite  # nats, -ln p(o | pose)
-    complexity: Finite = 0.0  # nats, divergence of the posterior from the prior
+    free_energy: Finite | None = None  # nats, accuracy + complexity
+    accuracy: Finite | None = None  # nats, -ln p(o | pose)
+    complexity: Finite | None = None  # nats, divergence of the posterior from the prior
     hypotheses: Annotated[list[Hypothesis], Field(max_length=64)] = []  # noqa: RUF012
     # best first; the first one is at `pose`
     estimator: Name = ""
@@ -99,7 +102,7 @@ class Belief(Stamped):
 
     @model_validator(mode="after")
     def _shapes(self) -> Belief:
-        if self.xi.shape != (3,):
+        if self.xi is not None and self.xi.shape != (3,):
             raise ValueError(f"xi has shape {self.xi.shape}, not (3,)")
         for name in ("covariance", "curvature"):
             matrix = getattr(self, name)
@@ -123,7 +126,7 @@ class Goal(Stamped):
 
     pose: Pose  # base_link in map
     tolerance: PositiveDistance = 0.2  # m, the goal is reached within this distance
-    yaw_tolerance: PositiveAngle | None = None  # rad, of the final heading; nil accepts any heading
+    yaw_tolerance: PositiveAngle | None = None  # rad, tolerance of the final heading; nil accepts any heading
     cancel: bool = False  # drop the goal and stop
 
 
@@ -147,7 +150,7 @@ class Status(Stamped):
     reason: Text = ""
     refused: bool = False  # blocked permanently, as the goal cannot be reached; if false, the way may become free
     goal: Pose | None = None  # base_link in map
-    goal_seq: Count = 0  # seq of the goal that this is about
+    goal_seq: Count = 0  # seq of the goal
     distance: Distance | None = None  # m, from the believed pose to the goal
 
 
@@ -200,3 +203,4 @@ class Health(Stamped):
     counters: dict[str, Count] = {}  # noqa: RUF012 - pydantic copies defaults
     note: Text = ""  # what the service waits for, or its last problem
     instance: Name = ""  # name of the process; each process numbers its own messages
+    idle: bool = False  # publishes no results on purpose: paused, or waiting for something that the note names

@@ -27,7 +27,7 @@ class Reply(Message):
     """Base of all replies, and a reply without data."""
 
     ok: bool = True
-    reason: Text = ""  # of the failure, if ok is false
+    reason: Text = ""  # why the request failed, if ok is false
 
 
 class PoseRequest(Request):
@@ -66,9 +66,9 @@ class SampleRequest(Request):
     """Simulate scans from given poses."""
 
     poses: Poses  # (N, 3) base_link in map
-    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)] | None = None  # number of beams; nil for that of the scanner
+    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)] | None = None  # number of beams; nil for the scanner's own
     noise: bool = False
-    seed: Count = 0  # of the noise
+    seed: Count = 0  # random seed of the noise
 
 
 class SampleReply(Reply):
@@ -82,7 +82,7 @@ class PredictRequest(Request):
     """Predict scans from given poses with the estimator's model."""
 
     poses: Poses  # (N, 3) base_link in map, N at most 1000
-    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)] | None = None  # evenly chosen from the scanner's; nil for all
+    beams: Annotated[int, Field(ge=2, le=MAX_BEAMS)] | None = None  # evenly spaced among the scanner's; nil for all
 
 
 class PredictReply(Reply):
@@ -130,7 +130,7 @@ class RecordReply(Reply):
 
     recording: bool = False
     file: Text = ""  # path on the recorder's machine of the present or last recording; empty if there is none yet
-    messages: Count = 0  # in that recording
+    messages: Count = 0  # number of messages in that recording
     seconds: NotNegative = 0.0  # s of wall time since its start, or its length once it is complete
 
 
@@ -141,9 +141,9 @@ class ConfigReply(Reply):
     config: Text = ""  # the settings as JSON
     versions: dict[str, str] = {}  # noqa: RUF012
     # versions of Python and packages, by name
-    protocol: Count = 0  # version of its messages, `PROTOCOL` in common/versions.py; 0 if unknown
-    host: Name = ""  # name of its machine
-    uptime: NotNegative = 0.0  # s of wall time since its start
+    protocol: Count = 0  # version of the message protocol (`PROTOCOL` in common/versions.py); 0 if unknown
+    host: Name = ""  # host name of the service's machine
+    uptime: NotNegative = 0.0  # s of wall time since the service's start
 
 
 class ModelRequest(Request):
@@ -160,5 +160,5 @@ class ModelReply(Reply):
     card: Text = ""  # the model card as JSON; empty if the model has no weights
     file: Text = ""  # NAME.safetensors, the file of the weights (the card is NAME.json); empty if there are none
     size: Count = 0  # bytes of the weights
-    sha256: Name = ""  # of the weights, hexadecimal
+    sha256: Name = ""  # SHA-256 of the weights, hexadecimal
     weights: Bytes = np.zeros(0, np.uint8)  # the weights, if they were requested

@@ -100,11 +100,3 @@ def chosen_scanner(
         return Scanner.model_validate({**scanner.model_dump(), **changes}) if changes else scanner
     except ValidationError as error:
         raise UserError(f"{scanner.name} with --noise {noise}: {first_fault(error)}") from None
-
-
-def scanner_arguments(name: str, beams: int | None, mount: str, *, upside_down: bool) -> tuple[str, ...]:
-    """Command-line options of the simulator for this scanner; raises UserError if it is invalid."""
-    chosen_scanner(name, beams, mount=mount)
-    options = {"--beams": "" if beams is None else str(beams), "--mount": mount}
-    given = [f"{option}={value}" for option, value in options.items() if value]
-    return ("--scanner", name, *given, *(["--upside-down"] if upside_down else []))

@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from prometheus_client.core import Metric
-from prometheus_client.registry import Collector
+from prometheus_client import CollectorRegistry
 
-from common.runtime.metrics import build_info, family, new_registry
+from common.runtime.metrics import add_build_info, gauge, new_registry
 
 if TYPE_CHECKING:
     from common.bus.bus import Bus
 
 
-class RouterMetrics(Collector):
-    """Uptime of the router, and number of sessions connected to it."""
-
-    def __init__(self, bus: Bus) -> None:
-        """``bus`` is the router's own session."""
-        self._bus, self._began = bus, time.monotonic()
-        self.registry = new_registry(self)
-
-    def collect(self) -> Iterator[Metric]:
-        """Yield the metrics for a scrape."""
-        yield build_info("", "router")
-        yield family("presage_router_uptime_seconds", [((), time.monotonic() - self._began)])
-        yield family("presage_router_sessions", [((), self._bus.count_links())])
+def router_metrics(bus: Bus) -> CollectorRegistry:
+    """Uptime of the router, and number of sessions connected to it; ``bus`` is the router's own session."""
+    registry, began = new_registry(), time.monotonic()
+    add_build_info(registry, "", "router")
+    gauge(registry, "presage_router_uptime_seconds").set_function(lambda: time.monotonic() - began)
+    gauge(registry, "presage_router_sessions").set_function(bus.count_links)
+    return registry

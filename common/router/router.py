@@ -60,7 +60,6 @@ class RouterSettings(ServiceSettings):
             connect,
             listen,
             router=True,
-            multicast=self.multicast,
             security=security,
             insecure=self.insecure,
         )
@@ -95,10 +94,10 @@ def route(link: Link, log: Logger, metrics: str = "") -> None:
             bus = stack.enter_context(open_bus(link, log_filter=LOG_FILTER))
             facts["lets_in"] = [member.name for member in link.security.members]
         if metrics:
-            from common.router.metrics import RouterMetrics  # noqa: PLC0415
+            from common.router.metrics import router_metrics  # noqa: PLC0415
             from common.runtime.metrics_server import serve  # noqa: PLC0415
 
-            log.info("metrics", address=stack.enter_context(serve(RouterMetrics(bus).registry, metrics)))
+            log.info("metrics", address=stack.enter_context(serve(router_metrics(bus), metrics)))
         log.info("router listens", endpoints=", ".join(link.listen), **facts)
         signal.sigwait(STOP_SIGNALS)
     log.info("ended", **({"refused": dict(refusals.counts)} if link.security is not None else {}))

@@ -1,7 +1,8 @@
 """Settings from defaults, a YAML file, the environment and the command line.
 
 Each service has one settings class. Environment variables, command-line options and their help are derived from its
-fields.
+fields. The command `presage` passes what it is given on to these classes, as arguments; it is written with typer,
+because a command is an action with arguments of its own, and a container of one service needs no typer.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
 import yaml
-from pydantic import Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 from pydantic_settings import (
     BaseSettings,
     CliApp,
@@ -29,10 +30,11 @@ from pydantic_settings import (
 
 from common.bus.bus import DEFAULT_ENDPOINT, Link
 from common.bus.security import Credentials, credentials
-from common.errors import UserError
+from common.errors import UserError, first_fault
 
 _file_values: ContextVar[dict[str, Any]] = ContextVar("_file_values")
 S = TypeVar("S", bound="ServiceSettings")
+M = TypeVar("M", bound=BaseModel)
 METRICS_PATTERN = r"^$|^(\[[0-9A-Fa-f:.]+\]:|[^\s:\[\]]+:)?\d{1,5}$"  # PORT, HOST:PORT, [IPv6]:PORT, or empty
 
 
@@ -63,7 +65,6 @@ class ServiceSettings(BaseSettings):
     listen: Annotated[
         str, Field(description="zenoh endpoints to listen on, comma-separated; by default only on loopback")
     ] = "tcp/127.0.0.1:0"
-    multicast: Annotated[bool, Field(description="also discover other sessions by multicast")] = False
     lossless: Annotated[
         bool,
         Field(description="wait for slow subscribers instead of dropping messages; for replays, not for a robot"),
@@ -101,7 +102,6 @@ class ServiceSettings(BaseSettings):
             self.robot,
             split_endpoints(self.connect),
             split_endpoints(self.listen),
-            multicast=self.multicast,
             lossless=self.lossless,
             security=self.credentials(),
             insecure=self.insecure,
@@ -198,6 +198,33 @@ class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
 
 def _read_file(cls: type[ServiceSettings], path: Path) -> dict[str, Any]:
     """Returns one service's settings: top-level keys apply to all services, the section of a service only to it."""
+    data = _load_mapping(path)
+    known = cls.model_fields.keys() - cls.private
+    shared = {k: v for k, v in data.items() if not isinstance(v, dict) and k in known}
+    return {**shared, **read_section(path, cls.service)}
+
+
+def read_section(path: Path, name: str) -> dict[str, Any]:
+    """The section ``name`` of a settings file, empty if there is none; raises UserError if the file is invalid."""
+    section = _load_mapping(path).get(name) or {}
+    if not isinstance(section, dict):
+        raise UserError(f"{path}: {name}: expected a mapping of settings")
+    return section
+
+
+def load_section(cls: type[M], path: Path | None, name: str, **options: object) -> M:
+    """The section ``name`` of a settings file as ``cls``; the ``options`` that are not empty take precedence.
+
+    Raises UserError if a setting is unknown or invalid.
+    """
+    section = {} if path is None else read_section(path, name)
+    try:
+        return cls.model_validate({**section, **{key: value for key, value in options.items() if value}})
+    except ValidationError as error:
+        raise UserError(f"{path or 'options'}: {first_fault(error)} (section {name})") from None
+
+
+def _load_mapping(path: Path) -> dict[str, Any]:
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
     except OSError as error:
@@ -207,9 +234,4 @@ def _read_file(cls: type[ServiceSettings], path: Path) -> dict[str, Any]:
         raise UserError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
     if not isinstance(data, dict):
         raise UserError(f"{path}: expected a mapping of settings")
-    known = cls.model_fields.keys() - cls.private
-    shared = {k: v for k, v in data.items() if not isinstance(v, dict) and k in known}
-    section = data.get(cls.service) or {}
-    if not isinstance(section, dict):
-        raise UserError(f"{path}: {cls.service}: expected a mapping of settings")
-    return {**shared, **section}
+    return data

@@ -1,6 +1,6 @@
 """A service's Prometheus metrics.
 
-`python -m common.runtime.metrics` prints the table of docs/operations.md.
+`python -m common.runtime.metrics` prints the table of all metrics.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, get_args
 
-from prometheus_client import CollectorRegistry, Histogram, ProcessCollector, disable_created_metrics
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
+from prometheus_client import CollectorRegistry, Gauge, Histogram, Info, ProcessCollector, disable_created_metrics
+from prometheus_client.core import CounterMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from common.messages.definitions import Belief, Health, Stamped, Status
@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 # Upper bounds of the histograms' buckets; 0.066 s is the period of a 15 Hz scanner.
 BUCKETS_S = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.066, 0.125, 0.25, 0.5, 1.0, 2.5)
 TOPIC_LABELS, SERVICE_LABELS = ("robot", "service", "topic"), ("robot", "service")
-STATES = {kind: get_args(kind.model_fields["state"].annotation) for kind in (Belief, Status)}
+STATES: dict[type[Stamped], tuple[str, ...]] = {
+    kind: get_args(kind.model_fields["state"].annotation) for kind in (Belief, Status)
+}
 
 
 @dataclass(frozen=True)
@@ -138,34 +140,27 @@ BY_NAME = {metric.name: metric for metric in METRICS}
 Values = Iterable[tuple[tuple[str, ...], float]]  # label values and value of each sample
 
 
-def family(name: str, values: Values) -> Metric:
-    """Build a counter or gauge of the table from its label values and values."""
-    definition = BY_NAME[name]
-    metric_class = CounterMetricFamily if definition.kind == "counter" else GaugeMetricFamily
-    metric = metric_class(name, definition.about, labels=definition.labels)
-    for labels, value in values:
-        metric.add_metric(labels, value)
-    return metric
-
-
-def build_info(robot: str, service: str) -> Metric:
-    """Build the metric whose labels are the versions of the running program."""
-    known, definition = versions(), BY_NAME["presage_build"]
-    packages = {"version": "presage", "zenoh": "eclipse-zenoh", "python": "python", "commit": "commit"}
-    values = {label: known.get(name, "unknown") for label, name in packages.items()}
-    labels = {"robot": robot, "service": service, "protocol": str(PROTOCOL), **values}
-    metric = InfoMetricFamily(definition.name, definition.about, labels=definition.labels)
-    metric.add_metric([labels[name] for name in definition.labels], {})
-    return metric
-
-
-def new_registry(collector: Collector) -> CollectorRegistry:
-    """Create a registry with ``collector`` and the CPU, memory and open files of the process."""
+def new_registry() -> CollectorRegistry:
+    """Create a registry with the CPU, memory and open files of the process."""
     disable_created_metrics()  # type: ignore[no-untyped-call]
     registry = CollectorRegistry()
     ProcessCollector(registry=registry)
-    registry.register(collector)
     return registry
+
+
+def gauge(registry: CollectorRegistry, name: str) -> Gauge:
+    """Register a gauge of the table."""
+    definition = BY_NAME[name]
+    return Gauge(name, definition.about, definition.labels, registry=registry)
+
+
+def add_build_info(registry: CollectorRegistry, robot: str, service: str) -> None:
+    """Register the metric whose labels are the versions of the running program."""
+    known, definition = versions(), BY_NAME["presage_build"]
+    packages = {"version": "presage", "zenoh": "eclipse-zenoh", "python": "python", "commit": "commit"}
+    values = {label: known.get(name, "unknown") for label, name in packages.items()}
+    info = Info(definition.name, definition.about, SERVICE_LABELS, registry=registry)
+    info.labels(robot, service).info({"protocol": str(PROTOCOL), **values})
 
 
 def topic_labels(key: str) -> tuple[str, str]:
@@ -175,22 +170,32 @@ def topic_labels(key: str) -> tuple[str, str]:
 
 
 class ServiceMetrics(Collector):
-    """Metrics of one service. The service's loop updates them; scrapes read them from another thread."""
+    """Metrics of one service. The service's loop updates them; scrapes read them from another thread.
+
+    The counters are collected at each scrape: the loop already has their totals, and a Counter can only be incremented.
+    """
 
     def __init__(self, robot: str, service: str, inbox: Inbox, counts: Callable[[], Mapping[str, Any]]) -> None:
         """Collect from ``inbox`` and ``counts``.
 
         ``counts()`` returns published and undecodable by key, failed, events by name, and began (s, monotonic clock).
         """
-        self.robot, self.service, self._inbox, self._counts = robot, service, inbox, counts
-        self._last: dict[str, Belief | Status] = {}  # by robot
+        self.service, self._labels, self._inbox, self._counts = service, (robot, service), inbox, counts
         self._health: Health | None = None
         self._last_health_time = time.monotonic()
-        self.registry = new_registry(self)
-        definitions = [BY_NAME[name] for name in ("presage_message_latency_seconds", "presage_step_duration_seconds")]
+        registry = self.registry = new_registry()
+        registry.register(self)
+        add_build_info(registry, *self._labels)
+        uptime, health_age = gauge(registry, "presage_uptime_seconds"), gauge(registry, "presage_pulse_age_seconds")
+        uptime.labels(*self._labels).set_function(lambda: time.monotonic() - counts()["began"])
+        health_age.labels(*self._labels).set_function(lambda: time.monotonic() - self._last_health_time)
+        self._rate = gauge(registry, "presage_message_rate_hertz")
+        self._free_energy = gauge(registry, "presage_free_energy_nats")
+        states = {Belief: "presage_estimator_state", Status: "presage_controller_state"}
+        self._states = {kind: gauge(registry, name) for kind, name in states.items()}
         self._latency, self._duration = (
-            Histogram(each.name, each.about, each.labels, buckets=BUCKETS_S, registry=self.registry)
-            for each in definitions
+            Histogram(name, BY_NAME[name].about, TOPIC_LABELS, buckets=BUCKETS_S, registry=registry)
+            for name in ("presage_message_latency_seconds", "presage_step_duration_seconds")
         )
         # By key: finding a histogram by its labels costs as much as an observation.
         self._children: dict[str, tuple[Histogram, Histogram]] = {}
@@ -206,22 +211,25 @@ class ServiceMetrics(Collector):
         latency, duration = self._children[key]
         if sample.published_ns:
             latency.observe(max(0.0, (time.time_ns() - sample.published_ns) * 1e-9))
-        began = time.perf_counter()
-        try:
+        with duration.time():
             yield
-        finally:
-            duration.observe(time.perf_counter() - began)
 
     def published(self, key: str, message: Stamped) -> None:
-        """Remember a message that was just published."""
+        """Update the gauges with a message that was just published."""
+        robot, _ = topic_labels(key)
         if isinstance(message, Health):
             self._health, self._last_health_time = message, time.monotonic()
+            for labels, rate in self._by_topic({row.key: row.rate for row in message.topics}):
+                self._rate.labels(*labels).set(rate)
         elif isinstance(message, Belief | Status):
-            self._last[topic_labels(key)[0]] = message
+            for state in STATES[type(message)]:
+                self._states[type(message)].labels(robot, self.service, state).set(state == message.state)
+            if isinstance(message, Belief) and message.free_energy is not None:
+                self._free_energy.labels(robot, self.service).set(message.free_energy)
 
     def collect(self) -> Iterator[Metric]:
-        """Yield all metrics but the histograms, which are collectors of their own."""
-        labels, now, counts = (self.robot, self.service), time.monotonic(), self._counts()
+        """Yield the counters."""
+        counts = self._counts()
         received, dropped, oversized = self._inbox.arrivals()
         undecodable = counts["undecodable"]
         counters = {
@@ -231,19 +239,19 @@ class ServiceMetrics(Collector):
             "undecodable": {key: undecodable.get(key, 0) + oversized[key] for key in received},
         }
         for name, by_key in counters.items():
-            yield family(f"presage_messages_{name}", self._by_topic(by_key))
-            yield family(f"presage_requests_{name}", [((*labels, k), n) for k, n in by_key.items() if not _is_key(k)])
-        yield family("presage_messages_published", self._by_topic(counts["published"]))
-        yield family("presage_steps_failed", [(labels, counts["failed"])])
+            requests = [((*self._labels, key), number) for key, number in by_key.items() if not _is_key(key)]
+            yield _counter(f"presage_messages_{name}", self._by_topic(by_key))
+            yield _counter(f"presage_requests_{name}", requests)
+        yield _counter("presage_messages_published", self._by_topic(counts["published"]))
+        yield _counter("presage_steps_failed", [(self._labels, counts["failed"])])
         events = dict(counts["events"])
         if (written := events.pop("written_bytes", None)) is not None:
-            yield family("presage_recorder_written_bytes", [(labels, written)])
-        yield family("presage_events", [((*labels, name), number) for name, number in events.items()])
-        yield family("presage_uptime_seconds", [(labels, now - counts["began"])])
-        yield family("presage_pulse_age_seconds", [(labels, now - self._last_health_time)])
-        yield build_info(*labels)
-        yield from self._from_health()
-        yield from self._states()
+            yield _counter("presage_recorder_written_bytes", [(self._labels, written)])
+        yield _counter("presage_events", [((*self._labels, name), number) for name, number in events.items()])
+        if self.service == "recorder" and (health := self._health) is not None:
+            for name in ("written", "missing"):
+                values = self._by_topic({row.key: getattr(row, name) for row in health.topics})
+                yield _counter(f"presage_recorder_messages_{name}", values)
 
     def _by_topic(self, by_key: Mapping[str, float]) -> Values:
         for key, number in by_key.items():
@@ -251,31 +259,13 @@ class ServiceMetrics(Collector):
                 robot, topic = topic_labels(key)
                 yield (robot, self.service, topic), number
 
-    def _from_health(self) -> Iterator[Metric]:
-        """Metrics that are known only from the last health message."""
-        rows = () if self._health is None else self._health.topics
-        yield family("presage_message_rate_hertz", self._by_topic({row.key: row.rate for row in rows}))
-        if self.service == "recorder":
-            for name in ("written", "missing"):
-                values = self._by_topic({row.key: getattr(row, name) for row in rows})
-                yield family(f"presage_recorder_messages_{name}", values)
 
-    def _states(self) -> Iterator[Metric]:
-        """Metrics of the last belief and the last controller status."""
-        last = dict(self._last)
-        beliefs = {robot: message for robot, message in last.items() if isinstance(message, Belief)}
-        if beliefs:
-            values = [((robot, self.service), belief.free_energy) for robot, belief in beliefs.items()]
-            yield family("presage_free_energy_nats", values)
-        for name, kind in (("presage_estimator_state", Belief), ("presage_controller_state", Status)):
-            states: list[tuple[tuple[str, ...], float]] = [
-                ((robot, self.service, state), float(state == message.state))
-                for robot, message in last.items()
-                if isinstance(message, kind)
-                for state in STATES[kind]
-            ]
-            if states:
-                yield family(name, states)
+def _counter(name: str, values: Values) -> CounterMetricFamily:
+    definition = BY_NAME[name]
+    metric = CounterMetricFamily(name, definition.about, labels=definition.labels)
+    for labels, value in values:
+        metric.add_metric(labels, value)
+    return metric
 
 
 def _is_key(name: str) -> bool:
@@ -284,7 +274,7 @@ def _is_key(name: str) -> bool:
 
 
 def table() -> str:
-    """The table of metrics in docs/operations.md, as Markdown."""
+    """The table of all metrics, as Markdown."""
     head = ["| metric | kind | labels | of | what |", "|---|---|---|---|---|"]
     rows = [
         f"| `{m.sample}` | {m.kind} | {', '.join(m.labels) or '-'} | {m.exported_by} | {m.about} |" for m in METRICS

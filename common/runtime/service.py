@@ -48,6 +48,7 @@ class Service(ABC):
         self.log: Logger = logger(self.name)
         self.counters: Counter[str] = Counter()  # published in health
         self.note = ""  # published in health
+        self.idle = False  # published in health: results are not expected now
         self._loop: Loop | None = None
 
     @property

@@ -20,6 +20,7 @@ from common.messages.requests import ConfigReply, Request
 from common.messages.topics import CONFIG, HEALTH, Query, Topic
 from common.messages.wire import DecodeError
 from common.runtime.heartbeat import Heartbeat
+from common.runtime.liveness import counts_of
 from common.runtime.protocol_check import ProtocolCheck, build_config_reply
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ class Loop:
         try:
             while not self._stopping and not self.try_start():
                 self.inbox.get(HEALTH_PERIOD_S / 2)
-                self._heartbeat.beat({}, linked=self.bus.linked(), note="standing by")
+                self._heartbeat.beat({}, linked=self.bus.linked(), note="standing by", idle=True)
             while not self._stopping:
                 self._step()
         finally:
@@ -145,12 +146,12 @@ class Loop:
         self.bus.request(query, request, self._request_number, self.inbox, timeout)
         return self._request_number
 
-    def reject(self, key: str, why: str) -> None:
+    def reject(self, key: str, reason: str) -> None:
         """Count a payload that could not be used, and log it at most once a second."""
         name = self.inbox.counted_as(key)
         self.undecodable[name] += 1
         if self._may_log(name):
-            self.service.log.warning("payload dropped", key=key, why=why, so_far=self.undecodable[name])
+            self.service.log.warning("payload dropped", key=key, reason=reason, so_far=self.undecodable[name])
 
     def _step(self) -> None:
         due = self.service.due()
@@ -181,8 +182,7 @@ class Loop:
             self._next_health = (now if late else self._next_health) + HEALTH_PERIOD_S
             health = self._health(now)
             self.publish(HEALTH, health)
-            counts = {row.key: row.model_dump(include={"received", "published", "written"}) for row in health.topics}
-            self._heartbeat.beat(counts, linked=self.bus.linked(), note=health.note)
+            self._heartbeat.beat(counts_of(health), linked=self.bus.linked(), note=health.note, idle=health.idle)
             self._protocol_check.poll(self._config)
             if self._election is not None:
                 self._election.refresh()
@@ -263,4 +263,5 @@ class Loop:
             counters=counters,
             note=self.service.note,
             instance=self.bus.instance,
+            idle=self.service.idle,
         )

@@ -26,7 +26,7 @@ MARKS = {
     "amcl-defaults": ("#CC79A7", "v", -14),
 }  # fmt: skip
 # Printed below each --markdown table, because the errors alone would hide the trials that failed.
-LEGEND = f"""Each cell: median / RMS position error of the trials that were found, i.e. within {FOUND_DISTANCE:g} m and
+LEGEND = f"""Each cell: median/RMS position error of the trials that were found, i.e. within {FOUND_DISTANCE:g} m and
 {np.rad2deg(FOUND_YAW):g}° of the true pose; how many of all trials were found; wrong: how many of all trials published
 `tracking` while the robot was elsewhere; NEES of the trials found (3 means a consistent covariance). The bound is the
 Cramér-Rao bound, RMS in mm. "Both kept": from scan {TWINS_REQUIRED_FROM_SCAN} until a scan distinguishes the two rooms,
@@ -134,7 +134,7 @@ def _cell(row: dict[str, Any]) -> str:
     counts = f"{row['found']}/{row['of']}, {row['tracking_but_wrong']} wrong"
     if row["position_error_median_m"] is None:
         return counts
-    error = f"{_number(row['position_error_median_m'], 1e3)} / {_number(row['position_error_rms_m'], 1e3)} mm"
+    error = f"{_number(row['position_error_median_m'], 1e3)}/{_number(row['position_error_rms_m'], 1e3)} mm"
     nees = f", NEES {row['nees_mean']:.2f}" if row["nees_mean"] is not None else ""
     return f"{error}, {counts}{nees}"
 

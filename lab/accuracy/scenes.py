@@ -132,7 +132,7 @@ def twin_path(scene: Scene) -> tuple[Array, int]:
     """
     while True:
         pose = np.array([*scene.rng.uniform([0.6, 0.4], [5.4, 2.2]), scene.rng.uniform(-np.pi, np.pi)])
-        if scene.world.clearance(pose[:2])[0] < ROBOT.radius or not _has_free_line_to_door(scene, pose):
+        if not scene.world.has_room(pose, ROBOT.radius) or not _has_free_line_to_door(scene, pose):
             continue
         if alike(scene, pose[None])[0]:
             break

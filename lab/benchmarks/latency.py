@@ -26,8 +26,8 @@ from common.messages.topics import CMD_VEL, ODOM, SCAN, TRUTH
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
 from common.versions import commit, versions
+from presage.session.running import credentials_for
 from presage.session.stack import Stack
-from presage.terminal.options import credentials_for
 from presage.terminal.output import check_file, write_json
 
 # The echo process uses the keys of a separate robot: it receives any bytes on `odom` and returns them on `truth`.
@@ -60,7 +60,7 @@ def latency(scans: int, rate: float, beams: int, console: Console) -> dict[str, 
     clean = world.ray_distances(se2.compose(start[None], scanner.mount), scanner.angles())[0]
     rng = np.random.default_rng(0)
     # This process publishes scans, and the echo process uses a scanner's keys: both need the simulator's role.
-    with Stack("bench", quiet=True, security=credentials_for("bench", "simulator")) as stack:
+    with Stack("bench", quiet=True, security=credentials_for("bench", ("simulator",))) as stack:
         stack.start_router()
         stack.start("controller")
         stack.start("estimator", "--initial-pose", f"{start[0]},{start[1]}")

@@ -23,7 +23,6 @@ from presage.terminal.output import check_file, make_folder, write_json
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import FreeSpaceGraph
 from services.estimator.particle_filter.likelihood_field import DistanceField
-from services.estimator.shared.generative_models import RayCaster
 from services.simulator.people import People
 from services.simulator.simulation import Setup, Simulation
 
@@ -72,10 +71,8 @@ def measure(path: str, beams: int, seed: int) -> list[tuple[str, float, str]]:
     timed("simulator: scans to learn from", lambda: simulation.sample(poses, None, None), SCANS)
     simulation.close()
     lasers, angles = se2.compose(poses, np.array(scanner.mount)), scanner.angles()
-    world.ray_distances(lasers[:1], angles)
-    timed("exact rays, numpy", lambda: world.ray_distances(lasers, angles), SCANS)
-    RayCaster(world).expect(lasers[:1], angles)
-    timed("exact rays, compiled", lambda: RayCaster(world).expect(lasers, angles), SCANS)
+    world.ray_distances(lasers[:1], angles)  # compiles
+    timed("exact rays", lambda: world.ray_distances(lasers, angles), SCANS)
     free = timed("controller: free space", lambda: FreeSpace.of(world))
     timed("controller: graph of free space", lambda: FreeSpaceGraph(free, Robot().radius))
     timed("particle filter: likelihood field", lambda: DistanceField(world))

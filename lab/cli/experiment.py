@@ -12,18 +12,14 @@ import typer
 from common.errors import UserError
 from lab.cli.navigation import navigate
 from lab.cli.options import (
-    CORES,
     OUT,
     Alpha,
-    Beams,
     Estimators,
     ExperimentSeed,
     Out,
-    Steps,
     Trials,
-    Workers,
-    World,
     show,
+    worker_count,
 )
 from presage.terminal.options import console
 from presage.terminal.output import make_folder
@@ -34,8 +30,6 @@ app = typer.Typer(
     no_args_is_help=True,
 )
 
-MIN_TRAINING_SAMPLES = 50
-
 
 @app.command("e1")
 def e1(
@@ -43,163 +37,123 @@ def e1(
     iterations: Annotated[int, typer.Option(min=1, help="Scans per trial.")] = 50,
     estimators: Estimators = "",
     alpha: Alpha = None,
-    steps: Steps = None,
-    world: World = "corridor",
-    beams: Beams = 622,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
-    workers: Workers = CORES,
 ) -> None:
     """E1: global localisation of a standing robot; error over iterations.
 
     Examples: `presage experiment e1 --trials 5`; `presage experiment e1 --alpha 5e-4 --out slow`;
     `presage experiment e1 --estimators "paper,precise" --iterations 200`.
     """
-    from lab.experiments.estimators import ExperimentWorld, descent_of, parse_estimators  # noqa: PLC0415
+    from lab.experiments.estimators import PAPER_DESCENT, parse_estimators  # noqa: PLC0415
     from lab.paper import e1_localisation as localisation  # noqa: PLC0415
 
-    job = localisation.Job(0, seed, iterations, field=ExperimentWorld(world, beams), descent=descent_of(alpha, steps))
+    job = localisation.Job(0, seed, iterations)
+    job = replace(job, descent=replace(PAPER_DESCENT, alpha=alpha)) if alpha is not None else job
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
-    show(localisation, lambda: localisation.run(job, trials, out, workers, console), out)
+    show(localisation, lambda: localisation.run(job, trials, out, worker_count(), console), out)
 
 
 @app.command("e2")
 def e2(
     trials: Trials = 12,
-    step: Annotated[float, typer.Option(min=1e-3, max=1.0, help="Length of each teleport, m.")] = 0.05,
     estimators: Estimators = "",
-    alpha: Alpha = None,
-    steps: Steps = None,
-    world: World = "corridor",
-    beams: Beams = 622,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
-    workers: Workers = CORES,
 ) -> None:
     """E2: crossing the map by small teleports at constant heading; error over time, with and without odometry.
 
-    Examples: `presage experiment e2 --trials 2`; `presage experiment e2 --step 0.02 --out slower`.
+    Examples: `presage experiment e2 --trials 2`; `presage experiment e2 --estimators precise`.
     """
-    from lab.experiments.estimators import ExperimentWorld, descent_of, parse_estimators  # noqa: PLC0415
+    from lab.experiments.estimators import parse_estimators  # noqa: PLC0415
     from lab.paper import e2_crossing as crossing  # noqa: PLC0415
 
-    job = crossing.Job(0, seed, step, field=ExperimentWorld(world, beams), descent=descent_of(alpha, steps))
+    job = crossing.Job(0, seed)
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
-    show(crossing, lambda: crossing.run(job, trials, out, workers, console), out)
+    show(crossing, lambda: crossing.run(job, trials, out, worker_count(), console), out)
 
 
 @app.command("e3")
 def e3(
     trials: Trials = 50,
-    apart: Annotated[
-        float, typer.Option(min=1.0, max=1000.0, help="Minimum distance between start and goal, m.")
-    ] = 12.0,
     free: Annotated[
         bool, typer.Option("--free/--any", help="Require a free straight line from start to goal, or allow any pair.")
     ] = True,
     estimators: Estimators = "",
-    alpha: Alpha = None,
-    steps: Steps = None,
-    world: World = "corridor",
-    beams: Beams = 622,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
-    workers: Workers = CORES,
 ) -> None:
     """E3: navigation from a known start to a goal, through the real processes in lockstep over zenoh.
 
-    Examples: `presage experiment e3 --trials 2`; `presage experiment e3 --estimators precise --apart 5 --out near`;
+    Examples: `presage experiment e3 --trials 2`; `presage experiment e3 --estimators precise --out near`;
     `presage experiment e3 --any --trials 20 --estimators precise --out any`.
     """
-    from lab.experiments.estimators import ExperimentWorld, descent_of, parse_estimators  # noqa: PLC0415
+    from lab.experiments.estimators import parse_estimators  # noqa: PLC0415
     from lab.paper import e3_navigation as navigation  # noqa: PLC0415
 
-    job = navigation.Job(
-        0, seed, apart, free=free, field=ExperimentWorld(world, beams), descent=descent_of(alpha, steps)
-    )
+    job = navigation.Job(0, seed, free=free)
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
-    show(navigation, lambda: navigation.run(job, trials, out, workers, console), out)
+    show(navigation, lambda: navigation.run(job, trials, out, worker_count(), console), out)
 
 
 @app.command("alpha")
 def alpha_sweep(
     trials: Trials = 25,
-    alphas: Annotated[str, typer.Option(help="Comma-separated step sizes, m². Default: 2e-4 to 2e-2.")] = "",
     seed: ExperimentSeed = 1,
     out: Out = OUT,
-    workers: Workers = CORES,
 ) -> None:
     """E1 with a range of values for the paper's step size α.
 
-    Examples: `presage experiment alpha --trials 10`; `presage experiment alpha --alphas 5e-4,1e-3,2e-3`.
+    Example: `presage experiment alpha --trials 10`.
     """
     from lab.paper import alpha_sweep as step_size  # noqa: PLC0415
     from lab.paper import e1_localisation as localisation  # noqa: PLC0415
 
-    try:
-        values = tuple(float(part) for part in alphas.split(",")) if alphas else step_size.ALPHAS
-    except ValueError:
-        raise UserError(f"--alphas {alphas!r}: give numbers, such as 2e-4,4e-4") from None
-    if not all(1e-8 <= value <= 1 for value in values):
-        raise UserError(f"--alphas {alphas!r}: each must lie between 1e-8 and 1 m²")
-    show(step_size, lambda: step_size.run(localisation.Job(0, seed, 50), trials, out, workers, console, values), out)
+    show(step_size, lambda: step_size.run(localisation.Job(0, seed, 50), trials, out, worker_count(), console), out)
 
 
 @app.command("steps")
-def step_sizes(trials: Trials = 10, seed: ExperimentSeed = 1, out: Out = OUT, workers: Workers = CORES) -> None:
+def step_sizes(trials: Trials = 10, seed: ExperimentSeed = 1, out: Out = OUT) -> None:
     """E3 with a range of step sizes β and γ, also with the paper's teleports: which give the paper's 12.5 iterations.
 
     Example: `presage experiment steps --trials 2`.
     """
     from lab.paper import step_sizes as stepping  # noqa: PLC0415
 
-    show(stepping, lambda: stepping.run(stepping.Job(0, seed), trials, out, workers, console), out)
+    show(stepping, lambda: stepping.run(stepping.Job(0, seed), trials, out, worker_count(), console), out)
 
 
 @app.command("samples")
 def samples_needed(
-    sizes: Annotated[
-        str, typer.Option(help="Comma-separated numbers of training samples. Default: 100 to 13000.")
-    ] = "",
-    places: Annotated[int, typer.Option(min=1, help="Places to localise at after training.")] = 50,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
-    workers: Workers = CORES,
 ) -> None:
     """Prediction error and localisation error as functions of the number of training samples.
 
-    Example: `presage experiment samples --sizes 500,2000 --places 10`.
+    Example: `presage experiment samples`.
     """
     from lab.paper import samples  # noqa: PLC0415
 
-    try:
-        values = tuple(int(part) for part in sizes.split(",")) if sizes else samples.SIZES
-    except ValueError:
-        raise UserError(f"--sizes {sizes!r}: give whole numbers, such as 500,2000") from None
-    if min(values) < MIN_TRAINING_SAMPLES:
-        raise UserError(f"--sizes {sizes!r}: each must be at least {MIN_TRAINING_SAMPLES} samples")
-    show(samples, lambda: samples.run(samples.Job(seed, places=places), out, workers, console, values), out)
+    show(samples, lambda: samples.run(samples.Job(seed), out, worker_count(), console), out)
 
 
 @app.command("aliasing")
 def similar_objects(
-    places: Annotated[int, typer.Option(min=1, help="Number of places in each world.")] = 30,
+    trials: Trials = 30,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
-    workers: Workers = CORES,
 ) -> None:
     """Worlds with similar objects or two identical rooms: places found, wrong claims, and ambiguity kept.
 
-    Example: `presage experiment aliasing --places 5`.
+    Example: `presage experiment aliasing --trials 5`.
     """
     from lab.paper import aliasing  # noqa: PLC0415
 
-    show(aliasing, lambda: aliasing.run(aliasing.Job(seed, places=places), out, workers, console), out)
+    show(aliasing, lambda: aliasing.run(aliasing.Job(seed, places=trials), out, worker_count(), console), out)
 
 
 @app.command("prediction")
 def predicted(
-    scans: Annotated[int, typer.Option(min=2, help="Number of test scans.")] = 500,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
 ) -> None:
@@ -209,13 +163,13 @@ def predicted(
     """
     from lab.paper import prediction  # noqa: PLC0415
 
-    show(prediction, lambda: prediction.run(prediction.Job(seed, scans), out, 1, console), out)
+    show(prediction, lambda: prediction.run(prediction.Job(seed), out, 1, console), out)
 
 
 @app.command("real")
 def real_drive(
     log: Annotated[Path, typer.Option(help="Recording or log with reference poses (docs/logs.md).")],
-    world: Annotated[str, typer.Option("--map", help="ROS map or world file of the training half.")],
+    world: Annotated[str, typer.Option(help="World file or ROS map.yaml of the training half.")],
     name: Annotated[str, typer.Option(help="Results are named real-NAME. Default: the log's name.")] = "",
     mount: Annotated[
         str, typer.Option(help="Pose of the laser in base_link, x,y[,yaw_deg] (m, deg). Default: as in the log.")
@@ -229,7 +183,6 @@ def real_drive(
     ] = False,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
-    workers: Workers = CORES,
 ) -> None:
     """A real log: trains and tunes on its first half, and localises on its second half.
 
@@ -237,8 +190,8 @@ def real_drive(
     c: global localisation, starting at every 50th scan; d: kidnapping. Errors are relative to the log's reference
     poses. After Ctrl-C the same command continues.
     Examples: `presage map drive.npz --mount 0,0,0 --half first -o first_half.yaml`, then
-    `presage experiment real --log drive.npz --mount 0,0,0 --map first_half.yaml --quick`;
-    `presage experiment real --log fr079.mcap --map fr079.yaml --name fr079 --every 50 --out mine`.
+    `presage experiment real --log drive.npz --mount 0,0,0 --world first_half.yaml --quick`;
+    `presage experiment real --log fr079.mcap --world fr079.yaml --name fr079 --every 50 --out mine`.
     """
     from common.geometry.pose_text import pose_of_text  # noqa: PLC0415
     from lab.real_logs import experiment as real  # noqa: PLC0415
@@ -247,17 +200,17 @@ def real_drive(
         raise UserError(f"--name {name!r}: use only letters, digits, '.', '_' and '-', as it becomes a file name")
     laser_pose: Any = tuple(pose_of_text(mount, "--mount").tolist()) if mount else None
     job = real.Job(log, world, laser_pose, every, quick, seed, name, exchange)
-    show(real, lambda: real.run(job, out, workers, console), out)
+    show(real, lambda: real.run(job, out, worker_count(), console), out)
 
 
 @app.command("all")
 def all_experiments(
     trials: Annotated[
-        int, typer.Option(min=0, help="Maximum number of trials of each experiment; 0 for each one's own number.")
+        int,
+        typer.Option(min=0, help="Maximum number of trials of each experiment; 0 for each one's own number."),
     ] = 0,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
-    workers: Workers = CORES,
 ) -> None:
     """Every experiment of the paper, one after another. After Ctrl-C the same command continues.
 
@@ -266,12 +219,12 @@ def all_experiments(
     from lab.paper.suite import run_all  # noqa: PLC0415
 
     make_folder(out, "--out")
-    run_all(trials, seed, out, workers, console)
+    run_all(trials, seed, out, worker_count(), console)
 
 
 @app.command("tables")
 def tables(
-    out: Annotated[Path, typer.Option(help="Folder with the results.")] = OUT,
+    out: Out = OUT,
     page: Annotated[Path | None, typer.Option(help="Markdown file in which to replace the marked tables.")] = None,
 ) -> None:
     """Prints the tables of existing results as Markdown, or inserts them into a page.

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lab.cli.options import CORES, OUT, Beams, ExperimentSeed, Out, Trials, Workers, show
+from lab.cli.options import OUT, ExperimentSeed, Out, Trials, show, worker_count
 from presage.terminal.options import console
+
+if TYPE_CHECKING:
+    from lab.experiments.results import Result
 
 
 def navigate(
@@ -18,19 +21,12 @@ def navigate(
         str, typer.Option(help="known or unknown: whether the estimator is given the start pose.")
     ] = "known",
     people: Annotated[int, typer.Option(min=0, max=100, help="Number of walking people; the map lacks them.")] = 0,
-    people_speed: Annotated[float, typer.Option(min=0.0, max=3.0, help="Walking speed of the people, m/s.")] = 1.0,
     estimator: Annotated[str, typer.Option(help="precise or particle-filter.")] = "precise",
     epistemic: Annotated[
         bool, typer.Option(help="While the pose is ambiguous, drive to where scans resolve the ambiguity.")
     ] = True,
-    prior: Annotated[
-        str, typer.Option(help="The estimator's motion prior between scans: motion (a motion model) or odometry.")
-    ] = "motion",
-    beams: Beams = 622,
-    limit: Annotated[float, typer.Option(min=1.0, max=3600.0, help="Simulated time limit of a trial, s.")] = 120.0,
     seed: ExperimentSeed = 1,
     out: Out = OUT,
-    workers: Workers = CORES + 1,
 ) -> None:
     """Navigation between random places, around walls and people.
 
@@ -46,12 +42,13 @@ def navigate(
     """
     from lab.navigation import experiment as driving  # noqa: PLC0415
 
-    job = driving.Job(
-        0, seed, start=start, people=people, people_speed=people_speed, estimator=estimator, prior=prior,
-        epistemic=epistemic, beams=beams, limit=limit,
-    )  # fmt: skip
+    job = driving.Job(0, seed, start=start, people=people, estimator=estimator, epistemic=epistemic)
     world_names, drive_names = (
         tuple(part.strip() for part in text.split(",") if part.strip()) for text in (worlds, drives)
     )
     driving.check(job, world_names, drive_names)
-    show(driving, lambda: driving.run(job, trials, out, workers, console, worlds=world_names, drives=drive_names), out)
+
+    def run() -> Result:
+        return driving.run(job, trials, out, worker_count(1), console, worlds=world_names, drives=drive_names)
+
+    show(driving, run, out)

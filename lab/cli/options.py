@@ -21,8 +21,7 @@ Trials = Annotated[int, typer.Option(min=1, help="Number of trials; a few are en
 ExperimentSeed = Annotated[
     int, typer.Option("--seed", min=0, max=2**31, help="Random seed of places, noise and particles.")
 ]
-Out = Annotated[Path, typer.Option(help="Folder for NAME.json, .csv, .pdf, .png.")]
-Workers = Annotated[int, typer.Option(min=1, help="Number of processes that run in parallel.")]
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for NAME.json, .csv, .pdf, .png.")]
 Estimators = Annotated[
     str,
     typer.Option(
@@ -34,14 +33,12 @@ Alpha = Annotated[
     float | None,
     typer.Option(min=1e-8, max=1.0, help="Step size of estimator paper in m². Default: the best value of the sweep."),
 ]
-Steps = Annotated[
-    int | None, typer.Option(min=1, help="Gradient steps per scan of estimator paper. Default: 1, as in the paper.")
-]
-World = Annotated[str, typer.Option(help="World; models for presets paper and precise must be trained for it.")]
-Beams = Annotated[int, typer.Option(min=2, help="Beams of the scanner.")]
-
 OUT = Path("experiments")
-CORES = os.cpu_count() or 1
+
+
+def worker_count(extra: int = 0) -> int:
+    """Number of worker processes: PRESAGE_WORKERS, by default one for each core and ``extra`` ones."""
+    return int(os.environ.get("PRESAGE_WORKERS") or (os.cpu_count() or 1) + extra)
 
 
 def show(experiment: ModuleType, run: Callable[[], Result], out: Path) -> None:

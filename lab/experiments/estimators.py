@@ -49,11 +49,6 @@ class ExperimentWorld:
         return float(load_world(self.world).start_pose(0.0)[2])
 
 
-def descent_of(alpha: float | None, steps: int | None) -> Descent:
-    """Parameters of the paper's estimator; ``alpha`` in m². An argument that is None defaults to `PAPER_DESCENT`."""
-    return Descent(alpha=PAPER_DESCENT.alpha if alpha is None else alpha, iterations=steps or PAPER_DESCENT.iterations)
-
-
 def parse_estimators(names: str) -> tuple[str, ...]:
     """Estimator names from a comma-separated text, in which a name is written without its own comma.
 

@@ -12,7 +12,6 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 from common.errors import UserError
 from common.versions import commit, versions
@@ -39,7 +38,6 @@ def bench_chaos(
     *,
     one_host: bool = False,
     quiet: bool = True,
-    in_markdown: bool = False,
 ) -> int:
     """Inject the faults, print the table and write it to ``json_file`` if given.
 
@@ -71,10 +69,7 @@ def bench_chaos(
                     outcomes.append(measure(system, fault))
                 problem = outcomes[-1].why
                 console.print(f"{'[red]no[/]' if problem else '[green]ok[/]'} {fault.name} {problem}", highlight=False)
-    if in_markdown:
-        print(markdown(outcomes))
-    else:
-        console.print(table(outcomes))
+    print(markdown(outcomes))
     data = {
         "command": "presage bench chaos", "arguments": {"faults": list(names), "repeats": repeats},
         "hosts": not missing, "rows": [outcome.row() for outcome in outcomes], "skipped": skipped,
@@ -85,7 +80,7 @@ def bench_chaos(
     return 1 if any(outcome.why for outcome in outcomes) else 0
 
 
-HEAD = ("fault", "detected", "robot stands", "new process", "at work again", "least speed meanwhile", "as expected")
+HEAD = ("fault", "detected (s)", "stopped (s)", "restarted (s)", "recovered (s)", "lowest speed (m/s)", "as expected")
 
 
 def rows_of(outcomes: Sequence[FaultOutcome]) -> list[tuple[str, ...]]:
@@ -96,22 +91,14 @@ def rows_of(outcomes: Sequence[FaultOutcome]) -> list[tuple[str, ...]]:
 
         def worst(what: str, rows: Sequence[FaultOutcome] = rows) -> str:
             known = [value for row in rows if (value := getattr(row, what)) is not None]
-            return f"{max(known):.2f} s" if known else ""
+            return f"{max(known):.2f}" if known else ""
 
         speeds = [row.least_speed for row in rows if row.least_speed is not None]
         as_expected = sum(not row.why for row in rows)
-        speed = f"{min(speeds):.2f} m/s" if speeds else ""
+        speed = f"{min(speeds):.2f}" if speeds else ""
         times = [worst(what) for what in ("detected_s", "stopped_s", "start_s", "again_s")]
-        table_rows.append((name, *times, speed, f"{as_expected} of {len(rows)}"))
+        table_rows.append((name, *times, speed, f"{as_expected}/{len(rows)}"))
     return table_rows
-
-
-def table(outcomes: Sequence[FaultOutcome]) -> Table:
-    """The table for a terminal."""
-    terminal_table = Table(*HEAD)
-    for row in rows_of(outcomes):
-        terminal_table.add_row(*row)
-    return terminal_table
 
 
 def markdown(outcomes: Sequence[FaultOutcome]) -> str:

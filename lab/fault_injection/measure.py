@@ -130,7 +130,7 @@ def judge(outcome: FaultOutcome, fault: Fault) -> str:
         wrong.append("the robot did not go on")
     if fault.expect != "goes on" or outcome.again_s is not None:
         if outcome.again_s is None:
-            wrong.append("never at work again")
+            wrong.append("did not recover")
         elif outcome.again_s > MAX_RECOVERY_TIME_S:
             wrong.append(f"at work only after more than {MAX_RECOVERY_TIME_S:g} s")
     return "; ".join(wrong)

@@ -98,25 +98,21 @@ def _distribution(axes: Axes, by_group: Mapping[str, Rows], quantity: str, label
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
-    """The Markdown table of docs/navigation.md."""
+    """The Markdown table of docs/navigation.md. Pairs are median; maximum, of the step time mean; maximum."""
     number, mm = results.number, results.millimetres
     people = any(row["min_clearance_to_people_m"] is not None for row in summary.values())
     heads = [
-        "world, drive", "reached", "claimed elsewhere", "trials with contact, moving; standing",
-        "path over shortest, median; max", "time over least, median; max", "least gap to walls (m)",
-        *(["to people (m)"] if people else []), "error, median; max (mm)", "localised after (s), median; max",
-        "replans, median", "blocked (s), all", "held back (scans)", "controller step (ms), mean; max",
+        "world, drive", "reached", "reported elsewhere", "contacts moving; standing", "path / shortest", "time / least",
+        "gap (m)", *(["to people (m)"] if people else []), "error (mm)", "step (ms)",
     ]  # fmt: skip
     rows = [
         [
-            name, f"{row['reached']} of {row['trials']}", str(row["trials_claimed_elsewhere"]),
+            name, f"{row['reached']}/{row['trials']}", str(row["trials_claimed_elsewhere"]),
             f"{row['trials_with_contact_moving']}; {row['trials_with_contact_standing']}",
             f"{number(row['median_path_over_shortest'])}; {number(row['max_path_over_shortest'])}",
             f"{number(row['median_time_over_least'])}; {number(row['max_time_over_least'])}",
             number(row["min_clearance_m"]), *([number(row["min_clearance_to_people_m"])] if people else []),
             f"{mm(row['median_error_median_m'])}; {mm(row['max_error_max_m'])}",
-            f"{number(row['median_tracking_s'], 1)}; {number(row['max_tracking_s'], 1)}",
-            number(row["median_replans"], 0), number(row["seconds_blocked"], 1), str(row["scans_held_back"]),
             f"{number(row['median_step_mean_ms'], 1)}; {number(row['max_step_max_ms'], 1)}",
         ]
         for name, row in summary.items()

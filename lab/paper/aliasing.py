@@ -222,9 +222,9 @@ def _bars(axes: Axes, summary: dict[str, dict[str, Any]]) -> None:
     ]
     good = len(groups)
     last = max(int(name.rsplit("_", 1)[1]) for name in one if name.startswith("within"))
-    groups.append((f"says: here, but\n> {FOUND_DISTANCE} m off", f"tracking_but_wrong_after_{last}"))
+    groups.append((f"`tracking`, but\n> {FOUND_DISTANCE} m off", f"tracking_but_wrong_after_{last}"))
     if "both_kept" in one:
-        groups.append(("says: one of\nthese two", "both_kept"))
+        groups.append(("both places\nkept", "both_kept"))
     at, width = np.arange(len(groups)) + 0.35 * (np.arange(len(groups)) >= good), 0.8 / len(summary)
     for number, (name, row) in enumerate(summary.items()):
         shares = [row[quantity] / row["places"] for _, quantity in groups]
@@ -237,23 +237,24 @@ def _bars(axes: Axes, summary: dict[str, dict[str, Any]]) -> None:
     if "both_kept" in one:
         edges = (-0.45, good - 0.55)
         axes.plot(edges, (0.5, 0.5), "--", color=drawing.BOUND, linewidth=1)
-        axes.text(edges[0], 0.52, "luck: one room in two", fontsize=9, color=drawing.BOUND)
+        axes.text(edges[0], 0.52, "chance: one room in two", fontsize=9, color=drawing.BOUND)
     axes.set(ylim=(0, 1.12), ylabel="share of places")
 
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
     """The Markdown table of docs/experiments.md."""
     moments = [name for name in next(iter(summary.values())) if name.startswith("within")]
+    scans = "; ".join(name.rsplit("_", 1)[1] for name in moments)
     heads = (
-        "world", "estimator", *(f"within 0.2 m after {name.rsplit('_', 1)[1]}" for name in moments), "of",
-        "median error (m)", "`tracking` but > 0.5 m off, at the end; ever", "both places kept",
+        "world", "estimator", f"within 0.2 m after {scans} scans", "median error (m)",
+        "wrong `tracking`, at the end; ever", "both places kept",
     )  # fmt: skip
     rows = []
     for row in summary.values():
         wrong = next(value for name, value in reversed(row.items()) if name.startswith("tracking_but_wrong_after"))
         rows.append([
-            row["world"], row["estimator"], *(str(row[name]) for name in moments), str(row["places"]),
+            row["world"], row["estimator"], "; ".join(f"{row[name]}/{row['places']}" for name in moments),
             results.number(row["final_error_median_m"], 4), f"{wrong}; {row['tracking_but_wrong_ever']}",
-            f"{row['both_kept']} of {row['places']}" if "both_kept" in row else "",
+            f"{row['both_kept']}/{row['places']}" if "both_kept" in row else "",
         ])  # fmt: skip
     return results.markdown(heads, rows)

@@ -91,13 +91,17 @@ def draw(summary: dict[str, dict[str, Any]], trials: int) -> Figure:
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
     """The Markdown table of docs/experiments.md."""
-    heads = ("step size", "within 0.2 m", "within 0.5 m", "median (m)", "mean ± std (m)", "in front: mean ± std (m)")
+    by_setting = {(row["alpha_m2"], row["steps_a_scan"]): row for row in summary.values()}
+    sizes, steps = (list(dict.fromkeys(setting)) for setting in zip(*by_setting, strict=True))
+    heads = ("α (m²)", *(f"{n} step{'s' if n > 1 else ''} per scan: within 0.2 m; median (m)" for n in steps))
     rows = [
         [
-            name, *(f"{row[f'found_within_{limit}_m']} of {row['trials']}" for limit in ("0.2", "0.5")),
-            results.number(row["final_error_median_m"]), results.mean_std(row, "final_error"),
-            results.mean_std(row, "in_front_error"),
+            f"{size:g}",
+            *(
+                f"{row['found_within_0.2_m']}/{row['trials']}; {results.number(row['final_error_median_m'])}"
+                for row in (by_setting[size, n] for n in steps)
+            ),
         ]
-        for name, row in summary.items()
-    ]  # fmt: skip
+        for size in sizes
+    ]
     return results.markdown(heads, rows)

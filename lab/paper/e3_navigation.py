@@ -222,16 +222,15 @@ def draw(rows: Sequence[dict[str, Any]], job: Job) -> Figure:
 def table(summary: dict[str, dict[str, Any]]) -> str:
     """The Markdown table of docs/experiments.md."""
     heads = (
-        "estimator", "reached", "trials with contact", "scans held back by the obstacle stop", "iterations, mean",
-        "time (s), median", "time over least, median; max", "path over straight, mean", "error, mean ± std (m)",
+        "estimator", "reached", "trials with contact", "scans with obstacle stop", "iterations, mean",
+        "time / least, median; max", "error, mean ± std (m)",
     )  # fmt: skip
     rows = [
         [
-            name, f"{row['reached']} of {row['trials']}", str(row["trials_with_contact"]),
-            str(row["scans_held_back"]),
-            results.number(row["iterations_mean"], 1), results.number(row["seconds_median"], 1),
+            name, f"{row['reached']}/{row['trials']}", str(row["trials_with_contact"]), str(row["scans_held_back"]),
+            results.number(row["iterations_mean"], 1),
             f"{results.number(row['time_over_least_median'])}; {results.number(row['time_over_least_max'])}",
-            results.number(row["path_over_straight_mean"], 5), results.mean_std(row, "error", 4),
+            results.mean_std(row, "error", 4),
         ]
         for name, row in summary.items()
     ]  # fmt: skip

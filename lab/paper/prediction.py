@@ -203,10 +203,11 @@ def _gaussian(factors: Array | Sequence[float]) -> Array:
 
 def table(summary: dict[str, dict[str, Any]]) -> str:
     """The Markdown table of docs/experiments.md."""
-    heads = ("", "range error, median (m)", "mean (m)", "stated σ, median (m)", *(f"within ± {k}σ" for k in GAUSSIAN))
+    intervals = (f"within ±{k}σ" for k in GAUSSIAN)
+    heads = ("", "range error, median (m)", "mean (m)", "predicted σ, median (m)", *intervals)
     rows = [
         [
-            f"{name}, all beams",
+            f"{name}",
             *(results.number(row[f"range_error_{which}_m"], 4) for which in ("median", "mean")),
             results.number(row["stated_sigma_median_m"], 4) + (" (Σ_o = 1)" if name == "paper" else ""),
             *(f"{row[f'within_{k}_sigma']:.1%}" for k in GAUSSIAN),
@@ -216,6 +217,6 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     for name, row in summary.items():
         if 0 < row["unsure_share"] < 1:
             shares = (f"{row[f'unsure_within_{k}_sigma']:.1%}" for k in GAUSSIAN)
-            rows.append([f"{name}, the {row['unsure_share']:.1%} of beams with m > σ", "", "", "", *shares])
+            rows.append([f"{name}, {row['unsure_share']:.1%} of beams with m > σ", "", "", "", *shares])
     rows.append(["Gaussian", "", "", "", *(f"{share:.1%}" for share in GAUSSIAN.values())])
     return results.markdown(heads, rows)

@@ -18,7 +18,7 @@ from common.geometry.world import World
 from common.robot.base import Robot
 from lab.experiments.journeys import ARRIVAL_DISTANCE, Journey
 from services.estimator.paper.decoder import PaperModel
-from services.estimator.paper.free_energy import gradient
+from services.estimator.paper.free_energy import FreeEnergy
 
 # "sum" sums the action over iterations, as equation 4 does. "step" takes the gradient alone as the displacement, so the
 # motion decays with the gradient, as the paper describes. "printed" uses the signs of both equations as printed.
@@ -93,7 +93,7 @@ def _perceive(o: Array, belief: Array, g_goal: Array, model: PaperModel, steps: 
     g, dg = model.predict(np.array([*belief, yaw]))
     if steps.form == "printed":
         return np.asarray((dg.T @ (o - g) + steps.beta * (dg.T @ (o - g_goal)))[:2])
-    return gradient(o, g, dg, np.ones(len(o)), g_goal, steps.beta).descent[:2]
+    return FreeEnergy(o, g, dg, np.ones(len(o)), g_goal, steps.beta).descent[:2]
 
 
 def _act(action: Array, o: Array, belief: Array, model: PaperModel, steps: Steps, yaw: float, metric: Array) -> Array:

@@ -1,4 +1,4 @@
-"""`presage info`, `echo`, `plot` and `export`."""
+"""`presage info`, `plot` and `export`."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from typing import Annotated
 
 import typer
 
-from common.bus.bus import DEFAULT_ENDPOINT
-from presage.terminal.options import Connect, Json, RobotName, console, link_of
+from presage.terminal.options import Json, console
 
 app = typer.Typer()
 
 
-@app.command(rich_help_panel="Record", short_help="Contents of a recording, and whether it is complete.")
+@app.command(rich_help_panel="Data", short_help="Contents of a recording, and whether it is complete.")
 def info(
     file: Annotated[Path, typer.Argument(help="A recording, finished or not (.mcap, .mcap.active).")],
     check: Annotated[
@@ -38,42 +37,11 @@ def info(
     raise typer.Exit(show(file, json_file, check, console))
 
 
-@app.command(rich_help_panel="Diagnose", short_help="Print messages of a topic or a recording as JSON.")
-def echo(
-    source: Annotated[str, typer.Argument(help="A topic on the bus, or a recording.", metavar="TOPIC|FILE")],
-    topic: Annotated[
-        str | None, typer.Argument(help="Topic or key of the recording to print. Defaults to all topics.")
-    ] = None,
-    count: Annotated[
-        int,
-        typer.Option("-n", "--count", min=0, help="Stop after this many messages. 0 prints until the end or Ctrl-C."),
-    ] = 0,
-    start: Annotated[
-        float, typer.Option(min=0.0, help="Skip this many seconds at the beginning of the recording.")
-    ] = 0.0,
-    full: Annotated[bool, typer.Option("--full", help="Print long arrays completely.")] = False,
-    robot: RobotName = "robot",
-    connect: Connect = DEFAULT_ENDPOINT,
-) -> None:
-    """Print messages as JSON lines, either live from a topic, or from a recording with their keys and times.
-
-    The name of a topic reads from the bus; anything else is a file name (./belief is a file, belief is a topic).
-
-    Examples: `presage echo belief -n 1`; `presage echo scan --full -n 1 | jq .ranges`;
-    `presage echo run.mcap`; `presage echo run.mcap belief -n 3 --start 10`;
-    `presage echo run.mcap belief | jq .free_energy`.
-    """
-    from presage.recordings.printing import echo_either  # noqa: PLC0415
-
-    link = link_of(connect, robot)
-    raise typer.Exit(echo_either(link, source, topic, count, start, console, full=full))
-
-
-@app.command(rich_help_panel="Record", short_help="Draw a recording and summarise it.")
+@app.command(rich_help_panel="Data", short_help="Draw a recording and summarise it.")
 def plot(
     file: Annotated[Path, typer.Argument(help="A recording, finished or not.")],
     out: Annotated[
-        Path | None, typer.Option(help="PNG file to write. Defaults to the recording's name with .png.")
+        Path | None, typer.Option("--out", "-o", help="PNG file to write. Defaults to the recording's name with .png.")
     ] = None,
     json_file: Json = None,
 ) -> None:
@@ -87,13 +55,15 @@ def plot(
     plot_command(file, out or file.with_name(stem_of(file) + ".png"), json_file, console)
 
 
-@app.command(rich_help_panel="Record", short_help="Export to Foxglove, CSV or TUM.")
+@app.command(rich_help_panel="Data", short_help="Export to Foxglove, CSV or TUM.")
 def export(
     file: Annotated[Path, typer.Argument(help="A recording, finished or not.")],
     to: Annotated[str, typer.Option("--format", help="Output format: csv, tum or foxglove.")],
     out: Annotated[
         Path | None,
-        typer.Option(help="Output folder (csv, tum) or file (foxglove). Defaults to a name beside the recording."),
+        typer.Option(
+            "--out", "-o", help="Folder (csv, tum) or file (foxglove). Defaults to a name beside the recording."
+        ),
     ] = None,
     arrays: Annotated[
         bool, typer.Option("--arrays", help="Also write arrays such as ranges, each to its own file (csv only).")

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 from pydantic import ValidationError
 
-from common.bus.bus import DEFAULT_ENDPOINT
 from common.errors import UserError, first_fault
-from presage.terminal.options import Connect, RobotName, console, link_of
+from presage.session.running import OBSERVER, link_of
+from presage.terminal.options import ALLOW_NEGATIVE_NUMBERS, Connect, RobotName, console
 
 if TYPE_CHECKING:
     from common.geometry.world import Obstacle
 
 app = typer.Typer(
-    help="Add, move and remove obstacles in a running simulator. They are not in the robot's map.",
+    help="List, add, move and remove obstacles in a running simulator. They are not in the robot's map.",
     no_args_is_help=True,
 )
 
-# Lets click pass a negative coordinate such as -1 as an argument instead of rejecting it as an unknown option.
-ALLOW_NEGATIVE_NUMBERS = {"ignore_unknown_options": True}
 Name = Annotated[str, typer.Argument(help="Name of the obstacle.")]
 X = Annotated[float, typer.Argument(help="x of the obstacle's centre in the map, m.")]
 Y = Annotated[float, typer.Argument(help="y of the obstacle's centre in the map, m.")]
@@ -37,8 +36,8 @@ def add(
     size: Size = (0.5, 0.5),
     yaw: Yaw = 0.0,
     radius: Radius = 0.0,
-    robot: RobotName = "robot",
-    connect: Connect = DEFAULT_ENDPOINT,
+    robot: RobotName = "",
+    connect: Connect = "",
 ) -> None:
     """Add an obstacle.
 
@@ -49,30 +48,57 @@ def add(
 
 
 @app.command(context_settings=ALLOW_NEGATIVE_NUMBERS)
-def move(
-    name: Name,
-    x: X,
-    y: Y,
-    size: Size = (0.5, 0.5),
-    yaw: Yaw = 0.0,
-    radius: Radius = 0.0,
-    robot: RobotName = "robot",
-    connect: Connect = DEFAULT_ENDPOINT,
-) -> None:
-    """Move an obstacle and replace its shape; options that are left out have their defaults, as for `add`.
+def move(name: Name, x: X, y: Y, robot: RobotName = "", connect: Connect = "") -> None:
+    """Move an obstacle; it keeps its shape and orientation.
 
     Example: `presage obstacle move crate 6 2`.
     """
-    _change("move", name, _shape(x, y, size, yaw, radius), connect, robot)
+    obstacles = {each.name: each for each in _obstacles(connect, robot)}
+    if name not in obstacles:
+        raise UserError(f"there is no obstacle {name!r} (there: {', '.join(obstacles) or 'none'})")
+    _change("move", name, _moved(obstacles[name], x, y), connect, robot)
 
 
 @app.command()
-def remove(name: Name, robot: RobotName = "robot", connect: Connect = DEFAULT_ENDPOINT) -> None:
+def remove(name: Name, robot: RobotName = "", connect: Connect = "") -> None:
     """Remove an obstacle; furniture of the world file can be removed too.
 
     Example: `presage obstacle remove crate`.
     """
     _change("remove", name, None, connect, robot)
+
+
+@app.command("list")
+def list_(robot: RobotName = "", connect: Connect = "") -> None:
+    """List the obstacles of the simulator with their shapes; those of the world file have numbers as names.
+
+    Example: `presage obstacle list`.
+    """
+    for obstacle in _obstacles(connect, robot):
+        shape = obstacle.model_dump_json(exclude={"name"}, exclude_none=True)
+        console.print(f"{obstacle.name}: {shape}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _obstacles(connect: str, robot: str) -> list[Obstacle]:
+    from common.messages.requests import Request, WorldReply  # noqa: PLC0415
+    from common.messages.topics import WORLD  # noqa: PLC0415
+    from presage.live.bus_watch import session  # noqa: PLC0415
+
+    with session(link_of(connect, robot, OBSERVER)) as bus:
+        reply = bus.ask(WORLD, Request(), WorldReply)
+    if reply.world is None:
+        raise UserError(f"refused: {reply.reason}")
+    return list(reply.world.obstacles)
+
+
+def _moved(obstacle: Obstacle, x: float, y: float) -> Obstacle:
+    """The obstacle with its centre at (x, y) m; a polygon's is the mean of its corners."""
+    if obstacle.polygon is not None:
+        by_x, by_y = np.subtract((x, y), np.mean(obstacle.polygon, axis=0))
+        return obstacle.model_copy(update={"polygon": [(px + by_x, py + by_y) for px, py in obstacle.polygon]})
+    kind, shape = ("circle", obstacle.circle) if obstacle.circle is not None else ("box", obstacle.box)
+    assert shape is not None  # noqa: S101 - an obstacle has exactly one shape
+    return obstacle.model_copy(update={kind: shape.model_copy(update={"center": (x, y)})})
 
 
 def _shape(x: float, y: float, size: tuple[float, float], yaw: float, radius: float) -> Obstacle:

@@ -7,27 +7,25 @@ from typing import Annotated
 
 import typer
 
-from common.bus.bus import DEFAULT_ENDPOINT
-from presage.terminal.options import Connect, RobotName, console, invocation
+from presage.session.running import link_of
+from presage.terminal.options import Connect, RobotName, arguments, console
 
 app = typer.Typer()
 
 
 @app.command(rich_help_panel="Record", short_help="Record a session into an MCAP file, until Ctrl-C.")
 def record(
-    out: Annotated[Path, typer.Option(help="Folder for the recording.")] = Path("recordings"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the recording.")] = Path("recordings"),
     topics: Annotated[str, typer.Option(help="Topics to record, separated by commas. Defaults to all topics.")] = "",
     split_minutes: Annotated[
-        float, typer.Option(min=0.0, help="Start a new complete file after this many minutes. 0 writes one file.")
-    ] = 0,
-    split_size: Annotated[
-        float, typer.Option(min=0.0, help="Start a new complete file after this many MB. 0 writes one file.")
-    ] = 0,
-    weights: Annotated[bool, typer.Option(help="Store the estimator's weights in the recording, up to 16 MiB.")] = True,
-    robot: RobotName = "robot",
-    connect: Connect = DEFAULT_ENDPOINT,
+        float | None, typer.Option(min=0.0, help="Start a new complete file after this many minutes.")
+    ] = None,
+    robot: RobotName = "",
+    connect: Connect = "",
 ) -> None:
     """Record a running session into an MCAP file until Ctrl-C.
+
+    Other settings come from environment variables, such as PRESAGE_SPLIT_SIZE=500 (MB) and PRESAGE_WEIGHTS=0.
 
     Examples: `presage record`; `presage record --out logs --topics scan,odom`;
     `presage record --split-minutes 10`.
@@ -40,11 +38,10 @@ def record(
         # The live page controls the session's own recorder, not this one.
         return RecorderService(settings, remote=False)
 
-    args = ["--directory", str(out), "--robot", robot, "--connect", connect]
-    args += ["--split-minutes", str(split_minutes), "--split-size", str(split_size)]
-    args += ["--weights" if weights else "--no-weights", *(["--topics", topics] if topics else [])]
-    if (current := invocation.get()).security is not None:
-        args += ["--security", str(current.security), "--role", current.role]
+    link = link_of(connect, robot, ("recorder",))
+    keys = None if link.security is None else link.security.folder.parent
+    args = arguments(directory=out, robot=link.robot, connect=",".join(link.connect), security=keys)
+    args += arguments(split_minutes=split_minutes, topics=topics)
     serve(RecorderSettings, make, args)
 
 
@@ -54,7 +51,7 @@ def recover(
         Path, typer.Argument(help="NAME.mcap.active, left by a recorder that was killed, or a damaged recording.")
     ],
     out: Annotated[
-        Path | None, typer.Option(help="File to write. Defaults to NAME.mcap or NAME-recovered.mcap.")
+        Path | None, typer.Option("--out", "-o", help="File to write. Defaults to NAME.mcap or NAME-recovered.mcap.")
     ] = None,
 ) -> None:
     """Make a complete recording from the readable parts of an unfinished or damaged one, and report what is missing.

@@ -7,9 +7,20 @@ from typing import Annotated
 
 import typer
 
-from common.bus.bus import DEFAULT_ENDPOINT
 from common.errors import UserError
-from presage.terminal.options import Connect, Json, console, link_of
+from common.runtime.config import read_section
+from presage.session.running import link_of
+from presage.terminal.options import (
+    Config,
+    Connect,
+    EstimatorName,
+    Json,
+    ModelName,
+    WorldName,
+    console,
+    given,
+    model_setting,
+)
 
 app = typer.Typer()
 
@@ -24,11 +35,13 @@ def replay(
     rate: Annotated[
         float | None,
         typer.Option(
-            min=0.0, help="Replay speed: 1 keeps the original timing, 2 is twice as fast, 0 as fast as possible."
+            min=0.0,
+            help="Replay speed: 1 keeps the original timing, 2 is twice as fast, 0 as fast as possible.",
         ),
     ] = None,
     start: Annotated[
-        float | None, typer.Option(min=0.0, help="Start this many seconds after the beginning of the recording.")
+        float | None,
+        typer.Option(min=0.0, help="Start this many seconds after the beginning of the recording."),
     ] = None,
     end: Annotated[
         float | None,
@@ -41,8 +54,9 @@ def replay(
     force: Annotated[
         bool, typer.Option("--force", help="Replay even if a live service publishes on the same keys.")
     ] = False,
-    paused: Annotated[bool, typer.Option("--paused", help="Start paused.")] = False,
-    stay: Annotated[bool, typer.Option("--stay", help="Pause at the end until Ctrl-C instead of exiting.")] = False,
+    paused: Annotated[
+        bool, typer.Option("--paused", help="Start paused, and pause at the end until Ctrl-C instead of exiting.")
+    ] = False,
     with_services: Annotated[
         str,
         typer.Option(
@@ -55,7 +69,7 @@ def replay(
         typer.Option("--every-scan", help="With --with: also send the scans for which the recording has no belief."),
     ] = False,
     json_file: Json = None,
-    connect: Connect = DEFAULT_ENDPOINT,
+    connect: Connect = "",
 ) -> None:
     """Publish a recording's messages again, with their original stamps; or compare services on recorded inputs.
 
@@ -74,71 +88,49 @@ def replay(
     """
     from presage.replay.bus_replay import choice_of, run_replay  # noqa: PLC0415
 
-    choice = choice_of(only, leave_out, rate, start, end, robot, loop=loop, force=force, paused=paused, stay=stay)
+    choice = choice_of(only, leave_out, rate, start, end, robot, loop=loop, force=force, paused=paused, stay=paused)
     if not with_services:
         if json_file is not None or every_scan:
             raise UserError("--json and --every-scan go with --with: a plain replay compares nothing")
-        run_replay(file, link_of(connect, "robot", "replay"), choice, console)
+        run_replay(file, link_of(connect, robot or "robot", ("replay",)), choice, console)
         return
-    if only or leave_out or robot or force or loop or paused or stay or start is not None or end is not None:
+    chosen = (rate, start, end)
+    if only or leave_out or robot or force or loop or paused or any(value is not None for value in chosen):
         raise UserError(
-            "--with replays all recorded inputs of the services: of the options that choose what to replay, only --rate"
-            " can be combined with it"
+            "--with sends all recorded inputs as fast as possible: leave out the options that choose what to replay"
         )
     from presage.replay.service_replay import ServiceReplayOptions, service_replay_command  # noqa: PLC0415
 
-    options = ServiceReplayOptions(file, with_services, rate, every_scan=every_scan)
+    options = ServiceReplayOptions(file, with_services, every_scan)
     raise typer.Exit(service_replay_command(options, json_file, console))
 
 
-@app.command(rich_help_panel="Offline", short_help="Run another estimator over a recording and compare.")
+@app.command(rich_help_panel="Data", short_help="Run another estimator over a recording and compare.")
 def rerun(
     file: Annotated[Path, typer.Argument(help="Recording with the scans.")],
-    estimator: Annotated[
-        str | None, typer.Option(help="Estimator preset: precise, paper, particle-filter or amcl-defaults.")
-    ] = None,
-    model: Annotated[
-        str | None, typer.Option(help="Generative model of preset precise: learned, exact, or a file of weights.")
-    ] = None,
-    models: Annotated[
-        Path | None, typer.Option(help="Folder of weights. Defaults to the recorded, else the shipped weights.")
-    ] = None,
-    prior: Annotated[
-        str | None, typer.Option(help="What predicts the motion between scans: motion, odometry or command.")
-    ] = None,
-    initial_pose: Annotated[
-        str | None, typer.Option(help="Initial pose x,y[,yaw_deg], in m and deg; '' for no initial pose.")
-    ] = None,
-    sigma: Annotated[float | None, typer.Option(help="Range noise of the scanner, m.")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Random seed.")] = None,
-    world: Annotated[str | None, typer.Option(help="World name, world file, or ROS map.yaml.")] = None,
+    estimator: EstimatorName = "",
+    model: ModelName = "",
+    world: WorldName = "",
     out: Annotated[
-        Path | None, typer.Option(help="Recording to write. Defaults to FILE-ESTIMATOR.mcap beside the recording.")
+        Path | None,
+        typer.Option("--out", "-o", help="Recording to write. Defaults to FILE-ESTIMATOR.mcap beside the recording."),
     ] = None,
+    config: Config = None,
     json_file: Json = None,
 ) -> None:
     """Run an estimator over a recording offline, as fast as possible, and compare it with the recorded estimator.
 
-    Options that are not given default to the recorded configuration. The new recording contains all messages of the
-    old one, and the new beliefs and predictions under presage/ROBOT-rerun/. Prints and draws (NEW.png, .pdf, data in
-    .csv) the errors against the recorded truth, NEES, share of scans in state tracking, computing times, and the
-    difference between the two estimators.
+    Settings that are neither given nor in section `estimator` of --config keep their recorded values. The new
+    recording contains all messages of the old one, and the new beliefs and predictions under presage/ROBOT-rerun/.
+    Prints and draws (NEW.png, .pdf, data in .csv) the errors against the recorded truth, NEES, share of scans in state
+    tracking, computing times, and the difference between the two estimators.
 
     Examples: `presage rerun run.mcap --estimator particle-filter --json pf.json`;
-    `presage rerun run.mcap --model exact --out exact.mcap`; `presage rerun run.mcap --prior odometry`;
-    `presage rerun run.mcap --estimator precise --initial-pose ''` (from nothing known).
+    `presage rerun run.mcap --model exact --out exact.mcap`;
+    `presage rerun run.mcap --config global.yaml`, which contains `estimator: {prior: odometry, initial_pose: ''}`.
     """
     from presage.replay.rerun import RerunOptions, rerun_command  # noqa: PLC0415
 
-    options = {
-        "estimator": estimator,
-        "model": model,
-        "models": str(models) if models else None,
-        "prior": prior,
-        "initial_pose": initial_pose,
-        "sigma": sigma,
-        "seed": seed,
-        "world": world,
-    }
-    given = {name: value for name, value in options.items() if value is not None}
-    rerun_command(RerunOptions(file, given, out), json_file, console)
+    chosen = {} if config is None else read_section(config, "estimator")
+    chosen |= given(estimator=estimator, world=world, **model_setting(model))
+    rerun_command(RerunOptions(file, chosen, out), json_file, console)

@@ -1,18 +1,14 @@
-"""`presage secure`, and the security options of other commands."""
+"""`presage secure`."""
 
 from __future__ import annotations
 
 import datetime as dt
 import json
-from collections.abc import Callable
-from functools import wraps
-from inspect import signature
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from presage.terminal import options
 from presage.terminal.options import console
 
 app = typer.Typer(
@@ -24,29 +20,6 @@ Days = Annotated[int, typer.Option(min=1, max=36_500, help="Days until the certi
 Robots = Annotated[str, typer.Option(help="Names of robots, separated by commas. Defaults to all robots.")]
 Hosts = Annotated[str, typer.Option(help="Host names or addresses in the router's certificate, separated by commas.")]
 EXPIRY_WARNING = dt.timedelta(days=30)
-
-
-def with_security(*apps: typer.Typer) -> None:
-    """Adds `--security` and `--role` to every command with a `--connect` or `--port` option."""
-    for each in apps:
-        for command in each.registered_commands:
-            if command.callback is not None and {"connect", "port"} & signature(command.callback).parameters.keys():
-                command.callback = secured(command.callback)
-
-
-def secured(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Adds `--security` and `--role` to a command; `credentials_for` reads their values while the command runs."""
-
-    @wraps(command)
-    def run(*args: Any, security: Path | None = None, role: str = "", **kwargs: Any) -> Any:
-        token = options.invocation.set(options.Invocation(command.__name__, security, role))
-        try:
-            return command(*args, **kwargs)
-        finally:
-            options.invocation.reset(token)
-
-    added = (("security", options.Security, None), ("role", options.RoleName, ""))
-    return options.with_options(run, command, added)
 
 
 @app.command()
@@ -71,7 +44,7 @@ def init(
     console.print(
         f"{len(members)} members in {folder}, valid until {_expiry_date(folder, members[0].name):%Y-%m-%d}. Keep "
         f"{folder / secure.AUTHORITY_FOLDER} secret. Copy to each host only the folders of the programs that run "
-        f"there, and start everything with --security. `presage secure show {folder}` lists the rights of each role.",
+        f"there, and set PRESAGE_SECURITY to the folder. `presage secure show {folder}` lists the rights of each role.",
         soft_wrap=True,
         highlight=False,
     )

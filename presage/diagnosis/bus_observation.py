@@ -15,6 +15,7 @@ from common.messages.definitions import Health, Scan
 from common.messages.requests import ConfigReply, Request
 from common.messages.topics import CONFIG, TOPICS
 from common.messages.wire import DecodeError
+from common.runtime.liveness import RobotLiveness
 from presage.diagnosis.findings import Finding
 from services.recorder.files.message_counts import Sequence
 
@@ -28,8 +29,9 @@ class BusObservation:
 
     robot: str
     seconds: float
-    alive: set[str] = field(default_factory=set)  # services of the robot with a liveliness token
-    robots: set[str] = field(default_factory=set)  # all robots with a service
+    liveness: RobotLiveness  # from 0 s to ``seconds``
+    connect: str = ""  # endpoints for the start commands of missing services; empty for the default
+    robots: set[str] = field(default_factory=set)  # all robots with a service at the end
     replies: dict[str, list[ConfigReply]] = field(default_factory=dict)  # by service; several if it runs several times
     health: dict[str, list[tuple[int, Health]]] = field(default_factory=dict)  # by service, with the time of arrival
     arrivals: Counter[str] = field(default_factory=Counter)  # number of messages, by key
@@ -52,9 +54,9 @@ def check_endpoint(endpoint: str) -> Finding | None:
     except socket.gaierror:
         return Finding("no_router", False, f"{endpoint}: no such host", endpoint, "check the host name")
     except (TimeoutError, OSError, OverflowError) as error:
-        why = "no answer" if isinstance(error, TimeoutError) else str(error)
+        reason = "no answer" if isinstance(error, TimeoutError) else str(error)
         advice = "is that machine on, and does a firewall let the port through?"
-        return Finding("blocked", False, f"{endpoint}: the port cannot be reached ({why})", endpoint, advice)
+        return Finding("blocked", False, f"{endpoint}: the port cannot be reached ({reason})", endpoint, advice)
 
 
 def observe_bus(link: Link, seconds: float) -> BusObservation | list[Finding]:
@@ -63,37 +65,41 @@ def observe_bus(link: Link, seconds: float) -> BusObservation | list[Finding]:
         if not wait_until(bus.linked, ZENOH_TIMEOUT_S):
             problems = [problem for endpoint in link.connect if (problem := check_endpoint(endpoint)) is not None]
             return problems or [_no_zenoh(", ".join(link.connect))]
-        observation = BusObservation(link.robot, seconds)
+        observation = BusObservation(link.robot, seconds, RobotLiveness(link.robot), link.connect_option)
         inbox, answers = Inbox(capacity=200_000), Inbox()
-        bus.watch_robots(lambda robot, _service, there: observation.robots.add(robot) if there else None)
+        tokens: set[tuple[str, str]] = set()  # robot and service; filled by zenoh's thread
+        bus.watch_robots(lambda robot, service, alive: (tokens.add if alive else tokens.discard)((robot, service)))
         for topic in TOPICS:
             bus.subscribe(topic, inbox, keep_all=True)
         # A new zenoh session discovers the others one by one: measure from the first message on, or after 1 s.
         wait_until(lambda: len(inbox) > 0, 1.0)
         query = bus.ask_each(CONFIG, Request(), answers, timeout=seconds)
-        _receive(inbox, observation)
-        observation.alive = bus.alive()
+        _receive(inbox, tokens, observation)
+        observation.robots = {robot for robot, _ in tokens.copy()}
+        observation.liveness.set_alive(bus.alive(), seconds)
         query.wait(1.0)
         _add_replies(answers, observation)
         return observation
 
 
 def _no_zenoh(where: str) -> Finding:
-    advice = "another program may use that port, or the router requires TLS or a password: use --security"
+    advice = "another program may use that port, or the router requires TLS or a password: set PRESAGE_SECURITY"
     return Finding(
         "no_router", False, f"no session at {where}: something listens there, but no zenoh answers", where, advice
     )
 
 
-def _receive(inbox: Inbox, observation: BusObservation) -> None:
-    deadline = time.monotonic() + observation.seconds
-    while (left := deadline - time.monotonic()) > 0:
-        sample = inbox.get(left)
+def _receive(inbox: Inbox, tokens: set[tuple[str, str]], observation: BusObservation) -> None:
+    began = time.monotonic()
+    while (now := time.monotonic() - began) < observation.seconds:
+        alive = {service for robot, service in tokens.copy() if robot == observation.robot}
+        observation.liveness.set_alive(alive, now)
+        sample = inbox.get(min(observation.seconds - now, 0.5))
         if isinstance(sample, Sample):
-            _add_sample(sample, observation)
+            _add_sample(sample, observation, time.monotonic() - began)
 
 
-def _add_sample(sample: Sample, observation: BusObservation) -> None:
+def _add_sample(sample: Sample, observation: BusObservation, now: float) -> None:
     observation.arrivals[sample.key] += 1
     try:
         message = sample.topic.message.decode(sample.payload)
@@ -104,9 +110,11 @@ def _add_sample(sample: Sample, observation: BusObservation) -> None:
         # Health messages on the key of another service are ignored.
         if sample.key == sample.topic.key(observation.robot, message.service):
             observation.health.setdefault(message.service, []).append((sample.received_ns, message))
+            observation.liveness.add_health(message, now)
     elif sample.topic.rate:
         if isinstance(message, Scan) and sample.key == sample.topic.key(observation.robot):
             observation.scan = message
+            observation.liveness.add_scan(now)
         observation.sequences.setdefault(sample.key, Sequence()).see(message.seq)
 
 

@@ -1,32 +1,19 @@
-"""Health messages as rows of a table."""
+"""The services of one robot as rows of `presage top`."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Container
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from statistics import median
-from typing import Literal
 
-from common.bus.bus import DEFAULT_ENDPOINT
 from common.messages.definitions import Health, Scan, Stamped
 from common.messages.topics import BELIEF, CMD_VEL, HEALTH, SCAN, Topic, expected_rate, topic_of
+from common.runtime.liveness import RobotLiveness, ServiceLiveness, start_command
 
-REQUIRED_SERVICES = ("simulator", "estimator", "controller")
-OPTIONAL_SERVICES = ("recorder", "viewer")
-REPLAY = "replay"  # publishes the messages of all other services
-SUBSTITUTES = {"simulator": "bridge_ros2"}  # a ROS robot takes the place of the simulator
-HEALTH_TIMEOUT_S = 2.5  # a service without health messages for so long is silent; they come once a second
-# A service with such a recent health message is alive although its liveliness token is missing: tokens disappear for a
-# moment when a link is re-established.
-LIVELINESS_GRACE_S = 1.5
-MAX_SERVICES = 50  # limits the memory if a program publishes health messages with made-up names
 LATENCY_WINDOW = 45  # number of messages whose median latency is shown: 3 s
 MIN_RATE_SHARE = 0.8  # of the nominal rate; a topic below is slow
 INPUT_AND_OUTPUT = {"estimator": (SCAN, BELIEF), "controller": (BELIEF, CMD_VEL)}  # for the latency of a service
 WATCHED = (HEALTH, SCAN, BELIEF, CMD_VEL)
-
-State = Literal["alive", "starting", "silent", "gone", "missing", "off"]
 
 
 @dataclass(frozen=True)
@@ -47,53 +34,32 @@ class Rate:
 class Row:
     """State of one service."""
 
-    name: str
-    state: State
-    age: float | None = None  # s since its last health message
-    uptime: float | None = None  # s
+    service: ServiceLiveness
+    state: str  # a word for the user
     published: tuple[Rate, ...] = ()
     received: tuple[Rate, ...] = ()
-    dropped: int = 0
-    undecodable: int = 0
-    failed: int = 0
     latency_ms: float | None = None  # between the publication of its input and of its output
-    note: str = ""  # the note of its health; for a service that is not running, how to start it
-
-    @property
-    def ok(self) -> bool:
-        """Whether the service needs no attention."""
-        return self.state in {"alive", "starting", "off"}
+    note: str = ""  # its problem and note; for an absent service, how to start it
 
 
-def is_replaced(name: str, alive: Container[str]) -> bool:
-    """Whether another running service takes the place of the service ``name``."""
-    return REPLAY in alive or SUBSTITUTES.get(name, "") in alive
-
-
-@dataclass
 class HealthBoard:
-    """The services of one robot. ``now`` is the time of a monotonic clock, s."""
+    """Collects the messages of one robot. ``now`` is the time of a monotonic clock, s."""
 
-    robot: str
-    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
-    _alive: dict[str, float] = field(default_factory=dict)  # service: time when its token was first seen
-    _health: dict[str, tuple[float, Health]] = field(default_factory=dict)  # service: time of arrival, last message
-    _published: dict[str, dict[int, int]] = field(default_factory=dict)  # topic: {stamp: ns of wall time}
-    _latencies: dict[str, deque[float]] = field(default_factory=dict)  # service: ms
-    _scan_time: float = 0.0  # s, of the last scan
-
-    def update_alive(self, names: set[str], now: float) -> None:
-        """Takes the names of all services that have a liveliness token."""
-        self._alive = {name: self._alive.get(name, now) for name in names}
+    def __init__(self, robot: str, connect: str = "") -> None:
+        """``connect``: endpoints for the start commands of absent services; empty for the default."""
+        self.robot, self.connect = robot, connect
+        self.liveness = RobotLiveness(robot)
+        self._published: dict[str, dict[int, int]] = {}  # topic: {stamp: ns of wall time}
+        self._latencies: dict[str, deque[float]] = {}  # service: ms
+        self._scan_time = 0.0  # s, of the last scan
 
     def add_message(self, topic: Topic, message: Stamped, published_ns: int, now: float) -> None:
         """Takes a message of a topic in `WATCHED`; ``published_ns`` is wall time."""
         if isinstance(message, Health):
-            if message.service not in self._health and len(self._health) >= MAX_SERVICES:
-                return
-            self._health[message.service] = (now, message)
+            self.liveness.add_health(message, now)
             return
         if isinstance(message, Scan):
+            self.liveness.add_scan(now)
             self._scan_time = message.scan_time
         published = self._published.setdefault(topic.name, {})
         first = message.stamp_ns not in published
@@ -108,41 +74,26 @@ class HealthBoard:
 
     def rows(self, now: float) -> list[Row]:
         """One row for each service: first those that every session has, then the others by name."""
-        known = [*REQUIRED_SERVICES, *OPTIONAL_SERVICES]
-        others = sorted((self._alive.keys() | self._health.keys()) - set(known))
-        return [self._row(name, now) for name in (*known, *others)]
+        return [self._row(service) for service in self.liveness.services(now)]
 
-    def all_reported(self) -> bool:
-        """Whether a health message of each live service has come."""
-        return self._alive.keys() <= self._health.keys()
-
-    def _row(self, name: str, now: float) -> Row:
-        if name not in self._alive and name not in self._health:
-            missing = name in REQUIRED_SERVICES and not is_replaced(name, self._alive)
-            return Row(name, "missing" if missing else "off", note=f"start it: {self.start_command(name)}")
-        arrival, health = self._health.get(name, (None, None))
-        if arrival is None or health is None:
-            if now - self._alive[name] <= HEALTH_TIMEOUT_S:
-                return Row(name, "starting")
-            return Row(name, "silent", note="alive, but it sends no health messages")
-        age = now - arrival
-        gone = name not in self._alive and age > LIVELINESS_GRACE_S
-        state: State = "gone" if gone else "alive" if age <= HEALTH_TIMEOUT_S else "silent"
-        rates = [(row, rate) for row in health.topics if (rate := self._rate(row.key, row.rate)) is not None]
-        stale = state != "alive"
-        latencies = self._latencies.get(name)
+    def _row(self, service: ServiceLiveness) -> Row:
+        if service.state == "absent":
+            word = "gone" if service.since is not None else "missing" if service.problem else "not running"
+            start = f"start it: {start_command(service.name, self.robot, self.connect)}"
+            return Row(service, word, note=start)
+        if service.state == "late":
+            return Row(service, "silent", note=service.text)
+        if service.health is None:
+            return Row(service, "alive" if service.reported else "starting", note=service.text)
+        rows = [(row, rate) for row in service.health.topics if (rate := self._rate(row.key, row.rate)) is not None]
+        latencies = self._latencies.get(service.name)
         return Row(
-            name,
-            state,
-            age,
-            health.uptime,
-            published=tuple(rate for row, rate in rates if row.published and not stale),
-            received=tuple(rate for row, rate in rates if not row.published and not stale),
-            dropped=sum(row.dropped for row in health.topics),
-            undecodable=sum(row.undecodable for row in health.topics),
-            failed=health.counters.get("failed", 0),
-            latency_ms=median(latencies) if latencies and not stale else None,
-            note=f"start it again: {self.start_command(name)}" if state == "gone" else health.note,
+            service,
+            "alive",
+            published=tuple(rate for row, rate in rows if row.published),
+            received=tuple(rate for row, rate in rows if not row.published),
+            latency_ms=median(latencies) if latencies else None,
+            note=service.text,
         )
 
     def _rate(self, key: str, hz: float) -> Rate | None:
@@ -151,9 +102,3 @@ class HealthBoard:
         if topic is None or topic is HEALTH or (not topic.rate and not hz):
             return None
         return Rate(topic.name, hz, expected_rate(topic, self._scan_time))
-
-    def start_command(self, name: str) -> str:
-        """The shell command that starts the service."""
-        robot = "" if self.robot == "robot" else f" --robot {self.robot}"
-        connect = "" if self.connect == (DEFAULT_ENDPOINT,) else f" --connect {','.join(self.connect)}"
-        return f"python -m services.{name}{robot}{connect}"

@@ -42,8 +42,7 @@ def _check_weights(used_world: str) -> Iterator[Finding]:
     try:
         precise.find(precise.FOLDER, load_world(used_world), used_world)
     except UserError as error:
-        what, _, advice = str(error).partition("; ")
-        yield Finding("weights", False, what, where, advice or precise.train_command(used_world))
+        yield Finding("weights", False, str(error), where)  # the message says what to do
     for world in known_worlds():
         learned = precise.path_of(precise.FOLDER, world).exists()
         others = sorted(path.stem for path in precise.FOLDER.glob(f"{world}-*.safetensors"))

@@ -19,9 +19,11 @@ SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - only tested for being writable
 def check_machine(recordings: Path) -> Iterator[Finding]:
     """Checks that the folder of recordings is writable and its disk not nearly full, and that caches are writable."""
     folder = _nearest_existing(recordings)
-    if why := why_not_writable(folder):
+    if problem := find_write_error(folder):
         advice = "choose another folder with --directory of the recorder, or change the permissions of this one"
-        yield Finding("not_writable", False, f"recordings cannot be written to {folder}: {why}", str(folder), advice)
+        yield Finding(
+            "not_writable", False, f"recordings cannot be written to {folder}: {problem}", str(folder), advice
+        )
     else:
         yield Finding("not_writable", True, f"recordings: {folder} is writable", str(folder))
     free = shutil.disk_usage(folder).free
@@ -33,12 +35,12 @@ def check_machine(recordings: Path) -> Iterator[Finding]:
 
 def _check_caches() -> Iterator[Finding]:
     cache = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[2] / "services" / "estimator")
-    if why := why_not_writable(_nearest_existing(cache)):
+    if problem := find_write_error(_nearest_existing(cache)):
         advice = "the estimator compiles its code again at each start; set NUMBA_CACHE_DIR to a writable folder"
-        yield Finding("not_writable", None, f"compiled code cannot be cached in {cache}: {why}", str(cache), advice)
-    if SHARED_MEMORY.is_dir() and (why := why_not_writable(SHARED_MEMORY)):
+        yield Finding("not_writable", None, f"compiled code cannot be cached in {cache}: {problem}", str(cache), advice)
+    if SHARED_MEMORY.is_dir() and (problem := find_write_error(SHARED_MEMORY)):
         advice = "experiments on several cores fail; the services do not need it"
-        yield Finding("not_writable", None, f"{SHARED_MEMORY} cannot be used: {why}", str(SHARED_MEMORY), advice)
+        yield Finding("not_writable", None, f"{SHARED_MEMORY} cannot be used: {problem}", str(SHARED_MEMORY), advice)
 
 
 def find_stopped_processes(service: str) -> Iterator[Finding]:
@@ -53,8 +55,8 @@ def find_stopped_processes(service: str) -> Iterator[Finding]:
             yield Finding("frozen", False, what, f"process {process.pid}", f"kill -CONT {process.pid} resumes it")
 
 
-def why_not_writable(folder: Path) -> str:
-    """Returns why no file can be created in an existing folder, or "" if one can; leaves no file behind."""
+def find_write_error(folder: Path) -> str:
+    """Returns the error when a file is created in an existing folder, or ""; leaves no file behind."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             return ""

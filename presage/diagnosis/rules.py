@@ -11,14 +11,12 @@ from common.messages.definitions import Health, TopicHealth
 from common.messages.requests import ConfigReply
 from common.messages.topics import CMD_VEL, SCAN, TOPICS, TRUTH, expected_rate, topic_of
 from common.robot.scan_geometry import Sweep
+from common.runtime.liveness import SUBSTITUTES, start_command
 from common.runtime.protocol_check import describe_version_differences, same_protocol
 from presage.diagnosis.bus_observation import BusObservation
 from presage.diagnosis.findings import Finding
-from presage.diagnosis.health_board import HEALTH_TIMEOUT_S, MIN_RATE_SHARE, REPLAY, SUBSTITUTES, is_replaced
-from presage.diagnosis.installation import PACKAGES_OF_SERVICES
+from presage.diagnosis.health_board import MIN_RATE_SHARE
 
-OPTIONAL_SERVICES = {"recorder": "needed only to record, with"}  # and the beginning of the advice
-SERVICES_WITHOUT_HEALTH = {REPLAY}
 MAX_CLOCK_DIFFERENCE_S = 0.5  # as long as the time-outs of the robot
 MAX_DROPPED_SHARE = 0.1  # of the received messages; a service that drops more cannot keep up
 MAY_SKIP_MESSAGES = {"viewer"}  # it shows only the newest messages
@@ -36,25 +34,26 @@ def evaluate(observation: BusObservation, own_config: ConfigReply) -> Iterator[F
 
 
 def _presence(observation: BusObservation) -> Iterator[Finding]:
+    services = observation.liveness.services(observation.seconds)
     others = observation.robots - {observation.robot}
-    if not observation.alive and others:
+    if others and all(service.state == "absent" for service in services):
         what = (
             f"no service of robot {observation.robot!r} is running; there are services of {', '.join(sorted(others))}"
         )
         yield Finding("no_such_robot", False, what, observation.robot, "name the robot with --robot")
-    for service in PACKAGES_OF_SERVICES:
-        alive = service in observation.alive
-        not_required = service in OPTIONAL_SERVICES or is_replaced(service, observation.alive)
-        what = f"{service} of {observation.robot!r}: {'alive' if alive else 'not running'}"
-        advice = "" if alive else f"{OPTIONAL_SERVICES.get(service, 'start it with')}: python -m services.{service}"
-        yield Finding("missing", alive or (None if not_required else False), what, service, advice)
-    for service in sorted(observation.alive - SERVICES_WITHOUT_HEALTH):
-        if service not in observation.health and observation.seconds >= HEALTH_TIMEOUT_S:
-            what = (
-                f"{service}: alive, but no health message came within {observation.seconds:g} s: the process is "
-                "stopped or in an endless step"
-            )
-            yield Finding("frozen", False, what, _where(observation, service), "see its log; resume it or restart it")
+    for service in services:
+        where, name = _where(observation, service.name), f"{service.name} of {observation.robot!r}"
+        if service.state == "absent":
+            advice = f"start it with: {start_command(service.name, observation.robot, observation.connect)}"
+            needed = service.name in observation.liveness.missing(observation.seconds)
+            yield Finding("missing", False if needed else None, f"{name}: not running", service.name, advice)
+        elif service.state == "late":
+            advice = "see its log; resume it or restart it"
+            yield Finding("frozen", False, f"{name}: {service.problem}", where, advice)
+        elif service.problem:
+            yield Finding("no_result", False, f"{name}: {service.problem}", where, "see its log")
+        else:
+            yield Finding("missing", True, f"{name}: alive", service.name)
 
 
 def _duplicates(observation: BusObservation) -> Iterator[Finding]:
@@ -100,7 +99,7 @@ def _clocks(observation: BusObservation) -> Iterator[Finding]:
 
 def _rates(observation: BusObservation) -> Iterator[Finding]:
     # A real robot's scanner may have any rate, and there is no ground truth.
-    real_robot = SUBSTITUTES["simulator"] in observation.alive
+    real_robot = observation.liveness.present(SUBSTITUTES["simulator"], observation.seconds)
     period = observation.scan.scan_time if observation.scan is not None else 0.0
     if real_robot and not period and (scans := observation.arrivals[SCAN.key(observation.robot)]):
         period = observation.seconds / scans  # some drivers do not fill in scan_time
@@ -115,9 +114,9 @@ def _rates(observation: BusObservation) -> Iterator[Finding]:
         if topic is CMD_VEL and rate > 1.5 * expected:
             ok, advice = False, "there may be several controllers: stop all but one"
         yield Finding("rate", ok, f"{topic.name}: {rate:.1f} of {expected:.3g} Hz", key, "" if ok else advice)
-    for key, why in sorted(observation.undecodable.items()):
+    for key, error in sorted(observation.undecodable.items()):
         advice = "another program or another version publishes there; `presage echo` shows the messages"
-        yield Finding("undecodable", False, f"{key}: {why}", key, advice)
+        yield Finding("undecodable", False, f"{key}: {error}", key, advice)
 
 
 def _scanner(observation: BusObservation) -> Iterator[Finding]:

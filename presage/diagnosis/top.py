@@ -21,7 +21,14 @@ from presage.live.bus_watch import session
 REFRESH_PERIOD_S = 0.5
 LIVELINESS_TIMEOUT_S = 5.0  # for the router's list of tokens; it answers at once unless the machine is busy
 MIN_OBSERVATION_S, MAX_OBSERVATION_S = 1.5, 4.0  # for a single table
-COLOURS = {"alive": "green", "starting": "cyan", "silent": "red", "gone": "red", "missing": "bold red", "off": "dim"}
+COLOURS = {
+    "alive": "green",
+    "starting": "cyan",
+    "silent": "red",
+    "gone": "red",
+    "missing": "bold red",
+    "not running": "dim",
+}
 COLUMNS = (
     "service", "state", "age", "up", "sends, Hz", "gets, Hz", "dropped", "invalid", "failed", "latency", "note",
 )  # fmt: skip
@@ -34,7 +41,7 @@ def run_top(link: Link, robots: list[str], console: Console, *, once: bool) -> i
     With ``once``, or without a terminal, prints one table and returns 1 if a service needs attention. Raises UserError
     if there is no session.
     """
-    boards = {robot: HealthBoard(robot, link.connect) for robot in robots}
+    boards = {robot: HealthBoard(robot, link.connect_option) for robot in robots}
     with session(link) as bus:
         feed = BoardFeed(bus, boards)
         if once or not console.is_terminal:
@@ -54,7 +61,7 @@ def _once(feed: BoardFeed, console: Console) -> int:
         feed.run(0.1)
     now = time.monotonic()
     console.print(tables(feed.boards, now))
-    return 0 if all(row.ok for board in feed.boards.values() for row in board.rows(now)) else 1
+    return 1 if any(row.service.problem for board in feed.boards.values() for row in board.rows(now)) else 0
 
 
 class BoardFeed:
@@ -71,7 +78,7 @@ class BoardFeed:
         """Updates the boards for ``seconds`` s."""
         deadline = time.monotonic() + seconds
         for robot, board in self.boards.items():
-            board.update_alive(self.bus.alive(timeout=LIVELINESS_TIMEOUT_S, robot=robot), time.monotonic())
+            board.liveness.set_alive(self.bus.alive(timeout=LIVELINESS_TIMEOUT_S, robot=robot), time.monotonic())
         while True:
             sample = self._inbox.get(max(0.0, deadline - time.monotonic()))
             if isinstance(sample, Sample):
@@ -81,7 +88,9 @@ class BoardFeed:
 
     def complete(self) -> bool:
         """Whether a health message of every live service has come."""
-        return all(board.all_reported() for board in self.boards.values())
+        now = time.monotonic()
+        services = [each for board in self.boards.values() for each in board.liveness.services(now)]
+        return all(each.reported for each in services if each.state != "absent")
 
     def _take(self, sample: Sample) -> None:
         topic, now = topic_of(sample.key), time.monotonic()
@@ -105,24 +114,32 @@ def _table(board: HealthBoard, now: float) -> Table:
         left = column in LEFT_ALIGNED
         table.add_column(column, justify="left" if left else "right", no_wrap=not left)
     for row in board.rows(now):
-        table.add_row(*_cells(row), style="dim" if row.state == "off" else "")
+        table.add_row(*_cells(row), style="dim" if row.state == "not running" else "")
     return table
 
 
 def _cells(row: Row) -> list[Text]:
-    counts = [(row.dropped, "yellow"), (row.undecodable, "yellow"), (row.failed, "red")]
-    has_counts = row.uptime is not None
+    health, age = row.service.health, row.service.age
     return [
-        _plain(row.name),
-        Text({"off": "not running"}.get(row.state, row.state), COLOURS[row.state]),
-        Text(f"{row.age:.1f} s" if row.age is not None else ""),
-        Text(_duration(row.uptime) if row.uptime is not None else ""),
+        _plain(row.service.name),
+        Text(row.state, COLOURS[row.state]),
+        Text(f"{age:.1f} s" if age is not None else ""),
+        Text(_duration(health.uptime) if health is not None else ""),
         _rates(row.published),
         _rates(row.received),
-        *(Text(f"{count}" if has_counts else "", colour if count else "") for count, colour in counts),
+        *_counts(health),
         Text(f"{row.latency_ms:.1f} ms" if row.latency_ms is not None else ""),
         _plain(row.note),
     ]
+
+
+def _counts(health: Health | None) -> list[Text]:
+    """Dropped and undecodable messages, and failed steps."""
+    if health is None:
+        return [Text("")] * 3
+    dropped, undecodable = (sum(getattr(row, kind) for row in health.topics) for kind in ("dropped", "undecodable"))
+    counts = [(dropped, "yellow"), (undecodable, "yellow"), (health.counters.get("failed", 0), "red")]
+    return [Text(f"{count}", colour if count else "") for count, colour in counts]
 
 
 def _plain(text: str) -> Text:

@@ -89,7 +89,8 @@ def drive_of(scans: Scans, log: Path) -> Drive:
         )
     if scans.stamps is None:
         raise UserError(f"{log}: no stamps, but they are needed to compute the velocity of the robot")
-    use = np.flatnonzero(np.isfinite(scans.truth).all(axis=1))
+    latest = np.maximum.accumulate(scans.stamps)  # stamps begin again where a simulation was restarted
+    use = np.flatnonzero(np.isfinite(scans.truth).all(axis=1) & (scans.stamps == latest))
     if not surfaces(scans.ranges[use]).any():
         raise UserError(f"{log}: no beam of the scans with a reference pose hit a surface")
     odom = None if scans.odom is None or not np.isfinite(scans.odom[use]).all() else scans.odom

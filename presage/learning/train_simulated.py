@@ -182,7 +182,8 @@ def _warn_if_nothing_learned(data: dict[str, Data], trainer: Trainer, console: C
     if trainer.progress.test_l1[-1] > 0.9 * constant:
         console.print(
             "[bold red]nothing was learned[/]: predicting the same scan everywhere is as accurate "
-            f"({constant:.3f} m). Try another --seed, a smaller --learning-rate or more --epochs."
+            f"({constant:.3f} m). Try another --seed, or in section train of --config a smaller "
+            "learning_rate or more epochs."
         )
 
 

@@ -68,7 +68,7 @@ def open_carmen(path: Path, reading: Reading) -> Log:
     if reading.odom_topic and (reading.odom_topic != "ODOM" or not len(survey.odom[0])):
         there = "ODOM lines" if len(survey.odom[0]) else "no ODOM lines"
         raise UserError(
-            f"{path}: --odom-topic {reading.odom_topic}: for a CARMEN log it can only be ODOM, and this one has {there}"
+            f"{path}: odom_topic {reading.odom_topic}: for a CARMEN log it can only be ODOM, and this one has {there}"
         )
     if not survey.firsts.get(name):
         raise UserError(f"{path}: every {name} line is malformed")
@@ -98,7 +98,7 @@ def open_carmen(path: Path, reading: Reading) -> Log:
         log.reference = f"{name}'s corrected pose"
     elif reading.reference:
         notes.append(f"no reference: the poses of {name} are odometry, and there are no TRUEPOS lines")
-    # Without known angles in the headers (--angles replaces them), other scans cannot be resampled.
+    # Without known angles in the headers (the setting angles replaces them), other scans cannot be resampled.
     fixed = reading.angles is not None or first.beams is None
     log.read = lambda: _read_scans(log, first, clock, odom, true, name, fixed=fixed)
     return log
@@ -107,13 +107,14 @@ def open_carmen(path: Path, reading: Reading) -> Log:
 def _choose_laser(path: Path, lasers: Counter[str], wanted: str) -> str:
     if wanted and wanted not in lasers:
         raise UserError(
-            f"{path}: no {wanted} lines in it; it has {', '.join(sorted(lasers))}: choose one with --scan-topic"
+            f"{path}: no {wanted} lines in it; it has {', '.join(sorted(lasers))}: "
+            "choose one with scan_topic in section log of --config"
         )
     return wanted or next((name for name in FRONT if name in lasers), min(lasers))
 
 
 def _angles(path: Path, name: str, first: LaserLine, reading: Reading, notes: list[str]) -> Array:
-    """Beam angles (B,) rad, from --angles, the line's header, or the usual scanner with this number of beams."""
+    """Beam angles (B,) rad, from the setting, the line's header, or the usual scanner with this number of beams."""
     count, header = len(first.ranges), first.beams
     if reading.angles is not None:
         return np.linspace(*reading.angles, count)
@@ -121,16 +122,19 @@ def _angles(path: Path, name: str, first: LaserLine, reading: Reading, notes: li
         return header.angles()
     if count not in SPANS_DEG:
         raise UserError(
-            f"{path}: {name} does not state the angles of its {count} beams: give the first and the last one, such as "
-            "--angles -90,90"
+            f"{path}: {name} does not state the angles of its {count} beams: give the first and the last one in "
+            "a settings file, such as log: {angles: '-90,90'}"
         )
     first_deg, last_deg = SPANS_DEG[count]
-    notes.append(f"assumed: the {count} beams cover {first_deg:g} to {last_deg:g} deg (change with --angles)")
+    notes.append(
+        f"assumed: the {count} beams cover {first_deg:g} to {last_deg:g} deg "
+        "(change with angles in section log of --config)"
+    )
     return np.deg2rad(np.linspace(first_deg, last_deg, count))
 
 
 def _range_max(survey: _Survey, name: str, reading: Reading, notes: list[str]) -> float:
-    """Range from which on there is no return, m: from --range-max, the line's header, a PARAM line, or of an LMS."""
+    """Range from which on there is no return, m: from the setting, the line's header, a PARAM line, or of an LMS."""
     lines = survey.firsts[name]
     if reading.range_max is not None:
         return reading.range_max
@@ -149,7 +153,9 @@ def _range_max(survey: _Survey, name: str, reading: Reading, notes: list[str]) -
             stated = 0.0
         range_max = LMS_NEAR_RANGE_MAX if near_codes else stated if 0 < stated < np.inf else LMS_FAR_RANGE_MAX
     if range_max != stated:
-        notes.append(f"assumed: ranges from {range_max:g} m on mean no return (change with --range-max)")
+        notes.append(
+            f"assumed: ranges from {range_max:g} m on mean no return (change with range_max in section log of --config)"
+        )
     return range_max
 
 

@@ -80,7 +80,8 @@ class FrameHistory:
             return None
         if any(edge.moves for edge in chain):
             raise UserError(
-                f"{laser} moves against {base}, but must be fixed to it: choose another frame with --base-frame"
+                f"{laser} moves against {base}, but must be fixed to it: choose another frame "
+                "with base_frame in section log of --config"
             )
         transform = IDENTITY
         for edge in chain:

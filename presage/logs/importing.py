@@ -177,7 +177,9 @@ def _stamped(log: Log, sweeps: Iterator[LoggedScan], rate: float | None) -> Iter
     """Yields the scans with their stamps; raises UserError if a stamp is missing or negative."""
     for k, sweep in enumerate(sweeps):
         if sweep.stamp_ns is None and rate is None:
-            raise UserError(f"{log.path}: has no stamps: give the number of scans per second with --rate")
+            raise UserError(
+                f"{log.path}: has no stamps: give the number of scans per second with rate in section log of --config"
+            )
         stamp_ns = round(k * 1e9 / (rate or 1.0)) if sweep.stamp_ns is None else sweep.stamp_ns
         if stamp_ns < 0:
             raise UserError(f"{log.path}: its stamps begin below 0 s: add a constant to all of them")

@@ -26,7 +26,8 @@ def open_npz(path: Path, reading: Reading) -> Log:
     """
     if reading.scan_topic or reading.odom_topic or reading.reference_topic:
         raise UserError(
-            f"{path}: an .npz file has no topics: leave out --scan-topic, --odom-topic and --reference-topic"
+            f"{path}: an .npz file has no topics: leave out scan_topic, odom_topic and "
+            "reference_topic in section log of --config"
         )
     data = _load_arrays(path)
     missing = [name for name in ("ranges", "angles", "range_max") if name not in data]

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
+
+from mcap.exceptions import McapError
+from mcap.reader import SeekingReader
 
 from common.errors import UserError
 from presage.logs.carmen import DECOMPRESSION_ERRORS, decompressed, open_carmen
@@ -44,7 +48,7 @@ def kind_of(path: Path) -> Kind:
     if head.startswith(b"SQLite format 3\x00"):
         return _check_suffix(path, ".db3")
     if head.startswith(MCAP):
-        return "recording" if _is_recording(path, head) else _check_suffix(path, ".mcap")
+        return "recording" if _is_recording(path) else _check_suffix(path, ".mcap")
     _check_carmen(path, head)
     return "carmen"
 
@@ -72,13 +76,14 @@ def with_reversed_beams(log: Log) -> Log:
     return replace(log, angles=-log.angles[::-1], read=lambda: (replace(s, ranges=s.ranges[::-1]) for s in log.read()))
 
 
-def _is_recording(path: Path, head: bytes) -> bool:
+def _is_recording(path: Path) -> bool:
     """Whether an MCAP file is a presage recording, by the profile in its header, else by its topics."""
-    # The header is: magic, opcode 1, length (u64), profile (u32 length and text), see https://mcap.dev/spec.
-    start = len(MCAP) + 9
-    length = int.from_bytes(head[start : start + 4], "little")
-    profile = head[start + 4 : start + 4 + length]
-    return profile == PROFILE.encode() or (not profile and bool(read_recording(path).topics()))
+    try:
+        with path.open("rb") as stream:
+            profile = SeekingReader(stream, record_size_limit=HEAD_BYTES).get_header().profile
+    except (McapError, struct.error, UnicodeDecodeError):  # damaged
+        profile = ""
+    return profile == PROFILE or (not profile and bool(read_recording(path).topics()))
 
 
 def _check_suffix(path: Path, suffix: str) -> Kind:

@@ -1,51 +1,59 @@
-"""Command-line options that describe a log."""
+"""Properties of a log that its file does not state: section `log` of a settings file."""
 
 from __future__ import annotations
 
 import re
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
 from common.errors import UserError
-from common.geometry.pose_text import NUMBER, pose_of_text
+from common.geometry.pose_text import NUMBER, POSE_TEXT, pose_of_text
 from presage.logs.log import Reading
+
+
+class LogSettings(BaseModel):
+    """What is empty or None defaults to what the log states."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    mount: Annotated[str, Field(pattern=POSE_TEXT)] = ""  # x,y[,yaw_deg] of the laser in base_link, m and deg
+    upside_down: bool | None = None  # the scanner is mounted with a roll of 180 deg
+    frame: Literal["base_link", "laser"] = "base_link"  # whose poses are estimated or recorded; in an .npz, given
+    scan_topic: str = ""  # of several; in a CARMEN log the type of line, such as RLASER
+    odom_topic: str = ""  # of several; in a CARMEN log ODOM reads the ODOM lines
+    odometry: bool = True  # whether `presage localize` uses the odometry
+    base_frame: str = ""  # frame of the robot in tf
+    reference: bool | None = None  # false reads no reference poses; true also those of corrected CARMEN scans
+    reference_topic: str = ""  # Odometry, PoseStamped or PoseWithCovarianceStamped in the map
+    angles: str = ""  # of the first and last beam in deg, such as -90,90
+    range_max: Annotated[float, Field(ge=0.1, le=1000)] | None = None  # m; longer ranges are beams without return
+    clock: Literal["sensor", "logger"] = "sensor"  # which stamps are used
+    rate: Annotated[float, Field(ge=0.01, le=1000)] | None = None  # Hz, scan rate of a log without stamps
+    sigma: Annotated[float, Field(ge=1e-4, le=10)] | None = None  # m, range noise of the scanner
+
+    def reading(self) -> Reading:
+        """The options for reading the log; raises UserError if the angles are malformed."""
+        return Reading(
+            pose_of_text(self.mount, "--mount") if self.mount else None,
+            self.scan_topic,
+            self.odom_topic,
+            self.base_frame,
+            self.upside_down,
+            self.reference,
+            self.reference_topic,
+            angles_of(self.angles) if self.angles else None,
+            self.range_max,
+            self.clock,
+        )
 
 
 def angles_of(text: str) -> tuple[float, float]:
     """Angles of the first and last beam, rad, from text FIRST,LAST in degrees; raises UserError if malformed."""
     if not re.fullmatch(f"{NUMBER},{NUMBER}", text):
-        raise UserError(f"--angles {text!r}: give the angles of the first and the last beam in degrees, such as -90,90")
+        raise UserError(f"angles {text!r}: give the angles of the first and the last beam in degrees, such as -90,90")
     first, last = (float(np.deg2rad(float(part))) for part in text.split(","))
     if not 0 < last - first <= 2 * np.pi:
-        raise UserError(f"--angles {text!r}: the last beam must lie up to 360 degrees to the left of the first")
+        raise UserError(f"angles {text!r}: the last beam must lie up to 360 degrees to the left of the first")
     return first, last
-
-
-def reading_of(
-    mount: str,
-    scan_topic: str,
-    odom_topic: str,
-    reference_topic: str,
-    base_frame: str,
-    angles: str,
-    clock: str,
-    *,
-    reference: bool | None,
-    range_max: float | None,
-    upside_down: bool | None,
-) -> Reading:
-    """The options of `presage import`, `localize` and `map` as a `Reading`; raises UserError if one is malformed."""
-    if clock not in ("sensor", "logger"):
-        raise UserError(f"no clock {clock!r}: choose sensor or logger")
-    return Reading(
-        pose_of_text(mount, "--mount") if mount else None,
-        scan_topic,
-        odom_topic,
-        base_frame,
-        upside_down,
-        reference,
-        reference_topic,
-        angles_of(angles) if angles else None,
-        range_max,
-        clock,  # type: ignore[arg-type]
-    )

@@ -105,7 +105,7 @@ class Poses:
         if offset is None:
             notes.append(
                 f"{topic} has poses of {child}, and tf does not connect {child} and {base}: assumed to be poses of "
-                f"{base} (change with --base-frame)"
+                f"{base} (change with base_frame in section log of --config)"
             )
         return np.zeros(3) if offset is None else offset
 

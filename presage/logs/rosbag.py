@@ -103,10 +103,13 @@ def open_rosbag(path: Path, kind: Literal["ros1", "ros2"], reading: Reading) -> 
         reading.range_max or float(first.range_max), scans, lambda: iter(()), float(first.range_min), notes=notes,
     )  # fmt: skip
     if not 0 < log.range_max < np.inf:
-        raise UserError(f"{path}: the stated maximum range is {log.range_max:g} m: give it with --range-max")
+        raise UserError(
+            f"{path}: the stated maximum range is {log.range_max:g} m: give range_max in section log of --config"
+        )
     log.odometry, odom = poses.odometry(topics.odom, base, notes)
     log.reference, reference = poses.reference(topics.reference, base, reading, notes)
-    log.read = lambda: _read_scans(bag, log, odom, reference, by_logger=by_logger, flipped=mount.upside_down)
+    topic, flipped = topics.scan[0].topic, mount.upside_down
+    log.read = lambda: _read_scans(bag, log, topic, odom, reference, by_logger=by_logger, flipped=flipped)
     return log
 
 
@@ -118,14 +121,17 @@ def _choose_topics(path: Path, connections: list[Connection], reading: Reading) 
         if wanted and wanted not in found:
             raise UserError(f"{path}: {option} {wanted}: no topic of that name and type; it has {_join(found)}")
         if len(candidates) > 1:
-            raise UserError(f"{path}: several topics of type {types[0]}, choose one with {option}: {_join(found)}")
+            raise UserError(
+                f"{path}: several topics of type {types[0]}, choose one with {option} in section log "
+                f"of --config: {_join(found)}"
+            )
         return [c for c in connections if c.msgtype in types and c.topic in candidates]
 
-    scan = choose((SCAN,), reading.scan_topic, "--scan-topic")
+    scan = choose((SCAN,), reading.scan_topic, "scan_topic")
     if not scan:
         raise UserError(f"{path}: no {SCAN} in it; it has {_join({c.msgtype for c in connections})}")
-    reference = choose(POSES, reading.reference_topic, "--reference-topic") if reading.reference_topic else []
-    odom = choose((ODOM,), reading.odom_topic, "--odom-topic")
+    reference = choose(POSES, reading.reference_topic, "reference_topic") if reading.reference_topic else []
+    odom = choose((ODOM,), reading.odom_topic, "odom_topic")
     return _Topics(scan, odom, [c for c in connections if c.msgtype in TF], reference)
 
 
@@ -150,7 +156,7 @@ def _mount(path: Path, frames: FrameHistory, base: str, laser: str, reading: Rea
     if mount is None:
         raise UserError(
             f"{path}: tf does not state where {laser or 'the laser'} is mounted on {base}: give it with "
-            "--mount x,y[,yaw_deg], or name another frame of the robot with --base-frame"
+            "--mount x,y[,yaw_deg], or name another frame of the robot with base_frame in section log of --config"
         )
     flipped = mount.upside_down if reading.upside_down is None else reading.upside_down
     if flipped:
@@ -174,9 +180,9 @@ def _angles(scan: Any, *, flipped: bool) -> tuple[Array, bool]:
 
 
 def _read_scans(
-    bag: Bag, log: Log, odom: Lookup, reference: Lookup, *, by_logger: bool, flipped: bool
+    bag: Bag, log: Log, topic: str, odom: Lookup, reference: Lookup, *, by_logger: bool, flipped: bool
 ) -> Iterator[LoggedScan]:
-    topic, resampled_scans = log.format.split("(")[1].rstrip(")"), 0
+    resampled_scans = 0
     with bag.open() as reader:
         connections = [c for c in reader.connections if c.topic == topic and c.msgtype == SCAN]
         for _, logged_ns, scan in bag.messages(reader, connections):

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import sys
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -11,21 +15,23 @@ from rich.console import Console
 
 from common.errors import UserError
 from common.geometry.se2 import Array
-from common.messages.definitions import Odom, Scan, Truth
-from common.messages.topics import ODOM, SCAN, TRUTH
+from common.messages.definitions import CmdVel, Goal, Odom, Scan, Stamped, Truth
+from common.messages.topics import CMD_VEL, GOAL, ODOM, SCAN, TRUTH
 from common.robot.ranges import ranges_for_localisation
+from presage.laser_scan import LaserScan
 from presage.logs.log import Log, Reading
 from presage.logs.opening import kind_of, open_log
+from presage.recordings.selection import entries, robot_of
 from services.estimator.factory import Geometry
-from services.estimator.shared.interface import Observation
 from services.recorder.reader import Recording, read_recording
 
 RECORDED_TRUTH = "the recorded truth"
+Prior = Literal["motion", "odometry", "command"]
 
 
 @dataclass(frozen=True)
 class Scans:
-    """N scans of B beams."""
+    """N scans of B beams from one scanner; ``scans[k]``, and iteration, give them as LaserScan."""
 
     geometry: Geometry
     ranges: Array  # (N, B) m; +inf for no return, -inf for not measured
@@ -36,6 +42,46 @@ class Scans:
     world: str | None = None  # name of the recorded world
     truth_is: str = RECORDED_TRUTH  # source of `truth`: the recorded truth, or the reference of a log
     notes: tuple[str, ...] = ()  # assumptions, and what was left out
+    commands: Array | None = None  # (N, 3) the last velocity command before each scan; NaN where there is none
+    goals: Array | None = None  # (N, 3) the goal at each scan; NaN where there is none
+    stamps_ns: npt.NDArray[np.int64] | None = None  # (N,) of a recording
+
+    def __len__(self) -> int:
+        return len(self.ranges)
+
+    def __getitem__(self, k: int) -> LaserScan:
+        def row(values: Array | None) -> Array | None:
+            return values[k] if values is not None and np.isfinite(values[k]).all() else None
+
+        stamp = None if self.stamps is None else float(self.stamps[k])
+        if self.stamps_ns is not None:
+            stamp = float(self.stamps_ns[k] * 1e-9)  # the estimator service's arithmetic, so that beliefs are equal
+        geometry = self.geometry
+        return LaserScan(
+            self.ranges[k],
+            geometry.angles,
+            geometry.range_max,
+            stamp,
+            row(self.odom),
+            row(self.commands),
+            row(self.goals),
+            geometry.mount,
+            geometry.sigma,
+            geometry.sigma_relative,
+            geometry.mount_assumed,
+            row(self.truth),
+        )
+
+    def __iter__(self) -> Iterator[LaserScan]:
+        return (self[k] for k in range(len(self)))
+
+    def with_prior(self, prior: Prior) -> Scans:
+        """The scans with only this source of the motion between them; "motion" is the scans alone."""
+        return replace(
+            self,
+            odom=self.odom if prior == "odometry" else None,
+            commands=self.commands if prior == "command" else None,
+        )
 
     def print_notes(self, console: Console) -> None:
         """Prints the notes, one line each."""
@@ -48,22 +94,23 @@ class Scans:
         The initial pose belongs to the first scan and is dropped if that is not selected.
         """
 
-        def of(values: Array | None) -> Array | None:
+        def of(values: npt.NDArray[Any] | None) -> Any:
             return None if values is None else values[numbers]
 
         return replace(
-            self, ranges=self.ranges[numbers], stamps=of(self.stamps), odom=of(self.odom), truth=of(self.truth),
+            self,
+            ranges=self.ranges[numbers],
+            stamps=of(self.stamps),
+            odom=of(self.odom),
+            truth=of(self.truth),
+            commands=of(self.commands),
+            goals=of(self.goals),
+            stamps_ns=of(self.stamps_ns),
             initial_pose=self.initial_pose if numbers[0] == 0 else None,
-        )  # fmt: skip
-
-    def observation(self, k: int, *, odometry: bool = True) -> Observation:
-        """The k-th scan as an estimator's observation."""
-        odom = self.odom[k] if odometry and self.odom is not None and np.isfinite(self.odom[k]).all() else None
-        stamp = None if self.stamps is None else float(self.stamps[k])
-        return Observation(self.ranges[k], self.geometry.angles, self.geometry.range_max, stamp, odom)
+        )
 
 
-def read_scans(path: Path, mount: Array | None = None, reading: Reading | None = None) -> Scans:
+def read_scans(path: str | Path, mount: Array | None = None, reading: Reading | None = None) -> Scans:
     """Reads all scans of a recording, an .npz file, a CARMEN log or a ROS bag; raises UserError if that fails.
 
     ``mount`` (3,) is the laser in base_link; it replaces the mount of a log and is ignored for a recording. The poses
@@ -71,7 +118,7 @@ def read_scans(path: Path, mount: Array | None = None, reading: Reading | None =
     laser. `Scans.truth` is the truth of a recording or the reference of a log. ``reading`` has further options for
     logs.
     """
-    reading = reading or Reading()
+    path, reading = Path(path), reading or Reading()
     if kind_of(path) == "recording":
         if not reading.is_default:
             raise UserError(
@@ -119,32 +166,59 @@ def mount_assumed(recording: Recording) -> bool:
 def _read_recording(path: Path) -> Scans:
     recording = read_recording(path)
     scans: list[Scan] = []
-    odoms: dict[int, Array] = {}
-    truths: dict[int, Array] = {}
-    for _, message, _ in recording.messages(SCAN, ODOM, TRUTH):
-        if isinstance(message, Scan) and (not scans or message.stamp_ns > scans[-1].stamp_ns):
+    keys: list[tuple[int, int]] = []  # of each scan
+    odoms: dict[tuple[int, int], Array] = {}
+    truths: dict[tuple[int, int], Array] = {}
+    commands, goals = [], []  # of each scan
+    command = goal = unknown = np.full(3, np.nan)
+    key_of = _StampCounter()
+    for _, message, _ in entries(recording, robot_of(recording), SCAN, ODOM, TRUTH, CMD_VEL, GOAL):
+        if isinstance(message, Scan) and (not scans or message.stamp_ns != scans[-1].stamp_ns):
             scans.append(message)
+            keys.append(key_of(message))
+            commands.append(command)
+            goals.append(goal)
         elif isinstance(message, Odom):
-            odoms[message.stamp_ns] = message.pose.array()
+            odoms[key_of(message)] = message.pose.array()
         elif isinstance(message, Truth):
-            truths[message.stamp_ns] = message.pose.array()
+            truths[key_of(message)] = message.pose.array()
+        elif isinstance(message, CmdVel):
+            command = message.twist.array()
+        elif isinstance(message, Goal):
+            goal = unknown if message.cancel else message.pose.array()
     if recording.warning:  # damage is only found while reading
-        print(recording.warning)
+        print(f"warning: {recording.warning}", file=sys.stderr)
     if not scans:
         raise UserError(f"{path}: no scan in it")
     first = scans[0]
     alike = [s for s in scans if len(s.ranges) == len(first.ranges) and s.mount == first.mount]
     if len(alike) != len(scans):
         raise UserError(f"{path}: the scanner changes during the recording; only one scanner per file is supported")
-    unknown = np.full(3, np.nan)
     world = recording.world()
     return Scans(
         replace(Geometry.of_scan(first), mount_assumed=mount_assumed(recording)),
         np.array([ranges_for_localisation(s.ranges) for s in scans]),
         seconds([s.stamp_ns for s in scans]),
-        np.array([odoms.get(s.stamp_ns, unknown) for s in scans]) if odoms else None,
+        np.array([odoms.get(key, unknown) for key in keys]) if odoms else None,
         None,
-        np.array([truths.get(s.stamp_ns, unknown) for s in scans]) if truths else None,
+        np.array([truths.get(key, unknown) for key in keys]) if truths else None,
         world.name if world is not None else None,
         recording.metadata.get("log", {}).get("reference") or RECORDED_TRUTH,
+        commands=np.array(commands),
+        goals=np.array(goals),
+        stamps_ns=np.array([s.stamp_ns for s in scans], np.int64),
     )
+
+
+class _StampCounter:
+    """Tells equal stamps of a simulation and of its restart apart: returns (number of the run, stamp in ns)."""
+
+    def __init__(self) -> None:
+        self._runs: Counter[type[Stamped]] = Counter()
+        self._last: dict[type[Stamped], int] = {}
+
+    def __call__(self, message: Stamped) -> tuple[int, int]:
+        kind = type(message)
+        self._runs[kind] += message.stamp_ns < self._last.get(kind, 0)
+        self._last[kind] = message.stamp_ns
+        return self._runs[kind], message.stamp_ns

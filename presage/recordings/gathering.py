@@ -79,7 +79,8 @@ class RecordedSession:
     predicted: tuple[Scan, Prediction] | None = None  # the last scan with a prediction
     truth: StampedRows = field(default_factory=StampedRows)
     contacts: int = 0  # number of truth messages in which the robot touches something
-    belief: StampedRows = field(default_factory=lambda: StampedRows(6))  # pose, free energy, accuracy, complexity
+    # Pose, free energy, accuracy, complexity; NaN where the estimator does not compute them.
+    belief: StampedRows = field(default_factory=lambda: StampedRows(6))
     states: list[str] = field(default_factory=list)  # of each belief
     estimator: str = ""  # of the last belief
     true_poses: Array = field(default_factory=lambda: np.zeros((0, 3)))  # at the stamp of each belief; NaN if unknown
@@ -89,7 +90,7 @@ class RecordedSession:
     healths: dict[str, Health] = field(default_factory=dict)  # the last of each service
 
     def energies(self) -> Array:
-        """Free energy, accuracy and complexity of each belief (N, 3), nats."""
+        """Free energy, accuracy and complexity of each belief (N, 3), nats; NaN where unknown."""
         return self.belief.rows[:, 3:]
 
     def errors(self) -> Array:
@@ -120,7 +121,7 @@ def load_session(path: Path) -> RecordedSession:
 
 def gather_session(recording: Recording) -> RecordedSession:
     """Gathers the messages of the recording's robot."""
-    robot = robot_of(recording, "")
+    robot = robot_of(recording)
     session = RecordedSession(
         world=recording.world(),
         robot=robot or recording.metadata.get("presage", {}).get("robot", "unknown"),
@@ -175,7 +176,8 @@ class _Gatherer:
             self._last_stamp_ns = truth.stamp_ns
 
     def _belief(self, belief: Belief, logged: int) -> None:
-        energies = (belief.free_energy, belief.accuracy, belief.complexity)
+        known = (belief.free_energy, belief.accuracy, belief.complexity)
+        energies = [np.nan if value is None else value for value in known]
         if self.session.belief.add(belief.stamp_ns, logged, *belief.pose.array(), *energies):
             self.session.states.append(belief.state)
             self.session.estimator = belief.estimator

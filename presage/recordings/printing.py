@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from rich.console import Console
@@ -96,7 +96,14 @@ def _size(count: int) -> str:
 
 
 def echo_either(
-    link: Link, source: str, topic: str | None, count: int, start_s: float, console: Console, *, full: bool
+    link: Callable[[], Link],
+    source: str,
+    topic: str | None,
+    count: int,
+    start_s: float,
+    console: Console,
+    *,
+    full: bool,
 ) -> int:
     """Prints messages of a topic on the bus, or of a recording; raises UserError if ``source`` is neither."""
     is_file = source.endswith((".mcap", ".mcap.active")) or Path(source).exists()
@@ -105,7 +112,7 @@ def echo_either(
     if topic is not None or start_s:
         topic_named(source)
         raise UserError(f"{source} is a topic on the bus: a second topic and --start are for recordings")
-    return echo(link, source, count, console, full=full)
+    return echo(link(), source, count, console, full=full)
 
 
 def echo_file(file: Path, name: str | None, count: int, start_s: float, console: Console, *, full: bool) -> int:

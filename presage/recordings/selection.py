@@ -21,7 +21,7 @@ def robots_of(recording: Recording) -> list[str]:
     return sorted({key.split("/")[1] for key in recording.topics()})
 
 
-def robot_of(recording: Recording, wanted: str) -> str:
+def robot_of(recording: Recording, wanted: str = "") -> str:
     """The robot ``wanted``, or if that is empty, the robot of the recording; raises UserError if it is not in there."""
     robots = robots_of(recording)
     if wanted and wanted not in robots:

@@ -195,18 +195,18 @@ def _draw_scan(axes: Axes, session: RecordedSession) -> None:
 
 
 def _draw_free_energy(axes: Axes, session: RecordedSession) -> None:
-    if not len(session.belief):
-        _missing(axes, "belief")
-        return
-    time = session.belief.stamps_ns * 1e-9
     total, accuracy, complexity = session.energies().T
-    shown = [total]
-    axes.plot(time, total, color=BELIEF, lw=2.2 if complexity.any() else 1.5, label="free energy F")
-    if complexity.any():
+    if not np.isfinite(total).any():
+        _missing(axes, "free energy" if len(total) else "belief")
+        return
+    time, shown = session.belief.stamps_ns * 1e-9, [total]
+    has_complexity = bool(np.nan_to_num(complexity).any())
+    axes.plot(time, total, color=BELIEF, lw=2.2 if has_complexity else 1.5, label="free energy F")
+    if has_complexity:
         shown = [total, accuracy, complexity]
         axes.plot(time, accuracy, color=MEASURED, lw=1.1, label="accuracy, −ln p(o|x)")
         axes.plot(time, complexity, color=GOAL, lw=1.1, label="complexity")
-    low, high = min(map(np.min, shown)), max(map(np.max, shown))
+    low, high = np.nanmin(shown), np.nanmax(shown)
     if low > 0 and high > 30 * low:
         axes.set_yscale("log")
     _mark_moments(axes, session)

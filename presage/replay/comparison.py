@@ -23,7 +23,7 @@ def same_belief(a: Belief, b: Belief) -> bool:
     return (
         a.pose == b.pose
         and covariances[0] == covariances[1]
-        and a.free_energy.hex() == b.free_energy.hex()
+        and repr(a.free_energy) == repr(b.free_energy)
         and a.state == b.state
     )
 

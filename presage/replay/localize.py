@@ -6,9 +6,9 @@ import csv
 import json
 import sys
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -21,13 +21,15 @@ from common.geometry.pose_text import pose_of_text
 from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from common.versions import commit, versions
+from presage.estimator import Estimator
+from presage.laser_scan import LaserScan
 from presage.logs.log import Reading
 from presage.logs.opening import kind_of
-from presage.logs.scan_files import Scans, read_scans
+from presage.logs.scan_files import Prior, Scans, read_scans
 from presage.session.stack import ignoring_interrupts
 from presage.terminal.output import check_file
 from presage.terminal.progress import progress, working
-from services.estimator.factory import Choice, Name, check_start, prepare
+from services.estimator.factory import Choice, Name, check_start
 from services.estimator.shared.interface import Posterior
 from services.recorder.reader import read_recording
 from services.recorder.replaying.player import span
@@ -48,7 +50,7 @@ class LocalizeOptions:
     choice: Choice
     mode: Literal["global", "track"] = "global"
     fresh: bool = False
-    odometry: bool = True
+    prior: Prior = "odometry"
     frame: Literal["base_link", "laser"] = "base_link"
     reading: Reading = Reading()  # noqa: RUF009 - frozen
     out: Path | None = None  # CSV or JSON; defaults to CSV on standard output
@@ -79,7 +81,8 @@ class LocalizeOptions:
             raise UserError(f"no frame {frame!r}: choose base_link or laser")
         if out is not None and out.suffix not in (".csv", ".json"):
             raise UserError(f"{out}: the name of the result must end with .csv or .json")
-        return cls(file, choice, mode, fresh, odometry, frame, reading, out, start, end, every)  # type: ignore[arg-type]
+        prior: Prior = "odometry" if odometry else "motion"
+        return cls(file, choice, mode, fresh, prior, frame, reading, out, start, end, every)  # type: ignore[arg-type]
 
 
 def choice_of(
@@ -109,6 +112,42 @@ def choice_of(
     return Choice(world, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
 
 
+@dataclass(frozen=True)
+class Localised:
+    """A belief, and how long it took."""
+
+    posterior: Posterior
+    update_ms: float
+
+
+def run(
+    estimator: Estimator, scans: Iterable[LaserScan], *, fresh: bool = False, start: Array | None = None
+) -> Iterator[Localised]:
+    """Yields the belief after each scan, from ``start`` (3,) or an unknown pose; with ``fresh``, each scan is alone."""
+    for k, scan in enumerate(scans):
+        if k == 0:
+            estimator.check(scan)
+        if start is not None if k == 0 else fresh:
+            estimator.restart(start)
+        began = time.perf_counter()
+        posterior = estimator.update(scan)
+        yield Localised(posterior, (time.perf_counter() - began) * 1e3)
+
+
+def prepare(choice: Choice, console: Console) -> Estimator:
+    """The chosen estimator, without its initial pose."""
+    with working(f"preparing {choice.estimator} for {choice.world_argument}", console):
+        return Estimator(
+            choice.world,
+            choice.estimator,
+            model=choice.model,
+            models=choice.models,
+            sigma=choice.sigma,
+            seed=choice.seed,
+            descent=choice.descent,
+        )
+
+
 def localize(job: LocalizeOptions, console: Console) -> list[dict[str, Any]]:
     """Localises each scan; writes the rows as they are computed, prints a summary and returns the rows.
 
@@ -121,38 +160,31 @@ def localize(job: LocalizeOptions, console: Console) -> list[dict[str, Any]]:
         world = job.choice.world
         check_start(job.choice, load_world(world) if isinstance(world, str) else world)
     laser, kind = job.frame == "laser", kind_of(job.file)
-    with working(f"preparing {job.choice.estimator} for {job.choice.world_argument}", console):
-        make = prepare(replace(job.choice, initial_pose=None))
+    estimator = prepare(job.choice, console)
     with working(f"reading {job.file.name}", console):
-        # With --frame laser, the poses in an .npz file are those of the laser, as if its mount were zero. For other
+        # With frame laser, the poses in an .npz file are those of the laser, as if its mount were zero. For other
         # files, base_link is localised and the result transformed.
         mount = np.zeros(3) if laser and kind == "npz" else None
         all_scans = read_scans(job.file, mount, job.reading)
     all_scans.print_notes(console)
-    scans = select_scans(job, all_scans)
-    start, count = _start(job, scans), len(scans.ranges)
-    estimator = make(scans.geometry)
+    scans = select_scans(job, all_scans).with_prior(job.prior)
+    start, count = _start(job, scans), len(scans)
+    estimator.check(scans[0])
     rows: list[dict[str, Any]] = []
-    if start is not None:
-        estimator.restart(start)
     try:
-        with _output(job, count) as write, closing(_numbers(job, count, console)) as numbers:
-            for k in numbers:
-                if job.fresh and k:
-                    estimator.restart(start)
-                observation = scans.observation(k, odometry=job.odometry)
-                started = time.perf_counter()
-                posterior = estimator.update(observation)
-                row = _row(scans, k, posterior, (time.perf_counter() - started) * 1e3, laser=laser)
+        found = run(estimator, scans, fresh=job.fresh, start=start)
+        with _output(job, count) as write, closing(_with_progress(job, found, count, console)) as localised:
+            for k, one in enumerate(localised):
+                row = _row(scans, k, one, laser=laser)
                 write(row)
                 rows.append(row)
     except KeyboardInterrupt:
         with ignoring_interrupts():
-            _summarise(scans, rows, len(all_scans.ranges), console, laser=laser)
+            _summarise(scans, rows, len(all_scans), console, laser=laser)
             where = "" if job.out is None else f"; their rows are in {job.out}"
             console.print(f"interrupted after {len(rows)} of {count} scans{where}", highlight=False, soft_wrap=True)
         raise
-    _summarise(scans, rows, len(all_scans.ranges), console, laser=laser)
+    _summarise(scans, rows, len(all_scans), console, laser=laser)
     return rows
 
 
@@ -171,12 +203,14 @@ def select_scans(job: LocalizeOptions, scans: Scans) -> Scans:
     return scans.part(np.flatnonzero(between)[:: job.every])
 
 
-def _numbers(job: LocalizeOptions, count: int, console: Console) -> Generator[int]:
-    """Yields 0 to count - 1 and shows the progress, unless the rows themselves are printed to the same terminal."""
+def _with_progress(
+    job: LocalizeOptions, found: Iterator[Localised], count: int, console: Console
+) -> Generator[Localised]:
+    """Shows the progress, unless the rows themselves are printed to the same terminal."""
     if job.out is None and sys.stdout.isatty() and console.is_terminal:
-        yield from range(count)
+        yield from found
         return
-    yield from progress(range(count), "localising", count, console)
+    yield from progress(found, "localising", count, console)
 
 
 def _start(job: LocalizeOptions, scans: Scans) -> Array | None:
@@ -195,7 +229,8 @@ def _start(job: LocalizeOptions, scans: Scans) -> Array | None:
     )
 
 
-def _row(scans: Scans, k: int, posterior: Posterior, update_ms: float, *, laser: bool) -> dict[str, Any]:
+def _row(scans: Scans, k: int, localised: Localised, *, laser: bool) -> dict[str, Any]:
+    posterior = localised.posterior
     pose, covariance = posterior.pose, posterior.covariance
     mount = scans.geometry.mount
     if laser and mount.any():  # the estimator localises base_link
@@ -204,7 +239,7 @@ def _row(scans: Scans, k: int, posterior: Posterior, update_ms: float, *, laser:
         covariance = None if covariance is None else by_pose @ covariance @ by_pose.T
     values = [None if covariance is None else float(covariance[i, j]) for i, j in UPPER_TRIANGLE]
     stamp = None if scans.stamps is None else float(scans.stamps[k])
-    numbers = [stamp, *map(float, pose), *values, posterior.free_energy, posterior.state, round(update_ms, 3)]
+    numbers = [stamp, *map(float, pose), *values, posterior.free_energy, posterior.state, round(localised.update_ms, 3)]
     return dict(zip(COLUMNS, numbers, strict=True))
 
 

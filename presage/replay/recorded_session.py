@@ -7,17 +7,20 @@ import json
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from common.errors import UserError
+from pydantic import ValidationError
+
+from common.errors import UserError, first_fault
 from common.messages.definitions import Scan
-from common.messages.topics import ROOT, SCAN
+from common.messages.topics import SCAN
 from common.runtime.config import ServiceSettings
 from common.versions import versions
 from services.controller.settings import ControllerSettings
 from services.estimator.settings import EstimatorSettings
 from services.recorder.reader import Recording
 
+S = TypeVar("S", bound=ServiceSettings)
 SETTINGS: dict[str, type[ServiceSettings]] = {"estimator": EstimatorSettings, "controller": ControllerSettings}
 # Settings of the process such as endpoints, which must not be taken from a recording.
 PROCESS_SETTINGS = frozenset({"config", "print_config", *ServiceSettings.model_fields})
@@ -30,13 +33,6 @@ class RecordedSettings:
 
     values: dict[str, Any]  # by name of the setting
     notes: tuple[str, ...] = ()
-
-
-def robot_of(recording: Recording) -> str:
-    """The robot of the session; of several robots, the one for which the recording was made."""
-    there = dict.fromkeys(key.split("/")[1] for key in recording.counts() if key.startswith(f"{ROOT}/"))
-    named = recording.metadata.get("presage", {}).get("robot", "")
-    return named if named in there or not there else next(iter(there))
 
 
 def recorded_settings(recording: Recording, service: str) -> RecordedSettings | None:
@@ -52,6 +48,18 @@ def recorded_settings(recording: Recording, service: str) -> RecordedSettings | 
     unknown = sorted(values.keys() - known.keys())
     notes = (f"settings of the {service} that this version does not know: {', '.join(unknown)}",) if unknown else ()
     return RecordedSettings({name: value for name, value in values.items() if name in known}, notes)
+
+
+def settings_with(kind: type[S], values: dict[str, Any]) -> S:
+    """Settings of a service with these values, else with its defaults, whatever the environment variables say.
+
+    Raises UserError if a value is invalid.
+    """
+    defaults = {name: field.get_default(call_default_factory=True) for name, field in kind.model_fields.items()}
+    try:
+        return kind(**{**defaults, **values})
+    except ValidationError as error:
+        raise UserError(f"setting of the {kind.service}: {first_fault(error)}") from None
 
 
 def estimator_settings(

@@ -15,7 +15,7 @@ from rich.table import Table
 from common.errors import UserError
 from common.geometry import se2
 from common.geometry.se2 import Array
-from common.messages.definitions import Belief, Truth
+from common.messages.definitions import Belief
 from presage.plotting.style import COLOURS, figure_of, legend_below, log_metres
 
 RECORDED_COLOUR = "#444444"
@@ -28,17 +28,15 @@ class BeliefSeries:
 
     name: str = ""
     stamps: list[int] = field(default_factory=list)
-    logged: list[int] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)
     covariances: list[Array | None] = field(default_factory=list)
     states: list[str] = field(default_factory=list)
     update_ms: list[float] = field(default_factory=list)
 
-    def add(self, belief: Belief, logged_ns: int, update_ms: float) -> None:
+    def add(self, belief: Belief, update_ms: float) -> None:
         """Adds a belief and the time that it took to compute."""
         self.name = self.name or belief.estimator or "recorded"
         self.stamps.append(belief.stamp_ns)
-        self.logged.append(logged_ns)
         self.poses.append(belief.pose.array())
         self.covariances.append(belief.covariance)
         self.states.append(belief.state)
@@ -53,53 +51,37 @@ class BeliefSeries:
             counts[stamp] += 1
         return result
 
-
-@dataclass
-class ComparisonBuilder:
-    """Collects beliefs and truth in a pass over a recording; needs some hundred bytes for each scan."""
-
-    old: BeliefSeries
-    new: BeliefSeries
-    last_scan_ns: int = 0  # time of publication of the last scan
-    # By stamp: (time of logging in ns, pose).
-    _truths: dict[int, list[tuple[int, Array]]] = field(default_factory=lambda: defaultdict(list))
-
-    def add_truth(self, truth: Truth, logged_ns: int) -> None:
-        """Adds a true pose."""
-        self._truths[truth.stamp_ns].append((logged_ns, truth.pose.array()))
-
-    def compare(self) -> Comparison:
-        """Compares the beliefs of the scans that both answered; of all scans if there are no recorded beliefs."""
-        old, new = self.old.index(), self.new.index()
-        both = [key for key in new if key in old] if old else list(new)
-        rows = [new[key] for key in both]
-        stamps = np.array([self.new.stamps[row] for row in rows], np.int64)
-        return Comparison(
-            stamps,
-            self._evaluate(self.old, [old[key] for key in both] if old else []),
-            self._evaluate(self.new, rows),
-            {"recorded": len(self.old.stamps), "new": len(self.new.stamps)},
-        )
-
-    def _evaluate(self, series: BeliefSeries, rows: list[int]) -> EstimatorResult:
-        poses = np.array([series.poses[row] for row in rows]).reshape(-1, 3)
-        true = np.array([self._true_pose(series, row) for row in rows]).reshape(-1, 3)
-        errors = poses - true
+    def result(self, rows: list[int], truth: Array) -> EstimatorResult:
+        """The beliefs ``rows`` (M,) with their errors against ``truth`` (M, 3)."""
+        poses = np.array([self.poses[row] for row in rows]).reshape(-1, 3)
+        errors = poses - truth
         errors[:, 2] = se2.wrap(errors[:, 2])
         return EstimatorResult(
-            series.name,
+            self.name,
             poses,
             errors,
-            [series.covariances[row] for row in rows],
-            np.array([series.states[row] == "tracking" for row in rows], bool),
-            np.array([series.update_ms[row] for row in rows]),
+            [self.covariances[row] for row in rows],
+            np.array([self.states[row] == "tracking" for row in rows], bool),
+            np.array([self.update_ms[row] for row in rows]),
         )
 
-    def _true_pose(self, series: BeliefSeries, row: int) -> Array:
-        truths = self._truths.get(series.stamps[row])
-        if not truths:
-            return np.full(3, np.nan)
-        return min(truths, key=lambda entry: abs(entry[0] - series.logged[row]))[1]
+
+def compare(old: BeliefSeries, new: BeliefSeries, truth: Array | None) -> Comparison:
+    """Compares the beliefs of the scans that both answered; of all scans if there are no recorded beliefs.
+
+    ``truth`` (N, 3) has a row for each new belief.
+    """
+    old_index, new_index = old.index(), new.index()
+    both = [key for key in new_index if key in old_index] if old_index else list(new_index)
+    rows = [new_index[key] for key in both]
+    poses = np.full((len(rows), 3), np.nan) if truth is None else truth[rows].reshape(-1, 3)
+    old_rows = [old_index[key] for key in both] if old_index else []
+    return Comparison(
+        np.array([new.stamps[row] for row in rows], np.int64),
+        old.result(old_rows, poses[: len(old_rows)]),
+        new.result(rows, poses),
+        {"recorded": len(old.stamps), "new": len(new.stamps)},
+    )
 
 
 @dataclass

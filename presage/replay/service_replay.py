@@ -1,31 +1,31 @@
-"""`presage replay --with SERVICE`: runs a service on its recorded inputs and compares.
+"""`presage replay --with SERVICE`: runs services on their recorded inputs, in this process, and compares.
 
-By default the replay runs in lockstep: a scan is sent when the outputs for the one before have come, so that nothing is
-dropped. Only the scans that the live estimator answered are sent, unless `every_scan` is set: a scan that it skipped,
-because a newer one had come or because it was not running yet, had no influence on its beliefs. A recording does not
-contain requests (`presage relocalise`), restarts of the estimator, and what happened before the recording began; these
-are not repeated.
+A scan is sent when the outputs for the one before have been computed, so nothing is dropped. Only the scans that the
+live estimator answered are sent, unless `every_scan` is set: a scan that it skipped, because a newer one had come or
+because it was not running yet, had no influence on its beliefs. A recording does not contain requests
+(`presage relocalise`), restarts of the estimator, and what happened before the recording began; these are not repeated.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import sys
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rich.console import Console
 
-from common.bus.bus import open_bus
 from common.errors import UserError
-from common.messages.topics import SCAN
+from common.log import set_up_logging
+from common.messages.topics import BELIEF, CMD_VEL, SCAN
+from common.runtime.service import Service
 from common.versions import commit
+from presage.recordings.selection import robot_of
 from presage.replay.comparison import COMPARED_FIELDS, TOLERANCE_M, TOLERANCE_RAD, ReplayOutcome
 from presage.replay.feed import ScanFeed
+from presage.replay.in_process import InProcessServices
 from presage.replay.recorded_session import (
     SETTINGS,
     RecordedSettings,
@@ -33,11 +33,13 @@ from presage.replay.recorded_session import (
     estimator_settings,
     other_versions,
     recorded_settings,
-    robot_of,
+    settings_with,
     world_file,
 )
-from presage.session.stack import Stack
 from presage.terminal.output import check_file, write_json
+from services.controller.service import ControllerService
+from services.controller.settings import ControllerSettings
+from services.estimator.service import EstimatorService
 from services.estimator.settings import EstimatorSettings
 from services.recorder.reader import Recording, read_recording
 
@@ -48,7 +50,6 @@ class ServiceReplayOptions:
 
     file: Path
     services: str = "estimator"  # comma-separated
-    rate: float | None = None  # None runs in lockstep
     every_scan: bool = False
 
     def names(self) -> tuple[str, ...]:
@@ -62,21 +63,17 @@ class ServiceReplayOptions:
 def service_replay_command(options: ServiceReplayOptions, json_file: Path | None, console: Console) -> int:
     """Runs the services, prints the comparison, and returns 0 if the results agree, else 1."""
     check_file(json_file, "--json")
+    set_up_logging("error")
     outcome = run_service_replay(options, console)
     for line in describe(outcome):
         console.print(line, highlight=False, soft_wrap=True)
-    about = {
-        "file": str(options.file),
-        "services": options.names(),
-        "rate": options.rate,
-        "every_scan": options.every_scan,
-    }
+    about = {"file": str(options.file), "services": options.names(), "every_scan": options.every_scan}
     write_json(json_file, {**about, **outcome.as_dict(), "commit": commit(), "arguments": sys.argv[1:]})
     return 0 if outcome.good else 1
 
 
 def run_service_replay(options: ServiceReplayOptions, console: Console) -> ReplayOutcome:
-    """Runs the services on the recorded inputs; raises UserError if the recording lacks something or a service ends."""
+    """Runs the services on the recorded inputs; raises UserError if the recording lacks something."""
     names, recording = options.names(), read_recording(options.file)
     if recording.warning:
         print(f"warning: {recording.warning}", file=sys.stderr)
@@ -90,19 +87,12 @@ def run_service_replay(options: ServiceReplayOptions, console: Console) -> Repla
         options = replace(options, every_scan=True)  # a log contains no beliefs that could select scans
     why = why_not_exact(recording, options)
     outcome = ReplayOutcome(not why, why, scans=scans, imported=imported)
-    # Settings must come from the recording only.
-    clean = {name: value for name, value in os.environ.items() if not name.startswith("PRESAGE_")}
-    clean["PRESAGE_LOSSLESS"] = "1"
-    with tempfile.TemporaryDirectory(prefix="presage-") as folder, Stack(robot, quiet=True, environment=clean) as stack:
-        config = configure(recording, names, Path(folder), outcome.notes)
-        stack.start_router()
-        for name in names:
-            stack.start(name, "--config", str(config))
-        with open_bus(stack.link()) as bus:
-            with console.status(f"starting {', '.join(names)} as recorded"):
-                stack.wait_alive(bus)
-            feed = ScanFeed(recording, bus, stack, outcome, rate=options.rate, every_scan=options.every_scan)
-            feed.run(console)
+    with tempfile.TemporaryDirectory(prefix="presage-") as folder:
+        services = build_services(recording, names, Path(folder), outcome.notes)
+        outputs = {BELIEF, CMD_VEL} if "controller" in names else {BELIEF}
+        with console.status(f"starting {', '.join(names)} as recorded"):
+            running = InProcessServices(services, robot)
+        ScanFeed(recording, running, outputs, outcome, every_scan=options.every_scan).run(console)
     outcome.damaged = recording.problem  # only known after reading
     if lost := outcome.numbers.missing:
         outcome.notes.append(
@@ -113,12 +103,12 @@ def run_service_replay(options: ServiceReplayOptions, console: Console) -> Repla
     return outcome
 
 
-def configure(recording: Recording, names: tuple[str, ...], folder: Path, notes: list[str]) -> Path:
-    """Writes the recorded settings of the services, and the files that they need, into ``folder``.
+def build_services(recording: Recording, names: tuple[str, ...], folder: Path, notes: list[str]) -> list[Service]:
+    """The services with their recorded settings; writes the files that they need into ``folder``.
 
-    Returns the file of settings, and adds to ``notes``. Raises UserError if something is missing in the recording.
+    Adds to ``notes``. Raises UserError if something is missing in the recording.
     """
-    sections: dict[str, dict[str, Any]] = {}
+    services: list[Service] = []
     for name in names:
         recorded = recorded_settings(recording, name)
         if recorded is None and "log" in recording.metadata:
@@ -131,27 +121,25 @@ def configure(recording: Recording, names: tuple[str, ...], folder: Path, notes:
                 f"{recording.path}: the {name}'s configuration was not recorded (it may not have been running); start "
                 f"the {name} yourself, and run `presage replay {recording.path} --only scan,odom,goal` beside it"
             )
-        settings = recorded
-        if name == "estimator":
-            imported = "log" in recording.metadata
-            settings = estimator_settings(recording, folder, recorded.values, weights=not imported)
-            notes += settings.notes
-            check_mount(recording, EstimatorSettings(**settings.values))
-        elif recorded.values.get("world") and (world := world_file(recording, folder)) is not None:
-            settings = replace(recorded, values={**recorded.values, "world": str(world)})
+        values: dict[str, Any] = recorded.values
         notes += recorded.notes
-        sections[name] = dict(settings.values)
-    if "controller" in sections:  # the replay may be slower than real time: beliefs must not count as late
-        sections["controller"]["belief_timeout"] = 60.0
-    path = folder / "settings.yaml"
-    path.write_text(yaml.safe_dump(sections), encoding="utf-8")
-    return path
+        if name == "estimator":
+            unpacked = estimator_settings(recording, folder, values, weights="log" not in recording.metadata)
+            notes += unpacked.notes
+            settings = settings_with(EstimatorSettings, unpacked.values)
+            check_mount(recording, settings)
+            services.append(EstimatorService(settings))
+        else:
+            if values.get("world") and (world := world_file(recording, folder)) is not None:
+                values = {**values, "world": str(world)}
+            services.append(ControllerService(settings_with(ControllerSettings, values)))
+    return services
 
 
 def why_not_exact(recording: Recording, options: ServiceReplayOptions) -> str:
     """Why the results need not be identical; "" if they must be."""
-    if options.rate is not None or options.every_scan:
-        return f"{'--every-scan' if options.rate is None else '--rate'} was given"
+    if options.every_scan:
+        return "--every-scan was given"
     estimator = recorded_settings(recording, "estimator")
     if estimator is not None and estimator.values.get("prior") == "command":
         return "with prior command, the order of commands and scans is not reproducible"
@@ -184,7 +172,7 @@ def describe(outcome: ReplayOutcome) -> list[str]:
     if outcome.left_out:
         lines[0] += f"; {outcome.left_out} left out, which the live estimator did not answer (--every-scan sends them)"
     if outcome.unanswered:
-        lines.append(f"[bold]{outcome.unanswered} scans were not answered in time in this replay[/]")
+        lines.append(f"[bold]{outcome.unanswered} scans were not answered in this replay[/]")
     if pairs.compared:
         lines.append(
             f"beliefs: {pairs.equal} of {pairs.compared} identical ({COMPARED_FIELDS}); maximum difference "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -24,9 +24,10 @@ from presage.live.bus_watch import Watch
 from presage.recordings.session_figure import draw_session
 from presage.recordings.session_summary import SessionSummary, summarise
 from presage.session.page import show_page_link, start_page
-from presage.session.preflight import check_services
-from presage.session.stack import Stack, controller_arguments
-from presage.terminal.options import credentials_for
+from presage.session.preflight import plan_session
+from presage.session.running import announced, credentials_for
+from presage.session.stack import Stack
+from presage.terminal.options import arguments
 from presage.terminal.output import check_file, make_folder, write_json
 
 # Measured with the stamps of the messages, so that they do not depend on the pace of the simulation:
@@ -35,23 +36,21 @@ ARRIVAL_TIMEOUT_S = 90.0  # from the goal; 12.5 m take about 15 s
 # Measured with the wall clock:
 FIRST_BELIEF_TIMEOUT_S = 30.0
 WALL_TIMEOUT_S = 120.0  # for localising, and again for the drive
+DEMO_BEAMS = 622  # as in the paper, unless the settings give another number
 
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """Options of `presage demo`."""
+    """Options of `presage demo`; what is None or empty is left to the environment, the settings file and defaults."""
 
-    world: str = "corridor"
+    config: Path | None = None
+    world: str = ""
     goal: tuple[float, float] | None = None
     out: Path = Path("recordings")
-    beams: int = 622
     seed: int = 0
-    pace: str = "realtime"
-    port: int | None = None  # of the router; defaults to a free port
-    estimator: tuple[str, ...] = ()  # command-line arguments of the estimator
-    viewer: bool = True
+    estimator: str = ""
+    quiet: bool = False  # no log lines of the services, no live page
     open_page: bool = False
-    people: int = 0  # number of simulated people
 
 
 def run_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple[Path, bool]:
@@ -59,31 +58,31 @@ def run_demo(demo: DemoOptions, stack: Stack, console: Console) -> tuple[Path, b
 
     Raises UserError if an option is wrong, a service fails, or no belief comes.
     """
-    goal = _choose_goal(demo, load_world(demo.world))
+    plan = plan_session(demo.config, demo.world, "", arguments(seed=demo.seed), arguments(estimator=demo.estimator))
+    goal = _choose_goal(demo, load_world(plan.estimator_settings.world))
     make_folder(demo.out, "--out")
     start_time = datetime.now(timezone.utc).strftime("%Y%m%d-%H%M%S")
-    estimator_args = ["--world", demo.world, *demo.estimator]
-    controller_args = controller_arguments(demo.world, demo.estimator, lockstep=demo.pace == "lockstep")
-    simulator_args = ["--world", demo.world, "--beams", str(demo.beams), "--seed", str(demo.seed)]
-    simulator_args += ["--pace", demo.pace, "--people", str(demo.people)]
-    check_services(demo.world, estimator_args, controller_args, simulator_args)
+    simulator = list(plan.simulator)
+    if plan.simulator_settings.beams is None:
+        simulator += arguments(beams=DEMO_BEAMS)
     # The random part keeps names unique if several demos record into the same folder in the same second.
     recording = demo.out / f"presage-{stack.robot}-{start_time}-{secrets.token_hex(3)}.mcap"
     stack.start_router()
     with open_bus(stack.link()) as bus:
         watch = Watch(bus, TRUTH, BELIEF, STATUS, HEALTH)
-        page = demo.viewer and start_page(stack, demo.out, console)
-        stack.start("recorder", "--directory", str(demo.out), "--file", recording.name)
-        stack.start("controller", *controller_args)
-        stack.start("estimator", *estimator_args)
-        if demo.pace != "realtime":  # simulated time must not pass before the other services run
-            simulator_args += ["--wait-for", "estimator,controller,recorder"]
-        stack.start("simulator", *simulator_args)
+        page = not demo.quiet and start_page(stack, [*plan.config, *arguments(recordings=demo.out)], console)
+        stack.start("recorder", *plan.config, *arguments(directory=demo.out, file=recording.name))
+        stack.start("controller", *plan.controller)
+        stack.start("estimator", *plan.estimator)
+        if plan.simulator_settings.pace != "realtime":  # simulated time must not pass before the other services run
+            simulator += arguments(wait_for="estimator,controller,recorder")
+        stack.start("simulator", *simulator)
         with console.status("starting simulator, estimator, controller, recorder"):
             stack.wait_alive(bus)
         if page:
             show_page_link(stack, console, open_it=demo.open_page)
-        reached = _localise(watch, stack, console) and _navigate(bus, watch, stack, goal, console)
+        with announced(stack.endpoint, [stack.robot], stack.security):
+            reached = _localise(watch, stack, console) and _navigate(bus, watch, stack, goal, console)
         stack.check()
         for name in ("controller", "estimator", "simulator"):
             stack.stop(name)
@@ -107,10 +106,8 @@ def _choose_goal(demo: DemoOptions, world: World) -> tuple[float, float]:
         aligned = free[np.abs(free[:, 1] - start[1]) < 0.1 * (y1 - y0)]  # preset paper drives in a straight line
         farthest = aligned[np.argmax(np.abs(aligned[:, 0] - start[0]))] if len(aligned) else free[0]
         return (15.5, float(start[1])) if world.name == "corridor" else (float(farthest[0]), float(farthest[1]))
-    if (clearance := float(world.clearance(demo.goal)[0])) < robot.radius:
-        raise UserError(
-            f"goal {demo.goal}: {clearance:.2f} m from a wall of {world.name!r}, the robot's radius is {robot.radius} m"
-        )
+    if (error := world.placement_error(np.array(demo.goal), robot.radius)) is not None:
+        raise UserError(f"goal {error} (--goal)")
     return demo.goal
 
 
@@ -136,7 +133,8 @@ def _localise(watch: Watch, stack: Stack, console: Console) -> bool:
                     if isinstance(truth, Truth)
                     else "truth unknown"
                 )
-                line.update(f"localising: scan {belief.seq}, F = {belief.free_energy:.0f} nats, {error}")
+                energy = "" if belief.free_energy is None else f"F = {belief.free_energy:.0f} nats, "
+                line.update(f"localising: scan {belief.seq}, {energy}{error}")
                 if belief.state == "tracking":
                     console.print(f"localised after {belief.seq + 1} scans, {error}")
                     return True
@@ -185,7 +183,8 @@ def _navigate(bus: Bus, watch: Watch, stack: Stack, place: tuple[float, float], 
             if status.state == "reached":
                 break
             passed = (status.stamp_ns - stamp) * 1e-9
-            if status.refused or (status.state == "lost" and passed > 5 and "standing" not in status.reason):
+            no_belief = status.state == "lost" and status.distance is None
+            if status.refused or (no_belief and passed > 5):
                 console.print(f"[bold]{status.state}: {status.reason}[/]")
                 return False
             if passed > ARRIVAL_TIMEOUT_S or time.monotonic() - start_s > WALL_TIMEOUT_S:
@@ -205,13 +204,11 @@ def show(summary: SessionSummary, recording: Path, figure: Path, console: Consol
     console.print(table)
 
 
-def demo_command(demo: DemoOptions, json_file: Path | None, *, quiet: bool) -> int:
+def demo_command(demo: DemoOptions, json_file: Path | None) -> int:
     """Runs the demo, prints its summary and draws its figure; returns status 1 if the goal was not reached."""
     console = Console(width=None if sys.stdout.isatty() else 150)
     check_file(json_file, "--json")
-    if quiet:
-        demo = replace(demo, viewer=False)
-    with Stack("robot", demo.port, quiet=quiet, security=credentials_for("robot")) as stack:
+    with Stack("robot", quiet=demo.quiet, security=credentials_for("robot")) as stack:
         recording, reached = run_demo(demo, stack, console)
     figure = recording.with_suffix(".png")
     with console.status("drawing"):

@@ -5,21 +5,21 @@ from __future__ import annotations
 import os
 import sys
 import webbrowser
+from collections.abc import Sequence
 from contextlib import suppress
 from importlib.util import find_spec
-from pathlib import Path
 
 from rich.console import Console
 
 from presage.session.stack import Stack
 
 
-def start_page(stack: Stack, recordings: Path, console: Console) -> bool:
-    """Starts the viewer for a folder of recordings; prints a note and returns False if its packages are missing."""
+def start_page(stack: Stack, arguments: Sequence[str], console: Console) -> bool:
+    """Starts the viewer with these arguments; prints a note and returns False if its packages are missing."""
     if any(find_spec(name) is None for name in ("starlette", "uvicorn", "websockets")):
         console.print("no live page: its packages are not installed; run pip install 'presage\\[viewer]'")
         return False
-    stack.start("viewer", "--recordings", str(recordings))
+    stack.start("viewer", *arguments)
     return True
 
 

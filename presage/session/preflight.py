@@ -1,36 +1,76 @@
-"""Checks that can be made before a process is started."""
+"""The settings of a session's services, checked before a process is started."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from common.errors import UserError
 from common.geometry.world import load_world
 from common.runtime.config import load_settings
+from presage.terminal.options import arguments
 from services.controller.settings import ControllerSettings
 from services.estimator.factory import check
 from services.estimator.service import choice_of
 from services.estimator.settings import EstimatorSettings
 from services.simulator.settings import SimulatorSettings
 
+LOCKSTEP_BELIEF_TIMEOUT_S = 20.0  # in lockstep time waits for the slowest service
 
-def check_services(
-    world: str, estimator: Sequence[str], controller: Sequence[str], simulator: Sequence[str] | None = None
-) -> None:
-    """Raises the UserError that a service would raise for its arguments and this process's environment.
 
-    ``simulator`` is None if no simulator is started. Models are read, but nothing is compiled and no bus is used.
+@dataclass(frozen=True)
+class Plan:
+    """Command-line arguments of the services of a session, and the settings that follow from them."""
+
+    config: tuple[str, ...]  # argument of every service
+    simulator: tuple[str, ...]
+    estimator: tuple[str, ...]
+    controller: tuple[str, ...]
+    simulator_settings: SimulatorSettings
+    estimator_settings: EstimatorSettings
+
+
+def plan_session(
+    config: Path | None,
+    world: str,
+    drive: str,
+    simulator: Sequence[str] = (),
+    estimator: Sequence[str] = (),
+    *,
+    simulated: bool = True,
+) -> Plan:
+    """Checks options, environment and settings file as the services would, so that a mistake is reported once.
+
+    Models are read, but nothing is compiled and no bus is used. Raises UserError for a mistake.
     """
-    loaded_world = load_world(world)
-    estimator_settings = load_settings(EstimatorSettings, list(estimator))
-    load_settings(ControllerSettings, list(controller)).check()
-    if simulator is not None:
-        settings = load_settings(SimulatorSettings, list(simulator))
-        settings.build_scanner()
-        radius, start = settings.build_robot().radius, settings.start_pose()
+    common = arguments(config=config)
+    shared = [*common, *arguments(world=world)]
+    simulator_args = [*shared, *arguments(drive=drive), *simulator]
+    estimator_args = [*shared, *estimator]
+    controller_args = [*shared, *arguments(drive=drive)]
+    simulator_settings = load_settings(SimulatorSettings, simulator_args)
+    estimator_settings = load_settings(EstimatorSettings, estimator_args)
+    if estimator_settings.estimator == "paper":  # it localises at one heading only, which its controller keeps
+        controller_args += arguments(preset="paper")
+    if simulator_settings.pace == "lockstep":
+        controller_args += arguments(belief_timeout=LOCKSTEP_BELIEF_TIMEOUT_S)
+    load_settings(ControllerSettings, controller_args).check()
+    loaded_world = load_world(estimator_settings.world)
+    if simulated:
+        simulator_settings.build_scanner()
+        radius, start = simulator_settings.build_robot().radius, simulator_settings.start_pose()
         pose = loaded_world.start_pose(radius) if start is None else np.array(start)
-        if (why := loaded_world.why_no_room(pose, radius)) is not None:
-            raise UserError(f"start {why} (--start, --radius)")
+        if (error := loaded_world.placement_error(pose, radius)) is not None:
+            raise UserError(f"start {error} (settings start and radius)")
     check(choice_of(estimator_settings), loaded_world)
+    return Plan(
+        tuple(common),
+        tuple(simulator_args),
+        tuple(estimator_args),
+        tuple(controller_args),
+        simulator_settings,
+        estimator_settings,
+    )

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from types import FrameType, TracebackType
@@ -46,19 +46,6 @@ class Process:
         """Shell command that starts the same service again."""
         variables = f"PRESAGE_CONNECT={stack.endpoint} PRESAGE_ROBOT={stack.robot} "
         return ("" if self.name == "router" else variables) + shlex.join(["python", *self.args])
-
-
-def controller_arguments(
-    world: str, estimator: Sequence[str], limits: Sequence[str] = ("--drive", "holonomic"), *, lockstep: bool = False
-) -> list[str]:
-    """Command-line arguments of the controller that goes with an estimator with the arguments ``estimator``.
-
-    The paper's estimator localises at one heading only and needs the paper's controller.
-    """
-    arguments = ["--world", world, *limits]
-    if "paper" in estimator:
-        arguments += ["--preset", "paper"]
-    return [*arguments, *(["--belief-timeout", "20"] if lockstep else [])]
 
 
 class Stack:
@@ -272,15 +259,18 @@ def _end(process: Process) -> int:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Makes SIGTERM and SIGHUP raise KeyboardInterrupt in the block, so that it cleans up as after Ctrl-C.
+    """Makes SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt in the block, so that it cleans up as after Ctrl-C.
 
-    A signal that is ignored, as SIGHUP is under nohup, stays ignored.
+    A script's shell starts background commands with SIGINT ignored, which is undone here. SIGHUP stays ignored where
+    it is, as under nohup.
     """
 
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    handled = [s for s in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(s) != signal.SIG_IGN]
+    handled = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        handled.append(signal.SIGHUP)
     previous = {s: signal.signal(s, interrupt) for s in handled}
     try:
         yield

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from rich.console import Console
@@ -10,83 +11,89 @@ from rich.console import Console
 from common.bus.bus import open_bus
 from common.errors import UserError
 from presage.session.page import show_page_link, start_page
-from presage.session.preflight import check_services
-from presage.session.stack import Stack, controller_arguments
-from presage.terminal.options import credentials_for
+from presage.session.preflight import Plan, plan_session
+from presage.session.running import announced, credentials_for
+from presage.session.stack import Stack
+from presage.terminal.options import arguments
 
-RECORDINGS = Path("recordings")  # folder whose recordings the live page shows, and into which it records
+
+@dataclass(frozen=True)
+class UpOptions:
+    """Options of `presage up`; what is None or empty is left to the environment, the settings file and defaults."""
+
+    config: Path | None = None
+    world: str = ""
+    drive: str = ""
+    simulator: list[str] = field(default_factory=list)  # further arguments of the simulator
+    estimator: list[str] = field(default_factory=list)  # further arguments of the estimator
+    robots: int = 1
+    record: Path | None = None
+    port: int = 7447  # 0 for a free one
+    without: frozenset[str] = frozenset()  # services that are not started
+    open_page: bool = False
 
 
-def run_up(
-    *,
-    world: str,
-    scanner: tuple[str, ...],
-    limits: tuple[str, ...],
-    pace: str,
-    seed: int,
-    record: Path | None,
-    robot: str,
-    simulated: bool = True,
-    port: int,
-    console: Console,
-    estimator: tuple[str, ...] = (),
-    viewer: bool = True,
-    open_page: bool = False,
-    people: tuple[str, ...] = (),
-    start: str = "",
-    robots: int = 1,
-) -> None:
+def run_up(options: UpOptions, console: Console) -> None:
     """Starts all services, waits until they are alive, prints hints, and runs until Ctrl-C.
 
     A service that ends is reported and not restarted. Raises UserError when all have ended.
     """
-    names = [robot] if robots == 1 else [f"{robot}-{k}" for k in range(1, robots + 1)]
-    if robots > 1 and record is not None:
-        raise UserError(
-            f"--record records one robot only: leave it out, and run `presage record --robot {names[0]}` beside it"
-        )
-    if not simulated and (robots > 1 or pace != "realtime"):
-        raise UserError("--no-simulator allows one robot in real time only: leave out --robots and --pace")
-    lockstep = pace == "lockstep"
-    estimator_args = ["--world", world, *estimator]
-    if robots > 1:
-        estimator_args += ["--robots", ",".join(names)]
-    controller_args = controller_arguments(world, estimator, limits, lockstep=lockstep)
-    simulator_args = ["--world", world, *scanner, *limits, "--pace", pace, *people, "--start", start]
-    # Without this check, each child would report the same mistake in its own log.
-    check_services(
-        world, estimator_args, controller_args, [*simulator_args, "--seed", str(seed)] if simulated else None
+    simulated = "simulator" not in options.without
+    plan = plan_session(
+        options.config, options.world, options.drive, options.simulator, options.estimator, simulated=simulated
     )
-    with Stack(names[0], port or None, security=credentials_for(names[0])) as stack:
+    robot, pace = plan.estimator_settings.robot, plan.simulator_settings.pace
+    robots = [robot] if options.robots == 1 else [f"{robot}-{k}" for k in range(1, options.robots + 1)]
+    if options.robots > 1 and options.record is not None:
+        raise UserError(
+            f"--record records one robot only: leave it out, and run `presage record --robot {robots[0]}` beside it"
+        )
+    if not simulated and (options.robots > 1 or pace != "realtime"):
+        raise UserError("--no-simulator allows one robot in real time only: leave out --robots, and the setting pace")
+    with Stack(robots[0], options.port or None, security=credentials_for(robots[0])) as stack:
         stack.start_router()
-        page = viewer and start_page(stack, record or RECORDINGS, console)
-        if (page or record is not None) and robots == 1:  # an idle recorder starts from a button on the page
-            stack.start("recorder", "--directory", str(record or RECORDINGS), *(["--idle"] if record is None else []))
-        stack.start("estimator", *estimator_args)
-        stack.start("controller", *controller_args)
-        awaited = ",".join(sorted(set(stack.processes) - {"router", "viewer"}))
-        simulator_args += ["--wait-for", awaited] if pace != "realtime" else []
-        if simulated:
-            stack.start("simulator", *simulator_args, "--seed", str(seed))
-        for k, name in enumerate(names[1:], 1):  # each further robot has its own simulation
-            stack.start_instance(f"controller-{k + 1}", "controller", name, *controller_args)
-            stack.start_instance(f"simulator-{k + 1}", "simulator", name, *simulator_args, "--seed", str(seed + k))
+        viewer = [*plan.config, *arguments(recordings=options.record)]
+        page = "viewer" not in options.without and start_page(stack, viewer, console)
+        _start_services(stack, options, plan, robots, page=page)
         with open_bus(stack.link()) as bus:
             stack.wait_alive(bus)
         if page:
-            show_page_link(stack, console, open_it=open_page)
-        options = "" if port == 7447 else f" --connect {stack.endpoint}"
-        options += f" --security {stack.security.folder.parent}" if stack.security is not None else ""
-        options += "" if names == ["robot"] else f" --robot {names[0]}"
-        if robots > 1:
-            console.print(f"robots: {', '.join(names)}, with one estimator for all", soft_wrap=True)
-        goal = "15 1.5" if world == "corridor" else "X Y"
-        console.print(
-            f"[bold green]all alive[/] at {stack.endpoint}. In another terminal: presage goal {goal} --wait{options} | "
-            f"presage echo belief{options} | presage hz{options}. Ctrl-C ends all services.",
-            soft_wrap=True,
-        )
-        _watch(stack, console)
+            show_page_link(stack, console, open_it=options.open_page)
+        with announced(stack.endpoint, robots, stack.security):
+            _show_hints(stack, plan.estimator_settings.world, robots, console)
+            _watch(stack, console)
+
+
+def _start_services(stack: Stack, options: UpOptions, plan: Plan, robots: list[str], *, page: bool) -> None:
+    record, without = options.record, options.without
+    if (page or record is not None) and len(robots) == 1:  # an idle recorder starts from a button on the page
+        stack.start("recorder", *plan.config, *arguments(directory=record, idle=record is None))
+    if "estimator" not in without:
+        stack.start("estimator", *plan.estimator, *arguments(robots=",".join(robots) if len(robots) > 1 else ""))
+    if "controller" not in without:
+        stack.start("controller", *plan.controller)
+    simulator = list(plan.simulator)
+    if plan.simulator_settings.pace != "realtime":
+        simulator += arguments(wait_for=",".join(sorted(set(stack.processes) - {"router", "viewer"})))
+    if "simulator" not in without:
+        stack.start("simulator", *simulator)
+    for k, name in enumerate(robots[1:], 1):  # each further robot has its own simulation
+        if "controller" not in without:
+            stack.start_instance(f"controller-{k + 1}", "controller", name, *plan.controller)
+        seed = arguments(seed=plan.simulator_settings.seed + k)
+        stack.start_instance(f"simulator-{k + 1}", "simulator", name, *simulator, *seed)
+
+
+def _show_hints(stack: Stack, world: str, robots: list[str], console: Console) -> None:
+    if len(robots) > 1:
+        console.print(f"robots: {', '.join(robots)}, with one estimator for all", soft_wrap=True)
+    goal = "15 1.5" if world == "corridor" else "X Y"
+    robot = "" if len(robots) == 1 else f" --robot {robots[0]}"
+    console.print(
+        f"[bold green]all alive[/] at {stack.endpoint}. In another terminal: presage goal {goal} --wait{robot} | "
+        f"presage echo belief{robot} | presage hz{robot}. Ctrl-C ends all services.",
+        soft_wrap=True,
+    )
 
 
 def _watch(stack: Stack, console: Console) -> None:

@@ -49,12 +49,12 @@ class Graph:
         hashes = {each.hash != NO_HASH for each in endpoints}
         if hashes != {not self._names.hashes}:  # no endpoints, matching ones, or a mixture
             return ""
-        nodes = _nodes(endpoints)
+        nodes, consequence = _nodes(endpoints), "or the robot will not receive what the bridge sends"
         if self._names.hashes:
-            return f"the types of {nodes} have no hashes, as Humble's: --distro humble, or it will not hear us"
-        return f"the types of {nodes} have hashes, as from Iron on: --distro jazzy, or it will not hear us"
+            return f"the message types of {nodes} have no hashes, as in Humble; set --distro humble, {consequence}"
+        return f"the message types of {nodes} have hashes, as since Iron; set --distro jazzy, {consequence}"
 
-    def why_silent(self, topic: str, kind: str, option: str, *, no_endpoints: str) -> str:
+    def explain_silence(self, topic: str, kind: str, option: str, *, no_endpoints: str) -> str:
         """Explains why no message of type ``kind`` arrives on ``topic``.
 
         ``option`` is the command-line option that selects another topic. Returns ``no_endpoints`` if there are no
@@ -72,18 +72,19 @@ class Graph:
         foreign = [each for each in of_kind if each.hash not in ("", NO_HASH, type_hash(kind))]
         if foreign:
             return (
-                f"{_nodes(foreign)} publishes it with the type hash {foreign[0].hash}, the {kind} known here has "
-                f"{type_hash(kind)}: another definition of the type"
+                f"the {kind} of {_nodes(foreign)} has the type hash {foreign[0].hash}, not {type_hash(kind)}: "
+                "the robot uses another definition of the type"
             )
         if of_kind:
-            return f"{_nodes(of_kind)} publishes it, but nothing arrives: is it paused, or cut off from the router?"
+            return (
+                f"{_nodes(of_kind)} publishes it, but nothing arrives: is it paused, or disconnected from the router?"
+            )
         if on_topic:
-            return f"it is of type {on_topic[0].kind}, not {kind}"
+            return f"its type is {on_topic[0].kind}, not {kind}"
         if others := sorted({each.topic for each in publishers if each.kind == kind}):
-            return f"nobody publishes it; {kind} is on {join_names(others)}: {option}"
-        return (
-            f"nobody publishes it, nor any other {kind}; there are {join_names(sorted({e.topic for e in publishers}))}"
-        )
+            return f"no node publishes it; set {option}: {kind} is published on {join_names(others)}"
+        topics = join_names(sorted({e.topic for e in publishers})) or "none"
+        return f"no node publishes {kind}; the published topics are: {topics}"
 
     def topics_of(self, kind: str) -> list[str]:
         """Names of the topics on which a type is published."""
@@ -102,7 +103,7 @@ class Graph:
 
 
 def _nodes(endpoints: list[Endpoint]) -> str:
-    return join_names(sorted({each.node for each in endpoints} - {""})) or "somebody"
+    return join_names(sorted({each.node for each in endpoints} - {""})) or "a node"
 
 
 def join_names(names: list[str]) -> str:

@@ -36,7 +36,18 @@ from services.bridge_ros2.ros_types import (
     CdrError,
     decode,
 )
-from services.bridge_ros2.settings import BridgeRos2Settings
+from services.bridge_ros2.settings import (
+    GOAL_TOPIC,
+    HYPOTHESES_TOPIC,
+    INITIAL_POSE_TOPIC,
+    MAP_FRAME,
+    MAP_TOPIC,
+    NODE,
+    POSE_TOPIC,
+    TF_TOPIC,
+    TRANSFORM_TOLERANCE_S,
+    BridgeRos2Settings,
+)
 
 MAP_PERIOD_S = 10.0  # the map is repeated for subscribers that missed it, as SLAM nodes do
 CHECK_PERIOD_S = 1.0  # between checks of the health, and between attempts to reach the router
@@ -58,7 +69,7 @@ class BridgeRos2Service(Service):
         self.motion = MountAndOdometry(settings.base_frame, settings.odom_frame, settings.build_mount())
         self.gate = CommandGate(settings.build_robot(), obstacle_stop=settings.obstacle_stop)
         self.self_filter = settings.build_self_filter()
-        self.note = f"waits for the zenoh router at {settings.ros_connect}"
+        self.note, self.idle = f"waiting for the zenoh router at {settings.ros_connect}", True
         self._ros: RosSession | None = None
         self._publishers: dict[str, RosPublisher] = {}  # by the option's topic name
         # Subscribed ROS topics by the name of their row: message type and handler.
@@ -69,7 +80,7 @@ class BridgeRos2Service(Service):
         self._clock: tuple[int, float] | None = None  # the last scan's stamp, and its monotonic reception time
         self._warned_waiting = False
         self._warned_unconnected_frame = False
-        self._reckoned = False  # the last scan came with odometry
+        self._with_odometry = False  # the last scan had odometry for its stamp
         self._map: Any = None  # the map message
         self._map_at = 0.0  # when the map is published next
         self._problem = ""  # why the last scan could not be used
@@ -78,7 +89,7 @@ class BridgeRos2Service(Service):
         """Checks the settings and declares publishers, because the first messages after a declaration may be lost."""
         self.options.check()
         if self.options.publish_map:
-            self._map = to_ros.map_message(rasterise(load_world(self.options.world)), self.options.map_frame)
+            self._map = to_ros.map_message(rasterise(load_world(self.options.world)), MAP_FRAME)
         for topic in (ODOM, SCAN):
             self.loop.bus.publisher(topic, self.name)
 
@@ -97,24 +108,24 @@ class BridgeRos2Service(Service):
                 self.log.warning(self.note)
             self._warned_waiting = True
             return
-        ros = self._ros = RosSession(session, options.names(), options.namespace, options.node, self.graph)
+        ros = self._ros = RosSession(session, options.names(), options.namespace, NODE, self.graph)
         self._began = time.monotonic()
         subscribed: list[tuple[str, str, Qos, Callable[[Any], None]]] = [
-            (options.tf_topic + "_static", TF_MESSAGE, TF_STATIC, self._on_tf),
-            (options.tf_topic, TF_MESSAGE, TF, self._on_tf),
+            (TF_TOPIC + "_static", TF_MESSAGE, TF_STATIC, self._on_tf),
+            (TF_TOPIC, TF_MESSAGE, TF, self._on_tf),
             (options.odom_topic, ODOMETRY, Qos(), self._on_odometry),
             (options.scan_topic, LASER_SCAN, SENSOR, self._on_scan),
-            (options.initial_pose_topic, POSE_WITH_COVARIANCE, Qos(), self._on_initial_pose),
+            (INITIAL_POSE_TOPIC, POSE_WITH_COVARIANCE, Qos(), self._on_initial_pose),
         ]
         published = [
-            (options.pose_topic, POSE_WITH_COVARIANCE, LATCHED),
-            (options.hypotheses_topic, POSE_ARRAY, SENSOR),
-            (options.tf_topic if options.tf != "none" else "", TF_MESSAGE, TF),
+            (POSE_TOPIC, POSE_WITH_COVARIANCE, LATCHED),
+            (HYPOTHESES_TOPIC, POSE_ARRAY, SENSOR),
+            (TF_TOPIC if options.tf != "none" else "", TF_MESSAGE, TF),
         ]
         if self._map is not None:
-            published.append((options.map_topic, OCCUPANCY_GRID, LATCHED))
+            published.append((MAP_TOPIC, OCCUPANCY_GRID, LATCHED))
         if options.commands:
-            subscribed.append((options.goal_topic, POSE_STAMPED, Qos(), self._on_goal))
+            subscribed.append((GOAL_TOPIC, POSE_STAMPED, Qos(), self._on_goal))
             published.append((options.cmd_topic, TWIST_STAMPED if options.stamped else TWIST, LATEST))
         self._publishers = {
             name: ros.publisher(options.topic(name), kind, qos) for name, kind, qos in published if name
@@ -152,20 +163,22 @@ class BridgeRos2Service(Service):
             self._connect()
             self._check_at = time.monotonic() + CHECK_PERIOD_S
         before = self.note
+        linked = self._ros is not None and self._ros.linked()
+        self.idle = not linked
         if self._ros is not None:
             self._publish_map(now)
-            static = self.options.topic(self.options.tf_topic + "_static")
+            static = self.options.topic(TF_TOPIC + "_static")
             if self.motion.mount() is None:
-                self._ros.fetch(_row(self.options.tf_topic + "_static"), static, self.loop.inbox)
+                self._ros.fetch(_row(TF_TOPIC + "_static"), static, self.loop.inbox)
             since = self._scan_at if self._scan_at is not None else self._began
             self.note = diagnose(
                 self.options,
                 self.graph,
                 self._problem,
-                linked=self._ros.linked(),
-                quiet=now - since,
-                heard=self._scan_at is not None,
-                reckoned=self._reckoned,
+                linked=linked,
+                scan_age=now - since,
+                received=self._scan_at is not None,
+                with_odometry=self._with_odometry,
             )
             self._warn_about_unconnected_frame(now)
         if self.note and self.note != before:
@@ -220,7 +233,7 @@ class BridgeRos2Service(Service):
         scan = scan_of(message, mount, stamp_ns)
         self._clock = (stamp_ns, now)
         odometry = self.motion.at(stamp_ns)
-        self._reckoned = odometry is not None
+        self._with_odometry = odometry is not None
         if odometry is not None:
             self.publish(ODOM, odom_of(odometry))
         else:
@@ -230,12 +243,12 @@ class BridgeRos2Service(Service):
         self._scan_at, self._problem = now, ""
 
     def _on_initial_pose(self, message: Any) -> None:
-        pose = pose_of(message, self.options.map_frame)
+        pose = pose_of(message, MAP_FRAME)
         self.log.info("initial pose from ROS", x=pose.x, y=pose.y, yaw=pose.yaw)
         self.request(LOCALISE, LocaliseRequest(pose=pose))
 
     def _on_goal(self, message: Any) -> None:
-        pose = pose_of(message, self.options.map_frame)
+        pose = pose_of(message, MAP_FRAME)
         self.log.info("goal from ROS", x=pose.x, y=pose.y, yaw=pose.yaw)
         stamp_ns = self._clock[0] if self._clock else 0
         self.publish(GOAL, Goal(stamp_ns=stamp_ns, pose=pose, yaw_tolerance=YAW_TOLERANCE_RAD))
@@ -243,7 +256,7 @@ class BridgeRos2Service(Service):
     def on_reply(self, query: Query, number: int, reply: Reply) -> None:  # noqa: ARG002
         """Logs if the estimator did not accept the initial pose."""
         if not reply.ok:
-            self.log.warning("the estimator did not accept the initial pose", why=reply.reason)
+            self.log.warning("the estimator did not accept the initial pose", reason=reply.reason)
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
         """Publishes a belief or a command to ROS."""
@@ -257,17 +270,16 @@ class BridgeRos2Service(Service):
 
     def _publish_belief(self, belief: Belief) -> None:
         """Publishes hypotheses and, while the robot is tracked, pose and transform."""
-        options = self.options
-        if (hypotheses := self._publishers.get(options.hypotheses_topic)) is not None:
-            hypotheses.put(to_ros.hypotheses_message(belief, options.map_frame))
+        if (hypotheses := self._publishers.get(HYPOTHESES_TOPIC)) is not None:
+            hypotheses.put(to_ros.hypotheses_message(belief, MAP_FRAME))
         if not to_ros.is_publishable(belief):
             self.counters["beliefs_not_said"] += 1
             return
-        if (pose := self._publishers.get(options.pose_topic)) is not None:
-            message = to_ros.pose_message(belief, options.map_frame)
+        if (pose := self._publishers.get(POSE_TOPIC)) is not None:
+            message = to_ros.pose_message(belief, MAP_FRAME)
             if message is not None:
                 pose.put(message)
-        if (tf := self._publishers.get(options.tf_topic)) is not None:
+        if (tf := self._publishers.get(TF_TOPIC)) is not None:
             self._publish_transform(belief, tf)
 
     def _publish_transform(self, belief: Belief, tf: RosPublisher) -> None:
@@ -278,15 +290,15 @@ class BridgeRos2Service(Service):
                 self.counters["transforms_without_odometry"] += 1
                 return
             odometry_pose, child = odometry.pose, options.odom_frame
-        stamp_ns = belief.stamp_ns + round(options.transform_tolerance * 1e9)
+        stamp_ns = belief.stamp_ns + round(TRANSFORM_TOLERANCE_S * 1e9)
         pose = to_ros.correction(belief.pose, odometry_pose)
-        tf.put(to_ros.transform_message(pose, stamp_ns, options.map_frame, child))
+        tf.put(to_ros.transform_message(pose, stamp_ns, MAP_FRAME, child))
 
     def _publish_map(self, now: float) -> None:
         """Publishes the map if it is due. It is latched, as map_server's, and repeated in case that fails."""
         if self._map is not None and now >= self._map_at:
             self._map_at = now + MAP_PERIOD_S
-            self._publishers[self.options.map_topic].put(self._map)
+            self._publishers[MAP_TOPIC].put(self._map)
 
     def _drive(self, twist: Array | None) -> None:
         """Publishes a velocity, stamped with the robot's clock. Does nothing if ``twist`` is None."""

@@ -18,6 +18,17 @@ ENDPOINT = r"[a-z]+/[^\s,]+:(6553[0-5]|655[0-2]\d|65[0-4]\d\d|6[0-4]\d{3}|[1-5]\
 ENDPOINTS = rf"^{ENDPOINT}(,{ENDPOINT})*$"
 FRAME = r"^[A-Za-z0-9_./-]{1,64}$"
 
+# Names that rviz, nav2 and tf2 use; they are in the namespace like the others.
+NODE = "presage"
+MAP_FRAME = "map"
+TF_TOPIC = "tf"  # fixed transforms are on tf_static
+POSE_TOPIC = "amcl_pose"
+HYPOTHESES_TOPIC = "pose_hypotheses"
+INITIAL_POSE_TOPIC = "initialpose"
+GOAL_TOPIC = "goal_pose"
+MAP_TOPIC = "map"
+TRANSFORM_TOLERANCE_S = 1.0  # by which the transform is stamped ahead, as in AMCL
+
 
 class BridgeRos2Settings(SeenRobotSettings):
     """Bridge to ROS 2: a robot, or Gazebo, replaces the simulator, and presage replaces AMCL. ROS is not needed here.
@@ -44,7 +55,6 @@ class BridgeRos2Settings(SeenRobotSettings):
             "domain",
             "distro",
             "flavor",
-            "node",
             "mount",
             "upside_down",
             "stamped",
@@ -78,13 +88,6 @@ class BridgeRos2Settings(SeenRobotSettings):
     namespace: Annotated[
         str, Field(pattern=rf"^$|^{NAME}/?$", description="namespace of relative topic names, such as robot1")
     ] = ""
-    node: Annotated[
-        str,
-        Field(
-            pattern=r"^[A-Za-z_][A-Za-z0-9_]*$",
-            description="name of the bridge's node in the ROS graph, of letters, digits and _",
-        ),
-    ] = "presage"
 
     scan_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="topic with scans (sensor_msgs/LaserScan)")] = (
         "scan"
@@ -93,28 +96,8 @@ class BridgeRos2Settings(SeenRobotSettings):
         str,
         Field(pattern=TOPIC, description="topic with odometry (nav_msgs/Odometry); empty to use odometry from tf"),
     ] = "odom"
-    tf_topic: Annotated[
-        str,
-        Field(
-            pattern=rf"^{NAME}$",
-            description="topic with transforms (tf2_msgs/TFMessage); fixed ones are on this name with _static",
-        ),
-    ] = "tf"
     cmd_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="topic for velocity commands")] = "cmd_vel"
     stamped: Annotated[bool, Field(description="send commands as TwistStamped instead of Twist")] = False
-    pose_topic: Annotated[
-        str,
-        Field(pattern=TOPIC, description="topic for the pose (PoseWithCovarianceStamped); empty to publish none"),
-    ] = "amcl_pose"
-    hypotheses_topic: Annotated[
-        str, Field(pattern=TOPIC, description="topic for all hypotheses (PoseArray); empty to publish none")
-    ] = "pose_hypotheses"
-    initial_pose_topic: Annotated[
-        str, Field(pattern=TOPIC, description="topic with initial poses (rviz's 2D Pose Estimate); empty for none")
-    ] = "initialpose"
-    goal_topic: Annotated[
-        str, Field(pattern=TOPIC, description="topic with goals (rviz's 2D Goal Pose); empty for none")
-    ] = "goal_pose"
     commands: Annotated[
         bool,
         Field(description="pass velocity commands and goals on; use --no-commands if nav2 or another program drives"),
@@ -123,7 +106,6 @@ class BridgeRos2Settings(SeenRobotSettings):
     publish_map: Annotated[
         bool, Field(description="publish the world as OccupancyGrid; only if no map_server is running")
     ] = False
-    map_topic: Annotated[str, Field(pattern=rf"^{NAME}$", description="topic for the map, with --publish-map")] = "map"
     world: Annotated[
         str,
         Field(
@@ -132,7 +114,6 @@ class BridgeRos2Settings(SeenRobotSettings):
         ),
     ] = "corridor"
 
-    map_frame: Annotated[str, Field(pattern=FRAME, description="frame of the map")] = "map"
     odom_frame: Annotated[str, Field(pattern=FRAME, description="frame of the odometry")] = "odom"
     base_frame: Annotated[str, Field(pattern=FRAME, description="frame of the robot's centre")] = "base_link"
     tf: Annotated[
@@ -142,9 +123,6 @@ class BridgeRos2Settings(SeenRobotSettings):
             "none if another node publishes it"
         ),
     ] = "map-odom"
-    transform_tolerance: Annotated[
-        float, Field(ge=0, le=60, description="time in s by which that transform is stamped ahead, as in AMCL")
-    ] = 1.0
     mount: Annotated[
         str,
         Field(
@@ -162,7 +140,7 @@ class BridgeRos2Settings(SeenRobotSettings):
 
     def check(self) -> None:
         """Raises UserError if settings contradict each other, or if a file is missing."""
-        frames = {"--map-frame": self.map_frame, "--odom-frame": self.odom_frame, "--base-frame": self.base_frame}
+        frames = {"the map": MAP_FRAME, "--odom-frame": self.odom_frame, "--base-frame": self.base_frame}
         if len(set(frames.values())) < len(frames):
             options = ", ".join(f"{option} {name}" for option, name in frames.items())
             raise UserError(f"{options}: these are three frames, each needs a name of its own")

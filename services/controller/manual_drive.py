@@ -1,4 +1,4 @@
-"""Driving by hand, with a timeout."""
+"""Manual velocity commands, with a timeout."""
 
 from __future__ import annotations
 

@@ -40,13 +40,7 @@ class ControllerSettings(SeenRobotSettings):
     epistemic: Annotated[
         bool, Field(description="with a goal and several possible places, drive where they can be told apart")
     ] = True
-    resume: Annotated[
-        bool, Field(description="after a restart, continue to the goal of the previous controller instance")
-    ] = True
     gamma: Annotated[float, Field(gt=0, lt=1, description="preset paper: action step size per scan (equation 4)")] = 0.3
-    reach: Annotated[
-        float, Field(gt=0, le=100, description="preset paper: upper limit of the goal's attraction, m")
-    ] = 2.0
     belief_timeout: Annotated[
         float, Field(gt=0, le=60, description="the robot stops after this time without a belief, s")
     ] = 0.5

@@ -21,7 +21,7 @@ from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.sensor import Sensor
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
 from services.estimator.precise.estimator import PreciseEstimator
-from services.estimator.precise.gauss_newton import View, polish
+from services.estimator.precise.gauss_newton import Optimiser, View, polish
 from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_places
 from services.estimator.precise.learning import weights
 from services.estimator.precise.likelihood import Likelihood
@@ -48,6 +48,9 @@ class Choice:
     seed: int = 0
     initial_pose: Array | None = None  # (3,); None if unknown (paper: the centre of the map)
     descent: Descent = Descent()  # noqa: RUF009 - frozen; for paper
+    generative_model: GenerativeModel | None = None  # for precise: used instead of `model`
+    likelihood: Likelihood | None = None  # for precise; None: of the weights' calibration, or of the scanner's noise
+    optimiser: Optimiser | None = None  # for precise; None: Gauss-Newton
 
     @property
     def world_argument(self) -> str:
@@ -140,23 +143,28 @@ def prepare(choice: Choice) -> Factory:
 
 
 def _precise(choice: Choice, world: World) -> Factory:
-    model, places, card = generative_model(choice, world)
+    model, places, card = load_model(choice, world)
     calibration = card.calibration if card else None
     settings = calibration.settings() if calibration else Settings(inflation=card.inflation if card else 1.0)
     if not calibration and (error := map_error(world)):
         # Errors of neighbouring cells are correlated, so they average out neither over beams nor over scans.
         settings = replace(settings, floor_position=error, floor_heading=error / TYPICAL_WALL_DISTANCE_M)
     seeds, bounds = Seeds.at(model, places), (card.world if card else world).bounds
-    _compile(model, seeds, Likelihood())
+    _compile(model, seeds, choice.likelihood or Likelihood())
 
     def make(geometry: Geometry) -> Estimator:
         if card:
             check_mount(geometry, card.scanner)
-        likelihood = geometry.likelihood(choice.sigma)
-        if calibration and choice.sigma is None:
+        if choice.likelihood is not None:
+            likelihood = choice.likelihood
+        elif calibration and choice.sigma is None:
             likelihood = calibration.likelihood
+        else:
+            likelihood = geometry.likelihood(choice.sigma)
         rng = np.random.default_rng(choice.seed)
-        made = PreciseEstimator(model, seeds, geometry.mount, likelihood, settings, rng, bounds)
+        made = PreciseEstimator(
+            model, seeds, geometry.mount, likelihood, settings, rng, bounds, optimiser=choice.optimiser
+        )
         if choice.initial_pose is not None:
             made.restart(choice.initial_pose)
         return made
@@ -164,12 +172,12 @@ def _precise(choice: Choice, world: World) -> Factory:
     return make
 
 
-def generative_model(choice: Choice, world: World) -> tuple[GenerativeModel, Array, weights.FieldCard | None]:
+def load_model(choice: Choice, world: World) -> tuple[GenerativeModel, Array, weights.FieldCard | None]:
     """Returns the model, places (S, 2) m where the laser can be, and the card of a learned model, else None."""
-    if choice.model == "exact":
-        places = world.sample_free(max(4000, int(60 * world.free_area)), np.random.default_rng(0), 0.05)
-        return RayCaster(world), thin_places(places, SEED_SPACING_M), None
-    return weights.load(field_path(choice, world))
+    if choice.generative_model is None and choice.model != "exact":
+        return weights.load(field_path(choice, world))
+    places = world.sample_free(max(4000, int(60 * world.free_area)), np.random.default_rng(0), 0.05)
+    return choice.generative_model or RayCaster(world), thin_places(places, SEED_SPACING_M), None
 
 
 def field_path(choice: Choice, world: World) -> Path:

@@ -1,146 +1,246 @@
-"""Schedules the estimators of several robots in one process.
-
-A round takes one question of every robot that tracks. A search has the time that tracking leaves, and a quarter of the
-beams at least; of several searches the one that began first goes on until it has ended.
-"""
+"""One estimator process for several robots: tracks all of them in one thread, and searches in another."""
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
-from collections.abc import Hashable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+import re
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING
 
-from services.estimator.shared.asking import Conversation, Conversing, Pieces, Question, Search, in_pieces
+from common.bus.inbox import Inbox, Sample
+from common.errors import UserError
+from common.log import LogRateLimiter, logger
+from common.messages.topics import SCAN
+from common.runtime.runnable import Runnable
+from common.runtime.service import Service
+from common.runtime.service_loop import Loop
+from services.estimator.service import EstimatorService, Models
+from services.estimator.settings import ROBOT_NAME, EstimatorSettings
+from services.estimator.shared.interface import SearchingEstimator
 
 if TYPE_CHECKING:
+    from common.bus.bus import Bus
+    from common.messages.definitions import Scan
     from services.estimator.shared.interface import Estimator, Observation, Posterior
 
-PIECE = 2000  # beams: a millisecond or two, after which whoever tracks comes first
-SHARE = 3  # times the beams of a piece that tracking may take before a search that waits has one
-TOGETHER = 4  # questions in one call of a model: more of them leave the processor's cache, and take longer
+DISCOVERY_PERIOD_S = 0.5  # between two checks which robots have appeared or gone
+HEALTH_CHECK_PERIOD_S = 0.05  # between two checks whose health message is due
+MAX_MESSAGES_PER_TURN = 20  # of one robot, before the next one's turn
+INBOX_MESSAGES, INBOX_BYTES = 1000, 1 << 24  # of one robot
+THREAD_SWITCH_INTERVAL_S = 5e-4  # a tenth of Python's, because tracking waits so long for the thread that searches
+StartSearch = Callable[[Callable[[], "Posterior"]], "Future[Posterior]"]
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What became of one robot's scan: one of the two."""
+class FleetRobot(EstimatorService):
+    """The estimator of one of several robots; its searches run in another thread."""
 
-    robot: str
-    posterior: Posterior | None
-    error: Exception | None = None
+    def __init__(
+        self, settings: EstimatorSettings, robot: str, models: Models, start_search: StartSearch, *, named: bool
+    ) -> None:
+        """``settings`` are those of the process; ``start_search`` runs a function in the thread for searches.
 
+        A ``named`` robot stays in the fleet while it is silent; the others were found by a pattern.
+        """
+        super().__init__(settings.model_copy(update={"robot": robot, "robots": ""}), models)
+        self.robot, self.named = robot, named
+        self.active = False  # while it is not, another process serves this robot, and this one stands by
+        self.last_seen = time.monotonic()
+        self.scans = 0  # received when it was last seen
+        self.log = logger(self.name).bind(robot=robot)
+        self.search: Future[Posterior] | None = None  # while it exists, no further message is handled
+        self._start_search = start_search
+        self._searched_scan: Scan | None = None
 
-class Fleet:
-    """The scans that are being answered, at most one a robot."""
-
-    def __init__(self, piece: int = PIECE, together: int = TOGETHER) -> None:
-        """``piece``: beams of a search between two looks at who tracks; ``together``: questions in one call."""
-        self.piece, self.together = piece, together
-        self.calls = self.answered = 0  # of models, and questions they answered
-        self._tracking: dict[str, tuple[Conversation[Posterior], Question]] = {}
-        self._searches: dict[str, Pieces[Posterior]] = {}  # in the order they began
-        self._ended: deque[Outcome] = deque()
-        self._owed = 0  # beams that tracking took while a search waited
-
-    def begin(self, robot: str, estimator: Estimator, observation: Observation) -> None:
-        """One more scan of a robot that is not `busy`; an estimator that does not converse answers it here."""
-        if self.busy(robot):
-            raise ValueError(f"{robot} has a scan that is not answered yet")
-        if isinstance(estimator, Conversing):
-            self._go_on(robot, estimator.updating(observation), None)
-            return
-        try:
-            self._ended.append(Outcome(robot, estimator.update(observation)))
-        except Exception as error:  # noqa: BLE001 - it is that robot's, and the shell's to tell
-            self._ended.append(Outcome(robot, None, error))
-
-    def busy(self, robot: str) -> bool:
-        """Whether its last scan is not answered yet."""
-        return (
-            robot in self._tracking or robot in self._searches or any(outcome.robot == robot for outcome in self._ended)
-        )
-
-    @property
-    def idle(self) -> bool:
-        """Whether every scan is answered."""
-        return not (self._tracking or self._searches or self._ended)
-
-    @property
-    def searching(self) -> int:
-        """Robots that search."""
-        return len(self._searches)
-
-    def drop(self, robot: str) -> None:
-        """Forget a robot's scan."""
-        self._tracking.pop(robot, None)
-        self._searches.pop(robot, None)
-        self._ended = deque(outcome for outcome in self._ended if outcome.robot != robot)
-
-    def step(self) -> list[Outcome]:
-        """A round of those that track, or a piece of a search; the scans that are answered by now."""
-        if self._tracking and not (self._searches and self._owed >= SHARE * self.piece):
-            self._round()
-        elif self._searches:
-            self._owed = 0
-            self._search()
-        ended = list(self._ended)
-        self._ended.clear()
-        return ended
-
-    def _round(self) -> None:
-        alike: dict[Hashable, list[str]] = defaultdict(list)
-        for robot, (_, question) in self._tracking.items():
-            alike[type(question), question.alike].append(robot)
-        for robots in alike.values():
-            for begin in range(0, len(robots), self.together):
-                self._answer(robots[begin : begin + self.together])
-
-    def _answer(self, robots: list[str]) -> None:
-        """One call of a model; where that fails, one each, so that whose question it is fails alone."""
-        asked = [(robot, *self._tracking.pop(robot)) for robot in robots]
-        questions = [question for _, _, question in asked]
-        if self._searches:
-            self._owed += sum(question.beams for question in questions)
-        self.calls, self.answered = self.calls + 1, self.answered + len(asked)
-        try:
-            answers = questions[0].answer_all(questions) if len(asked) > 1 else [questions[0].answer()]
-        except Exception as error:  # noqa: BLE001 - told to the conversation it belongs to
-            if len(asked) == 1:
-                self._fail(*asked[0][:2], error)
-                return
-            for robot, conversation, question in asked:
-                self._tracking[robot] = conversation, question
-                self._answer([robot])
-            return
-        for (robot, conversation, _), answer in zip(asked, answers, strict=True):
-            self._go_on(robot, conversation, answer)
-
-    def _go_on(self, robot: str, conversation: Conversation[Posterior], answer: Any) -> None:
-        """Until its next question, its search, or its end."""
-        try:
-            question = conversation.send(answer)
-        except StopIteration as end:
-            self._ended.append(Outcome(robot, end.value))
-        except Exception as error:  # noqa: BLE001 - that robot's
-            self._ended.append(Outcome(robot, None, error))
+    def update_estimator(self, scan: Scan, estimator: Estimator, observation: Observation) -> None:
+        """Tracks at once, and starts a search if one is needed."""
+        self.publish_search()  # of a scan that was handled late, because its odometry did not arrive
+        if not isinstance(estimator, SearchingEstimator):
+            super().update_estimator(scan, estimator, observation)
+        elif (posterior := estimator.track(observation)) is not None:
+            self.publish_posterior(scan, posterior, estimator.name)
         else:
-            if isinstance(question, Search):
-                self._searches[robot] = in_pieces(conversation, self.piece)
-            else:
-                self._tracking[robot] = conversation, question
+            self.search, self._searched_scan = self._start_search(estimator.search), scan
 
-    def _fail(self, robot: str, conversation: Conversation[Posterior], error: Exception) -> None:
-        conversation.close()
-        self._ended.append(Outcome(robot, None, error))
+    def publish_search(self) -> None:
+        """Publishes the result of the search, if there is one, and waits for it. Raises what the search raised."""
+        search, self.search = self.search, None
+        if search is not None and self._searched_scan is not None and self.estimator is not None:
+            self.publish_posterior(self._searched_scan, search.result(), self.estimator.name)
 
-    def _search(self) -> None:
-        robot = next(iter(self._searches))
+    def has_work(self) -> bool:
+        """Whether a search has ended or a message can be handled."""
+        return len(self.loop.inbox) > 0 if self.search is None else self.search.done()
+
+    def reset(self) -> None:
+        """Discards the belief; the result of a search that is running will not be used."""
+        if self.search is not None:
+            self.search.cancel()
+        self.search = self.estimator = self.geometry = self.waiting_scan = self.odom = self.command = self.last = None
+
+
+class FleetService(Service):
+    """The service that `main` runs for several robots."""
+
+    settings: EstimatorSettings
+    name = EstimatorService.name
+
+    def __init__(self, settings: EstimatorSettings) -> None:
+        """Raises UserError if a setting is only for one robot."""
+        super().__init__(settings)
+        if settings.initial_pose:
+            raise UserError("--initial-pose is for one robot: with --robots, set the pose of each robot by `localise`")
+
+    def make_loop(self, bus: Bus) -> Runnable:
+        """See Service."""
+        return FleetLoop(self.settings, bus)
+
+
+def key_expression(pattern: str) -> str:
+    """Zenoh's expression for a pattern of names; it matches the same names or more."""
+    written = re.sub(r"[*?]+", "$*", pattern)
+    return "*" if written == "$*" else written
+
+
+class FleetLoop:
+    """Runs the estimators of all robots on one session."""
+
+    def __init__(self, settings: EstimatorSettings, bus: Bus) -> None:
+        """``settings.robots`` are names and patterns of names, separated by commas."""
+        self.settings, self.bus = settings, bus
+        wanted = [part.strip() for part in settings.robots.split(",") if part.strip()]
+        self.names = list(dict.fromkeys(name for name in wanted if ROBOT_NAME.fullmatch(name)))
+        self.patterns = [name for name in wanted if name not in self.names]
+        if len(self.names) > settings.max_robots:
+            raise UserError(f"{len(self.names)} robots are named, --max-robots is {settings.max_robots}: raise it")
+        self.log = logger(FleetService.name)
+        self._robots: dict[str, FleetRobot] = {}
+        self._alive: dict[tuple[str, str], bool] = {}  # robot and service; changed by zenoh's threads
+        self._unserved_scans = Inbox(capacity=10 * settings.max_robots)  # of all robots that match a pattern
+        self._changed = threading.Condition()  # notified of every message and every search that ended
+        self._searches = ThreadPoolExecutor(1, "search")
+        self._may_log = LogRateLimiter()
+        self._next_health_check = self._next_discovery = 0.0
+        self._stopping = False
+
+    def run(self) -> None:
+        """Runs until `stop` is called."""
+        sys.setswitchinterval(THREAD_SWITCH_INTERVAL_S)
+        self.models = Models(self.settings)
+        for name in self.names:
+            self._add(name, named=True)
+        self.bus.watch_robots(self._note_liveliness)
+        for pattern in self.patterns:
+            self.bus.subscribe(SCAN, self._unserved_scans, robot=key_expression(pattern))
+        self.log.info("ready for robots", named=len(self.names), patterns=",".join(self.patterns) or "none")
         try:
-            next(self._searches[robot])
-        except StopIteration as end:
-            self._ended.append(Outcome(robot, end.value))
-        except Exception as error:  # noqa: BLE001 - that robot's
-            self._ended.append(Outcome(robot, None, error))
+            while not self._stopping:
+                self._turn()
+        finally:
+            self._searches.shutdown(cancel_futures=True)
+
+    def stop(self) -> None:
+        """Makes `run` return after its current step; safe to call from a signal handler."""
+        self._stopping = True
+        self._wake()
+
+    def _turn(self) -> None:
+        for robot in list(self._robots.values()):
+            self._serve(robot)
+        now = time.monotonic()
+        if now >= self._next_health_check:
+            self._next_health_check = now + HEALTH_CHECK_PERIOD_S
+            for robot in self._robots.values():
+                if robot.active:
+                    robot.loop.pulse()
+        if now >= self._next_discovery:
+            self._next_discovery = now + DISCOVERY_PERIOD_S
+            self._add_found_robots()
+            self._update_robots(now)
+        with self._changed:
+            if not self._stopping and not any(robot.has_work() for robot in self._robots.values()):
+                self._changed.wait(max(0.0, min(self._next_health_check, self._next_discovery) - time.monotonic()))
+
+    def _serve(self, robot: FleetRobot) -> None:
+        """Handles the messages of a robot in order, until a search has to end first."""
+        try:
+            for _ in range(MAX_MESSAGES_PER_TURN):
+                if not robot.has_work():
+                    return
+                if robot.search is not None:
+                    robot.loop.guard(robot.publish_search)
+                else:
+                    robot.loop.handle(robot.loop.inbox.get(0))
+        except UserError as error:  # concerns this robot only
+            self.log.warning(str(error), robot=robot.robot)
+            self._remove(robot)
+            if robot.named:
+                self._add(robot.robot, named=True)
+
+    def _start_search(self, search: Callable[[], Posterior]) -> Future[Posterior]:
+        future = self._searches.submit(search)
+        future.add_done_callback(lambda _: self._wake())
+        return future
+
+    def _wake(self) -> None:
+        with self._changed:
+            self._changed.notify_all()
+
+    def _note_liveliness(self, robot: str, service: str, alive: bool) -> None:  # noqa: FBT001
+        if alive:
+            self._alive[robot, service] = True
         else:
-            return
-        del self._searches[robot]
+            self._alive.pop((robot, service), None)
+
+    def _add_found_robots(self) -> None:
+        """Serves robots that a pattern found, unless they have an estimator of their own or there are too many."""
+        found = [robot for robot, service in list(self._alive) if service == "simulator"]
+        while isinstance(sample := self._unserved_scans.get(0), Sample):
+            found.append(sample.key.split("/")[1])
+        for name in found:
+            if name in self._robots or not self._matches(name) or (name, "estimator") in self._alive:
+                continue
+            if len(self._robots) < self.settings.max_robots:
+                self._add(name, named=False)
+            elif self._may_log("many"):
+                self.log.warning("too many robots", not_served=name, max_robots=self.settings.max_robots)
+
+    def _matches(self, name: str) -> bool:
+        return bool(ROBOT_NAME.fullmatch(name)) and any(fnmatchcase(name, pattern) for pattern in self.patterns)
+
+    def _update_robots(self, now: float) -> None:
+        """Starts robots that can become active, and forgets those without scans and simulator."""
+        for name, robot in list(self._robots.items()):
+            if not robot.active:
+                robot.active = robot.loop.try_start()
+            scans = robot.loop.inbox.received[SCAN.key(name)]
+            if scans != robot.scans or (name, "simulator") in self._alive:
+                robot.scans, robot.last_seen = scans, now
+            elif now - robot.last_seen > self.settings.forget:
+                if robot.estimator is not None or not robot.named:
+                    self.log.info("robot forgotten", robot=name, seconds=self.settings.forget)
+                robot.reset()
+                robot.last_seen = now
+                if not robot.named:
+                    self._remove(robot)
+
+    def _add(self, name: str, *, named: bool) -> None:
+        robot = FleetRobot(self.settings, name, self.models, self._start_search, named=named)
+        loop = Loop(robot, self.bus.for_robot(name), Inbox(INBOX_MESSAGES, INBOX_BYTES, self._changed))
+        loop.open()
+        robot.active = loop.try_start()
+        self._robots[name] = robot
+        self._count()
+
+    def _remove(self, robot: FleetRobot) -> None:
+        robot.reset()
+        del self._robots[robot.robot]
+        robot.loop.bus.undeclare_all()
+        self._count()
+
+    def _count(self) -> None:
+        for robot in self._robots.values():
+            robot.counters["robots_served"] = len(self._robots)

@@ -1,4 +1,4 @@
-"""Answers `predict`: scans expected from given poses."""
+"""Answers the query `predict`: scans expected from given poses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAX_POSES = 1000
 MAX_RANGES = 1_000_000  # take about half a second, during which no scan is processed
 
 
-def answer(estimator: Estimator, request: PredictRequest, angles: Array, range_max: float) -> PredictReply:
+def answer_prediction(estimator: Estimator, request: PredictRequest, angles: Array, range_max: float) -> PredictReply:
     """Predicts scans of a scanner with beams at ``angles`` (B,) rad; ranges beyond ``range_max`` m become +inf.
 
     Raises UserError if the request is too large, or the model cannot predict the poses.

@@ -1,4 +1,4 @@
-"""The process for one robot."""
+"""The estimator service: publishes a belief and a prediction for each scan of a robot."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from common.messages.topics import (
 )
 from common.robot.ranges import ranges_for_localisation
 from common.runtime.service import Service
-from services.estimator import prediction_query as predicting
 from services.estimator.factory import Choice, Factory, Geometry, prepare
 from services.estimator.model_card import ModelInUse, model_in_use
 from services.estimator.paper.perception import Descent
+from services.estimator.prediction_query import answer_prediction
 from services.estimator.settings import EstimatorSettings
 from services.estimator.shared.interface import Estimator, Observation, Posterior
 
@@ -39,7 +39,7 @@ def choice_of(settings: EstimatorSettings) -> Choice:
     return Choice(
         settings.world, settings.estimator, settings.model, settings.models, settings.sigma, settings.seed,
         initial_pose=pose_of_text(settings.initial_pose, "--initial-pose") if settings.initial_pose else None,
-        descent=Descent(alpha=settings.alpha, beta=settings.beta, iterations=settings.iterations),
+        descent=Descent(alpha=settings.alpha, iterations=settings.iterations),
     )  # fmt: skip
 
 
@@ -65,6 +65,7 @@ class Models:
 class EstimatorService(Service):
     """Publishes a belief and a prediction for each scan."""
 
+    settings: EstimatorSettings
     name: ClassVar[str] = "estimator"
     single: ClassVar[bool] = True
     serves_latched: ClassVar[tuple[Topic, ...]] = (GOAL, STATUS)
@@ -77,7 +78,6 @@ class EstimatorService(Service):
         The estimator is built at the first scan, for its geometry.
         """
         super().__init__(settings)
-        self.options = settings
         more = {"odometry": (ODOM,), "command": (CMD_VEL,)}.get(settings.prior, ())
         self.inputs = (SCAN, GOAL, *more)  # type: ignore[misc]
         self.models = models
@@ -87,17 +87,17 @@ class EstimatorService(Service):
         self.goal: Goal | None = None
         self.odom: Odom | None = None
         self.command: CmdVel | None = None
-        self.waiting: Scan | None = None  # a scan that waits for the odometry of its stamp
+        self.waiting_scan: Scan | None = None  # a scan that waits for the odometry of its stamp
         self.last: tuple[int, Belief, Prediction] | None = None
 
     def open(self) -> None:
         """Loads the models, so that missing weights are an error now and not at the first scan."""
-        options = self.options
+        settings = self.settings
         if self.models is None:
-            self.log.info("loading the world", world=options.world)
-            self.models = Models(options)
+            self.log.info("loading the world", world=settings.world)
+            self.models = Models(settings)
         self.model = self.models.in_use(None)
-        self.log.info("estimator", name=options.estimator, world=options.world, prior=options.prior)
+        self.log.info("estimator", name=settings.estimator, world=settings.world, prior=settings.prior)
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
         """Processes a scan; stores goal, odometry and command for the scans after it."""
@@ -107,19 +107,19 @@ class EstimatorService(Service):
             self.command = message
         elif isinstance(message, Odom):
             self.odom = message
-            if self.waiting is not None and message.stamp_ns >= self.waiting.stamp_ns:
-                self._perceive_waiting()
+            if self.waiting_scan is not None and message.stamp_ns >= self.waiting_scan.stamp_ns:
+                self._update_waiting()
         elif isinstance(message, Scan):
-            self._perceive_waiting()  # its odometry has not come in time
-            if self.options.prior == "odometry" and (self.odom is None or self.odom.stamp_ns < message.stamp_ns):
-                self.waiting = message
+            self._update_waiting()  # its odometry has not come in time
+            if self.settings.prior == "odometry" and (self.odom is None or self.odom.stamp_ns < message.stamp_ns):
+                self.waiting_scan = message
             else:
-                self._perceive(message)
+                self._update(message)
 
-    def _perceive_waiting(self) -> None:
-        scan, self.waiting = self.waiting, None
+    def _update_waiting(self) -> None:
+        scan, self.waiting_scan = self.waiting_scan, None
         if scan is not None:
-            self._perceive(scan)
+            self._update(scan)
 
     def on_request(self, query: Query, request: Request) -> Reply:
         """Answers a request to localise again, to predict scans, or to describe the model."""
@@ -130,33 +130,29 @@ class EstimatorService(Service):
         if self.estimator is None or self.geometry is None:
             return query.reply(ok=False, reason="no scan has come yet")
         if isinstance(request, PredictRequest):
-            return predicting.answer(self.estimator, request, self.geometry.angles, self.geometry.range_max)
+            return answer_prediction(self.estimator, request, self.geometry.angles, self.geometry.range_max)
         if not isinstance(request, LocaliseRequest):
             return super().on_request(query, request)
         self.estimator.restart(None if request.pose is None else request.pose.array())
         return Reply()
 
-    def _perceive(self, scan: Scan) -> None:
+    def _update(self, scan: Scan) -> None:
         if self.last is not None and self.last[0] == scan.stamp_ns:
-            _, belief, prediction = self.last  # a repeated scan gets the same answer again
-        else:
-            estimator = self._estimator_for(scan)
-            if estimator is not None:
-                self.infer(scan, estimator, self._observation(scan))
-            return
-        self._answer(belief, prediction)
+            self._publish(*self.last[1:])  # a repeated scan gets the same belief again
+        elif (estimator := self._estimator_for(scan)) is not None:
+            self.update_estimator(scan, estimator, self._observation(scan))
 
-    def infer(self, scan: Scan, estimator: Estimator, observation: Observation) -> None:
-        """Updates the estimator, and calls `conclude`; overridden where several robots share the time."""
-        self.conclude(scan, estimator.update(observation), estimator.name)
+    def update_estimator(self, scan: Scan, estimator: Estimator, observation: Observation) -> None:
+        """Updates the estimator and publishes the posterior."""
+        self.publish_posterior(scan, estimator.update(observation), estimator.name)
 
-    def conclude(self, scan: Scan, posterior: Posterior, estimator: str) -> None:
+    def publish_posterior(self, scan: Scan, posterior: Posterior, estimator: str) -> None:
         """Publishes the belief and the prediction after a scan."""
-        belief, prediction = _belief(scan, posterior, estimator), _prediction(scan, posterior)
+        belief, prediction = belief_message(scan, posterior, estimator), prediction_message(scan, posterior)
         self.last = (scan.stamp_ns, belief, prediction)
-        self._answer(belief, prediction)
+        self._publish(belief, prediction)
 
-    def _answer(self, belief: Belief, prediction: Prediction) -> None:
+    def _publish(self, belief: Belief, prediction: Prediction) -> None:
         self.publish(PREDICTION, prediction)
         self.publish(BELIEF, belief)
 
@@ -168,7 +164,7 @@ class EstimatorService(Service):
         assert self.models is not None  # noqa: S101 - set in open
         geometry = Geometry.of_scan(scan)
         try:
-            paper = self.options.estimator == "paper"
+            paper = self.settings.estimator == "paper"
             if self.geometry is None or not self.geometry.same(geometry, bound_to_beams=paper):
                 made = self.models.factory(geometry)
                 if self.geometry is not None:
@@ -179,14 +175,14 @@ class EstimatorService(Service):
         except UserError as error:
             self.counters["unfit_scans"] += 1
             if self.note != str(error):
-                self.log.warning("scan refused", why=str(error))
+                self.log.warning("scan refused", reason=str(error))
             self.note = str(error)
             return None
         self.note = ""
         return self.estimator
 
     def _observation(self, scan: Scan) -> Observation:
-        prior = self.options.prior
+        prior = self.settings.prior
         odom = self.odom if prior == "odometry" and self.odom and self.odom.stamp_ns == scan.stamp_ns else None
         if prior == "odometry" and odom is None:
             self.counters["scans_without_odometry"] += 1
@@ -202,7 +198,8 @@ class EstimatorService(Service):
         )
 
 
-def _belief(scan: Scan, posterior: Posterior, estimator: str) -> Belief:
+def belief_message(scan: Scan, posterior: Posterior, estimator: str) -> Belief:
+    """The posterior after a scan as a message."""
     return Belief(
         stamp_ns=scan.stamp_ns,
         state=posterior.state,
@@ -221,7 +218,8 @@ def _belief(scan: Scan, posterior: Posterior, estimator: str) -> Belief:
     )
 
 
-def _prediction(scan: Scan, posterior: Posterior) -> Prediction:
+def prediction_message(scan: Scan, posterior: Posterior) -> Prediction:
+    """The scan expected at the posterior's pose as a message."""
     return Prediction(
         stamp_ns=scan.stamp_ns,
         angle_min=scan.angle_min,

@@ -79,12 +79,6 @@ class EstimatorSettings(ServiceSettings):
     alpha: Annotated[
         float, Field(gt=0, lt=1, description="paper: step size of perception along the longest axis, m²")
     ] = 2e-3
-    beta: Annotated[
-        float,
-        Field(
-            ge=0, lt=10, description="paper: attraction of the goal in perception (eq. 3); 0 leaves the belief unbiased"
-        ),
-    ] = 0.0
     iterations: Annotated[
         int, Field(ge=1, le=1000, description="paper: gradient steps per scan; 1 in the publication")
     ] = 10

@@ -53,8 +53,8 @@ class Recording:
     profile: str = ""
     start_ns: int = 0  # wall time at which the first message was received
     end_ns: int = 0  # wall time at which the last message was received
-    _counts: Counter[str] = field(default_factory=Counter)  # messages by key
-    _finished: bool = False  # the file has a valid index
+    message_counts: Counter[str] = field(default_factory=Counter)  # by key
+    indexed: bool = False  # the file has a valid index, so damage is only found when the damaged part is read
 
     @property
     def complete(self) -> bool:
@@ -66,14 +66,14 @@ class Recording:
         """One line for the user if the file is incomplete, else an empty string."""
         if self.complete:
             return ""
-        why = (
+        consequence = (
             "the recorder is still writing it, or was killed"
             if self.path.suffix == ".active"
             else "it is cut short or damaged"
         )
-        readable = "the messages" if self._finished else f"the {sum(self._counts.values())} messages"
+        readable = "the messages" if self.indexed else f"the {sum(self.message_counts.values())} messages"
         return (
-            f"{self.path}: incomplete ({self.problem}): {why}; {readable} before that can be used, and "
+            f"{self.path}: incomplete ({self.problem}): {consequence}; {readable} before that can be used, and "
             "`presage recover` writes a complete file from the readable part"
         )
 
@@ -87,17 +87,10 @@ class Recording:
         """
         try:
             with self.path.open("rb") as stream:
-                for channel, message in (self._indexed if self._finished else self._torn)(
-                    stream, keys, start_ns, end_ns
-                ):
+                for channel, message in (self._indexed if self.indexed else self._torn)(stream, keys, start_ns, end_ns):
                     yield Raw(channel.topic, message.data, message.publish_time, message.log_time)
         except OSError as error:
             raise _unreadable(self.path, error) from None
-
-    @property
-    def indexed(self) -> bool:
-        """Whether the file has an index. If so, damage is only found when the damaged part is read."""
-        return self._finished
 
     @property
     def raw(self) -> list[Raw]:
@@ -110,7 +103,9 @@ class Recording:
         Payloads that cannot be decoded are skipped and counted in `undecodable`.
         """
         self.undecodable.clear()
-        rows = {key: topic for key in self._counts if (topic := topic_of(key)) and (not topics or topic in topics)}
+        rows = {
+            key: topic for key in self.message_counts if (topic := topic_of(key)) and (not topics or topic in topics)
+        }
         for raw in self.payloads(rows.keys()):
             try:
                 yield rows[raw.key], rows[raw.key].message.decode(raw.payload), raw
@@ -119,11 +114,11 @@ class Recording:
 
     def counts(self) -> Counter[str]:
         """Number of messages by key."""
-        return Counter(self._counts)
+        return Counter(self.message_counts)
 
     def topics(self) -> dict[str, Topic]:
         """Topics of the recording, by key. Keys that are not in the table of topics are left out."""
-        return {key: topic for key in sorted(self._counts) if (topic := topic_of(key)) is not None}
+        return {key: topic for key in sorted(self.message_counts) if (topic := topic_of(key)) is not None}
 
     def world(self) -> World | None:
         """The world of the session. Returns None if it was not recorded or is invalid."""
@@ -224,7 +219,7 @@ def _read_summary(recording: Recording, stream: BinaryIO) -> bool:
         for attachment in reader.iter_attachments():
             recording.attachments[attachment.name] = attachment.data
         for number, count in summary.statistics.channel_message_counts.items():
-            recording._counts[summary.channels[number].topic] += count  # noqa: SLF001 - same module
+            recording.message_counts[summary.channels[number].topic] += count
         recording.start_ns, recording.end_ns = (
             summary.statistics.message_start_time,
             summary.statistics.message_end_time,
@@ -232,10 +227,10 @@ def _read_summary(recording: Recording, stream: BinaryIO) -> bool:
     except OSError:
         raise
     except Exception as error:  # noqa: BLE001 - a damaged index can raise any error
-        recording.metadata, recording.attachments, recording._counts = {}, {}, Counter()  # noqa: SLF001
+        recording.metadata, recording.attachments, recording.message_counts = {}, {}, Counter()
         recording.problem = str(error) if isinstance(error, ValueError) else "its index is damaged"
         return False
-    recording._finished = True  # noqa: SLF001
+    recording.indexed = True
     return True
 
 
@@ -252,9 +247,9 @@ def _read_through(recording: Recording, stream: BinaryIO) -> None:
         elif isinstance(record, Attachment):
             recording.attachments[record.name] = record.data
         elif isinstance(record, McapMessage) and record.channel_id in keys:
-            if not recording._counts:  # noqa: SLF001
+            if not recording.message_counts:
                 recording.start_ns = record.log_time
-            recording._counts[keys[record.channel_id]] += 1  # noqa: SLF001
+            recording.message_counts[keys[record.channel_id]] += 1
             recording.end_ns = max(recording.end_ns, record.log_time)
 
 

@@ -1,4 +1,7 @@
-"""Rebuilds a complete file from a damaged or unfinished one."""
+"""Rebuilds a complete file from a damaged or unfinished one.
+
+mcap's readers stop at the first damaged record; here reading resumes after it.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,10 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
-from mcap import records as kinds
-from mcap.data_stream import ReadDataStream
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader
 
 from common.errors import UserError
 from services.recorder.files.chunks import MAGIC, PREFIX, mcap_writer, records_of
@@ -25,23 +28,6 @@ from services.recorder.files.message_counts import Ledger, as_metadata
 from services.recorder.files.writer import PROFILE, UNFINISHED_SUFFIX, claim, is_being_written
 
 TORN_SUFFIX = ".torn"  # appended to the name of an unfinished source file after recovery
-# Parsers of all records that may precede a file's end. Each record is parsed completely, to detect a damaged length or
-# opcode.
-PARSERS: dict[int, Callable[[ReadDataStream], object]] = {
-    Opcode.HEADER: Header.read,
-    Opcode.SCHEMA: Schema.read,
-    Opcode.CHANNEL: Channel.read,
-    Opcode.CHUNK: Chunk.read,
-    Opcode.MESSAGE_INDEX: kinds.MessageIndex.read,
-    Opcode.CHUNK_INDEX: kinds.ChunkIndex.read,
-    Opcode.ATTACHMENT: Attachment.read,
-    Opcode.ATTACHMENT_INDEX: kinds.AttachmentIndex.read,
-    Opcode.STATISTICS: kinds.Statistics.read,
-    Opcode.METADATA: Metadata.read,
-    Opcode.METADATA_INDEX: kinds.MetadataIndex.read,
-    Opcode.SUMMARY_OFFSET: kinds.SummaryOffset.read,
-    Opcode.DATA_END: DataEnd.read,
-}
 # Where reading may resume after damage: the prefix of a chunk, an attachment or metadata shorter than 2^40 bytes.
 LANDMARK = re.compile(rb"[\x06\x09\x0c](?=.{5}\x00\x00\x00)", re.DOTALL)
 
@@ -169,7 +155,7 @@ class _Copier:
         self._keys: dict[int, str] = {}
         self._started = False
 
-    def take(self, record: object) -> None:
+    def take(self, record: McapRecord) -> None:
         """Copies one record. Skips indexes and statistics, which the writer generates itself."""
         if not self._started:
             header = record if isinstance(record, Header) else Header(PROFILE, "presage recover")
@@ -230,61 +216,52 @@ def _reason(found: Recovered) -> str:
     return f"{lost} of its {found.size} bytes are damaged or cut short"
 
 
-def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[list[object], int]]:
+def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[list[McapRecord], int]]:
     """Yields the content of each intact record and its end offset. Skips damaged bytes up to the next intact record."""
-    at, size = len(MAGIC), len(data)
-    while at < size:
-        records = _parse(data, at)
+    offset, size = len(MAGIC), len(data)
+    while offset < size:
+        records = _parse(data, offset)
         if records is None:
-            after = _next_whole(data, at)
-            found.damages.append(Damage(at, after - at))
-            at = after
+            following = _next_intact(data, offset)
+            found.damages.append(Damage(offset, following - offset))
+            offset = following
             continue
-        opcode, length = PREFIX.unpack_from(data, at)
+        opcode, length = PREFIX.unpack_from(data, offset)
         if opcode == Opcode.DATA_END:
             found.whole = True
-            found.altered = not found.damages and not _is_checksum(data, at, records[0])
+            found.altered = not found.damages and not _is_checksum(data, offset, records[0])
             return
-        at += PREFIX.size + length
+        offset += PREFIX.size + length
         # In a chunked file, a message outside of the chunks is a misread index record.
         if opcode == Opcode.MESSAGE and found.chunks:
             continue
         found.chunks += opcode == Opcode.CHUNK
-        yield records, at
+        yield records, offset
 
 
-def _parse(data: mmap.mmap, at: int) -> list[object] | None:
-    """Content of the record at offset ``at``. Returns None if it is damaged or cut short."""
-    if at + PREFIX.size > len(data):
+def _parse(data: mmap.mmap, offset: int) -> list[McapRecord] | None:
+    """Content of the record at ``offset``. Returns None if it is damaged or cut short.
+
+    A record whose length, opcode or checksum is damaged differs from what mcap writes for its content.
+    """
+    if offset + PREFIX.size > len(data):
         return None
-    opcode, length = PREFIX.unpack_from(data, at)
-    begin = at + PREFIX.size
-    if begin + length > len(data) or not Opcode.HEADER <= opcode <= Opcode.DATA_END:
+    opcode, length = PREFIX.unpack_from(data, offset)
+    end = offset + PREFIX.size + length
+    if end > len(data) or not Opcode.HEADER <= opcode <= Opcode.DATA_END:
         return None
+    stored, written = data[offset:end], RecordBuilder()
     try:
-        return _records(data, opcode, begin, length)
+        record = next(StreamReader(BytesIO(stored), skip_magic=True, emit_chunks=True).records)
+        record.write(written)
+        if written.end() != stored:  # type: ignore[no-untyped-call]
+            return None
+        return records_of(record) if isinstance(record, Chunk) else [record]
     except Exception:  # noqa: BLE001 - each decompressor raises its own error types
         return None
 
 
-def _records(data: mmap.mmap, opcode: int, begin: int, length: int) -> list[object] | None:
-    body = ReadDataStream(BytesIO(data[begin : begin + length]))
-    record = Message.read(body, length) if opcode == Opcode.MESSAGE else PARSERS[opcode](body)
-    if body.count != length:
-        return None
-    if isinstance(record, Chunk):
-        return list(records_of(record))
-    if isinstance(record, Attachment) and zlib.crc32(data[begin : begin + length - 4]) != _crc(data, begin + length):
-        return None
-    return [record]
-
-
-def _crc(data: mmap.mmap, end: int) -> int:
-    """The checksum in the last four bytes before offset ``end``."""
-    return int.from_bytes(data[end - 4 : end], "little")
-
-
-def _is_checksum(data: mmap.mmap, end: int, record: object) -> bool:
+def _is_checksum(data: mmap.mmap, end: int, record: McapRecord) -> bool:
     """Whether the checksum of the bytes before ``end`` matches, or the file has none."""
     if not isinstance(record, DataEnd) or not record.data_section_crc:
         return True
@@ -292,12 +269,12 @@ def _is_checksum(data: mmap.mmap, end: int, record: object) -> bool:
         return bool(zlib.crc32(before) == record.data_section_crc)
 
 
-def _next_whole(data: mmap.mmap, damaged: int) -> int:
+def _next_intact(data: mmap.mmap, damaged: int) -> int:
     """Offset at which reading resumes after a damaged record: the following record, or else the next landmark."""
     if damaged + PREFIX.size <= len(data):
-        after = damaged + PREFIX.size + int(PREFIX.unpack_from(data, damaged)[1])
-        if _parse(data, after) is not None:
-            return after
+        following = damaged + PREFIX.size + int(PREFIX.unpack_from(data, damaged)[1])
+        if _parse(data, following) is not None:
+            return following
     for landmark in LANDMARK.finditer(data, damaged + 1):
         if _parse(data, landmark.start()) is not None:
             return landmark.start()

@@ -19,6 +19,7 @@ from services.recorder.session_description import DescriptionCollector, Descript
 from services.recorder.settings import RecorderSettings
 
 LINK_WARNING_DELAY_S = 3.0  # the recorder may start before the router, but then warns that it is waiting
+INBOX_CAPACITY = 20_000  # messages that wait to be written
 
 
 class RecorderService(Service):
@@ -50,7 +51,7 @@ class RecorderService(Service):
     def open(self) -> None:
         """Begins to record, unless idle, and starts to collect the services' descriptions."""
         options = self.options
-        self.loop.inbox.capacity = options.capacity
+        self.loop.inbox.capacity = INBOX_CAPACITY
         warn_about_unfinished(options.directory, self.log)
         if not options.idle:
             self._begin(numbered=False)
@@ -78,11 +79,11 @@ class RecorderService(Service):
         state = self._state()
         if request.action == "start":
             if self.recording is not None:
-                return state.model_copy(update={"ok": False, "reason": f"records already, into {state.file}"})
+                return state.model_copy(update={"ok": False, "reason": f"already recording, into {state.file}"})
             self._begin(numbered=True)
         elif request.action == "stop":
             if self.recording is None:
-                return state.model_copy(update={"ok": False, "reason": "records nothing: start first"})
+                return state.model_copy(update={"ok": False, "reason": "not recording"})
             self._write_answers()
             self._end()
         return self._state()
@@ -187,7 +188,8 @@ class RecorderService(Service):
 
     def _update_note(self) -> None:
         """Sets the note in the health message."""
-        self.note = self._no_link_note or ("" if self.recording is not None else "records nothing until told")
+        self.idle = self.recording is None
+        self.note = self._no_link_note or ("not recording until a request starts it" if self.idle else "")
 
     def _write_answers(self) -> None:
         if self.describer is None:

@@ -1,4 +1,4 @@
-"""Asks each service for its configuration, world and model."""
+"""Queries each service for its configuration, world and model."""
 
 from __future__ import annotations
 
@@ -83,12 +83,12 @@ def _records_of_model(reply: ModelReply) -> Iterator[MetadataRecord | Attachment
 class DescriptionCollector:
     """Queries services for their descriptions in a thread, so that a slow service does not hold up the recording."""
 
-    def __init__(self, bus: Bus, me: str, log: Logger, *, weights: bool = True) -> None:
-        """Starts the thread. The service ``me`` is not queried.
+    def __init__(self, bus: Bus, own_name: str, log: Logger, *, weights: bool = True) -> None:
+        """Starts the thread. The service ``own_name`` is not queried.
 
         With ``weights``, also fetches the model's weights, up to `MAX_WEIGHTS_BYTES`.
         """
-        self._bus, self._me, self._log, self._weights = bus, me, log, weights
+        self._bus, self._own_name, self._log, self._weights = bus, own_name, log, weights
         # Services that came (True) or went (False), from zenoh's thread; None wakes the thread.
         self._events: queue.SimpleQueue[tuple[str, bool] | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[tuple[str, DescriptionReply]] = queue.SimpleQueue()
@@ -100,7 +100,7 @@ class DescriptionCollector:
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="describer", daemon=True)
         self._thread.start()
-        bus.watch_alive(lambda service, there: self._events.put((service, there)))
+        bus.watch_alive(lambda service, alive: self._events.put((service, alive)))
 
     def answers(self) -> Iterator[tuple[str, DescriptionReply]]:
         """Yields service and reply for each reply since the last call."""
@@ -139,7 +139,7 @@ class DescriptionCollector:
         except UserError as error:
             delay, attempts = RETRY_DELAY_S if attempts + 1 < MAX_ATTEMPTS else None, attempts + 1
             if not self._stopping.is_set():
-                self._log.warning("a service did not describe itself", service=service, why=str(error))
+                self._log.warning("a service did not describe itself", service=service, reason=str(error))
         if delay is not None:
             self._scheduled[service, query.name] = (time.monotonic() + delay, attempts)
 
@@ -150,7 +150,7 @@ class DescriptionCollector:
             event = self._events.get(timeout=None if due is None else max(0.0, due - time.monotonic()))
         except queue.Empty:
             return
-        if event is None or event[0] == self._me:
+        if event is None or event[0] == self._own_name:
             return
         service, alive = event
         if service == ALL_SERVICES:
@@ -189,7 +189,7 @@ class DescriptionCollector:
             if self._weights and 0 < reply.size <= MAX_WEIGHTS_BYTES:
                 with_weights = self._bus.ask(MODEL, ModelRequest(weights=True), ModelReply, ANSWER_TIMEOUT_S)
                 if not with_weights.ok:
-                    self._log.warning("the weights are not stored", why=with_weights.reason)
+                    self._log.warning("the weights are not stored", reason=with_weights.reason)
                     with_weights = reply
             self._last[service, MODEL.name] = reply
             self._answers.put((service, with_weights))

@@ -40,9 +40,6 @@ class RecorderSettings(ServiceSettings):
     flush: Annotated[
         float, Field(ge=0.05, le=60, description="flush period in s; a kill loses at most the messages since then")
     ] = 0.5
-    capacity: Annotated[
-        int, Field(ge=1, le=10_000_000, description="maximum number of messages that wait to be written")
-    ] = 20_000
     split_size: Annotated[float, Field(ge=0, description="maximum size of one part in MB; 0 writes one file")] = 0.0
     split_minutes: Annotated[
         float, Field(ge=0, description="maximum duration of one part in minutes; 0 writes one file")

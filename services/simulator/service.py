@@ -1,4 +1,4 @@
-"""The process: pace, topics and requests around Simulation."""
+"""The simulator service: commands in; scans, odometry and truth out, at the chosen pace."""
 
 from __future__ import annotations
 
@@ -42,7 +42,6 @@ from common.messages.topics import (
     Topic,
 )
 from common.runtime.service import Service
-from services.simulator.odometry import Drift
 from services.simulator.settings import SimulatorSettings
 from services.simulator.simulation import Setup, Simulation
 
@@ -63,21 +62,22 @@ class SimulatorService(Service):
     inputs: ClassVar[tuple[Topic, ...]] = (CMD_VEL,)
     queries: ClassVar[tuple[Query, ...]] = (TELEPORT, RESET, PAUSE, RESUME, STEP, SPEED, OBSTACLE, SAMPLE, WORLD)
 
+    settings: SimulatorSettings
+
     def __init__(self, settings: SimulatorSettings) -> None:
         super().__init__(settings)
-        self.options = settings
         self.paused = False
         self.speed = 1.0  # simulated time over wall time, in pace realtime
         # The measurements at the present simulated time. None before the first ones, and after a reset.
         self._published: tuple[Stamped, Stamped, Stamped] | None = None
-        self._next_at = 0.0  # time.monotonic() of the next step; in lockstep, of publishing the same scan again
+        self._next_step_s = 0.0  # time.monotonic() of the next step; in lockstep, of publishing the same scan again
         self._alive: set[str] = set()  # services, updated from zenoh's thread
         self._required_services = settings.required_services()  # emptied when time begins
 
     @property
     def lockstep(self) -> bool:
         """Whether time advances only when a command answers the scan."""
-        return self.options.pace == "lockstep"
+        return self.settings.pace == "lockstep"
 
     @property
     def _period_s(self) -> float:
@@ -86,26 +86,24 @@ class SimulatorService(Service):
 
     def open(self) -> None:
         """Build the world and the robot. Time begins when the required services are running."""
-        options = self.options
-        drift = Drift(options.turn_by_turn, options.turn_by_path, options.path_by_path, options.path_by_turn)
-        robot = options.build_robot()
-        self.log.info("loading the world", world=options.world)
-        scanner = options.build_scanner()
+        settings = self.settings
+        robot = settings.build_robot()
+        self.log.info("loading the world", world=settings.world)
+        scanner = settings.build_scanner()
         self.setup = Setup(
-            world=load_world(options.world),
+            world=load_world(settings.world),
             scanner=scanner,
             robot=robot,
-            start=options.start_pose(),
-            seed=options.seed,
-            drift=drift,
-            obstacle_stop=options.obstacle_stop,
-            people=options.people,
-            people_speed=options.people_speed,
+            start=settings.start_pose(),
+            seed=settings.seed,
+            obstacle_stop=settings.obstacle_stop,
+            people=settings.people,
+            people_speed=settings.people_speed,
         )
         self._create_simulation()
-        if not options.obstacle_stop:
+        if not settings.obstacle_stop:
             self.log.warning("the obstacle stop is off, for fault injection: the robot will not brake before obstacles")
-        self._next_at = time.monotonic()
+        self._next_step_s = time.monotonic()
         if self._required_services:
             self._update_note()
             self.log.info(self.note)
@@ -122,7 +120,7 @@ class SimulatorService(Service):
         """
         robot = self.setup.robot
         fast = robot.command_age / robot.command_timeout
-        self.simulation.clock_factor = fast if self.options.pace == "fast" else max(1.0, self.speed)
+        self.simulation.clock_factor = fast if self.settings.pace == "fast" else max(1.0, self.speed)
 
     def _on_liveliness(self, service: str, alive: bool) -> None:  # noqa: FBT001 - zenoh calls it, in its own thread
         if alive:
@@ -140,21 +138,21 @@ class SimulatorService(Service):
             return None
         if self._required_services:
             return 0.0 if self._required_services <= self._alive else 0.05
-        return 0.0 if self.options.pace == "fast" else self._next_at - time.monotonic()
+        return 0.0 if self.settings.pace == "fast" else self._next_step_s - time.monotonic()
 
     def on_timer(self) -> None:
         """Publish the first scan, or the next one; in lockstep the same scan again."""
         if self._required_services:
             self._required_services = set()
             self._update_note()
-            self._next_at = time.monotonic()
+            self._next_step_s = time.monotonic()
         if self._published is None:
             self._observe()
         elif self.lockstep:
             self.log.warning(
                 "lockstep: no command answered the scan, so it is sent again; are estimator and controller running?",
                 stamp_ns=self.simulation.stamp_ns,
-                waited_s=self.options.lockstep_deadline,
+                waited_s=self.settings.lockstep_deadline,
             )
             self.counters["scans_sent_again"] += 1
             self._publish()
@@ -191,12 +189,12 @@ class SimulatorService(Service):
             self.publish(topic, message)
         now = time.monotonic()
         if self.lockstep:
-            self._next_at = now + self.options.lockstep_deadline
+            self._next_step_s = now + self.settings.lockstep_deadline
         else:
-            self._next_at += self._period_s
-            if now - self._next_at > MAX_LAG_S:
+            self._next_step_s += self._period_s
+            if now - self._next_step_s > MAX_LAG_S:
                 self.counters["late"] += 1
-                self._next_at = now
+                self._next_step_s = now
 
     def on_request(self, query: Query, request: Request) -> Reply:
         """Carry out a request. Raises UserError if that is not possible."""
@@ -227,13 +225,14 @@ class SimulatorService(Service):
         self._update_note()
         # In lockstep, a command that came during the pause did not advance time. Publish the scan again at once, so
         # that it is answered again.
-        self._next_at = time.monotonic()
+        self._next_step_s = time.monotonic()
 
     def _update_note(self) -> None:
         """Sets the note shown in health: whether and how fast time runs."""
         waits = f"waits for {', '.join(sorted(self._required_services))}" if self._required_services else ""
         speed = f"runs at {self.speed:g} x real time" if self.speed != 1 else ""
         self.note = "paused" if self.paused else waits or speed
+        self.idle = self.paused or bool(waits)
 
     def _step(self) -> Reply:
         """Advances by one scan while paused. In lockstep the present scan must have its command first."""
@@ -241,7 +240,7 @@ class SimulatorService(Service):
             return Reply(ok=False, reason="time runs: pause first, then step")
         if self._required_services:
             return Reply(ok=False, reason=f"time has not begun: waits for {', '.join(sorted(self._required_services))}")
-        self._next_at = time.monotonic()
+        self._next_step_s = time.monotonic()
         if self._published is not None and self.lockstep and not self.simulation.answered:
             self._publish()
             return Reply(ok=False, reason="no command has answered this scan yet; it is sent again: ask once more")
@@ -252,12 +251,13 @@ class SimulatorService(Service):
 
     def _set_speed(self, factor: float) -> Reply:
         """Sets the speed relative to real time."""
-        if self.options.pace != "realtime":
-            why = "each scan waits for its command" if self.lockstep else "it goes as fast as it can"
-            return Reply(ok=False, reason=f"the pace is {self.options.pace}: {why}; a speed needs --pace realtime")
+        if self.settings.pace != "realtime":
+            reason = "each scan waits for its command" if self.lockstep else "it goes as fast as it can"
+            return Reply(ok=False, reason=f"the pace is {self.settings.pace}: {reason}; a speed needs --pace realtime")
         self.speed = factor
         self._update_clock_factor()
-        self._next_at = min(self._next_at, time.monotonic() + self._period_s)  # a slow pace may have put it far ahead
+        # A slow pace may have put the next step far ahead.
+        self._next_step_s = min(self._next_step_s, time.monotonic() + self._period_s)
         self._update_note()
         self.log.info("speed", factor=factor)
         return Reply()
@@ -266,7 +266,7 @@ class SimulatorService(Service):
         self.setup = replace(self.setup, seed=self.setup.seed if seed is None else seed)
         self.simulation.close()
         self._create_simulation()
-        self._published, self._next_at = None, time.monotonic()
+        self._published, self._next_step_s = None, time.monotonic()
 
     def _sample(self, request: SampleRequest) -> SampleReply:
         scanner = self.setup.scanner.with_beams(request.beams)

@@ -75,10 +75,6 @@ class SimulatorSettings(RobotSettings):
     obstacle_stop: Annotated[
         bool, Field(description="brake before obstacles in the scan; turn off only for fault injection")
     ] = True
-    turn_by_turn: Annotated[float, Field(ge=0, description="odometry alpha 1, rad²/rad")] = 1e-3
-    turn_by_path: Annotated[float, Field(ge=0, description="odometry alpha 2, rad²/m")] = 5e-4
-    path_by_path: Annotated[float, Field(ge=0, description="odometry alpha 3, m²/m")] = 1e-3
-    path_by_turn: Annotated[float, Field(ge=0, description="odometry alpha 4, m²/rad")] = 1e-4
 
     def build_scanner(self) -> Scanner:
         """Scanner according to the settings. Raises UserError if it is unknown."""

@@ -49,8 +49,8 @@ class Simulation:
         self.setup, self.world = setup, _name_obstacles(setup.world)
         robot, scanner = setup.robot, setup.scanner
         pose = np.array(setup.start) if setup.start is not None else self.world.start_pose(robot.radius)
-        if (why := self.placement_error(pose)) is not None:
-            raise UserError(f"start {why}")
+        if (error := self.placement_error(pose)) is not None:
+            raise UserError(f"start {error}")
         # Separate random streams, so that people do not change the noise.
         scan_seed, odom_seed, people_seed = np.random.SeedSequence(setup.seed).spawn(3)
         self.people: People | None = None
@@ -213,15 +213,15 @@ class Simulation:
 
     def placement_error(self, pose: Array) -> str | None:
         """Why the robot cannot stand at a pose (3,). None if it can."""
-        return self.world.why_no_room(pose, self.setup.robot.radius)
+        return self.world.placement_error(pose, self.setup.robot.radius)
 
     def teleport(self, pose: Array) -> None:
         """Put the robot at a pose (3,), at rest. Odometry does not change, and people make room.
 
         Raises UserError if the robot cannot stand there.
         """
-        if (why := self.placement_error(pose)) is not None:
-            raise UserError(why)
+        if (error := self.placement_error(pose)) is not None:
+            raise UserError(error)
         self._make_room(pose)
         self.physics.place(pose)
         self._velocity, self._command = np.zeros(3), None

@@ -98,12 +98,13 @@ class WalkableGrid:
 
     def _shorten(self, place: Array, path: Array, blocked: Array) -> Array:
         """``place``, followed by those points of ``path`` (P, 2) m that are needed."""
-        shortened, at = [place], 0
-        while at < len(path):
-            visible = np.flatnonzero(self._clear_lines(shortened[-1], path[at : at + MAX_SHORTCUT_NODES], blocked))
-            at += int(visible[-1]) if len(visible) else 0  # the next node is always visible, but for rounding errors
-            shortened.append(path[at])
-            at += 1
+        shortened, index = [place], 0
+        while index < len(path):
+            next_nodes = path[index : index + MAX_SHORTCUT_NODES]
+            visible = np.flatnonzero(self._clear_lines(shortened[-1], next_nodes, blocked))
+            index += int(visible[-1]) if len(visible) else 0  # the next node is always visible, but for rounding errors
+            shortened.append(path[index])
+            index += 1
         return np.array(shortened)
 
     def _clear_lines(self, start: Array, ends: Array, blocked: Array) -> Array:

@@ -42,8 +42,8 @@ from common.messages.topics import (
     Query,
     Topic,
 )
+from common.runtime.liveness import start_command
 from services.viewer import visitor_requests as requests
-from services.viewer.state.health_rows import how_to_start
 from services.viewer.state.roster import Roster
 
 ANSWER_TIMEOUT_S = 3.0
@@ -114,7 +114,7 @@ class Control:
 
     def _check_running(self, robot: str, service: str) -> None:
         if service not in self._roster.services(robot):
-            start = how_to_start(service, robot, self._connect)
+            start = start_command(service, robot, self._connect)
             raise UserError(f"the {service} is not running; start it with: {start}")
 
     def _check_subscriber(self, robot: str, topic: Topic, service: str) -> None:

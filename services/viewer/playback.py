@@ -95,7 +95,7 @@ class Playback:
 
     def _start(self, name: str) -> Child:
         command = [sys.executable, "-m", "presage", "replay", str(self.folder / name), "--robot", self.robot]
-        command += ["--connect", self._connect, "--force", "--paused", "--stay"]
+        command += ["--connect", self._connect, "--force", "--paused"]
         stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed in _end
         process = subprocess.Popen(  # noqa: S603 - runs this package; `open` checked the name against the folder
             command,

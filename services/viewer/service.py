@@ -15,11 +15,11 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import ClassVar
 
-from common.bus.bus import DEFAULT_ENDPOINT
 from common.bus.inbox import Sample
 from common.messages.definitions import Health, Status
 from common.messages.topics import SCAN, TOPICS, Topic
 from common.messages.wire import DecodeError
+from common.runtime.liveness import RobotLiveness, start_command
 from common.runtime.service import Service
 from common.versions import versions
 from services.viewer.control import Control, RobotLookup
@@ -27,13 +27,12 @@ from services.viewer.desk import Desk, DeskContext
 from services.viewer.playback import Playback
 from services.viewer.server import WebServer, create_app, link, listen
 from services.viewer.settings import ViewerSettings
-from services.viewer.state.health_rows import HealthHistory, how_to_start, missing
+from services.viewer.state.health_rows import rows_of
 from services.viewer.state.robot_view import ALWAYS_READ_TOPICS, SHOWN_TOPICS, RobotView
 from services.viewer.state.roster import Roster
 from services.viewer.visitors import Hub, Visitor
 
 TICK_PERIOD_S = 1.0
-SCAN_TIMEOUT_S = 2.0  # after this time without a scan, the scanner counts as missing
 UNWATCHED_TIMEOUT_S = 600.0  # a robot is unsubscribed after this time without a visitor, except the configured one
 
 
@@ -42,9 +41,8 @@ class FollowedRobot:
     """A robot whose messages are subscribed."""
 
     view: RobotView
-    health: HealthHistory = field(default_factory=HealthHistory)
+    liveness: RobotLiveness
     unread: dict[Topic, Sample] = field(default_factory=dict)  # newest of each topic, not decoded yet
-    scan_at: float = -1e9  # monotonic time of the last scan, s
     watched_at: float = field(default_factory=time.monotonic)  # monotonic time at which a visitor last watched, s
     unsubscribe: list[Callable[[], None]] = field(default_factory=list)
 
@@ -64,9 +62,8 @@ class ViewerService(Service):
         self.pool = ThreadPoolExecutor(16, "action")
         self.robots: dict[str, FollowedRobot] = {}
         self._reopened: set[str] = set()  # robots of replays that now show another recording
-        self._changed: deque[str] = deque()  # robots whose services came or went
-        # For the start commands that the page shows; empty if they do not need --connect.
-        self._connect = "" if settings.connect == DEFAULT_ENDPOINT else settings.connect
+        self._changed: deque[str] = deque()  # robots whose services started or ended
+        self._connect = settings.link().connect_option
         self._tick_at = 0.0
         self._web: WebServer | None = None
 
@@ -75,7 +72,7 @@ class ViewerService(Service):
         options = self.options
         listener = listen(options)
         self._follow(options.robot)
-        self.loop.bus.watch_robots(self._came_or_went)
+        self.loop.bus.watch_robots(self._on_liveliness)
         lookup = RobotLookup(self._status, self._stamp_ns)
         context = DeskContext(
             hub=self.hub,
@@ -116,7 +113,7 @@ class ViewerService(Service):
         if followed is None or sample.topic not in SHOWN_TOPICS:
             return
         if sample.topic is SCAN:
-            followed.scan_at = time.monotonic()
+            followed.liveness.add_scan(time.monotonic())
         if robot in self.hub.watched or sample.topic in ALWAYS_READ_TOPICS:
             self._read(robot, followed, sample)
         else:
@@ -130,15 +127,15 @@ class ViewerService(Service):
             return
         now = time.monotonic()
         if isinstance(message, Health):
-            followed.health.add(message, now)
+            followed.liveness.add_health(message, now)
             return
         view = followed.view
         self._show(robot, view, view.add(sample.topic, message, now, sample.published_ns))
         if view.time_restarted:
             view.time_restarted = False
             self._tell(robot, "history", _history(view))
-        if view.log_changed:
-            view.log_changed = False
+        if view.journal_changed:
+            view.journal_changed = False
             self._tell(robot, "journal", _journal(view))
 
     def _show(self, robot: str, view: RobotView, frame: bytes | None) -> None:
@@ -152,8 +149,8 @@ class ViewerService(Service):
         if robot in self.hub.watched:
             self.hub.call_soon(partial(self.hub.queue_text, robot, kind, text))
 
-    def _came_or_went(self, robot: str, service: str, there: bool) -> None:  # noqa: FBT001 - zenoh's thread
-        self.roster.change(robot, service, there)
+    def _on_liveliness(self, robot: str, service: str, alive: bool) -> None:  # noqa: FBT001 - zenoh's thread
+        self.roster.change(robot, service, alive)
         self._changed.append(robot)
         self._wake()
 
@@ -168,7 +165,7 @@ class ViewerService(Service):
         return max(0.0, min([self._tick_at - now, *waits]))
 
     def on_timer(self) -> None:
-        """Sends what is due; see `due`."""
+        """Sends delayed frames, welcomes new visitors, and updates the list of services once a second."""
         now = time.monotonic()
         while self._reopened:
             if (followed := self.robots.get(robot := self._reopened.pop())) is not None:
@@ -227,12 +224,13 @@ class ViewerService(Service):
             self.log.error(self.note)
 
     def _services(self, robot: str, followed: FollowedRobot) -> str:
-        now, alive, linked = time.monotonic(), self.roster.services(robot), self.loop.bus.linked()
-        names = missing(alive, linked=linked, scans=now - followed.scan_at < SCAN_TIMEOUT_S)
+        now, linked, liveness = time.monotonic(), self.loop.bus.linked(), followed.liveness
+        liveness.set_alive(self.roster.services(robot), now)
+        missing = [*([] if linked else ["router"]), *liveness.missing(now)]
         message = {
             "type": "services",
-            "services": followed.health.rows(alive, now),
-            "missing": [{"name": name, "start": how_to_start(name, robot, self._connect)} for name in names],
+            "services": rows_of(liveness, now),
+            "missing": [{"name": name, "start": start_command(name, robot, self._connect)} for name in missing],
             "linked": linked,
         }
         return json.dumps(message)
@@ -241,7 +239,7 @@ class ViewerService(Service):
         """Subscribes to the robot's topics, unless that was done before."""
         if robot not in self.robots:
             live = "replay" not in self.roster.services(robot)
-            followed = self.robots[robot] = FollowedRobot(RobotView(robot, live=live))
+            followed = self.robots[robot] = FollowedRobot(RobotView(robot, live=live), RobotLiveness(robot))
             for topic in TOPICS:
                 # A replay publishes the messages of one step at once. All are kept, because the newest messages
                 # of different topics may have different stamps.

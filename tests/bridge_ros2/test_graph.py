@@ -19,7 +19,7 @@ def why(*tokens):
     graph = Graph()
     for each in tokens:
         graph.change(each, there=True)
-    return graph.why_silent("/scan", LASER_SCAN, "--scan-topic", no_endpoints="NOBODY")
+    return graph.explain_silence("/scan", LASER_SCAN, "--scan-topic", no_endpoints="NOBODY")
 
 
 def test_nobody_another_topic_another_type_another_hash_or_just_silence():
@@ -28,15 +28,15 @@ def test_nobody_another_topic_another_type_another_hash_or_just_silence():
     text = why(token("MP", "/scan_raw", LASER_SCAN), token("MP", "/odom", ODOMETRY))
     assert "/scan_raw" in text
     assert "--scan-topic" in text
-    assert "nor any other" in why(token("MP", "/odom", ODOMETRY))
-    assert "of type nav_msgs/msg/Odometry" in why(token("MP", "/scan", ODOMETRY))
+    assert "no node publishes sensor_msgs/msg/LaserScan" in why(token("MP", "/odom", ODOMETRY))
+    assert "its type is nav_msgs/msg/Odometry" in why(token("MP", "/scan", ODOMETRY))
     foreign = token("MP", "/scan", LASER_SCAN).replace(type_hash(LASER_SCAN), "RIHS01_1234")
     text = why(foreign)
     assert "RIHS01_1234" in text
     assert type_hash(LASER_SCAN) in text
     assert "nothing arrives" in why(token("MP", "/scan", LASER_SCAN))
     assert "/driver" in why(token("MP", "/scan", LASER_SCAN))
-    assert "nobody publishes it" in why(token("MS", "/scan", LASER_SCAN))
+    assert "no node publishes" in why(token("MS", "/scan", LASER_SCAN))
 
 
 def test_whoever_goes_is_forgotten():
@@ -56,30 +56,35 @@ def test_the_kind_of_command_that_the_robot_listens_for():
 
 
 def test_a_complaint_names_the_option_that_mends_it():
-    def said(graph, problem="", *, linked=True, quiet=0.0, heard=True, reckoned=True, **options):
+    def said(graph, problem="", *, linked=True, scan_age=0.0, received=True, with_odometry=True, **options):
         settings = BridgeRos2Settings(**options)
-        return diagnose(settings, graph, problem, linked=linked, quiet=quiet, heard=heard, reckoned=reckoned)
+        return diagnose(
+            settings, graph, problem, linked=linked, scan_age=scan_age, received=received, with_odometry=with_odometry
+        )
 
     graph = Graph()
     assert said(graph) == ""
-    assert "it is gone" in said(graph, linked=False)
-    assert said(graph, heard=False) == "no scan on /scan yet"
-    nothing = said(graph, quiet=4.0, ros_connect="tcp/rover:7447")
-    assert "nothing of ROS is heard at tcp/rover:7447" in nothing
+    assert "the connection is lost" in said(graph, linked=False)
+    assert said(graph, received=False) == "no scan on /scan yet"
+    nothing = said(graph, scan_age=4.0, ros_connect="tcp/rover:7447")
+    assert "there are no ROS nodes at tcp/rover:7447" in nothing
     assert "RMW_IMPLEMENTATION=rmw_zenoh_cpp" in nothing
-    assert "does zenoh-bridge-ros2dds run there" in said(graph, quiet=4.0, flavor="ros2dds")
-    assert said(graph, quiet=1.0, heard=False) == "no scan on /scan yet"  # only after the timeout
-    assert "on /r1/scan for 3 s" in said(graph, quiet=4.0, namespace="r1")
-    assert said(graph, "too odd", quiet=4.0) == "scans on /scan cannot be used: too odd"
-    assert "on /odom or in tf" in said(graph, reckoned=False)
+    assert "that zenoh-bridge-ros2dds runs there" in said(graph, scan_age=4.0, flavor="ros2dds")
+    assert said(graph, scan_age=1.0, received=False) == "no scan on /scan yet"  # only after the timeout
+    assert "on /r1/scan for 3 s" in said(graph, scan_age=4.0, namespace="r1")
+    assert said(graph, "too odd", scan_age=4.0) == "scans on /scan cannot be used: too odd"
+    assert "on /odom or in tf" in said(graph, with_odometry=False)
     graph.change(token("MP", "/odom", ODOMETRY, 9), there=True)
-    assert said(graph, odom_topic="odm") == "no odometry on /odm: nav_msgs/msg/Odometry is on /odom: --odom-topic"
+    assert (
+        said(graph, odom_topic="odm")
+        == "no odometry on /odm; set --odom-topic: nav_msgs/msg/Odometry is published on /odom"
+    )
     assert said(graph, odom_topic="odom") == ""
     graph.change(token("MP", "/odom", ODOMETRY, 9), there=False)
     assert said(graph, odom_topic="odm") == ""  # no other odometry topic exists, so tf is used
-    assert said(graph, reckoned=False, tf="map-base") == ""
+    assert said(graph, with_odometry=False, tf="map-base") == ""
     graph.change(token("MS", "/cmd_vel", TWIST_STAMPED), there=True)
-    assert said(graph) == "/cmd_vel: the robot listens for geometry_msgs/msg/TwistStamped: --stamped"
+    assert said(graph) == "the robot expects geometry_msgs/msg/TwistStamped on /cmd_vel; set --stamped"
     assert said(graph, stamped=True) == said(graph, commands=False) == ""
 
 
@@ -92,13 +97,13 @@ def silent(*tokens, **options):
     graph = Graph(settings.names())
     for each in tokens:
         graph.change(each, there=True)
-    return diagnose(settings, graph, "", linked=True, quiet=4.0, heard=False, reckoned=False)
+    return diagnose(settings, graph, "", linked=True, scan_age=4.0, received=False, with_odometry=False)
 
 
 def test_the_other_flavor_and_another_domain_are_named():
     far = Node(Names(domain=5), "ab", "", "driver").endpoint_token("MP", 1, "/scan", LASER_SCAN, Qos())
-    assert silent(DDS_SCAN).endswith("zenoh-bridge-ros2dds that speaks, not rmw_zenoh: --flavor ros2dds")
-    assert "in ROS domain 0, but in 5: --domain 5" in silent(far)
+    assert silent(DDS_SCAN).endswith("uses zenoh-bridge-ros2dds, not rmw_zenoh; set --flavor ros2dds")
+    assert "in ROS domain 0, but in 5; set --domain 5" in silent(far)
     assert silent(far, flavor="ros2dds").endswith("--flavor rmw_zenoh --domain 5")
     assert silent(token("MP", "/scan", LASER_SCAN), flavor="ros2dds").endswith("--flavor rmw_zenoh")
     # rviz is there, but the scanner is not.
@@ -118,12 +123,12 @@ def test_a_distro_that_does_not_fit_is_named_though_scans_come():
         graph = Graph(settings.names())
         for each in tokens:
             graph.change(each, there=True)
-        return diagnose(settings, graph, "", linked=True, quiet=0.0, heard=True, reckoned=True)
+        return diagnose(settings, graph, "", linked=True, scan_age=0.0, received=True, with_odometry=True)
 
     scans, listens = (humble.endpoint_token(*each, Qos()) for each in (
         ("MP", 1, "/scan", LASER_SCAN), ("MS", 2, "/cmd_vel", TWIST),
     ))  # fmt: skip
-    assert "types of /driver have no hashes, as Humble's: --distro humble" in said(scans, distro="jazzy")
+    assert "types of /driver have no hashes, as in Humble; set --distro humble" in said(scans, distro="jazzy")
     assert "--distro humble" in said(listens, distro="jazzy")
     assert "--distro jazzy" in said(jazzy, distro="humble")
     assert said(scans, distro="humble") == said(jazzy, distro="jazzy") == ""
@@ -137,9 +142,9 @@ def test_a_distro_that_does_not_fit_is_named_though_scans_come():
 def test_a_second_map_is_named():
     graph = Graph()
     graph.change(token("MP", "/map", OCCUPANCY_GRID), there=True)
-    for publish, says in ((True, "/map: /driver publishes a map there as well: leave out --publish-map"), (False, "")):
+    for publish, says in ((True, "/driver also publishes a map on /map; leave out --publish-map"), (False, "")):
         settings = BridgeRos2Settings(publish_map=publish)
-        said = diagnose(settings, graph, "", linked=True, quiet=0.0, heard=True, reckoned=True)
+        said = diagnose(settings, graph, "", linked=True, scan_age=0.0, received=True, with_odometry=True)
         assert said.startswith(says)
         assert bool(said) is publish
 

@@ -204,8 +204,8 @@ def test_it_says_what_it_waits_for_and_what_is_wrong(processes, router):
     bridge = processes.start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{port}", env=wrong)
     with Ros(port, "rmw_zenoh", "jazzy") as node:
         node.publisher("scan_raw", LASER)
-        nowhere.wait_for("waits for the zenoh router at tcp/127.0.0.1:1")
-        bridge.wait_for("nobody publishes it; sensor_msgs/msg/LaserScan is on /scan_raw: --scan-topic")
+        nowhere.wait_for("waiting for the zenoh router at tcp/127.0.0.1:1")
+        bridge.wait_for("no node publishes it; set --scan-topic: sensor_msgs/msg/LaserScan is published on /scan_raw")
         put, last = node.publisher("scan", LASER), [0.0]
 
         def complains_about_tf():
@@ -216,5 +216,5 @@ def test_it_says_what_it_waits_for_and_what_is_wrong(processes, router):
 
         assert wait_until(complains_about_tf, WAIT_TIMEOUT_S), bridge.output
     theirs.kill()
-    bridge.wait_for("it is gone")
+    bridge.wait_for("the connection is lost")
     assert nowhere.stop()[0] == bridge.stop()[0] == 0

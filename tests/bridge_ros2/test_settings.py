@@ -33,7 +33,7 @@ def test_router_without_a_port(said):
 @pytest.mark.parametrize(
     ("said", "why"),
     [
-        (["--map-frame", "odom"], "three frames, each needs a name of its own"),
+        (["--odom-frame", "map"], "three frames, each needs a name of its own"),
         (["--base-frame", "odom"], "--odom-frame odom, --base-frame odom"),
         (["--scan-topic", "odom"], "a topic has one type"),
         (["--ros-config", "no/such.json5"], "there is no such file"),

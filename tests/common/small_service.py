@@ -35,14 +35,14 @@ class Small(Service):
         self.fail = settings.fail
         if settings.slow == "making":
             self.log.info("in the making")
-            time.sleep(1.0)
+            time.sleep(0.5)
 
     def open(self):
         if self.fail == "open":
             raise UserError("no weights in that folder; train some")
         if self.settings.slow == "opening":
             self.log.info("opening")
-            time.sleep(1.0)
+            time.sleep(0.5)
 
     def on_message(self, topic, message):
         if isinstance(message, Scan):

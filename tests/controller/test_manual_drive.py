@@ -6,197 +6,111 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.geometry import se2
-from common.geometry.world import World
 from common.messages.definitions import Drive, Twist
 from common.robot.base import Robot
-from services.controller.manual_drive import MANUAL_TIMEOUT_NS, ManualDrive
+from services.controller.manual_drive import ManualDrive
 from services.controller.navigator import Navigator
-from tests.controller.test_navigator import PERIOD_NS, ROOM, belief, goal, scan
+from tests.controller.driving import PERIOD_NS, PERIOD_S, box, goal, room, scan, session
+
+ROOM = room(10, 4)
+NEAR, FAR, IN_A_WALL = goal(3, 2), goal(8.5, 2), goal(20, 20)
 
 
-def drive_message(vx=0.0, vy=0.0, wz=0.0) -> Drive:
+def move(vx=0.0, vy=0.0, wz=0.0) -> Drive:
     return Drive(stamp_ns=0, twist=Twist(vx=vx, vy=vy, wz=wz))
 
 
-def session(navigator, pose, drives, *, world=ROOM, first=0, state="tracking"):
-    """Drive a perfect robot; ``drives`` has a message or None for each scan. Returns (command, status, pose) tuples."""
-    pose, log = np.array(pose, float), []
-    for number, drive in enumerate(drives, start=first):
-        stamp = number * PERIOD_NS
-        navigator.on_scan(scan(stamp, pose, world))
-        if drive is not None:
-            navigator.on_drive(drive)
-        command, status = navigator.step(belief(stamp, pose, state))
-        log.append((command, status, pose))
-        pose = se2.compose(pose, command.twist.array() * PERIOD_NS * 1e-9)
-    return log
-
-
-def states(log) -> list[str]:
-    return [status.state for _, status, _ in log]
-
-
-def test_manual_drive_has_priority_until_it_times_out():
+@pytest.mark.parametrize(
+    ("to", "belief_state", "drives", "states"),
+    [
+        (FAR, "tracking", [None] * 3 + [move(-0.4)] * 20 + [None] * 20,
+         [("navigating", 3), ("manual", 27), ("navigating", 13)]),  # 7 periods are 0.467 s
+        (FAR, "tracking", [move(vy=0.5)] * 5 + [move()] * 30, [("manual", 13), ("navigating", 22)]),
+        (None, "tracking", [move(wz=1.0)] * 5 + [None] * 20, [("manual", 12), ("idle", 13)]),
+        (NEAR, "tracking", [None] * 2 + [move(1.0)] * 30 + [None] * 20, [("reached", 2), ("manual", 37), ("idle", 13)]),
+        (IN_A_WALL, "tracking", [None, move(1.0), *[None] * 10], [("blocked", 1), ("manual", 8), ("blocked", 3)]),
+        (FAR, "lost", [None, *[move(0.5)] * 10, *[None] * 9], [("lost", 1), ("manual", 17), ("lost", 2)]),
+    ],
+    ids=["with a goal", "repeated zero", "without a goal", "reached goal", "refused goal", "lost"],
+)  # fmt: skip
+def test_priority_until_the_timeout(to, belief_state, drives, states):
     navigator = Navigator(world=ROOM)
-    navigator.on_goal(goal(8.5, 2))
-    log = session(navigator, [3.0, 2, 0], [None] * 3 + [drive_message(vx=-0.4)] * 20 + [None] * 20)
-    assert states(log)[:3] == ["navigating"] * 3
-    assert states(log)[3:30] == ["manual"] * 27  # 7 periods are 0.467 s
-    assert states(log)[30:] == ["navigating"] * 13
-    assert log[15][0].twist.vx == pytest.approx(-0.4)
-    assert log[15][1].goal == goal(8.5, 2).pose
-    assert "by hand" in log[15][1].reason
-    assert "the goal waits" in log[15][1].reason
-    assert log[-1][0].twist.vx > 0.1
-
-
-def test_repeated_zero_velocity_releases_the_goal():
-    navigator = Navigator(world=ROOM)
-    navigator.on_goal(goal(8.5, 2))
-    log = session(navigator, [3.0, 2, 0], [drive_message(vy=0.5)] * 5 + [drive_message()] * 30)
-    assert states(log)[:13] == ["manual"] * 13
-    assert states(log)[13:] == ["navigating"] * 22
-    assert not log[12][0].twist.array().any()
-
-
-def test_idle_after_manual_drive_without_a_goal():
-    log = session(Navigator(world=ROOM), [3.0, 2, 0], [drive_message(wz=1.0)] * 5 + [None] * 20)
-    assert states(log) == ["manual"] * 12 + ["idle"] * 13
-    assert log[4][1].reason == "driven by hand"
-    assert log[4][0].twist.wz > 0.5
-    assert not log[-1][0].twist.array().any()
-
-
-def test_reached_goal_is_not_resumed():
-    navigator = Navigator(world=ROOM)
-    navigator.on_goal(goal(3.0, 2))
-    log = session(navigator, [3.0, 2, 0], [None] * 2 + [drive_message(vx=1.0)] * 30 + [None] * 20)
-    assert states(log)[1] == "reached"
-    assert states(log)[-1] == "idle"
-    assert log[-1][1].goal is None
-    assert log[-1][2][0] > 3.5
-
-
-def test_refused_goal_stays_refused():
-    navigator = Navigator(world=ROOM)
-    navigator.on_goal(goal(20, 20))
-    log = session(navigator, [3.0, 2, 0], [None, drive_message(vx=1.0), *[None] * 10])
-    assert (states(log)[1], states(log)[-1]) == ("manual", "blocked")
-    assert "goal refused" in log[-1][1].reason
+    if to is not None:
+        navigator.on_goal(to)
+    log = session(navigator, [3.0, 2, 0], drives, ROOM, state=belief_state)
+    assert [(state, len(list(run))) for state, run in itertools.groupby(log, lambda row: row[1].state)] == states
+    for _, status, _ in log:
+        if status.state == "manual":
+            assert status.reason == ("driven by hand; the goal waits" if to is FAR else "driven by hand")
 
 
 def test_goal_set_during_manual_drive():
     navigator = Navigator(world=ROOM)
-    session(navigator, [3.0, 2, 0], [drive_message(vx=0.2)] * 3)
+    session(navigator, [3.0, 2, 0], [move(0.2)] * 3, ROOM)
     navigator.on_goal(goal(8.5, 2, seq=7))
-    log = session(navigator, [3.0, 2, 0], [drive_message(vx=0.2)] * 3 + [None] * 9, first=3)
-    assert (states(log)[0], log[0][1].goal_seq) == ("manual", 7)
-    assert states(log)[-1] == "navigating"
+    log = session(navigator, [3.0, 2, 0], [move(0.2)] * 3 + [None] * 9, ROOM, first=3)
+    assert (log[0][1].state, log[0][1].goal_seq, log[-1][1].state) == ("manual", 7, "navigating")
+    assert log[2][0].twist.vx == pytest.approx(0.2)
 
 
-def test_manual_drive_with_a_lost_belief():
-    navigator = Navigator(world=ROOM)
-    navigator.on_goal(goal(8.5, 2))
-    log = session(navigator, [3.0, 2, 0], [None, *[drive_message(vx=0.5)] * 10, *[None] * 8], state="lost")
-    assert (states(log)[0], states(log)[-1]) == ("lost", "lost")
-    assert set(states(log)[1:11]) == {"manual"}
-    assert log[10][0].twist.vx == pytest.approx(0.5)
-
-
-@given(st.lists(st.tuples(*[st.floats(-1e3, 1e3)] * 3), min_size=5, max_size=25))
-def test_limits_hold_for_any_manual_velocity(drives):
+@settings(max_examples=15)
+@given(st.lists(st.tuples(*[st.floats(-1e3, 1e3)] * 3), min_size=5, max_size=15))
+def test_limits_hold_for_any_velocity(drives):
     robot = Robot(max_speed=0.6, acceleration=0.5)
-    log = session(Navigator(robot), [3.0, 2, 0], [drive_message(*twist) for twist in drives for _ in range(3)])
+    log = session(Navigator(robot), [3.0, 2, 0], [move(*twist) for twist in drives for _ in range(3)], ROOM)
     twists = np.array([command.twist.array() for command, _, _ in log])
-    period = PERIOD_NS * 1e-9
-    assert np.isfinite(twists).all()
-    assert np.linalg.norm(twists[:, :2], axis=1).max() <= 0.6 + 1e-9
+    speed = np.linalg.norm(twists[:, :2], axis=1)
+    assert speed.max() <= 0.6 + 1e-9
     assert np.abs(twists[:, 2]).max() <= robot.max_turn + 1e-9
-    changes = np.diff(twists, axis=0)
-    held = np.linalg.norm(twists[1:, :2], axis=1) < np.linalg.norm(twists[:-1, :2], axis=1)  # braking may be sharper
-    assert (np.linalg.norm(changes[:, :2], axis=1)[~held] <= 0.5 * period + 1e-6).all()
+    changes = np.linalg.norm(np.diff(twists, axis=0)[:, :2], axis=1)
+    assert (changes[speed[1:] >= speed[:-1]] <= 0.5 * PERIOD_S + 1e-6).all()  # braking may be sharper
 
 
-@pytest.mark.parametrize("heading", [0.0, 0.4, np.pi / 2, 2.5])
-def test_manual_drive_stops_before_obstacles(heading):
-    box = World(name="box", boundary=ROOM.boundary, obstacles=[{"box": {"center": (6, 2), "size": (1, 1)}}])
-    speeds = drive_message(vx=3 * np.cos(heading), vy=3 * np.sin(heading))
-    log = session(Navigator(), [3.0, 2, 0], [speeds] * 120, world=box)
+@pytest.mark.parametrize("heading", [0.0, 2.5])
+def test_stops_before_obstacles(heading):
+    world = room(10, 4, box(6, 2, 1, 1))
+    log = session(Navigator(), [3.0, 2, 0], [move(3 * np.cos(heading), 3 * np.sin(heading))] * 75, world)
     places = np.array([pose[:2] for _, _, pose in log])
-    assert box.clearance(places).min() > Robot().radius
+    assert world.clearance(places).min() > Robot().radius
     assert np.hypot(*(places[-1] - places[0])) > 1.0
     assert np.hypot(*log[-1][0].twist.array()[:2]) < 0.05
-    assert states(log)[-1] == "manual"
 
 
-def test_manual_drive_without_beliefs_brakes_after_the_timeout():
-    navigator, log = Navigator(world=ROOM), []
+def test_drive_without_beliefs_brakes_after_the_timeout():
+    navigator, answers = Navigator(world=ROOM), []
     for number in range(60):
-        navigator.on_scan(scan(number * PERIOD_NS, [3.0, 2, 0]))
+        navigator.on_scan(scan(number * PERIOD_NS, [3.0, 2, 0], ROOM))
         if 5 <= number < 30:
-            navigator.on_drive(drive_message(vx=0.8))
-        log.append(navigator.step_without_belief(number * PERIOD_NS))
-    assert log[:5] == [None] * 5
-    commands = [answer[0].twist.vx for answer in log[5:] if answer is not None]
+            navigator.on_drive(move(0.8))
+        answers.append(navigator.step_without_belief(number * PERIOD_NS))
+    assert answers[:5] == [None] * 5
+    assert answers[-1] is None  # the robot stands, and no drive message is valid
+    command, status = answers[20]
+    assert (command.stamp_ns, status.state) == (20 * PERIOD_NS, "manual")
+    commands = [command.twist.vx for command, _ in filter(None, answers)]
     assert max(commands) == pytest.approx(0.8)
     assert commands[-1] == 0.0
-    assert all(a - b <= PERIOD_NS * 1e-9 + 1e-9 for a, b in itertools.pairwise(commands))
-    assert log[20][1].state == "manual"
-    assert [answer[1].state for answer in log[5:] if answer is not None][-1] == "idle"
-    assert log[-1] is None  # the robot stands, and no drive message is valid
-    assert log[20][0].stamp_ns == 20 * PERIOD_NS
+    assert all(a - b <= PERIOD_S + 1e-9 for a, b in itertools.pairwise(commands))
 
 
-def test_reset_of_time_discards_the_last_message():
-    manual, late = ManualDrive(), 100 * 10**9
-    manual.update(drive_message(vx=1.0), late)
-    assert manual.twist(late) is not None
-    assert manual.twist(0) is None
-    assert manual.twist(late) is None
-
-
-@given(st.lists(st.tuples(st.integers(0, 400), st.booleans()), min_size=1, max_size=30), st.integers(0, 1500))
-def test_timeouts_for_random_message_sequences(messages, after):
-    """``messages``: ms since the last one, and whether it commands motion; queried ``after`` ms after the last one."""
-    manual, now, at = ManualDrive(), 0, []
-    for step, moves in messages:
-        now += step * 10**6
-        manual.update(drive_message(vx=1.0) if moves else drive_message(), now)
-        at.append((now, moves))
-    query = now + after * 10**6
-    last, in_motion = at[-1]
-    zero_since = last
-    for when, moves in reversed(at):
-        if moves:
-            break
-        zero_since = when  # intervals are shorter than the timeout, so the run is not interrupted
-    expected = query - last <= MANUAL_TIMEOUT_NS and (in_motion or query - zero_since <= MANUAL_TIMEOUT_NS)
-    assert (manual.twist(query) is not None) == expected
-
-
-def test_velocity_continues_after_a_pause():
-    navigator = Navigator(world=ROOM)
-    navigator.on_goal(goal(8.5, 2))
-    before = session(navigator, [2.0, 2, 0], [None] * 12)[-1]
-    stop = navigator.stop_without_belief(11 * PERIOD_NS, "no belief")[0]
-    assert not stop.twist.array().any()
-    after = session(navigator, before[2], [None] * 2, first=12)[0]
-    assert after[0].twist.vx >= before[0].twist.vx > 0.5
-    assert after[1].state == "navigating"
-
-
-@pytest.mark.parametrize("late", [1, 9])
-def test_velocity_starts_from_zero_after_a_late_estimator(late):
-    navigator = Navigator(world=ROOM)
-    navigator.on_goal(goal(8.5, 2))
-    before = session(navigator, [2.0, 2, 0], [None] * 12)[-1]
-    for number in range(12, 12 + late):
-        navigator.on_scan(scan(number * PERIOD_NS, before[2]))  # scans without beliefs
-    navigator.stop_without_belief(11 * PERIOD_NS, "no belief")
-    command, _ = navigator.step(belief((11 + late) * PERIOD_NS, before[2]))
-    assert 0 < command.twist.vx <= Robot().acceleration * late * PERIOD_NS * 1e-9 + 1e-9
-    assert command.twist.vx < before[0].twist.vx
+@pytest.mark.parametrize(
+    ("messages", "valid"),
+    [
+        ([], [(0, False)]),
+        ([(100, 1)], [(100, True), (600, True), (601, False)]),
+        ([(0, 1), (400, 0)], [(900, True), (901, False)]),  # zero velocity once
+        ([(0, 0), (400, 0)], [(500, True), (501, False)]),  # repeated: the time counts from the first
+        ([(0, 0), (400, 0), (600, 1)], [(1100, True)]),
+        ([(0, 0), (501, 0)], [(1001, True), (1002, False)]),  # after a gap it counts anew
+        ([(100_000, 1)], [(100_000, True), (0, False), (100_000, False)]),  # time went back: a reset
+    ],
+)
+def test_timeouts(messages, valid):
+    """``messages``: time in ms and vx; ``valid``: time in ms and whether the robot is driven by hand."""
+    manual = ManualDrive()
+    for now, vx in messages:
+        manual.update(move(vx), now * 10**6)
+    assert [(now, manual.twist(now * 10**6) is not None) for now, _ in valid] == valid

@@ -49,7 +49,7 @@ def beliefs(service):
     ("settings", "file"),
     [({"estimator": "precise"}, "corridor-precise"), ({"estimator": "paper"}, "corridor-paper-622")],
 )
-def test_the_answer_makes_the_very_same_estimator(settings, file, shipped, tmp_path):
+def test_same_estimator_from_reply(settings, file, shipped, tmp_path):
     # These weights differ from the shipped ones, so that use of the shipped ones by mistake is noticed.
     data = change_weights(shipped / f"{file}.safetensors")
     service = opened(models=shipped, **settings)
@@ -68,7 +68,7 @@ def test_the_answer_makes_the_very_same_estimator(settings, file, shipped, tmp_p
     assert beliefs(opened(**settings)) != first  # the difference is visible
 
 
-def test_weights_come_only_when_asked_for(shipped):
+def test_without_weights(shipped):
     service = opened(models=shipped)
     reply = ask(service, with_weights=False)
     assert len(reply.weights) == 0
@@ -76,7 +76,7 @@ def test_weights_come_only_when_asked_for(shipped):
     assert reply == ask(service).model_copy(update={"weights": reply.weights})
 
 
-def test_a_file_of_weights_gets_the_name_that_a_folder_wants(shipped, tmp_path):
+def test_file_name(shipped, tmp_path):
     for suffix in (".safetensors", ".json"):
         (shipped / f"corridor-precise{suffix}").rename(tmp_path / f"mine-of-old{suffix}")
     service = opened(model=str(tmp_path / "mine-of-old.safetensors"), world="maze")
@@ -88,14 +88,14 @@ def test_a_file_of_weights_gets_the_name_that_a_folder_wants(shipped, tmp_path):
 
 
 @pytest.mark.parametrize("settings", [{"estimator": "particle-filter"}, {"model": "exact"}])
-def test_what_learned_nothing_says_so_and_names_its_map(settings):
+def test_nothing_learned(settings):
     reply = ask(opened(**settings))
     assert reply.ok
     assert (reply.file, reply.card, reply.size) == ("", "", 0)
     assert reply.world == load_world("corridor")
 
 
-def test_the_paper_does_not_know_its_weights_before_it_knows_the_beams():
+def test_paper_before_first_scan():
     service = opened(estimator="paper")
     reply = ask(service)
     assert not reply.ok
@@ -108,7 +108,7 @@ def test_the_paper_does_not_know_its_weights_before_it_knows_the_beams():
     assert json.loads(ask(service).card)["scanner"]["beams"] == 811
 
 
-def test_weights_changed_on_disk_are_not_passed_off_as_those_in_use(shipped):
+def test_weights_changed_on_disk(shipped):
     service = opened(models=shipped)
     path = shipped / "corridor-precise.safetensors"
     before = ask(service)

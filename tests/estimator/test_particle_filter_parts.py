@@ -24,7 +24,7 @@ HALL = World(name="hall", boundary=[(0, 0), (10, 0), (10, 10), (0, 10)])
 ALPHAS = (0.04, 0.02, 0.03, 0.05, 0.01)
 
 
-def test_the_distance_field_is_exact_at_nodes_and_close_between():
+def test_distance_field():
     field, rng = DistanceField(ROOM, 0.05), np.random.default_rng(0)
     points = rng.uniform((-1, -1), (7, 5), (4000, 2))
     exact = np.clip(ROOM.clearance(points), -2, 2)
@@ -36,7 +36,7 @@ def test_the_distance_field_is_exact_at_nodes_and_close_between():
     assert np.abs(field(x, y) - nodes).max() < 2e-4  # single precision finds the node to 1e-6 of a cell
 
 
-def test_surfaces_are_where_they_are_seen_and_far_away_is_saturated():
+def test_surfaces_and_saturation():
     """The distance is 0 on the boundary of free space, to 0.1 mm, so that no pose is drawn into the walls."""
     field = DistanceField(HALL, 0.07)
     along = np.linspace(0.5, 9.5, 50)
@@ -46,7 +46,7 @@ def test_surfaces_are_where_they_are_seen_and_far_away_is_saturated():
     assert field(np.array([5.0]), np.array([5.0]))[0] == 2.0
 
 
-def test_a_world_too_large_for_the_field_is_refused():
+def test_too_large_world():
     huge = World(name="huge", boundary=[(0, 0), (9000, 0), (9000, 9000), (0, 9000)])
     with pytest.raises(UserError, match="coarser resolution"):
         DistanceField(huge)
@@ -55,7 +55,7 @@ def test_a_world_too_large_for_the_field_is_refused():
 
 
 @pytest.mark.parametrize("sigma", [0.05, 0.1, 0.5])
-def test_likelihood_field_of_a_beam_is_a_density(sigma):
+def test_likelihood_field_is_a_density(sigma):
     """Integrates over all ranges of a beam perpendicular to a wall, without other surfaces nearby."""
     field = LikelihoodField(DistanceField(HALL, 0.05), 0.95, 0.05)
     z, pose = np.linspace(0, 25, 25001), np.array([[5.0, 5.0, 0.0]])
@@ -65,7 +65,7 @@ def test_likelihood_field_of_a_beam_is_a_density(sigma):
     assert np.sum(density) * 0.01 == pytest.approx(1.0, abs=6e-3)
 
 
-def test_a_product_of_many_beams_does_not_underflow():
+def test_product_of_many_beams():
     field = LikelihoodField(DistanceField(ROOM), 0.95, 0.05)
     far = np.full((2, 811), 1.5)
     log = field.log_product(far, 0.1, 25.0)
@@ -75,7 +75,7 @@ def test_a_product_of_many_beams_does_not_underflow():
 
 @settings(max_examples=40, deadline=None)
 @given(st.floats(0.05, 30), st.floats(0.02, 1), st.floats(0.05, 3))
-def test_the_beam_model_is_a_density(expected, sigma, rate):
+def test_beam_model_is_a_density(expected, sigma, rate):
     model, z = BeamModel(0.5, 0.1, 0.05, 0.5, sigma, rate), np.linspace(0, 10, 40001)
     middles = (z[1:] + z[:-1]) / 2
     p = np.exp(model.log_density(middles, np.array([[expected]]), 10.0))[0]
@@ -83,18 +83,16 @@ def test_the_beam_model_is_a_density(expected, sigma, rate):
     assert p.sum() * (z[1] - z[0]) + nothing == pytest.approx(1.0, abs=2e-3)
 
 
-def test_the_beam_model_knows_people_from_holes():
-    model, seen = BeamModel(0.7, 0.2, 0.05, 0.05, 0.1, 1.0), np.array([[5.0]])
-    near, hit, beyond = (model.log_density(np.array([r]), seen, 25.0)[0, 0] for r in (2.0, 5.0, 8.0))
+def test_beam_model():
+    model, expected = BeamModel(0.7, 0.2, 0.05, 0.05, 0.1, 1.0), np.array([[5.0]])
+    near, hit, beyond, *unmeasured = (
+        model.log_density(np.array([r]), expected, 25.0)[0, 0] for r in (2.0, 5.0, 8.0, -np.inf, np.nan)
+    )
     assert hit > near > beyond
+    assert unmeasured == [0, 0]
 
 
-def test_a_beam_that_says_nothing_weighs_no_place_against_another():
-    model, seen = BeamModel(0.7, 0.2, 0.05, 0.05, 0.1, 1.0), np.array([[5.0, 5.0, 5.0], [2.0, 30.0, 0.1]])
-    assert not model.log_density(np.array([-np.inf, -np.inf, np.nan]), seen, 25.0).any()
-
-
-def test_the_range_table_agrees_with_exact_rays():
+def test_range_table():
     table, rng = RangeTable(ROOM, 0.02), np.random.default_rng(1)
     poses = np.column_stack([ROOM.sample_free(50, rng, 0.3), rng.uniform(-np.pi, np.pi, 50)])
     angles = np.linspace(-2, 2, 30)
@@ -103,7 +101,7 @@ def test_the_range_table_agrees_with_exact_rays():
     assert np.quantile(error, 0.95) < 0.05
 
 
-def test_omni_moments_are_the_analytic_ones():
+def test_omni_moments():
     rng, step, n = np.random.default_rng(2), np.array([0.3, 0.4, 0.2]), 200_000
     moved = motion.omni(np.tile([1.0, 2.0, 0.7], (n, 1)), step, ALPHAS, rng)
     mean = se2.compose(np.array([1.0, 2.0, 0.7]), step)
@@ -119,7 +117,7 @@ def test_omni_moments_are_the_analytic_ones():
 
 @pytest.mark.parametrize("sign", [1, -1], ids=["forward", "backward"])
 @pytest.mark.parametrize("path", [0.5, 0.004], ids=["far", "short"])
-def test_differential_moments_are_the_analytic_ones(sign, path):
+def test_differential_moments(sign, path):
     """On a straight line: path variance alpha3 p², turn variance 2 alpha2 p²; driving backwards is no turn by pi."""
     rng, n = np.random.default_rng(3), 200_000
     moved = motion.differential(np.zeros((n, 3)), np.array([sign * path, 0.0, 0.0]), ALPHAS, rng)
@@ -139,7 +137,7 @@ def test_differential_turns_in_place():
 
 @settings(max_examples=40, deadline=None)
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(-2, 2), st.floats(0, 1))
-def test_a_command_is_an_arc(vx, vy, w, dt):
+def test_command_is_an_arc(vx, vy, w, dt):
     fine, pose = np.array([vx, vy, w]) * dt / 500, np.zeros(3)
     for _ in range(500 if abs(w) > 1e-9 else 1):
         pose = pose + np.array([*se2.rotate(pose[2] + fine[2] / 2, fine[:2]), fine[2]])
@@ -148,7 +146,7 @@ def test_a_command_is_an_arc(vx, vy, w, dt):
     assert np.allclose(motion.arc(np.array([vx, vy, w]), dt), pose, atol=3e-6)
 
 
-def test_low_variance_resampling_is_unbiased_and_never_off_by_one():
+def test_low_variance_resampling():
     rng, weights = np.random.default_rng(5), np.array([0.05, 0.0, 0.33, 0.12, 0.5])
     draws = np.stack([np.bincount(resampling.low_variance(weights, 17, rng), minlength=5) for _ in range(20_000)])
     assert np.allclose(draws.mean(axis=0), 17 * weights, atol=0.02)
@@ -156,26 +154,27 @@ def test_low_variance_resampling_is_unbiased_and_never_off_by_one():
     assert draws.sum(axis=1).tolist() == [17] * 20_000
 
 
-def test_kld_bound_by_hand():
-    """For k = 2: 1 / (2 * 0.05) = 10 times (1 - 2/9 + sqrt(2/9) * 0.99)^3 = (7/9 + 0.466690...)^3 = 1.92721."""
-    assert float(resampling.kld_bound(2, 0.05, 0.99)) == 20
-    # k = 101: 1000 (1 - 1/450 + 0.0471405 * 0.99)^3 = 1000 * 1.0444469^3 = 1139.34
-    assert float(resampling.kld_bound(101, 0.05, 0.99)) == 1140
-    assert float(resampling.kld_bound(1, 0.05, 0.99)) == 1
-    # The chi-square it approximates: 2 n err is its quantile at k - 1 degrees of freedom; 124.342 at 0.95 and 100.
-    assert float(resampling.kld_bound(101, 0.05, 1.6449)) == pytest.approx(1243.42, abs=1.5)
+@pytest.mark.parametrize(
+    ("bins", "z", "bound"),
+    [
+        (2, 0.99, 20),  # 1 / (2 * 0.05) = 10 times (1 - 2/9 + sqrt(2/9) * 0.99)^3 = (7/9 + 0.466690...)^3 = 1.92721
+        (101, 0.99, 1140),  # 1000 (1 - 1/450 + 0.0471405 * 0.99)^3 = 1000 * 1.0444469^3 = 1139.34
+        (1, 0.99, 1),
+        (101, 1.6449, 1244),  # 2 n err is nearly the 0.95 quantile of chi squared with 100 degrees of freedom, 124.342
+    ],
+)
+def test_kld_bound(bins, z, bound):
+    assert float(resampling.kld_bound(bins, 0.05, z)) == pytest.approx(bound, abs=1 if z > 1 else 0)
 
 
-def test_the_number_of_particles_follows_the_bins_met():
-    one, many = np.zeros(20_000, np.int64), np.arange(20_000)
-    assert resampling.adaptive_count(one, 0.05, 0.99, 500, 20_000) == 500
-    assert resampling.adaptive_count(many, 0.05, 0.99, 500, 20_000) == 20_000
-    hundred = np.arange(20_000) % 101
-    assert resampling.adaptive_count(hundred, 0.05, 0.99, 500, 20_000) == 1140
-    assert resampling.adaptive_count(one[:100], 0.05, 0.99, 500, 20_000) == 500
+@pytest.mark.parametrize(
+    ("draws", "bins", "count"), [(20_000, 1, 500), (20_000, 20_000, 20_000), (20_000, 101, 1140), (100, 1, 500)]
+)
+def test_adaptive_count(draws, bins, count):
+    assert resampling.adaptive_count(np.arange(draws) % bins, 0.05, 0.99, 500, 20_000) == count
 
 
-def test_bins_touch_across_pi_and_do_not_across_a_gap():
+def test_cluster_labels():
     poses = np.array([[0.1, 0.1, np.pi - 0.05], [0.1, 0.1, -np.pi + 0.05], [-0.1, -0.4, -3.0], [2.0, 0.1, 3.1]])
     found = labels(poses)
     assert found[0] == found[1] == found[2] != found[3]
@@ -185,7 +184,7 @@ def test_bins_touch_across_pi_and_do_not_across_a_gap():
     assert len(np.unique(labels(turned))) == 3
 
 
-def test_hypotheses_are_clusters_by_weight():
+def test_hypotheses():
     rng = np.random.default_rng(7)
     centres = [(1.0, 1.0, 3.1), (4.0, 1.0, 0.0), (1.0, 5.0, 1.0)]
     poses = np.concatenate([np.array(c) + 0.05 * rng.standard_normal((300, 3)) for c in centres])
@@ -195,21 +194,18 @@ def test_hypotheses_are_clusters_by_weight():
     for h, centre in zip(found, (centres[1], centres[0], centres[2]), strict=True):
         assert np.allclose(se2.between(np.array(centre), h.pose), 0, atol=0.015)
         assert np.allclose(h.covariance, 0.0025 * np.eye(3), atol=6e-4)
+    one = hypotheses(np.array([[1.0, 2.0, 0.5]]), np.ones(1))[0]
+    assert np.linalg.eigvalsh(one.covariance).min() > 0
 
 
-def test_covariance_of_one_particle_can_be_inverted():
-    found = hypotheses(np.array([[1.0, 2.0, 0.5]]), np.ones(1))
-    assert np.linalg.eigvalsh(found[0].covariance).min() > 0
-
-
-def test_moments_average_headings_on_the_circle():
+def test_moments():
     mean, covariance = moments(np.array([[0, 0, np.pi - 0.1], [2.0, 0, -np.pi + 0.1]]), np.array([0.5, 0.5]))
     assert abs(mean[2]) == pytest.approx(np.pi)
     assert covariance[2, 2] == pytest.approx(0.01)
     assert covariance[0, 0] == pytest.approx(1.0)
 
 
-def test_recovery_draws_strangers_only_when_fits_fall():
+def test_recovery():
     recovery = Recovery(0.01, 0.3)
     for _ in range(20):
         recovery.add(0.9)
@@ -221,18 +217,13 @@ def test_recovery_draws_strangers_only_when_fits_fall():
     assert recovery.random_share < 0.12
 
 
-def test_settings_are_amcls_and_refuse_nonsense():
-    s = Settings()
-    assert (s.min_particles, s.max_particles, s.max_beams, s.sigma_hit, s.pf_err) == (500, 2000, 60, 0.2, 0.05)
-    assert (s.recovery_alpha_slow, s.recovery_alpha_fast, s.resample_interval) == (0.0, 0.0, 1)
-    tuned = Settings.tuned()
-    assert (tuned.max_particles, tuned.laser_model_type, tuned.sigma_hit) == (20_000, "likelihood_field_prob", 0.1)
+def test_settings():
     for wrong in ({"sigma_hit": 0.0}, {"alpha1": -1.0}, {"max_beams": 0}, {"z_rand": 0.0}, {"min_particles": 9000}):
         with pytest.raises(UserError, match="particle filter"):
-            dataclasses.replace(s, **wrong)
+            dataclasses.replace(Settings(), **wrong)
 
 
-def test_surfaces_hidden_inside_obstacles_count_for_nothing():
+def test_overlapping_obstacles():
     """Of two boxes that overlap, the edge of one inside the other is no surface."""
     boxes = [{"box": {"center": (c, 5), "size": (2, 2)}} for c in (4.5, 5.5)]
     world = World(name="pair", boundary=HALL.boundary, obstacles=boxes)

@@ -74,7 +74,7 @@ def is_at(guess: np.ndarray, pose: np.ndarray) -> bool:
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_it_is_found_from_nothing_and_tracked_at_the_bound(name):
+def test_found_and_tracked(name):
     scanner = EVERY[name]
     made = precise(learned(scanner.name), scanner)
     scene = Scene(ROOM, scanner, np.random.default_rng(1))
@@ -96,7 +96,7 @@ def test_it_is_found_from_nothing_and_tracked_at_the_bound(name):
     check(made, scene, tracked, path)
 
 
-def test_a_field_learned_with_one_scanner_serves_another_as_well():
+def test_field_of_another_scanner():
     """Learned with 270 deg, 20 mm noise and a beam per 1/3 deg; used with 180 deg, 5 mm noise and a beam per degree."""
     scanner = SCANNERS["lms200"]
     made = precise(learned("tim571"), scanner)
@@ -108,7 +108,7 @@ def test_a_field_learned_with_one_scanner_serves_another_as_well():
 
 
 @pytest.mark.parametrize("name", ["lms200", "tim571, upside down", "backwards, from 0 to 359 deg"])
-def test_the_particle_filter_takes_any_scanner(name):
+def test_particle_filter(name):
     scanner = EVERY[name]
     made = prepare(Choice(ROOM, "particle-filter"))(Geometry.of(scanner))
     scene = Scene(ROOM, scanner, np.random.default_rng(3))
@@ -123,7 +123,7 @@ def test_the_particle_filter_takes_any_scanner(name):
         assert np.hypot(*off) < 0.03
 
 
-def test_noise_comes_with_the_scan_unless_it_is_set():
+def test_stated_noise():
     scanner = SCANNERS["rplidar-a1"]
     stated = Geometry.of(scanner).likelihood()
     assert stated.relative == 0.01

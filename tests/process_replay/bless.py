@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from common.log import set_up_logging
@@ -17,41 +16,28 @@ from tests.process_replay import reference
 from tests.process_replay.reference import FOLDER, Row
 from tests.process_replay.sessions import SESSIONS
 
-MAX_SHOWN_DIFFERENCES = 12  # per service
+MAX_SHOWN_DIFFERENCES = 20  # per service
 
 
-def bless(
-    name: str, rows: list[Row], folder: Path = FOLDER, *, write: bool = True, report: Callable[[str], object] = print
-) -> bool:
-    """Reports the differences and writes the new reference. Returns whether there were any differences."""
-    path = folder / f"{name}.jsonl"
+def bless(name: str, rows: list[Row], folder: Path = FOLDER, *, write: bool = True) -> list[str]:
+    """Writes the new reference if it differs from the old one; returns the differences."""
     old = reference.read(name, folder)
-    if old:
-        differences = list(reference.compare(old, rows))
-        if not differences:
-            report(f"{name}: unchanged")
-            return False
-        report(reference.report(name, differences, MAX_SHOWN_DIFFERENCES))
-    else:
-        report(f"{name}: no reference yet; {len(rows)} messages")
-    if write:
-        before = path.read_text().splitlines() if old else []
-        after = reference.write(name, reference.merged(old, rows), folder).read_text().splitlines()
-        report(
-            f"{name}: written to {path.name}, {len(set(after) - set(before))} of {len(after)} lines new; see git diff"
-        )
-    return True
+    differences = reference.compare(old, rows)
+    if differences and write:
+        reference.write(name, reference.merged(old, rows), folder)
+    return differences
 
 
-def main(arguments: list[str], sessions: Mapping[str, Callable[..., list[Row]]] = SESSIONS) -> None:
+def main(arguments: list[str]) -> None:
     """Updates the references of the named services, or of all."""
-    names = [argument for argument in arguments if argument != "--show"] or list(sessions)
-    if unknown := set(names) - set(sessions):
-        sys.exit(f"no session {', '.join(sorted(unknown))}: choose from {', '.join(sessions)}")
+    names = [argument for argument in arguments if argument != "--show"] or list(SESSIONS)
+    if unknown := set(names) - set(SESSIONS):
+        sys.exit(f"no session {', '.join(sorted(unknown))}: choose from {', '.join(SESSIONS)}")
     set_up_logging("error", as_json=False)
     for name in names:
         with tempfile.TemporaryDirectory() as folder:
-            bless(name, sessions[name](Path(folder)), write="--show" not in arguments)
+            differences = bless(name, SESSIONS[name](Path(folder)), write="--show" not in arguments)
+        print(f"{name}: {len(differences)} differences", *differences[:MAX_SHOWN_DIFFERENCES], sep="\n  ")
 
 
 if __name__ == "__main__":

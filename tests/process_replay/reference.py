@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from difflib import SequenceMatcher
 from pathlib import Path
 from typing import Any
@@ -21,34 +20,12 @@ Row = dict[str, Any]
 FOLDER = Path(__file__).resolve().parent / "references"
 DIGITS = 7  # significant digits of numbers in a file
 SAMPLES = 6  # stored values of a long array
-MAX_SHOWN_DIFFERENCES = 6
 MISSING = "nothing"
 # Absolute and relative tolerance by the last name in a field's path that is listed here, otherwise of "". Run without
 # AVX and FMA, with another BLAS kernel and two threads, the same code gave differences of 6e-7 (relative) and 3e-7 m in
 # the network of preset paper (float32), and of 1e-15 elsewhere; ten times that is allowed. xi is a difference of large
 # numbers.
 TOLERANCES = {"": (1e-6, 5e-6), "xi": (1e-2, 1e-5)}
-
-
-@dataclass(frozen=True)
-class Difference:
-    """A field of a message that differs from the reference."""
-
-    number: int  # of the row in the reference, from 0; for a new message its own number
-    message: str  # kind and stamp
-    field: str  # path of the field; empty for the whole message
-    expected: Any
-    got: Any
-
-    def __str__(self) -> str:
-        where = f"message {self.number} ({self.message})"
-        if not self.field:
-            return f"{where}: " + ("missing" if self.got is MISSING else "new, the reference has none")
-        text = f"{where}: {self.field}: expected {_short(self.expected)}, got {_short(self.got)}"
-        if _is_number(self.expected) and _is_number(self.got):
-            allowed = tolerance(self.field, self.expected)
-            text += f" (off by {abs(self.got - self.expected):.3g}, allowed {allowed:.2g})"
-        return text
 
 
 def of_array(values: np.ndarray) -> Row:
@@ -78,14 +55,16 @@ def tolerance(field: str, expected: float) -> float:
     return absolute + relative * abs(expected)
 
 
-def compare(expected: Sequence[Row], got: Sequence[Row]) -> Iterator[Difference]:
-    """Yields every field that differs, and every message that is missing or new."""
+def compare(expected: Sequence[Row], got: Sequence[Row]) -> list[str]:
+    """A line for every field that differs, and for every message that is missing or new."""
+    found = []
     for number, old, new in _aligned(expected, got):
+        where = f"message {number} ({_kind(old or new or {})})"
         if old is None or new is None:
-            kind = _kind(new if old is None else old)
-            yield Difference(number, kind, "", MISSING if old is None else kind, MISSING if new is None else kind)
+            found.append(f"{where}: " + ("missing" if new is None else "new, the reference has none"))
         else:
-            yield from _compare(number, _kind(old), "", old, new)
+            found += [f"{where}: {line}" for line in _compare("", old, new)]
+    return found
 
 
 def _aligned(expected: Sequence[Row], got: Sequence[Row]) -> Iterator[tuple[int, Row | None, Row | None]]:
@@ -99,16 +78,15 @@ def _aligned(expected: Sequence[Row], got: Sequence[Row]) -> Iterator[tuple[int,
             yield from ((number, None, got[number]) for number in range(b, after_b))
 
 
-def _compare(number: int, message: str, path: str, old: Any, new: Any) -> Iterator[Difference]:
+def _compare(path: str, old: Any, new: Any) -> Iterator[str]:
     if isinstance(old, dict) and isinstance(new, dict):
         for name in dict.fromkeys([*old, *new]):
-            below = f"{path}.{name}" if path else name
-            yield from _compare(number, message, below, old.get(name, MISSING), new.get(name, MISSING))
+            yield from _compare(f"{path}.{name}" if path else name, old.get(name, MISSING), new.get(name, MISSING))
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         for index, (a, b) in enumerate(zip(old, new, strict=True)):
-            yield from _compare(number, message, f"{path}[{index}]", a, b)
+            yield from _compare(f"{path}[{index}]", a, b)
     elif not _same(path, old, new):
-        yield Difference(number, message, path, old, new)
+        yield f"{path}: expected {_short(old)}, got {_short(new)}"
 
 
 def _same(path: str, old: Any, new: Any) -> bool:
@@ -129,32 +107,6 @@ def _merged(old: Any, new: Any, path: str) -> Any:
     if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         return [_merged(a, b, path) for a, b in zip(old, new, strict=True)]
     return old if _same(path, old, new) else new
-
-
-def report(name: str, differences: Sequence[Difference], first: int = MAX_SHOWN_DIFFERENCES) -> str:
-    """Readable report: the first differences, and a count by kind."""
-    messages = len({d.number for d in differences})
-    lines = [f"{name}: {messages} message(s) differ from the reference, {len(differences)} field(s):"]
-    lines += [f"  {difference}" for difference in differences[:first]]
-    if len(differences) > first:
-        lines.append(f"  and {len(differences) - first} more; all of them by field:")
-        kinds: dict[str, list[Difference]] = {}
-        for each in differences:
-            kinds.setdefault(f"{each.message.split(',')[0]} {_without_index(each.field)}".strip(), []).append(each)
-        by_count = sorted(kinds.items(), key=lambda item: -len(item[1]))
-        lines += [
-            f"    {len(of_kind):4} x {kind}{_farthest(of_kind)}" for kind, of_kind in by_count[:MAX_SHOWN_DIFFERENCES]
-        ]
-        lines += (
-            [f"    and {len(kinds) - MAX_SHOWN_DIFFERENCES} more fields"] if len(kinds) > MAX_SHOWN_DIFFERENCES else []
-        )
-    return "\n".join(lines)
-
-
-def _farthest(differences: Sequence[Difference]) -> str:
-    """The largest of some numbers' differences, in words."""
-    off = [abs(d.got - d.expected) for d in differences if _is_number(d.got) and _is_number(d.expected)]
-    return f", by up to {max(off):.3g}" if off else ""
 
 
 def read(name: str, folder: Path = FOLDER) -> list[Row]:
@@ -186,10 +138,6 @@ def _kind(row: Row) -> str:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and not math.isnan(value)
-
-
-def _without_index(field: str) -> str:
-    return "".join(part.partition("]")[2] if "]" in part else part for part in field.split("["))
 
 
 def _short(value: Any) -> str:

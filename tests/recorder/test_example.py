@@ -12,15 +12,15 @@ from tests.recorder import sessions as made
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "read_recording.py"
 
 
-def test_it_reads_a_recording_and_needs_nothing_else(tmp_path):
+def test_example(tmp_path):
     file = made.write(tmp_path / "run.mcap")
-    told = subprocess.run([sys.executable, EXAMPLE, file], capture_output=True, text=True, check=True, cwd=tmp_path)
+    done = subprocess.run([sys.executable, EXAMPLE, file], capture_output=True, text=True, check=True, cwd=tmp_path)
     middle = sorted(made.error(i) for i in range(made.SCANS))[made.SCANS // 2]
-    assert told.stdout.split() == f"{made.SCANS} beliefs, 91 beams, median error {middle:.4f} m".split()
-    assert told.stderr == ""
+    assert done.stdout.split() == f"{made.SCANS} beliefs, 91 beams, median error {middle:.4f} m".split()
+    assert done.stderr == ""
 
 
-def test_it_has_twenty_lines_and_two_packages():
+def test_length_and_packages():
     source = EXAMPLE.read_text(encoding="utf-8")
     assert sum(bool(line.strip()) for line in source.splitlines()) <= 20
     found = {node.module if isinstance(node, ast.ImportFrom) else node.names[0].name

@@ -125,7 +125,7 @@ def test_faulty_session(process, bus, stopped_recorder, faulty_session, tmp_path
     assert find_fault(found, "protocol", f"protocol {PROTOCOL + 1}")["where"] == "estimator on far"
     assert find_fault(found, "versions", "presage")["where"] == "estimator on near"
     assert "ahead of" in find_fault(found, "clocks", "estimator on far, near: its clock is 60.0 s")["what"]
-    assert find_fault(found, "frozen", "no health message came")["where"] == "viewer"
+    assert find_fault(found, "frozen", "no sign of life")["where"] == "viewer"
     find_fault(found, "frozen", str(stopped_recorder.child.pid))
     assert "python -m services.controller" in find_fault(found, "missing", "controller")["advice"]
     find_fault(found, "rate", "scan: ")
@@ -174,9 +174,9 @@ def test_read_only_disk_and_no_weights(tmp_path, free_port):
     world.write_text("name: shed\nboundary: [[0, 0], [4, 0], [4, 3], [0, 3]]\nstart: {x: 2, y: 1, yaw_deg: 0}\n")
     command = (
         f"mount -t tmpfs -o size=1m,ro tmpfs {disk} && exec {sys.executable} -m presage doctor --seconds 1 "
-        f"--recordings {disk} --world {world} --json {tmp_path}/found.json --connect tcp/127.0.0.1:{free_port()}"
+        f"--world {world} --json {tmp_path}/found.json --connect tcp/127.0.0.1:{free_port()}"
     )
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PRESAGE_DIRECTORY": str(disk)}
     done = subprocess.run(
         ["unshare", "-m", "sh", "-c", command], env=environment, capture_output=True, text=True, timeout=120
     )
@@ -184,7 +184,7 @@ def test_read_only_disk_and_no_weights(tmp_path, free_port):
     found = read_findings(tmp_path)
     assert "Read-only file system" in find_fault(found, "not_writable", "recordings cannot be written to")["what"]
     assert find_fault(found, "disk", "MB free")["where"] == str(disk)
-    assert f"presage train --world {world}" in find_fault(found, "weights", "no field of world 'shed'")["advice"]
+    assert f"presage train --world {world}" in find_fault(found, "weights", "no field of world 'shed'")["what"]
 
 
 def words(text: str) -> str:

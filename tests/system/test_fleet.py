@@ -10,7 +10,7 @@ from common.bus.inbox import Inbox, Sample
 from common.messages.definitions import Belief, Health, Truth
 from common.messages.requests import ConfigReply, ModelReply, ModelRequest, Request
 from common.messages.topics import BELIEF, CONFIG, HEALTH, MODEL, SCAN, TRUTH
-from services.estimator.multi_robot_service import key_expression
+from services.estimator.multi_robot import key_expression
 
 NUMBERS = (1, 2, 3)
 STARTS = {1: "3,1.5,90", 2: "9,1.5,0", 3: "14,1.5,180"}

@@ -32,9 +32,12 @@ def world(tmp_path):
 def train(process, world, tmp_path):
     """A function that starts a training; the weights get into ``tmp_path / "models"``."""
 
-    def start(*args):
-        out = str(tmp_path / "models")
-        return process("presage.__main__", "train", "--world", world, "--out", out, "--beams", "61", *args)
+    config = tmp_path / "train.yaml"
+    config.write_text("train: {batch: 50, epochs: 12}")
+    args = ("--world", world, "--out", str(tmp_path / "models"), "--config", str(config), "--beams", "61")
+
+    def start(preset, samples):
+        return process("presage.__main__", "train", "--preset", preset, "--samples", str(samples), *args)
 
     return start
 
@@ -51,7 +54,7 @@ def assert_used(preset, process, bus, world, tmp_path):
 
 
 def test_precise_with_own_simulator(process, bus, world, train, tmp_path):
-    training = train("--samples", "300")
+    training = train("precise", 300)
     assert training.wait(120) == 0, training.output
     process("simulator", "--world", world, "--beams", "61")
     assert_used("precise", process, bus, world, tmp_path)
@@ -60,14 +63,13 @@ def test_precise_with_own_simulator(process, bus, world, train, tmp_path):
 def test_paper_with_running_scanner_and_interrupt(process, bus, world, train, tmp_path):
     process("simulator", "--world", world, "--beams", "61")
     assert wait_until(lambda: "simulator" in bus.alive(), 60)
-    args = ("--preset", "paper", "--samples", "100", "--batch", "50", "--epochs", "12")
-    training = train(*args)
+    training = train("paper", 100)
     state = tmp_path / "models" / ".closet-paper-61.unfinished" / "state.safetensors"
     assert wait_until(lambda: state.exists() or not training.running, 60)
     assert "samples come from the running scanner tim571 in closet" in training.output
     assert training.stop(signal.SIGINT, 30)[0] == 130, training.output
     assert not list((tmp_path / "models").glob("*.safetensors"))
-    again = train(*args)
+    again = train("paper", 100)
     assert again.wait(150) == 0, again.output
     assert "an interrupted run" in again.output
     assert_used("paper", process, bus, world, tmp_path)

@@ -19,15 +19,18 @@ from tests.conftest import ended
 from tests.recorder import sessions as made
 from tests.viewer.client import Page
 
-
-def demo(process, folder, *args):
-    numbers = folder / "demo.json"
-    return process("presage.__main__", "demo", "--out", str(folder / "out"), "--json", str(numbers), *args), numbers
+BACKGROUND = """
+import runpy, signal
+signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell does for a script's background commands
+runpy.run_module("presage", run_name="__main__")
+"""
 
 
 def test_demo_reaches_its_goal(process, tmp_path):
-    running, file = demo(process, tmp_path, "--pace", "lockstep")
-    out = tmp_path / "out"
+    out, file, config = tmp_path / "out", tmp_path / "demo.json", tmp_path / "lockstep.yaml"
+    config.write_text("simulator: {pace: lockstep}")
+    args = ("--config", str(config), "--out", str(out), "--json", str(file))
+    running = process("presage.__main__", "demo", *args)
     assert wait_until(lambda: list(out.glob("*.mcap.active")) or not running.running, 60), running.output
     made.write(out / "another.mcap")  # a file of another program, written during the demo
     assert running.wait(170) == 0, running.output
@@ -72,12 +75,14 @@ def test_demo_without_a_belief():
 
 
 @pytest.fixture
-def up(process, free_port):
+def up(process, free_port, tmp_path):
     """A function that runs `presage up` until all are alive. Returns it, its child processes and its port."""
+    (tmp_path / "background.py").write_text(BACKGROUND)
 
-    def start(*args):
+    def start(*args, **env):
         port = free_port()
-        running = process("presage.__main__", "up", "--port", str(port), *args, env={"PRESAGE_VIEWER_PORT": "0"})
+        args = ("up", "--port", str(port), *args)
+        running = process(tmp_path / "background.py", *args, env={"PRESAGE_VIEWER_PORT": "0", **env})
         running.wait_for("all alive", 120)
         return running, psutil.Process(running.child.pid).children(), port
 
@@ -102,7 +107,7 @@ def test_up_with_page_and_dead_service(up):
 
 
 def test_up_with_two_robots(up):
-    running, children, port = up("--robots", "2", "--robot", "r", "--beams", "64", "--no-viewer")
+    running, children, port = up("--robots", "2", "--no-viewer", PRESAGE_ROBOT="r", PRESAGE_BEAMS="64")
     assert "page:" not in running.output
     assert len(children) == 6  # a simulator and a controller for each robot, one router and one estimator
     for robot in ("r-1", "r-2"):

@@ -206,7 +206,7 @@ def pulses(scene: str) -> dict:
     quiet = {"published_hz": 0, "received_hz": 0, "dropped": 0, "undecodable": 0}
     rows = [
         {
-            "name": name, "alive": True, "age_s": 0.4, "uptime_s": 754.0, "note": "",
+            "name": name, "state": "alive", "alive": True, "age_s": 0.4, "uptime_s": 754.0, "note": "",
             "rates": [{**quiet, "topic": t, "published_hz": 15.0} for t in sends[name]]
             + [{**quiet, "topic": t, "received_hz": 15.0, "dropped": 2 * (t == "scan")} for t in hears[name]],
         }

@@ -1,4 +1,4 @@
-"""Moves to find out where the robot is.
+"""Chooses velocities that help to localise the robot.
 
 While several places are possible, destinations are rated by how well a scan taken there is expected to tell the places
 apart (`epistemic`). While no place is known at all, the robot drives where there is most room, because scans from there
@@ -14,10 +14,10 @@ import numpy as np
 from common.geometry import se2
 from common.robot.ranges import surfaces
 from common.robot.scan_geometry import Sweep
+from services.controller.policies.action_selection import Surroundings, select_action
 from services.controller.policies.decision import Decision
 from services.controller.policies.epistemic import CandidateMotions, DestinationSelector
 from services.controller.policies.motion_model import turn_to_attractor
-from services.controller.policies.policy import Surroundings, choose
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -94,7 +94,7 @@ class ActiveLocaliser:
     def decide(self, belief: Belief, scan: Scan, points: Array, velocity: Array, view: Sector) -> Decision:
         """Choose a velocity; ``points`` (K, 2) m in base_link are obstacles, ``view`` is what the scanner sees."""
         static = np.zeros(len(points), bool)
-        around = Surroundings(
+        surroundings = Surroundings(
             _no_walls, points, static, 0.0, self.min_point_distance, view=view, may_turn=self.may_turn
         )
         likely = [h for h in belief.hypotheses if h.weight >= MIN_WEIGHT][:MAX_HYPOTHESES]
@@ -103,13 +103,13 @@ class ActiveLocaliser:
             poses, weights = np.array([h.pose.array() for h in likely]), np.array([h.weight for h in likely])
             destination = self.selector.follow(belief.stamp_ns, poses, weights)
             if destination is not None:
-                return self._drive_to(poses[0], destination, around, velocity, len(likely))
+                return self._drive_to(poses[0], destination, surroundings, velocity, len(likely))
             return Decision(reason=f"{len(likely)} places are possible: looking for where to tell them apart")
         if self._unknown_since_ns is None or belief.stamp_ns < self._unknown_since_ns:
             self._unknown_since_ns = belief.stamp_ns
         if belief.stamp_ns - self._unknown_since_ns < INITIAL_WAIT_NS:
             return Decision(reason=f"the belief is {belief.state}: looking", state="lost")
-        return self._wander(belief, scan, around, velocity)
+        return self._wander(belief, scan, surroundings, velocity)
 
     def _destinations(self, pose: Array) -> tuple[Array, Array]:
         """Displacements (M, 3) in base_link and path lengths (M,) m of the destinations around a hypothesis (3,)."""
@@ -129,7 +129,9 @@ class ActiveLocaliser:
         heading = np.arctan2(*(places - previous).T[::-1])  # on arrival
         return se2.between(pose, np.column_stack([places, heading])), cost
 
-    def _drive_to(self, pose: Array, destination: Array, around: Surroundings, velocity: Array, count: int) -> Decision:
+    def _drive_to(
+        self, pose: Array, destination: Array, surroundings: Surroundings, velocity: Array, count: int
+    ) -> Decision:
         """Drives from the first of ``count`` hypotheses towards a destination (3,)."""
         target = destination[:2]
         if self._field is None or np.hypot(*(self._field[0] - target)) > self.graph.grid.resolution:
@@ -143,9 +145,9 @@ class ActiveLocaliser:
             return Decision(reason="no way to where places could be told apart", state="blocked")
         point = field.attractor(pose[:2], path)
         attractor = se2.rotate(-pose[2], point - pose[:2])
-        return self._approach(attractor, around, velocity, reason, path)
+        return self._approach(attractor, surroundings, velocity, reason, path)
 
-    def _wander(self, belief: Belief, scan: Scan, around: Surroundings, velocity: Array) -> Decision:
+    def _wander(self, belief: Belief, scan: Scan, surroundings: Surroundings, velocity: Array) -> Decision:
         """Drives in the direction with the most room, preferring directions ahead."""
         ranges = np.where(np.isneginf(scan.ranges), 0.0, scan.ranges.astype(np.float64))
         ranges = np.minimum(ranges, MAX_USEFUL_ROOM_M)
@@ -158,17 +160,21 @@ class ActiveLocaliser:
         padded = np.pad(ranges, half, mode="wrap") if sweep.all_round else np.pad(ranges, half)
         room = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1).min(axis=1)
         room[np.isinf(room)] = 0.0  # no beam in the window measured anything
-        best = int(np.argmax(room + 0.5 * np.cos(angles - around.forward)))
+        best = int(np.argmax(room + 0.5 * np.cos(angles - surroundings.forward)))
         reason = f"the belief is {belief.state}: going where there is room, to see more"
         if room[best] < MIN_ROOM_M:
             return Decision(np.array([0.0, 0.0, 0.5]), reason.replace("going", "turning to"), "exploring")
         distance = min(float(room[best]) - self.min_point_distance, 2.0)
         attractor = distance * np.array([np.cos(angles[best]), np.sin(angles[best])])
-        return self._approach(attractor, around, velocity, reason, np.zeros((0, 2)))
+        return self._approach(attractor, surroundings, velocity, reason, np.zeros((0, 2)))
 
-    def _approach(self, attractor: Array, around: Surroundings, velocity: Array, reason: str, path: Array) -> Decision:
-        choice = choose(velocity, attractor, around, self.robot)
-        action = turn_to_attractor(choice.action, attractor, self.robot, may_turn=self.may_turn, forward=around.forward)
+    def _approach(
+        self, attractor: Array, surroundings: Surroundings, velocity: Array, reason: str, path: Array
+    ) -> Decision:
+        selected = select_action(velocity, attractor, surroundings, self.robot)
+        action = turn_to_attractor(
+            selected.action, attractor, self.robot, may_turn=self.may_turn, forward=surroundings.forward
+        )
         if not action.any() and self.may_turn:  # no free motion: turn to look elsewhere
             action[2] = 0.5 if attractor[1] >= 0 else -0.5
         return Decision(action, reason, "exploring", path)

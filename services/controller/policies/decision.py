@@ -1,4 +1,4 @@
-"""The result of a policy: a command and its reasons."""
+"""The interface of a policy, and the decision that it returns."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _no_points() -> Array:
 
 @dataclass
 class Decision:
-    """The velocity chosen for one belief, before any limit, and why."""
+    """The velocity chosen for one belief, before any limit, with what `Status` shows about it."""
 
     action: Array = field(default_factory=lambda: np.zeros(3))  # (3,) m/s, m/s, rad/s in base_link
     reason: str = ""  # shown in Status; empty if nothing hinders the robot
@@ -29,7 +29,7 @@ class Decision:
     path: Array = field(default_factory=_no_points)  # (K, 2) m in map, to the goal or destination
     motion: Array = field(default_factory=_no_points)  # (T, 2) m in map, predicted for the action until standstill
     recovering: bool = False  # a recovery motion, which does not lead to the goal
-    refused: bool = False  # the goal turned out to be unreachable; `reason` says why
+    refused: bool = False  # the goal turned out to be unreachable
 
 
 class Policy(Protocol):

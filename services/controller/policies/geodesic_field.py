@@ -1,4 +1,4 @@
-"""Cost to go over free space: the goal as a preference.
+"""The goal as a preference: the cost of the way there over free space.
 
 A quadratic prior on the goal pulls straight at it, through walls. It is replaced by ``-ln p(x) = lambda d(x)``, where d
 is the geodesic distance to the goal and a metre near a wall counts for more. The slope of this prior is lambda

@@ -1,4 +1,4 @@
-"""Where a velocity leads, braking included.
+"""Predicted motion under a velocity command, until the robot stands.
 
 The outcome of an action is defined as the place where the robot would stand if it braked after the action. Acceleration
 limits are thus part of the prediction, and if an action's outcome is free, the robot can always stop in time.

@@ -8,9 +8,10 @@ not needed here: to first order, the prediction error at another pose x' is xi -
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from common.geometry import se2
 
@@ -30,16 +31,19 @@ class ActionParameters:
     action_precision: float = 1.0  # s²/m², if the pose's is 1/m²; prior on zero velocity, which damps the motion
 
 
-def observed_position(pose: Array, xi: Array, curvature: Array | None) -> Array:
+def observed_position(
+    pose: Array, xi: npt.NDArray[np.floating[Any]] | None, curvature: npt.NDArray[np.float64] | None
+) -> Array:
     """Position (2,) m according to the scan: the belief plus its natural-gradient step H^-1 xi.
 
-    Along directions about which the scan has little information (H nearly singular), it stays that of the belief.
+    Along directions about which the scan has little information (H nearly singular), it stays that of the belief; also
+    if the estimator does not compute xi or H.
     """
-    if curvature is None:
+    if xi is None or curvature is None:
         return np.array(pose[:2])
     H = curvature[:2, :2]
     damped = H + 1e-3 * max(float(np.trace(H)), 1e-9) * np.eye(2)
-    step = np.linalg.solve(damped, xi[:2])
+    step = np.linalg.solve(damped, xi[:2].astype(np.float64))
     return np.asarray(pose[:2] + step * min(1.0, MAX_CORRECTION_M / max(float(np.hypot(*step)), 1e-12)))
 
 

@@ -1,6 +1,6 @@
 """Default policy: drives to a goal around walls and obstacles.
 
-A pure computation: beliefs, scans and stamps in, actions and reasons out. The navigator applies the limits afterwards.
+The navigator applies the limits to the velocities that this policy returns.
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ import numpy.typing as npt
 from common.geometry import se2
 from common.robot.scan_geometry import ALL_ROUND, Sweep
 from common.runtime import safety
+from services.controller.policies.action_selection import Surroundings, least_distance, select_action
 from services.controller.policies.active_localisation import ActiveLocaliser
 from services.controller.policies.decision import Decision
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import WALL_COST_RANGE_M, CostField, FreeSpaceGraph
+from services.controller.policies.goal_check import refusal_text, wall_refusal
 from services.controller.policies.motion_model import is_moving, turn_to_attractor
 from services.controller.policies.obstacles import TemporaryObstacles
-from services.controller.policies.policy import Surroundings, choose, least_distance
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -69,24 +70,17 @@ class GeodesicPolicy:
 
     def refusal(self, goal: Array) -> str | None:
         """Why a goal (2,) m cannot be reached by the map, with the nearest place that can. None if it can."""
-        component = self._component
-        cell = self.graph.nearest_free(goal, self.robot.radius, map_only=True)
-        clearance = float(self.world.clearance(goal)[0])
-        reachable = cell is not None and component in (None, self.graph.component[cell])
-        if clearance >= self.robot.radius and reachable:
-            return None
-        if clearance < 0:
-            why = "is inside something, or off the map"
-        elif clearance < self.robot.radius or cell is None:
-            why = f"is {clearance:.2f} m from a wall"
-        else:
-            why = "cannot be reached from here"
-        nearest = self.graph.nearest_free(goal, component=component, map_only=True)
-        alternative = ""
-        if nearest is not None:
-            x, y = self.free.grid.centres([nearest])[0]
-            alternative = f"; the nearest place that can be reached is ({x:.2f}, {y:.2f})"
-        return f"goal refused: ({goal[0]:.2f}, {goal[1]:.2f}) in {self.world.name} {why}{alternative}"
+        refusal = wall_refusal(self.world, goal, self.robot.radius)
+        if refusal is None:
+            cell = self.graph.nearest_free(goal, self.robot.radius, map_only=True)
+            if cell is not None and self._component in (None, self.graph.component[cell]):
+                return None
+            refusal = refusal_text(self.world, goal, "cannot be reached from here")
+        nearest = self.graph.nearest_free(goal, component=self._component, map_only=True)
+        if nearest is None:
+            return refusal
+        x, y = self.free.grid.centres([nearest])[0]
+        return f"{refusal}; the nearest place that can be reached is ({x:.2f}, {y:.2f})"
 
     def set_goal(self, goal: Array | None) -> None:
         """Set the goal (2,) m in map, or none."""
@@ -125,27 +119,27 @@ class GeodesicPolicy:
         path = self.field.path(pose[:2]) if self.field is not None else np.zeros((0, 2))
         if not len(path):
             return Decision(reason="no way to the goal from here", state="blocked")
-        around = self._surroundings(pose, points, moving)
+        surroundings = self._surroundings(pose, points, moving)
         if self._backing_off_until_ns is not None and stamp_ns < self._backing_off_until_ns:
-            return self._back_off(pose, velocity, around, path)
+            return self._back_off(pose, velocity, surroundings, path)
         assert self.field is not None  # noqa: S101 - there is a path
         point = self.field.attractor(pose[:2], path)
         attractor = se2.rotate(-pose[2], point - pose[:2])
-        choice = choose(velocity, attractor, around, self.robot)
+        selected = select_action(velocity, attractor, surroundings, self.robot)
         action = turn_to_attractor(
-            choice.action, attractor, self.robot, may_turn=around.may_turn, forward=around.forward
+            selected.action, attractor, self.robot, may_turn=surroundings.may_turn, forward=surroundings.forward
         )
         # Judged by the command that was sent, not by the action: the limits may have stopped the robot.
         self._watch_progress(stamp_ns, moving=is_moving(velocity))
         reason = ""
-        if choice.hindered:
-            reason = self._hindrance(pose, around, standing=not choice.action.any())
+        if selected.hindered:
+            reason = self._hindrance(pose, surroundings, standing=not selected.action.any())
         if self.closed:
-            reason = self._no_path(pose, around)
-        if self.robot.drive == "differential" and not bool(around.sees(0.0)):
+            reason = self._no_path(pose, surroundings)
+        if self.robot.drive == "differential" and not bool(surroundings.sees(0.0)):
             reason = BLIND_AHEAD
-        blocked = bool(reason) and not choice.action.any()
-        motion = se2.transform(pose, choice.motion[:, :2])
+        blocked = bool(reason) and not selected.action.any()
+        motion = se2.transform(pose, selected.motion[:, :2])
         return Decision(action, reason, "blocked" if blocked else "navigating", path, motion)
 
     def prediction_request(self, belief: Belief) -> CandidateMotions | None:
@@ -239,34 +233,36 @@ class GeodesicPolicy:
         elif stamp_ns - self._standing_since_ns > STUCK_AFTER_NS:
             self._standing_since_ns, self._backing_off_until_ns = None, stamp_ns + BACK_OFF_NS
 
-    def _back_off(self, pose: Array, velocity: Array, around: Surroundings, path: Array) -> Decision:
+    def _back_off(self, pose: Array, velocity: Array, surroundings: Surroundings, path: Array) -> Decision:
         """Recovery: drives towards the direction with the largest gap to walls and obstacles."""
         angle = np.arange(16) * np.pi / 8
         targets = 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        target = targets[int(np.argmax(around.gaps(targets[:, None, :], np.zeros(1))[:, 0]))]
-        choice = choose(velocity, target, around, self.robot)
-        action = turn_to_attractor(choice.action, target, self.robot, may_turn=around.may_turn, forward=around.forward)
-        motion = se2.transform(pose, choice.motion[:, :2])
+        target = targets[int(np.argmax(surroundings.gaps(targets[:, None, :], np.zeros(1))[:, 0]))]
+        selected = select_action(velocity, target, surroundings, self.robot)
+        action = turn_to_attractor(
+            selected.action, target, self.robot, may_turn=surroundings.may_turn, forward=surroundings.forward
+        )
+        motion = se2.transform(pose, selected.motion[:, :2])
         return Decision(action, "stuck: backing off", path=path, motion=motion, recovering=True)
 
-    def _hindrance(self, pose: Array, around: Surroundings, *, standing: bool) -> str:
-        """Reason text: what hinders the robot, and where."""
+    def _hindrance(self, pose: Array, surroundings: Surroundings, *, standing: bool) -> str:
+        """The reason to show: what hinders the robot, and where."""
         verb = "waiting" if standing else "slowing"
-        if not len(around.points):
+        if not len(surroundings.points):
             return f"{verb}: a wall is near"
-        nearest, position = _nearest_point(pose, around)
+        nearest, position = _nearest_point(pose, surroundings)
         # Anything seen for less than a second may be a person, or a box that was just moved.
-        what = "something that may move" if around.moving[nearest] else "something that is not in the map"
-        return f"{verb}: {what}, {np.hypot(*around.points[nearest]):.1f} m away at {position}"
+        what = "something that may move" if surroundings.moving[nearest] else "something that is not in the map"
+        return f"{verb}: {what}, {np.hypot(*surroundings.points[nearest]):.1f} m away at {position}"
 
-    def _no_path(self, pose: Array, around: Surroundings) -> str:
-        """Reason text: obstacles leave no path."""
-        at = f" at {_nearest_point(pose, around)[1]}" if len(around.points) else ""
-        return f"no way around something that is not in the map{at}: waiting until it clears"
+    def _no_path(self, pose: Array, surroundings: Surroundings) -> str:
+        """The reason to show when obstacles leave no path."""
+        place = f" at {_nearest_point(pose, surroundings)[1]}" if len(surroundings.points) else ""
+        return f"no way around something that is not in the map{place}: waiting until it clears"
 
 
-def _nearest_point(pose: Array, around: Surroundings) -> tuple[int, str]:
+def _nearest_point(pose: Array, surroundings: Surroundings) -> tuple[int, str]:
     """Index of the obstacle point nearest to the robot, and its position in map as text. There must be one."""
-    nearest = int(np.argmin(np.hypot(*around.points.T)))
-    x, y = se2.transform(pose, around.points[nearest])
+    nearest = int(np.argmin(np.hypot(*surroundings.points.T)))
+    x, y = se2.transform(pose, surroundings.points[nearest])
     return nearest, f"({x:.1f}, {y:.1f})"

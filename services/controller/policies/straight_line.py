@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from services.controller.policies.decision import Decision, State
+from services.controller.policies.goal_check import wall_refusal
 from services.controller.policies.paper_action import (
     ActionParameters,
     next_action,
@@ -33,14 +34,7 @@ class StraightLinePolicy:
 
     def refusal(self, goal: Array) -> str | None:
         """Why a goal (2,) m in map cannot be reached: it is closer to a wall than the robot's radius."""
-        if self.world is None:
-            return None
-        clearance = float(self.world.clearance(goal)[0])
-        if clearance >= self.robot.radius:
-            return None
-        where = f"({goal[0]:.2f}, {goal[1]:.2f}) in {self.world.name}"
-        what = "inside something, or off the map" if clearance < 0 else f"{clearance:.2f} m from a wall"
-        return f"goal refused: {where} is {what}"
+        return None if self.world is None else wall_refusal(self.world, goal, self.robot.radius)
 
     def set_goal(self, goal: Array | None) -> None:
         """Set the goal (2,) m in map, and the sum of equation 4 to zero."""
@@ -62,7 +56,7 @@ class StraightLinePolicy:
         if self._goal is None:
             return Decision()
         pose = belief.pose.array()
-        observed = observed_position(pose, belief.xi.astype(np.float64), belief.curvature)
+        observed = observed_position(pose, belief.xi, belief.curvature)
         preferred = preferred_position(observed, self._goal, self.parameters.reach)
         self._action = next_action(self._action, observed, preferred, float(pose[2]), self.parameters)
         return Decision(np.array([self._action[0], self._action[1], 0.0]))

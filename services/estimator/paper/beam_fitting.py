@@ -70,9 +70,9 @@ def fit(scanner: Scanner, angles: Array, mount: Array, remedy: str) -> Fit:
     Raises UserError with the reason if the scans do not suit the model; ``remedy`` is the command that trains another.
     """
 
-    def refuse(why: str) -> UserError:
+    def refuse(reason: str) -> UserError:
         known = f"{scanner.name} with {scanner.beams} beams"
-        return UserError(f"the scan does not fit the weights, trained for {known}: {why}; train for it: {remedy}")
+        return UserError(f"the scan does not fit the weights, trained for {known}: {reason}; train for it: {remedy}")
 
     off = np.abs(mount[:2] - np.array(scanner.mount[:2])).max()
     if off > TOLERANCE:

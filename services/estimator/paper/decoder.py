@@ -28,10 +28,6 @@ class GenerativeModel(Protocol):
         """Ranges g (B,) in m at base_link ``pose`` (3,) in map, and dg (B, 3), by x, y (m/m) and yaw (m/rad)."""
         ...
 
-    def predict_all(self, poses: Array) -> tuple[Array, Array]:
-        """Ranges (N, B) and derivatives (N, B, 3) at poses (N, 3)."""
-        ...
-
 
 @dataclass(frozen=True)
 class Shape:
@@ -100,7 +96,11 @@ class Normalisation:
 
     def position(self, poses: Array, dtype: torch.dtype = torch.float32) -> torch.Tensor:
         """Normalised positions (N, 2) in [-1, 1] of poses (N, 3) in map."""
-        return torch.as_tensor((poses[:, :2] - np.array(self.center)) / np.array(self.half_size), dtype=dtype)
+        return torch.as_tensor(self.normalised(poses), dtype=dtype)
+
+    def normalised(self, poses: Array) -> Array:
+        """The same as `position`, in double precision, for poses (..., 3)."""
+        return np.asarray((poses[..., :2] - self.center) / self.half_size)
 
 
 class PaperModel:
@@ -114,15 +114,9 @@ class PaperModel:
 
     def predict(self, pose: Array) -> tuple[Array, Array]:
         """Predicts a scan (see GenerativeModel); the derivative by yaw is zero, because the heading is constant."""
-        ranges, jacobians = self.predict_all(pose[None])
-        return ranges[0], jacobians[0]
-
-    def predict_all(self, poses: Array) -> tuple[Array, Array]:
-        """Predicts scans; see GenerativeModel."""
-        positions = self.norm.position(poses, self.dtype).numpy()
-        ranges, tangents = (rows[..., : self.decoder.shape.beams] for rows in self._forward(positions))
-        full = np.zeros((*ranges.shape, 3))
-        full[..., :2] = tangents.transpose(0, 2, 1) * self.norm.range_scale / np.array(self.norm.half_size)
+        ranges, tangents = (rows[..., : self.decoder.shape.beams] for rows in self._forward(self.norm.normalised(pose)))
+        full = np.zeros((len(ranges), 3))
+        full[:, :2] = tangents.T * self.norm.range_scale / self.norm.half_size
         return ranges.astype(np.float64) * self.norm.range_scale, full
 
     def ranges(self, poses: Array) -> Array:

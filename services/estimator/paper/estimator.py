@@ -11,7 +11,6 @@ from common.geometry import se2
 from services.estimator.paper.beam_fitting import fit as own_fit
 from services.estimator.paper.perception import Descent, PaperEstimator
 from services.estimator.paper.training import usable_ranges
-from services.estimator.shared.asking import Conversation, alone
 from services.estimator.shared.generative_models import Expected
 from services.estimator.shared.interface import Hypothesis, Observation, Posterior, Predicted
 
@@ -60,24 +59,20 @@ class PaperPerception:
 
     def update(self, observation: Observation) -> Posterior:
         """Returns the posterior after descending on one scan."""
-        return alone(self.updating(observation))
-
-    def updating(self, observation: Observation) -> Conversation[Posterior]:
-        """`update` as a generator; see `services.estimator.shared.asking`."""
         ranges = self.fit.ranges(usable_ranges(observation.ranges, observation.range_max))
         measured = self.fit.valid_beams(observation.ranges > -np.inf)
-        estimate = yield from self.estimator.updating(ranges, observation.goal, measured)
-        found = estimate.gradient
+        estimate = self.estimator.update(ranges, observation.goal, measured)
+        free_energy = estimate.free_energy
         predicted = estimate.predicted
         if not self.fit.same:
             predicted = self.fit.predicted(predicted, observation.angles)[0]
         return Posterior(
             state=estimate.state,
             hypotheses=(Hypothesis(estimate.pose, None, 1.0),),
-            accuracy=found.accuracy,
-            complexity=found.attraction,
-            xi=found.xi,
-            curvature=found.curvature,
+            accuracy=free_energy.accuracy,
+            complexity=free_energy.attraction,
+            xi=free_energy.xi,
+            curvature=free_energy.curvature,
             predicted=predicted,
         )
 

@@ -26,27 +26,25 @@ class ForwardMode:
 
     def __init__(self, layers: Iterable[nn.Module]) -> None:
         """Copies the weights. Raises TypeError for layers of other types."""
+        layers = list(layers)
         self._steps = [_step(layer) for layer in layers]
+        self.dtype = next(p.detach().numpy().dtype for layer in layers for p in layer.parameters())
 
-    def __call__(self, positions: Array) -> tuple[Array, Array]:
-        """Output (N, L) of the last layer's only channel at ``positions`` (N, 2), and its derivatives (N, 2, L).
-
-        The numbers of a position do not depend, to the bit, on the other positions of the call.
-        """
-        rows = np.zeros((len(positions), 2, 3, 1), positions.dtype)
-        rows[:, :, 0, 0], rows[:, :, 1:, 0] = positions, np.eye(2)
+    def __call__(self, position: Array) -> tuple[Array, Array]:
+        """Output (L,) of the last layer's only channel at ``position`` (2,), and its derivatives (2, L)."""
+        rows = np.array([[position[0], 1, 0], [position[1], 0, 1]], self.dtype)[..., None]
         for step in self._steps:
             rows = step(rows)
-        return rows[:, 0, 0], rows[:, 0, 1:]
+        return rows[0, 0], rows[0, 1:]
 
 
 def _step(layer: nn.Module) -> Step:
-    """Function that applies a layer to (N, C, 3, L), the value and two tangents of each channel."""
+    """Function that applies a layer to (C, 3, L), the value and two tangents of each channel; it may change them."""
     if isinstance(layer, nn.ReLU):
-        return lambda rows: np.asarray(rows * (rows[:, :, :1] > 0))
+        return _relu
     if isinstance(layer, nn.Unflatten):
-        channels, length = layer.unflattened_size
-        return lambda rows: np.asarray(rows[..., 0].reshape(-1, channels, length, 3).transpose(0, 1, 3, 2))
+        shape = layer.unflattened_size
+        return lambda rows: np.asarray(rows[..., 0].reshape(*shape, 3).transpose(0, 2, 1))
     if isinstance(layer, nn.Linear | nn.Conv1d | nn.ConvTranspose1d):
         assert layer.bias is not None  # noqa: S101 - all layers of the decoder have a bias
         weight, bias = layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy()
@@ -59,12 +57,15 @@ def _step(layer: nn.Module) -> Step:
     raise TypeError(f"no forward mode for {layer}")
 
 
+def _relu(rows: Array) -> Array:
+    rows *= rows[:, :1] > 0
+    return rows
+
+
 def _apply(weight: Array, bias: Array, rows: Array) -> Array:
-    """Multiplies (N, C, 3, L) by ``weight`` (O, C), and adds ``bias`` to the values."""
-    count, channels, kinds, length = rows.shape
-    # One product for each of the N, because rounding in the matrix library depends on the shapes.
-    out = (weight @ rows.reshape(count, channels, kinds * length)).reshape(count, len(weight), kinds, length)
-    out[:, :, 0] += bias[:, None]
+    """Multiplies (C, 3, L) by ``weight`` (O, C), and adds ``bias`` to the values."""
+    out = (weight @ rows.reshape(len(rows), -1)).reshape(len(weight), *rows.shape[1:])
+    out[:, 0] += bias[:, None]
     return np.asarray(out)
 
 
@@ -72,7 +73,14 @@ def _convolution(weight: Array, bias: Array) -> Step:
     """A convolution of stride 1 that keeps the length, as one product with stacked shifted rows."""
     taps = weight.shape[2]
     flat = weight.transpose(0, 2, 1).reshape(len(weight), -1)
-    return lambda rows: _apply(flat, bias, np.concatenate([_shifted(rows, k - taps // 2) for k in range(taps)], axis=1))
+
+    def step(rows: Array) -> Array:
+        stacked = np.empty((taps, *rows.shape), rows.dtype)
+        for tap in range(taps):
+            _shift(rows, tap - taps // 2, stacked[tap])
+        return _apply(flat, bias, stacked.reshape(-1, *rows.shape[1:]))
+
+    return step
 
 
 def _transposed_convolution(weight: Array, bias: Array) -> Step:
@@ -84,21 +92,24 @@ def _transposed_convolution(weight: Array, bias: Array) -> Step:
     odd = np.concatenate([weight[:, :, 2], weight[:, :, 0]]).T.copy()
 
     def step(rows: Array) -> Array:
-        out = np.empty((len(rows), len(bias), rows.shape[2], 2 * rows.shape[3]), rows.dtype)
-        out[..., 0::2] = _apply(even, bias, np.concatenate([rows, _shifted(rows, -1)], axis=1))
-        out[..., 1::2] = _apply(odd, bias, np.concatenate([rows, _shifted(rows, 1)], axis=1))
+        channels, _, length = rows.shape
+        out = np.empty((len(bias), 3, 2 * length), rows.dtype)
+        stacked = np.empty((2 * channels, 3, length), rows.dtype)
+        stacked[:channels] = rows
+        _shift(rows, -1, stacked[channels:])
+        out[..., 0::2] = _apply(even, bias, stacked)
+        _shift(rows, 1, stacked[channels:])
+        out[..., 1::2] = _apply(odd, bias, stacked)
         return out
 
     return step
 
 
-def _shifted(rows: Array, by: int) -> Array:
-    """Shifts entries, so that entry l becomes the former entry l + ``by``; zero beyond the ends."""
-    if by == 0:
-        return rows
-    out = np.zeros_like(rows)
+def _shift(rows: Array, by: int, out: Array) -> None:
+    """Fills ``out`` so that its entry l is entry l + ``by`` of ``rows``; zero beyond the ends."""
     if by > 0:
-        out[..., :-by] = rows[..., by:]
+        out[..., :-by], out[..., -by:] = rows[..., by:], 0
+    elif by < 0:
+        out[..., -by:], out[..., :-by] = rows[..., :by], 0
     else:
-        out[..., -by:] = rows[..., :by]
-    return out
+        out[...] = rows

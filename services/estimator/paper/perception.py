@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from services.estimator.paper.free_energy import Gradient, gradient
-from services.estimator.shared.asking import Conversation, alone
+from services.estimator.paper.free_energy import FreeEnergy
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.estimator.paper.decoder import GenerativeModel
-    from services.estimator.shared.asking import Pieces
 
 Mask = npt.NDArray[np.bool_]
 State = Literal["localising", "tracking", "lost"]
@@ -42,36 +39,8 @@ class Estimate:
 
     pose: Array  # (3,) base_link in map
     predicted: Array  # (B,) m, g at the pose
-    gradient: Gradient
+    free_energy: FreeEnergy
     state: State
-
-
-@dataclass(frozen=True)
-class Decode:
-    """`GenerativeModel.predict` as a question (see `services.estimator.shared.asking`)."""
-
-    model: GenerativeModel
-    pose: Array  # (3,)
-    beams: int = 0
-
-    @property
-    def alike(self) -> Hashable:
-        """Questions to one network can be answered together."""
-        return id(self.model)
-
-    def answer(self) -> tuple[Array, Array]:
-        """Returns the ranges and their derivative."""
-        return self.model.predict(self.pose)
-
-    def answer_all(self, questions: Sequence[Decode]) -> list[tuple[Array, Array]]:
-        """Evaluates the network at all poses at once."""
-        ranges, jacobians = self.model.predict_all(np.array([question.pose for question in questions]))
-        return list(zip(ranges, jacobians, strict=True))
-
-    def in_pieces(self, beams: int) -> Pieces[tuple[Array, Array]]:  # noqa: ARG002
-        """Answers at once, because one pose cannot be divided."""
-        yield from ()
-        return self.answer()
 
 
 @dataclass
@@ -93,6 +62,7 @@ class PaperEstimator:
         self._steps: list[float] = []
         self._misfits: list[float] = []
         self._was_tracking = self.known
+        self._prediction: tuple[Array, Array] | None = None  # the model's, at the belief
 
     def restart(self, pose: Array, *, known: bool = False) -> None:
         """Starts at ``pose`` (3,), which is the true pose if ``known``, else only a start for localisation."""
@@ -104,12 +74,6 @@ class PaperEstimator:
 
         ``measured`` (B,) tells which beams to use; by default all.
         """
-        return alone(self.updating(ranges, goal, measured))
-
-    def updating(
-        self, ranges: Array, goal: Array | None = None, measured: Mask | None = None
-    ) -> Conversation[Estimate]:
-        """`update` as a generator; see `services.estimator.shared.asking`."""
         used = slice(None) if measured is None or measured.all() else measured
         ranges = ranges[used]
         precision = np.ones(len(ranges))
@@ -117,24 +81,24 @@ class PaperEstimator:
         metric = np.append(self.metric, 1.0)
         g_goal = None
         if goal is not None and self.settings.beta > 0:
-            g_goal, _ = yield Decode(self.model, goal)
-            g_goal = g_goal[used]
+            g_goal = self.model.predict(goal)[0][used]
+        g, dg = self._prediction or self.model.predict(self.pose)
         for _ in range(self.settings.iterations):
-            g, dg = yield Decode(self.model, self.pose)
-            found = gradient(ranges, g[used], dg[used], precision, g_goal, self.settings.beta)
-            step = self.settings.alpha * metric * found.descent
+            free_energy = FreeEnergy(ranges, g[used], dg[used], precision, g_goal, self.settings.beta)
+            step = self.settings.alpha * metric * free_energy.descent
             length = float(np.hypot(step[0], step[1]))
             self.pose = self._inside(self.pose + step * min(1.0, self.settings.max_step / max(length, 1e-12)))
-        g, dg = yield Decode(self.model, self.pose)
-        final = gradient(ranges, g[used], dg[used], precision, g_goal, self.settings.beta)
+            g, dg = self.model.predict(self.pose)
+        self._prediction = g, dg
+        free_energy = FreeEnergy(ranges, g[used], dg[used], precision, g_goal, self.settings.beta)
         # A scan without any measured beam keeps the misfit of the one before.
         misfit = float(np.mean(np.abs(ranges - g[used]))) if len(ranges) else (self._misfits or [np.inf])[-1]
         state = self._judge(float(np.hypot(*(self.pose - previous)[:2])), misfit)
-        return Estimate(self.pose.copy(), g, final, state)
+        return Estimate(self.pose.copy(), g, free_energy, state)
 
     def _inside(self, pose: Array) -> Array:
         x0, y0, x1, y1 = self.bounds
-        return np.array([np.clip(pose[0], x0, x1), np.clip(pose[1], y0, y1), pose[2]])
+        return np.array([min(max(pose[0], x0), x1), min(max(pose[1], y0), y1), pose[2]])
 
     def _judge(self, step: float, misfit: float) -> State:
         """Tracking once steps are short and the misfit is near the model's error; lost when it no longer is."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import ndtr
 
 from common.errors import UserError
-from services.estimator.shared.generative_models import RayCaster
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 HEADINGS = 360  # of the table; ranges are interpolated between them
 MAX_CELLS = 20_000_000
-_erf = np.vectorize(math.erf, otypes=[float])
 
 
 @dataclass(frozen=True)
@@ -49,10 +48,10 @@ class BeamModel:
         missed = not_measured | (ranges >= range_max)
         z = np.where(missed, 0.0, np.maximum(ranges, 0.0))
         root = math.sqrt(2) * self.sigma_hit
-        # The part of the Gaussian within [0, range_max]: nearly always 1, so erf is computed only near the limits.
+        # The part of the Gaussian within [0, range_max]: nearly always 1, so it is computed only near the limits.
         edge = (mean < 5 * self.sigma_hit) | (mean > range_max - 5 * self.sigma_hit)
         inside = np.ones_like(mean)
-        inside[edge] = 0.5 * (_erf((range_max - mean[edge]) / root) + _erf(mean[edge] / root))
+        inside[edge] = ndtr((range_max - mean[edge]) / self.sigma_hit) - ndtr(-mean[edge] / self.sigma_hit)
         hit = np.exp(-(((z - mean) / root) ** 2)) / (root * math.sqrt(math.pi) * inside)
         lam = self.lambda_short
         short = np.where(z <= mean, lam * np.exp(-lam * z) / -np.expm1(-lam * np.maximum(mean, 1e-6)), 0.0)
@@ -86,9 +85,9 @@ class RangeTable:
         ij = np.clip(np.floor((poses[:, :2] - self.origin) / self.resolution).astype(int), 0, self._limit)
         cells = ij[:, 0] * (self._limit[1] + 1) + ij[:, 1]
         self._cast(np.unique(cells[self._row[cells] < 0]))
-        at = ((poses[:, 2:3] + angles) % (2 * np.pi)) * (HEADINGS / (2 * np.pi))
-        low = np.floor(at).astype(int)
-        rows, part = self._row[cells][:, None], at - low
+        direction = ((poses[:, 2:3] + angles) % (2 * np.pi)) * (HEADINGS / (2 * np.pi))
+        low = np.floor(direction).astype(int)
+        rows, part = self._row[cells][:, None], direction - low
         a, b = self._ranges[rows, low % HEADINGS], self._ranges[rows, (low + 1) % HEADINGS]
         # At a silhouette the nearer heading is used, because interpolated ranges would end in free space.
         with np.errstate(invalid="ignore"):
@@ -101,8 +100,5 @@ class RangeTable:
         ij = np.stack(np.divmod(cells, self._limit[1] + 1), axis=-1)
         middles = np.column_stack([self.origin + (ij + 0.5) * self.resolution, np.zeros(len(cells))])
         self._row[cells] = len(self._ranges) + np.arange(len(cells), dtype=np.int32)
-        if self.world.grid is None:
-            found = self.world.ray_distances(middles, self._angles)
-        else:  # the compiled ray caster is several times faster in a grid
-            found = RayCaster(self.world).expect(middles, self._angles).ranges
+        found = self.world.ray_distances(middles, self._angles)
         self._ranges = np.concatenate([self._ranges, found.astype(np.float32)])

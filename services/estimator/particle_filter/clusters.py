@@ -33,9 +33,9 @@ def labels(poses: Array) -> npt.NDArray[np.int64]:
     xy, yaw = np.divmod(occupied, HEADING_BINS)
     beside = (xy + NEIGHBOURS[:, 0] * 2 * BIN_OFFSET + NEIGHBOURS[:, 1]) * HEADING_BINS
     beside = beside + (yaw + NEIGHBOURS[:, 2]) % HEADING_BINS
-    at = np.minimum(np.searchsorted(occupied, beside), len(occupied) - 1)
-    offset, a = np.nonzero(occupied[at] == beside)
-    b = at[offset, a]
+    index = np.minimum(np.searchsorted(occupied, beside), len(occupied) - 1)
+    offset, a = np.nonzero(occupied[index] == beside)
+    b = index[offset, a]
     # Every bin takes the least label among its neighbours, and then that label's own label, until none changes.
     label = np.arange(len(occupied))
     while True:

@@ -12,7 +12,6 @@ from services.estimator.particle_filter.clusters import hypotheses
 from services.estimator.particle_filter.recovery import Recovery
 from services.estimator.particle_filter.sensor import Sensor
 from services.estimator.particle_filter.settings import Settings
-from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.interface import Observation, Posterior, Predicted, State
 
 if TYPE_CHECKING:
@@ -108,7 +107,7 @@ class ParticleFilter:
 
     def predict(self, poses: Array, angles: Array) -> Predicted:
         """Predicts scans (see Estimator) by exact rays in the map; sigma is that of a hit while tracking."""
-        ranges = RayCaster(self.world).expect(se2.compose(poses, self.mount), angles).ranges
+        ranges = self.world.ray_distances(se2.compose(poses, self.mount), angles)
         return Predicted(ranges, np.full(ranges.shape, self.settings.sigma_hit))
 
     def _anywhere(self, count: int, places: Array | None = None) -> Array:
@@ -212,9 +211,9 @@ class ParticleFilter:
         """Draws as many particles as the belief needs; a share at random places if scans no longer fit."""
         s, rng = self.settings, self._rng
         share = self._recovery.random_share if self._recovers else 0.0
-        at = resampling.bins(self.particles)
-        trial = self._upper_bound(len(np.unique(at)), share)
-        drawn = at[rng.permutation(resampling.low_variance(self.weights, trial, rng))]
+        bins = resampling.bins(self.particles)
+        trial = self._upper_bound(len(np.unique(bins)), share)
+        drawn = bins[rng.permutation(resampling.low_variance(self.weights, trial, rng))]
         random_poses = self._anywhere(int(rng.binomial(trial, share))) if share > 0 else np.zeros((0, 3))
         if len(random_poses):
             drawn[rng.permutation(trial)[: len(random_poses)]] = resampling.bins(random_poses)

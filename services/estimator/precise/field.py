@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from services.estimator.shared import kernels
+from services.estimator.precise.field_tracing import end_in_unseen_cells, trace
 from services.estimator.shared.generative_models import Expected
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class DistanceField:
         shape = (len(lasers), len(angles))
         ranges, dip, edge, facing = (np.empty(shape) for _ in range(4))
         jacobian = np.empty((*shape, 3))
-        kernels.trace(self.phi, *self.origin, self.resolution, lasers, angles, ranges, jacobian, dip, edge, facing)
+        trace(self.phi, *self.origin, self.resolution, lasers, angles, ranges, jacobian, dip, edge, facing)
         return Traced(ranges, jacobian, dip, edge, facing)
 
 
@@ -77,7 +77,7 @@ class Seen:
     cells: npt.NDArray[np.bool_]  # (ny, nx); cell (i, j) begins at origin + SEEN_CELL_M * (j, i)
     origin: tuple[float, float]  # m in map
 
-    def at(self, field: DistanceField) -> npt.NDArray[np.bool_]:
+    def nodes_of(self, field: DistanceField) -> npt.NDArray[np.bool_]:
         """Whether each node of a field lies in a seen cell: (ny, nx)."""
         ny, nx = field.phi.shape
         i, j = (
@@ -99,9 +99,7 @@ class Seen:
     def limit(self, lasers: Array, angles: Array, ranges: Array, jacobian: Array, scale: Array) -> None:
         """Ends beams (N, B) where they enter cells that were not seen, with an infinite scale there, in place."""
         lasers, angles = np.asarray(lasers, float).reshape(-1, 3), np.asarray(angles, float)
-        kernels.end_in_unseen_cells(
-            self.cells, *self.origin, SEEN_CELL_M, lasers, angles, SEEN_CELL_M, ranges, jacobian, scale
-        )
+        end_in_unseen_cells(self.cells, *self.origin, SEEN_CELL_M, lasers, angles, SEEN_CELL_M, ranges, jacobian, scale)
 
 
 @dataclass(frozen=True)

@@ -2,16 +2,13 @@
 
 The step is (H + P^-1 + lambda D)^-1 (xi + P^-1 (prior - x)). H is the Gauss-Newton Hessian of accuracy (the Fisher
 information of the density), D its diagonal. A step that does not lower F is undone, and lambda is raised.
-
-Functions come in pairs: `descend` returns its result, `descending` is the same as a generator that leaves predictions
-to the caller (see `services.estimator.shared.asking`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +16,6 @@ import numpy.typing as npt
 from common.geometry import se2
 from common.robot.ranges import surfaces
 from services.estimator.precise.likelihood import Evidence
-from services.estimator.shared.asking import Conversation, alone
-from services.estimator.shared.generative_models import Expect, Expected
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -36,9 +31,40 @@ COARSE_SIGMA_M, MEDIUM_SIGMA_M, FINE_SIGMA_M = ANNEALING_SCHEDULE_M = (0.3, 0.1,
 DAMPING = np.diag([1.0, 1.0, 1.0]) * 1e-6  # 1/m², 1/rad²: no step along directions without information
 
 
+class Optimiser(Protocol):
+    """Finds poses at which a scan has little free energy. F is ``evidence.accuracy``, plus ``prior.energy(poses)``."""
+
+    def descend(
+        self, view: View, poses: Array, prior: Prior | None, extra_sigma: float, iterations: int
+    ) -> tuple[Array, Evidence]:
+        """Returns poses (N, 3) with less F than ``poses`` (N, 3), and ``view.evidence(poses, extra_sigma)`` there.
+
+        Used from seeds up to a metre away. May evaluate each pose about ``iterations`` times.
+        """
+        ...
+
+    def polish(self, view: View, poses: Array, prior: Prior | None, iterations: int) -> tuple[Array, Evidence]:
+        """Returns the minima of F next to ``poses`` (N, 3) to a fraction of a millimetre, and the evidence there."""
+        ...
+
+
+class GaussNewton:
+    """The default optimiser: the functions `descend` and `polish` of this module."""
+
+    def descend(
+        self, view: View, poses: Array, prior: Prior | None, extra_sigma: float, iterations: int
+    ) -> tuple[Array, Evidence]:
+        """See Optimiser."""
+        return descend(view, poses, prior, extra_sigma, iterations)
+
+    def polish(self, view: View, poses: Array, prior: Prior | None, iterations: int) -> tuple[Array, Evidence]:
+        """See Optimiser."""
+        return polish(view, poses, prior, iterations)
+
+
 @dataclass(frozen=True)
 class View:
-    """One scan, with the model and the likelihood by which poses are compared with it."""
+    """One scan, with the model, the likelihood and the optimiser by which poses are compared with it."""
 
     model: GenerativeModel
     likelihood: Likelihood
@@ -46,13 +72,24 @@ class View:
     angles: Array  # (B,) rad in laser
     ranges: Array  # (B,) m
     range_max: float  # m
+    optimiser: Optimiser = field(default_factory=GaussNewton)
 
     def thinned(self, beams: int) -> View:
         """Returns a view with every k-th beam, so that about ``beams`` are left."""
         k = max(1, len(self.angles) // beams)
         # numba would compile every loop once more for strided arrays, so these are contiguous.
         angles, ranges = np.ascontiguousarray(self.angles[::k]), np.ascontiguousarray(self.ranges[::k])
-        return View(self.model, self.likelihood, self.mount, angles, ranges, self.range_max)
+        return replace(self, angles=angles, ranges=ranges)
+
+    def descend(
+        self, poses: Array, prior: Prior | None = None, extra_sigma: float = 0.0, iterations: int = 10
+    ) -> tuple[Array, Evidence]:
+        """Returns poses (N, 3) after the descent from ``poses``, and the evidence there."""
+        return self.optimiser.descend(self, poses, prior, extra_sigma, iterations)
+
+    def polish(self, poses: Array, prior: Prior | None = None, iterations: int = 5) -> tuple[Array, Evidence]:
+        """Returns the minima next to ``poses`` (N, 3), and the evidence there."""
+        return self.optimiser.polish(self, poses, prior, iterations)
 
     @cached_property
     def points(self) -> Array:
@@ -66,12 +103,8 @@ class View:
 
         ``extra_sigma`` m is added in quadrature to every beam's standard deviation.
         """
-        return alone(self.looking(poses, extra_sigma))
-
-    def looking(self, poses: Array, extra_sigma: float = 0.0) -> Conversation[Evidence]:
-        """`evidence` as a generator."""
         lasers = se2.compose(poses, self.mount)
-        expected: Expected = yield Expect(self.model, lasers, self.angles)
+        expected = self.model.expect(lasers, self.angles)
         at_laser = self.likelihood.evaluate(self.ranges, self.range_max, expected, extra_sigma)
         # A rotation of base_link moves the laser sideways: J_base = J_laser T.
         T = np.tile(np.eye(3), (len(poses), 1, 1))
@@ -122,15 +155,8 @@ def descend(
     view: View, poses: Array, prior: Prior | None = None, extra_sigma: float = 0.0, iterations: int = 10
 ) -> tuple[Array, Evidence]:
     """Returns poses (N, 3) after the descent from ``poses``, and the evidence there."""
-    return alone(descending(view, poses, prior, extra_sigma, iterations))
-
-
-def descending(
-    view: View, poses: Array, prior: Prior | None = None, extra_sigma: float = 0.0, iterations: int = 10
-) -> Conversation[tuple[Array, Evidence]]:
-    """`descend` as a generator."""
     best = np.array(poses, float)
-    evidence = yield from view.looking(best, extra_sigma)
+    evidence = view.evidence(best, extra_sigma)
     energy = evidence.accuracy + (prior.energy(best) if prior else 0.0)
     damping, active = np.full(len(best), 1e-3), np.ones(len(best), bool)
     for _ in range(iterations):
@@ -140,7 +166,7 @@ def descending(
             break
         trial = best[active] + step[active]
         trial[:, 2] = se2.wrap(trial[:, 2])
-        trial_evidence = yield from view.looking(trial, extra_sigma)
+        trial_evidence = view.evidence(trial, extra_sigma)
         trial_prior = Prior(prior.mean[active], prior.information[active]) if prior else None
         trial_energy = trial_evidence.accuracy + (trial_prior.energy(trial) if trial_prior else 0.0)
         better = trial_energy < energy[active]
@@ -174,20 +200,13 @@ def polish(view: View, poses: Array, prior: Prior | None = None, iterations: int
     minimises F with the beams' weights held constant (iteratively reweighted least squares). Returns the last poses
     that were evaluated, at most ``SETTLED_STEP`` from the minimum, and the evidence there.
     """
-    return alone(polishing(view, poses, prior, iterations))
-
-
-def polishing(
-    view: View, poses: Array, prior: Prior | None = None, iterations: int = 5
-) -> Conversation[tuple[Array, Evidence]]:
-    """`polish` as a generator."""
     poses = np.array(poses, float)
-    evidence = yield from view.looking(poses)
+    evidence = view.evidence(poses)
     for _ in range(iterations - 1):
         step = _steps(poses, evidence, prior, np.zeros(len(poses)))
         if (np.abs(step) < SETTLED_STEP).all():
             break
         poses = poses + step
         poses[:, 2] = se2.wrap(poses[:, 2])
-        evidence = yield from view.looking(poses)
+        evidence = view.evidence(poses)
     return poses, evidence

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from common.geometry import se2
-from services.estimator.shared import kernels
-from services.estimator.shared.asking import without_pause
+from services.estimator.precise import beam_sums
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.estimator.precise.gauss_newton import View
-    from services.estimator.shared.asking import Pieces
     from services.estimator.shared.generative_models import GenerativeModel
 
 PANORAMA_BINS = 360
 SEED_SPACING_M = 0.3  # between the places at which a search begins
-LOOKUPS_PER_BEAM = 40  # lookups in a panorama that take as long as the prediction of one beam
+RANKED_HEADINGS, RANKED_BEAMS = 120, 72  # that are compared with the panorama of each place
 MISFIT_TOLERANCE_M = 0.35  # error of a beam at a place about as far from the true one
 
 
@@ -49,7 +47,7 @@ class Seeds:
         """Volume in m² rad of the poses that the seeds represent."""
         return max(1, len(self.places)) * SEED_SPACING_M**2 * 2 * np.pi
 
-    @property
+    @cached_property
     def spread(self) -> Array:
         """Covariance (3, 3) of a completely unknown pose: uniform over the map and all headings."""
         extent = np.ptp(self.places, axis=0) if len(self.places) else np.ones(2)
@@ -57,53 +55,15 @@ class Seeds:
 
     def rank(self, view: View, count: int) -> Array:
         """The ``count`` base_link poses (count, 3) that fit the scan best, best first; at most two per place."""
-        return Ranking(self, view, count).answer()
-
-
-@dataclass(frozen=True)
-class Ranking:
-    """`Seeds.rank` as a question (see `services.estimator.shared.asking`)."""
-
-    seeds: Seeds
-    view: View
-    count: int
-    headings: int = 120
-    thinned: int = 72  # beams of the scan that are compared
-
-    @property
-    def alike(self) -> Hashable:
-        """Every ranking is answered alone, since rankings share no computation."""
-        return id(self)
-
-    @property
-    def beams(self) -> int:
-        """Number of beam predictions that take as long as this ranking."""
-        return len(self.seeds.places) * self.headings * self.thinned // LOOKUPS_PER_BEAM
-
-    def answer(self) -> Array:
-        """Returns the ranked poses."""
-        return without_pause(self.in_pieces(self.beams + 1))
-
-    def answer_all(self, questions: Sequence[Ranking]) -> list[Array]:
-        """Returns the answers to several rankings."""
-        return [question.answer() for question in questions]
-
-    def in_pieces(self, beams: int) -> Pieces[Array]:
-        """Ranks a few places at a time."""
-        seeds, thin = self.seeds, self.view.thinned(self.thinned)
+        thin = view.thinned(RANKED_BEAMS)
         bins = np.round(thin.angles / (2 * np.pi / PANORAMA_BINS)).astype(np.int64)
         measured = thin.ranges.astype(np.float32)
-        costs = np.empty((len(seeds.places), self.headings), np.float32)
-        rows = max(1, beams * LOOKUPS_PER_BEAM // (self.headings * self.thinned))
-        tolerance, range_max = np.float32(MISFIT_TOLERANCE_M), np.float32(self.view.range_max)
-        for begin in range(0, len(costs), rows):
-            if begin:
-                yield
-            part = slice(begin, begin + rows)
-            kernels.rank_places(seeds.panoramas[part], bins, measured, tolerance, range_max, costs[part])
-        place, heading = _least_costs(costs, self.count)
-        lasers = np.column_stack([seeds.places[place], se2.wrap(heading * (2 * np.pi / self.headings))])
-        return se2.compose(lasers, se2.inverse(self.view.mount))
+        costs = np.empty((len(self.places), RANKED_HEADINGS), np.float32)
+        tolerance, range_max = np.float32(MISFIT_TOLERANCE_M), np.float32(view.range_max)
+        beam_sums.rank_places(self.panoramas, bins, measured, tolerance, range_max, costs)
+        place, heading = _least_costs(costs, count)
+        lasers = np.column_stack([self.places[place], se2.wrap(heading * (2 * np.pi / RANKED_HEADINGS))])
+        return se2.compose(lasers, se2.inverse(view.mount))
 
 
 def _least_costs(costs: np.ndarray[tuple[int, ...], np.dtype[np.float32]], count: int) -> tuple[Array, Array]:

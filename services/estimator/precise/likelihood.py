@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from services.estimator.shared import kernels
+from services.estimator.precise import beam_sums
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -69,7 +69,7 @@ class Likelihood:
         count = len(expected.ranges)
         total, gradient = np.zeros((count, 3)), np.zeros((count, 3))
         matrices = np.zeros((count, 3, 3, 3))
-        kernels.accumulate(
+        beam_sums.accumulate(
             measured, expected.ranges, expected.jacobian, expected.scale,
             self.sigma, self.relative, extra_sigma, self.short, self.random, range_max, self.unseen,
             total, gradient, matrices,

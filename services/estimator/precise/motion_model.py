@@ -131,24 +131,26 @@ def _propagate(
     return Candidate(name, se2.compose(pose, step), propagated, probability)
 
 
-def widen_unobserved(noise: MotionNoise, option: Candidate, direction: Array, scans: int, period: float) -> Candidate:
+def widen_unobserved(
+    noise: MotionNoise, candidate: Candidate, direction: Array, scans: int, period: float
+) -> Candidate:
     """Adds the motion at full speed along ``direction`` (2,), which the last ``scans`` scans did not observe.
 
     The standard deviation grows in proportion to time.
     """
-    covariance = option.covariance.copy()
+    covariance = candidate.covariance.copy()
     covariance[:2, :2] += np.outer(direction, direction) * (noise.speed * period) ** 2 * (2 * scans + 1)
-    return replace(option, covariance=covariance)
+    return replace(candidate, covariance=covariance)
 
 
-def limit_to_map(option: Candidate, unknown: Array) -> Candidate:
+def limit_to_map(candidate: Candidate, unknown: Array) -> Candidate:
     """Limits the variance of the position to that of a completely unknown pose, ``unknown`` (3, 3)."""
-    excess = np.sqrt(np.diag(option.covariance) / np.diag(unknown))
+    excess = np.sqrt(np.diag(candidate.covariance) / np.diag(unknown))
     excess[2] = 1.0
     if (excess <= 1).all():
-        return option
+        return candidate
     scale = 1 / np.maximum(excess, 1.0)
-    return replace(option, covariance=option.covariance * np.outer(scale, scale))
+    return replace(candidate, covariance=candidate.covariance * np.outer(scale, scale))
 
 
 def reachable_poses(noise: MotionNoise, pose: Array, period: float, basin: float) -> Array:

@@ -1,7 +1,7 @@
 """Decides whether unexplained beams contradict a pose or are only blocked.
 
-Something in the way of a beam makes it end early, at the right pose too. A beam ends late, behind the expected surface,
-only at a wrong pose (or where something was taken away).
+Something in the way of a beam makes it end early, at the right pose too. A beam ends behind the expected surface only
+at a wrong pose (or where something was taken away).
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ if TYPE_CHECKING:
     from services.estimator.precise.gauss_newton import View
     from services.estimator.shared.generative_models import Expected
 
-LATE_SIGMAS = 4.0  # standard deviations behind the expected surface, from which a beam counts as late
+BEHIND_SIGMAS = 4.0  # standard deviations behind the expected surface, from which a beam counts as behind it
 MIN_ACCOUNTED_SHARE = 0.95
 
 
 def contradicting_ratio(view: View, expected: Expected) -> float:
-    """Share of late beams among those that returned and have an expected surface; ``expected`` is for one pose."""
+    """Share of beams behind the expected surface among those that returned and have one; for one pose."""
     comparable = np.isfinite(view.ranges) & np.isfinite(expected.ranges[0])
-    return late_ratio(view, expected) * len(comparable) / max(1, int(comparable.sum()))
+    return behind_ratio(view, expected) * len(comparable) / max(1, int(comparable.sum()))
 
 
-def late_ratio(view: View, expected: Expected) -> float:
-    """Share of late beams among all beams, which is small if the model expects few surfaces."""
-    return float((np.isfinite(view.ranges) & (view.ranges > _late_from(view, expected))).mean())
+def behind_ratio(view: View, expected: Expected) -> float:
+    """Share of beams behind the expected surface, among all; it is small if the model expects few surfaces."""
+    return float((np.isfinite(view.ranges) & (view.ranges > _behind_from(view, expected))).mean())
 
 
 def is_only_blocked(view: View, expected: Expected, max_contradicting_ratio: float) -> bool:
-    """Whether the model knows nearly every beam and none is late, so that obstacles alone can explain the misfit."""
+    """Whether nearly all beams are known and none ends behind its surface, so that obstacles can explain the misfit."""
     known = np.isfinite(expected.scale[0])
-    accounted = float((known & (view.ranges <= _late_from(view, expected))).mean())
+    accounted = float((known & (view.ranges <= _behind_from(view, expected))).mean())
     return accounted > MIN_ACCOUNTED_SHARE - max_contradicting_ratio
 
 
@@ -49,7 +49,7 @@ def constraining_beams(view: View, pose: Array, direction: Array) -> float:
     return float(view.likelihood.inlier(view.ranges[used], surface[used], scale[used], view.range_max).sum())
 
 
-def _late_from(view: View, expected: Expected) -> Array:
+def _behind_from(view: View, expected: Expected) -> Array:
     """Ranges (B,) in m beyond which a beam is clearly behind the expected surface."""
     surface = expected.ranges[0]
-    return np.asarray(surface + LATE_SIGMAS * np.hypot(expected.scale[0], view.likelihood.deviation(surface)))
+    return np.asarray(surface + BEHIND_SIGMAS * np.hypot(expected.scale[0], view.likelihood.deviation(surface)))

@@ -13,12 +13,8 @@ from services.estimator.precise.gauss_newton import (
     MEDIUM_SIGMA_M,
     Prior,
     View,
-    descending,
-    polishing,
 )
-from services.estimator.precise.global_seeds import Ranking
 from services.estimator.precise.hypotheses import Mode, mode_from_search, select_distinct, weigh
-from services.estimator.shared.asking import Conversation
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
@@ -27,15 +23,14 @@ if TYPE_CHECKING:
     from services.estimator.precise.settings import Settings
 
 
-def search_everywhere(view: View, seeds: Seeds, settings: Settings, *, thorough: bool) -> Conversation[list[Mode]]:
+def search_everywhere(view: View, seeds: Seeds, settings: Settings, *, thorough: bool) -> list[Mode]:
     """Returns the hypotheses that fit best in the whole map, best first.
 
     If the first round explains too little and ``thorough`` is set, a second round descends from more seeds.
     """
     modes: list[Mode] = []
     for count in (settings.search_seeds, *([settings.thorough_search_seeds] if thorough else [])):
-        starts = yield Ranking(seeds, view, count)
-        modes = yield from _refine(view, starts, None, seeds, settings)
+        modes = _refine(view, seeds.rank(view, count), None, seeds, settings)
         if modes[0].inlier_ratio >= settings.conclusive_inlier_ratio:
             break
     return modes
@@ -43,14 +38,14 @@ def search_everywhere(view: View, seeds: Seeds, settings: Settings, *, thorough:
 
 def search_near(
     view: View, pose: Array, covariance: Array, seeds: Seeds, settings: Settings, rng: np.random.Generator
-) -> Conversation[list[Mode]]:
+) -> list[Mode]:
     """Returns the hypotheses that fit best near ``pose`` (3,), which is known within ``covariance`` (3, 3)."""
     starts = rng.multivariate_normal(pose, covariance, settings.search_seeds)
     starts[0] = pose
-    return (yield from _refine(view, starts, Prior.repeated(len(starts), pose, covariance), seeds, settings))
+    return _refine(view, starts, Prior.repeated(len(starts), pose, covariance), seeds, settings)
 
 
-def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) -> Conversation[tuple[Array, Evidence]]:
+def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) -> tuple[Array, Evidence]:
     """Descends from ``starts`` (N, 3), one per hypothesis, over a wider area than `polish`.
 
     The first hypothesis also descends from ``extra_starts`` (K, 3). Returns one pose (N, 3) per hypothesis and the
@@ -61,24 +56,22 @@ def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) 
     starts = np.concatenate([starts, extra_starts])
     repeated_prior = Prior(prior.mean[hypothesis], prior.information[hypothesis])
     for extra_sigma in ANNEALING_SCHEDULE_M:
-        starts, _ = yield from descending(view, starts, repeated_prior, extra_sigma, 5)
-    poses, evidence = yield from polishing(view, starts, repeated_prior)
+        starts, _ = view.descend(starts, repeated_prior, extra_sigma, 5)
+    poses, evidence = view.polish(starts, repeated_prior)
     own = np.flatnonzero(hypothesis == 0)
     keep = np.array([own[np.argmin(evidence.accuracy[own] + repeated_prior.energy(poses)[own])], *range(1, count)])
     return poses[keep], evidence.part(keep)
 
 
-def _refine(
-    view: View, starts: Array, prior: Prior | None, seeds: Seeds, settings: Settings
-) -> Conversation[list[Mode]]:
+def _refine(view: View, starts: Array, prior: Prior | None, seeds: Seeds, settings: Settings) -> list[Mode]:
     """Descends from all starts with few beams and wide deviations, then from the best ones with all beams."""
     few = view.thinned(settings.search_beams)
-    poses, evidence = yield from descending(few, starts, prior, COARSE_SIGMA_M, 5)
-    poses, evidence = yield from descending(few, poses, prior, MEDIUM_SIGMA_M, 4)
+    poses, evidence = few.descend(starts, prior, COARSE_SIGMA_M, 5)
+    poses, evidence = few.descend(poses, prior, MEDIUM_SIGMA_M, 4)
     keep = select_distinct(poses, evidence.accuracy, 2 * settings.max_hypotheses)
     part = Prior(prior.mean[keep], prior.information[keep]) if prior else None
-    poses, evidence = yield from descending(view, poses[keep], part, FINE_SIGMA_M, 4)
-    poses, evidence = yield from polishing(view, poses, part)
+    poses, evidence = view.descend(poses[keep], part, FINE_SIGMA_M, 4)
+    poses, evidence = view.polish(poses, part)
     keep = select_distinct(poses, evidence.accuracy, settings.max_hypotheses)
     modes = [mode_from_search(poses[k], evidence, k, part, seeds.volume, seeds.spread, view.model.ripple) for k in keep]
     return weigh(modes, settings.evidence_error_nats, settings.max_hypotheses)

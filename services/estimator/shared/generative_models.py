@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from services.estimator.shared import grid_ray_kernels as cell_kernels
-from services.estimator.shared import kernels
+from common.geometry.ray_casting import cast_rays_with_jacobian
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import World
-    from services.estimator.shared.asking import Pieces
 
 CORNER_ANGLE_RAD = 0.3  # a surface tilted by more is a corner, and not a ripple caused by learning
 EXACT_SCALE_M = 1e-4  # stated error of exact rays, for rounding
@@ -31,15 +28,6 @@ class Expected:
     def part(self, rows: slice) -> Expected:
         """Returns the scans at some of the poses."""
         return Expected(self.ranges[rows], self.scale[rows], self.jacobian[rows])
-
-    @classmethod
-    def joined(cls, parts: Sequence[Expected]) -> Expected:
-        """Concatenates the scans of several parts."""
-        return cls(
-            np.concatenate([part.ranges for part in parts]),
-            np.concatenate([part.scale for part in parts]),
-            np.concatenate([part.jacobian for part in parts]),
-        )
 
 
 class GenerativeModel(Protocol):
@@ -78,53 +66,5 @@ class RayCaster:
 
     def expect(self, lasers: Array, angles: Array) -> Expected:
         """Predicts scans; see GenerativeModel."""
-        lasers, angles = np.asarray(lasers, float).reshape(-1, 3), np.asarray(angles, float)
-        shape = (len(lasers), len(angles))
-        ranges, jacobian = np.empty(shape), np.empty((*shape, 3))
-        world = self.world
-        kernels.cast(world.outlines, world.circles, lasers, angles, ranges, jacobian)
-        if (grid := world.grid) is not None:
-            rays, size = grid.shapes.rays, grid.resolution
-            corner = grid.to_map(np.array([-size, -size]))  # the ray caster has a border of empty cells around the map
-            frame = np.array([*corner, grid.origin[2], size])
-            cell_kernels.cast_cells(rays.occupied, rays.clear, frame, lasers, angles, ranges, jacobian)
-        return Expected(ranges, np.full(shape, max(EXACT_SCALE_M, map_error(world))), jacobian)
-
-
-@dataclass(frozen=True)
-class Expect:
-    """`GenerativeModel.expect` as a question (see `services.estimator.shared.asking`)."""
-
-    model: GenerativeModel
-    lasers: Array  # (N, 3)
-    angles: Array  # (B,)
-
-    @property
-    def alike(self) -> Hashable:
-        """Questions to one model about the same beams can be answered together."""
-        return id(self.model), self.angles.tobytes()
-
-    @property
-    def beams(self) -> int:
-        """Number of beams to predict."""
-        return len(self.lasers) * len(self.angles)
-
-    def answer(self) -> Expected:
-        """Returns the predicted scans."""
-        return self.model.expect(self.lasers, self.angles)
-
-    def answer_all(self, questions: Sequence[Expect]) -> list[Expected]:
-        """Answers several questions with one call of the model."""
-        expected = self.model.expect(np.concatenate([question.lasers for question in questions]), self.angles)
-        ends = np.cumsum([len(question.lasers) for question in questions])
-        return [expected.part(slice(end - len(q.lasers), end)) for q, end in zip(questions, ends, strict=True)]
-
-    def in_pieces(self, beams: int) -> Pieces[Expected]:
-        """Predicts a few poses at a time."""
-        rows = max(1, beams // max(1, len(self.angles)))
-        parts = []
-        for begin in range(0, len(self.lasers), rows):
-            if begin:
-                yield
-            parts.append(self.model.expect(self.lasers[begin : begin + rows], self.angles))
-        return Expected.joined(parts)
+        ranges, jacobian = cast_rays_with_jacobian(self.world, lasers, angles)
+        return Expected(ranges, np.full(ranges.shape, max(EXACT_SCALE_M, map_error(self.world))), jacobian)

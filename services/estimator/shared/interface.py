@@ -1,9 +1,9 @@
-"""Observation, Posterior, Hypothesis and the Estimator protocol."""
+"""Observation, Posterior, Hypothesis and the Estimator protocols."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -95,4 +95,20 @@ class Estimator(Protocol):
 
     def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:
         """Discards the belief, and starts near ``pose`` (3,) with ``covariance`` (3, 3), or from an unknown pose."""
+        ...
+
+
+@runtime_checkable
+class SearchingEstimator(Protocol):
+    """An estimator whose searches can run in another thread; `update` is `track`, then `search` if it is needed.
+
+    While a search runs, no other method may be called.
+    """
+
+    def track(self, observation: Observation) -> Posterior | None:
+        """Returns the posterior after one more scan, or None if that takes a `search`, which was not made."""
+        ...
+
+    def search(self) -> Posterior:
+        """Searches for the scan last given to `track`, and returns the posterior."""
         ...

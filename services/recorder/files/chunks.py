@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Iterator
-from io import BytesIO
+from dataclasses import replace
 from struct import Struct
 from typing import BinaryIO
 
 import lz4.frame
 import zstandard
 from mcap._chunk_builder import ChunkBuilder
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Message, Schema
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 COMPRESSION = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
-# A file of 200 kB can unpack to chunks of gigabytes. The recorder writes at most half of this.
-MAX_CHUNK_BYTES = 1 << 24
+MAX_CHUNK_BYTES = 1 << 24  # the recorder writes at most half of this
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of every file
 PREFIX = Struct("<BQ")  # first bytes of every record: opcode and length (MCAP specification, "Records")
-BUILDER = "_Writer__chunk_builder"  # private: mcap has no option to repeat declarations in each chunk
-MESSAGE = Struct("<HIQQ")  # channel, sequence, log time, publish time
+# Private in mcap 1.6, whose writer declares each channel in one chunk only and has no option to repeat declarations.
+CHUNK_BUILDER = "_Writer__chunk_builder"
 
 
 class SelfContainedChunk(ChunkBuilder):
@@ -71,43 +67,26 @@ class SelfContainedChunk(ChunkBuilder):
 def mcap_writer(stream: BinaryIO, compression: str, chunk_size: int) -> tuple[Writer, SelfContainedChunk]:
     """Returns a writer that checksums every part of the file, and the chunk that it fills."""
     writer = Writer(stream, chunk_size=chunk_size, compression=COMPRESSION[compression], enable_data_crcs=True)
-    if not isinstance(getattr(writer, BUILDER, None), ChunkBuilder):
+    if not isinstance(getattr(writer, CHUNK_BUILDER, None), ChunkBuilder):
         raise TypeError("this version of the package mcap is not supported: install mcap 1.6")
     chunk = SelfContainedChunk()
-    setattr(writer, BUILDER, chunk)
+    setattr(writer, CHUNK_BUILDER, chunk)
     return writer, chunk
 
 
-def records_of(chunk: Chunk) -> Iterator[Schema | Channel | Message]:
-    """Yields the records of a chunk, after checking its checksum.
+def records_of(chunk: Chunk) -> list[McapRecord]:
+    """The schemas, channels and messages of a chunk, after checking its checksum.
 
     Raises ValueError, or the decompressor's own error, if the chunk is damaged or too large.
     """
-    data = uncompressed(chunk)
-    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise ValueError("a chunk's checksum is wrong")
-    at = 0
-    while at < len(data):
-        opcode, length = PREFIX.unpack_from(data, at)
-        begin, at = at + PREFIX.size, at + PREFIX.size + length
-        if at > len(data):
-            raise ValueError("a record is longer than its chunk")
-        if opcode == Opcode.MESSAGE:
-            channel, sequence, log_time, publish_time = MESSAGE.unpack_from(data, begin)
-            yield Message(
-                channel_id=channel,
-                log_time=log_time,
-                data=data[begin + MESSAGE.size : at],
-                publish_time=publish_time,
-                sequence=sequence,
-            )
-        elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
-            body = ReadDataStream(BytesIO(data[begin:at]))
-            yield Schema.read(body) if opcode == Opcode.SCHEMA else Channel.read(body)
+    return breakup_chunk(replace(chunk, compression="", data=uncompressed(chunk)), validate_crc=True)
 
 
 def uncompressed(chunk: Chunk) -> bytes:
-    """The uncompressed records of a chunk, at most `MAX_CHUNK_BYTES`. Raises the errors of `records_of`."""
+    """The uncompressed records of a chunk, at most `MAX_CHUNK_BYTES`. Raises the errors of `records_of`.
+
+    mcap's own decompression has no limit, and a file of 200 kB can unpack to chunks of gigabytes.
+    """
     size = chunk.uncompressed_size
     if size > MAX_CHUNK_BYTES:
         raise ValueError(f"a chunk of {size} bytes, where at most {MAX_CHUNK_BYTES} are read")

@@ -1,4 +1,8 @@
-"""The summary of an MCAP file, and its messages in order of time."""
+"""The summary of an MCAP file, and its messages in order of time.
+
+mcap's SeekingReader does the same, but checks no checksum of the summary and limits neither the size of unpacked chunks
+nor the memory of messages that wait for their turn.
+"""
 
 from __future__ import annotations
 
@@ -26,10 +30,10 @@ MAX_WAITING_BYTES = 1 << 28  # messages held in memory to sort them by time, if 
 def summary_of(stream: BinaryIO) -> Summary | None:
     """The summary at the end of a file. Returns None if the file has none; raises ValueError if it is damaged."""
     size = stream.seek(0, os.SEEK_END)
-    at = size - len(MAGIC) - FOOTER.size
-    stream.seek(max(0, at))
+    footer = size - len(MAGIC) - FOOTER.size
+    stream.seek(max(0, footer))
     tail = stream.read()
-    if at < len(MAGIC) or not tail.endswith(MAGIC):
+    if footer < len(MAGIC) or not tail.endswith(MAGIC):
         raise ValueError("its end is missing")
     opcode, length, start, _, crc = FOOTER.unpack_from(tail)
     if (opcode, length) != (Opcode.FOOTER, FOOTER.size - PREFIX.size):
@@ -37,7 +41,7 @@ def summary_of(stream: BinaryIO) -> Summary | None:
     if start == 0:
         return None
     stream.seek(start)
-    summary = stream.read(max(0, at + FOOTER.size - CRC_BYTES - start))
+    summary = stream.read(max(0, footer + FOOTER.size - CRC_BYTES - start))
     if crc and zlib.crc32(summary) != crc:
         raise ValueError("its index is damaged")
     stream.seek(0)

@@ -124,9 +124,9 @@ class RecordingWriter:
             step()
         except OSError as error:
             self.failed = True
-            why = error.strerror or str(error)
+            reason = error.strerror or str(error)
             raise UserError(
-                f"{self.active}: recording failed ({why}); the messages flushed before are in the file, and "
+                f"{self.active}: recording failed ({reason}); the messages flushed before are in the file, and "
                 f"`presage recover {self.active}` completes it: free some space, or choose another folder"
             ) from None
 

@@ -36,21 +36,21 @@ class Player:
             return self._position
         return min(self.end, self._position + max(0.0, now - self._since) * self.rate)
 
-    def wait(self, at: float, now: float) -> float:
-        """Seconds until a message at position ``at`` is due. 0 if it is due now, infinity while paused."""
+    def wait(self, position: float, now: float) -> float:
+        """Seconds until a message at ``position`` is due. 0 if it is due now, infinity while paused."""
         if self._steps:
             return 0.0
         if self.paused:
             return math.inf
         if self.rate == 0:
             return 0.0
-        return max(0.0, (at - self._position) / self.rate - (now - self._since))
+        return max(0.0, (position - self._position) / self.rate - (now - self._since))
 
-    def sent(self, at: float, now: float, *, whole: bool) -> None:
-        """Records that the message at position ``at`` was published. ``whole``: it completes a step."""
-        ahead = self.position(now) - at
+    def sent(self, position: float, now: float, *, whole: bool) -> None:
+        """Records that the message at ``position`` was published. ``whole``: it completes a step."""
+        ahead = self.position(now) - position
         if self.paused or self.rate == 0 or ahead > MAX_LAG_S * self.rate:
-            self._anchor(at, now)
+            self._anchor(position, now)
         if self._steps and whole:
             self._steps -= 1
 
@@ -119,7 +119,7 @@ def span(duration: float, start: float | None, end: float | None) -> tuple[float
 
 
 def select_topics(
-    there: Mapping[str, Topic], only: Collection[str] | None, leave_out: Collection[str] | None = None
+    recorded: Mapping[str, Topic], only: Collection[str] | None, leave_out: Collection[str] | None = None
 ) -> dict[str, Topic]:
     """Keys to replay, with their topics.
 
@@ -127,7 +127,7 @@ def select_topics(
     from it. Raises UserError for a name in ``only`` that the recording does not have, or in ``leave_out`` that the
     table of topics does not have.
     """
-    names = {topic.name for topic in there.values()}
+    names = {topic.name for topic in recorded.values()}
     if only is not None and (unknown := set(only) - names):
         raise UserError(
             f"the recording has no {', '.join(sorted(unknown))}; it has {', '.join(sorted(names)) or 'nothing'}"
@@ -136,7 +136,7 @@ def select_topics(
     if unknown := set(leave_out or ()) - known:
         raise UserError(f"no topic {', '.join(sorted(unknown))}: choose from {', '.join(sorted(known))}")
     wanted = (set(only) if only is not None else names - {HEALTH.name}) - set(leave_out or ())
-    return {key: topic for key, topic in there.items() if topic.name in wanted}
+    return {key: topic for key, topic in recorded.items() if topic.name in wanted}
 
 
 def key_for_robot(key: str, robot: str) -> str:

@@ -85,17 +85,17 @@ Steering = Callable[[ReplayControl], AbstractContextManager[object]]
 class Replay:
     """Publishes one recording on one bus session."""
 
-    def __init__(self, recording: Recording, choice: ReplayOptions, bus: Bus) -> None:
+    def __init__(self, recording: Recording, options: ReplayOptions, bus: Bus) -> None:
         """Selects the topics. Raises UserError if there is nothing to replay."""
-        self.recording, self.choice, self.bus = recording, choice, bus
-        self.topics = select_topics(recording.topics(), choice.only, choice.leave_out)
+        self.recording, self.options, self.bus = recording, options, bus
+        self.topics = select_topics(recording.topics(), options.only, options.leave_out)
         if not self.topics:
             raise UserError(f"{recording.path}: nothing to replay")
-        self.keys = {key: key_for_robot(key, choice.robot) for key in self.topics}
+        self.keys = {key: key_for_robot(key, options.robot) for key in self.topics}
         duration = (recording.end_ns - recording.start_ns) * 1e-9
-        begin, end = span(duration, choice.start, choice.end)
+        begin, end = span(duration, options.start, options.end)
         self.inbox = Inbox()
-        self.player = Player(begin, end, choice.rate, loop=choice.loop)
+        self.player = Player(begin, end, options.rate, loop=options.loop)
         self.counts: Counter[str] = Counter()  # messages by published key
         self.remote = ReplayControl(self.player, self.inbox, self.counts)
         self._stepwise = SCAN if SCAN in self.topics.values() else None
@@ -106,8 +106,8 @@ class Replay:
         Raises UserError if a live service publishes the same keys, unless forced.
         """
         alive = self._alive()
-        if not self.choice.force and (why := find_conflicts(self._published(), alive)):
-            raise UserError(why)
+        if not self.options.force and (conflicts := find_conflicts(self._published(), alive)):
+            raise UserError(conflicts)
         for key, topic in self._published().items():  # all declared before the first wait: parallel discovery
             self.bus.publisher(topic, key=key)
         if WORLD.server not in alive.get(self.bus.robot, set()):  # a live simulator answers this query itself
@@ -128,19 +128,19 @@ class Replay:
         """Publishes messages until the end, `ReplayControl.quit` or ``stop``."""
         player = self.player
         player.seek(player.begin, time.monotonic())
-        player.paused = self.choice.paused
+        player.paused = self.options.paused
         while (position := player.take_seek_target()) is not None:
             for raw in self.recording.payloads(self.topics.keys(), *self._window(position)):
-                at = (raw.logged_ns - self.recording.start_ns) * 1e-9
-                if not self._wait_until_due(at, on_progress, stop):
+                message_position = (raw.logged_ns - self.recording.start_ns) * 1e-9
+                if not self._wait_until_due(message_position, on_progress, stop):
                     break
-                self._send(raw, at)
+                self._send(raw, message_position)
                 on_progress(player.state(time.monotonic()))
             if stop.is_set() or self.remote.quitting:
                 break
             if player.loop and not player.seek_pending:
                 player.restart(time.monotonic())
-            elif self.choice.stay and not player.seek_pending:
+            elif self.options.stay and not player.seek_pending:
                 self._wait_at_end(on_progress, stop)
 
     def _window(self, position: float) -> tuple[int, int | None]:
@@ -148,13 +148,15 @@ class Replay:
 
         The end is exclusive. It is None if the user gave none, so that the last message is included.
         """
-        start, has_end = self.recording.start_ns, self.choice.end is not None
+        start, has_end = self.recording.start_ns, self.options.end is not None
         return start + round(position * 1e9), start + round(self.player.end * 1e9) if has_end else None
 
-    def _wait_until_due(self, at: float, on_progress: Callable[[PlayerReply], None], stop: threading.Event) -> bool:
+    def _wait_until_due(
+        self, position: float, on_progress: Callable[[PlayerReply], None], stop: threading.Event
+    ) -> bool:
         """Waits until a message is due and answers requests meanwhile. Returns False if it must not be published."""
         while True:
-            wait = self.player.wait(at, time.monotonic())
+            wait = self.player.wait(position, time.monotonic())
             entry = self.inbox.get(min(wait, POLL_PERIOD_S))
             if isinstance(entry, Call):
                 self._answer(entry)
@@ -162,7 +164,7 @@ class Replay:
                 on_progress(self.player.state(time.monotonic()))
             if stop.is_set() or self.remote.quitting or self.player.seek_pending:
                 return False
-            if entry is None and self.player.wait(at, time.monotonic()) <= 0:
+            if entry is None and self.player.wait(position, time.monotonic()) <= 0:
                 return True
 
     def _wait_at_end(self, on_progress: Callable[[PlayerReply], None], stop: threading.Event) -> None:
@@ -173,15 +175,15 @@ class Replay:
             if isinstance(entry := self.inbox.get(POLL_PERIOD_S), Call):
                 self._answer(entry)
 
-    def _send(self, raw: Raw, at: float) -> None:
+    def _send(self, raw: Raw, position: float) -> None:
         topic, key = self.topics[raw.key], self.keys[raw.key]
         self.bus.put(topic, raw.payload, key=key)
         self.counts[key] += 1
-        self.player.sent(at, time.monotonic(), whole=self._stepwise in (None, topic))
+        self.player.sent(position, time.monotonic(), whole=self._stepwise in (None, topic))
 
     def _answer(self, call: Call) -> None:
         if call.query is CONFIG:
-            config = {"file": str(self.recording.path), **asdict(self.choice)}
+            config = {"file": str(self.recording.path), **asdict(self.options)}
             plain = json.dumps(config, default=sorted)
             call.reply(build_config_reply(NAME, plain).encode())
             return
@@ -223,7 +225,7 @@ class Replay:
 def replay(
     path: Path,
     link: Link,
-    choice: ReplayOptions | None = None,
+    options: ReplayOptions | None = None,
     *,
     on_progress: Callable[[PlayerReply], None] = lambda _: None,
     stop: threading.Event | None = None,
@@ -236,16 +238,16 @@ def replay(
     that the router is reached; ``steering`` is entered for the duration of the replay. Raises UserError if the file
     cannot be read, the options are invalid, or a live service publishes the same keys.
     """
-    choice = choice or ReplayOptions()
+    options = options or ReplayOptions()
     recording = read_recording(path)
     if recording.warning:
         print(f"warning: {recording.warning}", file=sys.stderr)
     recorded_robots = robots_of_keys(recording.topics())
-    robot = choice.robot or (recorded_robots[0] if recorded_robots else link.robot)
-    if not math.isfinite(choice.rate):
-        choice = replace(choice, rate=0.0)
+    robot = options.robot or (recorded_robots[0] if recorded_robots else link.robot)
+    if not math.isfinite(options.rate):
+        options = replace(options, rate=0.0)
     with opening(replace(link, robot=robot)) as bus:
-        running = Replay(recording, choice, bus)
+        running = Replay(recording, options, bus)
         running.announce()
         with steering(running.remote):
             running.run(on_progress, stop or threading.Event())

@@ -50,10 +50,10 @@ class PlayingSettings(ServiceSettings):
         """Path of the recording. Raises UserError if it does not exist."""
         path = self.directory / self.replay
         if not self.replay or not path.is_file():
-            there = sorted(found.name for found in self.directory.glob("*.mcap"))
+            existing = sorted(found.name for found in self.directory.glob("*.mcap"))
             raise UserError(
                 f"no recording {self.replay!r} in {self.directory}: name one with --replay or PRESAGE_REPLAY; "
-                f"there {'are' if there else 'is'} {', '.join(there[-5:]) or 'none'}"
+                f"there {'are' if existing else 'is'} {', '.join(existing[-5:]) or 'none'}"
             )
         return path
 
@@ -93,7 +93,7 @@ class ReplayHeartbeat:
         if self._bus is None or self._remote is None or (now := time.monotonic()) < self._next_at:
             return
         counts = {key: {"published": count} for key, count in self._remote.counts.items()}
-        self._heart.beat(counts, linked=self._bus.linked(), note="paused" if state.paused else "")
+        self._heart.beat(counts, linked=self._bus.linked(), note="paused" if state.paused else "", idle=state.paused)
         self._next_at = now + HEARTBEAT_PERIOD_S
 
 
@@ -106,10 +106,16 @@ def main(argv: list[str] | None = None) -> None:
         settings = load_settings(PlayingSettings, argv)
         set_up_logging(settings.log_level, as_json=settings.log_json)
         path = settings.file()
-        choice, pulse, log = options_for(path, settings), ReplayHeartbeat(settings), logger(NAME)
-        log.info("replaying", file=str(path), topics=",".join(sorted(choice.only or ())), robot=settings.robot)
+        options, heartbeat, log = options_for(path, settings), ReplayHeartbeat(settings), logger(NAME)
+        log.info("replaying", file=str(path), topics=",".join(sorted(options.only or ())), robot=settings.robot)
         replay(
-            path, settings.link(), choice, on_progress=pulse, stop=stop, opening=pulse.opening, steering=pulse.steering
+            path,
+            settings.link(),
+            options,
+            on_progress=heartbeat,
+            stop=stop,
+            opening=heartbeat.opening,
+            steering=heartbeat.steering,
         )
         log.info("ended")
     except UserError as error:

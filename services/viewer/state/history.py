@@ -15,9 +15,9 @@ class ChartSample:
     """Values of one belief."""
 
     t: float  # stamp, s
-    free_energy: float  # nats
-    accuracy: float  # nats
-    complexity: float  # nats
+    free_energy: float | None  # nats; None, like the two below, if the estimator does not compute it
+    accuracy: float | None  # nats
+    complexity: float | None  # nats
     error: float | None  # m, distance from the true position
     speed: float | None  # m/s
 

@@ -27,17 +27,17 @@ class ReplayMoments:
         self._first = self._last = 0.0  # when the first and last new message arrived, s
         self._has_new = False  # messages have arrived since the last `choose`
 
-    def take(self, topic: Topic, message: Stamped, at: float) -> None:
-        """Adds a message received at time ``at`` in s."""
+    def take(self, topic: Topic, message: Stamped, now: float) -> None:
+        """Adds a message received at time ``now`` in s."""
         self._by_stamp.setdefault(message.stamp_ns, {})[topic.name] = message
         if len(self._by_stamp) > MAX_STAMPS:
             self._by_stamp.popitem(last=False)
-        self._first = self._first if self._has_new else at
-        self._last, self._has_new = at, True
+        self._first = self._first if self._has_new else now
+        self._last, self._has_new = now, True
 
-    def due(self, at: float) -> float | None:
+    def due(self, now: float) -> float | None:
         """Seconds until `choose` should be called. Returns None if there is no new message."""
-        return min(self._last + QUIET_TIME_S, self._first + MAX_GATHERING_S) - at if self._has_new else None
+        return min(self._last + QUIET_TIME_S, self._first + MAX_GATHERING_S) - now if self._has_new else None
 
     def choose(self) -> MessagesByTopic | None:
         """Messages of the stamp with the most messages among those not yet shown; the newest stamp if several match.

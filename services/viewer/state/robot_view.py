@@ -42,8 +42,8 @@ from common.messages.topics import (
 from services.viewer.state import frames
 from services.viewer.state.goal_field import GoalFields
 from services.viewer.state.history import ChartSample, History
+from services.viewer.state.journal import Journal
 from services.viewer.state.replay_moments import ReplayMoments
-from services.viewer.state.status_log import StatusLog
 
 ANSWER_TIMEOUT_S = 0.05  # wall time for which a frame waits for the answers to its scan
 SILENCE_TIMEOUT_S = 2.0  # behind the scan, by stamps and by wall time; older messages are not waited for and not shown
@@ -62,7 +62,7 @@ class ReceivedMessage:
     """A message and its times."""
 
     message: Stamped
-    at: float  # monotonic time of reception, s
+    received_at: float  # monotonic time, s
     published_ns: int  # wall time at the publisher, 0 if unknown
 
 
@@ -72,9 +72,9 @@ class RobotView:
     def __init__(self, robot: str, *, live: bool = True) -> None:
         """``live``: the robot is not a replay."""
         self.robot, self.live = robot, live
-        self.history, self.journal, self.fields = History(), StatusLog(), GoalFields()
+        self.history, self.journal, self.fields = History(), Journal(), GoalFields()
         self.time_restarted = False  # stamps went back; reset by the caller once visitors have the new history
-        self.log_changed = False  # the journal has new rows; reset by the caller once visitors have them
+        self.journal_changed = False  # the journal has new rows; reset by the caller once visitors have them
         self.frame: bytes | None = None  # the last frame
         self._received: dict[str, ReceivedMessage] = {}  # the last message by topic name
         self._truths: OrderedDict[int, Truth] = OrderedDict()  # by stamp
@@ -83,8 +83,8 @@ class RobotView:
         self._waiting: tuple[int, float] | None = None  # stamp of the scan that waits for answers, and since when
         self._latency_ms: float | None = None
 
-    def add(self, topic: Topic, message: Stamped, at: float, published_ns: int = 0) -> bytes | None:
-        """Stores a message received at monotonic time ``at`` in s.
+    def add(self, topic: Topic, message: Stamped, now: float, published_ns: int = 0) -> bytes | None:
+        """Stores a message received at monotonic time ``now`` in s.
 
         Returns a frame if this message completes one, or if it begins a new stamp while a frame is still incomplete.
         """
@@ -95,38 +95,38 @@ class RobotView:
         if topic in SENSOR_TOPICS and last is not None and message.stamp_ns < last.message.stamp_ns:
             self._restart()
         elif topic in SENSOR_TOPICS and self._waiting is not None and message.stamp_ns != self._waiting[0]:
-            frame = self._frame(at)
+            frame = self._frame(now)
         if isinstance(message, Truth) and last is not None and isinstance(last.message, Truth):
-            self.log_changed |= self.journal.add_carry(last.message, message)
-        self._received[topic.name] = ReceivedMessage(message, at, published_ns)
+            self.journal_changed |= self.journal.add_carry(last.message, message)
+        self._received[topic.name] = ReceivedMessage(message, now, published_ns)
         self._update(message)
         if not self.live:
-            self._moments.take(topic, message, at)
+            self._moments.take(topic, message, now)
             return None
         if isinstance(message, Scan):
-            self._waiting = (message.stamp_ns, at)
-        return self._frame(at) if self._is_complete(at) else frame
+            self._waiting = (message.stamp_ns, now)
+        return self._frame(now) if self._is_complete(now) else frame
 
-    def due(self, at: float) -> float | None:
+    def due(self, now: float) -> float | None:
         """Seconds until the waiting frame is sent, even if incomplete. Returns None if no frame is waiting."""
         if not self.live:
-            return self._moments.due(at)
-        return self._waiting[1] + ANSWER_TIMEOUT_S - at if self._waiting is not None else None
+            return self._moments.due(now)
+        return self._waiting[1] + ANSWER_TIMEOUT_S - now if self._waiting is not None else None
 
-    def overdue(self, at: float) -> bytes | None:
+    def overdue(self, now: float) -> bytes | None:
         """The waiting frame, if its wait is over, with the messages received so far."""
-        due = self.due(at)
+        due = self.due(now)
         if due is None or due > 0:
             return None
         if self.live:
-            return self._frame(at)
+            return self._frame(now)
         moment = self._moments.choose()
         if moment is None:
             return None
-        self._received.update({name: ReceivedMessage(message, at, 0) for name, message in moment.items()})
-        return self._frame(at)
+        self._received.update({name: ReceivedMessage(message, now, 0) for name, message in moment.items()})
+        return self._frame(now)
 
-    def fresh(self, topic: Topic, kind: type[M], at: float) -> M | None:
+    def fresh(self, topic: Topic, kind: type[M], now: float) -> M | None:
         """The last message of a topic. Returns None if it is too old, by its stamp and by wall time.
 
         While a simulation is paused, stamps do not advance and messages do not become too old.
@@ -135,7 +135,8 @@ class RobotView:
         if last is None or not isinstance(last.message, kind):
             return None
         behind = (self.stamp_ns - last.message.stamp_ns) * 1e-9
-        return None if self.live and behind > SILENCE_TIMEOUT_S and at - last.at > SILENCE_TIMEOUT_S else last.message
+        too_old = self.live and behind > SILENCE_TIMEOUT_S and now - last.received_at > SILENCE_TIMEOUT_S
+        return None if too_old else last.message
 
     @property
     def status(self) -> Status | None:
@@ -155,7 +156,7 @@ class RobotView:
         self._truths.clear()
         self.history.clear()
         self.journal.clear()
-        self._waiting, self._latency_ms, self.time_restarted, self.log_changed = None, None, True, True
+        self._waiting, self._latency_ms, self.time_restarted, self.journal_changed = None, None, True, True
 
     def _store_goal(self, message: Preference | Goal) -> None:
         """Stores a message that does not belong to a scan."""
@@ -181,7 +182,7 @@ class RobotView:
         elif isinstance(message, CmdVel):
             self._latency_ms = self._latency(message)
         elif isinstance(message, Status):
-            self.log_changed |= self.journal.add(message)
+            self.journal_changed |= self.journal.add(message)
 
     def _error(self, belief: Belief) -> float | None:
         """Distance in m between the belief and the true position at its stamp."""
@@ -207,38 +208,38 @@ class RobotView:
             return None
         return (published_ns - scan.published_ns) * 1e-6
 
-    def _is_complete(self, at: float) -> bool:
+    def _is_complete(self, now: float) -> bool:
         """Whether every answer topic with recent messages has one for the waiting scan."""
         if self._waiting is None:
             return False
-        last = (self.fresh(topic, Stamped, at) for topic in ANSWER_TOPICS)
+        last = (self.fresh(topic, Stamped, now) for topic in ANSWER_TOPICS)
         known = [message for message in last if message is not None and not _is_empty_plan(message)]
         # Before the first answer it is not known which topics to wait for, so the frame waits for the timeout.
         return bool(known) and all(message.stamp_ns >= self._waiting[0] for message in known)
 
-    def _frame(self, at: float) -> bytes | None:
+    def _frame(self, now: float) -> bytes | None:
         self._waiting = None
         scan = self._received[SCAN.name].message
         if not isinstance(scan, Scan):
             return None
-        belief = self.fresh(BELIEF, Belief, at)
+        belief = self.fresh(BELIEF, Belief, now)
         header = {
             "type": "frame",
             "t": scan.stamp_ns * 1e-9,
             "stamp_ns": scan.stamp_ns,
             "robot": self.robot,
-            "truth": frames.truth_of(self.fresh(TRUTH, Truth, at)),
+            "truth": frames.truth_of(self.fresh(TRUTH, Truth, now)),
             "belief": frames.belief_of(belief),
-            "odom": frames.odom_of(self.fresh(ODOM, Odom, at)),
+            "odom": frames.odom_of(self.fresh(ODOM, Odom, now)),
             "status": frames.status_of(self.status, self._goals),
-            "cmd": frames.cmd_of(self.fresh(CMD_VEL, CmdVel, at)),
+            "cmd": frames.cmd_of(self.fresh(CMD_VEL, CmdVel, now)),
             "error": self._error(belief) if belief is not None else None,
             "speed": self._speed(),
             "latency_ms": self._latency_ms,
             "scan": frames.scan_of(scan),
         }
-        prediction, plan = self.fresh(PREDICTION, Prediction, at), self.fresh(PLAN, Plan, at)
-        self.frame = frames.encode(header, frames.arrays_of(scan, prediction, plan, self.fresh(TRUTH, Truth, at)))
+        prediction, plan = self.fresh(PREDICTION, Prediction, now), self.fresh(PLAN, Plan, now)
+        self.frame = frames.encode(header, frames.arrays_of(scan, prediction, plan, self.fresh(TRUTH, Truth, now)))
         return self.frame
 
 

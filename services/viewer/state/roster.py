@@ -13,11 +13,11 @@ class Roster:
         self.robot = robot
         self._alive: dict[str, frozenset[str]] = {}  # replaced as a whole, because other threads read it
 
-    def change(self, robot: str, service: str, there: bool) -> None:  # noqa: FBT001
+    def change(self, robot: str, service: str, alive: bool) -> None:  # noqa: FBT001 - called as a callback
         """Records that a service came or went."""
         services = self._alive.get(robot, frozenset())
-        services = services | {service} if there else services - {service}
-        others = {name: alive for name, alive in self._alive.items() if name != robot}
+        services = services | {service} if alive else services - {service}
+        others = {name: known for name, known in self._alive.items() if name != robot}
         self._alive = {**others, robot: services} if services and len(others) < MAX_ROBOTS else others
 
     def services(self, robot: str) -> frozenset[str]:
@@ -26,5 +26,5 @@ class Roster:
 
     def robots(self) -> list[str]:
         """The viewer's own robot, then other robots with live services besides viewer and recorder."""
-        others = {name for name, alive in self._alive.items() if alive - {"viewer", "recorder"}}
+        others = {name for name, services in self._alive.items() if services - {"viewer", "recorder"}}
         return [self.robot, *sorted(others - {self.robot})]

@@ -66,67 +66,42 @@ TestModel = Model.TestCase
 TestModel.settings = settings(max_examples=100, stateful_step_count=30)
 
 
-def test_newest_only_keeps_the_newest_of_each_key():
-    inbox = Inbox()
-    for i in range(100):
-        inbox.put(sample("scan", b"%d" % i), newest_only=True)
-        inbox.put(sample("odom", b"%d" % i), newest_only=True)
-    assert [(e.key, e.payload) for e in (inbox.get(0), inbox.get(0))] == [("scan", b"99"), ("odom", b"99")]
-    assert inbox.get(0) is None
-    assert inbox.dropped == {"scan": 99, "odom": 99}
-    assert inbox.received == {"scan": 100, "odom": 100}
-
-
-def test_policy_all_keeps_every_entry_in_order():
-    inbox = Inbox()
-    for i in range(1000):
-        inbox.put(sample("scan", b"%d" % i))
-    assert [inbox.get(0).payload for _ in range(1000)] == [b"%d" % i for i in range(1000)]
-    assert not inbox.dropped
-
-
 def test_a_busy_key_does_not_displace_another():
     inbox = Inbox(capacity=2)
-    inbox.put(sample("goal", b"there"), newest_only=True)
+    inbox.put(sample("goal", b"here"), newest_only=True)
     for _ in range(1000):
         inbox.put(sample("scan"), newest_only=True)
-    assert inbox.get(0).payload == b"there"
+    assert inbox.get(0).payload == b"here"
 
 
-def test_oversized_payloads_are_counted_and_not_queued():
+def test_sources_do_not_replace_each_others_samples():
     inbox = Inbox()
-    inbox.put(sample("scan", bytes(MAX_BYTES)))
-    inbox.put(sample("scan", bytes(MAX_BYTES + 1)))
-    assert len(inbox) == 1
-    assert inbox.oversized == {"scan": 1}
-    assert inbox.received == {"scan": 2}
+    for number in range(3):
+        for source in ("robot", "repeater"):
+            inbox.put(Sample(SCAN, "k", f"{source} {number}".encode(), 0, 0, source), newest_only=True)
+    assert [inbox.get(0).payload for _ in range(2)] == [b"robot 2", b"repeater 2"]
+    assert inbox.get(0) is None
 
 
-def test_requests_are_refused_if_the_queue_is_full():
-    refused: list[str] = []
-    inbox = Inbox(capacity=1)
+def test_oversized_payloads():
+    inbox, refused = Inbox(), []
+    for size in (MAX_BYTES, MAX_BYTES + 1):
+        inbox.put(sample("scan", bytes(size)))
+    inbox.put(Call(TELEPORT, bytes(64 * MAX_BYTES + 1), lambda _: None, refused.append))
+    assert (len(inbox), len(refused)) == (1, 1)
+    assert inbox.oversized == {"scan": 1, "teleport": 1}
+    assert inbox.received == {"scan": 2, "teleport": 1}
+
+
+def test_full_queues_refuse_requests_and_keep_answers():
+    inbox, refused = Inbox(capacity=1), []
     for _ in range(2):
         inbox.put(Call(TELEPORT, b"", lambda _: None, refused.append))
-    assert len(inbox) == 1
     assert refused == ["too many requests are waiting"]
-
-
-def test_too_large_requests_are_refused():
-    refused: list[str] = []
-    inbox = Inbox()
-    inbox.put(Call(TELEPORT, bytes(64 * MAX_BYTES + 1), lambda _: None, refused.append))
-    assert len(inbox) == 0
-    assert len(refused) == 1
-
-
-def test_answers_are_queued_even_if_the_inbox_is_full():
-    inbox = Inbox(capacity=1)
-    inbox.put(sample())
     inbox.put(Answer(TELEPORT, 7, Reply(reason="here").encode()))
     inbox.put(Answer(TELEPORT, 8, bytes(64 * MAX_BYTES + 1)))
-    inbox.get(0)
-    assert inbox.get(0).reply() == Reply(reason="here")
-    large = inbox.get(0)
+    _, answer, large = (inbox.get(0) for _ in range(3))
+    assert answer.reply() == Reply(reason="here")
     assert (large.number, large.payload) == (8, b"")
     assert large.reply() == Reply(ok=False, reason=f"the reply of {64 * MAX_BYTES + 1} bytes is too large")
 
@@ -147,18 +122,13 @@ def test_invented_keys_do_not_fill_memory():
     assert inbox.received["presage/robot/health/0"] == 2
 
 
-def test_get_returns_when_an_entry_arrives():
+def test_get_waits_for_an_entry_or_a_wake():
     inbox = Inbox()
     began = time.monotonic()
     assert inbox.get(0.05) is None
-    assert 0.04 < time.monotonic() - began < 5
+    assert time.monotonic() - began > 0.04
     threading.Timer(0.05, lambda: inbox.put(sample("late"))).start()
     assert inbox.get(30).key == "late"
-
-
-def test_wake_ends_a_wait():
-    inbox = Inbox()
-    began = time.monotonic()
     threading.Timer(0.05, inbox.wake).start()
     assert inbox.get(30) is None
     assert time.monotonic() - began < 15
@@ -170,7 +140,7 @@ from common.bus.inbox import Inbox, Sample
 from common.messages.topics import SCAN
 
 signal.signal(signal.SIGALRM, signal.default_int_handler)
-for number in range(200):
+for number in range(100):
     inbox, putting = Inbox(), True
 
     def put():
@@ -180,7 +150,7 @@ for number in range(200):
     thread = threading.Thread(target=put, daemon=True)
     thread.start()
     try:
-        signal.setitimer(signal.ITIMER_REAL, 0.0005 + number * 2e-5)
+        signal.setitimer(signal.ITIMER_REAL, 0.0005 + number * 4e-5)
         while True:
             inbox.get(0.001)
     except (KeyboardInterrupt, RuntimeError):  # the second inside Condition.wait, in the moment before it waits
@@ -211,12 +181,3 @@ def test_entries_of_many_threads_are_all_counted():
         thread.join()
     assert sum(inbox.received.values()) == 8000
     assert got + sum(inbox.dropped.values()) == 8000
-
-
-def test_sources_do_not_replace_each_others_samples():
-    inbox = Inbox()
-    for number in range(3):
-        for source in ("robot", "repeater"):
-            inbox.put(Sample(SCAN, "k", f"{source} {number}".encode(), 0, 0, source), newest_only=True)
-    assert [inbox.get(0).payload for _ in range(2)] == [b"robot 2", b"repeater 2"]
-    assert inbox.get(0) is None

@@ -34,22 +34,22 @@ def test_other_names_are_returned_unchanged():
     assert describe_instance("estimator") == "estimator"
 
 
-EVERYBODY = [Instance(k, "host", 1, f"{k}").name for k in range(5)]
+NAMES = [Instance(k, "host", 1, f"{k}").name for k in range(5)]
 
 
-@given(st.lists(st.tuples(st.sampled_from(EVERYBODY), st.booleans(), st.booleans()), max_size=30))
+@given(st.lists(st.tuples(st.sampled_from(NAMES), st.booleans(), st.booleans()), max_size=30))
 def test_at_most_one_instance_becomes_the_leader(events):
     """Each instance sees all others; if none leads, exactly one of them may lead."""
-    everybody = {name: Instances(name) for name in EVERYBODY}
+    instances_of = {name: Instances(name) for name in NAMES}
     leading, waiting = set(), set()
-    for name, leads, there in events:
+    for name, leads, alive in events:
         group = leading if leads else waiting
-        (group.add if there else group.discard)(name)
-        for instances in everybody.values():
-            instances.update(name, leads=leads, alive=there)
-    candidates = [name for name in waiting - leading if everybody[name].may_lead()]
+        (group.add if alive else group.discard)(name)
+        for instances in instances_of.values():
+            instances.update(name, leads=leads, alive=alive)
+    candidates = [name for name in waiting - leading if instances_of[name].may_lead()]
     assert len(candidates) == (0 if leading or not waiting else 1)
-    stay = [name for name in leading if not everybody[name].must_yield()]
+    stay = [name for name in leading if not instances_of[name].must_yield()]
     assert stay == ([min(leading)] if leading else [])
 
 
@@ -86,7 +86,7 @@ def test_only_the_leader_is_selected_even_if_it_is_silent():
     assert not sources.accepts("presage/robot/scan", "simulator", "repeater", 0.0)
     assert sources.accepts("presage/robot/scan", "simulator", "0123456789abcdef", 5.0)
     assert not sources.accepts("presage/robot/scan", "simulator", "repeater", 50.0)
-    assert sources.accepts("presage/robot/belief", "estimator", "anybody", 50.0)  # the estimator has no leader
+    assert sources.accepts("presage/robot/belief", "estimator", "other", 50.0)  # the estimator has no leader
     younger = Instance(2, "host", 1, "ba9876543210")
     sources.update("robot", "simulator", younger.name, True)  # two parts of a network were joined
     assert not sources.accepts("presage/robot/scan", "simulator", "ba9876543210", 50.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from itertools import product
 
 import pytest
 from zenoh import KeyExpr
@@ -67,40 +66,46 @@ def test_requests_that_change_something_need_a_control_role():
     assert not {"viewer", "observer"} & set(CONTROL_ROLES)
 
 
-@pytest.mark.parametrize(("role", "topic"), list(product(sorted(set(ROLES) - {ROUTER}), TOPICS)))
-def test_rules_for_publishing_agree_with_the_table(role, topic):
-    own = service_of(role) or "nobody"
-    key = topic.key("r1", own)
-    assert may_send(role, "put", key) == may_put(role, topic)
-    assert not may_send(role, "delete", key)
+@pytest.mark.parametrize("role", sorted(set(ROLES) - {ROUTER}))
+def test_rules_for_publishing_agree_with_the_table(role):
+    for topic in TOPICS:
+        key = topic.key("r1", service_of(role) or "other")
+        assert may_send(role, "put", key) == may_put(role, topic)
+        assert not may_send(role, "delete", key)
     assert not may_send(role, "put", "presage/**")
-    assert not may_send(role, "put", "presage/r1/never-heard-of")
+    assert not may_send(role, "put", "presage/r1/unknown")
 
 
-def test_services_can_only_use_their_own_name():
-    assert may_send("estimator", "put", HEALTH.key("r1", "estimator"))
-    assert not may_send("estimator", "put", HEALTH.key("r1", "simulator"))
-    assert may_send("estimator", "liveliness_token", "presage/r1/alive/estimator")
-    assert may_send("estimator", "liveliness_token", "presage/r1/alive/estimator/instance")
-    assert not may_send("estimator", "liveliness_token", "presage/r1/alive/simulator")
-    assert not may_send("observer", "liveliness_token", "presage/r1/alive/estimator")
-    assert may_send("viewer-control", "put", HEALTH.key("r1", "viewer"))
+@pytest.mark.parametrize(
+    ("role", "message", "key", "allowed"),
+    [
+        ("estimator", "put", HEALTH.key("r1", "estimator"), True),
+        ("estimator", "put", HEALTH.key("r1", "simulator"), False),
+        ("viewer-control", "put", HEALTH.key("r1", "viewer"), True),
+        ("estimator", "liveliness_token", "presage/r1/alive/estimator", True),
+        ("estimator", "liveliness_token", "presage/r1/alive/estimator/instance", True),
+        ("estimator", "liveliness_token", "presage/r1/alive/simulator", False),
+        ("observer", "liveliness_token", "presage/r1/alive/estimator", False),
+        ("operator", "query", TELEPORT.key("r1"), True),
+        ("observer", "query", TELEPORT.key("r1"), False),
+        ("observer", "query", WORLD.key("r1"), True),
+        ("simulator", "declare_queryable", TELEPORT.key("r1"), True),
+        ("controller", "declare_queryable", TELEPORT.key("r1"), False),
+        ("controller", "reply", WORLD.key("r1"), False),
+    ],
+)
+def test_rules_for_names_and_queries(role, message, key, allowed):
+    assert may_send(role, message, key) == allowed
 
 
-def test_queries_and_replies_depend_on_the_role():
-    assert may_send("operator", "query", TELEPORT.key("r1"))
-    assert not may_send("observer", "query", TELEPORT.key("r1"))
-    assert may_send("observer", "query", WORLD.key("r1"))
-    assert may_send("simulator", "declare_queryable", TELEPORT.key("r1"))
-    assert not may_send("controller", "declare_queryable", TELEPORT.key("r1"))
-    assert not may_send("controller", "reply", WORLD.key("r1"))
-
-
-def test_members_for_one_robot_have_no_rights_for_others():
-    for message, key in (("put", "cmd_vel"), ("declare_subscriber", "scan"), ("liveliness_token", "alive/controller")):
-        assert may_send("controller", message, f"presage/one/{key}", ("one",))
-        assert not may_send("controller", message, f"presage/two/{key}", ("one",))
-        assert not may_send("controller", message, f"presage/*/{key}", ("one",))
+@pytest.mark.parametrize(
+    ("message", "key"), [("put", "cmd_vel"), ("declare_subscriber", "scan"), ("liveliness_token", "alive/controller")]
+)
+def test_rules_for_one_robot(message, key):
+    allowed = {
+        robot for robot in ("one", "two", "*") if may_send("controller", message, f"presage/{robot}/{key}", ("one",))
+    }
+    assert allowed == {"one"}
 
 
 def test_the_default_is_deny_and_clients_accept_only_routers():

@@ -12,52 +12,42 @@ from common.geometry import se2
 poses = st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-3.1, 3.1)).map(np.array)
 
 
-def same(a, b, tolerance=1e-9):
+def same(a, b, tolerance=1e-8):
     assert np.hypot(*(a - b)[:2]) < tolerance
     assert abs(float(se2.wrap(a[2] - b[2]))) < tolerance
 
 
-@given(st.floats(-1e6, 1e6))
-def test_wrap_stays_in_its_interval_and_keeps_the_direction(angle):
+@given(st.floats(-1e6, 1e6) | st.sampled_from([np.pi, -np.pi, 3 * np.pi, -1e-17]))
+def test_wrap(angle):
     wrapped = float(se2.wrap(angle))
     assert -np.pi <= wrapped < np.pi
-    assert np.cos(wrapped) == pytest.approx(np.cos(angle), abs=1e-6)
-    assert np.sin(wrapped) == pytest.approx(np.sin(angle), abs=1e-6)
-
-
-@pytest.mark.parametrize("angle", [np.pi, -np.pi, 3 * np.pi, -1e-17, 0.0])
-def test_wrap_at_the_limits(angle):
-    assert -np.pi <= float(se2.wrap(angle)) < np.pi
+    assert np.exp(1j * wrapped) == pytest.approx(np.exp(1j * angle), abs=1e-6)
 
 
 @given(poses, poses, poses)
 def test_group_laws(a, b, c):
-    same(se2.compose(se2.compose(a, b), c), se2.compose(a, se2.compose(b, c)), 1e-8)
+    same(se2.compose(se2.compose(a, b), c), se2.compose(a, se2.compose(b, c)))
     same(se2.compose(a, se2.inverse(a)), np.zeros(3))
-    same(se2.compose(a, se2.between(a, b)), b, 1e-8)
+    same(se2.compose(a, se2.between(a, b)), b)
 
 
-def test_a_known_pose():
+def test_known_poses():
     same(se2.compose([1, 2, np.pi / 2], [3, 0, 0.5]), np.array([1, 5, np.pi / 2 + 0.5]))
+    assert se2.compose(np.arange(12.0).reshape(4, 3), [0.2, 0, 0]).shape == (4, 3)
+    assert se2.rotate(np.pi / 2, [[1, 0], [0, 1]]) == pytest.approx(np.array([[0, 1], [-1, 0]]))
 
 
 @given(poses, poses)
-def test_jacobians_agree_with_finite_differences(a, b):
+def test_jacobians(a, b):
     h = 1e-6
     for found, which in zip(se2.compose_jacobians(a, b), (0, 1), strict=True):
         for axis in range(3):
-            args = [[a, b], [a, b]]
-            args[0][which] = args[0][which] + h * np.eye(3)[axis]
-            args[1][which] = args[1][which] - h * np.eye(3)[axis]
-            difference = se2.compose(*args[0]) - se2.compose(*args[1])
+            plus, minus = [a, b], [a, b]
+            plus[which] = plus[which] + h * np.eye(3)[axis]
+            minus[which] = minus[which] - h * np.eye(3)[axis]
+            difference = se2.compose(*plus) - se2.compose(*minus)
             difference[2] = se2.wrap(difference[2])
             assert found[:, axis] == pytest.approx(difference / (2 * h), abs=1e-4)
-
-
-def test_batches_broadcast():
-    many = np.arange(12.0).reshape(4, 3)
-    assert se2.compose(many, [0.2, 0, 0]).shape == (4, 3)
-    assert se2.rotate(np.pi / 2, [[1, 0], [0, 1]]) == pytest.approx(np.array([[0, 1], [-1, 0]]))
 
 
 @given(poses, poses)

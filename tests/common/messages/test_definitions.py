@@ -59,14 +59,6 @@ def test_encoded_messages_match_their_schema(message):
     check(msgpack.unpackb(message.encode()), schema, schema, type(message).__name__)
 
 
-def test_the_schema_check_can_fail():
-    schema = Scan.json_schema()
-    with pytest.raises(AssertionError, match="stamp_ns"):
-        check({"stamp_ns": "now"}, {**schema, "required": []}, schema, "Scan")
-    with pytest.raises(AssertionError):
-        check({}, schema, schema, "Scan")
-
-
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda c: c.__name__)
 def test_schemas_describe_all_fields_and_arrays(cls):
     schema = cls.json_schema()

@@ -48,21 +48,14 @@ def test_arrays_arrive_bit_for_bit_and_read_only():
     got = Scan.decode(a_scan(ranges=ranges).encode()).ranges
     assert got.dtype == np.dtype("<f4")
     assert got.tobytes() == ranges.tobytes()
-    for held in (got, a_scan(ranges=ranges).ranges):
-        with pytest.raises(ValueError, match="read-only"):
-            held[0] = 2.0
-
-
-def test_messages_copy_their_arrays():
-    ranges = np.ones(3, np.float32)
     scan = a_scan(ranges=ranges)
+    for stored in (got, scan.ranges):
+        with pytest.raises(ValueError, match="read-only"):
+            stored[0] = 2.0
     ranges[:] = 9.0
-    assert scan.ranges.tolist() == [1.0, 1.0, 1.0]
-
-
-def test_numbers_on_the_wire_are_little_endian():
+    assert scan.ranges.tobytes() == got.tobytes()  # a copy
     packed = msgpack.unpackb(a_scan(ranges=[1.0, 2.0]).encode())["ranges"]
-    assert packed == struct.pack("<2f", 1.0, 2.0)
+    assert packed == struct.pack("<2f", 1.0, 2.0)  # little-endian
 
 
 def changed(message, **changes) -> bytes:
@@ -76,16 +69,12 @@ def changed(message, **changes) -> bytes:
 
 
 ODOM = Odom(stamp_ns=1, pose=Pose(x=0.0, y=0.0), twist=Twist(), covariance=np.eye(3))
+POSE = Pose(x=0.0, y=0.0)
 BELIEF = Belief(
-    stamp_ns=1,
-    state="tracking",
-    pose=Pose(x=0.0, y=0.0),
-    xi=np.zeros(3),
-    covariance=np.eye(3),
-    free_energy=1.0,
-    accuracy=1.0,
+    stamp_ns=1, state="tracking", pose=POSE, xi=np.zeros(3), covariance=np.eye(3), free_energy=1.0, accuracy=1.0
 )
 GOAL = Goal(stamp_ns=1, pose=Pose(x=0.0, y=0.0))
+REQUEST = PredictRequest(poses=np.zeros((1, 3)))
 COMMAND = CmdVel(stamp_ns=1, twist=Twist(vx=0.5))
 BAD = {
     "a missing field": changed(COMMAND, twist=...),
@@ -117,7 +106,7 @@ BAD = {
     "an impossible time stamp": b"\xc7\x0c\xff" + b"\xff" * 12,
     "a reserved byte": b"\xc1",
 }
-BAD_ARRAYS = {
+BAD_VALUES = {
     "bytes that are no whole number": (Scan, changed(a_scan(), ranges=b"12345")),
     "NaN in a scan": (Scan, changed(a_scan(), ranges=np.float32([1, np.nan]).tobytes())),
     "a list for an array": (Scan, changed(a_scan(), ranges=[1.0, 2.0])),
@@ -140,36 +129,30 @@ BAD_ARRAYS = {
     "a goal's absurd tolerance": (Goal, changed(GOAL, tolerance=1e300)),
     "an absurd velocity": (Odom, changed(ODOM, twist={"vx": 1e300})),
     "a path beyond all maps": (Plan, changed(Plan(stamp_ns=1), path=np.float32([0, 1e20]).tobytes())),
-    "poses beyond all maps": (
-        PredictRequest,
-        changed(PredictRequest(poses=np.zeros((1, 3))), poses=np.full(3, 1e300).tobytes()),
-    ),
+    "poses beyond all maps": (PredictRequest, changed(REQUEST, poses=np.full(3, 1e300).tobytes())),
     "a name without end": (Scan, changed(a_scan(), frame_id="x" * 201)),
 }
 
 
-@pytest.mark.parametrize("what", BAD)
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda c: c.__name__)
-def test_invalid_payloads_raise_only_decode_errors(cls, what):
-    said = ""
-    try:
-        cls.decode(BAD[what])
-    except DecodeError as error:
-        said = str(error)
-    assert not said or (cls.__name__ in said and "\n" not in said)
+def test_invalid_payloads_raise_only_decode_errors(cls):
+    errors = []
+    for payload in BAD.values():
+        try:
+            cls.decode(payload)
+        except DecodeError as error:
+            errors.append(str(error))
+    assert all(cls.__name__ in error and "\n" not in error for error in errors)
 
 
-@pytest.mark.parametrize("what", BAD)
-def test_invalid_commands_are_refused(what):
-    with pytest.raises(DecodeError):
-        CmdVel.decode(BAD[what])
-
-
-@pytest.mark.parametrize("what", BAD_ARRAYS)
-def test_invalid_arrays_and_values_are_refused(what):
-    cls, payload = BAD_ARRAYS[what]
-    with pytest.raises(DecodeError):
-        cls.decode(payload)
+def test_invalid_values_are_refused():
+    cases = {**{what: (CmdVel, payload) for what, payload in BAD.items()}, **BAD_VALUES}
+    accepted = []
+    for what, (cls, payload) in cases.items():
+        with contextlib.suppress(DecodeError):
+            cls.decode(payload)
+            accepted.append(what)
+    assert not accepted
 
 
 def test_values_at_the_limits_are_accepted():
@@ -186,11 +169,11 @@ def test_the_error_names_the_field():
     with pytest.raises(DecodeError, match=r"CmdVel\.twist\.vx: .*finite"):
         CmdVel.decode(BAD["NaN as velocity"])
     with pytest.raises(DecodeError, match=r"Scan\.ranges: .*1 values are NaN"):
-        Scan.decode(BAD_ARRAYS["NaN in a scan"][1])
+        Scan.decode(BAD_VALUES["NaN in a scan"][1])
     with pytest.raises(DecodeError, match=rf"Scan\.ranges: .*{MAX_BEAMS + 1} values are more than {MAX_BEAMS}"):
-        Scan.decode(BAD_ARRAYS["a scan of more beams than any scanner has"][1])
+        Scan.decode(BAD_VALUES["a scan of more beams than any scanner has"][1])
     with pytest.raises(DecodeError, match=r"Goal\.pose\.y: .*greater than or equal to -10000"):
-        Goal.decode(BAD_ARRAYS["a goal beyond all maps"][1])
+        Goal.decode(BAD_VALUES["a goal beyond all maps"][1])
 
 
 def test_unknown_fields_are_ignored_and_missing_ones_have_defaults():
@@ -206,14 +189,12 @@ def test_random_bytes(cls, payload):
 
 
 values = st.recursive(
-    st.one_of(
-        st.none(),
-        st.booleans(),
-        st.integers(-(2**63), 2**64 - 1),
-        st.floats(),
-        st.text(max_size=5),
-        st.binary(max_size=30),
-    ),
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.text(max_size=5)
+    | st.binary(max_size=30),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
     max_leaves=5,
 )
@@ -251,11 +232,6 @@ def test_messages_are_equal_if_class_and_bytes_are():
     assert a_scan() != a_scan(seq=1)
     assert Pose(x=0.0, y=0.0) != Twist()
     assert len({a_scan(), a_scan(), a_scan(seq=1)}) == 2
-
-
-def test_messages_are_frozen():
-    with pytest.raises(ValueError, match="frozen"):
-        COMMAND.seq = 3
 
 
 def test_empty_arrays_are_valid():

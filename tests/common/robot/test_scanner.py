@@ -11,7 +11,7 @@ from common.errors import UserError
 from common.geometry import se2
 from common.robot.scan_geometry import ALL_ROUND, Sweep
 from common.robot.scanner import SCANNERS
-from common.robot.scanner_options import chosen_scanner, load_scanner, scanner_arguments
+from common.robot.scanner_options import chosen_scanner, load_scanner
 from common.runtime.config import load_settings
 from services.simulator.settings import SimulatorSettings
 
@@ -93,9 +93,6 @@ def test_a_file_describes_a_scanner(tmp_path):
     other = chosen_scanner(str(file), 100, 0.05, "0,-0.2,180", upside_down=False)
     assert (other.beams, other.sigma, other.upside_down) == (100, 0.05, False)
     assert other.mount == pytest.approx((0, -0.2, np.pi))
-    assert scanner_arguments(str(file), None, "0,1", upside_down=True) == (
-        "--scanner", str(file), "--mount=0,1", "--upside-down",
-    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -122,24 +119,23 @@ def test_invalid_files_are_explained(tmp_path, change, wrong):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", ["sonar", "no/such.yaml", ""])
-def test_an_unknown_scanner_lists_the_known_ones(name):
-    with pytest.raises(
-        UserError, match=r"choose one of tim571, ust-10lx, lms200, rplidar-a1, or give a file|cannot be"
-    ):
-        load_scanner(name)
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"name": "sonar"}, "choose one of tim571, ust-10lx, lms200, rplidar-a1, or give a file"),
+        ({"name": "no/such.yaml"}, "choose one of"),
+        ({"name": ""}, "cannot be read"),
+        *(({"mount": mount}, "--mount '.*': give x,y") for mount in ("1", "a,b", "1,2,3,4")),
+        *(({"noise": noise}, "tim571 with --noise .*: sigma: Input should be") for noise in (-1e-9, np.nan, np.inf)),
+    ],
+)
+def test_invalid_options_are_explained(options, error):
+    with pytest.raises(UserError, match=error):
+        chosen_scanner(**{"name": "tim571", **options})
 
 
-@pytest.mark.parametrize("mount", ["1", "a,b", "1,2,3,4"])
-def test_invalid_mounts_are_refused(mount):
-    with pytest.raises(UserError, match=r"--mount '.*': give x,y"):
-        chosen_scanner("tim571", mount=mount)
-
-
-@pytest.mark.parametrize("noise", [-1.0, -1e-9, float("nan"), float("inf")])
-def test_invalid_noise_is_refused(noise):
-    with pytest.raises(UserError, match=r"tim571 with --noise .*: sigma: Input should be"):
-        chosen_scanner("tim571", noise=noise)
+@pytest.mark.parametrize("noise", [-1.0, np.nan, np.inf])
+def test_invalid_noise_settings_are_refused(noise):
     with pytest.raises(UserError, match=r"noise: Input should be .*--noise, PRESAGE_NOISE"):
         load_settings(SimulatorSettings, [f"--noise={noise}"])
 

@@ -32,172 +32,138 @@ class Settings(ServiceSettings):
 
 
 @pytest.fixture
-def file(tmp_path):
-    def write(text: str) -> str:
-        path = tmp_path / "settings.yaml"
-        path.write_text(text)
-        return str(path)
+def load(tmp_path):
+    """Loads the settings from arguments and the text of a settings file."""
 
-    return write
+    def run(*argv, file="", cls=Settings):
+        (tmp_path / "settings.yaml").write_text(file)
+        return load_settings(cls, [*argv, *(["--config", str(tmp_path / "settings.yaml")] if file else [])])
+
+    return run
 
 
-def test_defaults():
-    settings = load_settings(Settings, [])
+def test_defaults(load):
+    settings = load()
     assert (settings.size, settings.label, settings.ratio) == (1, "plain", None)
     assert settings.link() == Link("robot", (DEFAULT_ENDPOINT,), ("tcp/127.0.0.1:0",), lossless=False)
 
 
-def test_precedence_of_sources(file, monkeypatch):
-    config = ["--config", file("size: 2\nlabel: file\nratio: 0.5\n")]
-    assert load_settings(Settings, config).size == 2
+def test_precedence(load, monkeypatch):
+    file = "size: 2\nlabel: file\nratio: 0.5\n"
+    assert load(file=file).size == 2
     monkeypatch.setenv("PRESAGE_SIZE", "3")
-    assert load_settings(Settings, config).size == 3
-    assert load_settings(Settings, [*config, "--size", "4"]).size == 4
-    settings = load_settings(Settings, [*config, "--size", "4"])
-    assert (settings.label, settings.ratio, settings.log_level) == ("file", 0.5, "info")
+    assert load(file=file).size == 3
+    settings = load("--size", "4", file=file)
+    assert (settings.size, settings.label, settings.ratio, settings.log_level) == (4, "file", 0.5, "info")
+    monkeypatch.delenv("PRESAGE_SIZE")
+    assert load().size == 1  # the file of an earlier call has no effect
 
 
-def test_the_services_section_overrides_the_top_level(file):
+def test_the_section_overrides_the_top_level(load):
     text = "size: 2\nlabel: shared\nalpha: 0.1\nthing: {size: 5}\nestimator: {alpha: 1, nonsense: 2}\n"
-    settings = load_settings(Settings, ["--config", file(text)])
+    settings = load(file=text)
     assert (settings.size, settings.label) == (5, "shared")
 
 
-def test_files_do_not_affect_later_calls(file):
-    load_settings(Settings, ["--config", file("size: 2\n")])
-    assert load_settings(Settings, []).size == 1
-
-
 @pytest.mark.parametrize("given", [["--label", "-3,1.5"], ["--label=-3,1.5"]])
-def test_a_value_may_begin_with_a_minus(given):
-    assert load_settings(Settings, [*given, "--size", "3"]).label == "-3,1.5"
-    assert load_settings(Settings, ["--ratio", "-.5", *given]).ratio == -0.5
+def test_a_value_may_begin_with_a_minus(load, given):
+    settings = load("--ratio", "-.5", *given, "--size", "3")
+    assert (settings.label, settings.ratio) == ("-3,1.5", -0.5)
 
 
-@pytest.mark.parametrize("text", ["3,1.5", "-3,1.5,-90", ".5,-2.", ""])
-def test_pose_texts(text):
+@pytest.mark.parametrize(
+    ("text", "pose"),
+    [("1,-2.5", [1, -2.5, 0]), ("-3,1.5,-90", [-3, 1.5, -np.pi / 2]), (".5,-2.", [0.5, -2, 0]), ("", None)],
+)
+def test_pose_texts(text, pose):
     assert re.match(POSE_TEXT, text)
-    assert all(np.isfinite(float(part)) for part in text.split(",") if part)
+    if pose is not None:
+        np.testing.assert_allclose(pose_of_text(text, "--start"), pose)
 
 
 @pytest.mark.parametrize("text", ["1.2.3,1", "1", ".,1", "nan,1", "1,2,3,4", "1,,2", "-,1", "1e3,1"])
-def test_invalid_poses_are_refused(text):
+def test_invalid_poses(text):
     assert not re.match(POSE_TEXT, text)
     with pytest.raises(UserError, match=r"--mount '.*': give x,y\[,yaw_deg\] in m and degrees"):
         pose_of_text(text, "--mount")
 
 
-def test_poses_beyond_the_limits_are_refused():
+def test_poses_beyond_the_limits():
     with pytest.raises(UserError, match=r"--start '999999999,1': x and y must be within 10000 m of the origin"):
         pose_of_text("999999999,1", "--start")
 
 
-def test_poses_are_converted_to_radians():
-    np.testing.assert_allclose(pose_of_text("1,-2.5", "--start"), [1, -2.5, 0])
-    np.testing.assert_allclose(pose_of_text("1,2,-90", "--start"), [1, 2, -np.pi / 2])
-
-
-def test_empty_values_are_ignored_only_in_the_environment(monkeypatch):
-    assert load_settings(Settings, ["--label", "", "--connect="]).label == ""
-    assert load_settings(Settings, ["--connect", ""]).link().connect == ()
+def test_empty_values_count_only_as_arguments(load, monkeypatch):
+    assert load("--label", "", "--connect=").label == ""
+    assert load("--connect", "").link().connect == ()
     monkeypatch.setenv("PRESAGE_LABEL", "")
     monkeypatch.setenv("PRESAGE_SIZE", "")
-    assert load_settings(Settings, []).label == "plain"
-    assert load_settings(Settings, []).size == 1
+    assert (load().label, load().size) == ("plain", 1)
 
 
 @pytest.mark.parametrize(
-    ("argv", "words"),
+    ("argv", "file", "words"),
     [
-        (["--size", "101"], ["size", "less than or equal to 100", "--size", "PRESAGE_SIZE"]),
-        (["--size", "many"], ["size", "integer", "--size"]),
-        (["--robot", "a/b"], ["robot", "--robot", "PRESAGE_ROBOT"]),
-        (["--robot", "*"], ["robot: '*' is not valid; expected: name of the robot"]),
-        (["--log-level", "loud"], ["--log-level", "PRESAGE_LOG_LEVEL"]),
-        (["--config", "nowhere.yaml"], ["nowhere.yaml", "cannot be read"]),
+        (["--size", "101"], "", ["size", "less than or equal to 100", "--size", "PRESAGE_SIZE"]),
+        (["--size", "many"], "", ["size", "integer"]),
+        (["--robot", "a/b"], "", ["robot", "--robot", "PRESAGE_ROBOT"]),
+        (["--robot", "*"], "", ["robot: '*' is not valid; expected: name of the robot"]),
+        (["--config", "nowhere.yaml"], "", ["nowhere.yaml", "cannot be read"]),
+        ([], "size: [", ["not valid YAML"]),
+        ([], "- 1\n- 2\n", ["a mapping of settings"]),
+        ([], "thing: 7\n", ["thing", "a mapping of settings"]),
+        ([], "thing: {colour: red}\n", ["colour", "settings.yaml"]),
+        ([], "label: 2020-13-45\n", ["settings.yaml: not valid YAML", "month"]),
+        ([], "[" * 20_000, ["settings.yaml: not valid YAML"]),
     ],
 )
-def test_invalid_arguments_are_named(argv, words, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_mistakes_are_one_line(load, argv, file, words):
     with pytest.raises(UserError) as caught:
-        load_settings(Settings, argv)
+        load(*argv, file=file)
     assert "\n" not in str(caught.value)
     assert all(word in str(caught.value) for word in words), str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("size: [", ["not valid YAML"]),
-        ("- 1\n- 2\n", ["a mapping of settings"]),
-        ("thing: 7\n", ["thing", "a mapping of settings"]),
-        ("thing: {colour: red}\n", ["colour", "settings.yaml"]),
-        ("size: 1000\n", ["size", "settings.yaml"]),
-        ("\xff\xfe", ["settings.yaml"]),
-        ("label: 2020-13-45\n", ["settings.yaml: not valid YAML", "month"]),
-        ("[" * 20_000, ["settings.yaml: not valid YAML"]),
-    ],
-)
-def test_invalid_files_are_named(file, text, words):
-    path = file(text)
-    with pytest.raises(UserError) as caught:
-        load_settings(Settings, ["--config", path])
-    assert "\n" not in str(caught.value)
-    assert all(word in str(caught.value) for word in words), str(caught.value)
-
-
-def test_binary_files_are_refused(tmp_path):
-    path = tmp_path / "binary.yaml"
-    path.write_bytes(b"\xff\xfe\x00\x80")
+def test_binary_files(tmp_path):
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(UserError, match=r"binary\.yaml: not valid YAML"):
-        load_settings(Settings, ["--config", str(path)])
+        load_settings(Settings, ["--config", str(tmp_path / "binary.yaml")])
 
 
-def test_invalid_variables_are_named(monkeypatch):
+def test_environment_variables(load, monkeypatch):
+    monkeypatch.setenv("PRESAGE_ALPHA", "x")
+    monkeypatch.setenv("PRESAGE_THING_SIZE", "7")  # only private fields have such names
+    assert load().size == 1
     monkeypatch.setenv("PRESAGE_SIZE", "-1")
-    with pytest.raises(UserError, match="PRESAGE_SIZE") as caught:
-        load_settings(Settings, [])
-    assert "\n" not in str(caught.value)
+    with pytest.raises(UserError, match="PRESAGE_SIZE"):
+        load()
 
 
-def test_an_unknown_option_ends_with_status_2(capsys):
+def test_unknown_options(load, capsys):
     with pytest.raises(SystemExit) as ended:
-        load_settings(Settings, ["--colour", "red"])
+        load("--colour", "red")
     assert ended.value.code == 2
     assert "unrecognized arguments: --colour" in capsys.readouterr().err
 
 
-def test_other_variables_are_ignored(monkeypatch):
-    monkeypatch.setenv("PRESAGE_ALPHA", "x")
-    monkeypatch.setenv("PRESAGE_THING_SIZE", "7")  # only private fields have such names
-    assert load_settings(Settings, []).size == 1
-
-
-def test_print_config_prints_the_settings_as_yaml(file, capsys):
+def test_print_config(load, capsys):
+    given = ("--size", "4", "--ratio", "0.25")
     with pytest.raises(SystemExit) as ended:
-        load_settings(Settings, ["--size", "4", "--ratio", "0.25", "--print-config"])
+        load(*given, "--print-config")
     assert ended.value.code == 0
     printed = capsys.readouterr().out
     assert yaml.safe_load(printed)["thing"]["size"] == 4
-    again = load_settings(Settings, ["--config", file(printed)])
-    assert again.effective() == load_settings(Settings, ["--size", "4", "--ratio", "0.25"]).effective()
+    assert load(file=printed).effective() == load(*given).effective()
 
 
-def test_help_shows_program_settings_and_examples(capsys):
-    with pytest.raises(SystemExit) as ended:
-        load_settings(Settings, ["--help"])
-    assert ended.value.code == 0
+def test_help(load, capsys):
+    for cls in (Settings, RouterSettings):
+        with pytest.raises(SystemExit):
+            load("--help", cls=cls)
     text = capsys.readouterr().out
-    assert "usage: python -m services.thing" in text
-    assert "python -m services.thing --size 3" in text
-    assert "how large" in text
-    for name in Settings.model_fields:
-        assert f"--{name.replace('_', '-')}" in text
-
-
-def test_settings_are_frozen():
-    with pytest.raises(ValueError, match="frozen"):
-        load_settings(Settings, []).size = 3
+    for part in ("usage: python -m services.thing", "python -m services.thing --size 3", "how large", "--log-json"):
+        assert part in text
+    assert "--robot" not in text.partition("usage: python -m common.router")[2]
 
 
 def test_endpoints_are_split_at_commas():
@@ -205,23 +171,15 @@ def test_endpoints_are_split_at_commas():
     assert split_endpoints("") == ()
 
 
-def test_a_router_ignores_the_settings_of_services(file, monkeypatch):
+def test_a_router_ignores_the_settings_of_services(load, monkeypatch):
     monkeypatch.setenv("PRESAGE_CONNECT", "tcp/127.0.0.1:1")
     monkeypatch.setenv("PRESAGE_LISTEN", "tcp/127.0.0.1:2")
-    shared = ["--config", file("listen: tcp/127.0.0.1:3\n")]
-    assert load_settings(RouterSettings, shared).link() == Link("robot", (), (DEFAULT_ENDPOINT,), router=True)
-    own = ["--config", file("listen: tcp/127.0.0.1:3\nrouter: {listen: 'tcp/127.0.0.1:4'}\n")]
-    assert load_settings(RouterSettings, own).listen == "tcp/127.0.0.1:4"
+    shared = "listen: tcp/127.0.0.1:3\n"
+    assert load(file=shared, cls=RouterSettings).link() == Link("robot", (), (DEFAULT_ENDPOINT,), router=True)
+    own = shared + "router: {listen: 'tcp/127.0.0.1:4'}\n"
+    assert load(file=own, cls=RouterSettings).listen == "tcp/127.0.0.1:4"
     monkeypatch.setenv("PRESAGE_ROUTER_LISTEN", "tcp/127.0.0.1:5")
-    assert load_settings(RouterSettings, own).listen == "tcp/127.0.0.1:5"
-    assert load_settings(RouterSettings, [*own, "--listen", "tcp/127.0.0.1:6"]).listen == "tcp/127.0.0.1:6"
-
-
-def test_a_routers_errors_and_help_name_its_variables(monkeypatch, capsys):
+    assert load(file=own, cls=RouterSettings).listen == "tcp/127.0.0.1:5"
+    assert load("--listen", "tcp/127.0.0.1:6", file=own, cls=RouterSettings).listen == "tcp/127.0.0.1:6"
     with pytest.raises(UserError, match="PRESAGE_ROUTER_LISTEN"):
-        load_settings(RouterSettings, ["--listen", ""])
-    with pytest.raises(SystemExit):
-        load_settings(RouterSettings, ["--help"])
-    text = capsys.readouterr().out
-    assert "usage: python -m common.router" in text
-    assert "--robot" not in text
+        load("--listen", "", cls=RouterSettings)

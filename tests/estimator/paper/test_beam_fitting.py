@@ -29,7 +29,7 @@ def fitted(scanner, model=TIM571):
     return fit(model, scanner.angles(), np.array(scanner.mount), "train")
 
 
-def test_its_own_scan_is_left_as_it_is():
+def test_same_beams():
     same = fitted(TIM571)
     assert same.same
     ranges = seen(TIM571)
@@ -46,7 +46,7 @@ def test_its_own_scan_is_left_as_it_is():
         SCANNERS["rplidar-a1"].model_copy(update={"mount": (0.2, 0.0, 0.0), "first": 0.0, "upside_down": True}),
     ],
 )
-def test_other_beams_in_the_same_directions_give_the_same_scan(scanner):
+def test_other_beams(scanner):
     found = fitted(scanner)
     assert found.ranges(seen(scanner)) == pytest.approx(seen(TIM571), abs=1e-6)
     back = found.predicted(seen(TIM571), scanner.angles())[0]
@@ -55,26 +55,21 @@ def test_other_beams_in_the_same_directions_give_the_same_scan(scanner):
     assert np.median(np.abs(back - seen(scanner))[known]) < 1e-3
 
 
-def test_between_beams_it_is_linear_and_round_the_back_too():
+def test_interpolation():
+    """Also between the last beam and the first of a scanner that sees all round."""
     model = SCANNERS["rplidar-a1"]
     scanner = model.model_copy(update={"first": model.angle_min + 0.25 * model.angle_increment})
     ranges = np.arange(360.0)
     expected = ranges - 0.25
-    expected[0] = 0.75 * 0 + 0.25 * 359
+    expected[0] = 0.25 * 359
     assert fitted(scanner, model).ranges(ranges) == pytest.approx(expected)
-
-
-def test_a_beam_is_made_of_both_its_neighbours():
-    model = SCANNERS["rplidar-a1"]
-    scanner = model.model_copy(update={"first": model.angle_min + 0.25 * model.angle_increment})
-    valid = np.ones(360, bool)
-    valid[7] = False
+    valid = ranges != 7
     assert np.flatnonzero(~fitted(scanner, model).valid_beams(valid)).tolist() == [7, 8]
     assert np.flatnonzero(~fitted(model, model).valid_beams(valid)).tolist() == [7]
 
 
 @pytest.mark.parametrize(
-    ("scanner", "why"),
+    ("scanner", "reason"),
     [
         (SCANNERS["lms200"], "does not look towards -135 deg of base_link"),
         (like_tim571(mount=(0.2, 0.0, 0.2)), "does not look towards -135 deg"),
@@ -83,12 +78,12 @@ def test_a_beam_is_made_of_both_its_neighbours():
         (like_tim571(mount=(0.2, 0.1, 0.0)), r"mounted at \(0.2, 0.1\) m, theirs at \(0.2, 0\) m"),
     ],
 )
-def test_what_does_not_fit_is_refused_with_the_reason(scanner, why):
-    with pytest.raises(UserError, match=f"trained for tim571 with 271 beams: .*{why}.*; train for it: train"):
+def test_unfit_scanner(scanner, reason):
+    with pytest.raises(UserError, match=f"trained for tim571 with 271 beams: .*{reason}.*; train for it: train"):
         fitted(scanner)
 
 
-def test_the_shipped_paper_weights_take_a_scanner_that_looks_all_round():
+def test_shipped_weights():
     scanner = SCANNERS["rplidar-a1"].model_copy(update={"mount": SCANNERS["tim571"].mount, "sigma_relative": 0.0})
     made = prepare(Choice("corridor", "paper"))(Geometry.of(scanner))
     world, pose = made.card.world, np.array([9.0, 1.5, made.card.heading])

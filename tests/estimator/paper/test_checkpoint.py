@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -31,7 +34,7 @@ def folder(tmp_path):
     return checkpoint.folder
 
 
-def test_the_same_recipe_takes_it_up(folder):
+def test_resumed(folder):
     again = Checkpoint(folder, RECIPE)
     assert not again.discarded
     kept = again.samples("train")
@@ -44,7 +47,7 @@ def test_the_same_recipe_takes_it_up(folder):
         assert torch.equal(a, b)
 
 
-def test_another_recipe_throws_it_away_and_says_so(folder):
+def test_other_recipe(folder):
     other = Checkpoint(folder, {**RECIPE, "epochs": 4})
     assert other.discarded
     assert other.samples("train") is None
@@ -52,37 +55,39 @@ def test_another_recipe_throws_it_away_and_says_so(folder):
     assert not Checkpoint(folder, RECIPE).discarded  # nothing was in it yet
 
 
+def flipped(data):
+    return data[: len(data) // 2] + bytes([data[len(data) // 2] ^ 1]) + data[len(data) // 2 + 1 :]
+
+
+def arrays(**values):
+    def write(_):
+        np.savez(stream := io.BytesIO(), **values)
+        return stream.getvalue()
+
+    return write
+
+
 @pytest.mark.parametrize(
-    "garbage", [b"", b"no archive at all", b"PK\x03\x04" + bytes(200)], ids=["empty", "text", "zip"]
+    ("name", "damage"),
+    [
+        ("train.npz", lambda _: b""),
+        ("train.npz", lambda _: b"no archive at all"),
+        ("train.npz", lambda _: b"PK\x03\x04" + bytes(200)),
+        ("train.npz", flipped),
+        ("train.npz", arrays(poses=np.zeros((4, 3)))),
+        ("train.npz", arrays(poses=np.zeros((4, 3)), ranges=np.zeros(3))),
+        ("state.safetensors", lambda _: b""),
+        ("state.safetensors", lambda data: data[:5]),
+        ("state.safetensors", lambda data: data[:2000]),
+    ],
 )
-def test_damaged_samples_are_one_line(folder, garbage):
-    (folder / "train.npz").write_bytes(garbage)
-    damaged(folder / "train.npz", lambda: Checkpoint(folder, RECIPE).samples("train"))
-
-
-@pytest.mark.parametrize("arrays", [{"poses": np.zeros((4, 3))}, {"poses": np.zeros((4, 3)), "ranges": np.zeros(3)}])
-def test_samples_that_are_none_are_one_line(folder, arrays):
-    np.savez(folder / "train.npz", **arrays)
-    damaged(folder / "train.npz", lambda: Checkpoint(folder, RECIPE).samples("train"))
-
-
-def test_a_damaged_byte_is_noticed(folder):
-    data = bytearray((folder / "train.npz").read_bytes())
-    data[len(data) // 2] ^= 1
-    (folder / "train.npz").write_bytes(data)
-    damaged(folder / "train.npz", lambda: Checkpoint(folder, RECIPE).samples("train"))
-
-
-@pytest.mark.parametrize("keep", [0, 5, 100, 2000])
-def test_a_damaged_state_is_one_line(folder, keep):
-    path = folder / "state.safetensors"
-    path.write_bytes(path.read_bytes()[:keep])
-    damaged(path, lambda: Checkpoint(folder, RECIPE).restore(trainer()))
-
-
-def damaged(path, read):
+def test_damaged_file(folder, name, damage):
+    path = folder / name
+    path.write_bytes(damage(path.read_bytes()))
+    checkpoint = Checkpoint(folder, RECIPE)
+    read = partial(checkpoint.samples, "train") if name == "train.npz" else partial(checkpoint.restore, trainer())
     with pytest.raises(UserError, match="cannot be resumed") as error:
         read()
     assert str(path) in str(error.value)
-    assert f"remove {path.parent} and train from the start" in str(error.value)
+    assert f"remove {folder} and train from the start" in str(error.value)
     assert "\n" not in str(error.value)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from services.estimator.paper.free_energy import accuracy, attraction, gradient
+from services.estimator.paper.free_energy import FreeEnergy, accuracy, attraction
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -34,9 +34,9 @@ def free_energy(g, o, precision, x, goal, beta):
 
 
 @given(seeds, st.floats(0.01, 2.0))
-def test_descent_is_minus_the_gradient_of_f(seed, beta):
+def test_descent(seed, beta):
     g, dg, o, precision, belief, goal = scene(seed)
-    found = gradient(o, g(belief), dg(belief), precision, g(goal), beta)
+    found = FreeEnergy(o, g(belief), dg(belief), precision, g(goal), beta)
     h = 1e-6
     for axis in range(3):
         step = h * np.eye(3)[axis]
@@ -44,21 +44,10 @@ def test_descent_is_minus_the_gradient_of_f(seed, beta):
         assert found.descent[axis] == pytest.approx(-(f[0] - f[1]) / (2 * h), rel=1e-4, abs=1e-4)
 
 
-@given(seeds, st.floats(0.01, 2.0))
-def test_a_short_step_along_the_descent_lowers_f(seed, beta):
-    g, dg, o, precision, belief, goal = scene(seed)
-    found = gradient(o, g(belief), dg(belief), precision, g(goal), beta)
-    length = 1e-4 / max(np.linalg.norm(found.descent), 1e-9)
-    if np.linalg.norm(found.descent) < 1e-3:
-        return  # at a stationary point there is nothing to descend
-    after = free_energy(g, o, precision, belief + length * found.descent, goal, beta)
-    assert after < free_energy(g, o, precision, belief, goal, beta)
-
-
 @given(seeds)
-def test_curvature_is_the_gauss_newton_hessian(seed):
-    g, dg, o, precision, belief, _ = scene(seed)
-    found = gradient(g(belief), g(belief), dg(belief), precision)  # without misfit the Gauss-Newton Hessian is exact
+def test_curvature(seed):
+    g, dg, _, precision, belief, _ = scene(seed)
+    found = FreeEnergy(g(belief), g(belief), dg(belief), precision)  # without misfit the Gauss-Newton Hessian is exact
     h = 1e-4
     for i in range(3):
         for j in range(3):
@@ -66,7 +55,6 @@ def test_curvature_is_the_gauss_newton_hessian(seed):
             f = {(a, b): accuracy(g(belief), g(belief + a * ei + b * ej), precision) for a in (1, -1) for b in (1, -1)}
             numeric = (f[1, 1] - f[1, -1] - f[-1, 1] + f[-1, -1]) / (4 * h * h)
             assert found.curvature[i, j] == pytest.approx(numeric, rel=1e-3, abs=1e-2)
-    assert o.shape == (40,)
 
 
 def test_accuracy_is_a_density():
@@ -79,11 +67,11 @@ def test_accuracy_is_a_density():
 
 
 @given(seeds)
-def test_the_printed_goal_term_points_away_from_the_goal(seed):
+def test_printed_goal_term(seed):
     """The goal term as printed, beta dg' Pi (o - g_goal), ascends F near the goal if the belief is the true pose."""
     g, dg, _, precision, belief, _ = scene(seed)
     goal = belief + 1e-3 * np.random.default_rng(seed).normal(size=3)
     o = g(belief)
     printed = (dg(belief).T * precision) @ (o - g(goal))
-    ours = gradient(o, g(belief), dg(belief), precision, g(goal), 1.0).xi_goal
+    ours = FreeEnergy(o, g(belief), dg(belief), precision, g(goal), 1.0).xi_goal
     assert printed @ (goal - belief) < 0 < ours @ (goal - belief)

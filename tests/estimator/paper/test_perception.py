@@ -21,17 +21,17 @@ def scan(pose, rng) -> np.ndarray:
     return exact + 0.02 * rng.standard_normal(len(exact))
 
 
-def test_a_near_belief_descends_to_the_truth_and_tracks():
+def test_descent_and_state():
     rng, truth = np.random.default_rng(0), (3.0, 1.5)
     found = estimator((3.15, 1.4), alpha=2e-3, iterations=1)
     estimates = [found.update(scan(truth, rng)) for _ in range(60)]
     assert np.hypot(*(estimates[-1].pose[:2] - truth)) < 0.01
-    assert estimates[-1].gradient.accuracy < estimates[0].gradient.accuracy
+    assert estimates[-1].free_energy.accuracy < estimates[0].free_energy.accuracy
     assert [e.state for e in estimates[:3]] == ["localising"] * 3
     assert estimates[-1].state == "tracking"
 
 
-def test_carried_off_is_lost():
+def test_lost():
     rng = np.random.default_rng(1)
     found = estimator((3.0, 1.5), alpha=2e-3, iterations=1)
     for _ in range(30):
@@ -42,7 +42,7 @@ def test_carried_off_is_lost():
     assert "lost" in states
 
 
-def test_the_belief_stays_in_the_world_and_steps_are_bounded():
+def test_bounds_and_steps():
     rng = np.random.default_rng(2)
     found = estimator((3.0, 1.5), alpha=0.5, max_step=0.3, iterations=1)
     before = found.pose.copy()
@@ -54,7 +54,7 @@ def test_the_belief_stays_in_the_world_and_steps_are_bounded():
         before = pose
 
 
-def test_the_goal_draws_the_belief_only_where_beta_says_so():
+def test_goal_and_beta():
     rng, truth, goal = np.random.default_rng(3), (3.0, 1.5), np.array([3.4, 1.5, HEADING])
     plain, drawn = estimator(truth, alpha=1e-3, iterations=1), estimator(truth, alpha=1e-3, iterations=1, beta=0.5)
     for _ in range(40):
@@ -62,10 +62,10 @@ def test_the_goal_draws_the_belief_only_where_beta_says_so():
         a, b = plain.update(o, goal), drawn.update(o, goal)
     assert np.hypot(*(a.pose[:2] - truth)) < 0.02
     assert np.hypot(*(b.pose - goal)[:2]) < np.hypot(*(a.pose - goal)[:2]) - 0.05
-    assert b.gradient.attraction > 0 == a.gradient.attraction
+    assert b.free_energy.attraction > 0 == a.free_energy.attraction
 
 
-def test_beams_that_say_nothing_are_as_if_they_were_not_there():
+def test_unmeasured_beams():
     rng, truth = np.random.default_rng(6), (3.0, 1.5)
     plain, masked, blind = (estimator((3.15, 1.4), alpha=2e-3, iterations=1) for _ in range(3))
     measured = rng.random(len(scan(truth, rng))) < 0.7
@@ -77,19 +77,10 @@ def test_beams_that_say_nothing_are_as_if_they_were_not_there():
     assert found.state == "tracking"
     assert np.hypot(*(found.pose[:2] - truth)) < 0.01 < np.hypot(*(plain.pose[:2] - truth))
     assert stays.pose.tolist() == [3.15, 1.4, HEADING]
-    assert (stays.state, stays.gradient.accuracy) == ("localising", 0.0)
+    assert (stays.state, stays.free_energy.accuracy) == ("localising", 0.0)
 
 
-def test_restart_forgets():
-    rng = np.random.default_rng(4)
-    found = estimator((3.0, 1.5), alpha=2e-3, iterations=1)
-    for _ in range(30):
-        found.update(scan((3.0, 1.5), rng))
-    found.restart(np.array([1.0, 1.0, HEADING]))
-    assert found.update(scan((3.0, 1.5), rng)).state == "localising"
-
-
-def test_told_where_it_is_it_tracks_at_once_unless_the_scan_says_otherwise():
+def test_known_start():
     rng = np.random.default_rng(5)
     found = estimator((1.0, 1.0), alpha=2e-3, iterations=1)
     found.restart(np.array([3.0, 1.5, HEADING]), known=True)
@@ -99,7 +90,7 @@ def test_told_where_it_is_it_tracks_at_once_unless_the_scan_says_otherwise():
 
 
 @pytest.mark.parametrize("beams", [622, 811])
-def test_shipped_weights_localise_in_the_corridor(beams):
+def test_shipped_weights(beams):
     """From the map's centre, 25 scans: most beliefs end within 1 m, the median within 0.25 m."""
     model, card = weights.load(weights.find(weights.FOLDER, "corridor", "paper", beams))
     world, rng = load_world("corridor"), np.random.default_rng(5)

@@ -21,6 +21,7 @@ from services.estimator.shared.interface import Observation
 from tests.estimator.models import ROOM
 
 BEAMS = 271
+HALL = World(name="hall", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)])  # longer than the scanner's 25 m
 
 
 def estimator(world: World, beams: int = BEAMS) -> tuple[PreciseEstimator, Scene]:
@@ -41,12 +42,12 @@ def off(posterior, pose):
     return error
 
 
-def test_the_cost_of_a_search_does_not_grow_with_the_beams(monkeypatch):
+def test_search_with_many_beams(monkeypatch):
     made, scene = estimator(ROOM, beams=MAX_BEAMS)
-    looked_at = []
+    predicted = []
 
     def expect(self, lasers, angles):
-        looked_at.append((len(lasers), len(angles)))
+        predicted.append((len(lasers), len(angles)))
         return cast(self, lasers, angles)
 
     cast = RayCaster.expect
@@ -55,10 +56,10 @@ def test_the_cost_of_a_search_does_not_grow_with_the_beams(monkeypatch):
     posterior = feed(made, scene, pose, 1)[0]
     assert np.abs(off(posterior, pose)).max() < 0.01
     assert posterior.predicted.shape == posterior.sigma.shape == (MAX_BEAMS,)
-    assert max(beams for poses, beams in looked_at if poses > 1) < 2 * TARGET_BEAMS
+    assert max(beams for poses, beams in predicted if poses > 1) < 2 * TARGET_BEAMS
 
 
-def test_one_scan_finds_the_place_and_twenty_are_worth_more():
+def test_error_and_bound():
     made, scene = estimator(ROOM)
     outcome = tasks.standing(made, scene, 40, iter)
     one, many = outcome["from nothing, 1 scan"], outcome["standing, 20 scans"]
@@ -69,19 +70,19 @@ def test_one_scan_finds_the_place_and_twenty_are_worth_more():
     assert rms[1] < 1.6 * limit[1]
 
 
-def test_the_stated_covariance_is_consistent():
-    """NEES of 300 scans: mean of chi squared with 3 degrees of freedom, 99.9 % band."""
+def test_covariance():
+    """NEES of 100 scans: mean of chi squared with 3 degrees of freedom, 99.9 % band."""
     made, scene = estimator(ROOM)
     outcome = tasks.Outcome()
-    for pose in scene.poses(300):
+    for pose in scene.poses(100):
         made.restart(pose, np.diag([1.0, 1.0, 1.0]))
         outcome.add(feed(made, scene, pose, 1)[0], pose, None)
-    assert len(outcome.misfits) >= 298
-    assert np.mean(outcome.misfits) == pytest.approx(3, abs=3.3 * np.sqrt(6 / 300))
+    assert len(outcome.misfits) >= 99
+    assert np.mean(outcome.misfits) == pytest.approx(3, abs=3.3 * np.sqrt(6 / 100))
 
 
 @pytest.mark.parametrize("odometry", [False, True])
-def test_it_tracks_and_is_never_lost(odometry):
+def test_tracking(odometry):
     made, scene = estimator(ROOM)
     (outcome,) = tasks.tracking(made, scene, 20.0, iter, odometry=odometry).values()
     assert outcome.found == outcome.of == 300
@@ -89,31 +90,23 @@ def test_it_tracks_and_is_never_lost(odometry):
     assert rms < 1.3 * np.sqrt(np.mean(np.square(outcome.bounds)))
 
 
-def test_carried_off_it_is_found_again_by_the_next_scan():
+def test_kidnapping():
     made, scene = estimator(load_world("maze"))  # unlike the empty room, it has no two similar places
     outcome = tasks.kidnapped(made, scene, 15, iter)
     assert outcome["kidnapped, 1 scan"].found == 15
     assert outcome["kidnapped, 3 scans"].wrong == 0
 
 
-def test_people_in_the_way():
+def test_blocked_beams():
     made, scene = estimator(ROOM)
     outcome = tasks.blocked(made, scene, 10, iter)["30 % blocked, 1 scan"]
     assert outcome.found >= 9
     assert np.median(np.hypot(*np.array(outcome.errors)[:, :2].T)) < 0.01
 
 
-def test_two_rooms_alike_are_both_kept_until_a_scan_tells():
-    made, scene = estimator(TWINS)
-    outcome = tasks.twins(made, scene, 4, iter)
-    assert outcome["two rooms alike: both kept"].found == 4
-    assert outcome["two rooms alike: right after"].found == 4
-
-
-def test_in_a_corridor_without_features_the_covariance_says_so():
-    """With two walls of 60 m and a scanner of 25 m the position is unknown along the walls, and well known across."""
-    hall = World(name="hall", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)])
-    made, scene = estimator(hall, 90)
+def test_standing_in_a_featureless_hall():
+    """The position is unknown along the walls, and well known across."""
+    made, scene = estimator(HALL, 90)
     pose = np.array([30.0, 0.9, 0.1])
     made.restart(pose, np.diag([0.04, 0.04, 0.01]))
     for k, posterior in enumerate(feed(made, scene, pose, 10)):
@@ -125,13 +118,12 @@ def test_in_a_corridor_without_features_the_covariance_says_so():
 
 
 @pytest.mark.parametrize("learned", [False, True])
-def test_driving_along_such_a_corridor_it_does_not_pretend_to_know_how_far(learned):
+def test_driving_in_a_featureless_hall(learned):
     """Without odometry and features the error along the walls grows, but remains within the stated covariance."""
-    hall = World(name="hall", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)])
-    made, scene = estimator(hall, 360)
+    made, scene = estimator(HALL, 360)
     if learned:
         geometry = Geometry(scene.scanner.angles(), np.array(scene.scanner.mount), 25.0)
-        made.model = quick_field(hall, geometry, np.random.default_rng(0), 3000)
+        made.model = quick_field(HALL, geometry, np.random.default_rng(0), 3000)
     pose = np.array([27.0, 0.9, 0.1])
     made.restart(pose, np.diag([1e-4, 1e-4, 1e-4]))
     for k in range(75):
@@ -145,7 +137,7 @@ def test_driving_along_such_a_corridor_it_does_not_pretend_to_know_how_far(learn
     assert posterior.state != "tracking"
 
 
-def test_begun_near_a_pose_it_stays_near():
+def test_initial_pose():
     made, scene = estimator(TWINS)
     pose = np.array([7.5, 2.6, 0.4])
     made.restart(pose + np.array([0.2, -0.1, 0.1]))
@@ -154,7 +146,7 @@ def test_begun_near_a_pose_it_stays_near():
     assert np.abs(off(posterior, pose)).max() < 0.02
 
 
-def test_scans_that_nothing_explains():
+def test_unexplained_scans():
     made, scene = estimator(ROOM)
     rng, angles = np.random.default_rng(0), scene.scanner.angles()
     garbage = [Observation(rng.uniform(0.1, 20, BEAMS), angles, 25.0, k / 15) for k in range(3)]
@@ -167,7 +159,7 @@ def test_scans_that_nothing_explains():
 
 
 @pytest.mark.parametrize("value", [np.inf, -np.inf])
-def test_scans_without_a_single_range_do_no_harm(value):
+def test_empty_scans(value):
     made, scene = estimator(ROOM)
     pose = np.array([3.0, 1.5, 1.0])
     empty = Observation(np.full(BEAMS, value), scene.scanner.angles(), 25.0, 0.0)
@@ -178,22 +170,14 @@ def test_scans_without_a_single_range_do_no_harm(value):
     assert np.abs(off(feed(made, scene, pose, 3, 5)[-1], pose)).max() < 0.02
 
 
-def test_the_same_scans_give_the_same_beliefs():
-    def run():
-        made, scene = estimator(ROOM)
-        return np.array([p.pose for p in feed(made, scene, np.array([3.0, 1.5, 1.0]), 5)])
-
-    assert np.array_equal(run(), run())
-
-
 @pytest.mark.parametrize("world", ["corridor", "maze", "office"])
-def test_shipped_fields_find_the_robot_anywhere(world):
-    """Finds 20 of 20 poses to a few millimetres; nothing was tuned on these poses and this noise."""
+def test_shipped_fields(world):
+    """Finds 10 of 10 poses to a few millimetres; nothing was tuned on these poses and this noise."""
     scene = Scene.of(load_world(world), 622, 4242)
     scanner = scene.scanner
     made = prepare(Choice(world))(Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max))
     errors = []
-    for pose in scene.poses(20):
+    for pose in scene.poses(10):
         made.restart()
         errors.append(off(feed(made, scene, pose, 1)[0], pose))
     position = np.hypot(*np.array(errors)[:, :2].T)
@@ -220,19 +204,19 @@ KINDS = ("ordinary", "no return", "says nothing", "random", "a ring", "scaled", 
 
 
 @pytest.fixture(scope="module")
-def in_a_hall():
-    """An estimator between two walls of 60 m, along which the position is unknown."""
-    made, scene = estimator(World(name="hall", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)]), 60)
+def hall_estimator():
+    """An estimator with few beams in HALL."""
+    made, scene = estimator(HALL, 60)
     made.bounds = scene.world.bounds
     return made, scene
 
 
 @given(st.lists(st.sampled_from(KINDS), min_size=5, max_size=12), st.integers(0, 1000), st.sampled_from([1 / 15, 1.0]))
 @example(["random"] * 20, 25, 1.0)
-@settings(max_examples=8, deadline=None)
-def test_the_belief_stays_in_the_map_whatever_the_scans_are(in_a_hall, kinds, seed, period):
+@settings(max_examples=5, deadline=None)
+def test_belief_stays_in_the_map(hall_estimator, kinds, seed, period):
     """Also checks that a hypothesis moves at most 20 steps of a descent, 10 m, beyond what motion allows."""
-    made, scene = in_a_hall
+    made, scene = hall_estimator
     rng = np.random.default_rng(seed)
     pose = np.array([rng.uniform(5, 55), rng.uniform(0.5, 1.5), rng.uniform(-3, 3)])
     made.restart(pose, np.diag([1e-4] * 3))

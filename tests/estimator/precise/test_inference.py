@@ -8,13 +8,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from common.geometry import se2
+from common.geometry.ray_casting import MIN_COSINE
 from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View, descend, difference, polish
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.precise.hypotheses import Mode, select_distinct, weigh
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import Candidate, MotionNoise, fuse, predict_motion
 from services.estimator.shared.generative_models import Expected, RayCaster
-from services.estimator.shared.kernels import FACING
 from tests.estimator.models import ROOM
 
 MOUNT = np.array([0.2, 0.05, 0.3])
@@ -32,7 +32,7 @@ def view(ranges, likelihood=None):
 
 
 @pytest.mark.parametrize(("expected", "scale"), [(5.0, 1e-3), (5.0, 0.3), (12.0, 0.05), (np.inf, 0.1)])
-def test_the_likelihood_is_a_density(expected, scale):
+def test_likelihood_is_a_density(expected, scale):
     o = np.linspace(0, 25.0, 2_000_001)
     density = Likelihood().density(o, expected, scale, 25.0)
     no_return = np.exp(-accuracy_of_no_return(expected, scale))
@@ -44,7 +44,7 @@ def accuracy_of_no_return(expected, scale):
     return Likelihood().evaluate(np.array([np.inf]), 25.0, one).accuracy[0]
 
 
-def test_accuracy_is_the_sum_of_minus_log_densities():
+def test_accuracy():
     likelihood, rng = Likelihood(), np.random.default_rng(0)
     g, m = rng.uniform(1, 9, 50), rng.uniform(1e-3, 0.1, 50)
     o = np.clip(g + rng.normal(0, 0.5, 50) * (rng.random(50) < 0.5), 0.1, 24)
@@ -53,7 +53,7 @@ def test_accuracy_is_the_sum_of_minus_log_densities():
     assert found.accuracy[0] == pytest.approx(by_hand)
 
 
-def test_no_return_is_evidence_and_too_close_is_not():
+def test_beams_without_range():
     likelihood = Likelihood()
     expected = Expected(np.array([[3.0, np.inf, 3.0]]), np.full((1, 3), 1e-3), np.ones((1, 3, 3)))
 
@@ -66,7 +66,7 @@ def test_no_return_is_evidence_and_too_close_is_not():
 
 
 @pytest.mark.parametrize("relative", [0.0, 0.05])
-def test_the_slope_of_a_beam_is_that_of_its_energy(relative):
+def test_slope_of_a_beam(relative):
     likelihood, step = Likelihood(relative=relative), 1e-6
     g, m, o = np.array([1.0, 4.0, 9.0]), np.full(3, 0.01), np.array([1.02, 3.9, 9.3])
 
@@ -92,7 +92,7 @@ def smooth_beams(ranges, pose, step):
     offsets = step * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     seen = RayCaster(ROOM).expect(se2.compose(pose + offsets, MOUNT), ANGLES)
     here, above, below = seen.ranges[0], seen.ranges[1:4], seen.ranges[4:]
-    grazes = np.hypot(*seen.jacobian[0, :, :2].T) > 0.999 / FACING
+    grazes = np.hypot(*seen.jacobian[0, :, :2].T) > 0.999 / MIN_COSINE
     jumps = (np.abs(above - 2 * here + below) > 1e-3 * step).any(axis=0)
     crosses = ((ranges < seen.ranges) != (ranges < here)).any(axis=0)
     return ~(grazes | jumps | crosses)
@@ -101,7 +101,7 @@ def smooth_beams(ranges, pose, step):
 @given(st.integers(0, 10_000))
 @settings(max_examples=30, deadline=None)
 @example(6339)  # a beam grazes the circle
-def test_xi_is_minus_the_gradient_of_accuracy_by_base_link(seed):
+def test_gradient(seed):
     rng = np.random.default_rng(seed)
     pose, step = TRUTH + rng.normal(0, [0.01, 0.01, 0.005]), 1e-6
     ranges = scan(TRUTH, rng)
@@ -115,17 +115,17 @@ def test_xi_is_minus_the_gradient_of_accuracy_by_base_link(seed):
         assert found[axis] == pytest.approx(-(high - low) / (2 * step), rel=1e-4, abs=5e-3)
 
 
-def test_the_derivative_of_a_grazing_beam_is_limited():
+def test_grazing_beam():
     """Where a beam touches a circle its range has no finite derivative, and a step along it would mean nothing."""
     tangent = np.array([4.5 - 2.0, 3 - 0.4 + 1e-7, 0.0])
     expected = RayCaster(ROOM).expect(tangent[None], np.zeros(1))
     assert expected.ranges[0, 0] == pytest.approx(2, abs=1e-3)
-    assert np.hypot(*expected.jacobian[0, 0, :2]) == pytest.approx(1 / FACING)
+    assert np.hypot(*expected.jacobian[0, 0, :2]) == pytest.approx(1 / MIN_COSINE)
 
 
 @given(st.integers(0, 10_000))
 @settings(max_examples=20, deadline=None)
-def test_the_descent_lowers_f_and_finds_the_truth(seed):
+def test_descent(seed):
     rng = np.random.default_rng(seed)
     seen = view(scan(TRUTH, rng))
     starts = TRUTH + rng.normal(0, [0.1, 0.1, 0.05], (8, 3))
@@ -138,7 +138,7 @@ def test_the_descent_lowers_f_and_finds_the_truth(seed):
     assert evidence.inlier_ratio[best] > 0.9
 
 
-def test_a_prior_holds_where_the_scan_says_nothing():
+def test_prior_without_evidence():
     nothing = view(np.full(len(ANGLES), -np.inf))
     prior = Prior(TRUTH[None], np.diag([100.0, 100.0, 400.0])[None])
     poses, _ = descend(nothing, TRUTH[None] + 0.2, prior)
@@ -146,7 +146,7 @@ def test_a_prior_holds_where_the_scan_says_nothing():
 
 
 @given(st.integers(0, 10_000))
-def test_fusing_is_bayes_rule_for_gaussians(seed):
+def test_fusion_is_bayes_rule(seed):
     rng = np.random.default_rng(seed)
     a, b = rng.normal(0, 0.1, (2, 3, 3))
     P, H = a @ a.T + 0.01 * np.eye(3), np.linalg.inv(b @ b.T + 0.01 * np.eye(3))
@@ -170,7 +170,7 @@ def test_fusing_is_bayes_rule_for_gaussians(seed):
     st.lists(st.floats(1e-4, 300), min_size=3, max_size=3),
 )
 @example([0, 0, 0, 0.3, 0, 0, 4.7, 0, 0], [0, 1e4, 1e4], [2.9, 0.01, 0.01])  # no curvature along x: 39.5 m
-def test_fusing_takes_no_step_beyond_the_trust_region(numbers, curvatures, deviations):
+def test_trust_region(numbers, curvatures, deviations):
     mean, mode, slope = np.array(numbers).reshape(3, 3)
     mean[2] = se2.wrap(mean[2])
     found = fuse(Candidate("x", mean, np.diag(deviations) ** 2, 0.5), mode, slope, np.diag(curvatures))
@@ -199,19 +199,19 @@ def mode(x, energy):
     return Mode(np.array([x, 0.0, 0.0]), np.eye(3), np.zeros((3, 3)), 1.0, energy, 0.0, energy, np.zeros(3), np.eye(3))
 
 
-def test_modes_are_merged_weighed_and_dropped():
+def test_hypothesis_weights():
     found = weigh([mode(5.0, 20.0), mode(0.0, 0.0), mode(0.01, 3.0), mode(9.0, 5000.0)], 20.0, 8)
     assert [m.pose[0] for m in found] == [0.0, 5.0]
     assert found[0].weight / found[1].weight == pytest.approx(np.e)
     assert sum(m.weight for m in found) == pytest.approx(1)
 
 
-def test_headings_a_turn_apart_are_one():
+def test_headings_across_pi():
     poses = np.array([[0, 0, np.pi - 0.01], [0, 0, -np.pi + 0.01], [0, 0, 0.0]])
     assert select_distinct(poses, np.array([1.0, 0.0, 2.0]), 8) == [1, 2]
 
 
-def test_ranking_puts_the_truth_among_the_first():
+def test_seed_ranking():
     rng = np.random.default_rng(3)
     seeds = Seeds.at(RayCaster(ROOM), thin_places(ROOM.sample_free(2000, rng, 0.05), 0.3))
     for _ in range(10):
@@ -221,7 +221,7 @@ def test_ranking_puts_the_truth_among_the_first():
         assert (near & (np.abs(se2.wrap(ranked[:, 2] - pose[2])) < 0.2)).any()
 
 
-def test_one_place_a_square():
+def test_thin_places():
     points = np.random.default_rng(0).uniform(0, 3, (5000, 2))
     thin = thin_places(points, 0.5)
     assert len(thin) == 36

@@ -31,7 +31,7 @@ def expected_at(view, pose):
     return view.model.expect(np.array([[*pose]]), view.angles)
 
 
-def test_people_contradict_nothing_and_another_place_does():
+def test_contradicting_beams():
     made, scene = estimator(ROOM)
     made.mount = np.zeros(3)
     here, there = np.array([2.5, 2.0, 0.3]), np.array([5.0, 3.0, -1.0])
@@ -42,19 +42,19 @@ def test_people_contradict_nothing_and_another_place_does():
     assert obstruction.contradicting_ratio(whole, expected_at(whole, there)) > 0.2
 
 
-def test_where_no_return_is_expected_nothing_contradicts():
+def test_no_return_expected():
     made, scene = estimator(ROOM)
     count = len(scene.scanner.angles())
     nothing = Expected(np.full((1, count), np.inf), np.full((1, count), 0.01), np.zeros((1, count, 3)))
     for measured in (np.inf, 2.0, -np.inf):
         view = view_of(made, scene, np.full(count, measured))
         assert obstruction.is_only_blocked(view, nothing, 0.02)
-        assert obstruction.late_ratio(view, nothing) == obstruction.contradicting_ratio(view, nothing) == 0
+        assert obstruction.behind_ratio(view, nothing) == obstruction.contradicting_ratio(view, nothing) == 0
     unknown = Expected(nothing.ranges, np.full((1, count), np.inf), nothing.jacobian)
     assert not obstruction.is_only_blocked(view_of(made, scene, np.full(count, np.inf)), unknown, 0.02)
 
 
-def test_what_holds_a_place_along_a_hall_is_what_stands_across():
+def test_constraining_beams():
     hall = World(name="hall", boundary=[(0, 0), (20, 0), (20, 2), (0, 2)])
     made, scene = estimator(hall, 361)
     made.mount = np.zeros(3)
@@ -70,7 +70,7 @@ def test_what_holds_a_place_along_a_hall_is_what_stands_across():
     assert obstruction.constraining_beams(view_of(made, scene, hidden), pose, along) < 0.1
 
 
-def test_in_a_crowd_a_tracked_robot_keeps_its_place_and_carried_off_it_is_found():
+def test_crowd_and_kidnapping():
     made, scene = estimator(load_world("maze"))
     here, there = scene.poses(2)
     made.restart(here, np.diag([1e-4, 1e-4, 1e-4]))

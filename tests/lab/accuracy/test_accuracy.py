@@ -155,7 +155,7 @@ def test_short_table(capsys):
     tim = scanners_of("tim571", "")[0]
     job = Job("precise", "office", tim, 3, 1.0, 0)
     rows = [_row(job, "office", task, each) for task, each in (("kidnapped", outcome), ("blocked", nothing))]
-    assert "| kidnapped | 5.00 / 5.00 mm, 1/3, 2 wrong, NEES 2.50 |" in _markdown(rows, "office")
+    assert "| kidnapped | 5.00/5.00 mm, 1/3, 2 wrong, NEES 2.50 |" in _markdown(rows, "office")
     assert "| blocked | 0/3, 1 wrong |" in _markdown(rows, "office")
     assert rows[0]["found_share_95"] == pytest.approx([0.061, 0.792], abs=1e-3)
 

@@ -129,7 +129,7 @@ def test_e3_through_real_processes(tmp_path):
     assert 1 <= summary["path_over_straight_max"] < 1.02
     assert summary["error_max_m"] < 0.2
     assert {path.suffix for path in tmp_path.iterdir()} >= {".json", ".csv", ".pdf", ".png"}
-    assert "| precise | 1 of 1 | 0 |" in navigation.table(result.summary)
+    assert "| precise | 1/1 | 0 |" in navigation.table(result.summary)
 
 
 class Linear:

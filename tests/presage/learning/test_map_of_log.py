@@ -39,7 +39,7 @@ def test_a_map_of_a_half_is_the_room_of_that_time(log, tmp_path, half, world):
     other = real_drive.AFTER if world is real_drive.BEFORE else real_drive.BEFORE
     x, y = np.meshgrid(np.arange(0.5, 8.9, 0.1), np.arange(0.5, 5.9, 0.1))
     places = np.stack([x, y], axis=-1).reshape(-1, 2)
-    values, room, away = mapped.grid.at(places), world.clearance(places), other.clearance(places)
+    values, room, away = mapped.grid.values_at(places), world.clearance(places), other.clearance(places)
     looked = values != UNKNOWN
     assert (values[looked & (room > 0.15)] == FREE).mean() > 0.99
     assert looked[room > 0.15].mean() > 0.9

@@ -1,4 +1,4 @@
-"""The tree of frames, and poses between those that were logged."""
+"""The tree of frames, and interpolated poses."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from presage.logs.poses import Track
 SECOND = 1_000_000_000
 
 
-def placed(x=0.0, y=0.0, yaw=0.0, roll=0.0):
+def transform(x=0.0, y=0.0, yaw=0.0, roll=0.0):
     a, b = yaw / 2, roll / 2
     turn = [np.cos(a) * np.sin(b), np.sin(a) * np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)]
     rotation = read_rotation(SimpleNamespace(**dict(zip("xyzw", turn, strict=True))))
     return Transform(np.array([x, y, 0.3]), rotation)
 
 
-def test_a_mount_over_several_frames():
+def test_mount_over_several_frames():
     frames = FrameHistory()
-    frames.add("base_link", "plate", 0, placed(0.2, 0.1, np.pi / 2))
-    frames.add("/plate", "/laser", 0, placed(0.1, 0.0, 0.0, np.pi))  # ROS 1 began names with a slash
+    frames.add("base_link", "plate", 0, transform(0.2, 0.1, np.pi / 2))
+    frames.add("/plate", "/laser", 0, transform(0.1, 0.0, 0.0, np.pi))  # ROS 1 began names with a slash
     mount = frames.mount("base_link", "laser")
     np.testing.assert_allclose(mount.pose, [0.2, 0.2, np.pi / 2], atol=1e-12)
     assert mount.upside_down
@@ -33,26 +33,26 @@ def test_a_mount_over_several_frames():
     assert frames.mount("laser", "base_link") is None
 
 
-def test_what_is_no_mount_is_refused():
+def test_mount_refusals():
     frames = FrameHistory()
-    frames.add("base_link", "tilted", 0, placed(roll=np.deg2rad(15)))
+    frames.add("base_link", "tilted", 0, transform(roll=np.deg2rad(15)))
     with pytest.raises(UserError, match=r"tilted on base_link: the scanner is inclined by 15 degrees.*--mount"):
         frames.mount("base_link", "tilted")
     for k in range(3):
-        frames.add("base_link", "nodding", k, placed(yaw=0.1 * k))
+        frames.add("base_link", "nodding", k, transform(yaw=0.1 * k))
     with pytest.raises(UserError, match="moves against base_link"):
         frames.mount("base_link", "nodding")
 
 
-def test_frames_that_bite_their_tail_hang_on_nothing():
+def test_cycles_of_frames():
     frames = FrameHistory()
     for parent, child in (("a", "b"), ("b", "c"), ("c", "a"), ("d", "d")):
-        frames.add(parent, child, 0, placed())
+        frames.add(parent, child, 0, transform())
     assert frames.chain("map", "c") is None
     assert frames.chain("d", "d") == []
 
 
-def test_between_two_poses_and_nowhere_else():
+def test_interpolation():
     track = Track()
     for seconds, yaw in ((2, -3.0), (1, 3.0), (4, 0.0)):  # in any order
         track.add(seconds * SECOND, np.array([seconds, 0.0, yaw]))
@@ -65,7 +65,7 @@ def test_between_two_poses_and_nowhere_else():
     assert Track().at(0) is None
 
 
-def test_what_stands_still_costs_nothing():
+def test_standing_still_takes_no_memory():
     track, still = Track(), np.array([1.0, 2.0, 3.0])
     for k in range(1000):
         track.add(k * SECOND // 100, still)

@@ -1,4 +1,4 @@
-"""`presage import`: what comes out is a recording like any other."""
+"""`presage import`: the recording of a log."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import load_world
 from common.messages.topics import ODOM, SCAN, TRUTH
+from common.runtime.config import load_section
 from presage.logs.importing import ImportOptions, import_command
 from presage.logs.log import Reading
-from presage.logs.options import reading_of
+from presage.logs.options import LogSettings
 from presage.logs.scan_files import read_scans
 from presage.recordings.info import survey
 from presage.recordings.session_figure import draw_session
@@ -62,7 +63,7 @@ def make(folder, name):
 
 
 @pytest.mark.parametrize("name", ["carmen", "npz", "ros1", "db3", "mcap"])
-def test_reads_as_the_log_does(tmp_path, name):
+def test_recording_equals_log(tmp_path, name):
     file = make(tmp_path, name)
     reading = Reading(mount=MOUNT) if name == "npz" else Reading()
     out, facts = imported(file, reading=reading, world="corridor")
@@ -82,7 +83,7 @@ def test_reads_as_the_log_does(tmp_path, name):
     assert facts["scans"] == SCANS
 
 
-def test_is_whole_and_says_where_it_comes_from(tmp_path):
+def test_recording_is_complete(tmp_path):
     out, _ = imported(make(tmp_path, "mcap"), robot="truck")
     recording = read_recording(out)
     facts = survey(recording, check=True)
@@ -100,7 +101,7 @@ def test_is_whole_and_says_where_it_comes_from(tmp_path):
     assert recording.start_ns == STAMPS[0]
 
 
-def test_velocities_are_those_between_scans(tmp_path):
+def test_velocities(tmp_path):
     out, _ = imported(npz(tmp_path), reading=Reading(mount=MOUNT))
     twists = [m.twist.array() for _, m, _ in read_recording(out).messages(TRUTH)]
     assert not twists[0].any()
@@ -109,20 +110,21 @@ def test_velocities_are_those_between_scans(tmp_path):
     )  # s in float64
 
 
-def test_localises_from_its_reference_on(tmp_path):
+def position_errors(file, world):
+    choice = choice_of(file, world, "precise", "exact", None, 0.02, 0, "")
+    options = {"fresh": False, "odometry": True, "out": file.with_name("p.json")}
+    rows = localize(LocalizeOptions.of(file, choice, "track", "base_link", Reading(), **options), CONSOLE)
+    return np.hypot(*(np.array([[row["x"], row["y"]] for row in rows]) - truth(STAMPS)[:, :2]).T)
+
+
+def test_localisation(tmp_path):
     out, _ = imported(make(tmp_path, "ros1"), world="corridor")
     for file, world in ((out, ""), (tmp_path / "drive.bag", "corridor")):
-        choice = choice_of(file, world, "precise", "exact", None, 0.02, 0, "")
-        job = LocalizeOptions.of(
-            file, choice, "track", "base_link", Reading(), fresh=False, odometry=True, out=tmp_path / "p.json"
-        )
-        rows = localize(job, CONSOLE)
-        found = np.array([[row["x"], row["y"]] for row in rows])
-        assert np.hypot(*(found - truth(STAMPS)[:, :2]).T).max() < 0.02
+        assert position_errors(file, world).max() < 0.02
 
 
 @pytest.mark.parametrize("name", ["npz", "mcap"])
-def test_poses_of_the_laser(tmp_path, name):
+def test_laser_frame(tmp_path, name):
     file = make(tmp_path, name)
     scans = read_scans(imported(file, laser=True)[0])
     assert not scans.geometry.mount.any()
@@ -131,21 +133,21 @@ def test_poses_of_the_laser(tmp_path, name):
     np.testing.assert_allclose(scans.odom, wanted, atol=1e-6)
 
 
-def test_a_scanner_upside_down_is_turned_over(tmp_path):
+def test_upside_down_scanner(tmp_path):
     file = npz(tmp_path, ranges=ranges()[:, ::-1])
     scans = read_scans(imported(file, reading=Reading(mount=MOUNT, upside_down=True))[0])
     np.testing.assert_allclose(scans.ranges, ranges(), rtol=1e-6)
     np.testing.assert_allclose(scans.geometry.angles, ANGLES, atol=1e-6)
 
 
-def test_a_log_without_times(tmp_path):
+def test_log_without_stamps(tmp_path):
     file = npz(tmp_path, stamps=None)
-    with pytest.raises(UserError, match="--rate"):
+    with pytest.raises(UserError, match="with rate in section log"):
         imported(file)
     np.testing.assert_allclose(read_scans(imported(file, rate=5.0)[0]).stamps, np.arange(SCANS) / 5)
 
 
-def test_reference_poses_that_are_not_known_throughout(tmp_path):
+def test_partial_reference(tmp_path):
     reference = truth(STAMPS)
     reference[4:6] = np.nan
     file = npz(tmp_path, reference=reference)
@@ -162,13 +164,13 @@ def test_reference_poses_that_are_not_known_throughout(tmp_path):
         ({"stamps": np.zeros(SCANS)}, "too few usable scans: 1; left out: scans twice: 11"),
     ],
 )
-def test_what_no_recording_can_be_made_of_leaves_no_file(tmp_path, changes, why):
+def test_refusals_leave_no_file(tmp_path, changes, why):
     with pytest.raises(UserError, match=why):
         imported(npz(tmp_path, **changes))
     assert [path.name for path in tmp_path.iterdir()] == ["drive.npz"]
 
 
-def test_names_that_cannot_be(tmp_path):
+def test_names_of_files(tmp_path):
     file = npz(tmp_path)
     (tmp_path / "there.mcap").write_bytes(b"")
     for out, why in (("out.bag", "must end with .mcap"), ("there.mcap", "exists already; choose another name")):
@@ -179,26 +181,28 @@ def test_names_that_cannot_be(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("said", "why"),
+    ("section", "why"),
     [
-        ({"mount": "1"}, "--mount '1'"), ({"angles": "90"}, "--angles '90'"), ({"angles": "90,-90"}, "to the left"),
-        ({"clock": "wall"}, "no clock 'wall'"),
+        ("mount: '1'", "mount"),
+        ("angles: '90'", "angles '90'"),
+        ("angles: 90,-90", "to the left"),
+        ("clock: wall", "clock"),
     ],
-)  # fmt: skip
-def test_words_that_are_not_known(said, why):
-    usual = dict.fromkeys(("mount", "scan_topic", "odom_topic", "reference_topic", "base_frame", "angles"), "")
+)
+def test_invalid_log_settings(tmp_path, section, why):
+    (tmp_path / "c.yaml").write_text(f"log:\n  {section}\n")
     with pytest.raises(UserError, match=why):
-        reading_of(**{**usual, "clock": "sensor", **said}, reference=None, range_max=None, upside_down=None)
+        load_section(LogSettings, tmp_path / "c.yaml", "log").reading()
 
 
-def test_is_drawn_without_a_word(tmp_path):
+def test_figure_without_poses(tmp_path):
     """Without poses there is but a world; warnings are errors."""
     out, _ = imported(make(tmp_path, "mcap"), world="corridor", reading=Reading(reference=False))
     draw_session(out, tmp_path / "drive.png")
     assert (tmp_path / "drive.png").stat().st_size > 10_000
 
 
-def test_an_rplidar_that_looks_all_round(tmp_path):
+def test_rplidar_of_a_full_turn(tmp_path):
     """The first direction is measured twice, in single precision a little more than a turn; beams come and go."""
     exact = load_world("corridor")
 
@@ -215,9 +219,4 @@ def test_an_rplidar_that_looks_all_round(tmp_path):
     assert (facts["scans"], facts["left_out"]) == (SCANS, {})
     assert any("resampled at the angles of the first" in note for note in facts["notes"])
     assert read_recording(out).scanner().beams == 360
-    choice = choice_of(out, "", "precise", "exact", None, 0.02, 0, "")
-    job = LocalizeOptions.of(
-        out, choice, "track", "base_link", Reading(), fresh=False, odometry=True, out=tmp_path / "p.json"
-    )
-    found = np.array([[row["x"], row["y"]] for row in localize(job, CONSOLE)])
-    assert np.hypot(*(found - truth(STAMPS)[:, :2]).T).max() < 0.02
+    assert position_errors(out, "").max() < 0.02

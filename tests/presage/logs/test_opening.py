@@ -1,4 +1,4 @@
-"""Which format a file has, and that whatever is cut, damaged or foreign ends in one line that says so."""
+"""The format of a file, and one-line errors for cut, damaged and foreign ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from presage.logs.scan_files import read_scans
 from tests.presage.logs.drives import ANGLES, MOUNT, SCANS, STAMPS, Bag, carmen, odom, ranges, truth, write_bag
 from tests.recorder.sessions import write as write_recording
 
-CUTS = 15  # places at which a file is cut, and at which one is damaged
+CUTS = 8  # places at which a file is cut, and at which one is damaged
 
 
 def npz(folder):
@@ -42,15 +42,15 @@ MAKERS = {"npz": npz, "carmen": log, "ros1": bag("ros1"), "db3": bag("db3"), "mc
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_told_by_content_not_by_name(tmp_path, name):
+def test_format_by_content(tmp_path, name):
     file = MAKERS[name](tmp_path)
     kind = {"db3": "ros2", "mcap": "ros2"}.get(name, name)
     assert kind_of(file) == kind
-    if kind != "ros2":  # whose reader goes by the name, which is said: test_rosbag
+    if kind != "ros2":  # its reader needs the suffix
         assert kind_of(file.rename(tmp_path / "anything.dat")) == kind
 
 
-def test_a_recording_is_none_of_them(tmp_path):
+def test_recording_is_no_log(tmp_path):
     file = write_recording(tmp_path / "run.mcap")
     assert kind_of(file) == "recording"
     with pytest.raises(UserError, match="is a presage recording already"):
@@ -71,7 +71,7 @@ def test_a_recording_is_none_of_them(tmp_path):
         (b"PK\x03\x04 not really", "not an .npz"),
     ],
 )
-def test_what_is_none_of_them(tmp_path, content, why):
+def test_unknown_contents(tmp_path, content, why):
     file = tmp_path / "drive.bag"
     file.write_bytes(content)
     with pytest.raises(UserError, match=why):
@@ -80,7 +80,7 @@ def test_what_is_none_of_them(tmp_path, content, why):
         read_scans(file, MOUNT)
 
 
-def test_no_file_and_no_bag(tmp_path):
+def test_missing_files(tmp_path):
     with pytest.raises(UserError, match="no such file"):
         kind_of(tmp_path / "no.bag")
     with pytest.raises(UserError, match=r"without metadata.yaml"):
@@ -91,7 +91,7 @@ def test_no_file_and_no_bag(tmp_path):
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_cut_or_damaged_anywhere(tmp_path, name):
+def test_cuts_and_damage(tmp_path, name):
     file = MAKERS[name](tmp_path)
     whole = file.read_bytes()
     rng, refused = np.random.default_rng(0), 0
@@ -102,7 +102,7 @@ def test_cut_or_damaged_anywhere(tmp_path, name):
             file.write_bytes(content)
             try:
                 scans = read_scans(file)
-                assert 0 < len(scans.ranges) <= SCANS  # what can be read is given, and what was left out is counted
+                assert 0 < len(scans.ranges) <= SCANS
             except UserError as error:
                 refused += 1
                 assert str(file) in str(error)  # noqa: PT017

@@ -35,7 +35,7 @@ def rows_of(path):
         return list(csv.DictReader(stream))
 
 
-def test_a_row_a_message_with_every_scalar(tmp_path):
+def test_rows_of_scalars(tmp_path):
     folder, _ = tables(tmp_path)
     rows = rows_of(folder / "belief.csv")
     assert len(rows) == driven.STEPS
@@ -51,7 +51,7 @@ def test_a_row_a_message_with_every_scalar(tmp_path):
     assert rows_of(folder / "scan.csv")[0]["mount.x"] == "0.2"
 
 
-def test_lists_and_maps_have_tables_of_their_own(tmp_path):
+def test_tables_of_lists_and_maps(tmp_path):
     folder, rows = tables(tmp_path)
     hypotheses = rows_of(folder / "belief.hypotheses.csv")
     assert len(hypotheses) == 2 * driven.STEPS
@@ -67,7 +67,7 @@ def test_lists_and_maps_have_tables_of_their_own(tmp_path):
     assert not list(folder.glob("*ranges*"))  # not asked for
 
 
-def test_arrays_where_asked_for(tmp_path):
+def test_arrays(tmp_path):
     folder, _ = tables(tmp_path, arrays=True)
     rows = rows_of(folder / "scan.ranges-4.csv")
     assert [rows[2][str(n)] for n in range(4)] == ["1.0", "inf", "-inf", "2.5"]
@@ -75,7 +75,7 @@ def test_arrays_where_asked_for(tmp_path):
     assert len(rows_of(folder / "prediction.sigma-4.csv")) == driven.STEPS
 
 
-def test_the_readme_says_what_each_column_means(tmp_path):
+def test_readme_explains_columns(tmp_path):
     folder, rows = tables(tmp_path)
     text = (folder / "README.md").read_text()
     for name in rows:
@@ -88,7 +88,7 @@ def test_the_readme_says_what_each_column_means(tmp_path):
 
 
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
-def test_columns_have_names_of_their_own_and_most_a_meaning(topic):
+def test_columns_are_unique_and_explained(topic):
     columns = columns_of(topic.message)
     names = [column.name for column in columns]
     assert len(names) == len(set(names))
@@ -97,7 +97,7 @@ def test_columns_have_names_of_their_own_and_most_a_meaning(topic):
     assert unsaid <= {"frame_id", "state", "reason", "estimator", "service"}  # words
 
 
-def test_what_cannot_be_decoded_is_left_out_and_said(tmp_path, capsys):
+def test_undecodable_messages_are_counted(tmp_path, capsys):
     recording = driven.write(tmp_path / "run.mcap", also=[(TRUTH, TRUTH.key("rob"), b"\xc1", driven.BEGAN_NS)])
     run_export(ExportOptions(recording, "csv", tmp_path / "csv"), tmp_path / "out.json", QUIET)
     assert len(rows_of(tmp_path / "csv" / "truth.csv")) == driven.STEPS
@@ -114,7 +114,7 @@ def tum(tmp_path, *leave_out, localised_only=False, **how):
     return tmp_path / "tum", rows
 
 
-def test_trajectories_on_the_messages_own_stamps(tmp_path):
+def test_tum_trajectories(tmp_path):
     folder, rows = tum(tmp_path)
     assert rows == {"truth.tum": driven.STEPS, "belief.tum": driven.STEPS, "odom.tum": driven.STEPS}
     for name, where in (("truth", driven.true), ("belief", driven.believed), ("odom", driven.odometry)):
@@ -126,14 +126,14 @@ def test_trajectories_on_the_messages_own_stamps(tmp_path):
         assert not table[:, 3:6].any()
 
 
-def test_big_stamps_keep_their_nanoseconds(tmp_path):
+def test_tum_stamps_in_nanoseconds(tmp_path):
     stamp = 1_700_000_000_123_456_789
     late = Truth(stamp_ns=stamp, pose=Pose(x=0.0, y=0.0), twist=Twist()).encode()
     folder, _ = tum(tmp_path, also=[(TRUTH, TRUTH.key("rob"), late, driven.BEGAN_NS + 10**12)])
     assert (folder / "truth.tum").read_text().splitlines()[-1].startswith("1700000000.123456789 ")
 
 
-def test_a_simulation_begun_anew_gets_a_file_of_its_own(tmp_path):
+def test_tum_after_a_restart(tmp_path):
     poses = [Truth(stamp_ns=stamp, pose=Pose(x=9.0, y=9.0), twist=Twist()) for stamp in (0, 0, 5)]  # one twice
     began = driven.BEGAN_NS + 10**11
     again = [(TRUTH, TRUTH.key("rob"), pose.encode(), began + number) for number, pose in enumerate(poses)]
@@ -143,14 +143,14 @@ def test_a_simulation_begun_anew_gets_a_file_of_its_own(tmp_path):
     assert np.all(np.diff(np.loadtxt(folder / "truth-2.tum")[:, 0]) > 0)
 
 
-def test_beliefs_that_know_the_place_alone(tmp_path):
+def test_tum_of_tracked_beliefs(tmp_path):
     _, rows = tum(tmp_path, localised_only=True)
     assert rows["belief.tum"] == driven.STEPS - 3
     assert rows["truth.tum"] == driven.STEPS
 
 
 @pytest.mark.skipif(shutil.which("evo_ape") is None, reason="evo is not installed")
-def test_evo_reads_them_and_finds_the_error(tmp_path):
+def test_evo_finds_the_error(tmp_path):
     folder, _ = tum(tmp_path)
     run = ["evo_ape", "tum", "truth.tum", "belief.tum"]
     home = {**os.environ, "HOME": str(tmp_path)}  # it writes its settings there
@@ -159,15 +159,17 @@ def test_evo_reads_them_and_finds_the_error(tmp_path):
     assert "rmse\t0.050000" in done.stdout
 
 
-def test_nothing_to_export_is_named(tmp_path):
+def test_export_refusals(tmp_path):
     empty = read_recording(driven.write(tmp_path / "run.mcap", *TOPICS))
     with pytest.raises(UserError, match="nothing to export"):
         export_csv(empty, tmp_path / "csv", "", QUIET, arrays=False, force=False)
     with pytest.raises(UserError, match="no trajectory"):
         export_tum(empty, tmp_path / "tum", "", QUIET, localised_only=False, force=False)
+    with pytest.raises(UserError, match="no format 'xml': choose csv, tum, foxglove"):
+        run_export(ExportOptions(tmp_path / "run.mcap", "xml"), None, QUIET)
 
 
-def test_a_folder_with_something_in_it_is_not_written_into(tmp_path):
+def test_folder_must_be_empty(tmp_path):
     recording = driven.write(tmp_path / "run.mcap")
     (tmp_path / "csv").mkdir()
     (tmp_path / "csv" / "mine.txt").touch()
@@ -179,12 +181,7 @@ def test_a_folder_with_something_in_it_is_not_written_into(tmp_path):
     assert (tmp_path / "csv" / "belief.tum").exists()
 
 
-def test_a_format_that_is_none(tmp_path):
-    with pytest.raises(UserError, match="no format 'xml': choose csv, tum, foxglove"):
-        run_export(ExportOptions(tmp_path / "run.mcap", "xml"), None, QUIET)
-
-
-def test_beside_the_recording_where_no_place_is_named(tmp_path):
+def test_default_folder(tmp_path):
     active = driven.write(tmp_path / "run.mcap", BELIEF, ODOM, HEALTH, finish=False)
     run_export(ExportOptions(active, "tum"), None, QUIET)
     assert [path.name for path in (tmp_path / "run-tum").iterdir()] == ["truth.tum"]

@@ -1,7 +1,11 @@
+"""The figure of a recorded session."""
+
 from __future__ import annotations
 
+from array import array
 from io import BytesIO
 
+import numpy as np
 import pytest
 from matplotlib.image import imread
 
@@ -21,7 +25,7 @@ def labels(axes):
     return {text.get_text() for text in legend.get_texts()} if legend else set()
 
 
-def test_the_whole_picture(tmp_path):
+def test_picture(tmp_path):
     png = tmp_path / "run.png"
     draw_session(made.write(tmp_path / "run.mcap"), png, title="a run")
     image = imread(BytesIO(png.read_bytes()))
@@ -33,7 +37,7 @@ def test_the_whole_picture(tmp_path):
         assert part[..., :3].std() > 0.05
 
 
-def test_every_panel_has_its_lines(tmp_path):
+def test_lines_of_panels(tmp_path):
     figure = figure_of(load_session(made.write(tmp_path / "run.mcap")), "run")
     plan, scan, energy, errors = figure.axes
     assert {"last scan", "goal and tolerance", "believed path", "true path", "true start"} <= labels(plan)
@@ -63,7 +67,7 @@ def test_every_panel_has_its_lines(tmp_path):
     ],
     ids=["everything", "truth", "belief", "prediction", "scan", "goal", "world"],
 )
-def test_a_panel_says_what_is_missing(tmp_path, missing, world, said):
+def test_missing_topics(tmp_path, missing, world, said):
     figure = figure_of(load_session(made.write(tmp_path / "part.mcap", *missing, world=world)), "part")
     png = BytesIO()
     figure.savefig(png, dpi=30)
@@ -72,7 +76,13 @@ def test_a_panel_says_what_is_missing(tmp_path, missing, world, said):
     assert texts(figure) == " | ".join(f"no {what} in this recording" for what in said)
 
 
-def test_a_place_that_cannot_be_written_to(tmp_path):
+def test_beliefs_without_free_energy(tmp_path):
+    session = load_session(made.write(tmp_path / "run.mcap"))
+    session.belief._rows = array("d", [np.nan if k % 6 > 2 else v for k, v in enumerate(session.belief._rows)])
+    assert texts(figure_of(session, "run")) == "no free energy in this recording"
+
+
+def test_unwritable_folder(tmp_path):
     recording = made.write(tmp_path / "run.mcap")
     with pytest.raises(UserError, match="cannot be written"):
         draw_session(recording, tmp_path / "nowhere" / "run.png")

@@ -1,3 +1,5 @@
+"""The summary of a session, against values worked out by hand from tests/recorder/sessions.py."""
+
 from __future__ import annotations
 
 import json
@@ -18,77 +20,46 @@ def recording(tmp_path_factory):
     return made.write(tmp_path_factory.mktemp("session") / "run.mcap")
 
 
-def test_the_summary_is_what_the_hand_works_out(recording):
-    summary = summarise(recording)
-    assert (summary.world, summary.robot, summary.complete) == ("hall", "robot", True)
-    assert summary.scans == 100
-    assert summary.messages == 4 * 100 + 1 + 70 + 4
-    assert summary.undecodable == 0
-    assert summary.dropped == 7  # the last health of each service, not the sum over time
-    assert summary.dropped_by_key == {"presage/robot/scan": 7}
-    assert summary.duration_s == pytest.approx(10.0)
-    assert summary.duration_stamped_s == pytest.approx(9.9)
-    assert summary.localised_after_scans == 21
-    assert summary.localised_after_s == pytest.approx(2.0)
-    assert summary.localised_error_m == pytest.approx(0.05)
-    # The truth ends at 1 + 0.1 * 69 = 7.9, the belief 0.2 further.
-    assert summary.goal_reached is True
-    assert summary.goal_distance_m == pytest.approx(0.1)
-    assert summary.goal_distance_believed_m == pytest.approx(0.1)
-    assert summary.position_error_m == pytest.approx(0.2)
-    # Scans 20 to 30 at 0.05 m, 31 to 99 at 0.2 m.
-    assert summary.position_error_median_m == pytest.approx(0.2)
-    assert summary.position_error_max_m == pytest.approx(0.2)
-    assert summary.position_error_navigating_median_m == pytest.approx(0.2)
-    assert summary.path_m == pytest.approx(6.9)
-    assert summary.straight_line_m == pytest.approx(7.0)
-    assert summary.contacts == 3
+def test_summary(recording):
+    summary = summarise(recording).as_dict()
+    expected = {
+        "world": "hall", "robot": "robot", "complete": True, "scans": 100, "messages": 4 * 100 + 1 + 70 + 4,
+        "undecodable": 0, "dropped": 7,  # the last health of each service, not the sum over time
+        "duration_s": 10.0, "duration_stamped_s": 9.9, "localised_after_scans": 21, "localised_after_s": 2.0,
+        "localised_error_m": 0.05,
+        # The truth ends at 1 + 0.1 * 69 = 7.9, the belief 0.2 further.
+        "goal_reached": True, "goal_distance_m": 0.1, "goal_distance_believed_m": 0.1, "position_error_m": 0.2,
+        # Scans 20 to 30 at 0.05 m, 31 to 99 at 0.2 m.
+        "position_error_median_m": 0.2, "position_error_max_m": 0.2, "position_error_navigating_median_m": 0.2,
+        "path_m": 6.9, "straight_line_m": 7.0, "contacts": 3,
+    }  # fmt: skip
+    assert {name: summary[name] for name in expected} == pytest.approx(expected)
+    assert json.loads(json.dumps(summary)) == summary
+    lines = dict(summarise(recording).lines())
+    assert (lines["goal"], lines["distance to goal"]) == ("reached", "0.100 m, believed 0.100 m")
+    assert "incomplete" not in lines
 
 
-def test_navigating_begins_with_the_goal_and_ends_when_it_is_reached(recording):
+def test_time_of_navigating(recording):
     session = load_session(recording)
     assert session.goal_times_ns == [made.MOVED * made.PERIOD_NS]  # though the goal's own stamp is 0
     # The belief 1.2 + 0.1 (i - 30) first lies within 0.15 m of 8 at i = 97.
     assert session.reached_ns() == 97 * made.PERIOD_NS
 
 
-def test_the_summary_is_plain_data_and_lines(recording):
-    summary = summarise(recording)
-    assert json.loads(json.dumps(summary.as_dict())) == summary.as_dict()
-    lines = dict(summary.lines())
-    assert lines["goal"] == "reached"
-    assert lines["distance to goal"] == "0.100 m, believed 0.100 m"
-    assert "incomplete" not in lines
-
-
-def test_what_is_not_recorded_is_none_not_zero(tmp_path):
-    summary = summarise(
-        made.write(tmp_path / "scans.mcap", TRUTH, BELIEF, PREDICTION, GOAL, STATUS, HEALTH, world=False)
-    )
-    told = {name for name, value in summary.as_dict().items() if value is not None}
-    assert told == {
+def test_missing_topics_give_none(tmp_path):
+    scans = summarise(made.write(tmp_path / "s.mcap", TRUTH, BELIEF, PREDICTION, GOAL, STATUS, HEALTH, world=False))
+    known = {name for name, value in scans.as_dict().items() if value is not None}
+    assert known == {
         "robot", "complete", "scans", "messages", "undecodable", "duration_s", "duration_stamped_s", "dropped_by_key",
     }  # fmt: skip
-    assert dict(summary.lines())["localised"] == "never"
-
-
-def test_a_session_without_any_message(tmp_path):
-    summary = summarise(made.write(tmp_path / "empty.mcap", *TOPICS, world=False))
-    assert (summary.scans, summary.messages, summary.duration_s) == (0, 0, 0.0)
-    assert summary.position_error_m is None
-
-
-def test_without_truth_no_error_is_claimed(tmp_path):
-    summary = summarise(made.write(tmp_path / "real.mcap", TRUTH))
-    assert summary.localised_after_scans == 21
-    assert summary.localised_error_m is None
-    assert summary.position_error_m is None
-    assert summary.position_error_max_m is None
-    assert summary.path_m is None
-    assert summary.contacts is None
-    assert summary.goal_reached is True  # the controller said so
-    assert summary.goal_distance_m is None
-    assert summary.goal_distance_believed_m == pytest.approx(0.1)
+    assert dict(scans.lines())["localised"] == "never"
+    empty = summarise(made.write(tmp_path / "empty.mcap", *TOPICS, world=False))
+    assert (empty.scans, empty.duration_s, empty.position_error_m) == (0, 0.0, None)
+    real = summarise(made.write(tmp_path / "real.mcap", TRUTH)).as_dict()
+    names = ("localised_error_m", "position_error_m", "position_error_max_m", "path_m", "contacts", "goal_distance_m")
+    assert [real[name] for name in names] == [None] * len(names)
+    assert (real["goal_reached"], real["localised_after_scans"]) == (True, 21)  # the controller reported it
 
 
 def write(path, *entries):
@@ -109,7 +80,7 @@ def belief(stamp, x, y=0.0, state="tracking"):
     )
 
 
-def test_a_belief_is_compared_with_the_truth_of_its_own_stamp(tmp_path):
+def test_error_at_the_beliefs_stamp(tmp_path):
     path = write(
         tmp_path / "late.mcap", truth(0, 0.0), truth(1, 1.0), belief(0, 0.3, 0.4), truth(2, 2.0), belief(5, 9.0)
     )
@@ -119,7 +90,7 @@ def test_a_belief_is_compared_with_the_truth_of_its_own_stamp(tmp_path):
     assert summarise(path).position_error_m is None
 
 
-def test_a_simulation_that_began_anew_uses_stamps_twice(tmp_path):
+def test_error_after_a_restart(tmp_path):
     path = write(
         tmp_path / "reset.mcap",
         truth(0, 0.0),
@@ -132,7 +103,7 @@ def test_a_simulation_that_began_anew_uses_stamps_twice(tmp_path):
     assert load_session(path).errors() == pytest.approx([1.0, 0.0, 0.0])
 
 
-def test_one_message_sent_again_counts_once(tmp_path):
+def test_repeated_messages_count_once(tmp_path):
     again = [truth(0, 0.0), belief(0, 1.0, state="localising")] * 3
     path = write(tmp_path / "again.mcap", *again, truth(1, 0.0), belief(1, 0.5))
     # Alternating topics: each is compared with the last of its own kind.
@@ -140,7 +111,7 @@ def test_one_message_sent_again_counts_once(tmp_path):
     assert summarise(path).messages == 8
 
 
-def test_a_cancelled_goal_is_no_goal(tmp_path):
+def test_cancelled_goal(tmp_path):
     goal = Goal(stamp_ns=0, pose=Pose(x=1, y=1))
     path = write(
         tmp_path / "cancel.mcap", truth(0, 0.0), (GOAL, goal), (GOAL, goal.model_copy(update={"cancel": True}))
@@ -149,12 +120,9 @@ def test_a_cancelled_goal_is_no_goal(tmp_path):
     assert summarise(path).goal_distance_m is None
 
 
-def test_an_unreadable_payload_is_counted_in_the_summary(tmp_path):
+def test_unreadable_payload_and_file(tmp_path):
     writer = RecordingWriter(tmp_path / "bad.mcap")
     writer.write(SCAN, SCAN.key("robot"), b"\xc1nonsense", 1, 1)
     assert summarise(writer.finish()).undecodable == 1
-
-
-def test_no_file(tmp_path):
     with pytest.raises(UserError, match=r"no\.mcap: cannot be read"):
         summarise(tmp_path / "no.mcap")

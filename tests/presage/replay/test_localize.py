@@ -1,4 +1,4 @@
-"""`presage localize` over files made here: npz in every form, a recording, and what is refused."""
+"""`presage localize` over .npz files and a recording."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from common.bus.bus import wait_until
 from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import load_world
+from common.messages.definitions import CmdVel, Goal, Odom, Pose, Scan, Truth, Twist
+from common.messages.topics import CMD_VEL, GOAL, ODOM, SCAN, TRUTH
 from common.robot.scanner import SCANNERS
 from presage.logs.importing import ImportOptions, import_command
 from presage.logs.log import Reading
@@ -24,6 +26,7 @@ from presage.logs.scan_files import Scans, read_scans
 from presage.replay.localize import COLUMNS, LocalizeOptions, choice_of, localize, select_scans
 from presage.replay.rerun import RerunOptions, rerun_command
 from services.estimator.precise.learning.weights import FOLDER
+from services.recorder.files.writer import RecordingWriter
 from tests.conftest import WAIT_TIMEOUT_S
 from tests.recorder.sessions import write
 
@@ -62,11 +65,9 @@ def errors(rows, path=PATH):
 
 @pytest.mark.parametrize("fresh", [False, True])
 @pytest.mark.parametrize("model", ["learned", "exact"])
-def test_a_csv_with_a_row_for_each_scan(tmp_path, fresh, model):
-    out = tmp_path / "poses.csv"
-    localize(job(npz(tmp_path), fresh=fresh, model=model, out=out), CONSOLE)
-    with out.open() as file:
-        rows = list(csv.DictReader(file))
+def test_csv(tmp_path, capsys, fresh, model):
+    localize(job(npz(tmp_path), fresh=fresh, model=model), Console(stderr=True))
+    rows = list(csv.DictReader(capsys.readouterr().out.splitlines()))  # nothing else on standard output
     assert tuple(rows[0]) == COLUMNS
     assert len(rows) == 10
     numbers = [{k: float(v) for k, v in row.items() if k != "state"} for row in rows]
@@ -75,22 +76,22 @@ def test_a_csv_with_a_row_for_each_scan(tmp_path, fresh, model):
     assert all(row["cov_xx"] > 0 and row["update_ms"] > 0 for row in numbers)
 
 
-def test_json_says_what_was_run(tmp_path):
+def test_json(tmp_path):
     out = tmp_path / "poses.json"
-    localize(job(npz(tmp_path), out=out), CONSOLE)
+    rows = localize(job(npz(tmp_path), out=out), CONSOLE)
     data = json.loads(out.read_text())
-    assert {"world", "estimator", "model", "frame", "seed", "commit", "rows"} <= set(data)
-    assert len(data["rows"]) == 10
+    assert {"world", "estimator", "model", "frame", "seed", "commit"} <= set(data)
+    assert data["rows"] == rows
 
 
-def test_the_laser_frame_is_that_of_the_files_poses_too(tmp_path):
+def test_laser_frame(tmp_path):
     file = npz(tmp_path, mount=(0, 0, 0))  # PATH is the laser's
     assert errors(localize(job(file, frame="laser"), CONSOLE)).max() < 0.02
     assert errors(localize(job(file, frame="base_link"), CONSOLE)).min() > 0.15
 
 
-def test_a_mount_that_is_only_assumed_must_be_that_of_the_weights(tmp_path):
-    """The file does not state it, and 0.2,0,0 is assumed: a forgotten --mount would put every pose off by 0.2 m."""
+def test_assumed_mount_must_fit_weights(tmp_path):
+    """A forgotten --mount would put every pose off by 0.2 m."""
     folder = shutil.copytree(FOLDER, tmp_path / "models", ignore=lambda _, names: set(names) - set(CORRIDOR))
     card = json.loads((folder / CORRIDOR[0]).read_text())
     card["scanner"]["mount"] = [0.0, 0.0, 0.0]
@@ -111,7 +112,7 @@ def test_a_mount_that_is_only_assumed_must_be_that_of_the_weights(tmp_path):
     assert errors(localize(job(npz(tmp_path), models=folder, reading=elsewhere), CONSOLE)).max() < 0.02
 
 
-def test_only_what_is_needed(tmp_path):
+def test_start_pose(tmp_path):
     file = npz(tmp_path, stamps=None, odom=None, initial_pose=None)
     assert errors(localize(job(file), CONSOLE)).max() < 0.02
     with pytest.raises(UserError, match="mode track needs the pose of the first scan"):
@@ -119,7 +120,7 @@ def test_only_what_is_needed(tmp_path):
     assert errors(localize(job(file, mode="track", initial_pose="4,1.5,57"), CONSOLE)).max() < 0.02
 
 
-def test_a_reference_is_what_errors_are_against_and_where_tracking_begins(tmp_path, capsys):
+def test_reference(tmp_path, capsys):
     reference = PATH.copy()
     reference[5:] = np.nan  # not known throughout
     file = npz(tmp_path, mount=(0, 0, 0), reference=reference, initial_pose=None)
@@ -130,16 +131,9 @@ def test_a_reference_is_what_errors_are_against_and_where_tracking_begins(tmp_pa
 
 
 @pytest.mark.parametrize("estimator", ["particle-filter", "amcl-defaults"])
-def test_the_particle_filter_over_the_same_file(tmp_path, estimator):
+def test_particle_filter(tmp_path, estimator):
     rows = localize(job(npz(tmp_path), mode="track", estimator=estimator), CONSOLE)
     assert errors(rows).max() < 0.5
-
-
-def test_the_standard_output_is_csv_alone(tmp_path, capsys):
-    localize(job(npz(tmp_path)), Console(stderr=True))
-    out = capsys.readouterr().out.splitlines()
-    assert out[0] == ",".join(COLUMNS)
-    assert len(out) == 11
 
 
 @pytest.mark.parametrize(
@@ -155,42 +149,27 @@ def test_the_standard_output_is_csv_alone(tmp_path, capsys):
         ({"ranges": np.zeros((2, 3, 4))}, "not \\(N, B\\)"),
     ],
 )
-def test_what_is_wrong_with_a_file_is_said(tmp_path, changes, why):
-    with pytest.raises(UserError, match=why) as error:
-        localize(job(npz(tmp_path, **changes)), CONSOLE)
-    assert "scans.npz" in str(error.value)
+def test_wrong_arrays(tmp_path, changes, why):
+    with pytest.raises(UserError, match=rf"scans.npz.*{why}"):
+        read_scans(npz(tmp_path, **changes))
 
 
-def test_files_that_are_none(tmp_path):
-    garbage = tmp_path / "x.npz"
-    garbage.write_bytes(b"PK\x03\x04 not really")
-    foreign = tmp_path / "x.npz.txt"
-    foreign.write_text("ranges, angles\n")
-    for file, why in (
-        (garbage, "not an .npz"),
-        (tmp_path / "no.npz", "no such file"),
-        (foreign, "not a presage recording, a CARMEN log"),
-    ):
-        with pytest.raises(UserError, match=why):
-            read_scans(file, np.zeros(3))
-    pickled = tmp_path / "p.npz"
+def test_wrong_files(tmp_path):
+    pickled, foreign = tmp_path / "p.npz", tmp_path / "x.npz.txt"
     np.savez(pickled, ranges=np.array([{}], dtype=object), angles=np.zeros(3), range_max=1.0)
-    with pytest.raises(UserError, match="plain arrays"):
-        read_scans(pickled, np.zeros(3))
+    foreign.write_text("ranges, angles\n")
+    for file, why in ((pickled, "plain arrays"), (foreign, "not a presage recording, a CARMEN log")):
+        with pytest.raises(UserError, match=why):
+            read_scans(file)
 
 
-def test_stamps_are_the_numbers_they_were(tmp_path):
+def test_stamps_and_ranges_of_an_npz(tmp_path):
     stamps = [1000.0, 1000.1, 1600000000.3]
-    values = {"ranges": np.ones((3, 6)), "angles": np.arange(6) / 10, "range_max": 25.0}
-    np.savez(tmp_path / "scan.npz", stamps=np.array(stamps), **values)
-    assert read_scans(tmp_path / "scan.npz", np.zeros(3)).stamps.tolist() == stamps
-
-
-def test_what_says_nothing_about_the_place_is_minus_infinity(tmp_path):
-    row = np.array([[1.0, 25.0, np.inf, 0.0, np.nan, -np.inf]])
-    np.savez(tmp_path / "scan.npz", ranges=row, angles=np.arange(6) / 10, range_max=25.0)
-    found = read_scans(tmp_path / "scan.npz", np.zeros(3)).ranges
-    assert found.tolist() == [[1.0, np.inf, np.inf, -np.inf, -np.inf, -np.inf]]
+    row = [1.0, 25.0, np.inf, 0.0, np.nan, -np.inf]
+    np.savez(tmp_path / "s.npz", stamps=stamps, ranges=[row] * 3, angles=np.arange(6) / 10, range_max=25.0)
+    scans = read_scans(tmp_path / "s.npz")
+    assert scans.stamps.tolist() == [scan.stamp for scan in scans] == stamps
+    assert scans[0].ranges.tolist() == [1.0, np.inf, np.inf, -np.inf, -np.inf, -np.inf]
 
 
 def plain(rows):
@@ -198,7 +177,7 @@ def plain(rows):
 
 
 @pytest.mark.parametrize("estimator", ["precise", "particle-filter"])
-def test_chosen_scans_give_the_rows_of_a_file_with_only_these(tmp_path, estimator):
+def test_selected_scans(tmp_path, estimator):
     whole, stamps = npz(tmp_path), 1.6e9 + np.arange(10) / 10
     data = dict(np.load(whole))
     chosen = slice(2, 9, 3)  # between 0.2 and 0.8 s each third scan: 2, 5, 8
@@ -214,7 +193,7 @@ def test_chosen_scans_give_the_rows_of_a_file_with_only_these(tmp_path, estimato
     assert [row["stamp"] for row in rows] == stamps[chosen].tolist()
 
 
-def test_the_summary_counts_the_chosen_scans(tmp_path, capsys):
+def test_summary_of_selected_scans(tmp_path, capsys):
     reference = np.column_stack([PATH[:, :2] + np.arange(10)[:, None], PATH[:, 2]])  # 0 m off at the first, then more
     out = tmp_path / "poses.json"
     file = npz(tmp_path, reference=reference)
@@ -228,7 +207,7 @@ def test_the_summary_counts_the_chosen_scans(tmp_path, capsys):
     assert (data["start"], data["end"], data["every"], data["complete"]) == (0.1, None, 4, True)
 
 
-def test_choices_that_leave_nothing(tmp_path):
+def test_selection_refusals(tmp_path):
     file = npz(tmp_path)
     scans, unstamped = read_scans(file), replace(read_scans(file), stamps=None)
     for wrong, why in (
@@ -246,17 +225,17 @@ def test_choices_that_leave_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", ["csv", "json"])
-def test_an_interrupted_run_keeps_its_rows(tmp_path, capsys, monkeypatch, suffix):
-    file, out, given = npz(tmp_path), tmp_path / f"poses.{suffix}", Scans.observation
+def test_interrupted_run_keeps_rows(tmp_path, capsys, monkeypatch, suffix):
+    file, out, given = npz(tmp_path), tmp_path / f"poses.{suffix}", Scans.__getitem__
 
-    def interrupted_at_the_fifth(scans, k, **how):
+    def interrupted_at_the_fifth(scans, k):
         if k < 4:
-            return given(scans, k, **how)
+            return given(scans, k)
         if suffix == "csv":  # also of a run that is killed
             assert len(out.read_text().splitlines()) == 1 + 4
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Scans, "observation", interrupted_at_the_fifth)
+    monkeypatch.setattr(Scans, "__getitem__", interrupted_at_the_fifth)
     with pytest.raises(KeyboardInterrupt):
         localize(job(file, out=out), Console(width=500))
     last = capsys.readouterr().out.splitlines()[-2:]
@@ -271,28 +250,21 @@ def test_an_interrupted_run_keeps_its_rows(tmp_path, capsys, monkeypatch, suffix
         assert len([float(row["update_ms"]) for row in csv.DictReader(stream)]) == 4
 
 
-def test_ctrl_c_ends_with_a_table_and_status_130(tmp_path, processes):
+def test_ctrl_c_ends_with_status_130(tmp_path, processes):
     data = dict(np.load(npz(tmp_path)))
     many = {name: np.tile(data[name], (300, 1)) for name in ("ranges", "odom")}
     np.savez(tmp_path / "long.npz", **{**data, **many, "stamps": np.arange(3000) / 10})
     out = tmp_path / "poses.csv"
-    arguments = ["localize", str(tmp_path / "long.npz"), "--world", "corridor", "--fresh", "--out", str(out)]
+    arguments = ["localize", str(tmp_path / "long.npz"), "--world", "corridor", "--mode", "single", "--out", str(out)]
     running = processes.start("presage.__main__", *arguments)
-    wait_until(
-        lambda: not running.running or (out.exists() and len(out.read_text().splitlines()) > 3), 4 * WAIT_TIMEOUT_S
-    )
+    assert wait_until(lambda: out.exists() and len(out.read_text().splitlines()) > 3, 4 * WAIT_TIMEOUT_S)
     assert running.stop(signal.SIGINT)[0] == 130
-    lines = running.output.splitlines()
-    assert "reading long.npz" in lines
-    assert lines[-1].startswith("interrupted after ")
-    assert lines[-1].endswith(f" of 3000 scans; their rows are in {out}")
-    with out.open() as stream:
-        rows = list(csv.DictReader(stream))
-    assert len(rows) == int(lines[-1].split()[2])
-    assert all(None not in row.values() and row["update_ms"] for row in rows)
+    last = running.output.splitlines()[-1]
+    assert last.endswith(f" of 3000 scans; their rows are in {out}")
+    assert len(out.read_text().splitlines()) == int(last.split()[2]) + 1
 
 
-def test_words_that_are_not_known(tmp_path):
+def test_option_refusals(tmp_path):
     file = npz(tmp_path)
     for wrong, why in (
         ({"mode": "best"}, "no mode"), ({"frame": "map"}, "no frame"), ({"estimator": "kalman"}, "no estimator"),
@@ -305,15 +277,39 @@ def test_words_that_are_not_known(tmp_path):
             localize(job(file, **wrong), CONSOLE)
 
 
-def test_a_recording_says_its_world_and_its_truth(tmp_path):
-    file = tmp_path / "run.mcap"
-    write(file)
-    scans = read_scans(file, np.zeros(3))
-    assert scans.truth is not None
-    assert len(scans.stamps) == len(scans.ranges) == len(scans.truth)
+def test_recording(tmp_path):
+    file = write(tmp_path / "run.mcap")
+    scans = read_scans(file)
+    assert len(scans.stamps) == len(scans) == len(scans.truth)
     rows = localize(job(file, world="", model="exact"), CONSOLE)
     assert errors(rows, scans.truth).max() < 0.03
     with pytest.raises(UserError, match="leave out the options for logs"):
         localize(job(file, world="", model="exact", reading=Reading(mount=np.zeros(3))), CONSOLE)
-    with pytest.raises(UserError, match="presage train --world hall"):  # no field was learned of that world
+    with pytest.raises(UserError, match="presage train --world hall"):  # there are no weights for that world
         localize(job(file, world=""), CONSOLE)
+
+
+def test_recording_of_a_restarted_simulation(tmp_path):
+    """Stamps begin again; truth, odometry, command and goal are those at the scan."""
+    writer = RecordingWriter(tmp_path / "r.mcap")
+    pose, scan = Pose(x=0.0, y=0.0), Scan(
+        stamp_ns=0, angle_min=0.0, angle_increment=0.1, range_min=0.0, range_max=9.0, ranges=np.ones(4)
+    )  # fmt: skip
+    for number in range(4):  # stamps 0, 1, 0, 1
+        stamp, x = number % 2, float(number)
+        command = CmdVel(stamp_ns=stamp, twist=Twist(vx=x))
+        goal = Goal(stamp_ns=stamp, pose=pose.model_copy(update={"x": x}), cancel=number == 3)
+        truth = Truth(stamp_ns=stamp, pose=goal.pose, twist=Twist())
+        odom = Odom(stamp_ns=stamp, pose=goal.pose, twist=Twist(), covariance=np.eye(3))
+        messages = (CMD_VEL, command), (GOAL, goal), (SCAN, scan.model_copy(update={"stamp_ns": stamp}))
+        for topic, message in (*messages, (SCAN, messages[2][1]), (TRUTH, truth), (ODOM, odom)):
+            writer.write(topic, topic.key("robot"), message.encode(), 10 * number, 10 * number)
+    scans = read_scans(writer.finish())
+    assert scans.stamps_ns.tolist() == [0, 1, 0, 1]
+    for column in (scans.truth, scans.odom, scans.commands):
+        assert column[:, 0].tolist() == [0, 1, 2, 3]
+    assert scans[2].goal[0] == 2
+    assert scans[3].goal is None
+    priors = {prior: scans.with_prior(prior)[1] for prior in ("motion", "odometry", "command")}
+    given = {prior: (scan.odom is not None, scan.command is not None) for prior, scan in priors.items()}
+    assert given == {"motion": (False, False), "odometry": (True, False), "command": (False, True)}

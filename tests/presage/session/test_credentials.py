@@ -111,11 +111,3 @@ def test_the_commands_end_to_end(tmp_path):
     config = json.loads(run.invoke(app, ["secure", "show", folder, "--zenoh", "observer"]).output)
     assert config["mode"] == "client"
     assert config["transport"]["link"]["tls"]["enable_mtls"] is True
-
-
-def test_every_command_with_a_session_takes_security_and_role():
-    for words in (["goal"], ["teleport"], ["echo"], ["hz"], ["top"], ["doctor"], ["record"], ["replay"], ["train"],
-                  ["up"], ["demo"], ["relocalise"], ["bench", "latency"]):  # fmt: skip
-        helped = run.invoke(app, [*words, "--help"], env={"COLUMNS": "200", "TERMINAL_WIDTH": "200"})
-        assert "--security" in helped.output, words
-        assert "--role" in helped.output, words

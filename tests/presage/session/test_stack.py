@@ -1,4 +1,4 @@
-"""What starts the services: which signals end it, and that nothing outlives it."""
+"""Signals that end a command."""
 
 from __future__ import annotations
 
@@ -10,22 +10,32 @@ import pytest
 from presage.session.stack import interruptible
 
 
-@pytest.fixture(params=[signal.SIGTERM, signal.SIGHUP])
-def number(request):
-    before = signal.getsignal(request.param)
-    yield request.param
-    signal.signal(request.param, before)
+@pytest.fixture
+def restored():
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.getsignal(number) for number in numbers}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
-def test_it_ends_the_block_as_ctrl_c_does(number):
-    signal.signal(number, signal.SIG_DFL)
-    with pytest.raises(KeyboardInterrupt), interruptible():
-        os.kill(os.getpid(), number)
-    assert signal.getsignal(number) == signal.SIG_DFL
-
-
-def test_what_is_ignored_stays_ignored_as_under_nohup(number):
-    signal.signal(number, signal.SIG_IGN)
-    with interruptible():
-        os.kill(os.getpid(), number)
-    assert signal.getsignal(number) == signal.SIG_IGN
+@pytest.mark.usefixtures("restored")
+@pytest.mark.parametrize(
+    ("number", "before", "ends"),
+    [
+        (signal.SIGTERM, signal.SIG_DFL, True),
+        (signal.SIGHUP, signal.SIG_DFL, True),
+        (signal.SIGHUP, signal.SIG_IGN, False),  # as under nohup
+        (signal.SIGINT, signal.SIG_IGN, True),  # as in the background of a script
+    ],
+)
+def test_signals(number, before, ends):
+    signal.signal(number, before)
+    ended = False
+    try:
+        with interruptible():
+            os.kill(os.getpid(), number)
+    except KeyboardInterrupt:
+        ended = True
+    assert ended == ends
+    assert signal.getsignal(number) == before

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import errno
 import json
-import os
+from io import BytesIO
 
 import pytest
 from hypothesis import given
@@ -16,25 +15,26 @@ from common.errors import UserError
 from common.geometry.world import load_world
 from common.messages.definitions import Pose, Truth, Twist
 from common.messages.topics import HEALTH, ODOM, SCAN, TOPICS, TRUTH
-from services.recorder.files.chunks import MAGIC
+from services.recorder.files.chunks import CHUNK_BUILDER, MAGIC
 from services.recorder.files.writer import NameTakenError, RecordingWriter
 from services.recorder.reader import read_recording
 from services.recorder.recording import open_writer
 from services.recorder.service import RecorderService, chosen_topics
 from services.recorder.settings import RecorderSettings
-from tests.recorder import sessions as made
+from tests.recorder import sessions
 
 KEYS = [(SCAN, "presage/r/scan"), (ODOM, "presage/other/odom"), (HEALTH, "presage/r/health/me")]
 TIMES = st.integers(0, 2**63)
 ENTRIES = st.lists(st.tuples(st.sampled_from(KEYS), st.binary(max_size=300), TIMES, TIMES), max_size=30)
+COMPRESSIONS = st.sampled_from(["zstd", "lz4", "none"])
 
 
 def truth(stamp):
     return Truth(stamp_ns=stamp, pose=Pose(x=1.0, y=2.0), twist=Twist()).encode()
 
 
-@given(entries=ENTRIES, compression=st.sampled_from(["zstd", "lz4", "none"]), flushes=st.sets(st.integers(0, 29)))
-def test_payloads_and_times_come_back_bit_exactly(tmp_path_factory, entries, compression, flushes):
+@given(entries=ENTRIES, compression=COMPRESSIONS, flushes=st.sets(st.integers(0, 29)))
+def test_round_trip(tmp_path_factory, entries, compression, flushes):
     writer = RecordingWriter(tmp_path_factory.mktemp("round") / "run.mcap", compression, chunk_size=1024)
     for number, ((topic, key), payload, published, received) in enumerate(entries):
         writer.write(topic, key, payload, published, received)
@@ -43,20 +43,21 @@ def test_payloads_and_times_come_back_bit_exactly(tmp_path_factory, entries, com
     path = writer.finish()
     recording = read_recording(path)
     wanted = [(key, payload, published, received) for (_, key), payload, published, received in entries]
-    assert [(r.key, r.payload, r.published_ns, r.logged_ns) for r in recording.raw] == sorted(
-        wanted, key=lambda w: w[3]
-    )
+    found = [(r.key, r.payload, r.published_ns, r.logged_ns) for r in recording.raw]
+    assert found == sorted(wanted, key=lambda w: w[3])
     assert recording.complete
     assert recording.counts() == writer.written
     with path.open("rb") as stream:
-        theirs = [
-            (channel.topic, message.data, message.publish_time, message.log_time)
-            for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False)
-        ]
-    assert theirs == wanted
+        messages = make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False)
+        assert [(channel.topic, m.data, m.publish_time, m.log_time) for _, channel, m in messages] == wanted
 
 
-def test_every_topic_has_its_schema_and_its_channel(tmp_path):
+def test_private_name_of_mcap():
+    changed = f"mcap.writer.Writer has no {CHUNK_BUILDER} any more: see services/recorder/files/chunks.py"
+    assert hasattr(Writer(BytesIO()), CHUNK_BUILDER), changed
+
+
+def test_schemas_and_channels(tmp_path):
     writer = RecordingWriter(tmp_path / "run.mcap")
     for topic in TOPICS:
         writer.write(topic, topic.key("rob", "me"), b"", 1, 1)
@@ -72,113 +73,59 @@ def test_every_topic_has_its_schema_and_its_channel(tmp_path):
         assert json.loads(schema.data) == topic.message.json_schema()
 
 
-def test_metadata_stand_first_and_the_world_comes_back(tmp_path):
-    path = made.write(tmp_path / "run.mcap")
-    text = path.read_bytes()
+def test_metadata_and_world(tmp_path):
+    path = sessions.write(tmp_path / "run.mcap")
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     first_chunk = min(index.chunk_start_offset for index in summary.chunk_indexes)
     assert max(index.offset for index in summary.metadata_indexes + summary.attachment_indexes) < first_chunk
-    assert text[summary.attachment_indexes[0].offset :].find(b"world.yaml") > 0
     recording = read_recording(path)
-    assert recording.world() == made.WORLD
+    assert recording.world() == sessions.WORLD
     assert recording.robot().radius == 0.3
     (tmp_path / "world.yaml").write_bytes(recording.attachments["world.yaml"])
-    assert load_world(str(tmp_path / "world.yaml")) == made.WORLD
+    assert load_world(str(tmp_path / "world.yaml")) == sessions.WORLD
 
 
-def test_messages_are_decoded_and_what_is_none_is_counted(tmp_path):
+def test_decoded_messages(tmp_path):
     writer = RecordingWriter(tmp_path / "run.mcap")
     for number, payload in enumerate([truth(7), b"", b"\xc1", truth(8)]):
         writer.write(TRUTH, "presage/r/truth", payload, 0, number)
     writer.write(SCAN, "presage/r/scan", truth(9), 0, 9)  # another message's bytes
     recording = read_recording(writer.finish())
-    assert [(topic, message.stamp_ns, raw.logged_ns) for topic, message, raw in recording.messages()] == [
-        (TRUTH, 7, 0),
-        (TRUTH, 8, 3),
-    ]
+    found = [(topic, message.stamp_ns, raw.logged_ns) for topic, message, raw in recording.messages()]
+    assert found == [(TRUTH, 7, 0), (TRUTH, 8, 3)]
     assert recording.undecodable == {"presage/r/truth": 2, "presage/r/scan": 1}
     assert list(recording.messages(ODOM)) == []
 
 
-def test_an_unfinished_file_is_known_by_its_name(tmp_path):
-    writer = RecordingWriter(tmp_path / "run.mcap")
+def test_names(tmp_path):
+    options = RecorderSettings(directory=tmp_path, file="run")
+    writer = open_writer(options)
     assert [p.name for p in tmp_path.iterdir()] == ["run.mcap.active"]
-    writer.finish()
-    assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
+    with pytest.raises(NameTakenError, match=r"run\.mcap\.active: is there already.*--file"):
+        open_writer(options)
+    whole = writer.finish().read_bytes()
+    with pytest.raises(NameTakenError, match=r"run\.mcap: is there already.*--file"):
+        open_writer(options)
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("run.mcap", whole)]
 
 
-def test_no_recording_is_written_over(tmp_path):
-    for name in ("run.mcap", "run.mcap.active"):
-        (tmp_path / name).write_bytes(b"precious")
-        with pytest.raises(UserError, match="--file"):
-            RecordingWriter(tmp_path / "run.mcap")
-        assert (tmp_path / name).read_bytes() == b"precious"
-        (tmp_path / name).unlink()
+def test_generated_names(tmp_path, monkeypatch):
+    monkeypatch.setattr("services.recorder.recording.file_path", lambda _: tmp_path / "now.mcap")
+    writers = [open_writer(RecorderSettings(directory=tmp_path)) for _ in range(3)]
+    assert [writer.finish().name for writer in writers] == ["now.mcap", "now-2.mcap", "now-3.mcap"]
 
 
-def test_a_folder_that_cannot_be_made(tmp_path):
+def test_unusable_folder(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(UserError, match=r"cannot be written to .*; choose another folder"):
         RecordingWriter(tmp_path / "file" / "run.mcap")
 
 
-def test_a_full_disk_is_one_line_and_leaves_what_was_flushed(tmp_path, monkeypatch):
-    writer = RecordingWriter(tmp_path / "run.mcap")
-    writer.write(TRUTH, "presage/r/truth", truth(1), 1, 1)
-    writer.flush()
-
-    def full():
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(writer._writer, "flush", full)
-    with pytest.raises(UserError, match="No space left on device") as told:
-        writer.flush()
-    assert "\n" not in str(told.value)
-    assert writer.failed
-    assert writer.finish() == tmp_path / "run.mcap.active"
-    assert [raw.payload for raw in read_recording(writer.active).raw] == [truth(1)]
-
-
-WRITING = """
-import sys
-import threading
-from pathlib import Path
-from common.messages.definitions import Odom, Pose, Twist
-from common.messages.topics import ODOM
-from services.recorder.files.writer import RecordingWriter
-
-writer = RecordingWriter(Path(sys.argv[1]))
-writer.metadata("presage", {"robot": "r"})
-for number in range(2000):
-    odom = Odom(stamp_ns=number, pose=Pose(x=0.0, y=0.0), twist=Twist(), covariance=[[0.0] * 3] * 3)
-    writer.write(ODOM, "presage/r/odom", odom.encode(), number, number)
-    if number == 1499:
-        writer.flush()
-        print("flushed", flush=True)
-print("all", flush=True)
-threading.Event().wait()
-"""
-
-
-def test_kill_9_loses_no_more_than_what_was_not_flushed(tmp_path, processes):
-    (tmp_path / "writing.py").write_text(WRITING)
-    child = processes.start(tmp_path / "writing.py", str(tmp_path / "run.mcap"))
-    child.wait_for("all")
-    child.kill()
-    recording = read_recording(tmp_path / "run.mcap.active")
-    assert not recording.complete
-    assert "incomplete" in recording.warning
-    assert recording.metadata["presage"]["robot"] == "r"
-    stamps = [message.stamp_ns for _, message, _ in recording.messages()]
-    assert stamps == list(range(len(stamps)))
-    assert 1500 <= len(stamps) < 2000
-
-
 @given(data=st.data())
-def test_a_file_cut_anywhere_gives_its_whole_chunks_or_one_clear_line(tmp_path_factory, data):
+def test_cut_file(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("cut")
-    writer = RecordingWriter(folder / "run.mcap", data.draw(st.sampled_from(["zstd", "lz4", "none"])), chunk_size=1024)
+    writer = RecordingWriter(folder / "run.mcap", data.draw(COMPRESSIONS), chunk_size=1024)
     for number in range(40):
         writer.write(TRUTH, "presage/r/truth", truth(number), number, number)
     whole = writer.finish().read_bytes()
@@ -194,7 +141,7 @@ def test_a_file_cut_anywhere_gives_its_whole_chunks_or_one_clear_line(tmp_path_f
     assert stamps == list(range(len(stamps)))
 
 
-def test_a_damaged_chunk_is_noticed(tmp_path):
+def test_damaged_chunk(tmp_path):
     writer = RecordingWriter(tmp_path / "run.mcap", "none")
     writer.write(TRUTH, "presage/r/truth", truth(12345), 1, 1)
     data = bytearray(writer.finish().read_bytes())
@@ -202,7 +149,6 @@ def test_a_damaged_chunk_is_noticed(tmp_path):
     (tmp_path / "bad.mcap").write_bytes(data)
     recording = read_recording(tmp_path / "bad.mcap")
     assert recording.raw == []
-    assert not recording.complete
     assert "damaged" in recording.warning
 
 
@@ -216,7 +162,7 @@ def foreign(path):
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda path: None, "cannot be read"),
         (lambda path: path.mkdir(), "cannot be read"),
@@ -226,46 +172,15 @@ def foreign(path):
     ],
     ids=["missing", "folder", "empty", "picture", "ros2"],
 )
-def test_what_is_no_recording_is_named(tmp_path, make, said):
+def test_other_files(tmp_path, make, message):
     make(tmp_path / "x.mcap")
-    with pytest.raises(UserError, match=said) as told:
+    with pytest.raises(UserError, match=rf"^{tmp_path}/x.mcap.*{message}"):
         read_recording(tmp_path / "x.mcap")
-    assert str(tmp_path / "x.mcap") in str(told.value)
-    assert "\n" not in str(told.value)
 
 
-def test_two_recordings_never_share_a_name(tmp_path):
-    def name(recording):
-        return recording.path.name.rsplit("-r-", 1)[-1][len("20260101-000000") :]
-
-    options = RecorderSettings(directory=tmp_path, robot="r")
-    writers = [open_writer(options) for _ in range(3)]
-    stamp = writers[0].path.stem
-    while writers[-1].path.stem != f"{stamp}-3":  # unless the second turned between two of them
-        stamp = (first := open_writer(options)).path.stem
-        writers += [first, *(open_writer(options) for _ in range(2))]
-    assert [name(w) for w in writers[-3:]] == [".mcap", "-2.mcap", "-3.mcap"]
-    assert len({w.finish() for w in writers}) == len(writers)
-
-
-def test_a_name_asked_for_is_never_another(tmp_path):
-    options = RecorderSettings(directory=tmp_path, file="run")
-    writer = open_writer(options)
-    with pytest.raises(NameTakenError, match=r"run\.mcap\.active: is there already"):
-        open_writer(options)
-    whole = writer.finish().read_bytes()
-    with pytest.raises(NameTakenError, match=r"run\.mcap: is there already"):
-        open_writer(options)
-    assert [path.read_bytes() for path in tmp_path.iterdir()] == [whole]
-
-
-def test_topics_are_chosen_by_name():
-    assert chosen_topics("") == tuple(topic for topic in TOPICS if topic.recorded)
+def test_chosen_topics():
+    recorded = tuple(topic for topic in TOPICS if topic.recorded)
+    assert set(RecorderService.inputs) == set(chosen_topics("")) == set(recorded)
     assert chosen_topics("odom, scan,odom") == (ODOM, SCAN)
     with pytest.raises(UserError, match="no topic skan: choose from scan, odom"):
         chosen_topics("skan")
-
-
-def test_the_recorder_takes_every_row_that_is_marked():
-    assert set(RecorderService.inputs) == {topic for topic in TOPICS if topic.recorded}
-    assert RecorderService.keep_all

@@ -27,12 +27,12 @@ RATES = st.floats(0.01, 100)
 
 def play(player, times, now=0.0):
     """Wall times at which messages are published, without any request."""
-    went = []
+    published = []
     for at in times:
         now += player.wait(at, now)
         player.sent(at, now, whole=True)
-        went.append(now)
-    return went
+        published.append(now)
+    return published
 
 
 def ask(player, action, value=0.0, now=0.0):
@@ -40,20 +40,20 @@ def ask(player, action, value=0.0, now=0.0):
 
 
 @given(TIMES, RATES)
-def test_the_original_distances_divided_by_the_rate(times, rate):
-    went = play(Player(0.0, 100.0, rate), times)
-    assert went == pytest.approx([at / rate for at in times], abs=1e-6)
+def test_rate(times, rate):
+    published = play(Player(0.0, 100.0, rate), times)
+    assert published == pytest.approx([at / rate for at in times], abs=1e-6)
 
 
 @given(TIMES, st.sampled_from([0.0, -1.0, math.inf]))
-def test_no_rate_is_as_fast_as_it_goes(times, rate):
+def test_no_rate(times, rate):
     player = Player(0.0, 100.0, rate)
     assert play(player, times, 5.0) == [5.0] * len(times)
     assert player.position(9.0) == times[-1]
 
 
 @given(times=TIMES, rate=RATES, at=st.floats(0, 100), length=st.floats(0, 1e4))
-def test_a_pause_moves_what_comes_after_it_and_nothing_else(times, rate, at, length):
+def test_pause(times, rate, at, length):
     player = Player(0.0, 100.0, rate)
     now = at / rate
     before = [t for t in times if t <= at]
@@ -67,7 +67,7 @@ def test_a_pause_moves_what_comes_after_it_and_nothing_else(times, rate, at, len
 
 
 @given(rate=RATES, place=st.floats(-50, 150), now=st.floats(0, 1000))
-def test_a_seek_goes_there_or_to_the_nearest_end(rate, place, now):
+def test_seek(rate, place, now):
     player = Player(10.0, 90.0, rate)
     reply = ask(player, "seek", place, now)
     there = min(max(place, 10.0), 90.0)
@@ -80,7 +80,7 @@ def test_a_seek_goes_there_or_to_the_nearest_end(rate, place, now):
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=40), st.integers(1, 5))
-def test_a_step_goes_on_to_the_next_scan_and_stands(scans, steps):
+def test_steps(scans, steps):
     """``scans``: for each message, whether it is a scan."""
     player = Player(0.0, 100.0)
     for _ in range(steps):
@@ -98,7 +98,7 @@ def test_a_step_goes_on_to_the_next_scan_and_stands(scans, steps):
 
 
 @given(first=RATES, then=RATES, when=st.floats(0, 10))
-def test_another_rate_holds_from_now_on(first, then, when):
+def test_changed_rate(first, then, when):
     player = Player(0.0, 1e6, first)
     here = player.position(when)
     assert ask(player, "rate", then, when).position_s == pytest.approx(here)
@@ -107,7 +107,7 @@ def test_another_rate_holds_from_now_on(first, then, when):
     assert player.rate == then
 
 
-def test_who_was_held_up_goes_on_from_there_and_does_not_hurry():
+def test_long_delay():
     player = Player(0.0, 100.0, 2.0)
     assert play(player, [0.0, 2.0]) == [0.0, 1.0]
     late = 1.0 + MAX_LAG_S * 50
@@ -116,13 +116,13 @@ def test_who_was_held_up_goes_on_from_there_and_does_not_hurry():
     assert player.wait(6.0, late) == pytest.approx(1.0)
 
 
-def test_a_little_late_is_caught_up():
+def test_short_delay():
     player = Player(0.0, 100.0)
     player.sent(4.0, 4.0 + MAX_LAG_S / 2, whole=True)
     assert player.wait(5.0, 4.0 + MAX_LAG_S / 2) == pytest.approx(1.0 - MAX_LAG_S / 2)
 
 
-def test_a_loop_begins_anew_a_moment_later():
+def test_loop():
     player = Player(3.0, 8.0, loop=True)
     player.restart(50.0)
     assert player.take_seek_target() == 3.0
@@ -131,7 +131,7 @@ def test_a_loop_begins_anew_a_moment_later():
     assert player.state(50.0).loop
 
 
-def test_a_span_is_of_the_recording():
+def test_span():
     assert span(20.0, None, None) == (0.0, 20.0)
     assert span(20.0, 5.0, -5.0) == (5.0, 15.0)
     assert span(20.0, 5.0, 99.0) == (5.0, 20.0)
@@ -144,37 +144,39 @@ def test_a_span_is_of_the_recording():
 KEYS = {topic.key("r", "estimator"): topic for topic in TOPICS}
 
 
-def test_topics_are_selected_by_name_and_health_only_when_asked_for():
+def test_selected_topics():
     there = {key: KEYS[key] for key in KEYS if KEYS[key] in (SCAN, ODOM, HEALTH)}
     assert set(select_topics(there, None).values()) == {SCAN, ODOM}
     assert set(select_topics(there, {"odom", "health"}).values()) == {ODOM, HEALTH}
-    assert set(select_topics(there, None, {"odom", "belief"}).values()) == {SCAN}  # belief is none to begin with
+    assert set(select_topics(there, None, {"odom", "belief"}).values()) == {SCAN}
     with pytest.raises(UserError, match="no belief; it has health, odom, scan"):
         select_topics(there, {"belief", "scan"})
     with pytest.raises(UserError, match="no topic smell: choose from belief"):
         select_topics(there, None, {"smell"})
 
 
-def test_a_key_gets_another_robot():
+def test_key_for_robot():
     assert key_for_robot("presage/robot/health/estimator", "ghost") == "presage/ghost/health/estimator"
     assert key_for_robot("presage/robot/scan", "") == "presage/robot/scan"
 
 
-def test_beside_whom_keys_are_not_published():
+def test_conflicts():
     assert find_conflicts(KEYS, {"r": set()}) == ""
     assert find_conflicts(KEYS, {"other": {"estimator", "simulator"}}) == ""
     assert find_conflicts(KEYS, {"r": {"recorder", "viewer"}}) == ""
-    why = find_conflicts({key: KEYS[key] for key in KEYS if KEYS[key] is not HEALTH}, {"r": {"estimator", "recorder"}})
-    assert "the estimator of 'r' is alive and publishes presage/r/belief, presage/r/prediction" in why
-    assert "--except belief,prediction" in why
-    assert "--force" in why
+    conflict = find_conflicts(
+        {key: KEYS[key] for key in KEYS if KEYS[key] is not HEALTH}, {"r": {"estimator", "recorder"}}
+    )
+    assert "the estimator of 'r' is alive and publishes presage/r/belief, presage/r/prediction" in conflict
+    assert "--except belief,prediction" in conflict
+    assert "--force" in conflict
     assert "presage/r/health/estimator" in find_conflicts(KEYS, {"r": {"estimator"}})
     assert find_conflicts({SCAN.key("r"): SCAN}, {"r": {"estimator"}}) == ""
     assert "simulator" in find_conflicts({SCAN.key("r"): SCAN}, {"r": {"simulator"}})
     assert "the replay of 'r'" in find_conflicts({BELIEF.key("r"): BELIEF}, {"r": {"replay"}})
 
 
-def test_commands_do_not_drive_a_live_simulator_and_goals_belong_to_nobody():
+def test_conflicts_of_commands_and_goals():
     assert "would drive the live simulator" in find_conflicts({CMD_VEL.key("r"): CMD_VEL}, {"r": {"simulator"}})
     assert find_conflicts({CMD_VEL.key("r"): CMD_VEL}, {"r": {"estimator"}}) == ""
     assert find_conflicts({GOAL.key("r"): GOAL}, {"r": {"simulator", "controller", "viewer"}}) == ""

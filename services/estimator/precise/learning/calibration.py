@@ -95,27 +95,27 @@ class Drive:
         )
 
 
-def calibrate(model: GenerativeModel, held: Drive, motion: MotionNoise, sigma: float) -> Calibration:
+def calibrate(model: GenerativeModel, held_out: Drive, motion: MotionNoise, sigma: float) -> Calibration:
     """Calibrates on scans from which ``model`` has not learned; ``sigma`` m is the scanner's noise."""
-    lasers = se2.compose(held.poses, held.mount)
-    expected = model.expect(lasers, held.angles)
-    likelihood = learn_shares(held.ranges, expected, held.range_max, Likelihood(sigma))
+    lasers = se2.compose(held_out.poses, held_out.mount)
+    expected = model.expect(lasers, held_out.angles)
+    likelihood = learn_shares(held_out.ranges, expected, held_out.range_max, Likelihood(sigma))
     inlier_ratios, accuracies, late, beams = [], [], [], []
-    for k, scan in enumerate(held.ranges):
-        view = View(model, likelihood, held.mount, held.angles, scan, held.range_max)
+    for k, scan in enumerate(held_out.ranges):
+        view = View(model, likelihood, held_out.mount, held_out.angles, scan, held_out.range_max)
         one = expected.part(slice(k, k + 1))
-        evidence = likelihood.evaluate(scan, held.range_max, one)
+        evidence = likelihood.evaluate(scan, held_out.range_max, one)
         inlier_ratios.append(float(evidence.inlier_ratio[0]))
         accuracies.append(float(evidence.accuracy[0]))
         late.append(obstruction.contradicting_ratio(view, one))
-        beams.append(_energy_of_beams(likelihood, scan, held.range_max, one))
+        beams.append(_energy_of_beams(likelihood, scan, held_out.range_max, one))
     each = np.concatenate(beams)
     count = float(np.mean([len(b) for b in beams]))
-    floor, inflation, nees = _pose_precision(model, likelihood, held)
+    floor, inflation, nees = _pose_precision(model, likelihood, held_out)
     return Calibration(
         likelihood=likelihood,
         motion=motion,
-        scans=len(held.ranges),
+        scans=len(held_out.ranges),
         usual=float(np.median(inlier_ratios)),
         unusual=float(np.quantile(inlier_ratios, 0.05)),
         late=float(np.quantile(late, 0.9)),
@@ -127,7 +127,7 @@ def calibrate(model: GenerativeModel, held: Drive, motion: MotionNoise, sigma: f
         log_likelihood=-float(each.mean()),
         nees_median=float(np.median(nees)),
         nees_mean=float(np.mean(nees)),
-        coverage=_coverage(likelihood, held.ranges, expected, held.range_max),
+        coverage=_coverage(likelihood, held_out.ranges, expected, held_out.range_max),
     )
 
 
@@ -146,7 +146,7 @@ def _energy_of_beams(likelihood: Likelihood, scan: Array, range_max: float, expe
 
 
 def _pose_precision(
-    model: GenerativeModel, likelihood: Likelihood, held: Drive
+    model: GenerativeModel, likelihood: Likelihood, held_out: Drive
 ) -> tuple[tuple[float, float], float, Array]:
     """Returns the floors of position (m) and heading (rad), the inflation, and the NEES (N,) with both.
 
@@ -154,8 +154,8 @@ def _pose_precision(
     one with which the median of the squared errors is right, so that a few poor reference poses do not decide.
     """
     errors, covariances = [], []
-    for pose, scan in zip(held.poses, held.ranges, strict=True):
-        view = View(model, likelihood, held.mount, held.angles, scan, held.range_max)
+    for pose, scan in zip(held_out.poses, held_out.ranges, strict=True):
+        view = View(model, likelihood, held_out.mount, held_out.angles, scan, held_out.range_max)
         found, evidence = polish(view, pose[None])
         error = difference(found, pose[None])[0]
         if np.hypot(error[0], error[1]) < MAX_POSITION_ERROR_M:

@@ -53,29 +53,29 @@ def learn_drive(drive: Drive, recipe: Recipe, simulated: Beams | None, report: R
     """
     sigma = estimate_noise(drive.ranges, drive.angles)
     numbers = np.arange(len(drive.ranges))
-    held_out = numbers % HELD_OUT_EVERY == HELD_OUT_EVERY // 2
-    held = drive.part(numbers[held_out])
+    is_held_out = numbers % HELD_OUT_EVERY == HELD_OUT_EVERY // 2
+    held_out = drive.part(numbers[is_held_out])
     report("first field, without the held-out scans", 0.0)
     trial = _learn_model(
-        drive.part(numbers[~held_out]),
+        drive.part(numbers[~is_held_out]),
         recipe,
         simulated,
         lambda done: report("first field, without the held-out scans", 0.4 * done),
     )
-    lasers = se2.compose(held.poses, held.mount)
-    scales = learn_scales(trial.field, held.poses, held.mount, held.angles, held.ranges, sigma)
-    trial = replace(trial, scales=scales, ripple=learn_ripple(trial.field, lasers, held.angles))
+    lasers = se2.compose(held_out.poses, held_out.mount)
+    scales = learn_scales(trial.field, held_out.poses, held_out.mount, held_out.angles, held_out.ranges, sigma)
+    trial = replace(trial, scales=scales, ripple=learn_ripple(trial.field, lasers, held_out.angles))
     report("calibration", 0.45)
     motion = learn_motion(drive.stamps, drive.poses, drive.odom)
-    calibration = calibrate(trial, held, motion, sigma)
-    expected = trial.expect(lasers, held.angles)
-    both = np.isfinite(held.ranges) & np.isfinite(expected.ranges) & np.isfinite(expected.scale)
+    calibration = calibrate(trial, held_out, motion, sigma)
+    expected = trial.expect(lasers, held_out.angles)
+    both = np.isfinite(held_out.ranges) & np.isfinite(expected.ranges) & np.isfinite(expected.scale)
     final = _learn_model(drive, recipe, simulated, lambda done: report("final field", 0.55 + 0.4 * done))
     final = replace(final, scales=scales, ripple=trial.ripple)
     visited = se2.compose(drive.poses, drive.mount)[:, :2]
     places = thin_places(np.concatenate([visited, reachable(final.field, visited, seen=final.seen)]), SEED_SPACING_M)
     report("learned", 1.0)
-    return Learned(final, places, calibration, np.abs(held.ranges[both] - expected.ranges[both]))
+    return Learned(final, places, calibration, np.abs(held_out.ranges[both] - expected.ranges[both]))
 
 
 def _learn_model(drive: Drive, recipe: Recipe, simulated: Beams | None, report: Callable[[float], None]) -> FieldModel:

@@ -13,9 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from common.geometry.se2 import Array, compose, wrap
 from services.estimator.precise.field import CLASSES, SEEN_CELL_M, DistanceField, Floats, Seen
+from services.estimator.precise.learning.beam_cells import mark_seen_cells
 from services.estimator.precise.learning.surfaces import (
     MIN_POINTS_PER_CELL,
     MIN_PRESENT_SHARE,
@@ -24,7 +26,6 @@ from services.estimator.precise.learning.surfaces import (
     field_of_surfaces,
     has_neighbours,
 )
-from services.estimator.shared import kernels
 from services.estimator.shared.generative_models import CORNER_ANGLE_RAD
 
 CARVED_DISTANCE_CELLS = 0.5  # phi of a node through which beams pass is at least so much
@@ -71,7 +72,7 @@ def seen_cells(beams: Beams) -> Seen:
     low = np.minimum(ends.min(0), beams.starts.min(0)) - SEEN_CELL_M
     shape = np.ceil((np.maximum(ends.max(0), beams.starts.max(0)) - low) / SEEN_CELL_M).astype(int)[::-1] + 1
     cells = np.zeros(shape, np.bool_)
-    kernels.mark_seen_cells(beams.starts - low, beams.unit(), beams.ranges, SEEN_CELL_M, cells)
+    mark_seen_cells(beams.starts - low, beams.unit(), beams.ranges, SEEN_CELL_M, cells)
     return Seen(cells, (float(low[0]), float(low[1])))
 
 
@@ -82,22 +83,10 @@ def reachable(field: DistanceField, visited: Array, clearance: float = 0.1, seen
     """
     free = field.phi > clearance
     if seen is not None:
-        free &= seen.at(field)
-    grown = np.zeros_like(free)
-    node = np.round((visited - field.origin) / field.resolution).astype(int)
-    grown[node[:, 1], node[:, 0]] = True
-    grown &= free
-    while True:
-        wider = grown.copy()
-        wider[1:] |= grown[:-1]
-        wider[:-1] |= grown[1:]
-        wider[:, 1:] |= grown[:, :-1]
-        wider[:, :-1] |= grown[:, 1:]
-        wider &= free
-        if (wider == grown).all():
-            break
-        grown = wider
-    i, j = np.nonzero(grown)
+        free &= seen.nodes_of(field)
+    region, _ = ndimage.label(free)
+    column, row = np.round((visited - field.origin) / field.resolution).astype(int).T
+    i, j = np.nonzero(free & np.isin(region, region[row, column]))
     return np.asarray(np.array(field.origin) + field.resolution * np.column_stack([j, i]))
 
 

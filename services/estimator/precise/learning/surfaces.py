@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import shapely
+from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from common.geometry.se2 import Array, compose
 from services.estimator.precise.field import DistanceField, Floats
-from services.estimator.shared import kernels
+from services.estimator.precise.learning.beam_cells import count_crossings
 
 POOL_CELLS = 1  # cells to each side whose points are pooled to find a normal
 ELEMENT_RADIUS_CELLS = 2.0  # around a surface element, within which it shapes the field
@@ -74,11 +75,7 @@ def field_of_surfaces(beams: Beams, h: float) -> DistanceField:
 
     def pooled(values: Array | None) -> Array:
         grid = np.bincount(index, values, int(shape.prod())).reshape(shape)
-        padded = np.pad(grid, POOL_CELLS)
-        side = 2 * POOL_CELLS + 1
-        return sum(  # type: ignore[return-value]
-            padded[i : i + shape[0], j : j + shape[1]] for i in range(side) for j in range(side)
-        )
+        return np.asarray(ndimage.correlate(grid, np.ones((2 * POOL_CELLS + 1,) * 2), mode="constant"))
 
     own = np.bincount(index, minlength=int(shape.prod())).reshape(shape)
     local = ends - low  # smaller numbers, so that sums of squares lose less precision
@@ -93,7 +90,7 @@ def field_of_surfaces(beams: Beams, h: float) -> DistanceField:
     flip = np.where(nx * dx + ny * dy > 0, -1.0, 1.0)  # against the beams, that is, towards free space
     nx, ny = nx * flip, ny * flip
     crossed = np.zeros(own.shape)
-    kernels.count_crossings(beams.starts - low, unit, beams.ranges, h, surface, mx, my, nx, ny, PASSED_DEPTH_M, crossed)
+    count_crossings(beams.starts - low, unit, beams.ranges, h, surface, mx, my, nx, ny, PASSED_DEPTH_M, crossed)
     surface &= own >= MIN_PRESENT_SHARE * (own + crossed)
     return DistanceField(_distances(surface, mx, my, nx, ny, own, h), (float(low[0]), float(low[1])), h)
 
@@ -116,9 +113,7 @@ def _distances(surface: np.ndarray, mx: Array, my: Array, nx: Array, ny: Array, 
             np.add.at(total, (i[inside], j[inside]), (w * (ax * vx + ay * vy))[inside])
             np.add.at(weight, (i[inside], j[inside]), w[inside])
     near = weight > 0
-    tree = shapely.STRtree([shapely.Point(x, y) for x, y in zip(ex, ey, strict=True)])
-    ii, jj = np.nonzero(~near)
-    nearest = tree.nearest(shapely.points(np.stack([jj * h, ii * h], -1)))
     phi = np.divide(total, weight, out=np.zeros_like(total), where=near)
-    phi[~near] = np.hypot(jj * h - ex[nearest], ii * h - ey[nearest])
+    nodes = np.argwhere(~near)[:, ::-1] * h
+    phi[~near], _ = cKDTree(np.column_stack([ex, ey])).query(nodes)
     return phi.astype(np.float32)

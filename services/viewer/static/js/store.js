@@ -2,7 +2,6 @@
 
 export const WINDOW = 60; // s of history
 const SERIES = ["free_energy", "accuracy", "complexity", "error", "speed"];
-const PULSELESS = 4; // s without a pulse, of which there is one a second
 const JUMP = 0.4; // m between two frames: carried off, no path between them
 
 const nan = (value) => (value === null || value === undefined ? NaN : value);
@@ -40,9 +39,9 @@ export class Store {
     return Boolean(this.hello?.control);
   }
 
-  /** Services that are connected and show no sign of life. */
+  /** Services that are connected but send no health messages. */
   get stuck() {
-    return this.services.filter((one) => one.alive && one.age_s > PULSELESS);
+    return this.services.filter((one) => one.state === "late");
   }
 
   /** The goal prior, where it is about the goal there is. */

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from services.estimator.precise.estimator import PreciseEstimator
+from services.estimator.precise.field import FieldModel
 from services.estimator.precise.gauss_newton import View
 from services.estimator.precise.global_seeds import Seeds
 from services.estimator.precise.learning.calibration import estimate_noise, learn_motion, learn_shares
@@ -14,6 +15,7 @@ from services.estimator.precise.learning.field_learning import Recipe, learn_fie
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.shared.generative_models import Expected
+from services.estimator.shared.interface import Observation
 from tests.lab.real_logs import drives as real_drive
 from tests.lab.real_logs.drives import ANGLES, BEFORE, LONG, NONE, POSED, RANGE_MAX, SHORT, SIGMA, disturbed
 
@@ -31,7 +33,7 @@ def learned(drive):
     return learn_drive(drive.part(np.arange(SCANS // 2)), RECIPE, None, lambda *_: None)
 
 
-def test_expectation_maximisation_recovers_the_shares():
+def test_outlier_shares():
     rng = np.random.default_rng(3)
     surface = rng.uniform(2, 8, (200, 121))
     expected = Expected(surface, np.full(surface.shape, 1e-3), np.zeros((*surface.shape, 3)))
@@ -42,7 +44,7 @@ def test_expectation_maximisation_recovers_the_shares():
     assert found.unseen == pytest.approx(NONE, abs=0.002)
 
 
-def test_the_noise_is_told_from_scans_alone():
+def test_noise():
     rng = np.random.default_rng(1)
     clean = BEFORE.ray_distances(np.array([[3.0, 3.0, yaw] for yaw in np.linspace(0, 6, 40)]), ANGLES)
     blocked = np.where(np.abs(ANGLES - 0.3) < 0.1, 0.7, clean)
@@ -52,7 +54,7 @@ def test_the_noise_is_told_from_scans_alone():
         assert found == pytest.approx(sigma, rel=0.25)
 
 
-def test_motion_is_learned_from_the_drive(drive):
+def test_motion(drive):
     found = learn_motion(drive.stamps, drive.poses, drive.odom)
     assert found.period == pytest.approx(0.25)
     assert 0.3 < found.speed < 0.8  # m/s; the robot drives at 0.4 to 0.5 m/s
@@ -60,7 +62,7 @@ def test_motion_is_learned_from_the_drive(drive):
     assert without.path_by_path != found.path_by_path
 
 
-def test_what_beams_go_through_is_no_surface():
+def test_transient_object():
     """A person seen in a tenth of the scans leaves no surface in the field."""
     poses = np.array([[3.0, 3.0, yaw] for yaw in np.linspace(-np.pi, np.pi, 100)])
     ranges = BEFORE.ray_distances(poses, ANGLES)
@@ -72,7 +74,7 @@ def test_what_beams_go_through_is_no_surface():
     assert (error > 0.3).mean() < 0.02
 
 
-def test_nothing_is_expected_where_nobody_looked():
+def test_unseen_cells():
     """The range of a beam into cells that were never seen is neither evidence for a pose nor against it."""
     poses = np.array([[2.0, 4.0, yaw] for yaw in np.linspace(2.8, 3.5, 100)])  # never facing right
     ranges = BEFORE.ray_distances(poses, ANGLES)
@@ -80,8 +82,6 @@ def test_nothing_is_expected_where_nobody_looked():
     seen = seen_cells(beams)
     assert seen.contains(np.array([[1.0, 4.0]]))[0]
     assert not seen.contains(np.array([[8.5, 1.0], [50.0, 0.0]])).any()
-    from services.estimator.precise.field import FieldModel  # noqa: PLC0415
-
     model = FieldModel(learn_field(beams, RECIPE), seen=seen)
     right = np.array([[2.0, 4.0, 0.0]])
     expected = model.expect(right, np.zeros(1))
@@ -92,7 +92,7 @@ def test_nothing_is_expected_where_nobody_looked():
     assert near == pytest.approx(far)
 
 
-def test_the_stated_precision_is_honest(learned):
+def test_covariance(learned):
     """NEES of poses found in held-out scans, with floors of the size of the references' error, 2 cm."""
     found = learned.calibration
     assert found.scans == 16
@@ -104,7 +104,7 @@ def test_the_stated_precision_is_honest(learned):
     assert all(abs(observed - stated) < 0.12 for stated, observed in found.coverage)
 
 
-def test_it_localises_the_second_half_among_moved_furniture(drive, learned):
+def test_second_half_of_the_drive(drive, learned):
     """With and without odometry from a known pose, and from an unknown pose."""
     settings = learned.calibration.settings()
     made = PreciseEstimator(
@@ -126,7 +126,5 @@ def test_it_localises_the_second_half_among_moved_furniture(drive, learned):
 
 
 def observation(drive, k, *, odometry):
-    from services.estimator.shared.interface import Observation  # noqa: PLC0415
-
     odom = drive.odom[k] if odometry else None
     return Observation(drive.ranges[k], ANGLES, RANGE_MAX, float(drive.stamps[k]), odom)

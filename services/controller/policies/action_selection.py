@@ -1,4 +1,4 @@
-"""Chooses a velocity by expected free energy."""
+"""Selects the velocity of least expected free energy."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def least_distance(positions: Array, points: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class VelocityChoice:
+class SelectedAction:
     """The best candidate action."""
 
     action: Array  # (3,) m/s, m/s, rad/s in base_link
@@ -103,8 +103,8 @@ class VelocityChoice:
     hindered: bool  # an obstacle, or one that may approach, ruled out a better action
 
 
-def choose(current: Array, attractor: Array, around: Surroundings, robot: Robot) -> VelocityChoice:
-    """Choose the candidate action of least expected free energy.
+def select_action(current: Array, attractor: Array, surroundings: Surroundings, robot: Robot) -> SelectedAction:
+    """The candidate action of least expected free energy.
 
     ``current`` (3,) is the present velocity and ``attractor`` (2,) m the target, both in base_link.
 
@@ -113,10 +113,10 @@ def choose(current: Array, attractor: Array, around: Surroundings, robot: Robot)
     choice. An action is excluded if its motion is not free, or may not stay free until the robot stands.
     """
     actions = motion.candidate_actions(current, attractor, robot)
-    actions = _visible_actions(actions, around)
+    actions = _visible_actions(actions, surroundings)
     poses, times, standing_after = motion.rollouts(current, actions, robot)
-    gaps = around.gaps(poses, times, standing_after, COMFORT_GAP_M)
-    present_gap = float(around.gaps(np.zeros((1, 1, 3)), np.zeros(1), max_gap=COMFORT_GAP_M)[0, 0])
+    gaps = surroundings.gaps(poses, times, standing_after, COMFORT_GAP_M)
+    present_gap = float(surroundings.gaps(np.zeros((1, 1, 3)), np.zeros(1), max_gap=COMFORT_GAP_M)[0, 0])
     # If the robot is too close to something already, every motion that leads away from it counts as free.
     free = np.all(gaps >= min(0.0, present_gap) - 1e-3, axis=1)
     progress = to_go(poses[0, -1], attractor, robot) - to_go(poses[:, -1], attractor, robot)
@@ -131,7 +131,7 @@ def choose(current: Array, attractor: Array, around: Surroundings, robot: Robot)
         best = 0
     unhindered = int(np.argmax(np.where(np.isfinite(value), value, -np.inf)))
     hindered = bool(value[unhindered] > allowed_value[best] + 0.05)
-    return VelocityChoice(actions[best], poses[best], float(progress[best]), hindered=hindered)
+    return SelectedAction(actions[best], poses[best], float(progress[best]), hindered=hindered)
 
 
 def to_go(poses: Array, attractor: Array, robot: Robot) -> Array:
@@ -147,12 +147,12 @@ def to_go(poses: Array, attractor: Array, robot: Robot) -> Array:
     return np.asarray(distance + turn * robot.max_speed / robot.max_turn * np.minimum(1.0, distance / HEADING_FADE_M))
 
 
-def _visible_actions(actions: Array, around: Surroundings) -> Array:
+def _visible_actions(actions: Array, surroundings: Surroundings) -> Array:
     """Removes actions (N, 3) into directions that the scanner does not see, or slows them if the base may not turn."""
     speed = np.hypot(actions[:, 0], actions[:, 1])
-    too_fast = speed > BLIND_SPEED if not around.may_turn else speed > motion.STANDING_SPEED
-    blind = ~around.sees(np.arctan2(actions[:, 1], actions[:, 0])) & too_fast
-    if around.may_turn:
+    too_fast = speed > BLIND_SPEED if not surroundings.may_turn else speed > motion.STANDING_SPEED
+    blind = ~surroundings.sees(np.arctan2(actions[:, 1], actions[:, 0])) & too_fast
+    if surroundings.may_turn:
         return actions[~blind]
     scale = np.where(blind, BLIND_SPEED / np.maximum(speed, 1e-9), 1.0)
     return np.column_stack([actions[:, :2] * scale[:, None], actions[:, 2]])

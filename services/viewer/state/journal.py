@@ -1,4 +1,4 @@
-"""Recent controller statuses."""
+"""Journal of the controller: its recent changes of state, with the reasons."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ACCELERATION, TURN_ACCELERATION = 2.0, 12.0  # m/s² and rad/s²; more than robo
 NUMBERS = re.compile(r"[-+\d.,()]+")
 
 
-class StatusLog:
+class Journal:
     """Has one row for each change of state or reason.
 
     A reason that ends, or that only differs in its numbers, makes no new row.

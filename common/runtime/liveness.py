@@ -1,0 +1,226 @@
+"""Which services of a robot are alive, since when, and what is wrong with them.
+
+`presage top`, `presage doctor`, the page and the health checks of containers all use this model and only show its
+results. It imports only the standard library, so that a health check starts in 20 ms. Times are s of a monotonic clock.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from common.messages.definitions import Health
+
+REQUIRED_SERVICES = ("simulator", "estimator", "controller")  # without which a robot does not navigate
+OPTIONAL_SERVICES = ("recorder", "viewer")
+REPLAY = "replay"  # publishes the messages of all other services, and no health messages
+SUBSTITUTES = {"simulator": "bridge_ros2"}  # a ROS robot takes the place of the simulator
+
+REPORT_TIMEOUT_S = 2.5  # without a report (health message or heartbeat), which comes once a second, a service is late
+INPUT_TIMEOUT_S = 2.0  # inputs newer than this count as arriving
+RESULT_TIMEOUT_S = 5.0  # without a result while inputs arrive, a service is faulty
+FORGET_AFTER_S = 30.0  # a service that ended longer ago is no longer listed
+MAX_SERVICES = 50  # limits the memory if a program publishes health messages with made-up names
+
+# The input (or None) and the result of each service: topic (or * for any), and kind of count.
+RESULTS = {
+    "simulator": (None, ("scan", "published")),
+    "bridge_ros2": (None, ("scan", "published")),
+    "replay": (None, ("scan", "published")),
+    "remote": (None, ("scan", "received")),
+    "estimator": (("scan", "received"), ("belief", "published")),
+    "controller": (("belief", "received"), ("status", "published")),
+    "recorder": (("*", "received"), ("*", "written")),
+}
+COUNT_KINDS = ("received", "published", "written")
+
+State = Literal["alive", "late", "absent"]
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a service last reported about itself, in a health message or a heartbeat file."""
+
+    time: float  # when it was made
+    linked: bool = True  # connected to at least one other session
+    note: str = ""
+    idle: bool = False  # publishes no results on purpose
+    last: dict[str, dict[str, float]] = field(default_factory=dict)  # by key and kind: when the count last increased
+
+
+@dataclass(frozen=True)
+class ServiceLiveness:
+    """The state of one service. A late service is connected but does not report."""
+
+    name: str
+    state: State
+    problem: str = ""  # empty if the service needs no attention
+    since: float | None = None  # time at which the state began; None if the service was not seen
+    health: Health | None = None  # its last health message
+    age: float | None = None  # s since its last health message
+
+    @property
+    def reported(self) -> bool:
+        """Whether a health message has come, or none is expected."""
+        return self.health is not None or self.name == REPLAY
+
+    @property
+    def text(self) -> str:
+        """The problem and the service's own note, in one line."""
+        note = self.health.note if self.health is not None else ""
+        return f"{self.problem} ({note})" if self.problem and note else self.problem or note
+
+
+def find_problem(service: str, robot: str, report: Report, now: float, never: float = -math.inf) -> str:
+    """What is wrong with a connected service by its last report; empty if nothing is.
+
+    ``never`` is the time from which the age of a result is counted that was not seen yet.
+    """
+    if (age := now - report.time) > REPORT_TIMEOUT_S:
+        return f"no sign of life for {age:.0f} s: it is stopped, hangs, or gets no processor time"
+    if not report.linked:
+        return "not connected to any session; is the router running?"
+    if service not in RESULTS or report.idle:
+        return ""
+    needed, (topic, kind) = RESULTS[service]
+    if needed is not None and now - _last_time(report, robot, *needed) > INPUT_TIMEOUT_S:
+        return ""
+    age = now - max(never, _last_time(report, robot, topic, kind))
+    if age <= RESULT_TIMEOUT_S:
+        return ""
+    how_long = f"for {age:.0f} s" if math.isfinite(age) else "so far"
+    return f"no {'message' if topic == '*' else topic} was {kind} {how_long}"
+
+
+def _last_time(report: Report, robot: str, topic: str, kind: str) -> float:
+    """Time at which the count of a topic last increased."""
+    stem = f"presage/{robot}/"
+    rows = [row for key, row in report.last.items() if key.startswith(stem) and topic in ("*", key.removeprefix(stem))]
+    return max((row[kind] for row in rows if kind in row), default=-math.inf)
+
+
+def start_command(service: str, robot: str, connect: str = "") -> str:
+    """The shell command that starts a service. ``connect``: endpoints, or empty for the default."""
+    if service == "router":
+        return "python -m common.router"
+    options = [f"--robot {robot}"] * (robot != "robot") + [f"--connect {connect}"] * bool(connect)
+    return " ".join([f"python -m services.{service}", *options])
+
+
+class CountTimes:
+    """Remembers when each count of a service last increased."""
+
+    def __init__(self) -> None:
+        self.last: dict[str, dict[str, float]] = {}  # by key and kind
+        self._counts: dict[tuple[str, str], int] = {}
+
+    def update(self, counts: Mapping[str, Mapping[str, int]], now: float) -> None:
+        """Takes the totals so far, by key and kind."""
+        for key, row in counts.items():
+            for kind in COUNT_KINDS:
+                count = row.get(kind, 0)
+                if count > self._counts.get((key, kind), 0):
+                    self.last.setdefault(key, {})[kind] = now
+                self._counts[key, kind] = count
+
+
+def counts_of(health: Health) -> dict[str, dict[str, int]]:
+    """The totals of a health message, by key and kind."""
+    return {row.key: {kind: getattr(row, kind) for kind in COUNT_KINDS} for row in health.topics}
+
+
+@dataclass
+class _Service:
+    """What is known about one run of a service."""
+
+    began: float  # first sign of life
+    report: Report  # a first one without contents, until a health message comes
+    token_at: float = -math.inf  # when its liveliness token was last seen
+    has_token: bool = False
+    health: Health | None = None
+    times: CountTimes = field(default_factory=CountTimes)
+
+    def present(self, now: float) -> bool:
+        """Whether it is connected. A recent report is enough: tokens disappear while a link is re-established."""
+        return self.has_token or now - self.report.time <= REPORT_TIMEOUT_S
+
+
+class RobotLiveness:
+    """The services of one robot, from their liveliness tokens and health messages."""
+
+    def __init__(self, robot: str) -> None:
+        self.robot = robot
+        self._services: dict[str, _Service] = {}
+        self._scan_at = -math.inf
+
+    def set_alive(self, names: Collection[str], now: float) -> None:
+        """Takes the names of all services that have a liveliness token; to be called about once a second."""
+        for name in names:
+            if (service := self._service(name, now)) is not None:
+                service.has_token, service.token_at = True, now
+        for name, service in list(self._services.items()):
+            service.has_token = name in names
+            if not service.has_token and now - max(service.token_at, service.report.time) > FORGET_AFTER_S:
+                del self._services[name]
+
+    def add_health(self, health: Health, now: float) -> None:
+        """Takes a health message."""
+        service = self._service(health.service, now)
+        if service is not None and service.health is not None and health.uptime < service.health.uptime:
+            self._services.pop(health.service)  # the service was restarted
+            service = self._service(health.service, now)
+        if service is None:
+            return
+        service.times.update(counts_of(health), now)
+        service.health = health
+        service.report = Report(now, note=health.note, idle=health.idle, last=service.times.last)
+
+    def add_scan(self, now: float) -> None:
+        """Takes the arrival of a scan: while scans arrive, as from a robot's own driver, no simulator is needed."""
+        self._scan_at = now
+
+    def services(self, now: float) -> list[ServiceLiveness]:
+        """First the services that a session usually has, present or not, then the others by name."""
+        usual = [*REQUIRED_SERVICES, *OPTIONAL_SERVICES]
+        return [self._state(name, now) for name in (*usual, *sorted(self._services.keys() - set(usual)))]
+
+    def missing(self, now: float) -> list[str]:
+        """Absent services that the robot needs to navigate."""
+        return [name for name in REQUIRED_SERVICES if not self.present(name, now) and self._is_needed(name, now)]
+
+    def present(self, name: str, now: float) -> bool:
+        """Whether a service is alive or late."""
+        return name in self._services and self._services[name].present(now)
+
+    def _service(self, name: str, now: float) -> _Service | None:
+        """The record of a service that shows a sign of life; None if there are too many services."""
+        usual = name in REQUIRED_SERVICES or name in OPTIONAL_SERVICES
+        if name not in self._services and len(self._services) >= MAX_SERVICES and not usual:
+            return None
+        if not self.present(name, now):
+            self._services[name] = _Service(now, Report(now))
+        return self._services[name]
+
+    def _is_needed(self, name: str, now: float) -> bool:
+        """Whether the robot needs the service and nothing takes its place."""
+        replaced = self.present(REPLAY, now) or (name in SUBSTITUTES and self.present(SUBSTITUTES[name], now))
+        has_scans = name == "simulator" and now - self._scan_at <= INPUT_TIMEOUT_S
+        return name in REQUIRED_SERVICES and not replaced and not has_scans
+
+    def _state(self, name: str, now: float) -> ServiceLiveness:
+        service = self._services.get(name)
+        if service is None:
+            return ServiceLiveness(name, "absent", "not running" if self._is_needed(name, now) else "")
+        # The token of a replay is all that is known about it.
+        health, report = service.health, Report(now, idle=True) if name == REPLAY else service.report
+        age = now - report.time if health is not None else None
+        if not service.present(now):
+            since = max(service.token_at, service.report.time)
+            return ServiceLiveness(name, "absent", f"gone for {now - since:.0f} s", since, health, age)
+        problem = find_problem(name, self.robot, report, now, never=service.began)
+        if now - report.time > REPORT_TIMEOUT_S:
+            return ServiceLiveness(name, "late", problem, report.time + REPORT_TIMEOUT_S, health, age)
+        return ServiceLiveness(name, "alive", problem, service.began, health, age)

@@ -1,0 +1,123 @@
+"""`presage topics`, `hz`, `echo`, `top` and `doctor`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from common.bus.bus import Link
+from presage.session.running import OBSERVER, find_session, link_of
+from presage.terminal.options import Connect, Json, RobotName, WorldName, console
+
+app = typer.Typer()
+
+
+@app.command(rich_help_panel="Diagnose", short_help="Print the table of topics and queryables.")
+def topics() -> None:
+    """Print the table of topics and queryables.
+
+    Example: `presage topics`.
+    """
+    from presage.live.commands import list_topics  # noqa: PLC0415
+
+    list_topics("ROBOT", console)
+
+
+@app.command(rich_help_panel="Diagnose", short_help="Measure message rates on the bus.")
+def hz(
+    topic: Annotated[str | None, typer.Argument(help="Topic to measure. Defaults to all topics.")] = None,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Duration of the measurement, s.")] = 3.0,
+    robot: RobotName = "",
+    connect: Connect = "",
+) -> None:
+    """Measure the message rates on the bus.
+
+    Examples: `presage hz`; `presage hz scan --seconds 10`.
+    """
+    from presage.live.commands import show_rates  # noqa: PLC0415
+
+    raise typer.Exit(show_rates(link_of(connect, robot, OBSERVER), topic, seconds, console))
+
+
+@app.command(rich_help_panel="Diagnose", short_help="Health of every service, until Ctrl-C.")
+def top(
+    robot: Annotated[
+        list[str] | None,
+        typer.Option(envvar="PRESAGE_ROBOT", help="Robot name; may be repeated. Defaults to the session's robots."),
+    ] = None,
+    once: Annotated[
+        bool, typer.Option("--once", help="Print one table and exit, with status 1 if a service is missing.")
+    ] = False,
+    connect: Connect = "",
+) -> None:
+    """Show the health of every service until Ctrl-C: rates, latency, drops, missing services and how to start them.
+
+    Examples: `presage top`; `presage top --once`; `presage top --robot one --robot two`.
+    """
+    from presage.diagnosis.top import run_top  # noqa: PLC0415
+
+    robots = list(dict.fromkeys(robot or find_session(connect).robots))
+    raise typer.Exit(run_top(link_of(connect, robots[0], OBSERVER), robots, console, once=once))
+
+
+@app.command(rich_help_panel="Diagnose", short_help="Find problems of the installation and the session.")
+def doctor(
+    seconds: Annotated[
+        float,
+        typer.Option(
+            min=0.5,
+            help="How long to observe the bus, s. Detecting a frozen service takes at least 2.5 s.",
+        ),
+    ] = 3.0,
+    robot: RobotName = "",
+    connect: Connect = "",
+    world: WorldName = "corridor",
+    json_file: Json = None,
+) -> None:
+    """Check the installation, this machine and the running session for problems.
+
+    Exits with status 1 if there is a problem.
+
+    Examples: `presage doctor`; `presage doctor --seconds 10 --json findings.json`; `presage doctor --world my.yaml`;
+    `presage doctor --connect tcp/192.168.0.10:7447 --robot two`.
+    """
+    from common.runtime.config import load_settings  # noqa: PLC0415
+    from presage.diagnosis.doctor import run_doctor  # noqa: PLC0415
+    from services.recorder.settings import RecorderSettings  # noqa: PLC0415
+
+    link, recordings = link_of(connect, robot, OBSERVER), load_settings(RecorderSettings, []).directory
+    raise typer.Exit(run_doctor(link, seconds, console, world=world, recordings=recordings, json_file=json_file))
+
+
+@app.command(rich_help_panel="Diagnose", short_help="Print messages of a topic or a recording as JSON.")
+def echo(
+    source: Annotated[str, typer.Argument(help="A topic on the bus, or a recording.", metavar="TOPIC|FILE")],
+    topic: Annotated[
+        str | None, typer.Argument(help="Topic or key of the recording to print. Defaults to all topics.")
+    ] = None,
+    count: Annotated[
+        int,
+        typer.Option("-n", "--count", min=0, help="Stop after this many messages. 0 prints until the end or Ctrl-C."),
+    ] = 0,
+    start: Annotated[
+        float, typer.Option(min=0.0, help="Skip this many seconds at the beginning of the recording.")
+    ] = 0.0,
+    full: Annotated[bool, typer.Option("--full", help="Print long arrays completely.")] = False,
+    robot: RobotName = "",
+    connect: Connect = "",
+) -> None:
+    """Print messages as JSON lines, either live from a topic, or from a recording with their keys and times.
+
+    The name of a topic reads from the bus; anything else is a file name (./belief is a file, belief is a topic).
+
+    Examples: `presage echo belief -n 1`; `presage echo scan --full -n 1 | jq .ranges`;
+    `presage echo run.mcap`; `presage echo run.mcap belief -n 3 --start 10`;
+    `presage echo run.mcap belief | jq .free_energy`.
+    """
+    from presage.recordings.printing import echo_either  # noqa: PLC0415
+
+    def link() -> Link:  # a recording needs no session
+        return link_of(connect, robot, OBSERVER)
+
+    raise typer.Exit(echo_either(link, source, topic, count, start, console, full=full))

@@ -1,0 +1,127 @@
+"""`presage goal`, `teleport` and `relocalise`."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+
+from common.errors import UserError
+from common.geometry import se2
+from common.limits import MAX_COORDINATE_M
+from presage.session.running import link_of
+from presage.terminal.options import ALLOW_NEGATIVE_NUMBERS, Connect, RobotName, console
+
+if TYPE_CHECKING:
+    from common.messages.definitions import Pose
+
+app = typer.Typer()
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise typer.BadParameter(f"{text} is neither a number nor an option") from None
+
+
+@app.command(
+    context_settings=ALLOW_NEGATIVE_NUMBERS,
+    rich_help_panel="Drive",
+    short_help="Send the robot to a goal, or cancel it.",
+)
+def goal(
+    x: Annotated[float | None, typer.Argument(help="x of the goal in the map, m.")] = None,
+    y: Annotated[float | None, typer.Argument(help="y of the goal in the map, m.")] = None,
+    yaw: Annotated[float | None, typer.Argument(parser=_number, help="Heading at the goal, deg. Default: any.")] = None,
+    yaw_option: Annotated[float | None, typer.Option("--yaw", hidden=True)] = None,
+    tolerance: Annotated[float, typer.Option(min=0.01, help="Distance at which the goal counts as reached, m.")] = 0.2,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="Wait until the goal is reached, refused, or blocked for 30 s.")
+    ] = False,
+    cancel: Annotated[bool, typer.Option("--cancel", help="Cancel the current goal and stop the robot.")] = False,
+    robot: RobotName = "",
+    connect: Connect = "",
+) -> None:
+    """Send the robot to a goal, or cancel its goal.
+
+    Examples: `presage goal 15 1.5 --wait`; `presage goal 15 1.5 90`; `presage goal --cancel`.
+    """
+    from common.messages.definitions import Goal  # noqa: PLC0415
+    from presage.live.commands import send_goal  # noqa: PLC0415
+
+    if not cancel and (x is None or y is None):
+        raise UserError("a goal is two numbers, X Y in m (or --cancel)")
+    yaw = yaw_option if yaw is None else yaw
+    if not np.isfinite(tolerance):
+        raise UserError(f"--tolerance {tolerance}: a finite number is needed, in m")
+    # The time as sequence number distinguishes this goal from those of other clients in the controller's status.
+    request = Goal(
+        stamp_ns=0,
+        seq=time.time_ns(),
+        pose=_pose(x or 0.0, y or 0.0, yaw or 0.0),
+        tolerance=tolerance,
+        yaw_tolerance=None if yaw is None else 0.1,
+        cancel=cancel,
+    )
+    raise typer.Exit(send_goal(link_of(connect, robot), request, console, wait=wait))
+
+
+@app.command(
+    context_settings=ALLOW_NEGATIVE_NUMBERS, rich_help_panel="Drive", short_help="Move the simulated robot elsewhere."
+)
+def teleport(
+    x: Annotated[float, typer.Argument(help="x in the map, m.")],
+    y: Annotated[float, typer.Argument(help="y in the map, m.")],
+    yaw: Annotated[float, typer.Argument(parser=_number, help="Heading, deg, counter-clockwise from x.")] = 90.0,
+    robot: RobotName = "",
+    connect: Connect = "",
+) -> None:
+    """Move the simulated robot to another place, without any trace in its odometry.
+
+    Example: `presage teleport 9 1.5`. Preset paper can only localise at the heading it was trained for, 90 deg in
+    corridor.
+    """
+    from presage.live.commands import teleport as run  # noqa: PLC0415
+
+    run(link_of(connect, robot), _pose(x, y, yaw), console)
+
+
+@app.command(
+    context_settings=ALLOW_NEGATIVE_NUMBERS,
+    rich_help_panel="Drive",
+    short_help="Restart localisation, near a position or globally.",
+)
+def relocalise(
+    x: Annotated[
+        float | None, typer.Argument(help="x in the map, m. Defaults to the estimator's initial pose.")
+    ] = None,
+    y: Annotated[float | None, typer.Argument(help="y in the map, m.")] = None,
+    yaw: Annotated[float, typer.Argument(parser=_number, help="Heading, deg.")] = 0.0,
+    robot: RobotName = "",
+    connect: Connect = "",
+) -> None:
+    """Reset the estimator and localise again, near a given position or globally.
+
+    Examples: `presage relocalise`; `presage relocalise 3 1.5`.
+    """
+    from presage.live.commands import relocalise as run  # noqa: PLC0415
+
+    if (x is None) != (y is None):
+        raise UserError("a position is two numbers, X Y in m")
+    pose = _pose(x, y, yaw) if x is not None and y is not None else None
+    run(link_of(connect, robot), pose, console)
+
+
+def _pose(x: float, y: float, yaw: float = 0.0) -> Pose:
+    """A pose from m and deg; raises UserError if a value is not finite or too far from the origin."""
+    from common.messages.definitions import Pose  # noqa: PLC0415
+
+    if not np.isfinite([x, y, yaw]).all():
+        given = f"{x:g} {y:g}" + (f" {yaw:g}" if yaw else "")
+        raise UserError(f"{given}: a place is finite numbers, X Y in m and YAW in deg")
+    if max(abs(x), abs(y)) > MAX_COORDINATE_M:
+        raise UserError(f"{x:g} {y:g}: X and Y must be within {MAX_COORDINATE_M:g} m of the origin")
+    return Pose(x=x, y=y, yaw=float(se2.wrap(np.deg2rad(yaw))))

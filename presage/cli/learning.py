@@ -1,0 +1,137 @@
+"""`presage train` and `map`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from common.errors import UserError
+from presage.terminal.options import (
+    Config,
+    MountText,
+    ScannerName,
+    Seed,
+    arguments,
+    console,
+    err_console,
+)
+from presage.terminal.output import make_folder
+
+app = typer.Typer()
+
+
+@app.command(rich_help_panel="Learn", short_help="Train the model of a world, or of a recorded drive.")
+def train(
+    world: Annotated[
+        str,
+        typer.Option(
+            help="World name, world file, or ROS map.yaml. Defaults to corridor; with --from, to the drive alone."
+        ),
+    ] = "",
+    drive: Annotated[
+        Path | None,
+        typer.Option("--from", help="Recording or log with reference poses whose scans train (precise only)."),
+    ] = None,
+    preset: Annotated[str, typer.Option(help="Estimator preset to train: precise or paper.")] = "precise",
+    scanner: ScannerName = "",
+    mount: MountText = "",
+    beams: Annotated[int | None, typer.Option(min=2, help="Beams per scan. Defaults to the scanner's number.")] = None,
+    samples: Annotated[
+        int | None,
+        typer.Option(
+            min=10,
+            help="Simulated scans. Defaults to 5000 (precise), 13000 (paper) or 2000 (with --from).",
+        ),
+    ] = None,
+    seed: Seed = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for the weights. Defaults to the folder the services read."),
+    ] = None,
+    config: Config = None,
+) -> None:
+    """Train the generative model of a world, or of a recorded drive.
+
+    The scans come from the running session if it has this scanner and world, otherwise from a simulator that the
+    command starts. To resume an interrupted run of preset paper, give the same command again.
+
+    With --from, the model learns from the scans of the drive at their reference poses. Every fifth scan is held out to
+    measure the prediction error. With --world as well, scans simulated in that map cover the places not visited.
+    Sections `train` and `log` of --config hold further parameters.
+
+    Examples: `presage train --world my.yaml`; `presage train --preset paper --beams 622 --out mine`;
+    `presage train --world my.yaml --scanner my-laser.yaml --mount 0.1,0,0`;
+    `presage train --from drive.npz --mount 0,0,0 --world map.yaml --out mine`, then
+    `presage localize drive.npz --mount 0,0,0 --world map.yaml --model mine`.
+    """
+    from common.runtime.config import load_section, load_settings  # noqa: PLC0415
+    from presage.learning import train_precise as precise  # noqa: PLC0415
+    from presage.learning import train_simulated as paper  # noqa: PLC0415
+    from presage.learning.options import TrainSettings  # noqa: PLC0415
+    from presage.learning.train_drive import TrainDriveOptions, train_from_drive  # noqa: PLC0415
+    from presage.logs.options import LogSettings  # noqa: PLC0415
+    from presage.session.running import link_of  # noqa: PLC0415
+    from services.estimator.paper.training import Recipe as PaperRecipe  # noqa: PLC0415
+    from services.estimator.precise.learning.field_learning import Recipe  # noqa: PLC0415
+    from services.estimator.precise.learning.weights import FOLDER  # noqa: PLC0415
+    from services.simulator.settings import SimulatorSettings  # noqa: PLC0415
+
+    if preset not in ("precise", "paper"):
+        raise UserError(f"no preset {preset!r}: choose precise or paper")
+    if drive is not None and preset != "precise":
+        raise UserError("--from trains preset precise only: the paper's decoder needs scans taken at one heading")
+    folder, seed = out or FOLDER, seed or 0
+    tuning = load_section(TrainSettings, config, "train")
+    if drive is not None:
+        make_folder(folder, "--out")
+        reading = load_section(LogSettings, config, "log", mount=mount).reading()
+        recipe = Recipe(tuning.resolution or 0.05, seed=seed)
+        train_from_drive(
+            TrainDriveOptions(drive, world, folder, samples or 2000, recipe, tuning.share, reading), console
+        )
+        return
+    simulator = arguments(config=config, scanner=scanner, mount=mount, beams=beams)
+    settings = load_settings(SimulatorSettings, simulator)
+    world, chosen, link = world or settings.world, settings.build_scanner(), link_of(settings.connect, settings.robot)
+    make_folder(folder, "--out")
+    if preset == "precise":
+        recipe = Recipe(tuning.resolution or 0.04, seed=seed)
+        job = precise.TrainPreciseOptions(world, chosen, tuple(simulator), folder, samples or 5000, recipe)
+        precise.train_precise(job, link, console)
+    else:
+        descent = PaperRecipe(tuning.epochs, tuning.batch, tuning.learning_rate, seed)
+        options = paper.TrainPaperOptions(world, preset, chosen, tuple(simulator), folder, samples or 13_000, descent)
+        paper.train(options, link, console)
+
+
+@app.command("map", rich_help_panel="Learn", short_help="Build a ROS map from a drive with known poses.")
+def map_(
+    log: Annotated[Path, typer.Argument(help="A recording or log with reference poses (docs/logs.md).")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Map to write, NAME.yaml. Defaults to the log's name, in this folder."),
+    ] = None,
+    half: Annotated[
+        str, typer.Option(help="Half of the drive to use: first or second. Defaults to the whole drive.")
+    ] = "",
+    cell: Annotated[float, typer.Option(min=0.005, max=1.0, help="Edge length of a cell, m.")] = 0.05,
+    mount: MountText = "",
+    config: Config = None,
+) -> None:
+    """Build a ROS map (NAME.yaml and .pgm) from a drive with known poses. This is not SLAM.
+
+    A cell is occupied if beams of at least two scans ended in it, and of at least 60 % of the scans that observed it.
+    It is free if a beam passed through it, otherwise unknown.
+
+    Examples: `presage map run.mcap`; `presage map fr079.npz --mount 0,0,0 --half first -o first_half.yaml`, then
+    `presage experiment real --log fr079.npz --mount 0,0,0 --world first_half.yaml`.
+    """
+    from common.runtime.config import load_section  # noqa: PLC0415
+    from presage.learning.map_of_log import MapOptions, map_command  # noqa: PLC0415
+    from presage.logs.options import LogSettings  # noqa: PLC0415
+
+    target = out or Path(f"{log.resolve().name.split('.')[0]}.yaml")
+    reading = load_section(LogSettings, config, "log", mount=mount).reading()
+    map_command(MapOptions(log, target, half, cell, reading), console, err_console)

@@ -1,0 +1,56 @@
+"""One scan as the Python API takes it: ranges, beam directions, and where the scanner is mounted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from common.errors import UserError
+from common.geometry.se2 import Array
+from common.robot.ranges import normalise_driver_ranges, ranges_for_localisation
+from services.estimator.factory import Geometry
+from services.estimator.shared.interface import Observation
+
+
+@dataclass(frozen=True)
+class LaserScan(Observation):
+    """One scan, with its scanner's mount and noise.
+
+    ``ranges`` are those of a driver: range_max and more mean no return; NaN, 0 and negative values are not used. They
+    are stored as estimators need them: +inf for no return, -inf for a beam that is not used. Raises UserError if
+    the shapes do not fit.
+    """
+
+    mount: Array = field(default_factory=lambda: np.zeros(3))  # (3,) laser in base_link: m, m, rad
+    sigma: float = 0.0  # m, standard deviation of a range; unknown if this and sigma_relative are 0
+    sigma_relative: float = 0.0  # its part that grows with the range, as a share
+    mount_assumed: bool = False  # nothing states the mount
+    reference: Array | None = None  # (3,) true or reference pose, base_link in map; estimators do not use it
+
+    def __post_init__(self) -> None:
+        ranges, angles = np.asarray(self.ranges, float), np.asarray(self.angles, float)
+        if ranges.ndim != 1 or ranges.shape != angles.shape:
+            raise UserError(f"a scan needs as many ranges as angles, not shapes {ranges.shape} and {angles.shape}")
+        ranges = normalise_driver_ranges(ranges, 0.0, self.range_max)
+        stored = {
+            "ranges": ranges_for_localisation(ranges),
+            "angles": angles,
+            **{name: self._pose(name) for name in ("mount", "odom", "command", "goal", "reference")},
+        }
+        for name, value in stored.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def geometry(self) -> Geometry:
+        """Beams, mount and noise of the scanner."""
+        return Geometry(
+            self.angles, self.mount, self.range_max, self.sigma, self.sigma_relative, mount_assumed=self.mount_assumed
+        )
+
+    def _pose(self, name: str) -> Array | None:
+        value = getattr(self, name)
+        pose = None if value is None else np.asarray(value, np.float64)
+        if pose is not None and pose.shape != (3,):
+            raise UserError(f"{name} of a scan has three numbers, not the shape {pose.shape}")
+        return pose

@@ -1,0 +1,23 @@
+"""Refuses goals at which the robot would touch a wall of the map."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from common.geometry.se2 import Array
+    from common.geometry.world import World
+
+
+def wall_refusal(world: World, goal: Array, radius: float) -> str | None:
+    """Why a robot of ``radius`` m cannot stand at a goal (2,) m. None if it can."""
+    if world.has_room(goal, radius):
+        return None
+    clearance = float(world.clearance(goal)[0])
+    problem = "is inside something, or off the map" if clearance < 0 else f"is {clearance:.2f} m from a wall"
+    return refusal_text(world, goal, problem)
+
+
+def refusal_text(world: World, goal: Array, problem: str) -> str:
+    """The reason in `Status` for refusing a goal (2,) m."""
+    return f"goal refused: ({goal[0]:.2f}, {goal[1]:.2f}) in {world.name} {problem}"

@@ -1,0 +1,124 @@
+"""Sums over the beams of a scan, compiled by numba: its likelihood, and its misfit at many places.
+
+numba keeps the compiled code beside this file, or in NUMBA_CACHE_DIR, so it is compiled once per machine.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numba
+import numpy as np
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from common.geometry.se2 import Array
+
+    Singles = npt.NDArray[np.float32]
+
+SHORT_MISFIT_FACTOR = 0.6  # a beam that is too short counts less than one too long, because it may be blocked
+UNKNOWN_MISFIT = 0.4  # of a beam for which the model expects nothing
+
+jit = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@jit
+def accumulate(
+    measured: Array,
+    expected: Array,
+    jacobian: Array,
+    scale: Array,
+    sigma: float,
+    relative: float,
+    extra_sigma: float,
+    short: float,
+    random: float,
+    range_max: float,
+    unseen: float,
+    total: Array,
+    gradient: Array,
+    matrices: Array,
+) -> None:
+    """Sums -ln p(o | pose) and its derivatives over the beams; see `services.estimator.precise.likelihood`.
+
+    Adds to total (N, 3), whose columns are the energy, the expected number of inliers and the number of used beams; to
+    gradient (N, 3); and to matrices (N, 3, 3, 3), which are the curvature and the covariances of the gradient caused by
+    the scanner's noise and by the model's error.
+    """
+    flat = random / range_max
+    for k in range(expected.shape[0]):
+        for b in range(measured.shape[0]):
+            o, g = measured[b], expected[k, b]
+            if o == -np.inf or np.isnan(o):
+                continue
+            if scale[k, b] == np.inf:  # unknown beyond g: all ranges beyond are equally likely
+                if o < g:
+                    total[k, 2] += 1.0
+                    total[k, 0] -= math.log((1.0 - unseen) * (flat + short / max(g, 1e-3)))
+                elif o < np.inf:
+                    total[k, 0] -= math.log((1.0 - unseen) * (flat + (1.0 - short - random) / max(range_max - g, 1.0)))
+                else:
+                    total[k, 0] -= math.log(unseen)
+                continue
+            total[k, 2] += 1.0
+            if o == np.inf:
+                total[k, 0] -= math.log(unseen if g < range_max else 1.0 - unseen)
+                total[k, 1] += 0.0 if g < range_max else 1.0
+                continue
+            if g >= range_max:
+                total[k, 0] -= math.log(unseen / range_max)
+                continue
+            noise, model = sigma * sigma + relative * relative * g * g, scale[k, b] * scale[k, b]
+            variance = noise + model + extra_sigma * extra_sigma
+            e = o - g
+            core = (1.0 - short - random) * math.exp(-0.5 * e * e / variance) / math.sqrt(2 * math.pi * variance)
+            early = short / max(g, 1e-3) if o < g else 0.0
+            density = core + flat + early
+            inlier = core / density
+            total[k, 0] -= math.log(density * (1.0 - unseen))
+            total[k, 1] += inlier
+            weight = inlier / variance
+            slope = weight * e - early / (max(g, 1e-3) * density)  # d ln p / dg
+            slope += inlier * relative * relative * g * (e * e / variance - 1.0) / variance
+            for i in range(3):
+                gradient[k, i] += slope * jacobian[k, b, i]
+                for j in range(3):
+                    outer = jacobian[k, b, i] * jacobian[k, b, j] * weight
+                    matrices[k, 0, i, j] += outer
+                    matrices[k, 1, i, j] += outer * noise / variance
+                    matrices[k, 2, i, j] += outer * model / variance
+
+
+@jit
+def rank_places(
+    panoramas: Singles,
+    bins: npt.NDArray[np.int_],
+    measured: Singles,
+    tolerance: float,
+    range_max: float,
+    costs: Singles,
+) -> None:
+    """Fills costs (S, H) of every place and heading with the mean over beams of e² / (e² + tolerance²).
+
+    Shortened beams count less, see `SHORT_MISFIT_FACTOR`.
+    """
+    size, headings = panoramas.shape[1], costs.shape[1]
+    for s in range(panoramas.shape[0]):
+        for h in range(headings):
+            shift = h * size // headings
+            total, used = 0.0, 0
+            for b in range(bins.shape[0]):
+                o = measured[b]
+                if o == -np.inf or np.isnan(o):
+                    continue
+                g = panoramas[s, (bins[b] + shift) % size]
+                if np.isnan(g):
+                    total, used = total + UNKNOWN_MISFIT, used + 1
+                    continue
+                e = min(o, range_max) - min(g, range_max)
+                misfit = e * e / (e * e + tolerance * tolerance)
+                total += misfit if e > 0.0 else SHORT_MISFIT_FACTOR * misfit
+                used += 1
+            costs[s, h] = total / max(used, 1)

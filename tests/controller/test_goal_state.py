@@ -1,0 +1,68 @@
+"""The table of transitions of a goal's phase."""
+
+from __future__ import annotations
+
+import pytest
+
+from services.controller.goal_state import GoalState
+from services.controller.policies.decision import Decision
+from tests.controller.driving import goal
+
+
+def event(method, *args, **more):
+    return lambda state: method(state, *args, **more)
+
+
+def progress(seconds, *, moving=False, limited=False, **decision):
+    now_ns = round(seconds * 1e9)
+    return event(GoalState.update_progress, now_ns, Decision(**decision), moving=moving, limited_by_scan=limited)
+
+
+START, REFUSED = (event(GoalState.start, goal(1, 2), refusal) for refusal in (None, "in a wall"))
+REFUSE, REACH = event(GoalState.refuse, "far"), event(GoalState.reach, "near")
+LOSE, EXPLORE = (event(GoalState.lose_pose, activity, "unsure") for activity in ("lost", "exploring"))
+NO_BELIEF, FIND = event(GoalState.lose_belief, "no belief"), GoalState.find_pose
+CANCEL, SUSPEND = GoalState.cancel, GoalState.suspend
+MOVES, HINDERED = progress(0, moving=True), progress(1, limited=True)
+
+
+@pytest.mark.parametrize(
+    ("events", "shown", "reason", "active"),
+    [
+        ([], "idle", "", False),
+        ([NO_BELIEF], "idle", "", False),
+        ([START], "navigating", "", True),
+        ([REFUSED], "blocked", "in a wall", False),
+        ([REFUSED, NO_BELIEF, SUSPEND, progress(9)], "blocked", "in a wall", False),
+        ([REFUSED, START], "navigating", "", True),
+        ([START, REFUSE], "blocked", "far", False),
+        ([START, CANCEL], "idle", "cancelled", False),
+        ([START, CANCEL, SUSPEND], "idle", "", False),
+        ([START, REACH], "reached", "near", False),
+        ([START, REACH, NO_BELIEF], "reached", "near", False),
+        ([START, REACH, SUSPEND], "idle", "", False),
+        ([START, LOSE], "lost", "unsure", True),
+        ([START, LOSE, EXPLORE, progress(9)], "exploring", "unsure", True),
+        ([START, EXPLORE, NO_BELIEF], "lost", "no belief", True),
+        ([START, NO_BELIEF, FIND], "navigating", "", True),
+        ([START, NO_BELIEF, SUSPEND], "navigating", "", True),
+        ([START, HINDERED], "navigating", "slowed by the scan", True),
+        ([START, HINDERED, progress(2.9, limited=True)], "navigating", "slowed by the scan", True),
+        ([START, HINDERED, progress(3, limited=True)], "blocked", "the scan shows something in the way", True),
+        ([START, HINDERED, progress(3, state="blocked", reason="a box")], "blocked", "a box", True),
+        ([START, HINDERED, progress(3, reason="slow")], "navigating", "slow", True),
+        ([START, HINDERED, MOVES, progress(3, limited=True)], "navigating", "slowed by the scan", True),
+        ([START, HINDERED, progress(3, limited=True), MOVES], "navigating", "", True),
+        ([START, progress(0, recovering=True, reason="backs off")], "blocked", "backs off", True),
+        ([START, progress(0, recovering=True), LOSE, FIND], "navigating", "", True),
+    ],
+)
+def test_transitions(events, shown, reason, active):
+    state = GoalState()
+    for apply in events:
+        apply(state)
+    status = state.status(7, 0.5)
+    assert (status.state, status.reason, state.active) == (shown, reason, active)
+    assert (status.stamp_ns, status.distance) == (7, 0.5)
+    assert status.refused == (shown == "blocked" and not active)
+    assert (status.goal is None) == (shown == "idle")

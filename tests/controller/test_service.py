@@ -1,0 +1,95 @@
+"""When the controller answers a belief, also if scan or predictions come late."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from common.bus.inbox import Inbox
+from common.messages.requests import PredictReply, Reply
+from common.messages.topics import BELIEF, CMD_VEL, PREDICT, SCAN
+from common.runtime.service import Loop
+from services.controller import service as shell
+from services.controller.policies.epistemic import CandidateMotions
+from services.controller.service import ControllerService
+from services.controller.settings import ControllerSettings
+from tests.controller.driving import PERIOD_NS, belief, goal, room, scan
+from tests.process_replay.harness import FakeBus
+
+ROOM, POSE = room(10, 4), np.array([2.0, 2.0, 0.0])
+MOTIONS = CandidateMotions(POSE[None], np.ones(1), POSE[None], np.ones(1))
+
+
+class Clock:
+    now = 0.0
+
+    def monotonic(self):
+        return self.now
+
+    def thread_time_ns(self):
+        return 0
+
+
+class Predicting:
+    """Stands in for the policy that needs predictions, for beliefs with the given numbers."""
+
+    def __init__(self, numbers):
+        self.numbers, self.used = numbers, 0
+
+    def prediction_request(self, message):
+        return MOTIONS if message.stamp_ns // PERIOD_NS in self.numbers else None
+
+    def use_predictions(self, reply):
+        self.used += 1
+
+
+@pytest.mark.parametrize(
+    ("needs_predictions", "events", "answers"),
+    [
+        ((), "s0 b0 s1 b1", ". 0 . 1"),
+        ((), "s0 b0 b0", ". 0 0"),  # a repeated belief is answered again
+        ((), "s0 b1 s1 b1", ". . 1 1"),  # before its scan
+        ((), "s0 b1 b1 s1", ". . . 1"),
+        ((), "s0 b1 t", ". . 1"),  # the scan does not come
+        ((), "s0 b1 b2 s2", ". . 1 2"),
+        ((), "s0 b0 t s1 b1 t", ". 0 0 . 1 1"),  # no belief: stops with the latest stamp
+        ((1,), "s1 b1 r1", ". . 1"),
+        ((1,), "s1 b1 f1", ". . 1"),  # no predictions
+        ((1,), "s1 b1 b1 r1", ". . . 1"),
+        ((1,), "s1 b1 s2 b2 r1", ". . . 2 ."),  # a newer belief takes its place; the policy still gets the predictions
+        ((1, 2), "s1 b1 s2 b2 r1 r2", ". . . . . 2"),  # only the latest request counts
+        ((1,), "s1 b1 b2 s2", ". . 1 2"),
+        ((1,), "s0 b1 s1 r1", ". . . 1"),
+        ((1,), "s1 b1 t", ". . 0"),  # no reply and no newer belief
+    ],
+)
+def test_answers(monkeypatch, needs_predictions, events, answers):
+    """Events: s scan, b belief, r reply, f failed reply, each with a number; t timer, when it is due."""
+    clock = Clock()
+    monkeypatch.setattr(shell, "time", clock)
+    service, bus = ControllerService(ControllerSettings(preset="paper", world="")), FakeBus()
+    loop = Loop(service, bus, Inbox())
+    service.open()
+    service.navigator.on_goal(goal(8, 2))
+    service.geodesic = policy = Predicting(needs_predictions)
+    monkeypatch.setattr(service, "_publish_plan", lambda stamp_ns: None)
+    requests = {}
+    monkeypatch.setattr(loop, "request", lambda *_: requests.setdefault(len(requests) + 1, len(requests) + 1))
+    found = []
+    for event in events.split():
+        kind, number = event[0], int(event[1:] or 0)
+        if kind == "s":
+            service.on_message(SCAN, scan(number * PERIOD_NS, POSE, ROOM))
+        elif kind == "b":
+            service.on_message(BELIEF, belief(number * PERIOD_NS, POSE))
+        elif kind == "t":
+            clock.now += service.due()
+            service.on_timer()
+        else:
+            reply = PredictReply() if kind == "r" else Reply(ok=False, reason="busy")
+            service.on_reply(PREDICT, number, reply)
+        sent = [CMD_VEL.message.decode(p).stamp_ns // PERIOD_NS for topic, p in bus.sent if topic is CMD_VEL]
+        bus.sent.clear()
+        found.append(" ".join(map(str, sent)) or ".")
+    assert " ".join(found) == answers
+    assert policy.used == len([e for e in events.split() if e == f"r{max(requests, default=0)}"])

@@ -1,0 +1,139 @@
+"""The Python API: the code of its page, what it refuses, and a service of one's own."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import presage
+from common.geometry import se2
+from common.messages.definitions import Belief, Odom, Pose, Scan, Twist
+from common.messages.topics import ODOM, SCAN
+from presage.replay.in_process import InProcessServices
+from services.recorder.files.writer import RecordingWriter
+from tests.conftest import ROOT
+
+SCANNER = presage.SCANNERS["tim571"].with_beams(200)
+POSE = np.array([4.0, 1.5, 1.0])
+
+
+@pytest.fixture(scope="module")
+def world():
+    return presage.load_world("corridor")
+
+
+@pytest.fixture(scope="module")
+def ranges(world):
+    return SCANNER.noisy(
+        world.ray_distances(se2.compose(POSE, np.array(SCANNER.mount))[None], SCANNER.angles())[0],
+        np.random.default_rng(0),
+    )
+
+
+@pytest.fixture(scope="module")
+def estimator(world):
+    return presage.Estimator(world, scanner=SCANNER)
+
+
+def scan_message(ranges, stamp_ns=0):
+    return Scan(
+        stamp_ns=stamp_ns,
+        angle_min=SCANNER.angle_min,
+        angle_increment=SCANNER.angle_increment,
+        range_min=0.05,
+        range_max=25.0,
+        ranges=ranges,
+        mount=Pose.of(SCANNER.mount),
+    )
+
+
+@pytest.mark.parametrize("page", ["docs/api.md", "README.md"])
+def test_examples_of_a_page(page, ranges, tmp_path, monkeypatch):
+    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE)
+    writer = RecordingWriter(tmp_path / "run.mcap")
+    for k in range(3):
+        message = scan_message(ranges, k * 10**8)
+        writer.write(SCAN, SCAN.key("robot"), message.encode(), message.stamp_ns, message.stamp_ns)
+    writer.finish()
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for block in blocks:
+        exec(block, names)
+        np.testing.assert_allclose(names["belief"].pose, POSE, atol=0.02)
+
+
+def test_import_is_light():
+    heavy = ["numpy", "numba", "torch", "zenoh", "pydantic", "matplotlib", "pybullet"]
+    program = f"import sys, presage; print(sorted(set({heavy}) & set(sys.modules)), set(presage.__all__) <= set(dir()))"
+    program = program.replace("dir()", "dir(presage)")
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split("\n")[0] == "[] True"
+
+
+def test_all_names_exist():
+    assert all(getattr(presage, name) for name in presage.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        presage.nothing  # noqa: B018
+
+
+def test_plain_ranges_are_a_scan(estimator, world, ranges):
+    estimator.restart()
+    belief = estimator.update(ranges, stamp=0.0)
+    scan = presage.LaserScan(ranges, SCANNER.angles(), 25.0, 0.0, mount=SCANNER.mount, sigma=SCANNER.sigma)
+    other = presage.Estimator(world).update(scan)
+    assert belief.state == "tracking"
+    assert (belief.pose.tobytes(), belief.free_energy) == (other.pose.tobytes(), other.free_energy)
+
+
+def test_prediction_shapes(estimator, ranges):
+    one, two = estimator.predict(POSE), estimator.predict([POSE, POSE], angles=[0.0, 0.1, 0.2])
+    assert (one.ranges.shape, one.sigma.shape, two.ranges.shape) == ((200,), (200,), (2, 3))
+    assert np.median(np.abs(one.ranges - ranges)) < 0.05
+
+
+def test_mount_argument_replaces_the_scans(world, ranges):
+    scan = presage.LaserScan(ranges, SCANNER.angles(), 25.0)  # the laser's own pose
+    belief = presage.Estimator(world, mount=SCANNER.mount).update(scan)
+    np.testing.assert_allclose(belief.pose, POSE, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("call", "why"),
+    [
+        (lambda e, r: presage.Estimator("corridor", scanner="sonar"), "no scanner 'sonar': give a Scanner, or one of"),
+        (lambda e, r: presage.Estimator("nowhere"), "no world 'nowhere'"),
+        (lambda e, r: presage.Estimator("corridor", "kalman"), "no estimator 'kalman'"),
+        (lambda e, r: presage.Estimator("corridor", model="best"), "no model 'best'"),
+        (lambda e, r: presage.Estimator("corridor", initial_pose=(400, 0, 0)), "off the map"),
+        (lambda e, r: e.update(r[:50]), r"ranges of shape \(50,\), but scanner tim571 has 200 beams"),
+        (lambda e, r: e.update(presage.LaserScan(r, SCANNER.angles(), 25.0)), "the scanner, its mount or its noise"),
+        (lambda e, r: presage.LaserScan(r, SCANNER.angles()[1:], 25.0), "as many ranges as angles"),
+        (lambda e, r: presage.LaserScan(r, SCANNER.angles(), 25.0, odom=(0, 0)), "odom of a scan has three numbers"),
+        (lambda e, r: presage.Estimator("corridor").update(r), "the directions of these ranges are not known"),
+        (lambda e, r: presage.Estimator("corridor").predict(POSE), "which beams to predict is not known"),
+        (lambda e, r: presage.Estimator("corridor").restart(), "nothing to restart"),
+    ],
+)
+def test_refusals(estimator, ranges, call, why):
+    with pytest.raises(presage.UserError, match=why):
+        call(estimator, ranges)
+
+
+def test_example_estimator(ranges):
+    example = runpy.run_path(str(ROOT / "docs/examples/my_estimator.py"))
+    service = example["MyEstimator"](example["MySettings"](start="1,2,90"))
+    services = InProcessServices([service], "robot")
+    scan = scan_message(ranges, 5)
+    assert services.send(SCAN, scan.encode()) == []
+    for x in (7.0, 8.0):
+        odom = Odom(stamp_ns=5, pose=Pose(x=x, y=0.0), twist=Twist(), covariance=np.eye(3))
+        services.send(ODOM, odom.encode())
+    (belief,) = services.send(SCAN, scan.encode())
+    assert isinstance(belief, Belief)
+    np.testing.assert_allclose(belief.pose.array(), [1, 3, np.pi / 2], atol=1e-12)
+    assert belief.xi is belief.free_energy is belief.complexity is None
