@@ -58,10 +58,11 @@ endef
 demo: install ## localise and drive in the corridor: every service, a live page, a recording, a picture
 	$(BIN)/presage demo --open $(ARGS)
 
-test: install ## all tests, the fast ones first
+test: install ## all tests
 	@# Hundreds of processes are started: each would compile all modules anew where Python is told to write none (PYTHONDONTWRITEBYTECODE).
 	@$(BIN)/python -m compileall -q common services presage lab worlds models tests
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+	@# Three workers keep two cores busy, because tests of processes wait much; one core for each, as more threads only disturb others.
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 bless: install ## show what services answer differently than their references, and accept it
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.process_replay.bless $(ARGS)

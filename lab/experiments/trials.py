@@ -72,7 +72,7 @@ def _run_in_parallel(
     except BrokenProcessPool:
         raise UserError(
             "a worker process was killed, perhaps for lack of memory; run the same command again to continue, with "
-            "fewer --workers if memory is short"
+            "a smaller PRESAGE_WORKERS if memory is short"
         ) from None
 
 

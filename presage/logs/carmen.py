@@ -122,8 +122,8 @@ def _angles(path: Path, name: str, first: LaserLine, reading: Reading, notes: li
         return header.angles()
     if count not in SPANS_DEG:
         raise UserError(
-            f"{path}: {name} does not state the angles of its {count} beams: give the first and the last one, such as "
-            "--angles -90,90"
+            f"{path}: {name} does not state the angles of its {count} beams: give the first and the last one in "
+            "a settings file, such as log: {angles: '-90,90'}"
         )
     first_deg, last_deg = SPANS_DEG[count]
     notes.append(

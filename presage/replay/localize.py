@@ -162,7 +162,7 @@ def localize(job: LocalizeOptions, console: Console) -> list[dict[str, Any]]:
     laser, kind = job.frame == "laser", kind_of(job.file)
     estimator = prepare(job.choice, console)
     with working(f"reading {job.file.name}", console):
-        # With --frame laser, the poses in an .npz file are those of the laser, as if its mount were zero. For other
+        # With frame laser, the poses in an .npz file are those of the laser, as if its mount were zero. For other
         # files, base_link is localised and the result transformed.
         mount = np.zeros(3) if laser and kind == "npz" else None
         all_scans = read_scans(job.file, mount, job.reading)

@@ -51,7 +51,7 @@ def folder(tmp_path_factory):
     return made
 
 
-def test_the_card_has_the_models_origin_and_errors(folder):
+def test_card(folder):
     _, places, card = weights.load(folder / "before-precise.safetensors")
     assert card.source == "100 posed scans of drive.npz; elsewhere 100 simulated scans in map before"
     assert card.calibration is not None
@@ -63,7 +63,7 @@ def test_the_card_has_the_models_origin_and_errors(folder):
     assert raw["calibration"]["log_likelihood"] == pytest.approx(card.calibration.log_likelihood)
 
 
-def test_logs_without_enough_reference_poses_are_refused(tmp_path):
+def test_too_few_reference_poses(tmp_path):
     real_drive.save(tmp_path / "bare.npz", real_drive.drive(60), reference=False)
     with pytest.raises(UserError, match="no reference poses"):
         train_from_drive(Training(tmp_path / "bare.npz", out=tmp_path, reading=HERE), Console(quiet=True))
@@ -73,7 +73,7 @@ def test_logs_without_enough_reference_poses_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("estimator", ["precise", "particle-filter"])
-def test_a_kidnapped_robot_is_localised_again(folder, estimator):
+def test_kidnapped_robot(folder, estimator):
     job = Job(
         str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), estimator, KIDNAPPED, 100, to=155,
         model=str(folder / "before-precise.safetensors"),
@@ -91,7 +91,7 @@ def test_a_kidnapped_robot_is_localised_again(folder, estimator):
         assert found["wrong_claim_longest_s"] <= 2
 
 
-def test_tuning_uses_the_second_quarter_in_a_map_of_the_first(folder, tmp_path, monkeypatch):
+def test_scans_used_for_tuning(folder, tmp_path, monkeypatch):
     """The half evaluated later must not affect the settings, and the map must lack rooms, as it does later."""
     tried = []
 
@@ -116,12 +116,12 @@ def test_tuning_uses_the_second_quarter_in_a_map_of_the_first(folder, tmp_path, 
     assert (mapped.clearance(poses) > 0).mean() > 0.9
 
 
-def test_amcl_uses_the_omnidirectional_motion_model(folder):
+def test_motion_model_of_amcl(folder):
     job = Job(str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "amcl-defaults", LASER, 100)
     assert create_estimator(job).settings == ParticleSettings(robot_model_type="omni")
 
 
-def test_odometry_does_not_reveal_a_kidnapping():
+def test_odometry_of_a_kidnapping():
     rng = np.random.default_rng(0)
     odom = np.cumsum(rng.normal(0, 0.1, (20, 3)), axis=0)
     told = hide_kidnapping(odom, 12)
@@ -130,7 +130,7 @@ def test_odometry_does_not_reveal_a_kidnapping():
     assert se2.between(told[12], told[15]) == pytest.approx(se2.between(odom[12], odom[15]))
 
 
-def test_time_increases_when_a_robot_is_moved_to_an_earlier_scan(folder):
+def test_time_of_a_kidnapping(folder):
     job = Job(
         str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "precise", KIDNAPPED, 155, to=100,
         model=str(folder / "before-precise.safetensors"),
@@ -141,7 +141,7 @@ def test_time_increases_when_a_robot_is_moved_to_an_earlier_scan(folder):
 
 
 @pytest.mark.parametrize("count", [20, 21])
-def test_halves_are_disjoint_and_complete(count):
+def test_halves(count):
     drive = real_drive.drive(count)
     first, second = split(drive)
     assert len(first.ranges) == count // 2
@@ -149,7 +149,7 @@ def test_halves_are_disjoint_and_complete(count):
 
 
 @pytest.mark.parametrize("count", [20, 21])
-def test_time_increases_in_a_drive_with_exchanged_halves(count):
+def test_exchanged_halves(count):
     drive = real_drive.drive(count)
     first, second = split(drive)
     turned = exchange_halves(drive)
@@ -162,7 +162,7 @@ def test_time_increases_in_a_drive_with_exchanged_halves(count):
 
 @pytest.mark.parametrize("count", [100, 101])
 @pytest.mark.parametrize("exchanged", [False, True])
-def test_no_scan_is_used_for_both_training_and_localisation(tmp_path, count, exchanged):
+def test_scans_of_training(tmp_path, count, exchanged):
     log = tmp_path / "drive.npz"
     real_drive.save(log, real_drive.drive(count))
     first, second = split(drive_at(str(log), None))
@@ -175,7 +175,7 @@ def test_no_scan_is_used_for_both_training_and_localisation(tmp_path, count, exc
     assert np.hypot(steps[:, 0], steps[:, 1]).max() < 0.4  # the robot drives at most 0.2 m between two scans
 
 
-def test_with_halves_exchanged_the_first_scans_are_localised(folder):
+def test_localised_half(folder):
     where, mount = str(folder / "drive.npz"), (0.0, 0.0, 0.0)
     job = Job(
         where, str(folder / "before.yaml"), mount, "precise", LASER, 100, 30,
@@ -195,7 +195,7 @@ def row(task, error, state, stamps=None):
     }  # fmt: skip
 
 
-def test_wrong_claims_and_their_durations():
+def test_durations_of_wrong_claims():
     t, lost = "tracking", "lost"
     found = real.summarise([row("odometry", [0, 9, 9, 9, 9, 0, 9], [t, t, t, t, lost, t, t])])
     assert found["wrong_claim_longest_s"] == pytest.approx(1.0)  # from the second to the fourth scan
@@ -206,21 +206,21 @@ def test_wrong_claims_and_their_durations():
     assert searched["scans_until_found_median"] == 4
 
 
-def test_the_table_of_the_page(tmp_path):
+def test_table(tmp_path):
     assert page.MODULES["real"] == "lab.real_logs.experiment"
     summary = {"a: tracking with odometry, precise": real.summarise([row("odometry", [0.01, 0.02], ["tracking"] * 2)])}
     table = real.table(summary)
     assert "| a, precise | 15.0 |" in table
 
 
-def test_a_log_too_short_is_refused(folder, tmp_path):
+def test_short_log(folder, tmp_path):
     real_drive.save(tmp_path / "few.npz", real_drive.drive(100))
     job = real.Job(tmp_path / "few.npz", str(folder / "before.yaml"))
     with pytest.raises(UserError, match="100 posed scans; at least 160"):
         real.run(job, tmp_path, 1, Console(quiet=True))
 
 
-def test_a_map_of_another_place_is_refused(folder, tmp_path):
+def test_map_of_another_place(folder, tmp_path):
     job = real.Job(folder / "drive.npz", "office", (0.0, 0.0, 0.0))
     elsewhere = World(name="elsewhere", boundary=[(50, 50), (60, 50), (60, 60), (50, 60)])
     (tmp_path / "elsewhere.yaml").write_text(save_world(elsewhere), encoding="utf-8")
