@@ -1,4 +1,4 @@
-"""Exit status 0 where a service is healthy: `python -m common.containers.healthcheck NAME`.
+"""Exits with status 0 if a service is healthy: `python -m common.containers.healthcheck NAME`.
 
 A service is healthy if its heartbeat is recent, it is connected to another session, and it publishes its results while
 its inputs arrive. An open port or a running loop alone would not show that it works.
@@ -22,13 +22,13 @@ from common.containers.run_per_robot import robot_names
 from common.runtime.heartbeat import read_beats
 from common.runtime.liveness import Report, find_problem
 
-CONNECT_TIMEOUT_S = 4.0  # for the router or the page
+CONNECT_TIMEOUT_S = 4.0  # for the router or the live page
 PAGE = ("127.0.0.1", 8080)
 SINGLE_PROCESS = {"viewer"}  # one process for all robots, whose heartbeat has the first robot's name
 
 
 def main(service: str) -> None:
-    """Raise ValueError, OSError or UserError, with the reason, if the service is not healthy."""
+    """Check a service; raises ValueError, OSError or UserError, with the reason, if it is not healthy."""
     if service == "router":
         _reach_router()
         return
@@ -41,9 +41,9 @@ def main(service: str) -> None:
 
 
 def fault_of(service: str, beats: dict[str, Report], robots: Collection[str], now: float) -> str:
-    """What is wrong with a service at ``now`` s (monotonic clock), by its heartbeats; empty if nothing is.
+    """The problem of a service at ``now`` s (monotonic clock), by its heartbeats; empty if it is healthy.
 
-    ``beats`` are by the name of the robot, one for each process.
+    ``beats`` has the heartbeat of each process, by the name of its robot.
     """
     for robot in robots:
         beat = beats.get(next(iter(robots)) if service in SINGLE_PROCESS else robot)

@@ -62,7 +62,7 @@ class ZenohLogParser:
     _caching: dict[str, int] = field(default_factory=dict)  # by thread: remaining lines that are not refusals
 
     def read(self, line: str) -> Refusal | str | None:
-        """Returns a refusal, or the text of another error or warning, or None for other lines."""
+        """Read a line; returns a refusal, the text of another error or warning, or None for any other line."""
         plain = COLOUR.sub("", line).rstrip()
         match = LINE.match(plain)
         if match is None:

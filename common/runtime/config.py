@@ -151,7 +151,7 @@ def join_negative_values(argv: list[str]) -> list[str]:
 
 
 def load_settings(cls: type[S], argv: list[str] | None = None) -> S:
-    """Returns the settings of a service from all sources.
+    """Load the settings of a service from all sources.
 
     ``argv`` defaults to the arguments of the process. With ``--print-config``, prints the settings and exits. Raises
     UserError for an invalid setting or file.
@@ -197,7 +197,7 @@ class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
 
 
 def _read_file(cls: type[ServiceSettings], path: Path) -> dict[str, Any]:
-    """Returns one service's settings: top-level keys apply to all services, the section of a service only to it."""
+    """Read one service's settings: top-level keys apply to all services, the section of a service only to it."""
     data = _load_mapping(path)
     known = cls.model_fields.keys() - cls.private
     shared = {k: v for k, v in data.items() if not isinstance(v, dict) and k in known}
@@ -213,7 +213,7 @@ def read_section(path: Path, name: str) -> dict[str, Any]:
 
 
 def load_section(cls: type[M], path: Path | None, name: str, **options: object) -> M:
-    """The section ``name`` of a settings file as ``cls``; the ``options`` that are not empty take precedence.
+    """Load the section ``name`` of a settings file as ``cls``; ``options`` that are not empty take precedence.
 
     Raises UserError if a setting is unknown or invalid.
     """

@@ -1,4 +1,4 @@
-"""Which services of a robot are alive, since when, and what is wrong with them.
+"""Tracks which services of a robot are alive, since when, and their problems.
 
 `presage top`, `presage doctor`, the page and the health checks of containers all use this model and only show its
 results. It imports only the standard library, so that a health check starts in 20 ms. Times are s of a monotonic clock.
@@ -75,7 +75,7 @@ class ServiceLiveness:
 
 
 def find_problem(service: str, robot: str, report: Report, now: float, never: float = -math.inf) -> str:
-    """What is wrong with a connected service by its last report; empty if nothing is.
+    """The problem of a connected service by its last report; empty if it is healthy.
 
     ``never`` is the time from which the age of a result is counted that was not seen yet.
     """

@@ -1,4 +1,4 @@
-"""Which map and weights an estimator uses, for recordings."""
+"""Describes the map and the weights that an estimator uses, for recordings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Opens a recording as a robot of its own."""
+"""Opens a recording and replays it as a separate robot."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Playback:
 
     @property
     def name(self) -> str:
-        """File name of the open recording. Empty if none is open."""
+        """File name of the open recording; empty if none is open."""
         child = self._child
         return child.name if child is not None else ""
 

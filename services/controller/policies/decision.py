@@ -36,7 +36,7 @@ class Policy(Protocol):
     """Turns a goal and beliefs into velocities. The setting `preset` selects one."""
 
     def refusal(self, goal: Array) -> str | None:
-        """Why a goal (2,) m in map cannot be reached. None if nothing known so far speaks against it.
+        """The reason why a goal (2,) m in map cannot be reached, or None if nothing is known to prevent it.
 
         What becomes known only on the way is reported by `decide`, as `Decision.refused`.
         """

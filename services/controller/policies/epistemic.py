@@ -183,7 +183,7 @@ class DestinationSelector:
     def choose(
         self, stamp_ns: int, motions: CandidateMotions, ranges: Array, sigma: Array, range_max: float
     ) -> Array | None:
-        """The destination (3,) in map under the first hypothesis. None if no motion gains enough.
+        """The destination (3,) in map under the first hypothesis, or None if no motion gains enough.
 
         ``ranges`` and ``sigma`` (K, M, B) m are the predictions for `CandidateMotions.poses`. The previous destination
         is kept unless another one is better by ``switch_margin`` or its gain has dropped.
@@ -245,7 +245,7 @@ class DestinationSelector:
         self.chosen = None
 
     def _index_of_chosen(self, places: Array, gain: Array, motions: CandidateMotions) -> int | None:
-        """Index of the candidate (M, 3) at the kept destination. None if there is none, or its gain has dropped."""
+        """Index of the candidate (M, 3) at the kept destination, or None if there is none or its gain has dropped."""
         chosen = self.chosen
         if chosen is None or not len(places):
             return None

@@ -1,4 +1,4 @@
-"""How the robot may have moved since the last scan, and fusion with the scan.
+"""Predicts the motion since the last scan, and fuses it with the scan.
 
 The prior is a mixture of motions, here called candidates:
 

@@ -37,7 +37,7 @@ class Player:
         return min(self.end, self._position + max(0.0, now - self._since) * self.rate)
 
     def wait(self, position: float, now: float) -> float:
-        """Seconds until a message at ``position`` is due. 0 if it is due now, infinity while paused."""
+        """Seconds until a message at ``position`` is due: 0 if it is due now, infinity while paused."""
         if self._steps:
             return 0.0
         if self.paused:
@@ -140,7 +140,7 @@ def select_topics(
 
 
 def key_for_robot(key: str, robot: str) -> str:
-    """The same key for another robot. Unchanged if ``robot`` is empty."""
+    """The same key for another robot; unchanged if ``robot`` is empty."""
     root, recorded_robot, rest = key.split("/", 2)
     return f"{root}/{robot or recorded_robot}/{rest}"
 

@@ -146,7 +146,7 @@ class RobotView:
 
     @property
     def stamp_ns(self) -> int:
-        """Stamp of the newest sensor message. 0 before the first."""
+        """Stamp of the newest sensor message; 0 before the first."""
         return max((last.message.stamp_ns for t in SENSOR_TOPICS if (last := self._received.get(t.name))), default=0)
 
     def _restart(self) -> None:

@@ -1,4 +1,4 @@
-"""Which services of which robots are alive."""
+"""Tracks which services of which robots are alive."""
 
 from __future__ import annotations
 
