@@ -34,13 +34,13 @@ def main(service: str) -> None:
         return
     folder = Path(os.environ.get("PRESAGE_HEARTBEAT") or "/tmp")  # noqa: S108 - the folder used in the images
     robots = robot_names(os.environ)
-    if fault := fault_of(service, read_beats(folder, service), robots, time.monotonic()):
+    if fault := find_fault(service, read_beats(folder, service), robots, time.monotonic()):
         raise ValueError(fault)
     if service == "viewer":
         _check_page()
 
 
-def fault_of(service: str, beats: dict[str, Report], robots: Collection[str], now: float) -> str:
+def find_fault(service: str, beats: dict[str, Report], robots: Collection[str], now: float) -> str:
     """The problem of a service at ``now`` s (monotonic clock), by its heartbeats; empty if it is healthy.
 
     ``beats`` has the heartbeat of each process, by the name of its robot.
@@ -72,7 +72,7 @@ def _reach_router() -> None:
     from common.runtime.config import ServiceSettings, load_settings  # noqa: PLC0415
 
     link = replace(load_settings(ServiceSettings, ["--role", "router"]).link(), listen=())
-    with open_bus(link, patience=CONNECT_TIMEOUT_S) as bus:
+    with open_bus(link, connect_timeout=CONNECT_TIMEOUT_S) as bus:
         if not wait_until(bus.linked, CONNECT_TIMEOUT_S):
             raise ValueError(f"no session through {', '.join(link.connect)} within {CONNECT_TIMEOUT_S:g} s")
 

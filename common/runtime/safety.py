@@ -8,7 +8,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.messages.definitions import Scan
 from common.robot.base import Robot
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 
 REACTION_TIME_S = 2 / 15  # the scan is up to one 15 Hz period old, and the command holds for another
 FOOTPRINT_MARGIN_M = 0.01  # must be free around the footprint
@@ -18,7 +18,7 @@ PATH_STEP_S = 1 / 60  # between the points of a stopping path: 17 mm at 1 m/s, w
 def scan_points(scan: Scan) -> Array:
     """(K, 2) end points in m in base_link of the beams that hit something; too close (-inf) counts as at range_min."""
     close = np.isneginf(scan.ranges)
-    hit = surfaces(scan.ranges) | close
+    hit = is_surface(scan.ranges) | close
     ranges = np.where(close, scan.range_min, scan.ranges.astype(np.float64))
     angles, ranges = scan.angles()[hit], ranges[hit]
     in_laser = np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=-1)

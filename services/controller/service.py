@@ -198,7 +198,7 @@ class ControllerService(Service):
         return deadline_s - time.monotonic()
 
     def on_timer(self) -> None:
-        """Process the belief that has waited too long for its scan; otherwise stop the robot, because beliefs stay away."""
+        """Process the belief that has waited too long for its scan; otherwise stop the robot, as no belief comes."""
         if isinstance(self._wait, AwaitsScan):
             self._process(self._wait.belief)
             return

@@ -145,7 +145,7 @@ class Simulation:
         """Measurements at the present time. Each call draws new noise for the scan."""
         pose, twist, scanner = self.physics.pose(), self.physics.twist(), self.setup.scanner
         exact = self._cast_rays(pose[None])[0]
-        ranges = scanner.limit(scanner.noisy(exact, self._noise))
+        ranges = scanner.limit(scanner.add_noise(exact, self._noise))
         velocity = Twist(vx=float(twist[0]), vy=float(twist[1]), wz=float(twist[2]))
         odometer = self.odometer
         odom = Odom(
@@ -208,7 +208,7 @@ class Simulation:
         ]
         ranges = np.concatenate(blocks) if blocks else np.zeros((0, scanner.beams))
         if noise_seed is not None:
-            ranges = scanner.noisy(ranges, np.random.default_rng(noise_seed))
+            ranges = scanner.add_noise(ranges, np.random.default_rng(noise_seed))
         return scanner.limit(ranges)
 
     def placement_error(self, pose: Array) -> str | None:

@@ -9,7 +9,7 @@ import pytest
 
 from common.bus.bus import wait_until
 from common.bus.inbox import Inbox
-from common.containers.healthcheck import fault_of
+from common.containers.healthcheck import find_fault
 from common.messages.definitions import Scan
 from common.messages.topics import SCAN, TOPICS, TRUTH
 from common.runtime.heartbeat import read_beats
@@ -54,7 +54,7 @@ def test_a_recording_replaces_the_simulator(bus, process, recording, tmp_path):
     for _ in range(2):  # the replay loops
         for number in range(SCANS):
             assert wait_for_message(scans, Scan, lambda message: True).seq == number, running.output
-    healthy = lambda: fault_of("replay", read_beats(tmp_path, "replay"), [bus.robot], time.monotonic()) == ""  # noqa: E731
+    healthy = lambda: find_fault("replay", read_beats(tmp_path, "replay"), [bus.robot], time.monotonic()) == ""  # noqa: E731
     assert wait_until(healthy, TIMEOUT_S), read_beats(tmp_path, "replay")
     assert running.stop()[0] == 0
     assert not all_else.received
@@ -81,7 +81,7 @@ def test_a_recording_without_scans_is_refused(process, tmp_path):
 
 def test_waiting_for_a_remote_robot_reports_when_its_scans_start_and_stop(bus, process, tmp_path):
     running = process("common.containers.remote_robot", "--heartbeat", str(tmp_path))
-    fault = lambda: fault_of("remote", read_beats(tmp_path, "remote"), [bus.robot], time.monotonic())  # noqa: E731
+    fault = lambda: find_fault("remote", read_beats(tmp_path, "remote"), [bus.robot], time.monotonic())  # noqa: E731
     wanted = f"{bus.robot}: no scan was received so far (no scan so far)"
     assert wait_until(lambda: fault() == wanted, TIMEOUT_S), fault()
     assert bus.wait_matching(SCAN, TIMEOUT_S)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 from common.robot.scan_geometry import Sweep
 from services.controller.policies.action_selection import Surroundings, select_action
 from services.controller.policies.decision import Decision
@@ -46,7 +46,7 @@ class ActiveLocaliser:
     def __init__(
         self, robot: Robot, graph: FreeSpaceGraph, min_point_distance: float, *, may_turn: bool = True
     ) -> None:
-        """Keep ``min_point_distance`` m from the robot's centre to all scan points; ``may_turn``: the heading is free."""
+        """Keep ``min_point_distance`` m from the robot's centre to scan points; ``may_turn``: the heading is free."""
         self.may_turn = may_turn
         self.robot = robot.model_copy(update={"max_speed": min(robot.max_speed, MAX_SPEED)})
         self.graph, self.min_point_distance = graph, min_point_distance
@@ -61,7 +61,7 @@ class ActiveLocaliser:
         self._requested, self._field, self._unknown_since_ns = None, None, None
 
     def prediction_request(self, belief: Belief) -> CandidateMotions | None:
-        """Candidate motions for whose end poses scans must be predicted; pass the answer to `use_predictions`.
+        """Candidate motions; scans must be predicted for their end poses and passed to `use_predictions`.
 
         Returns None if no predictions are needed now.
         """
@@ -124,7 +124,7 @@ class ActiveLocaliser:
         # Thin out to MAX_DESTINATIONS, evenly over the costs.
         selected = np.argsort(cost, kind="stable")[:: max(1, -(-len(cost) // MAX_DESTINATIONS))]
         cells, cost = cells[selected], cost[selected]
-        # The field's paths lead to the hypothesis, so the next cell of a path is the one from which the robot would come.
+        # Paths of the field lead to the hypothesis, so a cell's next cell is the previous one on the way there.
         places, previous = self.graph.grid.centres(cells), self.graph.grid.centres(field.next_cell[cells])
         heading = np.arctan2(*(places - previous).T[::-1])  # on arrival
         return se2.between(pose, np.column_stack([places, heading])), cost
@@ -152,7 +152,7 @@ class ActiveLocaliser:
         ranges = np.where(np.isneginf(scan.ranges), 0.0, scan.ranges.astype(np.float64))
         ranges = np.minimum(ranges, MAX_USEFUL_ROOM_M)
         # Beams that were not measured, or were cut out, must not limit the room: their neighbours decide.
-        ranges[~surfaces(scan.ranges) & ~np.isinf(scan.ranges)] = np.inf
+        ranges[~is_surface(scan.ranges) & ~np.isinf(scan.ranges)] = np.inf
         angles = scan.angles() + scan.mount.yaw
         sweep = Sweep.of(scan)
         half = max(1, round(WINDOW_RAD / max(sweep.spacing, WINDOW_RAD / 1000)))  # beams

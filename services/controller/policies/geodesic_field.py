@@ -106,7 +106,7 @@ class FreeSpaceGraph:
         return int(cells[best]) if distance[best] <= within else None
 
     def cost_field(self, point: Array, within: float = np.inf) -> CostField | None:
-        """Costs from every cell to the free cell nearest to ``point`` (2,) m, or None if none is within ``within`` m."""
+        """Costs from all cells to the free cell nearest to ``point`` (2,) m, or None if none is within ``within`` m."""
         cell = self.nearest_free(point, within)
         if cell is None:
             return None
@@ -153,7 +153,7 @@ class CostField:
         return np.concatenate([np.atleast_2d(point), centres[1:-1], self.goal[None]])
 
     def attractor(self, point: Array, path: Array) -> Array:
-        """The point (2,) m of ``path`` that attracts a robot at ``point``: the farthest that a free straight line reaches."""
+        """The point (2,) m of ``path`` that attracts a robot at ``point``: the farthest on a free straight line."""
         distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
         near = np.flatnonzero(distance[1:] <= ATTRACTOR_RANGE_M) + 1
         tried = np.array([1])

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from common.geometry import se2
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 from common.robot.scan_geometry import Sweep
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class TemporaryObstacles:
         laser = se2.compose(pose, scan.mount.array())
         ranges = scan.ranges.astype(np.float64)
         angles = scan.angles()
-        hit = surfaces(ranges) & (ranges < MAX_RANGE_M)
+        hit = is_surface(ranges) & (ranges < MAX_RANGE_M)
         heading = laser[2] + angles[hit]
         ends = laser[:2] + ranges[hit, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
         unmapped = ends[self._free.grid.inside(ends) & (self._free.clearance_at(ends) > MIN_WALL_DISTANCE_M)]
@@ -68,7 +68,7 @@ class TemporaryObstacles:
         if young.any() and old.any():
             points = self.points()
             distance, _ = cKDTree(points[old]).query(points[young], distance_upper_bound=SAME_OBSTACLE_M)
-            young[young] = ~np.isfinite(distance)
+            young[young] = ~np.isfinite(distance)  # keeps the young cells without an old one nearby
         return np.asarray(young)
 
     def _cell_of(self, points: Array) -> npt.NDArray[np.int64]:

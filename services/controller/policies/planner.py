@@ -143,7 +143,7 @@ class GeodesicPolicy:
         return Decision(action, reason, "blocked" if blocked else "navigating", path, motion)
 
     def prediction_request(self, belief: Belief) -> CandidateMotions | None:
-        """Motions to whose end poses scans must be predicted before `decide_unlocalised`, or None if none are needed."""
+        """Motions for which scans must be predicted before `decide_unlocalised`; None if none are needed."""
         if self._goal is None or not self.epistemic:
             return None
         return self.localiser.prediction_request(belief)

@@ -46,12 +46,12 @@ class Player:
             return 0.0
         return max(0.0, (position - self._position) / self.rate - (now - self._since))
 
-    def sent(self, position: float, now: float, *, whole: bool) -> None:
-        """Records that the message at ``position`` was published. ``whole``: it completes a step."""
+    def mark_sent(self, position: float, now: float, *, completes_step: bool) -> None:
+        """Records that the message at ``position`` was published. ``completes_step``: it is the last one of a step."""
         ahead = self.position(now) - position
         if self.paused or self.rate == 0 or ahead > MAX_LAG_S * self.rate:
             self._anchor(position, now)
-        if self._steps and whole:
+        if self._steps and completes_step:
             self._steps -= 1
 
     def handle(self, request: PlayerRequest, now: float) -> PlayerReply:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.geometry import se2
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 from services.estimator.precise import obstruction
 from services.estimator.precise.gauss_newton import View, difference, polish
 from services.estimator.precise.likelihood import Likelihood
@@ -198,7 +198,7 @@ def estimate_noise(ranges: Array, angles: Array) -> float:
     """
     turn = 2 * np.cos(np.diff(angles).mean())
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1 / np.where(surfaces(ranges), ranges, np.nan)
+        inverse = 1 / np.where(is_surface(ranges), ranges, np.nan)
         bend = (inverse[:, 2:] - turn * inverse[:, 1:-1] + inverse[:, :-2]) * ranges[:, 1:-1] ** 2
     return max(MIN_SIGMA_M, float(1.4826 * np.nanmedian(np.abs(bend)) / np.sqrt(2 + turn**2)))
 
