@@ -59,7 +59,7 @@ def _config(link: Link, join_timeout: float = JOIN_TIMEOUT_S) -> zenoh.Config:
         "timestamping/enabled": True,
         # Time in ms after which a silent session (frozen, disconnected) counts as gone; zenoh's default is 10 s.
         "transport/link/tx/lease": 3000,
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 5000,  # us
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 5000,  # microseconds
     }
     if not all(map(on_loopback, link.listen)):
         # Only one of two peers that discover each other may connect: if both try, both may be refused, and neither

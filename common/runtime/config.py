@@ -1,8 +1,8 @@
 """Settings from defaults, a YAML file, the environment and the command line.
 
 Each service has one settings class. Environment variables, command-line options and their help are derived from its
-fields. The command `presage` passes what it is given on to these classes, as arguments; it is written with typer,
-because a command is an action with arguments of its own, and a container of one service needs no typer.
+fields. The command `presage` passes its options on to these classes as arguments. It uses typer for its sub-commands;
+services have none, so a container of one service needs no typer.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ class RobotSettings(ServiceSettings):
         )
 
 
-class SeenRobotSettings(RobotSettings):
+class SelfFilterSettings(RobotSettings):
     """Settings of a robot whose scanner sees parts of the robot. Controller and bridge have to get the same values."""
 
     ignore_angles: Annotated[

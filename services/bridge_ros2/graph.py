@@ -15,13 +15,13 @@ class Graph:
     """
 
     def __init__(self, names: Names | None = None) -> None:
-        """``names``: how the bridge itself names topics on zenoh."""
+        """``names`` are the bridge's own keys on zenoh."""
         self._names = names or Names()
         self._tokens: dict[str, Endpoint] = {}
 
-    def change(self, token: str, *, there: bool) -> None:
+    def change(self, token: str, *, alive: bool) -> None:
         """Records that a token appeared or disappeared."""
-        if there and (endpoint := read_token(token)) is not None:
+        if alive and (endpoint := read_token(token)) is not None:
             self._tokens[token] = endpoint
         else:
             self._tokens.pop(token, None)

@@ -97,7 +97,7 @@ class RosSession:
     def _on_token(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
         if self._node is None or f"/{self._node.zid}/" not in key:  # not the bridge's own
-            self._graph.change(key, there=sample.kind == zenoh.SampleKind.PUT)
+            self._graph.change(key, alive=sample.kind == zenoh.SampleKind.PUT)
 
     def _declare_token(self, key: str) -> None:
         self._declared.append(self._session.liveliness().declare_token(key))

@@ -1,4 +1,4 @@
-"""The process: two zenoh sessions."""
+"""The bridge service, with one zenoh session for presage and one for ROS."""
 
 from __future__ import annotations
 

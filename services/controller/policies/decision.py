@@ -51,7 +51,7 @@ class Policy(Protocol):
         """Undo the last `interrupt`: the simulation was only paused, no simulated time has passed."""
 
     def observe(self, scan: Scan, belief: Belief) -> None:
-        """Take a scan and the belief computed from it."""
+        """Process a scan and the belief computed from it."""
 
     def decide(self, belief: Belief, velocity: Array) -> Decision:
         """Choose a velocity towards the goal when the pose is known; ``velocity`` (3,) is the latest command."""

@@ -31,7 +31,7 @@ MAX_TRIED_DESTINATIONS = 20
 
 @dataclass(frozen=True)
 class PredictionTrust:
-    """How far differences between predicted scans are trusted to tell hypotheses apart.
+    """Parameters that limit how much evidence differences between predicted scans can give.
 
     A beam is an outlier with probability e = ``outliers``; every range is then equally likely:
     p(o) = (1 - e) N(o; r, s²) + e / R.
@@ -117,7 +117,7 @@ def expected_free_energy(gain: Array, length: Array, nats_per_metre: float) -> A
 
 
 def best_index(energy: Array, length: Array) -> int | None:
-    """Index of the least expected free energy (M,), or None if none is finite.
+    """Index of the lowest expected free energy (M,), or None if none is finite.
 
     Among equal ones, the shortest path is preferred, then the first.
     """

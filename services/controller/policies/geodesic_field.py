@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.controller.policies.free_space import FreeSpace
 
-WALL_GAP_M = 0.03  # least distance between footprint and wall, a little more than the obstacle stop needs
-WALL_COST_RANGE_M = 0.35  # beyond the least clearance, up to where a metre costs more
-MAX_WALL_COST = 1.0  # additional cost of a metre at the least clearance
+WALL_GAP_M = 0.03  # minimum distance between footprint and wall, a little more than the obstacle stop needs
+WALL_COST_RANGE_M = 0.35  # range of clearances beyond the minimum within which a metre costs more
+MAX_WALL_COST = 1.0  # additional cost of a metre at the minimum clearance
 ATTRACTOR_RANGE_M = 3.0  # length of the path within which the attractor is chosen
 MAX_ATTRACTOR_CANDIDATES = 12
 MAX_LINE_COST_RATIO = 1.02  # cost of the straight line to the attractor, relative to the path on the grid

@@ -53,9 +53,7 @@ class PaperEstimator:
     settings: Descent = field(default_factory=Descent)
     # (2,) factor on alpha for each axis, see Normalisation.metric
     metric: Array = field(default_factory=lambda: np.ones(2))
-    known: bool = (
-        False  # whether the initial belief is the true pose; the state is then tracking from the first scan on
-    )
+    known: bool = False  # the initial belief is the true pose, so the state is tracking from the first scan
 
     def __post_init__(self) -> None:
         """Clears the averages of step and misfit."""

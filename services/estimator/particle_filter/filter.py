@@ -25,11 +25,11 @@ INITIAL_COVARIANCE = np.diag([0.25, 0.25, (np.pi / 12) ** 2])  # nav2's initial_
 COMMAND_NOISE = 0.5  # as a share of the recently commanded speed, because the base lags behind its command
 COMMAND_MEMORY_S = 0.5  # for which a past command may still have effect
 MAX_CLUSTER_DEVIATION_M = 0.3  # position standard deviation of a cluster that counts as one place
-TRACKING_WEIGHT = 0.95  # least weight of the best cluster in state tracking
+TRACKING_WEIGHT = 0.95  # minimum weight of the best cluster in state tracking
 SAMPLED_PLACES = 20_000  # in free space, sampled in advance because sampling takes longer than an update
 LOST_FIT_RATIO = 0.65  # ratio of short- to long-term fit below which the pose is not believed
 FOUND_FIT_RATIO = 0.85  # ratio above which it is believed again
-MAX_SEARCHES = 3  # that end at one place with a poor fit, before the fit is attributed to a change of the world
+MAX_SEARCHES = 3  # after so many searches that end at one place with a poor fit, the world must have changed
 
 
 class ParticleFilter:

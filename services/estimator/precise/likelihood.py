@@ -55,9 +55,9 @@ class Likelihood:
     """Parameters of the density, as the module describes it."""
 
     sigma: float = 0.02  # m
-    short: float = 0.25
-    random: float = 0.005
-    unseen: float = 0.05
+    short: float = 0.25  # share of beams that end early
+    random: float = 0.005  # share of other outliers
+    unseen: float = 0.05  # probability of no return from a surface
     relative: float = 0.0  # standard deviation of the noise that grows with the range, as a share of the range
 
     def evaluate(self, measured: Array, range_max: float, expected: Expected, extra_sigma: float = 0.0) -> Evidence:

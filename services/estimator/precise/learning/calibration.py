@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from services.estimator.shared.generative_models import Expected, GenerativeModel
 
 EM_STEPS = 30
-PRIOR_BEAMS = 10.0  # pseudo-count: as if this many beams of every kind had been seen in addition
+PRIOR_BEAMS = 10.0  # pseudo-count of each kind of beam
 MIN_SIGMA_M = 0.003
 CHI2_MEDIAN = 2.366  # median of chi squared with three degrees of freedom
-MAX_POSITION_ERROR_M = 0.3  # beyond it another place was found, for which the covariance does not hold
+MAX_POSITION_ERROR_M = 0.3  # larger errors mean that another place was found; the covariance does not describe them
 PROBABILITIES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 
 

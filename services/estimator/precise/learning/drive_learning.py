@@ -28,7 +28,7 @@ from services.estimator.precise.learning.field_learning import (
 )
 from services.estimator.precise.learning.surfaces import Beams
 
-HELD_OUT_EVERY = 5  # one scan in so many is held out to measure the precision
+HELD_OUT_EVERY = 5  # every fifth scan is held out, to measure the precision
 MIN_SCANS = 50
 Report = Callable[[str, float], None]
 
