@@ -13,7 +13,7 @@ from common.geometry.world import World
 from common.robot.ranges import normalise_driver_ranges
 from common.robot.scanner import SCANNERS, Scanner
 from presage.laser_scan import LaserScan
-from services.estimator.factory import Choice, Geometry, Name, prepare
+from services.estimator.factory import EstimatorOptions, Geometry, Name, prepare
 from services.estimator.paper.perception import Descent
 from services.estimator.precise.gauss_newton import Optimiser
 from services.estimator.precise.likelihood import Likelihood
@@ -66,7 +66,7 @@ class Estimator:
             descent: parameters of preset "paper".
 
         """
-        choice = Choice(
+        choice = EstimatorOptions(
             world if isinstance(world, World) else str(world),
             preset,
             model=str(model) if isinstance(model, str | Path) else "",

@@ -44,7 +44,7 @@ ALSO_SHELL = {
     "services/estimator/paper/weights.py",
     "services/estimator/precise/learning/weights.py",
     "services/viewer/control.py",
-    "services/viewer/desk.py",
+    "services/viewer/request_handler.py",
     "services/viewer/playback.py",
     "services/viewer/server.py",
     "services/viewer/visitor_session.py",

@@ -19,13 +19,13 @@ from common.versions import commit, versions
 from lab.accuracy import tasks
 from lab.accuracy.scenes import TWINS, Scene
 from lab.workers import pool
-from services.estimator.factory import Choice, Geometry, Name, prepare
+from services.estimator.factory import EstimatorOptions, Geometry, Name, prepare
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_places
-from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_ripple, learn_scales
+from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_scales, measure_ripple
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.interface import Estimator
@@ -68,7 +68,7 @@ def run(job: Job) -> list[dict[str, Any]]:
     world = load_world(job.world)
     geometry = Geometry.of(job.scanner)
     name, model = ESTIMATORS[job.estimator]
-    estimator = prepare(Choice(job.world, name, model, seed=job.seed))(geometry)
+    estimator = prepare(EstimatorOptions(job.world, name, model, seed=job.seed))(geometry)
     outcomes: dict[str, tasks.Outcome] = {}
     for number, task in enumerate((tasks.standing, tasks.blocked, tasks.kidnapped)):
         if task.__name__ in job.tasks:
@@ -125,7 +125,7 @@ def quick_field(
         clean, noisy = (np.where(ranges > geometry.range_max, np.inf, ranges) for ranges in (clean, noisy))
     field = learn_field(Beams.of(poses[split:], geometry.mount, geometry.angles, noisy), Recipe(sweeps=6))
     scales = learn_scales(field, poses[:split], geometry.mount, geometry.angles, clean[:split], 0.0)
-    ripple = learn_ripple(field, se2.compose(poses[:split], geometry.mount), geometry.angles)
+    ripple = measure_ripple(field, se2.compose(poses[:split], geometry.mount), geometry.angles)
     return FieldModel(field, scales, ripple)
 
 

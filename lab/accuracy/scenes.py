@@ -48,7 +48,7 @@ class Scene:
         """Observation of noise-free ranges (B,) with fresh noise added."""
         scanner = self.scanner
         return Observation(
-            scanner.limit(scanner.noisy(clean, self.rng)), scanner.angles(), scanner.range_max, stamp, odom
+            scanner.limit(scanner.add_noise(clean, self.rng)), scanner.angles(), scanner.range_max, stamp, odom
         )
 
     def blocked(self, clean: Array, share: float) -> Array:

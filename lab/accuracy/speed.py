@@ -17,7 +17,7 @@ from lab.accuracy.runner import ESTIMATORS, provenance
 from lab.accuracy.scenes import Scene
 from lab.workers import pool
 from presage.terminal.output import check_file, write_json
-from services.estimator.factory import Choice, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, Geometry, prepare
 
 LIMITS = {"tracking": 5.0, "from nothing": 500.0}  # ms per update, the requirement for preset precise
 TRACKING_UPDATES = 300
@@ -56,7 +56,7 @@ def measure(estimator: str, world_name: str, beams: int, seed: int) -> dict[str,
     scene = Scene.of(load_world(world_name), beams, seed)
     began = time.perf_counter()
     geometry = Geometry.of(scene.scanner)
-    estimator_under_test = prepare(Choice(world_name, name, model, seed=seed))(geometry)
+    estimator_under_test = prepare(EstimatorOptions(world_name, name, model, seed=seed))(geometry)
     ready = time.perf_counter() - began
     searches = []
     for clean in scene.clean(scene.poses(20)):

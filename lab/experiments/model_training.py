@@ -23,8 +23,8 @@ from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_
 from services.estimator.precise.learning.field_learning import (
     Recipe,
     learn_field,
-    learn_ripple,
     learn_scales,
+    measure_ripple,
     reachable,
 )
 from services.estimator.precise.learning.surfaces import Beams
@@ -117,7 +117,7 @@ def learn_precise(scene: Scene, samples: int, recipe: Recipe | None = None) -> T
     field = learn_field(Beams.of(data.poses[split:], mount, angles, data.ranges[split:]), recipe)
     held, scans = data.poses[:split], data.ranges[:split]
     model = FieldModel(field, learn_scales(field, held, mount, angles, scans, scanner.sigma))
-    model = replace(model, ripple=learn_ripple(field, se2.compose(held, mount), angles))
+    model = replace(model, ripple=measure_ripple(field, se2.compose(held, mount), angles))
     visited = se2.compose(data.poses, mount)[:, :2]
     places = thin_places(np.concatenate([visited, reachable(field, visited)]), SEED_SPACING_M)
     return TrainedField(model, Seeds.at(model, places), time.process_time() - began)

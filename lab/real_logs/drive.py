@@ -15,7 +15,7 @@ from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from presage.learning.train_drive import drive_of, split
 from presage.logs.scan_files import read_scans
-from services.estimator.factory import Choice, Factory, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.sensor import Sensor
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
@@ -149,7 +149,7 @@ def particle_settings(changed: tuple[tuple[str, float], ...]) -> ParticleSetting
 
 @functools.lru_cache(maxsize=2)
 def _precise(world: str, model: str) -> Factory:
-    return prepare(Choice(world, "precise", model))
+    return prepare(EstimatorOptions(world, "precise", model))
 
 
 @functools.lru_cache(maxsize=4)

@@ -19,7 +19,7 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.occupancy_grid import FREE, MAX_CELLS, OCCUPIED, UNKNOWN, Cells
 from common.geometry.se2 import Array
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 from presage.learning.grid_map import write_map
 from presage.learning.train_drive import drive_of, split
 from presage.logs.log import Reading
@@ -105,7 +105,7 @@ def cells_of(drive: Drive, cell: float, progress: Console | None = None) -> tupl
 
 def _beam_points(laser: Array, ranges: Array, drive: Drive, cell: float) -> tuple[Array, Array]:
     """Ends of the beams (K, 2) m in map, and points (L, 2) along them, half a cell apart."""
-    hit = surfaces(ranges) & (ranges < drive.range_max)
+    hit = is_surface(ranges) & (ranges < drive.range_max)
     ranges = ranges[hit]
     angles = laser[2] + drive.angles[hit]
     unit = np.stack([np.cos(angles), np.sin(angles)], axis=-1)

@@ -16,7 +16,7 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import World, load_world
 from common.robot.base import Robot
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 from common.robot.scanner import Scanner
 from common.versions import commit, versions
 from presage.learning.drive_figure import draw_learned
@@ -91,7 +91,7 @@ def drive_of(scans: Scans, log: Path) -> Drive:
         raise UserError(f"{log}: no stamps, but they are needed to compute the velocity of the robot")
     latest = np.maximum.accumulate(scans.stamps)  # stamps begin again where a simulation was restarted
     use = np.flatnonzero(np.isfinite(scans.truth).all(axis=1) & (scans.stamps == latest))
-    if not surfaces(scans.ranges[use]).any():
+    if not is_surface(scans.ranges[use]).any():
         raise UserError(f"{log}: no beam of the scans with a reference pose hit a surface")
     odom = None if scans.odom is None or not np.isfinite(scans.odom[use]).all() else scans.odom
     whole = Drive(

@@ -28,8 +28,8 @@ from services.estimator.precise.learning.evaluation import Quality, evaluate
 from services.estimator.precise.learning.field_learning import (
     Recipe,
     learn_field,
-    learn_ripple,
     learn_scales,
+    measure_ripple,
     reachable,
 )
 from services.estimator.precise.learning.surfaces import Beams
@@ -102,7 +102,7 @@ def _train(
         TEST_SAMPLES // 2
     )  # the precision is learned from one half of the test scans, the errors are computed from the other
     scales = learn_scales(field, poses["test"][:half], mount, angles, scans["test"][:half], 0.0)
-    ripple = learn_ripple(field, se2.compose(poses["test"][:half], mount), angles)
+    ripple = measure_ripple(field, se2.compose(poses["test"][:half], mount), angles)
     model = FieldModel(field, scales, ripple)
     quality = evaluate(
         model,

@@ -33,7 +33,7 @@ from common.geometry import rasterize as raster
 from common.geometry.se2 import Array
 from common.geometry.world import World
 from common.messages.definitions import Belief, Hypothesis, Plan, Prediction, Preference, Scan
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 
 TRUTH, BELIEF, GOAL = (0.0, 0.0, 0.0), (0.84, 0.37, 0.0), (0.0, 0.62, 0.45)  # RGB, as in `presage plot`
 WALL, FURNITURE = (0.55, 0.55, 0.55), (0.78, 0.78, 0.78)
@@ -84,7 +84,7 @@ def transform(parent: str, child: str, xyyaw: Array, ns: int) -> FrameTransform:
 
 def laser_scan(scan: Scan | Prediction, ns: int) -> LaserScan:
     """Measured or predicted ranges in frame laser; values that are not distances (±inf, 0) become NaN, not drawn."""
-    ranges = np.where(surfaces(scan.ranges), scan.ranges, np.nan).astype(float)
+    ranges = np.where(is_surface(scan.ranges), scan.ranges, np.nan).astype(float)
     return LaserScan(
         timestamp=time_of(ns),
         frame_id="laser",

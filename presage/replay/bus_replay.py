@@ -26,8 +26,8 @@ def run_replay(file: Path, link: Link, choice: ReplayOptions, console: Console) 
     """Replays the recording onto the bus until its end, the key q, or Ctrl-C."""
 
     @contextmanager
-    def steering(remote: ReplayControl) -> Iterator[None]:
-        with keyboard(remote) as available:
+    def show_progress(control: ReplayControl) -> Iterator[None]:
+        with keyboard(control) as available:
             if available:
                 console.print(HELP, style="dim", highlight=False)
             with bar:
@@ -42,7 +42,7 @@ def run_replay(file: Path, link: Link, choice: ReplayOptions, console: Console) 
             shown = now
             bar.update(task, completed=state.position_s, total=max(state.duration_s, 1e-9), status=describe(state))
 
-    counts = replay(file, link, choice, on_progress=show, opening=session, steering=steering)
+    counts = replay(file, link, choice, on_progress=show, open_session=session, control_context=show_progress)
     console.print("replayed " + (", ".join(f"{key} {count}" for key, count in sorted(counts.items())) or "nothing"))
 
 

@@ -29,7 +29,7 @@ from presage.logs.scan_files import Prior, Scans, read_scans
 from presage.session.stack import ignoring_interrupts
 from presage.terminal.output import check_file
 from presage.terminal.progress import progress, working
-from services.estimator.factory import Choice, Name, check_start
+from services.estimator.factory import EstimatorOptions, Name, check_start
 from services.estimator.shared.interface import Posterior
 from services.recorder.reader import read_recording
 from services.recorder.replaying.player import span
@@ -47,7 +47,7 @@ class LocalizeOptions:
     """Options of `presage localize`."""
 
     file: Path
-    choice: Choice
+    choice: EstimatorOptions
     mode: Literal["global", "track"] = "global"
     fresh: bool = False
     prior: Prior = "odometry"
@@ -62,7 +62,7 @@ class LocalizeOptions:
     def of(
         cls,
         file: Path,
-        choice: Choice,
+        choice: EstimatorOptions,
         mode: str,
         frame: str,
         reading: Reading,
@@ -94,7 +94,7 @@ def choice_of(
     sigma: float | None,
     seed: int,
     initial_pose: str,
-) -> Choice:
+) -> EstimatorOptions:
     """The estimator chosen on the command line; the world defaults to that of the recording.
 
     Raises UserError if the estimator is unknown or there is no world.
@@ -108,8 +108,8 @@ def choice_of(
         recorded = read_recording(file).world()
         if recorded is None:
             raise UserError(f"{file}: no world was recorded: give one with --world")
-        return Choice(recorded, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
-    return Choice(world, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
+        return EstimatorOptions(recorded, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
+    return EstimatorOptions(world, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def run(
         yield Localised(posterior, (time.perf_counter() - began) * 1e3)
 
 
-def prepare(choice: Choice, console: Console) -> Estimator:
+def prepare(choice: EstimatorOptions, console: Console) -> Estimator:
     """The chosen estimator, without its initial pose."""
     with working(f"preparing {choice.estimator} for {choice.world_argument}", console):
         return Estimator(

@@ -36,7 +36,7 @@ from presage.replay.recorded_session import estimator_settings, recorded_setting
 from presage.replay.report import BeliefSeries, compare, draw, table
 from presage.terminal.output import check_file, write_json
 from presage.terminal.progress import progress
-from services.estimator.service import belief_message, choice_of, prediction_message
+from services.estimator.service import belief_message, estimator_options, prediction_message
 from services.estimator.settings import EstimatorSettings
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.reader import Raw, Recording, read_recording
@@ -77,7 +77,7 @@ def rerun_command(job: RerunOptions, json_file: Path | None, console: Console) -
         out = job.target(settings.estimator)
         for beside in (".png", ".pdf", ".csv"):
             check_file(out.with_suffix(beside), "--out")
-        scans, choice = read_scans(job.file).with_prior(settings.prior), choice_of(settings)
+        scans, choice = read_scans(job.file).with_prior(settings.prior), estimator_options(settings)
         localised = run(prepare(choice, console), scans, start=choice.initial_pose)
         with closing(progress(localised, "localising", len(scans), console)) as shown:
             old, new = write_recording(recording, robot, settings, scans, shown, out)

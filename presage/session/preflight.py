@@ -14,7 +14,7 @@ from common.runtime.config import load_settings
 from presage.terminal.options import arguments
 from services.controller.settings import ControllerSettings
 from services.estimator.factory import check
-from services.estimator.service import choice_of
+from services.estimator.service import estimator_options
 from services.estimator.settings import EstimatorSettings
 from services.simulator.settings import SimulatorSettings
 
@@ -65,7 +65,7 @@ def plan_session(
         pose = loaded_world.start_pose(radius) if start is None else np.array(start)
         if (error := loaded_world.placement_error(pose, radius)) is not None:
             raise UserError(f"start {error} (settings start and radius)")
-    check(choice_of(estimator_settings), loaded_world)
+    check(estimator_options(estimator_settings), loaded_world)
     return Plan(
         tuple(common),
         tuple(simulator_args),

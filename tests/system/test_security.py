@@ -52,7 +52,7 @@ class SecureRouter:
     @contextmanager
     def session(self, name, **more):
         link = Link(connect=(f"tcp/127.0.0.1:{self.port}",), security=credentials(self.keys, (name,)), **more)
-        with open_bus(link, patience=WAIT_TIMEOUT_S) as bus:
+        with open_bus(link, connect_timeout=WAIT_TIMEOUT_S) as bus:
             assert wait_until(bus.linked, WAIT_TIMEOUT_S)
             yield bus
 
@@ -162,7 +162,7 @@ def test_imposter_of_the_router(secure_router, name, answered):
     )
     fake.wait_for("serving")
     link = Link(connect=(f"tcp/127.0.0.1:{port}",), security=credentials(secure_router.keys, ("operator",)))
-    with open_bus(link, patience=WAIT_TIMEOUT_S) as bus:
+    with open_bus(link, connect_timeout=WAIT_TIMEOUT_S) as bus:
         assert wait_until(bus.linked, WAIT_TIMEOUT_S)
         if answered:
             assert bus.ask(WORLD, Request(), WorldReply, WAIT_TIMEOUT_S).reason == "I am the world"

@@ -13,7 +13,7 @@ from common.limits import MAX_BEAMS
 from lab.accuracy import bound, tasks
 from lab.accuracy.runner import quick_field
 from lab.accuracy.scenes import TWINS, Scene
-from services.estimator.factory import Choice, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, Geometry, prepare
 from services.estimator.precise.estimator import TARGET_BEAMS, PreciseEstimator
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.shared.generative_models import RayCaster
@@ -175,7 +175,7 @@ def test_shipped_fields(world):
     """Finds 10 of 10 poses to a few millimetres; nothing was tuned on these poses and this noise."""
     scene = Scene.of(load_world(world), 622, 4242)
     scanner = scene.scanner
-    made = prepare(Choice(world))(Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max))
+    made = prepare(EstimatorOptions(world))(Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max))
     errors = []
     for pose in scene.poses(10):
         made.restart()

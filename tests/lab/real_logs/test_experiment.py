@@ -45,7 +45,7 @@ def folder(tmp_path_factory):
     made = tmp_path_factory.mktemp("drive")
     real_drive.save(made / "drive.npz", real_drive.drive(200))
     (made / "before.yaml").write_text(save_world(real_drive.BEFORE), encoding="utf-8")
-    recipe = Recipe(resolution=0.05, sweeps=4, beams_a_sweep=40_000)
+    recipe = Recipe(resolution=0.05, sweeps=4, beams_per_sweep=40_000)
     job = Training(made / "drive.npz", str(made / "before.yaml"), made, 100, recipe, 0.5, HERE)
     train_from_drive(job, Console(quiet=True))
     return made
