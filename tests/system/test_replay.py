@@ -20,7 +20,7 @@ import pytest
 
 from common.bus.bus import wait_until
 from common.bus.inbox import Inbox, Sample
-from common.containers.healthcheck import fault_of
+from common.containers.healthcheck import find_fault
 from common.geometry import se2
 from common.geometry.world import load_world
 from common.messages.definitions import Belief, CmdVel, Goal, Health, Pose, Scan
@@ -172,7 +172,7 @@ def test_recording_instead_of_the_simulator(bus, process, recordings, tmp_path):
             assert wait_for_message(scans, Scan, lambda _: True).seq == number, running.output
 
     def healthy():
-        return fault_of("replay", read_beats(tmp_path, "replay"), [bus.robot], time.monotonic()) == ""
+        return find_fault("replay", read_beats(tmp_path, "replay"), [bus.robot], time.monotonic()) == ""
 
     assert wait_until(healthy, WAIT_TIMEOUT_S), read_beats(tmp_path, "replay")
     assert running.stop()[0] == 0
@@ -197,7 +197,7 @@ def test_wait_for_a_remote_robot(bus, process, tmp_path):
     running = process("common.containers.remote_robot", "--heartbeat", str(tmp_path))
 
     def fault():
-        return fault_of("remote", read_beats(tmp_path, "remote"), [bus.robot], time.monotonic())
+        return find_fault("remote", read_beats(tmp_path, "remote"), [bus.robot], time.monotonic())
 
     wanted = f"{bus.robot}: no scan was received so far (no scan so far)"
     assert wait_until(lambda: fault() == wanted, WAIT_TIMEOUT_S), fault()
