@@ -117,23 +117,33 @@ def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: P
         model, size = learn(scans)
         took = time.monotonic() - began
         quality = evaluate(model, scans.test, np.zeros(3), scans.angles, scans.test_ranges, 25.0, scans.sigma)
-        rows.append({
-            "decoder": name, "learning_s": round(took, 1), "numbers": size,
-            "range_error_median_m": quality.range_error_median, "range_error_mean_m": quality.range_error_mean,
-            "share_above_5_cm": quality.share_above_5_cm, "position_error_median_m": quality.position_error_median,
-            "position_error_rms_m": quality.position_error_rms,
-        })  # fmt: skip
+        rows.append(
+            {
+                "decoder": name,
+                "learning_s": round(took, 1),
+                "numbers": size,
+                "range_error_median_m": quality.range_error_median,
+                "range_error_mean_m": quality.range_error_mean,
+                "share_above_5_cm": quality.share_above_5_cm,
+                "position_error_median_m": quality.position_error_median,
+                "position_error_rms_m": quality.position_error_rms,
+            }
+        )
     table = Table(title=f"{world}, {samples} scans of 811 beams with noise of 0.02 m", title_justify="left")
     table.add_column("decoder")
     for column in COLUMNS:
         table.add_column(column, justify="right")
     for row in rows:
         table.add_row(
-            row["decoder"], f"{row['learning_s']:.0f}", f"{row['numbers'] / 1e6:.2f} M",
-            f"{row['range_error_median_m'] * 1e3:.2f}", f"{row['range_error_mean_m'] * 1e3:.1f}",
-            f"{row['share_above_5_cm'] * 100:.1f}", f"{row['position_error_median_m'] * 1e3:.2f}",
+            row["decoder"],
+            f"{row['learning_s']:.0f}",
+            f"{row['numbers'] / 1e6:.2f} M",
+            f"{row['range_error_median_m'] * 1e3:.2f}",
+            f"{row['range_error_mean_m'] * 1e3:.1f}",
+            f"{row['share_above_5_cm'] * 100:.1f}",
+            f"{row['position_error_median_m'] * 1e3:.2f}",
             f"{row['position_error_rms_m'] * 1e3:.2f}",
-        )  # fmt: skip
+        )
     console.print(table)
     console.print(
         "position: error of the pose estimated from noise-free scans, starting at the true pose. It is due to the "

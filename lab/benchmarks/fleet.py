@@ -67,12 +67,20 @@ class DeploymentResult:
         if self.way == DEPLOYMENTS[0]:
             per_robot = (self.memory_mb[most] - self.memory_mb[fewest]) / max(1, most - fewest)
         return {
-            "estimator": self.estimator, "way": self.way, "robots_served": self.served,
-            "at_most_tried": most, "memory_per_robot_mb": per_robot, "memory_mb": self.memory_mb[most],
-            "p50_ms": best and best["p50_ms"], "p99_ms": best and best["p99_ms"],
-            "cpu_ms_per_scan": cpu_ms, "robots_by_cpu": 1e3 / self.rate / cpu_ms, "windows": self.windows,
-            "while_one_searches": self.searching, "message_bytes": self.bytes,
-        }  # fmt: skip
+            "estimator": self.estimator,
+            "way": self.way,
+            "robots_served": self.served,
+            "at_most_tried": most,
+            "memory_per_robot_mb": per_robot,
+            "memory_mb": self.memory_mb[most],
+            "p50_ms": best and best["p50_ms"],
+            "p99_ms": best and best["p99_ms"],
+            "cpu_ms_per_scan": cpu_ms,
+            "robots_by_cpu": 1e3 / self.rate / cpu_ms,
+            "windows": self.windows,
+            "while_one_searches": self.searching,
+            "message_bytes": self.bytes,
+        }
 
 
 class EstimatorDeployment:
@@ -148,11 +156,17 @@ class EstimatorDeployment:
 
 def _row(window: Window, cpu_s: float, plan: Plan) -> dict[str, Any]:
     return {
-        "robots": window.robots, "sent": window.sent, "answered_share": window.answered / window.sent,
-        "in_time_share": window.in_time_share, "p50_ms": window.percentile(50), "p99_ms": window.percentile(99),
-        "cpu_ms_per_scan": 1e3 * cpu_s / max(1, window.answered), "core_share": cpu_s / plan.seconds,
-        "tracking": window.tracking, "served": window.in_time_share >= plan.share,
-    }  # fmt: skip
+        "robots": window.robots,
+        "sent": window.sent,
+        "answered_share": window.answered / window.sent,
+        "in_time_share": window.in_time_share,
+        "p50_ms": window.percentile(50),
+        "p99_ms": window.percentile(99),
+        "cpu_ms_per_scan": 1e3 * cpu_s / max(1, window.answered),
+        "core_share": cpu_s / plan.seconds,
+        "tracking": window.tracking,
+        "served": window.in_time_share >= plan.share,
+    }
 
 
 def max_robots_served(served: Callable[[int], bool], most: int) -> int:
@@ -224,9 +238,17 @@ def bench_fleet(estimators: str, plan: Plan, json_file: Path | None, console: Co
     ratios = show(rows, plan, console)
     load_average = os.getloadavg()[0]
     console.print(f"load of the machine at the end: {load_average:.1f} on {os.cpu_count()} cores", highlight=False)
-    write_json(json_file, {
-        "rows": rows, "ratio_one_process_to_one_each": ratios, "load_average_1min": load_average,
-        "arguments": sys.argv[1:], "seed": plan.seed, "commit": commit(), "versions": versions(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-    })  # fmt: skip
+    write_json(
+        json_file,
+        {
+            "rows": rows,
+            "ratio_one_process_to_one_each": ratios,
+            "load_average_1min": load_average,
+            "arguments": sys.argv[1:],
+            "seed": plan.seed,
+            "commit": commit(),
+            "versions": versions(),
+            "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        },
+    )
     return 0

@@ -103,9 +103,13 @@ class Load:
         """
         rate = rate or self.rate
         schedule = sorted(
-            (((k + robot.phase) / rate, robot, robot.scans + k) for robot in self.robots[:count]
-             for k in range(max(1, int(seconds * rate)))), key=lambda row: row[0],
-        )  # fmt: skip
+            (
+                ((k + robot.phase) / rate, robot, robot.scans + k)
+                for robot in self.robots[:count]
+                for k in range(max(1, int(seconds * rate)))
+            ),
+            key=lambda row: row[0],
+        )
         payloads = [self._payload(robot, k) for _, robot, k in schedule]
         while self._inbox.get(0) is not None:
             pass  # discard late answers to the previous measurement
@@ -129,11 +133,16 @@ class Load:
         scanner, laser = self.scanner, se2.compose(robot.pose(k, self.rate), self.scanner.mount)
         clean = self.world.ray_distances(laser[None], scanner.angles())[0]
         return Scan(
-            stamp_ns=self._stamp(k), seq=k, angle_min=scanner.angle_min, angle_increment=scanner.angle_increment,
-            range_min=scanner.range_min, range_max=scanner.range_max,
+            stamp_ns=self._stamp(k),
+            seq=k,
+            angle_min=scanner.angle_min,
+            angle_increment=scanner.angle_increment,
+            range_min=scanner.range_min,
+            range_max=scanner.range_max,
             ranges=clean + scanner.sigma * self._rng.standard_normal(len(clean)),
-            mount=Pose.of(scanner.mount), scan_time=1 / self.rate,
-        ).encode()  # fmt: skip
+            mount=Pose.of(scanner.mount),
+            scan_time=1 / self.rate,
+        ).encode()
 
     def _window(self, count: int, sent: dict[tuple[str, int], int]) -> Window:
         """Match the received answers to the scans in ``sent``, waiting up to `ANSWER_TIMEOUT_S` for the last ones."""

@@ -50,12 +50,15 @@ def show(rows: list[dict[str, Any]], plan: Plan, console: Console) -> dict[str, 
         table.add_column(column, justify="left" if column in {"estimator", "way"} else "right")
     for row in rows:
         table.add_row(
-            row["estimator"], row["way"], f"{row['robots_served']}",
+            row["estimator"],
+            row["way"],
+            f"{row['robots_served']}",
             *(f"{row[name]:.1f}" if row[name] is not None else "" for name in ("p50_ms", "p99_ms")),
             f"{row['cpu_ms_per_scan']:.2f}",
             f"{row['robots_by_cpu']:.1f}",
-            f"{row['memory_per_robot_mb']:.1f}", f"{row['memory_mb']:.0f}",
-        )  # fmt: skip
+            f"{row['memory_per_robot_mb']:.1f}",
+            f"{row['memory_mb']:.0f}",
+        )
     console.print(table)
     for row in rows:
         if (other := row["while_one_searches"]) is not None and other["p99_ms"] is not None:

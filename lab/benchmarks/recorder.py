@@ -56,8 +56,10 @@ def publish_main() -> None:
     job = json.loads(os.environ["BENCH_RECORDER"])
     load, rng = Load(**job["load"]), np.random.default_rng(0)
     ranges = rng.uniform(0.1, 25.0, (64, load.beams)).astype(np.float32)
-    bodies = [Scan(stamp_ns=0, angle_min=0, angle_increment=0, range_min=0, range_max=25, ranges=r).model_dump()
-              for r in ranges]  # fmt: skip
+    bodies = [
+        Scan(stamp_ns=0, angle_min=0, angle_increment=0, range_min=0, range_max=25, ranges=r).model_dump()
+        for r in ranges
+    ]
     from common.bus.bus import Link  # noqa: PLC0415
 
     with open_bus(Link(robot=ROBOT, connect=(os.environ["PRESAGE_CONNECT"],))) as bus:
@@ -129,9 +131,11 @@ def _observe(
                 after, ended = recorder.cpu_times(), time.monotonic()
     spent = after.user + after.system - before.user - before.system
     return {
-        "core_share": spent / (ended - began), "memory_mb": memory / 1e6, "memory_before_mb": first_mb,
+        "core_share": spent / (ended - began),
+        "memory_mb": memory / 1e6,
+        "memory_before_mb": first_mb,
         "seconds": ended - began,
-    }  # fmt: skip
+    }
 
 
 def _compare(sent: dict[str, Any], file: Path) -> dict[str, Any]:

@@ -161,11 +161,18 @@ def _report(without: Cost, viewed: Cost, seconds: float, rounds: int, beams: int
         numbers[f"unanswered_{name}"] = cost.unanswered
     return {
         **numbers,
-        "viewer_cpu_share": viewed.cpu_s / viewed.seconds, "viewer_memory_mb": viewed.memory_mb,
-        "frames_hz": viewed.frames / viewed.seconds, "frame_bytes": viewed.bytes / max(1, viewed.frames),
-        "seconds": seconds, "rounds": rounds, "beams": beams, "commit": commit(), "versions": versions(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores", "arguments": sys.argv[1:],
-    }  # fmt: skip
+        "viewer_cpu_share": viewed.cpu_s / viewed.seconds,
+        "viewer_memory_mb": viewed.memory_mb,
+        "frames_hz": viewed.frames / viewed.seconds,
+        "frame_bytes": viewed.bytes / max(1, viewed.frames),
+        "seconds": seconds,
+        "rounds": rounds,
+        "beams": beams,
+        "commit": commit(),
+        "versions": versions(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "arguments": sys.argv[1:],
+    }
 
 
 def bench_viewer(seconds: float, rounds: int, beams: int, json_file: Path | None, console: Console) -> int:

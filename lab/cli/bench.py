@@ -122,9 +122,20 @@ def bench_accuracy(
     from lab.accuracy.report import bench_accuracy as run  # noqa: PLC0415
 
     code = run(
-        worlds, "", estimators, tasks, trials, minutes, seed, min(2, worker_count()), json_file, figure,
-        console, markdown=markdown, scanner=scanner,
-    )  # fmt: skip
+        worlds,
+        "",
+        estimators,
+        tasks,
+        trials,
+        minutes,
+        seed,
+        min(2, worker_count()),
+        json_file,
+        figure,
+        console,
+        markdown=markdown,
+        scanner=scanner,
+    )
     raise typer.Exit(code)
 
 

@@ -35,9 +35,12 @@ def run_trials(
     if done:
         console.print(f"{name}: going on after {len(done)} of {len(jobs)} trials of an interrupted run")
     columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
         TimeRemainingColumn(),
-    )  # fmt: skip
+    )
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(name, total=len(jobs), completed=len(done))
 
@@ -61,9 +64,12 @@ def run_trials(
 
 
 def _run_in_parallel(
-    trial: Callable[[Job], Result], jobs: Sequence[Job], remaining: list[int], workers: int,
+    trial: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    remaining: list[int],
+    workers: int,
     store_result: Callable[[int, Result], None],
-) -> None:  # fmt: skip
+) -> None:
     try:
         with pool(workers) as executor:
             futures = {executor.submit(trial, jobs[index]): index for index in remaining}

@@ -71,11 +71,16 @@ def bench_chaos(
                 console.print(f"{'[red]no[/]' if problem else '[green]ok[/]'} {fault.name} {problem}", highlight=False)
     print(markdown(outcomes))
     data = {
-        "command": "presage bench chaos", "arguments": {"faults": list(names), "repeats": repeats},
-        "hosts": not missing, "rows": [outcome.row() for outcome in outcomes], "skipped": skipped,
+        "command": "presage bench chaos",
+        "arguments": {"faults": list(names), "repeats": repeats},
+        "hosts": not missing,
+        "rows": [outcome.row() for outcome in outcomes],
+        "skipped": skipped,
         "limits": {"stopped_s": MAX_STOP_TIME_S, "again_s": MAX_RECOVERY_TIME_S},
-        "versions": versions(), "commit": commit(), "machine": platform.processor() or platform.machine(),
-    }  # fmt: skip
+        "versions": versions(),
+        "commit": commit(),
+        "machine": platform.processor() or platform.machine(),
+    }
     write_json(json_file, data)
     return 1 if any(outcome.why for outcome in outcomes) else 0
 

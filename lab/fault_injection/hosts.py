@@ -164,6 +164,8 @@ def port_of(name: str) -> str:
 def _child(*command: str) -> subprocess.Popen[bytes]:
     parent = os.getpid()
     return subprocess.Popen(  # noqa: S603 - fixed commands
-        command, stdin=subprocess.DEVNULL, start_new_session=True,
+        command,
+        stdin=subprocess.DEVNULL,
+        start_new_session=True,
         preexec_fn=lambda: end_with_parent(parent, signal.SIGKILL),  # noqa: PLW1509 - one call, before any thread of the child
-    )  # fmt: skip
+    )

@@ -70,9 +70,13 @@ def bench_hosts(seconds: float, beams: int, json_file: Path | None, console: Con
     for what, each in delays_by_topic.items():
         console.print(f"scan to {what}, at the robot: {each['median_ms']:.1f} ms median, {each['p99_ms']:.1f} ms p99")
     data: dict[str, Any] = {
-        "command": "presage bench hosts", "arguments": {"seconds": seconds, "beams": beams},
-        "links_bytes_per_s": links, "delays": delays_by_topic, "versions": versions(), "commit": commit(),
-    }  # fmt: skip
+        "command": "presage bench hosts",
+        "arguments": {"seconds": seconds, "beams": beams},
+        "links_bytes_per_s": links,
+        "delays": delays_by_topic,
+        "versions": versions(),
+        "commit": commit(),
+    }
     write_json(json_file, data)
     return 0
 

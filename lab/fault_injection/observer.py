@@ -32,9 +32,12 @@ def describe(message: Message) -> dict[str, Any]:
         return {"what": "truth", "speed": speed, "stamp": message.stamp_ns, "contact": message.contact, "place": place}
     if isinstance(message, Status):
         return {
-            "what": "status", "state": message.state, "reason": message.reason, "goal_seq": message.goal_seq,
+            "what": "status",
+            "state": message.state,
+            "reason": message.reason,
+            "goal_seq": message.goal_seq,
             "distance": message.distance,
-        }  # fmt: skip
+        }
     if isinstance(message, Belief):
         return {
             "what": "belief",

@@ -31,16 +31,24 @@ from lab.navigation.shortest_path import MIN_TRIP_LENGTH, START_GOAL_MARGIN, WAL
 EXPERIMENT_ID = 7  # part of the random seeds
 WORLDS, DRIVES = ("maze", "office"), ("holonomic", "differential")
 OPTION_VALUES = {
-    "drives": DRIVES, "start": ("known", "unknown"), "estimator": ("precise", "particle-filter"),
+    "drives": DRIVES,
+    "start": ("known", "unknown"),
+    "estimator": ("precise", "particle-filter"),
     "prior": ("motion", "odometry"),
-}  # fmt: skip
+}
 WORST_TRIALS = 5  # trials named in the summary
 QUANTITIES = {  # statistics over the trials that reached the goal; the other trials are listed under `worst`
-    "path_over_shortest": ("median", "max"), "time_over_least": ("median", "max"), "seconds": ("median", "max"),
-    "time_over_bound": ("median", "max"), "untracked_s": ("median", "max"), "claimed_error_max_m": ("max",),
-    "error_median_m": ("median",), "error_max_m": ("max",), "tracking_s": ("median", "max"),
+    "path_over_shortest": ("median", "max"),
+    "time_over_least": ("median", "max"),
+    "seconds": ("median", "max"),
+    "time_over_bound": ("median", "max"),
+    "untracked_s": ("median", "max"),
+    "claimed_error_max_m": ("max",),
+    "error_median_m": ("median",),
+    "error_max_m": ("max",),
+    "tracking_s": ("median", "max"),
     "replans": ("median", "max"),
-}  # fmt: skip
+}
 STATISTICS: dict[str, Callable[[Any], Any]] = {"median": np.median, "max": np.max, "min": np.min}
 
 
@@ -71,14 +79,18 @@ class Job:
         epistemic_option = "--epistemic" if self.epistemic else "--no-epistemic"
         people = ("--people", str(self.people), "--people-speed", repr(self.people_speed)) if self.people else ()
         return LockstepRun(
-            journey, yaw, self.world, self.beams, (self.seed * 100_003 + self.index) % 2**31,
+            journey,
+            yaw,
+            self.world,
+            self.beams,
+            (self.seed * 100_003 + self.index) % 2**31,
             ("--estimator", self.estimator, "--prior", self.prior),
             round(self.limit * SCANNERS["tim571"].rate),
             controller=("--preset", "geodesic", "--drive", self.drive, epistemic_option),
             simulator=("--drive", self.drive, *people),
             start_known=self.start == "known",
             ends_with_status=True,
-        )  # fmt: skip
+        )
 
 
 def check(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> None:
@@ -188,9 +200,15 @@ def _why(row: dict[str, Any]) -> str:
 
 
 def run(
-    job: Job, trials: int, out: Path, workers: int, console: Console, *, worlds: Sequence[str] = WORLDS,
+    job: Job,
+    trials: int,
+    out: Path,
+    workers: int,
+    console: Console,
+    *,
+    worlds: Sequence[str] = WORLDS,
     drives: Sequence[str] = DRIVES,
-) -> results.Result:  # fmt: skip
+) -> results.Result:
     """All trials of all worlds and drives; writes NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
     check(job, worlds, drives)
     name = result_name(job, worlds, drives)
@@ -212,9 +230,15 @@ def run(
         "robot": Robot().model_dump(exclude={"drive"}),
     }
     result = results.Result(
-        name, f"Navigation: {driving_figure.describe(job)}", job.seed, parameters,
-        {group: summarise(of) for group, of in by_group.items()}, columns(rows), rows, [_note(job, trials)],
-    )  # fmt: skip
+        name,
+        f"Navigation: {driving_figure.describe(job)}",
+        job.seed,
+        parameters,
+        {group: summarise(of) for group, of in by_group.items()},
+        columns(rows),
+        rows,
+        [_note(job, trials)],
+    )
     result.write(out, driving_figure.draw(by_group, {group.group: group.world for group in groups}, result.title))
     return result
 

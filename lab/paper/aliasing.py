@@ -39,9 +39,10 @@ ALIKE = World(
     obstacles=[{"box": {"center": (x, 3.9), "size": (0.7, 0.7)}} for x in (3.6, 7.2, 10.8, 14.4)],
 )
 TITLES = {
-    "corridor": "corridor: four different objects", "alike": "alike: four equal boxes",
+    "corridor": "corridor: four different objects",
+    "alike": "alike: four equal boxes",
     "twins": "twins: two rooms alike",
-}  # fmt: skip
+}
 ESTIMATORS = ("paper", "precise", "particle-filter")
 MOMENTS = (1, 10, 50)  # numbers of scans after which the results are evaluated
 
@@ -175,9 +176,15 @@ def run(job: Job, out: Path, workers: int, console: Console, worlds: Sequence[st
         curves[f"{key} share within 0.2 m"] = (errors < CLOSE_DISTANCE).mean(axis=0).tolist()
     summary = {f"{row['world']}, {row['estimator']}": summarise(row) for row in rows}
     result = results.Result(
-        "aliasing", "Similar objects", job.seed, asdict(job) | {"worlds": list(worlds)}, summary, curves, rows,
+        "aliasing",
+        "Similar objects",
+        job.seed,
+        asdict(job) | {"worlds": list(worlds)},
+        summary,
+        curves,
+        rows,
         ["twins: only places of which no scan says which room it is; to know the place is then luck, one in two"],
-    )  # fmt: skip
+    )
     result.write(out, draw(rows, summary))
     return result
 
@@ -246,15 +253,24 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     moments = [name for name in next(iter(summary.values())) if name.startswith("within")]
     scans = "; ".join(name.rsplit("_", 1)[1] for name in moments)
     heads = (
-        "world", "estimator", f"within 0.2 m after {scans} scans", "median error (m)",
-        "wrong `tracking`, at the end; ever", "both places kept",
-    )  # fmt: skip
+        "world",
+        "estimator",
+        f"within 0.2 m after {scans} scans",
+        "median error (m)",
+        "wrong `tracking`, at the end; ever",
+        "both places kept",
+    )
     rows = []
     for row in summary.values():
         wrong = next(value for name, value in reversed(row.items()) if name.startswith("tracking_but_wrong_after"))
-        rows.append([
-            row["world"], row["estimator"], "; ".join(f"{row[name]}/{row['places']}" for name in moments),
-            results.number(row["final_error_median_m"], 4), f"{wrong}; {row['tracking_but_wrong_ever']}",
-            f"{row['both_kept']}/{row['places']}" if "both_kept" in row else "",
-        ])  # fmt: skip
+        rows.append(
+            [
+                row["world"],
+                row["estimator"],
+                "; ".join(f"{row[name]}/{row['places']}" for name in moments),
+                results.number(row["final_error_median_m"], 4),
+                f"{wrong}; {row['tracking_but_wrong_ever']}",
+                f"{row['both_kept']}/{row['places']}" if "both_kept" in row else "",
+            ]
+        )
     return results.markdown(heads, rows)

@@ -51,9 +51,14 @@ def run(
     curves = {name: [row[name] for row in summary.values()] for name in columns}
     parameters = {"alphas": alphas, "steps": STEPS_PER_SCAN, "trials": trials, "e1": asdict(job)}
     result = results.Result(
-        "alpha", "Step size of the paper's perception", job.seed, parameters, summary, curves,
+        "alpha",
+        "Step size of the paper's perception",
+        job.seed,
+        parameters,
+        summary,
+        curves,
         notes=[f"best with {each} a scan: {best(summary, each):g} m² (most within 0.2 m)" for each in STEPS_PER_SCAN],
-    )  # fmt: skip
+    )
     result.write(out, draw(summary, trials))
     return result
 

@@ -81,9 +81,14 @@ def trial(job: Job) -> dict[str, Any]:
     with session() as stack:
         for name in job.estimators:
             lockstep_run = LockstepRun(
-                journey, job.field.heading, job.field.world, job.field.beams, seed, arguments(name, job.descent),
+                journey,
+                job.field.heading,
+                job.field.world,
+                job.field.beams,
+                seed,
+                arguments(name, job.descent),
                 job.limit,
-            )  # fmt: skip
+            )
             outcome["estimators"][name] = _run(lockstep_run, stack)
     return outcome
 
@@ -156,10 +161,15 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
     straight = [row["straight_m"] for row in rows]
     drawn = {name: sum(row[name] for row in rows) for name in ("too_near", "obstructed")}
     parameters = asdict(job) | {
-        "trials": trials, "close_m": ARRIVAL_DISTANCE, "clearance_m": CLEARANCE, "robot": Robot().model_dump(),
-        "straight_mean_m": float(np.mean(straight)), "straight_max_m": float(np.max(straight)),
-        "pairs_redrawn_too_near": drawn["too_near"], "pairs_redrawn_obstructed": drawn["obstructed"],
-    }  # fmt: skip
+        "trials": trials,
+        "close_m": ARRIVAL_DISTANCE,
+        "clearance_m": CLEARANCE,
+        "robot": Robot().model_dump(),
+        "straight_mean_m": float(np.mean(straight)),
+        "straight_max_m": float(np.max(straight)),
+        "pairs_redrawn_too_near": drawn["too_near"],
+        "pairs_redrawn_obstructed": drawn["obstructed"],
+    }
     note = f"{trials} pairs at random, though this controller goes straight: what stands between holds the robot."
     if job.free:
         note = (
@@ -169,10 +179,15 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
         )
     note += f" On average the goal is {np.mean(straight):.1f} m from the start (the paper: about 11 to 13.5 m)."
     result = results.Result(
-        "e3", "E3: navigation through the real processes", job.seed, parameters,
-        {name: summarise(rows, name) for name in job.estimators}, curves, rows,
+        "e3",
+        "E3: navigation through the real processes",
+        job.seed,
+        parameters,
+        {name: summarise(rows, name) for name in job.estimators},
+        curves,
+        rows,
         [note],
-    )  # fmt: skip
+    )
     result.write(out, draw(rows, job))
     return result
 
@@ -222,16 +237,24 @@ def draw(rows: Sequence[dict[str, Any]], job: Job) -> Figure:
 def table(summary: dict[str, dict[str, Any]]) -> str:
     """The Markdown table of docs/experiments.md."""
     heads = (
-        "estimator", "reached", "trials with contact", "scans with obstacle stop", "iterations, mean",
-        "time / least, median; max", "error, mean ± std (m)",
-    )  # fmt: skip
+        "estimator",
+        "reached",
+        "trials with contact",
+        "scans with obstacle stop",
+        "iterations, mean",
+        "time / least, median; max",
+        "error, mean ± std (m)",
+    )
     rows = [
         [
-            name, f"{row['reached']}/{row['trials']}", str(row["trials_with_contact"]), str(row["scans_held_back"]),
+            name,
+            f"{row['reached']}/{row['trials']}",
+            str(row["trials_with_contact"]),
+            str(row["scans_held_back"]),
             results.number(row["iterations_mean"], 1),
             f"{results.number(row['time_over_least_median'])}; {results.number(row['time_over_least_max'])}",
             results.mean_std(row, "error", 4),
         ]
         for name, row in summary.items()
-    ]  # fmt: skip
+    ]
     return results.markdown(heads, rows)

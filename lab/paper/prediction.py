@@ -57,8 +57,11 @@ def trial(job: Job) -> dict[str, Any]:
     pose = in_front(job.field, sample)
     noisy = sample.observe(sample.clean(pose[None])[0], 0.0).ranges
     outcome: dict[str, Any] = {
-        "pose": pose.tolist(), "angle_rad": sample.scanner.angles().tolist(), "measured_m": noisy.tolist(), "models": {}
-    }  # fmt: skip
+        "pose": pose.tolist(),
+        "angle_rad": sample.scanner.angles().tolist(),
+        "measured_m": noisy.tolist(),
+        "models": {},
+    }
     poses = test.poses(job.scans)
     clean = test.clean(poses)
     for name in ESTIMATORS:
@@ -72,13 +75,18 @@ def trial(job: Job) -> dict[str, Any]:
         unsure = sigma > IMPRECISE_FACTOR * test.scanner.sigma
         one, deviation = _expected(name, job.field, sample, pose[None])
         outcome["models"][name] = {
-            "expected_m": one[0].tolist(), "sigma_m": deviation[0].tolist(), "beams": error.size,
-            "within": _shares(error, sigma), "unsure_share": float(unsure.mean()),
+            "expected_m": one[0].tolist(),
+            "sigma_m": deviation[0].tolist(),
+            "beams": error.size,
+            "within": _shares(error, sigma),
+            "unsure_share": float(unsure.mean()),
             "unsure_within": _shares(error[unsure], sigma[unsure]),
             "unsure_within_noise_alone": _shares(error[unsure], np.full(unsure.sum(), test.scanner.sigma)),
-            "range_error_median_m": float(np.median(error)), "range_error_mean_m": float(error.mean()),
-            "stated_sigma_median_m": float(np.median(sigma)), "stated_sigma_p99_m": float(np.quantile(sigma, 0.99)),
-        }  # fmt: skip
+            "range_error_median_m": float(np.median(error)),
+            "range_error_mean_m": float(error.mean()),
+            "stated_sigma_median_m": float(np.median(sigma)),
+            "stated_sigma_p99_m": float(np.quantile(sigma, 0.99)),
+        }
     return outcome
 
 
@@ -121,10 +129,18 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
         curves |= {f"{name} expected m": model_row["expected_m"], f"{name} sigma m": model_row["sigma_m"]}
     x, y, yaw = row["pose"]
     result = results.Result(
-        "prediction", "Predicted against measured scan", job.seed, asdict(job), summary, curves, rows,
-        [f"sample: seed {job.seed}, robot at ({x:.2f}, {y:.2f}) m, heading {np.rad2deg(yaw):.0f}°; drawn at random",
-         f"paper states no precision: Σ_o = 1, taken as {PAPER_SIGMA:g} m² for every beam"],
-    )  # fmt: skip
+        "prediction",
+        "Predicted against measured scan",
+        job.seed,
+        asdict(job),
+        summary,
+        curves,
+        rows,
+        [
+            f"sample: seed {job.seed}, robot at ({x:.2f}, {y:.2f}) m, heading {np.rad2deg(yaw):.0f}°; drawn at random",
+            f"paper states no precision: Σ_o = 1, taken as {PAPER_SIGMA:g} m² for every beam",
+        ],
+    )
     result.write(out, draw(result))
     return result
 
@@ -171,9 +187,14 @@ def draw(result: results.Result) -> Figure:
 
 def _band(axes: Axes, angle: Array, middle: Array, sigma: Array) -> None:
     axes.fill_between(
-        angle, middle - 2 * sigma, middle + 2 * sigma, color=drawing.PREDICTED, alpha=0.25, linewidth=0,
+        angle,
+        middle - 2 * sigma,
+        middle + 2 * sigma,
+        color=drawing.PREDICTED,
+        alpha=0.25,
+        linewidth=0,
         label="stated ± 2σ",
-    )  # fmt: skip
+    )
 
 
 def _calibration(axes: Axes, model_row: dict[str, Any], scans: int) -> None:
@@ -213,7 +234,7 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
             *(f"{row[f'within_{k}_sigma']:.1%}" for k in GAUSSIAN),
         ]
         for name, row in summary.items()
-    ]  # fmt: skip
+    ]
     for name, row in summary.items():
         if 0 < row["unsure_share"] < 1:
             shares = (f"{row[f'unsure_within_{k}_sigma']:.1%}" for k in GAUSSIAN)

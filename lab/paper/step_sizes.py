@@ -201,8 +201,9 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
     }
     nearest = min(
         (each for each in grid if each.loop == "displacement" and summary[each.name]["reached"] == trials),
-        key=lambda each: abs(summary[each.name]["iterations_mean"] - PAPER_ITERATIONS), default=None,
-    )  # fmt: skip
+        key=lambda each: abs(summary[each.name]["iterations_mean"] - PAPER_ITERATIONS),
+        default=None,
+    )
     note = "no setting reached every goal"
     if nearest is not None:
         mean = summary[nearest.name]["iterations_mean"]
@@ -211,9 +212,15 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
             f"{nearest.name}: {mean:.1f}"
         )
     result = results.Result(
-        "steps", "Step sizes of action and goal", job.seed, {**asdict(job), "trials": trials, "alpha": ALPHA}, summary,
-        curves, rows, [note],
-    )  # fmt: skip
+        "steps",
+        "Step sizes of action and goal",
+        job.seed,
+        {**asdict(job), "trials": trials, "alpha": ALPHA},
+        summary,
+        curves,
+        rows,
+        [note],
+    )
     result.write(out, draw(grid, summary))
     return result
 
@@ -273,9 +280,11 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     heads = ("step sizes", "reached", "iterations, mean", "error, mean (m)")
     rows = [
         [
-            name, f"{row['reached']}/{row['journeys']}", results.number(row["iterations_mean"], 1),
+            name,
+            f"{row['reached']}/{row['journeys']}",
+            results.number(row["iterations_mean"], 1),
             results.number(row["error_mean_m"]),
         ]
         for name, row in summary.items()
-    ]  # fmt: skip
+    ]
     return results.markdown(heads, rows)

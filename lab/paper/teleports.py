@@ -61,9 +61,14 @@ class Outcome:
 
 
 def travel(
-    journey: Journey, steps: Steps, model: PaperModel, look: Callable[[Array], Array], world: World, yaw: float,
+    journey: Journey,
+    steps: Steps,
+    model: PaperModel,
+    look: Callable[[Array], Array],
+    world: World,
+    yaw: float,
     limit: int,
-) -> Outcome:  # fmt: skip
+) -> Outcome:
     """Runs algorithm 1 with the belief starting at the true start, for at most ``limit`` iterations.
 
     ``look`` returns usable ranges (B,), m, with fresh noise at a pose (3,).

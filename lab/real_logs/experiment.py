@@ -45,9 +45,11 @@ from services.estimator.precise.learning.field_learning import Recipe
 
 ESTIMATORS = ("precise", "particle-filter", "amcl-defaults")
 TASKS = {
-    ODOMETRY: "a: tracking with odometry", LASER: "b: tracking without", GLOBAL: "c: from nothing",
+    ODOMETRY: "a: tracking with odometry",
+    LASER: "b: tracking without",
+    GLOBAL: "c: from nothing",
     KIDNAPPED: "d: carried off",
-}  # fmt: skip
+}
 MIN_FREE_SHARE = 0.5  # of the reference poses in free space; the map may lack places that the drive saw
 # Within this heading error (rad) and TRACKED_DISTANCE of the reference a scan counts as tracked. Otherwise state
 # `tracking` is a wrong claim.
@@ -108,14 +110,23 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
         if any(r["task"] == task for r in rows)
     }
     result = results.Result(
-        job.result, f"A real drive: {job.log.name}", job.seed,
-        {**{k: str(v) if isinstance(v, Path) else v for k, v in asdict(job).items()}, "scans": len(drive.ranges),
-         "particle_filter": {
-             **{name: dict(each) for name, each in _settings_by_task(tuned).items()}, "tried": tuned.tried
-         },
-         "calibration": asdict(card.calibration) if card.calibration else None},
-        summary, curves_of(rows), rows, notes(job, card, tuned),
-    )  # fmt: skip
+        job.result,
+        f"A real drive: {job.log.name}",
+        job.seed,
+        {
+            **{k: str(v) if isinstance(v, Path) else v for k, v in asdict(job).items()},
+            "scans": len(drive.ranges),
+            "particle_filter": {
+                **{name: dict(each) for name, each in _settings_by_task(tuned).items()},
+                "tried": tuned.tried,
+            },
+            "calibration": asdict(card.calibration) if card.calibration else None,
+        },
+        summary,
+        curves_of(rows),
+        rows,
+        notes(job, card, tuned),
+    )
     result.write(out, draw(card.calibration, rows, TASKS))
     return result
 
@@ -205,17 +216,24 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     reached = [k for k in first if k is not None]
     known = np.array([value for value in nees[tracked_scans & claims] if value is not None], float)
     return {
-        "trials": len(rows), "scans": len(error), "error_median_m": float(np.median(error)),
-        "error_rms_m": float(np.sqrt(np.mean(error**2))), "error_95_m": float(np.quantile(error, 0.95)),
+        "trials": len(rows),
+        "scans": len(error),
+        "error_median_m": float(np.median(error)),
+        "error_rms_m": float(np.sqrt(np.mean(error**2))),
+        "error_95_m": float(np.quantile(error, 0.95)),
         "tracked_error_rms_m": float(np.sqrt(np.mean(error[tracked_scans] ** 2))) if tracked_scans.any() else None,
-        "yaw_error_median_rad": float(np.median(yaw)), "tracked_share": float(tracked_scans.mean()),
-        "claimed_share": float(claims.mean()), "wrong_claims_share": float((claims & ~tracked_scans).mean()),
+        "yaw_error_median_rad": float(np.median(yaw)),
+        "tracked_share": float(tracked_scans.mean()),
+        "claimed_share": float(claims.mean()),
+        "wrong_claims_share": float((claims & ~tracked_scans).mean()),
         "wrong_claim_longest_s": max(_longest_wrong(row, skip) for row, skip in zip(rows, after, strict=True)),
-        "found": len(reached), "scans_until_found_median": float(np.median(reached)) if reached else None,
+        "found": len(reached),
+        "scans_until_found_median": float(np.median(reached)) if reached else None,
         "scans_until_found_mean": float(np.mean(reached)) if reached else None,
         "nees_median": float(np.median(known)) if len(known) else None,
-        "ms_median": float(np.median(ms)), "ms_95": float(np.quantile(ms, 0.95)),
-    }  # fmt: skip
+        "ms_median": float(np.median(ms)),
+        "ms_95": float(np.quantile(ms, 0.95)),
+    }
 
 
 def _is_tracked(row: dict[str, Any], skip: int) -> np.ndarray[Any, np.dtype[np.bool_]]:
@@ -286,11 +304,13 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     heads = ("task, estimator", "median (mm)", "tracked", "wrong claims; longest (s)", "found", "NEES, median")
     rows = [
         [
-            f"{name[0]},{name.rpartition(',')[2]}", results.millimetres(row["error_median_m"]),
-            f"{row['tracked_share']:.1%}", f"{row['wrong_claims_share']:.1%}; {row['wrong_claim_longest_s']:.1f}",
+            f"{name[0]},{name.rpartition(',')[2]}",
+            results.millimetres(row["error_median_m"]),
+            f"{row['tracked_share']:.1%}",
+            f"{row['wrong_claims_share']:.1%}; {row['wrong_claim_longest_s']:.1f}",
             "–" if name.startswith(("a:", "b:")) else f"{row['found']}/{row['trials']}",
             results.number(row["nees_median"], 2),
         ]
         for name, row in summary.items()
-    ]  # fmt: skip
+    ]
     return results.markdown(heads, rows)

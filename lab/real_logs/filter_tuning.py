@@ -80,9 +80,12 @@ def starting_point(motion: MotionNoise) -> Settings:
     # AMCL's standard deviation grows with the path, the learned variance does; they are equal over a decimetre.
     along = float(np.sqrt(motion.path_by_path / 0.1))
     return (
-        ("alpha1", motion.path_by_turn), ("alpha2", motion.turn_by_path / 0.1), ("alpha3", along**2),
-        ("alpha4", motion.turn_by_turn / 0.1), ("alpha5", along**2),
-    )  # fmt: skip
+        ("alpha1", motion.path_by_turn),
+        ("alpha2", motion.turn_by_path / 0.1),
+        ("alpha3", along**2),
+        ("alpha4", motion.turn_by_turn / 0.1),
+        ("alpha5", along**2),
+    )
 
 
 def tune(job: Job, half: int, start: Settings, folder: Path, report: Callable[[str, float], None]) -> Tuned:

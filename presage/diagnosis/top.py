@@ -30,8 +30,18 @@ COLOURS = {
     "not running": "dim",
 }
 COLUMNS = (
-    "service", "state", "age", "up", "sends, Hz", "gets, Hz", "dropped", "invalid", "failed", "latency", "note",
-)  # fmt: skip
+    "service",
+    "state",
+    "age",
+    "up",
+    "sends, Hz",
+    "gets, Hz",
+    "dropped",
+    "invalid",
+    "failed",
+    "latency",
+    "note",
+)
 LEFT_ALIGNED = {"service", "state", "sends, Hz", "gets, Hz", "note"}
 
 

@@ -90,9 +90,12 @@ def cells_of(drive: Drive, cell: float, progress: Console | None = None) -> tupl
     hits, passes = np.zeros(rows * columns, np.int64), np.zeros(rows * columns, np.int64)
     lasers = se2.compose(drive.poses, drive.mount)
     for laser, ranges in track(
-        list(zip(lasers, drive.ranges, strict=True)), "mapping", console=progress, transient=True,
+        list(zip(lasers, drive.ranges, strict=True)),
+        "mapping",
+        console=progress,
+        transient=True,
         disable=progress is None,
-    ):  # fmt: skip
+    ):
         hit, passed = (
             _cell_indices(points, corner, cell, rows, columns) for points in _beam_points(laser, ranges, drive, cell)
         )

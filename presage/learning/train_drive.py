@@ -95,9 +95,14 @@ def drive_of(scans: Scans, log: Path) -> Drive:
         raise UserError(f"{log}: no beam of the scans with a reference pose hit a surface")
     odom = None if scans.odom is None or not np.isfinite(scans.odom[use]).all() else scans.odom
     whole = Drive(
-        scans.stamps, scans.truth, scans.ranges, scans.geometry.angles, scans.geometry.mount,
-        scans.geometry.range_max, odom,
-    )  # fmt: skip
+        scans.stamps,
+        scans.truth,
+        scans.ranges,
+        scans.geometry.angles,
+        scans.geometry.mount,
+        scans.geometry.range_max,
+        odom,
+    )
     return whole.part(use)
 
 
@@ -135,10 +140,17 @@ def scanner_of(drive: Drive, sigma: float, name: str) -> Scanner:
     fov = float(abs(angles[-1] - angles[0]))
     x, y, yaw = map(float, drive.mount)
     return Scanner(
-        name=name, beams=len(angles), fov=min(fov, 2 * np.pi), rate=float(1 / np.median(np.diff(drive.stamps))),
-        range_min=0.0, range_max=drive.range_max, sigma=sigma, mount=(x, y, yaw),
-        first=float(-angles[0] if angles[-1] < angles[0] else angles[0]), upside_down=bool(angles[-1] < angles[0]),
-    )  # fmt: skip
+        name=name,
+        beams=len(angles),
+        fov=min(fov, 2 * np.pi),
+        rate=float(1 / np.median(np.diff(drive.stamps))),
+        range_min=0.0,
+        range_max=drive.range_max,
+        sigma=sigma,
+        mount=(x, y, yaw),
+        first=float(-angles[0] if angles[-1] < angles[0] else angles[0]),
+        upside_down=bool(angles[-1] < angles[0]),
+    )
 
 
 def card_of(job: TrainDriveOptions, world: World, drive: Drive, learned: Learned, seconds: float) -> weights.FieldCard:

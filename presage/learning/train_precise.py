@@ -122,13 +122,25 @@ def _card(
     job: TrainPreciseOptions, world: World, scanner: Scanner, model: FieldModel, quality: Quality, seconds: float
 ) -> weights.FieldCard:
     return weights.FieldCard(
-        world=world, scanner=scanner, samples=job.samples, seed=job.recipe.seed, resolution=job.recipe.resolution,
-        origin=model.field.origin, sweeps=job.recipe.sweeps, ripple=model.ripple, inflation=round(quality.inflation, 3),
-        test_samples=TEST_SAMPLES // 2, test_range_error_median_m=quality.range_error_median,
-        test_range_error_mean_m=quality.range_error_mean, test_share_above_5_cm=quality.share_above_5_cm,
-        test_position_error_rms_m=quality.position_error_rms, learning_s=round(seconds, 1), commit=commit(),
-        command="presage " + " ".join(sys.argv[1:]), versions=versions(),
-    )  # fmt: skip
+        world=world,
+        scanner=scanner,
+        samples=job.samples,
+        seed=job.recipe.seed,
+        resolution=job.recipe.resolution,
+        origin=model.field.origin,
+        sweeps=job.recipe.sweeps,
+        ripple=model.ripple,
+        inflation=round(quality.inflation, 3),
+        test_samples=TEST_SAMPLES // 2,
+        test_range_error_median_m=quality.range_error_median,
+        test_range_error_mean_m=quality.range_error_mean,
+        test_share_above_5_cm=quality.share_above_5_cm,
+        test_position_error_rms_m=quality.position_error_rms,
+        learning_s=round(seconds, 1),
+        commit=commit(),
+        command="presage " + " ".join(sys.argv[1:]),
+        versions=versions(),
+    )
 
 
 def _draw(model: FieldModel, card: weights.FieldCard, png: Path) -> None:
@@ -145,8 +157,10 @@ def _draw(model: FieldModel, card: weights.FieldCard, png: Path) -> None:
         x0 + h * np.arange(nx), y0 + h * np.arange(ny), field.phi, levels=[0.0], colors="#D55E00", linewidths=0.8
     )
     axes.set(
-        xlabel="x (m)", ylabel="y (m)", aspect="equal",
+        xlabel="x (m)",
+        ylabel="y (m)",
+        aspect="equal",
         title=f"{card.world.name}: learned distance (m) to the nearest surface, and its zero",
-    )  # fmt: skip
+    )
     figure.colorbar(image, ax=axes, shrink=0.8)
     figure.savefig(png, dpi=120)

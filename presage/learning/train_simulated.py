@@ -204,14 +204,30 @@ def _save(
     error = np.abs(predicted - data["test"].ranges)
     recipe = job.recipe
     card = weights.ModelCard(
-        preset=job.preset, world=world, scanner=scanner, heading=heading, samples=job.samples, epochs=recipe.epochs,
-        batch=recipe.batch, learning_rate=recipe.learning_rate, seed=recipe.seed, hidden=job.shape_hidden,
-        channels=job.shape_channels, center=trainer.norm.center, half_size=trainer.norm.half_size,
-        range_scale=trainer.norm.range_scale, test_samples=TEST_SAMPLES, test_l1_mean=float(error.mean()),
-        test_l1_median=float(np.median(error)), curve_train_l1=[round(v, 5) for v in trainer.progress.train_l1],
-        curve_test_l1=[round(v, 5) for v in trainer.progress.test_l1], training_s=round(seconds, 1), commit=commit(),
-        command="presage " + " ".join(sys.argv[1:]), versions=versions(),
-    )  # fmt: skip
+        preset=job.preset,
+        world=world,
+        scanner=scanner,
+        heading=heading,
+        samples=job.samples,
+        epochs=recipe.epochs,
+        batch=recipe.batch,
+        learning_rate=recipe.learning_rate,
+        seed=recipe.seed,
+        hidden=job.shape_hidden,
+        channels=job.shape_channels,
+        center=trainer.norm.center,
+        half_size=trainer.norm.half_size,
+        range_scale=trainer.norm.range_scale,
+        test_samples=TEST_SAMPLES,
+        test_l1_mean=float(error.mean()),
+        test_l1_median=float(np.median(error)),
+        curve_train_l1=[round(v, 5) for v in trainer.progress.train_l1],
+        curve_test_l1=[round(v, 5) for v in trainer.progress.test_l1],
+        training_s=round(seconds, 1),
+        commit=commit(),
+        command="presage " + " ".join(sys.argv[1:]),
+        versions=versions(),
+    )
     weights.save(path, trainer.decoder, card)
     _draw_curve(card, path.with_suffix(".png"))
 
@@ -224,9 +240,11 @@ def _draw_curve(card: weights.ModelCard, png: Path) -> None:
     axes.plot(epochs, card.curve_train_l1, color="#0072B2", label=f"{card.samples} training samples")
     axes.plot(epochs, card.curve_test_l1, color="#D55E00", label=f"{card.test_samples} test samples")
     axes.set(
-        xlabel="epoch", ylabel="L1 error (m, mean over beams)", yscale="log",
+        xlabel="epoch",
+        ylabel="L1 error (m, mean over beams)",
+        yscale="log",
         title=f"{card.preset} in {card.world.name}, {card.scanner.beams} beams",
-    )  # fmt: skip
+    )
     axes.grid(alpha=0.3, which="both")
     axes.legend()
     figure.savefig(png, dpi=120)

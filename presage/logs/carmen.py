@@ -32,9 +32,16 @@ DECOMPRESSION_ERRORS = (EOFError, OSError, lzma.LZMAError, zlib.error)  # for a 
 # Angles of the first and last beam in degrees, by number of beams, for lines that only state the number. 180 and 360
 # are scans of 181 and 361 beams without the last.
 SPANS_DEG = {
-    101: (-50, 50), 180: (-90, 89), 181: (-90, 90), 201: (-50, 50), 360: (-90, 89.5), 361: (-90, 90), 401: (-50, 50),
-    541: (-135, 135), 1081: (-135, 135),
-}  # fmt: skip
+    101: (-50, 50),
+    180: (-90, 89),
+    181: (-90, 90),
+    201: (-50, 50),
+    360: (-90, 89.5),
+    361: (-90, 90),
+    401: (-50, 50),
+    541: (-135, 135),
+    1081: (-135, 135),
+}
 # A SICK LMS reports "no return" as a code of 81.83 m and more, or in its millimetre mode as 8.183 m and more. All in m.
 LMS_FAR_RANGE_MAX, LMS_NEAR_RANGE_MAX = 80.0, 8.18
 LMS_NEAR_CODES = (8.18, 8.192)

@@ -108,13 +108,21 @@ class Written:
     def facts(self, job: ImportOptions, log: Log) -> dict[str, Any]:
         """Facts about the import, for --json and the metadata of the recording."""
         return {
-            "file": str(job.file), "out": str(job.out), "format": log.format, "scans": self.scans,
-            "beams": len(log.angles), "duration_s": (self.last_ns - (self.first_ns or 0)) * 1e-9,
-            "odometry": log.odometry, "odometry_poses": self.odoms,
-            "reference": log.reference, "reference_poses": self.references,
-            "mount": log.mount.tolist(), "mount_assumed": log.mount_assumed,
-            "left_out": dict(log.left_out + log.left_out_beside), "notes": log.notes,
-        }  # fmt: skip
+            "file": str(job.file),
+            "out": str(job.out),
+            "format": log.format,
+            "scans": self.scans,
+            "beams": len(log.angles),
+            "duration_s": (self.last_ns - (self.first_ns or 0)) * 1e-9,
+            "odometry": log.odometry,
+            "odometry_poses": self.odoms,
+            "reference": log.reference,
+            "reference_poses": self.references,
+            "mount": log.mount.tolist(),
+            "mount_assumed": log.mount_assumed,
+            "left_out": dict(log.left_out + log.left_out_beside),
+            "notes": log.notes,
+        }
 
 
 def write_recording(job: ImportOptions, log: Log, world: World | None, sweeps: Iterator[LoggedScan] | Any) -> Written:
@@ -132,10 +140,16 @@ def write_recording(job: ImportOptions, log: Log, world: World | None, sweeps: I
         write_description(writer, "simulator", WorldReply(world=world, scanner=scanner))
         message_writer = _MessageWriter(writer, job.robot, written)
         template = Scan(
-            stamp_ns=0, angle_min=start, angle_increment=step, range_min=log.range_min, range_max=log.range_max,
-            ranges=np.zeros(0, np.float32), mount=Pose.of(log.mount), scan_time=period,
+            stamp_ns=0,
+            angle_min=start,
+            angle_increment=step,
+            range_min=log.range_min,
+            range_max=log.range_max,
+            ranges=np.zeros(0, np.float32),
+            mount=Pose.of(log.mount),
+            scan_time=period,
             sigma=job.sigma or 0.0,
-        )  # fmt: skip
+        )
         for stamp_ns, sweep in itertools.chain(first_scans, stamped):
             message_writer.write_scan(stamp_ns, sweep, template)
         facts = written.facts(job, log)
@@ -165,10 +179,16 @@ def scanner_of(log: Log, start: float, step: float, period: float, sigma: float 
     fov = min(step * (len(log.angles) - 1), 2 * np.pi)  # in single precision, a full turn may exceed 2 pi
     try:
         return Scanner(
-            name="log", beams=len(log.angles), fov=fov, rate=1 / period if period else 0.0,
-            range_min=log.range_min, range_max=log.range_max, sigma=DEFAULT_SIGMA_M if sigma is None else sigma,
-            mount=(x, y, yaw), first=start,
-        )  # fmt: skip
+            name="log",
+            beams=len(log.angles),
+            fov=fov,
+            rate=1 / period if period else 0.0,
+            range_min=log.range_min,
+            range_max=log.range_max,
+            sigma=DEFAULT_SIGMA_M if sigma is None else sigma,
+            mount=(x, y, yaw),
+            first=start,
+        )
     except ValidationError:
         return None
 

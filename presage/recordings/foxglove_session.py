@@ -115,10 +115,19 @@ class SessionConverter:
         self._goal: Array | None = None
         self._last_log: dict[str, str] = {}  # key of the last log line, by topic and name
         self._converters: dict[type[Stamped], Callable[[Any, int, int], Iterator[tuple[str, Any]]]] = {
-            Scan: self._scan, Odom: self._odom, Truth: self._truth, Belief: self._belief, Prediction: self._prediction,
-            Goal: self._new_goal, CmdVel: self._command, Status: self._status, Health: self._health,
-            Drive: self._drive, Plan: self._plan, Preference: self._preference,
-        }  # fmt: skip
+            Scan: self._scan,
+            Odom: self._odom,
+            Truth: self._truth,
+            Belief: self._belief,
+            Prediction: self._prediction,
+            Goal: self._new_goal,
+            CmdVel: self._command,
+            Status: self._status,
+            Health: self._health,
+            Drive: self._drive,
+            Plan: self._plan,
+            Preference: self._preference,
+        }
 
     def convert(self, topic: Topic, message: Stamped, raw: Raw) -> Iterator[FoxgloveMessage]:
         """Yields the Foxglove messages for one message; counts messages of unsupported topics in `left_out`."""

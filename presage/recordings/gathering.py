@@ -146,9 +146,14 @@ class _Gatherer:
         self._last_stamp_ns = 0  # of scan or truth
         self._waiting: dict[int, Scan] = {}  # scans whose prediction may still come, by stamp
         self._handlers: dict[type[Stamped], Callable[[Any, int], None]] = {
-            Goal: self._goal, Status: self._status, Health: self._health, Scan: self._scan,
-            Prediction: self._prediction, Truth: self._truth, Belief: self._belief,
-        }  # fmt: skip
+            Goal: self._goal,
+            Status: self._status,
+            Health: self._health,
+            Scan: self._scan,
+            Prediction: self._prediction,
+            Truth: self._truth,
+            Belief: self._belief,
+        }
 
     def add(self, message: Stamped, logged: int) -> None:
         """Adds a message with the time of its reception, ns of wall time."""

@@ -35,9 +35,20 @@ from services.recorder.reader import read_recording
 from services.recorder.replaying.player import span
 
 COLUMNS = (
-    "stamp", "x", "y", "yaw", "cov_xx", "cov_xy", "cov_xyaw", "cov_yy", "cov_yyaw", "cov_yawyaw",
-    "free_energy", "state", "update_ms",
-)  # fmt: skip
+    "stamp",
+    "x",
+    "y",
+    "yaw",
+    "cov_xx",
+    "cov_xy",
+    "cov_xyaw",
+    "cov_yy",
+    "cov_yyaw",
+    "cov_yawyaw",
+    "free_energy",
+    "state",
+    "update_ms",
+)
 STAMP_ROUNDING_S = 1e-6  # precision of a double for a stamp of the year 2020
 UPPER_TRIANGLE = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
 
@@ -271,11 +282,22 @@ def _output(job: LocalizeOptions, count: int) -> Iterator[Callable[[dict[str, An
 
 def _write_json(job: LocalizeOptions, out: Path, rows: list[dict[str, Any]], *, complete: bool) -> None:
     meta = {
-        "file": str(job.file), "world": job.choice.world_argument, "estimator": job.choice.estimator,
-        "model": job.choice.model, "frame": job.frame, "mode": job.mode, "fresh": job.fresh,
-        "start": job.start, "end": job.end, "every": job.every, "complete": complete,
-        "seed": job.choice.seed, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:],
-    }  # fmt: skip
+        "file": str(job.file),
+        "world": job.choice.world_argument,
+        "estimator": job.choice.estimator,
+        "model": job.choice.model,
+        "frame": job.frame,
+        "mode": job.mode,
+        "fresh": job.fresh,
+        "start": job.start,
+        "end": job.end,
+        "every": job.every,
+        "complete": complete,
+        "seed": job.choice.seed,
+        "commit": commit(),
+        "versions": versions(),
+        "arguments": sys.argv[1:],
+    }
     out.write_text(json.dumps({**meta, "rows": rows}, indent=1) + "\n", encoding="utf-8")
 
 
