@@ -31,14 +31,14 @@ COLUMNS = ("learning s", "numbers", "range median mm", "mean mm", "> 5 cm %", "p
 PAPER = "the paper's decoder, L1, one heading"
 HEADING = np.pi / 2  # rad, of all scans for the paper's decoder, which has no heading input
 TEST_SCANS, CALIBRATION_SCANS = 200, 300
-Learn = Callable[["Scans"], tuple[GenerativeModel, int]]  # returns the model and how many numbers it stores
+Learn = Callable[["TrainingScans"], tuple[GenerativeModel, int]]  # returns the model and how many numbers it stores
 
 
-class Scans:
+class TrainingScans:
     """Noisy scans for training, and noise-free ones for calibration and testing; the laser is at base_link's origin."""
 
     def __init__(self, world: str, samples: int, seed: int, heading: float | None = None) -> None:
-        """Cast scans at random poses: all with the given ``heading`` (rad), or by default with random headings."""
+        """Casts scans at random poses: all with the given ``heading`` (rad), or by default with random headings."""
         self.world, self.seed = load_world(world), seed
         self.scanner = SCANNERS["tim571"].model_copy(update={"mount": (0.0, 0.0, 0.0)})
         scene = Scene(self.world, self.scanner, np.random.default_rng(seed))
@@ -57,7 +57,7 @@ class Scans:
 def field(resolution: float, share: float = 1.0, sweeps: int = 10) -> Learn:
     """Returns a function that learns a distance field from the given share of the scans."""
 
-    def learn(scans: Scans) -> tuple[GenerativeModel, int]:
+    def learn(scans: TrainingScans) -> tuple[GenerativeModel, int]:
         count, mount = int(share * len(scans.poses)), np.zeros(3)
         beams = Beams.of(scans.poses[:count], mount, scans.angles, scans.ranges[:count])
         learned = learn_field(beams, Recipe(resolution=resolution, sweeps=sweeps))
@@ -70,7 +70,7 @@ def field(resolution: float, share: float = 1.0, sweeps: int = 10) -> Learn:
 def panorama(steps: int, **shape: Any) -> Learn:
     """Returns a function that trains a panorama network for ``steps`` batches of 256 scans."""
 
-    def learn(scans: Scans) -> tuple[GenerativeModel, int]:
+    def learn(scans: TrainingScans) -> tuple[GenerativeModel, int]:
         model = train_panorama(Shape(**shape), scans.poses, scans.angles, scans.ranges, steps, 0)
         return model, sum(x.numel() for x in model.network.parameters())
 
@@ -80,7 +80,7 @@ def panorama(steps: int, **shape: Any) -> Learn:
 def paper(epochs: int) -> Learn:
     """Returns a function that trains the paper's decoder on scans of one heading."""
 
-    def learn(scans: Scans) -> tuple[GenerativeModel, int]:
+    def learn(scans: TrainingScans) -> tuple[GenerativeModel, int]:
         norm = Normalisation.of(scans.world.bounds, float(scans.ranges.max()))
         recipe = training.Recipe(epochs=epochs, learning_rate=3e-3)
         data = training.Data(scans.poses, scans.ranges)
@@ -94,7 +94,7 @@ def paper(epochs: int) -> Learn:
 
 
 def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: Path | None, console: Console) -> int:
-    """Train and evaluate every model, print the table and write it to ``json_file`` if given. Returns exit status 0."""
+    """Trains and evaluates the models, prints a table and writes ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
     learners: dict[str, Learn] = {
         PAPER: paper(max(1, steps // 50)),
@@ -109,7 +109,7 @@ def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: P
         "distance field, 0.04 m": field(0.04),
         "distance field, 0.02 m": field(0.02),
     }
-    any_heading, one_heading = Scans(world, samples, seed), Scans(world, samples, seed, HEADING)
+    any_heading, one_heading = TrainingScans(world, samples, seed), TrainingScans(world, samples, seed, HEADING)
     rows: list[dict[str, Any]] = []
     for name, learn in track(list(learners.items()), "learning", console=console, transient=True):
         scans = one_heading if name == PAPER else any_heading

@@ -138,7 +138,7 @@ class PanoramaModel:
 
 
 def train_panorama(shape: Shape, lasers: Array, angles: Array, ranges: Array, steps: int, seed: int) -> PanoramaModel:
-    """Train on scans ``ranges`` (N, B), m, taken at ``lasers`` (N, 3), the laser's poses.
+    """Trains on scans ``ranges`` (N, B), m, taken at ``lasers`` (N, 3), the laser's poses.
 
     Takes ``steps`` steps of 256 scans each; the learning rate decays to zero along a cosine.
     """

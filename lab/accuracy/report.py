@@ -16,7 +16,7 @@ from common.errors import UserError
 from common.geometry.world import load_world
 from common.robot.scanner import Scanner
 from common.robot.scanner_options import chosen_scanner
-from lab.accuracy.runner import ESTIMATORS, TASKS, Job, provenance, run_all
+from lab.accuracy.runner import ESTIMATORS, TASKS, AccuracyJob, provenance, run_all
 from lab.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW, TWINS_REQUIRED_FROM_SCAN
 from presage.terminal.output import check_file, write_json
 
@@ -52,7 +52,7 @@ def bench_accuracy(
     markdown: bool = False,
     scanner: str = "tim571",
 ) -> int:
-    """Run the benchmark, print a table per world and scanner, and write ``json_file`` and ``figure`` if given."""
+    """Runs the benchmark, prints a table per world and scanner, and writes ``json_file`` and ``figure`` if given."""
     chosen = estimators.split(",")
     unknown = [name for name in chosen if name not in ESTIMATORS]
     if unknown:
@@ -67,7 +67,7 @@ def bench_accuracy(
     check_file(json_file, "--json")
     check_file(figure, "--figure")
     jobs = [
-        Job(estimator, world, each, trials, minutes * 60, seed, wanted)
+        AccuracyJob(estimator, world, each, trials, minutes * 60, seed, wanted)
         for world in names
         for each in scanners
         for estimator in chosen

@@ -25,7 +25,7 @@ SKIPPED_UPDATES = 5  # at the start of the path, while caches warm up
 
 
 def bench_speed(world: str, beams: str, seed: int, json_file: Path | None, console: Console) -> int:
-    """Run the benchmark, print the table and write it to ``json_file`` if given. Returns exit status 0."""
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
     load_world(world)
     jobs = [(name, world, int(count), seed) for count in beams.split(",") for name in ESTIMATORS]

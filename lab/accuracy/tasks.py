@@ -29,7 +29,7 @@ def is_at(believed: Array, pose: Array) -> bool:
 
 
 @dataclass
-class Outcome:
+class TaskOutcome:
     """Results of one estimator in one task."""
 
     errors: list[Array] = field(default_factory=list)  # (3,) m, m, rad
@@ -44,7 +44,7 @@ class Outcome:
     independent: bool = True  # whether the counts are of separate trials, not of scans along one path
 
     def add(self, posterior: Posterior, pose: Array, limit: float | None) -> bool:
-        """Record an estimate. Returns whether it is at the true ``pose``; ``limit`` is the position bound in m."""
+        """Records an estimate. Returns whether it is at the true ``pose``; ``limit`` is the position bound in m."""
         error = posterior.pose - pose
         error[2] = se2.wrap(error[2])
         found_here = is_at(posterior.pose, pose)
@@ -60,7 +60,7 @@ class Outcome:
         return found_here
 
 
-def _timed_update(estimator: Estimator, observation: Observation, outcome: Outcome | None = None) -> Posterior:
+def _timed_update(estimator: Estimator, observation: Observation, outcome: TaskOutcome | None = None) -> Posterior:
     began = time.perf_counter()
     posterior = estimator.update(observation)
     if outcome is not None:
@@ -68,9 +68,9 @@ def _timed_update(estimator: Estimator, observation: Observation, outcome: Outco
     return posterior
 
 
-def standing(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, Outcome]:
+def standing(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
     """Global localisation of a standing robot, without odometry: after one scan and after twenty."""
-    one, many = Outcome(), Outcome()
+    one, many = TaskOutcome(), TaskOutcome()
     poses = scene.poses(trials)
     limits = bound.position(bound.single(scene, poses))
     for pose, clean, limit in zip(progress(poses), scene.clean(poses), limits, strict=True):
@@ -84,12 +84,12 @@ def standing(estimator: Estimator, scene: Scene, trials: int, progress: Progress
     return {"from nothing, 1 scan": one, "standing, 20 scans": many}
 
 
-def blocked(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, Outcome]:
+def blocked(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
     """Global localisation with 30 % of the beams shortened by unknown obstacles: after one scan and after twenty.
 
     The obstacles are drawn once per trial.
     """
-    one, many = Outcome(), Outcome()
+    one, many = TaskOutcome(), TaskOutcome()
     poses = scene.poses(trials)
     for pose, clean in zip(progress(poses), scene.clean(poses), strict=True):
         estimator.restart()
@@ -104,9 +104,9 @@ def blocked(estimator: Estimator, scene: Scene, trials: int, progress: ProgressW
 
 def tracking(
     estimator: Estimator, scene: Scene, seconds: float, progress: ProgressWrapper, *, odometry: bool
-) -> dict[str, Outcome]:
+) -> dict[str, TaskOutcome]:
     """Tracking along a path from a known start, with the simulator's odometry or without."""
-    outcome, path = Outcome(independent=False), scene.path(seconds)
+    outcome, path = TaskOutcome(independent=False), scene.path(seconds)
     # Without odometry the motion is unknown, so the bound is that of each scan alone.
     limits = bound.recursive(scene, path, Drift()) if odometry else bound.single(scene, path)
     odometer = Odometer(Drift(), scene.rng)
@@ -121,9 +121,9 @@ def tracking(
     return {"tracking, odometry" if odometry else "tracking, no odometry": outcome}
 
 
-def kidnapped(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, Outcome]:
+def kidnapped(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
     """Teleports of a standing robot every 20 scans: whether it is found after one, three and twenty scans."""
-    after = {1: Outcome(), 3: Outcome(), 20: Outcome()}
+    after = {1: TaskOutcome(), 3: TaskOutcome(), 20: TaskOutcome()}
     poses, stamp = scene.poses(trials + 1), 0
     estimator.restart()
     for number, (pose, clean) in enumerate(zip(progress(poses), scene.clean(poses), strict=True)):
@@ -140,14 +140,14 @@ def holds_both(posterior: Posterior, pose: Array) -> bool:
     return all(any(is_at(h.pose, place) for h in posterior.hypotheses) for place in (pose, twin_of(pose)))
 
 
-def twins(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, Outcome]:
+def twins(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
     """A path out of one of two identical rooms: both kept while ambiguous, and the right one believed at the end.
 
     "Both kept" counts trials in which every belief from the 20th scan until the first scan that distinguishes the rooms
     has a hypothesis at the true pose and one at its twin, of any weight. Its ``wrong`` counts trials that published
     `tracking` at the wrong place during that time.
     """
-    kept, right = Outcome(), Outcome()
+    kept, right = TaskOutcome(), TaskOutcome()
     for _ in progress(np.arange(float(trials))):
         path, same = twin_path(scene)
         estimator.restart()

@@ -18,7 +18,7 @@ from common.bus.bus import open_bus
 from common.errors import UserError
 from common.geometry.world import load_world
 from common.versions import commit, versions
-from lab.benchmarks.fleet_load import Load, Window
+from lab.benchmarks.fleet_load import FleetLoad, Window
 from lab.benchmarks.fleet_table import DEPLOYMENTS, show
 from presage.session.stack import Stack
 from presage.terminal.output import check_file, write_json
@@ -31,7 +31,7 @@ MAX_SETTLING_ROUNDS = 5
 
 
 @dataclass(frozen=True)
-class Plan:
+class FleetPlan:
     """Parameters of the benchmark."""
 
     world: str
@@ -86,13 +86,13 @@ class DeploymentResult:
 class EstimatorDeployment:
     """The running estimators of one deployment, pinned to one core."""
 
-    def __init__(self, stack: Stack, load: Load, plan: Plan, result: DeploymentResult, core: int) -> None:
-        """Start no process yet."""
+    def __init__(self, stack: Stack, load: FleetLoad, plan: FleetPlan, result: DeploymentResult, core: int) -> None:
+        """Does not start any process yet."""
         self.stack, self.load, self.plan, self.result, self.core = stack, load, plan, result, core
         self.ready = 0  # number of robots that are localised
 
     def prepare(self, count: int) -> None:
-        """Start estimators for the first ``count`` robots and let them localise (preset paper may fail to)."""
+        """Starts estimators for the first ``count`` robots and lets them localise (preset paper may fail to)."""
         if count <= self.ready:
             return
         arguments = ["--world", self.plan.world, "--estimator", self.result.estimator]
@@ -137,7 +137,7 @@ class EstimatorDeployment:
         return False
 
     def search(self) -> None:
-        """Measure how one robot's global searches delay the others. Skips preset paper, which has no global search."""
+        """Measures how one robot's global searches delay the others. Skips preset paper, which has no global search."""
         count = max(2, self.result.served // 2)
         if self.result.estimator != "paper" and count <= self.plan.max_robots:
             self.prepare(count)
@@ -154,7 +154,7 @@ class EstimatorDeployment:
         return sum(t.user + t.system for t in (process.cpu_times() for process in self.processes()))
 
 
-def _row(window: Window, cpu_s: float, plan: Plan) -> dict[str, Any]:
+def _row(window: Window, cpu_s: float, plan: FleetPlan) -> dict[str, Any]:
     return {
         "robots": window.robots,
         "sent": window.sent,
@@ -183,13 +183,13 @@ def max_robots_served(served: Callable[[int], bool], most: int) -> int:
     return good
 
 
-def measure(estimator: str, way: str, plan: Plan, console: Console) -> DeploymentResult:
-    """Measure one estimator in one deployment, with its own router."""
+def measure(estimator: str, way: str, plan: FleetPlan, console: Console) -> DeploymentResult:
+    """Measures one estimator in one deployment, with its own router."""
     result, cores = DeploymentResult(estimator, way, plan.rate), sorted(os.sched_getaffinity(0))
     with Stack("bench", quiet=True) as stack:
         stack.start_router()
         with open_bus(stack.link()) as bus:
-            load = Load(bus, load_world(plan.world), plan.beams, plan.rate, plan.max_robots, plan.seed)
+            load = FleetLoad(bus, load_world(plan.world), plan.beams, plan.rate, plan.max_robots, plan.seed)
             deployment = EstimatorDeployment(stack, load, plan, result, cores[-1])
             deployment.prepare(1)
             if way == DEPLOYMENTS[0]:
@@ -216,7 +216,7 @@ def measure(estimator: str, way: str, plan: Plan, console: Console) -> Deploymen
 
 @contextmanager
 def _harness_on_other_cores(cores: list[int]) -> Iterator[None]:
-    """Keep the threads of this process off the last core, if there are several cores."""
+    """Keeps the threads of this process off the last core, if there are several cores."""
     _pin_threads(psutil.Process(), set(cores[:-1] or cores))
     try:
         yield
@@ -225,14 +225,14 @@ def _harness_on_other_cores(cores: list[int]) -> Iterator[None]:
 
 
 def _pin_threads(process: psutil.Process, cores: set[int]) -> None:
-    """Pin every thread of the process to the cores; threads that are created later inherit the setting."""
+    """Pins every thread of the process to the cores; threads that are created later inherit the setting."""
     for thread in process.threads():
         with suppress(ProcessLookupError):  # the thread has just ended
             os.sched_setaffinity(thread.id, cores)
 
 
-def bench_fleet(estimators: str, plan: Plan, json_file: Path | None, console: Console) -> int:
-    """Run the benchmark, print the table and write it to ``json_file`` if given. Returns exit status 0."""
+def bench_fleet(estimators: str, plan: FleetPlan, json_file: Path | None, console: Console) -> int:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
     rows = [measure(name, way, plan, console).row() for name in estimators.split(",") for way in DEPLOYMENTS]
     ratios = show(rows, plan, console)

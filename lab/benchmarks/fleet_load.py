@@ -60,11 +60,11 @@ class Window:
         return float(np.percentile(self.latency_ms, q)) if len(self.latency_ms) else None
 
 
-class Load:
+class FleetLoad:
     """Simulated robots. Their scans are computed before they are sent, so that sending takes little processor time."""
 
     def __init__(self, bus: Bus, world: World, beams: int, rate: float, count: int, seed: int) -> None:
-        """Place ``count`` robots at random in the world; each sends scans at ``rate`` Hz."""
+        """Places ``count`` robots at random in the world; each sends scans at ``rate`` Hz."""
         self.world, self.rate = world, rate
         self.scanner: Scanner = SCANNERS["tim571"].with_beams(beams)
         self._rng = np.random.default_rng(seed)
@@ -96,7 +96,7 @@ class Load:
         return found
 
     def play(self, count: int, seconds: float, rate: float | None = None, *, searching: bool = False) -> Window:
-        """Send scans of the first ``count`` robots for ``seconds`` s, and return how they were answered.
+        """Sends scans of the first ``count`` robots for ``seconds`` s, and returns how they were answered.
 
         ``rate`` in Hz defaults to the load's rate. With ``searching``, the first robot requests a global localisation
         once a second and is left out of the result.
@@ -145,7 +145,7 @@ class Load:
         ).encode()
 
     def _window(self, count: int, sent: dict[tuple[str, int], int]) -> Window:
-        """Match the received answers to the scans in ``sent``, waiting up to `ANSWER_TIMEOUT_S` for the last ones."""
+        """Matches the received answers to the scans in ``sent``, waiting up to `ANSWER_TIMEOUT_S` for the last ones."""
         deadline, latency, states = (
             time.monotonic() + ANSWER_TIMEOUT_S,
             dict[tuple[str, int], float](),

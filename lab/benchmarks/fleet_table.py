@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from lab.benchmarks.fleet import Plan
+    from lab.benchmarks.fleet import FleetPlan
 
 DEPLOYMENTS = ("one process", "one each")
 LARGE_FLEET = 1000  # robots, for the extrapolation
@@ -29,8 +29,8 @@ def _large_fleet_note(row: dict[str, Any], rate: float) -> str:
     )
 
 
-def show(rows: list[dict[str, Any]], plan: Plan, console: Console) -> dict[str, dict[str, float | None]]:
-    """Print the table. Returns, by estimator, the ratios of one process for all robots to one process per robot."""
+def show(rows: list[dict[str, Any]], plan: FleetPlan, console: Console) -> dict[str, dict[str, float | None]]:
+    """Prints the table. Returns, by estimator, the ratios of one process for all robots to one process per robot."""
     table = Table(
         title=f"{plan.world}, {plan.beams} beams at {plan.rate:g} Hz, one core, "
         f"{100 * plan.share:g} % of the scans answered within {1e3 / plan.rate:.1f} ms",

@@ -148,7 +148,7 @@ def _wait_for(inbox: Inbox, wanted: Any) -> bool:
 
 
 def bench_latency(scans: int, rate: float, beams: int, json_file: Path | None, console: Console) -> int:
-    """Run the benchmark, print the table and write it to ``json_file`` if given.
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given.
 
     Returns exit status 1 if a payload was not answered.
     """

@@ -32,7 +32,7 @@ SCANS = 100
 def bench_map(
     world: str, size: int, beams: int, out: Path | None, seed: int, json_file: Path | None, console: Console
 ) -> int:
-    """Run the benchmark, print the table and write it to ``json_file`` if given. Returns exit status 0."""
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
     if out is not None:
         make_folder(out, "--out")

@@ -98,7 +98,7 @@ def observation_us() -> float:
 
 
 def bench_metrics(seconds: float, rounds: int, json_file: Path | None, console: Console) -> int:
-    """Run the benchmark, print the table and write it to ``json_file`` if given. Returns exit status 0."""
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
     unscraped, scraped = measure(seconds, rounds, console)
     table = Table(title=f"{rounds} x {seconds:g} s each, one scrape a second", title_justify="left")

@@ -179,10 +179,10 @@ def bench_recorder(
 
     Examples: `presage bench recorder`; `presage bench recorder --seconds 10 --rate 5000 --json recorder.json`.
     """
-    from lab.benchmarks.recorder import Load  # noqa: PLC0415
+    from lab.benchmarks.recorder import RecorderLoad  # noqa: PLC0415
     from lab.benchmarks.recorder import bench_recorder as run  # noqa: PLC0415
 
-    raise typer.Exit(run(Load(rate, seconds), out, json_file, console))
+    raise typer.Exit(run(RecorderLoad(rate, seconds), out, json_file, console))
 
 
 @app.command("chaos")
@@ -224,10 +224,10 @@ def bench_fleet(
 
     Examples: `presage bench fleet`; `presage bench fleet --estimators precise --seconds 3 --most 8` (quick).
     """
-    from lab.benchmarks.fleet import Plan  # noqa: PLC0415
+    from lab.benchmarks.fleet import FleetPlan  # noqa: PLC0415
     from lab.benchmarks.fleet import bench_fleet as run  # noqa: PLC0415
 
-    plan = Plan("corridor", BEAMS, rate=15.0, seconds=seconds, max_robots=most, share=0.999, seed=1)
+    plan = FleetPlan("corridor", BEAMS, rate=15.0, seconds=seconds, max_robots=most, share=0.999, seed=1)
     raise typer.Exit(run(estimators, plan, json_file, console))
 
 

@@ -42,7 +42,7 @@ def worker_count(extra: int = 0) -> int:
 
 
 def show(experiment: ModuleType, run: Callable[[], Result], out: Path) -> None:
-    """Run the experiment, then print its table, its notes and the files it wrote."""
+    """Runs the experiment, then prints its table, its notes and the files it wrote."""
     make_folder(out, "--out")
     result = run()
     print(f"\n{experiment.table(result.summary)}\n")

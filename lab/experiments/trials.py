@@ -30,7 +30,7 @@ def run_trials(
     ``trial`` must be a module-level function whose result depends on its job alone. Finished trials are stored in
     ``out`` until all are done, so that after Ctrl-C the same command continues.
     """
-    store = Store(out / f".{name}.unfinished.jsonl", jobs)
+    store = TrialStore(out / f".{name}.unfinished.jsonl", jobs)
     done = store.read()
     if done:
         console.print(f"{name}: going on after {len(done)} of {len(jobs)} trials of an interrupted run")
@@ -82,11 +82,11 @@ def _run_in_parallel(
         ) from None
 
 
-class Store:
+class TrialStore:
     """A file with the results of an unfinished run, one per line, valid for the same jobs and commit only."""
 
     def __init__(self, path: Path, jobs: Sequence[Any]) -> None:
-        """Remember the path and the jobs' key; the file is neither read nor written yet."""
+        """Stores the path and the jobs' key; the file is neither read nor written yet."""
         self.path = path
         plain = json.dumps([commit(), [asdict(job) for job in jobs]], sort_keys=True, default=str)
         self.key = hashlib.sha256(plain.encode()).hexdigest()
@@ -110,7 +110,7 @@ class Store:
         return done
 
     def add(self, index: int, result: Result) -> None:
-        """Append a result."""
+        """Appends a result."""
         first = "" if self.path.exists() else self.key + "\n"
         with self.path.open("a", encoding="utf-8") as file:
             file.write(first + json.dumps([index, result]) + "\n")

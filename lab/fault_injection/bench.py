@@ -39,7 +39,7 @@ def bench_chaos(
     one_host: bool = False,
     quiet: bool = True,
 ) -> int:
-    """Inject the faults, print the table and write it to ``json_file`` if given.
+    """Injects the faults, prints the table and writes it to ``json_file`` if given.
 
     Returns exit status 0 if the system reacted to every fault as expected, otherwise 1.
     """

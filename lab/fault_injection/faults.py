@@ -144,7 +144,7 @@ def _misbehaving_peer(what: str, *args: str) -> tuple[Callable[[System], None], 
 
 
 def _start_recorder_on_full_disk(system: System) -> None:
-    """Start a second recorder on a disk that soon is full."""
+    """Starts a second recorder on a disk that is soon full."""
     disk = system.folder / "full"
     disk.mkdir(exist_ok=True)
     run("mount", "-t", "tmpfs", "-o", f"size={FULL_DISK_SIZE}", "tmpfs", str(disk))

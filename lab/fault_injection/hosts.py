@@ -94,7 +94,7 @@ class Network:
         run("ip", "link", "delete", SWITCH)
 
     def add(self, name: str) -> Host:
-        """Create a host that is connected to all others."""
+        """Creates a host that is connected to all others."""
         holder = _child("unshare", "--net", "sleep", "infinity")
         mine = Path("/proc/self/ns/net").stat().st_ino
         if not wait_until(lambda: Path(f"/proc/{holder.pid}/ns/net").stat().st_ino != mine, 10):
@@ -106,11 +106,11 @@ class Network:
         return host
 
     def cut(self, name: str) -> None:
-        """Cut the host's link; packets are lost without notice."""
+        """Cuts the host's link; packets are lost without notice."""
         run("ip", "link", "set", port_of(name), "down")
 
     def restore(self, name: str) -> None:
-        """Restore the host's link to its original state."""
+        """Restores the host's link to its original state."""
         host = self.hosts[name]
         if host.relay is None:
             run("ip", "link", "set", port_of(name), "up")
@@ -121,7 +121,7 @@ class Network:
         self._wire(host)
 
     def degrade(self, name: str, *, delay_ms: float, jitter_ms: float, loss: float) -> None:
-        """Delay the packets to and from the host, and lose a share ``loss`` (0 to 1) of them.
+        """Delays the packets to and from the host, and drops a share ``loss`` (0 to 1) of them.
 
         A relay process passes the packets on, because not every kernel has netem.
         """

@@ -34,7 +34,7 @@ SERVICES_ON_HOST = {"robot": "simulator, controller", "brain": "estimator"}
 
 
 def bench_hosts(seconds: float, beams: int, json_file: Path | None, console: Console) -> int:
-    """Run the benchmark, print traffic and delays and write them to ``json_file`` if given. Returns exit status 0.
+    """Runs the benchmark, prints traffic and delays and writes them to ``json_file`` if given. Returns exit status 0.
 
     Raises UserError if this machine permits no network namespaces.
     """

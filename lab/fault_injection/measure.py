@@ -68,7 +68,7 @@ def measure(system: System, fault: Fault) -> FaultOutcome:
 
 
 def _measure_recovery(system: System, fault: Fault, returned: float, outcome: FaultOutcome) -> None:
-    """Measure when the robot drives again, or when the affected services work again."""
+    """Measures when the robot drives again, or when the affected services work again."""
     timeline = system.timeline
     if fault.expect == "goes on":
         works = [
@@ -97,7 +97,7 @@ def _wait_for(timeline: Timeline, since: float, wanted: Any, timeout: float) -> 
 
 
 def _evaluate(timeline: Timeline, injected: float, speed: float, fault: Fault, outcome: FaultOutcome) -> None:
-    """Derive detection, contact and lowest speed from the recorded events."""
+    """Derives detection, contact and lowest speed from the recorded events."""
 
     def is_detection(row: Row) -> bool:
         if any(is_gone(name)(row) for name in fault.services) or is_lost(row):

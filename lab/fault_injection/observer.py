@@ -59,7 +59,7 @@ def describe(message: Message) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Print events until the process is ended."""
+    """Prints events until the process is ended."""
     connect, robot = os.environ["PRESAGE_CONNECT"], os.environ["PRESAGE_ROBOT"]
     listen = os.environ.get("PRESAGE_LISTEN") or "tcp/127.0.0.1:0"
     inbox = Inbox()

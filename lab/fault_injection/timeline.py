@@ -18,13 +18,13 @@ class Timeline:
     """Events from the observer in the order of arrival; one thread adds them, another reads them."""
 
     def __init__(self) -> None:
-        """Start without events."""
+        """Starts with an empty list of events."""
         self.rows: list[Row] = []
         self._lock = threading.RLock()  # entered directly, because Ctrl-C in Condition.__enter__ would leave it locked
         self._changed = threading.Condition(self._lock)
 
     def add(self, row: Row) -> None:
-        """Append an event and wake up waiting threads."""
+        """Appends an event and wake up waiting threads."""
         with self._lock:
             self.rows.append(row)
             self._changed.notify_all()
@@ -54,7 +54,7 @@ class Timeline:
                     raise UserError(f"{what}: did not happen within {timeout:g} s")
 
     def forget(self, before: float) -> None:
-        """Remove events before the time ``before`` (s)."""
+        """Removes events before the time ``before`` (s)."""
         with self._lock:
             self.rows = [row for row in self.rows if row["t"] >= before]
 

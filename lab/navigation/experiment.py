@@ -53,7 +53,7 @@ STATISTICS: dict[str, Callable[[Any], Any]] = {"median": np.median, "max": np.ma
 
 
 @dataclass(frozen=True)
-class Job:
+class NavigationJob:
     """One start and goal in one world, with one drive."""
 
     index: int
@@ -93,7 +93,7 @@ class Job:
         )
 
 
-def check(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> None:
+def check(job: NavigationJob, worlds: Sequence[str], drives: Sequence[str]) -> None:
     """Checks the options before anything runs. Raises UserError for unknown or repeated values."""
     for world in worlds:
         load_world(world)
@@ -109,7 +109,7 @@ def check(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> None:
         raise UserError("--worlds: two of the files have the same name; rename one, because results are named after it")
 
 
-def result_name(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> str:
+def result_name(job: NavigationJob, worlds: Sequence[str], drives: Sequence[str]) -> str:
     """Name of the result: `navigation` and the options that differ from the defaults.
 
     Results of different options therefore do not overwrite each other.
@@ -119,16 +119,16 @@ def result_name(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> str:
         *([] if tuple(drives) == DRIVES else drives),
         *(["unknown"] if job.start == "unknown" else []),
         *([f"people{job.people}"] if job.people else []),
-        *([f"{job.people_speed:g}mps"] if job.people and job.people_speed != Job.people_speed else []),
-        *([job.estimator] if job.estimator != Job.estimator else []),
-        *([job.prior] if job.prior != Job.prior else []),
+        *([f"{job.people_speed:g}mps"] if job.people and job.people_speed != NavigationJob.people_speed else []),
+        *([job.estimator] if job.estimator != NavigationJob.estimator else []),
+        *([job.prior] if job.prior != NavigationJob.prior else []),
         *([] if job.epistemic else ["no-epistemic"]),
-        *([f"beams{job.beams}"] if job.beams != Job.beams else []),
+        *([f"beams{job.beams}"] if job.beams != NavigationJob.beams else []),
     ]
     return "-".join(["navigation", *parts])
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: NavigationJob) -> dict[str, Any]:
     """Runs one drive. Returns its statistics."""
     robot = Robot.model_validate({"drive": job.drive})
     trip = draw_trip(job.world, np.random.default_rng((job.seed, EXPERIMENT_ID, job.index)), robot)
@@ -200,7 +200,7 @@ def _why(row: dict[str, Any]) -> str:
 
 
 def run(
-    job: Job,
+    job: NavigationJob,
     trials: int,
     out: Path,
     workers: int,
@@ -243,7 +243,7 @@ def run(
     return result
 
 
-def _note(job: Job, trials: int) -> str:
+def _note(job: NavigationJob, trials: int) -> str:
     return f"{trials} pairs at random in each world, the same for every drive; {driving_figure.describe(job)}."
 
 

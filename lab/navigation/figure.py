@@ -14,14 +14,14 @@ from lab.experiments import results
 from presage.plotting import style as drawing
 
 if TYPE_CHECKING:
-    from lab.navigation.experiment import Job
+    from lab.navigation.experiment import NavigationJob
 
 Rows = Sequence[dict[str, Any]]
 LINES = ("-", "--", ":", "-.")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 
 
-def describe(job: Job) -> str:
+def describe(job: NavigationJob) -> str:
     """The options that differ between experiments, in words."""
     parts = [f"start {job.start}", f"estimator {job.estimator}"]
     parts += [f"{job.people} people at {job.people_speed:g} m/s"] if job.people else []

@@ -48,7 +48,7 @@ MOMENTS = (1, 10, 50)  # numbers of scans after which the results are evaluated
 
 
 @dataclass(frozen=True)
-class Job:
+class AliasingJob:
     """One estimator in one world, at all places."""
 
     seed: int
@@ -68,7 +68,7 @@ def world_of(name: str) -> World:
     return {"alike": ALIKE, "twins": TWINS}.get(name) or load_world(name)
 
 
-def scene_of(job: Job, *seed: int) -> Scene:
+def scene_of(job: AliasingJob, *seed: int) -> Scene:
     """The job's world with random numbers that do not depend on the estimator."""
     return Scene.of(world_of(job.world), job.beams, (job.seed, EXPERIMENT_ID, list(TITLES).index(job.world), *seed))
 
@@ -92,7 +92,7 @@ def sample_places(scene: Scene, count: int) -> Array:
     return np.asarray(poses)
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: AliasingJob) -> dict[str, Any]:
     """Trains the job's estimator, then runs it at each place."""
     make = _estimator_factory(job)
     rows = []
@@ -105,7 +105,7 @@ def trial(job: Job) -> dict[str, Any]:
     return {"world": job.world, "estimator": job.estimator, "places": rows}
 
 
-def _estimator_factory(job: Job) -> Callable[[int], Estimator]:
+def _estimator_factory(job: AliasingJob) -> Callable[[int], Estimator]:
     """Trains the model. Returns a function that makes a new estimator, without start pose, for a place's number."""
     scene = scene_of(job, LEARNING_SEED, ESTIMATORS.index(job.estimator))
     if job.estimator == "paper":
@@ -162,7 +162,9 @@ def summarise(row: dict[str, Any]) -> dict[str, Any]:
     return statistics
 
 
-def run(job: Job, out: Path, workers: int, console: Console, worlds: Sequence[str] = tuple(TITLES)) -> results.Result:
+def run(
+    job: AliasingJob, out: Path, workers: int, console: Console, worlds: Sequence[str] = tuple(TITLES)
+) -> results.Result:
     """Every estimator in every world; writes aliasing.json, .csv, .pdf and .png into ``out``."""
     # The longest jobs first: the training of the paper's decoders.
     jobs = [replace(job, world=world, estimator=name) for name in ESTIMATORS for world in worlds]

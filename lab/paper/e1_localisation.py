@@ -39,7 +39,7 @@ CLOSE_DISTANCE = 0.2  # m; an error below it counts as close
 
 
 @dataclass(frozen=True)
-class Job:
+class LocalisationJob:
     """One trial: one place, with the same scans for every estimator."""
 
     index: int
@@ -50,7 +50,7 @@ class Job:
     descent: Descent = PAPER_DESCENT
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: LocalisationJob) -> dict[str, Any]:
     """Runs one trial. Returns each estimator's error (m) after every iteration and its final state, and the bound."""
     scene = job.field.scene(job.seed, EXPERIMENT_ID, job.index)
     pose = scene.poses(1)[0]
@@ -105,7 +105,7 @@ def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
     }
 
 
-def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
+def run(job: LocalisationJob, trials: int, out: Path, workers: int, console: Console) -> results.Result:
     """Runs all trials. Writes e1.json, .csv, .pdf and .png into ``out``."""
     jobs = [replace(job, index=index) for index in range(trials)]
     rows = run_trials("e1", trial, jobs, out, workers, console)

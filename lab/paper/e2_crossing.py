@@ -55,7 +55,7 @@ MARGIN = 0.1  # m, between the robot and any obstacle
 
 
 @dataclass(frozen=True)
-class Job:
+class CrossingJob:
     """One crossing, with the same scans for every estimator."""
 
     index: int
@@ -86,7 +86,7 @@ def path_of(scene: Scene, heading: float, step: float) -> Array:
     raise UserError(f"world {scene.world.name!r} has no free straight line from one side to the other: take another")
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: CrossingJob) -> dict[str, Any]:
     """Runs one crossing. Returns each estimator's error (m) at every scan, and the bounds."""
     scene = job.field.scene(job.seed, EXPERIMENT_ID, job.index)
     path = path_of(scene, job.field.heading, job.step)
@@ -129,7 +129,7 @@ def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
     }
 
 
-def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
+def run(job: CrossingJob, trials: int, out: Path, workers: int, console: Console) -> results.Result:
     """Runs all crossings. Writes e2.json, .csv, .pdf and .png into ``out``."""
     jobs = [replace(job, index=index) for index in range(trials)]
     rows = run_trials("e2", trial, jobs, out, workers, console)

@@ -42,7 +42,7 @@ ESTIMATORS = ("paper", "precise")
 
 
 @dataclass(frozen=True)
-class Job:
+class PredictionJob:
     """One sample scan for the figure, and ``scans`` test scans."""
 
     seed: int
@@ -50,7 +50,7 @@ class Job:
     field: ExperimentWorld = ExperimentWorld()  # noqa: RUF009 - frozen
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: PredictionJob) -> dict[str, Any]:
     """The sample scan as measured and predicted; shares of test beams within multiples of the predicted deviation."""
     use_one_core()
     sample, test = (job.field.scene(job.seed, EXPERIMENT_ID, part) for part in (SAMPLE_SEED, TEST_SEED))
@@ -114,7 +114,7 @@ def _expected(name: str, field: ExperimentWorld, scene: Scene, poses: Array) -> 
     return ranges, np.sqrt(expected.scale**2 + scene.scanner.sigma**2)
 
 
-def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
+def run(job: PredictionJob, out: Path, workers: int, console: Console) -> results.Result:
     """Runs the experiment. Writes prediction.json, .csv, .pdf and .png into ``out``."""
     rows = run_trials("prediction", trial, [job], out, workers, console)
     row = rows[0]

@@ -36,7 +36,7 @@ SHARED_SEED, LEARNING_SEED = 0, 1  # parts of the random seeds: of the common te
 
 
 @dataclass(frozen=True)
-class Job:
+class SamplesJob:
     """One model, trained on a number of samples."""
 
     seed: int
@@ -50,7 +50,7 @@ class Job:
     descent: Descent = PAPER_DESCENT
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: SamplesJob) -> dict[str, Any]:
     """Trains a model. Returns the errors of its predicted ranges, and of the poses estimated with it."""
     training_scene = job.field.scene(
         job.seed, EXPERIMENT_ID, LEARNING_SEED, ESTIMATORS.index(job.estimator), job.samples
@@ -104,7 +104,7 @@ def summarise(row: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def run(job: Job, out: Path, workers: int, console: Console, sizes: Sequence[int] = SIZES) -> results.Result:
+def run(job: SamplesJob, out: Path, workers: int, console: Console, sizes: Sequence[int] = SIZES) -> results.Result:
     """Runs every estimator with every number of samples. Writes samples.json, .csv, .pdf and .png into ``out``."""
     jobs = [replace(job, estimator=name, samples=size) for name in ESTIMATORS for size in sizes]
     rows = run_trials("samples", trial, jobs, out, workers, console)

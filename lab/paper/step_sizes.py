@@ -68,7 +68,7 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Job:
+class StepSizeJob:
     """One journey with one setting."""
 
     index: int
@@ -90,7 +90,7 @@ def settings() -> list[Setting]:
     return [Setting("displacement", each) for each in every] + [Setting("velocity", each) for each in driven]
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: StepSizeJob) -> dict[str, Any]:
     """Runs one journey. Returns its number of iterations, and in the velocity loop its time over the minimum."""
     world = job.field.scene(0).world
     journey = draw_journey(world, np.random.default_rng((job.seed, navigation.EXPERIMENT_ID, job.index)), Robot())
@@ -104,7 +104,7 @@ def _model(field: ExperimentWorld) -> tuple[PaperModel, weights.ModelCard]:
     return weights.load(weights.find(weights.FOLDER, field.world, "paper", field.beams))
 
 
-def _run_displacement(job: Job, world: World, journey: Journey) -> dict[str, Any]:
+def _run_displacement(job: StepSizeJob, world: World, journey: Journey) -> dict[str, Any]:
     scene = job.field.scene(job.seed, EXPERIMENT_ID, job.index)
 
     def look(pose: Array) -> Array:
@@ -120,7 +120,7 @@ def _run_displacement(job: Job, world: World, journey: Journey) -> dict[str, Any
     }
 
 
-def _run_velocity(job: Job, world: World, journey: Journey) -> dict[str, Any]:
+def _run_velocity(job: StepSizeJob, world: World, journey: Journey) -> dict[str, Any]:
     """Runs the journey as in E3, but in one process and with the job's step sizes."""
     from services.simulator.simulation import Setup, Simulation  # noqa: PLC0415 - pybullet, for this alone
 
@@ -181,7 +181,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
+def run(job: StepSizeJob, trials: int, out: Path, workers: int, console: Console) -> results.Result:
     """Runs every setting over the first ``trials`` journeys of E3.
 
     Writes steps.json, .csv, .trials.jsonl, .pdf and .png into ``out``.

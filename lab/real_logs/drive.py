@@ -32,7 +32,7 @@ ODOMETRY, LASER, GLOBAL, KIDNAPPED = "odometry", "laser", "global", "kidnapped"
 
 
 @dataclass(frozen=True)
-class Job:
+class StretchJob:
     """One estimator on one stretch of a drive; all values are plain, so that jobs can be compared and pickled."""
 
     log: str
@@ -79,7 +79,7 @@ def exchange_halves(drive: Drive) -> Drive:
     return replace(exchanged, stamps=np.concatenate([late.stamps, early.stamps + offset]))
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: StretchJob) -> dict[str, Any]:
     """Runs the job's estimator over its stretch. Returns errors, states and times of every scan."""
     drive, estimator = job.drive, create_estimator(job)
     if job.task in (ODOMETRY, LASER):
@@ -128,7 +128,7 @@ def hide_kidnapping(odom: Array, carried: int) -> Array:
     return np.asarray(moved)
 
 
-def create_estimator(job: Job) -> Estimator:
+def create_estimator(job: StretchJob) -> Estimator:
     """A new estimator for the job's map, without a start pose."""
     drive = job.drive
     if job.estimator == "precise":

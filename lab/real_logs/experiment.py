@@ -31,11 +31,11 @@ from lab.real_logs.drive import (
     ODOMETRY,
     SCANS_BEFORE_KIDNAPPING,
     TRACKED_DISTANCE,
+    StretchJob,
     trial,
 )
-from lab.real_logs.drive import Job as Stretch
 from lab.real_logs.figure import draw
-from lab.real_logs.filter_tuning import Settings, Tuned, starting_point, tune
+from lab.real_logs.filter_tuning import Settings, TunedSettings, starting_point, tune
 from presage.learning.train_drive import TrainDriveOptions as Training
 from presage.learning.train_drive import card_of
 from services.estimator.precise.learning import weights
@@ -58,7 +58,7 @@ QUICK_SCANS = 120  # scans of (a) and (b) with --quick
 
 
 @dataclass(frozen=True)
-class Job:
+class RealLogJob:
     """Parameters of the experiment."""
 
     log: Path
@@ -77,10 +77,10 @@ class Job:
         return f"real-{self.name or stem}"
 
 
-def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
+def run(job: RealLogJob, out: Path, workers: int, console: Console) -> results.Result:
     """Trains, tunes and localises. Writes real-NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
     world = load_world(job.map)
-    plain = Stretch(str(job.log), job.map, job.mount, "precise", ODOMETRY, 0, seed=job.seed, exchanged=job.exchange)
+    plain = StretchJob(str(job.log), job.map, job.mount, "precise", ODOMETRY, 0, seed=job.seed, exchanged=job.exchange)
     drive = plain.drive
     half = plain.learned
     x, y, yaw = drive.mount
@@ -142,8 +142,8 @@ def _check_map(world: World, learned: Drive, name: str) -> None:
 
 
 def _train_and_tune(
-    job: Job, stretch: Stretch, half: int, out: Path, console: Console
-) -> tuple[Path, weights.FieldCard, Tuned]:
+    job: RealLogJob, stretch: StretchJob, half: int, out: Path, console: Console
+) -> tuple[Path, weights.FieldCard, TunedSettings]:
     """The model trained on the training half, and the settings of the particle filter tuned on it.
 
     An interrupted run's model and settings are reused if the command and the commit are the same.
@@ -156,7 +156,7 @@ def _train_and_tune(
         before = json.loads(kept.read_text(encoding="utf-8"))
         if before["key"] == key:
             odometry, laser, finding = (tuple(before[what].items()) for what in ("odometry", "laser", "finding"))
-            return path, weights.load(path)[2], Tuned(odometry, laser, finding, before["tried"])
+            return path, weights.load(path)[2], TunedSettings(odometry, laser, finding, before["tried"])
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("learning", total=1.0)
@@ -171,7 +171,7 @@ def _train_and_tune(
         weights.save(path, learned.model, learned.places, card)
         start = starting_point(learned.calibration.motion)
         tuned = (
-            Tuned(start, start, (*start, ("keep_initial_pose", 0.0)), [])
+            TunedSettings(start, start, (*start, ("keep_initial_pose", 0.0)), [])
             if job.quick
             else tune(replace(stretch, estimator="particle-filter"), half, start, path.parent, report)
         )
@@ -180,15 +180,15 @@ def _train_and_tune(
     return path, card, tuned
 
 
-def _settings(tuned: Tuned, task: str) -> Settings:
+def _settings(tuned: TunedSettings, task: str) -> Settings:
     return _settings_by_task(tuned).get(task, tuned.finding)
 
 
-def _settings_by_task(tuned: Tuned) -> dict[str, Settings]:
+def _settings_by_task(tuned: TunedSettings) -> dict[str, Settings]:
     return {ODOMETRY: tuned.odometry, LASER: tuned.laser, "finding": tuned.finding}
 
 
-def stretches(plain: Stretch, half: int, count: int, job: Job, *, odometry: bool) -> list[Stretch]:
+def stretches(plain: StretchJob, half: int, count: int, job: RealLogJob, *, odometry: bool) -> list[StretchJob]:
     """The trials of one estimator, the longest first."""
     length = min(QUICK_SCANS, count - half) if job.quick else count - half
     whole = [replace(plain, task=task, count=length) for task in ((ODOMETRY, LASER) if odometry else (LASER,))]
@@ -267,7 +267,7 @@ def curves_of(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
     return curves
 
 
-def notes(job: Job, card: weights.FieldCard, tuned: Tuned) -> list[str]:
+def notes(job: RealLogJob, card: weights.FieldCard, tuned: TunedSettings) -> list[str]:
     """Notes below the table: definitions, tuned settings and calibration."""
     found, learned = card.calibration, "second" if job.exchange else "first"
     lines = [

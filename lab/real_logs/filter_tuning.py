@@ -29,7 +29,7 @@ from lab.real_logs.drive import (
     ODOMETRY,
     SCANS_BEFORE_KIDNAPPING,
     TRACKED_DISTANCE,
-    Job,
+    StretchJob,
     trial,
 )
 from presage.learning.grid_map import write_map
@@ -62,7 +62,7 @@ Settings = tuple[tuple[str, float], ...]
 
 
 @dataclass(frozen=True)
-class Tuned:
+class TunedSettings:
     """Tuned settings of the particle filter."""
 
     odometry: Settings  # for tracking with odometry
@@ -88,7 +88,9 @@ def starting_point(motion: MotionNoise) -> Settings:
     )
 
 
-def tune(job: Job, half: int, start: Settings, folder: Path, report: Callable[[str, float], None]) -> Tuned:
+def tune(
+    job: StretchJob, half: int, start: Settings, folder: Path, report: Callable[[str, float], None]
+) -> TunedSettings:
     """Tunes the settings by coordinate search. Writes the map of the first quarter into ``folder``.
 
     ``job`` gives the log, the map and the mount; ``half`` is the number of scans in the first half, ``start`` the
@@ -138,10 +140,10 @@ def tune(job: Job, half: int, start: Settings, folder: Path, report: Callable[[s
         odometry = coordinate_search(ODOMETRY, start, TRACKING_CANDIDATES, partial(tracking, ODOMETRY))
     # A kidnapped robot must give up its given pose, and nav2's default number of particles is too small for a search.
     found = _with(_with(odometry, "keep_initial_pose", 0.0), "amcl_defaults", 0.0)
-    return Tuned(odometry, laser, coordinate_search("finding", found, SEARCH_CANDIDATES, finding), lines)
+    return TunedSettings(odometry, laser, coordinate_search("finding", found, SEARCH_CANDIDATES, finding), lines)
 
 
-def _map_of_quarter(job: Job, quarter: int, folder: Path) -> Path:
+def _map_of_quarter(job: StretchJob, quarter: int, folder: Path) -> Path:
     """Writes a ROS map of the first ``quarter`` scans, with the cell size of the job's map. Returns its path."""
     grid = load_world(job.map).grid
     cell = grid.resolution if grid is not None else CELL_SIZE
@@ -149,7 +151,7 @@ def _map_of_quarter(job: Job, quarter: int, folder: Path) -> Path:
     return write_map(folder, values, name="quarter", image="quarter.pgm", resolution=cell, origin=[x, y, 0.0])
 
 
-def _evenly_spaced(job: Job, first: int, last: int, count: int) -> list[int]:
+def _evenly_spaced(job: StretchJob, first: int, last: int, count: int) -> list[int]:
     """Indices of ``count`` scans from ``first`` to ``last``, evenly spaced among those with a pose in free space."""
     free = np.flatnonzero(load_world(job.map).clearance(job.drive.poses[first : last + 1, :2]) > 0)
     numbers = first + (free if len(free) else np.arange(last + 1 - first))

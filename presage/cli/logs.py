@@ -88,7 +88,7 @@ def localize(
         settings.seed,
         settings.initial_pose,
     )
-    job = LocalizeOptions.of(
+    options = LocalizeOptions.of(
         file,
         choice,
         "global" if mode == "single" else mode,
@@ -101,7 +101,7 @@ def localize(
         end=end,
         every=every,
     )
-    run(job, err_console)
+    run(options, err_console)
 
 
 @app.command("import", rich_help_panel="Data", short_help="Convert a log to a recording.")
@@ -133,5 +133,5 @@ def import_(
     log = load_section(LogSettings, config, "log", mount=mount)
     target = out or Path(f"{file.resolve().name.split('.')[0]}.mcap")
     laser = log.frame == "laser"
-    job = ImportOptions(file, target, log.reading(), world, laser=laser, rate=log.rate, sigma=log.sigma)
-    import_command(job, json_file, console, err_console)
+    options = ImportOptions(file, target, log.reading(), world, laser=laser, rate=log.rate, sigma=log.sigma)
+    import_command(options, json_file, console, err_console)

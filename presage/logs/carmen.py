@@ -20,7 +20,7 @@ from common.geometry.se2 import Array
 from common.robot.ranges import normalise_driver_ranges
 from presage.logs.carmen_lines import LINE_TYPE, LaserLine, is_laser, laser_line, pose_line
 from presage.logs.log import Log, LoggedScan, Reading
-from presage.logs.poses import Track
+from presage.logs.poses import PoseTrack
 from presage.logs.resampling import resample
 
 MAX_LINE_CHARACTERS = 1 << 22  # far more than the lines of real logs; limits the memory for other files
@@ -62,8 +62,10 @@ class _Survey:
     lasers: Counter[str] = field(default_factory=Counter)  # lines by name
     firsts: dict[str, list[LaserLine]] = field(default_factory=dict)  # the first lines of each laser
     mounts: dict[str, tuple[Array, Array]] = field(default_factory=dict)  # minimum and maximum of laser in base_link
-    odom: tuple[Track, Track] = field(default_factory=lambda: (Track(), Track()))  # by ipc stamp, by logger stamp
-    true: tuple[Track, Track] = field(default_factory=lambda: (Track(), Track()))  # likewise
+    odom: tuple[PoseTrack, PoseTrack] = field(
+        default_factory=lambda: (PoseTrack(), PoseTrack())
+    )  # by ipc stamp, by logger stamp
+    true: tuple[PoseTrack, PoseTrack] = field(default_factory=lambda: (PoseTrack(), PoseTrack()))  # likewise
 
 
 def open_carmen(path: Path, reading: Reading) -> Log:
@@ -241,7 +243,7 @@ def _note_laser(survey: _Survey, words: list[str]) -> None:
 
 
 def _read_scans(
-    log: Log, first: LaserLine, clock: int, odom: Track | None, true: Track | None, name: str, *, fixed: bool
+    log: Log, first: LaserLine, clock: int, odom: PoseTrack | None, true: PoseTrack | None, name: str, *, fixed: bool
 ) -> Iterator[LoggedScan]:
     resampled_scans = 0
     for words in _read_words(log.path):

@@ -53,35 +53,35 @@ class ImportOptions:
     sigma: float | None = None  # m, range noise; None leaves it unknown
 
 
-def import_command(job: ImportOptions, json_file: Path | None, console: Console, err_console: Console) -> None:
+def import_command(options: ImportOptions, json_file: Path | None, console: Console, err_console: Console) -> None:
     """Imports the log and prints a summary, with progress on ``err_console``.
 
     Raises UserError if the log cannot be imported; no file is left then.
     """
     check_file(json_file, "--json")
-    if kind_of(job.file) == "recording":
-        raise UserError(f"{job.file}: {IS_A_RECORDING}")
-    if job.out.suffix != ".mcap":
-        raise UserError(f"{job.out}: the name of a recording must end with .mcap")
-    if job.out.exists():
-        raise UserError(f"{job.out}: exists already; choose another name with --out")
-    world = load_world(job.world) if job.world else None
-    with working(f"reading {job.file.name}", err_console):
-        log = _open(job)
+    if kind_of(options.file) == "recording":
+        raise UserError(f"{options.file}: {IS_A_RECORDING}")
+    if options.out.suffix != ".mcap":
+        raise UserError(f"{options.out}: the name of a recording must end with .mcap")
+    if options.out.exists():
+        raise UserError(f"{options.out}: exists already; choose another name with --out")
+    world = load_world(options.world) if options.world else None
+    with working(f"reading {options.file.name}", err_console):
+        log = _open(options)
     with closing(progress(log.sweeps(), "importing", log.scans, err_console)) as sweeps:
-        written = write_recording(job, log, world, sweeps)
-    facts = written.facts(job, log)
-    console.print(*_lines(job, log, facts), sep="\n", highlight=False, soft_wrap=True)
+        written = write_recording(options, log, world, sweeps)
+    facts = written.facts(options, log)
+    console.print(*_lines(options, log, facts), sep="\n", highlight=False, soft_wrap=True)
     write_json(json_file, {**facts, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:]})
 
 
-def _open(job: ImportOptions) -> Log:
+def _open(options: ImportOptions) -> Log:
     """Opens the log; its poses are those of the frame that the options choose."""
-    if not job.laser:
-        return open_log(job.file, job.reading)
-    if kind_of(job.file) == "npz":  # with mount zero, the poses of an .npz file are taken as the laser's
-        return open_log(job.file, replace(job.reading, mount=np.zeros(3)))
-    log = open_log(job.file, job.reading)
+    if not options.laser:
+        return open_log(options.file, options.reading)
+    if kind_of(options.file) == "npz":  # with mount zero, the poses of an .npz file are taken as the laser's
+        return open_log(options.file, replace(options.reading, mount=np.zeros(3)))
+    log = open_log(options.file, options.reading)
     mount = log.mount
 
     def laser_pose(pose: Array | None) -> Array | None:
@@ -95,7 +95,7 @@ def _open(job: ImportOptions) -> Log:
 
 
 @dataclass
-class Written:
+class ImportCounts:
     """Counts of what was written to the recording."""
 
     scans: int = 0
@@ -105,11 +105,11 @@ class Written:
     last_ns: int = 0
     ledger: Ledger = field(default_factory=Ledger)
 
-    def facts(self, job: ImportOptions, log: Log) -> dict[str, Any]:
+    def facts(self, options: ImportOptions, log: Log) -> dict[str, Any]:
         """Facts about the import, for --json and the metadata of the recording."""
         return {
-            "file": str(job.file),
-            "out": str(job.out),
+            "file": str(options.file),
+            "out": str(options.out),
             "format": log.format,
             "scans": self.scans,
             "beams": len(log.angles),
@@ -125,20 +125,22 @@ class Written:
         }
 
 
-def write_recording(job: ImportOptions, log: Log, world: World | None, sweeps: Iterator[LoggedScan] | Any) -> Written:
+def write_recording(
+    options: ImportOptions, log: Log, world: World | None, sweeps: Iterator[LoggedScan] | Any
+) -> ImportCounts:
     """Writes all scans and poses to the recording; removes the recording if that fails."""
     start, step = beam_spacing(log)
-    first_scans = list(itertools.islice(stamped := _stamped(log, sweeps, job.rate), RATE_SCANS))
+    first_scans = list(itertools.islice(stamped := _stamped(log, sweeps, options.rate), RATE_SCANS))
     if not first_scans:
         left_out = log.describe_left_out()
         raise UserError(f"{log.path}: no usable scan in it" + (f"; left out: {left_out}" if left_out else ""))
     period = float(np.median(np.diff([stamp for stamp, _ in first_scans])) * 1e-9) if len(first_scans) > 1 else 0.0
-    writer, written = RecordingWriter(job.out), Written(first_ns=first_scans[0][0])
+    writer, written = RecordingWriter(options.out), ImportCounts(first_ns=first_scans[0][0])
     try:
-        writer.metadata("presage", {"robot": job.robot, "command": " ".join(sys.argv), **versions()})
-        scanner = scanner_of(log, start, step, period, job.sigma)
+        writer.metadata("presage", {"robot": options.robot, "command": " ".join(sys.argv), **versions()})
+        scanner = scanner_of(log, start, step, period, options.sigma)
         write_description(writer, "simulator", WorldReply(world=world, scanner=scanner))
-        message_writer = _MessageWriter(writer, job.robot, written)
+        message_writer = _MessageWriter(writer, options.robot, written)
         template = Scan(
             stamp_ns=0,
             angle_min=start,
@@ -148,11 +150,11 @@ def write_recording(job: ImportOptions, log: Log, world: World | None, sweeps: I
             ranges=np.zeros(0, np.float32),
             mount=Pose.of(log.mount),
             scan_time=period,
-            sigma=job.sigma or 0.0,
+            sigma=options.sigma or 0.0,
         )
         for stamp_ns, sweep in itertools.chain(first_scans, stamped):
             message_writer.write_scan(stamp_ns, sweep, template)
-        facts = written.facts(job, log)
+        facts = written.facts(options, log)
         writer.metadata("log", {k: v if isinstance(v, str) else json.dumps(v) for k, v in facts.items()})
         counts = written.ledger.written
         writer.metadata("counters", as_metadata(written.ledger.counts(counts, {}, {})))
@@ -209,7 +211,7 @@ def _stamped(log: Log, sweeps: Iterator[LoggedScan], rate: float | None) -> Iter
 class _MessageWriter:
     """Writes scans, odometry and reference poses as the messages that services publish."""
 
-    def __init__(self, writer: RecordingWriter, robot: str, written: Written) -> None:
+    def __init__(self, writer: RecordingWriter, robot: str, written: ImportCounts) -> None:
         self._writer, self._robot, self._written = writer, robot, written
         self._last: dict[Topic, tuple[int, Array]] = {}
 
@@ -250,7 +252,7 @@ class _MessageWriter:
         self._written.ledger.see(key, payload)
 
 
-def _lines(job: ImportOptions, log: Log, facts: dict[str, Any]) -> list[str]:
+def _lines(options: ImportOptions, log: Log, facts: dict[str, Any]) -> list[str]:
     """The summary of the import, one line each."""
     first, last = np.rad2deg(log.angles[[0, -1]])
     x, y, yaw = np.round([*log.mount[:2], np.rad2deg(log.mount[2])], 4) + 0.0  # avoids 1e-17 and -0
@@ -263,4 +265,4 @@ def _lines(job: ImportOptions, log: Log, facts: dict[str, Any]) -> list[str]:
     ]
     if left_out := log.describe_left_out():
         lines.append(f"left out: {left_out}")
-    return [*lines, f"wrote {job.out}"]
+    return [*lines, f"wrote {options.out}"]

@@ -11,7 +11,7 @@ from rich.console import Console
 from common.bus.bus import open_bus
 from common.errors import UserError
 from presage.session.page import show_page_link, start_page
-from presage.session.preflight import Plan, plan_session
+from presage.session.preflight import SessionPlan, plan_session
 from presage.session.running import announced, credentials_for
 from presage.session.stack import Stack
 from presage.terminal.options import arguments
@@ -64,7 +64,7 @@ def run_up(options: UpOptions, console: Console) -> None:
             _watch(stack, console)
 
 
-def _start_services(stack: Stack, options: UpOptions, plan: Plan, robots: list[str], *, page: bool) -> None:
+def _start_services(stack: Stack, options: UpOptions, plan: SessionPlan, robots: list[str], *, page: bool) -> None:
     record, without = options.record, options.without
     if (page or record is not None) and len(robots) == 1:  # an idle recorder starts from a button on the page
         stack.start("recorder", *plan.config, *arguments(directory=record, idle=record is None))

@@ -73,7 +73,7 @@ def test_error_and_bound():
 def test_covariance():
     """NEES of 100 scans: mean of chi squared with 3 degrees of freedom, 99.9 % band."""
     made, scene = estimator(ROOM)
-    outcome = tasks.Outcome()
+    outcome = tasks.TaskOutcome()
     for pose in scene.poses(100):
         made.restart(pose, np.diag([1.0, 1.0, 1.0]))
         outcome.add(feed(made, scene, pose, 1)[0], pose, None)

@@ -308,7 +308,7 @@ def test_the_drive_ends_with_the_scan_at_which_the_controller_reports_the_goal()
 
 
 def test_result_names_depend_on_the_options():
-    job = driving.Job(0, 1)
+    job = driving.NavigationJob(0, 1)
     assert driving.result_name(job, driving.WORLDS, driving.DRIVES) == "navigation"
     assert driving.result_name(replace(job, seed=7, limit=9.0), driving.WORLDS, driving.DRIVES) == "navigation"
     odd = replace(job, start="unknown", people=10, epistemic=False, estimator="particle-filter", prior="odometry")
@@ -320,7 +320,9 @@ def test_result_names_depend_on_the_options():
 
 
 def test_services_get_the_jobs_options():
-    job = driving.Job(3, 2, "office", "differential", "unknown", 4, 0.5, "particle-filter", "odometry", epistemic=False)
+    job = driving.NavigationJob(
+        3, 2, "office", "differential", "unknown", 4, 0.5, "particle-filter", "odometry", epistemic=False
+    )
     lockstep_run = job.lockstep_run(Journey((1.0, 1.0), (5.0, 1.0)), 0.5)
     assert lockstep_run.controller == ("--preset", "geodesic", "--drive", "differential", "--no-epistemic")
     assert lockstep_run.simulator == ("--drive", "differential", "--people", "4", "--people-speed", "0.5")
@@ -352,7 +354,7 @@ def test_invalid_options_are_refused_in_one_line(args, says):
 
 
 def test_a_small_run_writes_all_files_and_is_reproducible(tmp_path):
-    job = driving.Job(0, 1, beams=101, limit=30.0)
+    job = driving.NavigationJob(0, 1, beams=101, limit=30.0)
     result = driving.run(job, 1, tmp_path, 2, QUIET, worlds=("maze",))
     assert {path.name for path in tmp_path.iterdir()} == {
         f"navigation-maze-beams101{suffix}" for suffix in (".json", ".csv", ".trials.jsonl", ".pdf", ".png")
