@@ -26,7 +26,7 @@ class FaultOutcome:
     fault: str
     about: str
     expect: str
-    detected_s: float | None = None  # from the fault until a token disappears, the status is `lost` or the robot brakes
+    detected_s: float | None = None  # from the fault until the system reacts, see `_evaluate`
     stopped_s: float | None = None  # from the fault until the robot stands
     start_s: float | None = None  # from the restart of a killed service until its liveliness token appears
     again_s: float | None = None  # from a service's return until the robot drives, or the service works, again
@@ -100,9 +100,7 @@ def _evaluate(timeline: Timeline, injected: float, speed: float, fault: Fault, o
     """Derives detection, contact and lowest speed from the recorded events."""
 
     def is_detection(row: Row) -> bool:
-        if any(is_gone(name)(row) for name in fault.services) or is_lost(row):
-            return True
-        if row["what"] == "line" and any(word in row["line"] for word in ("standing by", "No space left", "full")):
+        if any(is_gone(name)(row) for name in fault.services) or is_lost(row) or fault.is_detection(row):
             return True
         return fault.expect == "stops" and is_truth(row) and row["speed"] < BRAKING_RATIO * speed
 

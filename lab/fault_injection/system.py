@@ -79,7 +79,7 @@ class System(Stack):
 
     def child_environment(self, name: str) -> Mapping[str, str]:
         """Environment variables of a process; with several hosts it listens on its host's address."""
-        more = {"PRESAGE_INSECURE": "1", **self.extra.get(name, {})}
+        more = {"PRESAGE_INSECURE": "1", "PRESAGE_LOG_JSON": "true", **self.extra.get(name, {})}
         if self.network is None or name == "router":
             return more
         host = self.network.hosts[HOST_OF[name]].address if name in HOST_OF else self.network.here
@@ -176,9 +176,11 @@ class System(Stack):
         return next((row for row in reversed(self.timeline.rows) if row["what"] == what), None)
 
     def on_output(self, name: str, line: str) -> None:
-        """Adds a process's output line to the timeline: the observer's lines as events, others as text."""
-        row: Row = {"t": time.monotonic(), "what": "line", "name": name, "line": line}
-        if name == "observer":
-            with suppress(json.JSONDecodeError):  # zenoh may print lines of its own
-                row = json.loads(line)
-        self.timeline.add(row)
+        """Adds a line to the timeline: one of the observer as it is, a log line of another process with its fields."""
+        now, fields = time.monotonic(), None
+        with suppress(json.JSONDecodeError):  # zenoh may print lines of its own
+            fields = json.loads(line)
+        if isinstance(fields, dict):
+            self.timeline.add(
+                fields if name == "observer" else {"t": now, "what": "log", "name": name, "fields": fields}
+            )

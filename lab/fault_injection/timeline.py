@@ -84,6 +84,16 @@ def is_back(service: str) -> Callable[[Row], bool]:
     return lambda row: row["what"] == "alive" and row["service"] == service and bool(row["there"])
 
 
+def is_standing_by(process: str) -> Callable[[Row], bool]:
+    """Returns a predicate: whether an event is the log line of a process that waits for the active instance to end."""
+    return lambda row: row["what"] == "log" and row["name"] == process and "leads" in row["fields"]
+
+
+def is_error(process: str) -> Callable[[Row], bool]:
+    """Returns a predicate: whether an event is an error that the process logged."""
+    return lambda row: row["what"] == "log" and row["name"] == process and row["fields"].get("level") == "error"
+
+
 def is_lost(row: Row) -> bool:
     """Whether the event is a controller status `lost`."""
     return bool(row["what"] == "status" and row["state"] == "lost")
