@@ -27,11 +27,11 @@ from services.estimator.precise.learning.field_learning import Recipe, learn_fie
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import GenerativeModel
 
-COLUMNS = ("learning s", "numbers", "range median mm", "mean mm", "> 5 cm %", "position median mm", "RMS mm")
+COLUMNS = ("training s", "parameters", "range median mm", "mean mm", "> 5 cm %", "position median mm", "RMS mm")
 PAPER = "the paper's decoder, L1, one heading"
 HEADING = np.pi / 2  # rad, of all scans for the paper's decoder, which has no heading input
 TEST_SCANS, CALIBRATION_SCANS = 200, 300
-Learn = Callable[["TrainingScans"], tuple[GenerativeModel, int]]  # returns the model and how many numbers it stores
+Learn = Callable[["TrainingScans"], tuple[GenerativeModel, int]]  # returns the model and its number of parameters
 
 
 class TrainingScans:
@@ -146,8 +146,8 @@ def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: P
         )
     console.print(table)
     console.print(
-        "position: error of the pose estimated from noise-free scans, starting at the true pose. It is due to the "
-        "model alone"
+        "position: error of the pose estimated from noise-free scans, starting at the true pose. Only the model "
+        "causes it"
     )
     write_json(json_file, {"rows": rows, "samples": samples, "network_steps": steps, **provenance(seed)})
     return 0

@@ -133,21 +133,21 @@ def _row(job: AccuracyJob, world: str, task: str, outcome: tasks.TaskOutcome) ->
     """Row of the report; None where a quantity is not defined for this task."""
     errors = np.array(outcome.errors).reshape(-1, 3)
     position = np.hypot(errors[:, 0], errors[:, 1])
-    count, misfits = len(position), np.array(outcome.misfits)
+    count, nees = len(position), np.array(outcome.nees)
     rms = float(np.sqrt(np.mean(position**2))) if count else None
     limit = float(np.sqrt(np.mean(np.square(outcome.bounds)))) if outcome.bounds else None
-    half = 1.96 * np.sqrt(2 * DEGREES_OF_FREEDOM / max(len(misfits), 1))
+    half = 1.96 * np.sqrt(2 * DEGREES_OF_FREEDOM / max(len(nees), 1))
     return {
         "world": world,
         "scanner": job.scanner.name,
         "beams": job.scanner.beams,
         "estimator": job.estimator,
         "task": task,
-        "of": outcome.of,
+        "of": outcome.total,
         "found": outcome.found,
         "tracking_but_wrong": outcome.wrong,
-        "found_share_95": wilson_interval(outcome.found, outcome.of) if outcome.independent else None,
-        "tracking_but_wrong_share_95": wilson_interval(outcome.wrong, outcome.of) if outcome.independent else None,
+        "found_share_95": wilson_interval(outcome.found, outcome.total) if outcome.independent else None,
+        "tracking_but_wrong_share_95": wilson_interval(outcome.wrong, outcome.total) if outcome.independent else None,
         "position_error_median_m": float(np.median(position)) if count else None,
         "position_error_rms_m": rms,
         "position_error_p95_m": float(np.quantile(position, 0.95)) if count else None,
@@ -155,8 +155,8 @@ def _row(job: AccuracyJob, world: str, task: str, outcome: tasks.TaskOutcome) ->
         "heading_error_median_deg": float(np.rad2deg(np.median(np.abs(errors[:, 2])))) if count else None,
         "bound_rms_m": limit,
         "rms_over_bound": rms / limit if rms is not None and limit else None,
-        "nees_mean": float(misfits.mean()) if len(misfits) else None,
-        "nees_band": [DEGREES_OF_FREEDOM - half, DEGREES_OF_FREEDOM + half] if len(misfits) else None,
+        "nees_mean": float(nees.mean()) if len(nees) else None,
+        "nees_band": [DEGREES_OF_FREEDOM - half, DEGREES_OF_FREEDOM + half] if len(nees) else None,
         "update_ms_median": float(np.median(outcome.update_ms)) if outcome.update_ms else None,
     }
 
@@ -169,5 +169,5 @@ def wilson_interval(count: int, of: int) -> list[float]:
 
 
 def provenance(seed: int) -> dict[str, Any]:
-    """What one needs to reproduce a result: seed, commit, versions and command-line arguments."""
+    """The information needed to reproduce a result: seed, commit, versions and command-line arguments."""
     return {"seed": seed, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:]}

@@ -33,13 +33,11 @@ class TaskOutcome:
     """Results of one estimator in one task."""
 
     errors: list[Array] = field(default_factory=list)  # (3,) m, m, rad
-    misfits: list[float] = field(
-        default_factory=list
-    )  # NEES: error' covariance^-1 error, with the estimate's covariance
+    nees: list[float] = field(default_factory=list)  # NEES: error' covariance^-1 error, with the estimate's covariance
     bounds: list[float] = field(default_factory=list)  # m, Cramér-Rao bound of the position
     update_ms: list[float] = field(default_factory=list)
     found: int = 0
-    of: int = 0
+    total: int = 0
     wrong: int = 0  # estimates in state `tracking` while the robot was elsewhere
     independent: bool = True  # whether the counts are of separate trials, not of scans along one path
 
@@ -48,7 +46,7 @@ class TaskOutcome:
         error = posterior.pose - pose
         error[2] = se2.wrap(error[2])
         found_here = is_at(posterior.pose, pose)
-        self.of += 1
+        self.total += 1
         self.found += found_here
         self.wrong += posterior.state == "tracking" and not found_here
         if found_here:
@@ -56,7 +54,7 @@ class TaskOutcome:
             if limit is not None:
                 self.bounds.append(limit)
             if posterior.covariance is not None:
-                self.misfits.append(float(error @ np.linalg.solve(posterior.covariance, error)))
+                self.nees.append(float(error @ np.linalg.solve(posterior.covariance, error)))
         return found_here
 
 
@@ -159,6 +157,6 @@ def twins(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWra
             wrong |= posterior.state == "tracking" and not is_at(posterior.pose, pose)
             if k + 1 >= TWINS_REQUIRED_FROM_SCAN:
                 both &= holds_both(posterior, pose)
-        kept.of, kept.found, kept.wrong = kept.of + 1, kept.found + both, kept.wrong + wrong
+        kept.total, kept.found, kept.wrong = kept.total + 1, kept.found + both, kept.wrong + wrong
         right.add(posterior, pose, None)
     return {"two rooms alike: both kept": kept, "two rooms alike: right after": right}

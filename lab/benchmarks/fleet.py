@@ -48,7 +48,7 @@ class DeploymentResult:
     """Measurements of one estimator in one deployment: one process for all robots, or one process per robot."""
 
     estimator: str
-    way: str
+    deployment: str
     rate: float  # Hz
     windows: list[dict[str, Any]] = field(default_factory=list)
     served: int = 0  # largest number of robots that was served
@@ -64,11 +64,11 @@ class DeploymentResult:
         cpu_ms = min(window["cpu_ms_per_scan"] for window in self.windows if window["robots"] == busiest)
         fewest, most = min(self.memory_mb), max(self.memory_mb)
         per_robot = self.memory_mb[most] / most
-        if self.way == DEPLOYMENTS[0]:
+        if self.deployment == DEPLOYMENTS[0]:
             per_robot = (self.memory_mb[most] - self.memory_mb[fewest]) / max(1, most - fewest)
         return {
             "estimator": self.estimator,
-            "way": self.way,
+            "way": self.deployment,
             "robots_served": self.served,
             "at_most_tried": most,
             "memory_per_robot_mb": per_robot,
@@ -96,7 +96,7 @@ class EstimatorDeployment:
         if count <= self.ready:
             return
         arguments = ["--world", self.plan.world, "--estimator", self.result.estimator]
-        if self.result.way == DEPLOYMENTS[0]:
+        if self.result.deployment == DEPLOYMENTS[0]:
             if not self.ready:
                 names = ",".join(robot.name for robot in self.load.robots)
                 self.stack.start("estimator", *arguments, "--robots", names)
@@ -121,7 +121,7 @@ class EstimatorDeployment:
         """The estimator processes."""
         return [psutil.Process(p.child.pid) for name, p in self.stack.processes.items() if name != "router"]
 
-    def served(self, count: int) -> bool:
+    def can_serve(self, count: int) -> bool:
         """Whether ``count`` robots are answered in time. Measures a second time if the first fails."""
         self.prepare(count)
         for _ in range(2):
@@ -136,7 +136,7 @@ class EstimatorDeployment:
                 return True
         return False
 
-    def search(self) -> None:
+    def measure_search(self) -> None:
         """Measures how one robot's global searches delay the others. Skips preset paper, which has no global search."""
         count = max(2, self.result.served // 2)
         if self.result.estimator != "paper" and count <= self.plan.max_robots:
@@ -183,34 +183,33 @@ def max_robots_served(served: Callable[[int], bool], most: int) -> int:
     return good
 
 
-def measure(estimator: str, way: str, plan: FleetPlan, console: Console) -> DeploymentResult:
+def measure(estimator: str, deployment: str, plan: FleetPlan, console: Console) -> DeploymentResult:
     """Measures one estimator in one deployment, with its own router."""
-    result, cores = DeploymentResult(estimator, way, plan.rate), sorted(os.sched_getaffinity(0))
+    result, cores = DeploymentResult(estimator, deployment, plan.rate), sorted(os.sched_getaffinity(0))
     with Stack("bench", quiet=True) as stack:
         stack.start_router()
         with open_bus(stack.link()) as bus:
             load = FleetLoad(bus, load_world(plan.world), plan.beams, plan.rate, plan.max_robots, plan.seed)
-            deployment = EstimatorDeployment(stack, load, plan, result, cores[-1])
-            deployment.prepare(1)
-            if way == DEPLOYMENTS[0]:
-                deployment.prepare(
-                    plan.max_robots
-                )  # for the memory of all robots; a robot without scans takes no processor time
+            estimators = EstimatorDeployment(stack, load, plan, result, cores[-1])
+            estimators.prepare(1)
+            if deployment == DEPLOYMENTS[0]:
+                # Measures the memory of all robots; a robot without scans takes no processor time.
+                estimators.prepare(plan.max_robots)
             result.bytes = load.message_sizes()
-            with _harness_on_other_cores(cores), console.status(f"{estimator}, {way}") as status:
+            with _harness_on_other_cores(cores), console.status(f"{estimator}, {deployment}") as status:
 
                 def served(count: int) -> bool:
-                    status.update(f"{estimator}, {way}: {count} robots")
-                    answer = deployment.served(count)
+                    status.update(f"{estimator}, {deployment}: {count} robots")
+                    answer = estimators.can_serve(count)
                     last = result.windows[-1]
                     console.print(
-                        f"{estimator}, {way}: {count} robots, {100 * last['in_time_share']:.2f} % in time",
+                        f"{estimator}, {deployment}: {count} robots, {100 * last['in_time_share']:.2f} % in time",
                         highlight=False,
                     )
                     return answer
 
                 result.served = max_robots_served(served, plan.max_robots)
-                deployment.search()
+                estimators.measure_search()
     return result
 
 
@@ -234,7 +233,9 @@ def _pin_threads(process: psutil.Process, cores: set[int]) -> None:
 def bench_fleet(estimators: str, plan: FleetPlan, json_file: Path | None, console: Console) -> int:
     """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
-    rows = [measure(name, way, plan, console).row() for name in estimators.split(",") for way in DEPLOYMENTS]
+    rows = [
+        measure(name, deployment, plan, console).row() for name in estimators.split(",") for deployment in DEPLOYMENTS
+    ]
     ratios = show(rows, plan, console)
     load_average = os.getloadavg()[0]
     console.print(f"load of the machine at the end: {load_average:.1f} on {os.cpu_count()} cores", highlight=False)

@@ -38,16 +38,16 @@ def show(rows: list[dict[str, Any]], plan: FleetPlan, console: Console) -> dict[
     )
     for column in (
         "estimator",
-        "way",
+        "deployment",
         "robots",
         "p50 ms",
         "p99 ms",
-        "CPU ms a scan",
+        "CPU ms/scan",
         "robots by CPU",
-        "MB a robot",
-        "MB in all",
+        "MB/robot",
+        "MB total",
     ):
-        table.add_column(column, justify="left" if column in {"estimator", "way"} else "right")
+        table.add_column(column, justify="left" if column in {"estimator", "deployment"} else "right")
     for row in rows:
         table.add_row(
             row["estimator"],
@@ -70,9 +70,9 @@ def show(rows: list[dict[str, Any]], plan: FleetPlan, console: Console) -> dict[
             )
     size = rows[0]["message_bytes"]
     console.print(
-        "bytes a message: "
+        "bytes per message: "
         + ", ".join(f"{name} {count}" for name, count in size.items())
-        + f"; scans to the estimator: {size['scan'] * plan.rate / 1e3:.1f} kB/s a robot",
+        + f"; scans to the estimator: {size['scan'] * plan.rate / 1e3:.1f} kB/s per robot",
         highlight=False,
     )
     for row in rows:
@@ -87,7 +87,9 @@ def show(rows: list[dict[str, Any]], plan: FleetPlan, console: Console) -> dict[
         )
     ratios: dict[str, dict[str, float | None]] = {}
     for name in dict.fromkeys(row["estimator"] for row in rows):
-        one, each = (next(r for r in rows if r["estimator"] == name and r["way"] == way) for way in DEPLOYMENTS)
+        one, each = (
+            next(r for r in rows if r["estimator"] == name and r["way"] == deployment) for deployment in DEPLOYMENTS
+        )
         ratios[name] = {
             "robots_served": one["robots_served"] / each["robots_served"] if each["robots_served"] else None,
             "robots_by_cpu": one["robots_by_cpu"] / each["robots_by_cpu"],
@@ -95,8 +97,8 @@ def show(rows: list[dict[str, Any]], plan: FleetPlan, console: Console) -> dict[
         }
         served = f"{ratios[name]['robots_served']:.2f}" if each["robots_served"] else "an unknown number of"
         console.print(
-            f"{name}: one process serves {served} times the robots of one each; "
-            f"by processor time {ratios[name]['robots_by_cpu']:.2f} times",
+            f"{name}: one process for all serves {served} times as many robots as one process per robot; "
+            f"extrapolated from processor time, {ratios[name]['robots_by_cpu']:.2f} times",
             highlight=False,
         )
     return ratios

@@ -57,7 +57,7 @@ def measure(path: str, beams: int, seed: int) -> list[tuple[str, float, str]]:
         began = time.process_time()
         result = work()
         seconds = (time.process_time() - began) / times
-        rows.append((name, seconds * 1e3, "ms a scan") if times > 1 else (name, seconds, "s"))
+        rows.append((name, seconds * 1e3, "ms per scan") if times > 1 else (name, seconds, "s"))
         return result
 
     world: World = timed("load", lambda: load_world(path))

@@ -174,9 +174,9 @@ def predicted(
 def real_drive(
     log: Annotated[Path, typer.Option(help="Recording or log with reference poses (docs/logs.md).")],
     world: Annotated[str, typer.Option(help="World file or ROS map.yaml of the training half.")],
-    name: Annotated[str, typer.Option(help="Results are named real-NAME. Default: the log's name.")] = "",
+    name: Annotated[str, typer.Option(help="Results are named real-NAME. Defaults to the log's name.")] = "",
     mount: Annotated[
-        str, typer.Option(help="Pose of the laser in base_link, x,y[,yaw_deg] (m, deg). Default: as in the log.")
+        str, typer.Option(help="Pose of the laser in base_link, x,y[,yaw_deg] (m, deg). Defaults to the log's.")
     ] = "",
     every: Annotated[int, typer.Option(min=1, help="Number of scans between the starts of tasks c and d.")] = 50,
     quick: Annotated[
@@ -231,7 +231,7 @@ def tables(
     out: Out = OUT,
     page: Annotated[Path | None, typer.Option(help="Markdown file in which to replace the marked tables.")] = None,
 ) -> None:
-    """Prints the tables of existing results as Markdown, or inserts them into a page.
+    """Tables of existing results, as Markdown or inserted into a page.
 
     Examples: `presage experiment tables`;
     `presage experiment tables --page docs/experiments.md --out docs/experiments`.

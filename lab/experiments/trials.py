@@ -33,7 +33,7 @@ def run_trials(
     store = TrialStore(out / f".{name}.unfinished.jsonl", jobs)
     done = store.read()
     if done:
-        console.print(f"{name}: going on after {len(done)} of {len(jobs)} trials of an interrupted run")
+        console.print(f"{name}: continuing after {len(done)} of {len(jobs)} trials of an interrupted run")
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),

@@ -67,7 +67,7 @@ def bench_chaos(
             for repeat in range(repeats):
                 with console.status(f"{fault.name} ({repeat + 1} of {repeats}): {fault.about}"):
                     outcomes.append(measure(system, fault))
-                problem = outcomes[-1].why
+                problem = outcomes[-1].deviations
                 console.print(f"{'[red]no[/]' if problem else '[green]ok[/]'} {fault.name} {problem}", highlight=False)
     print(markdown(outcomes))
     data = {
@@ -82,7 +82,7 @@ def bench_chaos(
         "machine": platform.processor() or platform.machine(),
     }
     write_json(json_file, data)
-    return 1 if any(outcome.why for outcome in outcomes) else 0
+    return 1 if any(outcome.deviations for outcome in outcomes) else 0
 
 
 HEAD = ("fault", "detected (s)", "stopped (s)", "restarted (s)", "recovered (s)", "lowest speed (m/s)", "as expected")
@@ -99,7 +99,7 @@ def rows_of(outcomes: Sequence[FaultOutcome]) -> list[tuple[str, ...]]:
             return f"{max(known):.2f}" if known else ""
 
         speeds = [row.least_speed for row in rows if row.least_speed is not None]
-        as_expected = sum(not row.why for row in rows)
+        as_expected = sum(not row.deviations for row in rows)
         speed = f"{min(speeds):.2f}" if speeds else ""
         times = [worst(what) for what in ("detected_s", "stopped_s", "start_s", "again_s")]
         table_rows.append((name, *times, speed, f"{as_expected}/{len(rows)}"))

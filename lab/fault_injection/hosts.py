@@ -26,7 +26,7 @@ NETWORK = "10.77.0"  # cannot collide with other networks, because the namespace
 
 
 def missing_for_namespaces() -> str:
-    """Why this process cannot create network namespaces; empty if it can."""
+    """Returns why this process cannot create network namespaces; an empty string if it can."""
     for tool, package in (("unshare", "util-linux"), ("nsenter", "util-linux"), ("ip", "iproute2")):
         if shutil.which(tool) is None:
             return f"{tool} is not installed (package {package})"
@@ -76,7 +76,7 @@ class Network:
     here = f"{NETWORK}.1"
 
     def __init__(self) -> None:
-        """Call `enter_own_namespaces` first."""
+        """Needs namespaces of its own: call `enter_own_namespaces` first."""
         self.hosts: dict[str, Host] = {}
 
     def __enter__(self) -> Self:

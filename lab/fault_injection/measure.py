@@ -32,11 +32,13 @@ class FaultOutcome:
     again_s: float | None = None  # from a service's return until the robot drives, or the service works, again
     least_speed: float | None = None  # m/s, during a fault in which the robot should keep driving
     contact: bool = False
-    why: str = ""  # deviations from the expectation; empty if there are none
+    deviations: str = ""  # deviations from the expectation; empty if there are none
 
     def row(self) -> dict[str, Any]:
         """The result as a row of the JSON file."""
-        return asdict(self)
+        row = asdict(self)
+        row["why"] = row.pop("deviations")
+        return row
 
 
 def measure(system: System, fault: Fault) -> FaultOutcome:
@@ -63,7 +65,7 @@ def measure(system: System, fault: Fault) -> FaultOutcome:
     _measure_recovery(system, fault, returned, outcome)
     time.sleep(OBSERVATION_TIME_S)
     _evaluate(timeline, injected, before["speed"], fault, outcome)
-    outcome.why = judge(outcome, fault)
+    outcome.deviations = judge(outcome, fault)
     return outcome
 
 

@@ -181,10 +181,12 @@ def worst(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     order = sorted(
         rows, key=lambda r: (r["reached"], -r["contacts_moving"], -r["contacts_standing"], -r["time_over_least"])
     )
-    return [{"trial": row["trial"], "outcome": row["outcome"], "why": _why(row)} for row in order[:WORST_TRIALS]]
+    return [
+        {"trial": row["trial"], "outcome": row["outcome"], "why": _describe_trial(row)} for row in order[:WORST_TRIALS]
+    ]
 
 
-def _why(row: dict[str, Any]) -> str:
+def _describe_trial(row: dict[str, Any]) -> str:
     parts = [row["why"]] if row["why"] else []
     if touched := row["contacts_moving"] + row["contacts_standing"]:
         first = row["contact_at"][0]
@@ -209,7 +211,7 @@ def run(
     worlds: Sequence[str] = WORLDS,
     drives: Sequence[str] = DRIVES,
 ) -> results.Result:
-    """All trials of all worlds and drives; writes NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
+    """Runs all trials of all worlds and drives. Writes NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
     check(job, worlds, drives)
     name = result_name(job, worlds, drives)
     groups = [replace(job, world=world, drive=drive) for world in worlds for drive in drives]
@@ -234,7 +236,7 @@ def run(
         f"Navigation: {driving_figure.describe(job)}",
         job.seed,
         parameters,
-        {group: summarise(of) for group, of in by_group.items()},
+        {group: summarise(group_rows) for group, group_rows in by_group.items()},
         columns(rows),
         rows,
         [_note(job, trials)],

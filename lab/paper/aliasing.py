@@ -32,7 +32,7 @@ from services.estimator.shared.interface import Estimator, Posterior
 
 EXPERIMENT_ID = 5  # part of the random seeds
 PLACES_SEED, LEARNING_SEED, SCANS_SEED = 0, 1, 2  # parts of the random seeds
-HEADING = float(np.pi / 2)  # rad, of all places; only the paper's estimator is given it
+HEADING = float(np.pi / 2)  # rad, of all places; only the paper's estimator knows it
 ALIKE = World(
     name="alike",
     boundary=[(0, 0), (18, 0), (18, 4.5), (0, 4.5)],
@@ -136,7 +136,7 @@ def _row(pose: Array, posteriors: Sequence[Posterior], *, twins: bool) -> dict[s
     if not twins:
         return statistics
     twin = twin_of(pose)
-    near = [any(np.hypot(*(h.pose - at)[:2]) < CLOSE_DISTANCE for h in last.hypotheses) for at in (pose, twin)]
+    near = [any(np.hypot(*(h.pose - place)[:2]) < CLOSE_DISTANCE for h in last.hypotheses) for place in (pose, twin)]
     either = min(off[-1], float(np.hypot(*(last.pose - twin)[:2])))
     return {**statistics, "both_kept": int(last.state == "ambiguous" and all(near)), "either_error_m": round(either, 6)}
 
@@ -165,7 +165,7 @@ def summarise(row: dict[str, Any]) -> dict[str, Any]:
 def run(
     job: AliasingJob, out: Path, workers: int, console: Console, worlds: Sequence[str] = tuple(TITLES)
 ) -> results.Result:
-    """Every estimator in every world; writes aliasing.json, .csv, .pdf and .png into ``out``."""
+    """Runs every estimator in every world. Writes aliasing.json, .csv, .pdf and .png into ``out``."""
     # The longest jobs first: the training of the paper's decoders.
     jobs = [replace(job, world=world, estimator=name) for name in ESTIMATORS for world in worlds]
     rows = run_trials("aliasing", trial, jobs, out, workers, console)
@@ -185,7 +185,7 @@ def run(
         summary,
         curves,
         rows,
-        ["twins: only places of which no scan says which room it is; to know the place is then luck, one in two"],
+        ["twins: only places whose scans are the same in both rooms, so that an estimator can only guess the room"],
     )
     result.write(out, draw(rows, summary))
     return result
@@ -234,13 +234,13 @@ def _bars(axes: Axes, summary: dict[str, dict[str, Any]]) -> None:
     groups.append((f"`tracking`, but\n> {FOUND_DISTANCE} m off", f"tracking_but_wrong_after_{last}"))
     if "both_kept" in one:
         groups.append(("both places\nkept", "both_kept"))
-    at, width = np.arange(len(groups)) + 0.35 * (np.arange(len(groups)) >= good), 0.8 / len(summary)
+    positions, width = np.arange(len(groups)) + 0.35 * (np.arange(len(groups)) >= good), 0.8 / len(summary)
     for number, (name, row) in enumerate(summary.items()):
         shares = [row[quantity] / row["places"] for _, quantity in groups]
-        x = at + (number - (len(summary) - 1) / 2) * width
+        x = positions + (number - (len(summary) - 1) / 2) * width
         bars = axes.bar(x, shares, 0.92 * width, color=drawing.COLOURS[name], label=name)
         axes.bar_label(bars, [f"{row[quantity]}" for _, quantity in groups], fontsize=9, padding=1)
-    axes.set_xticks(at, [label for label, _ in groups])
+    axes.set_xticks(positions, [label for label, _ in groups])
     axes.grid(visible=False, axis="x")
     axes.axvline(good - 0.5 + 0.17, color="#AAAAAA", linewidth=0.8)
     if "both_kept" in one:

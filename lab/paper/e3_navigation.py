@@ -121,15 +121,15 @@ def measure(trace: RunTrace, journey: Journey) -> dict[str, Any]:
 def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
     """Statistics of one estimator over all trials; times and paths only of trials that reached the goal."""
     every = [each["estimators"][name] for each in trials]
-    there = [each for each in every if each["reached"]]
+    reached = [each for each in every if each["reached"]]
     error = np.concatenate([each["error_m"] for each in every])
 
     def of(quantity: str, statistic: Any) -> float | None:
-        return float(statistic([each[quantity] for each in there])) if there else None
+        return float(statistic([each[quantity] for each in reached])) if reached else None
 
     return {
         "trials": len(every),
-        "reached": len(there),
+        "reached": len(reached),
         "trials_with_contact": sum(each["contacts"] > 0 for each in every),
         "scans_held_back": sum(each["held_back"] for each in every),
         "iterations_mean": of("iterations", np.mean),

@@ -150,7 +150,7 @@ def draw(result: results.Result) -> Figure:
             errors = curves[f"{name} range_error_{quantity}_m"]
             left.plot(curves["samples"], errors, style + mark, color=colour, label=f"{name}, {quantity} range error")
         errors = curves[f"{name} position_error_median_m"]
-        right.plot(curves["samples"], errors, "-" + mark, color=colour, label=_how(name, result.parameters))
+        right.plot(curves["samples"], errors, "-" + mark, color=colour, label=_describe(name, result.parameters))
         offset = 10 if name == "paper" else -16  # points
         for size, error, count in zip(curves["samples"], errors, curves[f"{name} found_within_0.2_m"], strict=True):
             text = f"{count / places:.0%}"
@@ -167,9 +167,9 @@ def draw(result: results.Result) -> Figure:
     return figure
 
 
-def _how(name: str, parameters: dict[str, Any]) -> str:
+def _describe(name: str, parameters: dict[str, Any]) -> str:
     if name == "precise":
-        return "precise, position: 1 scan, nothing known"
+        return "precise, position: 1 scan, unknown start"
     return f"paper, position: {parameters['iterations']} scans from the centre"
 
 

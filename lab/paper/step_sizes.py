@@ -169,12 +169,12 @@ def _run_velocity(job: StepSizeJob, world: World, journey: Journey) -> dict[str,
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Statistics of one setting; iterations and times only of journeys that reached the goal."""
-    there = [row for row in rows if row["reached"]]
-    over = [row["time_over_least"] for row in there if "time_over_least" in row]
+    reached = [row for row in rows if row["reached"]]
+    over = [row["time_over_least"] for row in reached if "time_over_least" in row]
     return {
         "journeys": len(rows),
-        "reached": len(there),
-        "iterations_mean": float(np.mean([row["iterations"] for row in there])) if there else None,
+        "reached": len(reached),
+        "iterations_mean": float(np.mean([row["iterations"] for row in reached])) if reached else None,
         "time_over_least_median": float(np.median(over)) if over else None,
         "stopped_by_walls": sum(row.get("stopped", 0) for row in rows),
         "error_mean_m": float(np.mean([row["error_m"] for row in rows])),

@@ -84,22 +84,22 @@ def trial(job: StretchJob) -> dict[str, Any]:
     drive, estimator = job.drive, create_estimator(job)
     if job.task in (ODOMETRY, LASER):
         estimator.restart(drive.poses[job.first], START_COVARIANCE)
-        numbers = np.arange(job.first, job.first + job.count)
+        indices = np.arange(job.first, job.first + job.count)
     elif job.task == GLOBAL:
-        numbers = np.arange(job.first, min(job.first + (job.count or MAX_SEARCH_SCANS), len(drive.ranges)))
+        indices = np.arange(job.first, min(job.first + (job.count or MAX_SEARCH_SCANS), len(drive.ranges)))
     else:
         estimator.restart(drive.poses[job.first], START_COVARIANCE)
         after = np.arange(job.to, min(job.to + MAX_SEARCH_SCANS, len(drive.ranges)))
-        numbers = np.concatenate([np.arange(job.first, job.first + SCANS_BEFORE_KIDNAPPING), after])
-    clock = drive.stamps[numbers]
-    odom = None if drive.odom is None or job.task == LASER else drive.odom[numbers]
+        indices = np.concatenate([np.arange(job.first, job.first + SCANS_BEFORE_KIDNAPPING), after])
+    clock = drive.stamps[indices]
+    odom = None if drive.odom is None or job.task == LASER else drive.odom[indices]
     if job.task == KIDNAPPED:  # the stamps have no gap at the kidnapping
         clock[SCANS_BEFORE_KIDNAPPING:] += (
             drive.stamps[job.first + SCANS_BEFORE_KIDNAPPING] - clock[SCANS_BEFORE_KIDNAPPING]
         )
         odom = None if odom is None else hide_kidnapping(odom, SCANS_BEFORE_KIDNAPPING)
     rows: dict[str, list[Any]] = {name: [] for name in ("stamp_s", "error_m", "yaw_error_rad", "state", "nees", "ms")}
-    for i, k in enumerate(numbers):
+    for i, k in enumerate(indices):
         odom_pose = None if odom is None else odom[i]
         observation = Observation(drive.ranges[k], drive.angles, drive.range_max, float(clock[i]), odom_pose)
         began = time.process_time()

@@ -284,14 +284,14 @@ def notes(job: RealLogJob, card: weights.FieldCard, tuned: TunedSettings) -> lis
     if found is not None:
         shares = found.likelihood
         lines.append(
-            f"held out of the {learned} half, {found.scans} scans: {found.log_likelihood:.2f} nats a beam; "
+            f"held out of the {learned} half, {found.scans} scans: {found.log_likelihood:.2f} nats per beam; "
             f"{shares.short:.1%} of the beams end early, {shares.random:.1%} anywhere; pose within "
             f"{found.floor_position * 1e3:.0f} mm and {np.rad2deg(found.floor_heading):.2f} deg of the reference "
             f"beyond the scan's covariance; NEES "
-            f"{found.nees_median:.2f} median (honest 2.37), {found.nees_mean:.1f} mean (3)"
+            f"{found.nees_median:.2f} median (ideal 2.37), {found.nees_mean:.1f} mean (3)"
         )
     if job.quick:
-        lines.append("quick: a look; few scans, and of the particle filter's settings only its motion noise is learned")
+        lines.append("quick run: few scans, and the particle filter is not tuned except for its motion noise")
     return lines
 
 

@@ -122,16 +122,16 @@ def tune(
         tried: dict[str, tuple[float, ...]],
         score: Callable[[Settings], tuple[float, float]],
     ) -> Settings:
-        best, most = settings, score(settings)
-        lines.append(f"{title}, as it begins: {most[0]:.0%}, {-most[1]:.3g}")
+        best, best_score = settings, score(settings)
+        lines.append(f"{title}, initial settings: {best_score[0]:.0%}, {-best_score[1]:.3g}")
         for name, values in tried.items():
             base = best
             for value in values:
                 changed = _with(base, name, value)
-                found = score(changed)
-                lines.append(f"{title}, {name} {value:g}: {found[0]:.0%}, {-found[1]:.3g}")
-                if found > most:
-                    best, most = changed, found
+                changed_score = score(changed)
+                lines.append(f"{title}, {name} {value:g}: {changed_score[0]:.0%}, {-changed_score[1]:.3g}")
+                if changed_score > best_score:
+                    best, best_score = changed, changed_score
                 report(f"particle filter, {title}: {name}", len(lines) / total)
         return best
 
@@ -139,8 +139,10 @@ def tune(
     if job.drive.odom is not None:
         odometry = coordinate_search(ODOMETRY, start, TRACKING_CANDIDATES, partial(tracking, ODOMETRY))
     # A kidnapped robot must give up its given pose, and nav2's default number of particles is too small for a search.
-    found = _with(_with(odometry, "keep_initial_pose", 0.0), "amcl_defaults", 0.0)
-    return TunedSettings(odometry, laser, coordinate_search("finding", found, SEARCH_CANDIDATES, finding), lines)
+    start_finding = _with(_with(odometry, "keep_initial_pose", 0.0), "amcl_defaults", 0.0)
+    return TunedSettings(
+        odometry, laser, coordinate_search("finding", start_finding, SEARCH_CANDIDATES, finding), lines
+    )
 
 
 def _map_of_quarter(job: StretchJob, quarter: int, folder: Path) -> Path:
@@ -154,8 +156,8 @@ def _map_of_quarter(job: StretchJob, quarter: int, folder: Path) -> Path:
 def _evenly_spaced(job: StretchJob, first: int, last: int, count: int) -> list[int]:
     """Indices of ``count`` scans from ``first`` to ``last``, evenly spaced among those with a pose in free space."""
     free = np.flatnonzero(load_world(job.map).clearance(job.drive.poses[first : last + 1, :2]) > 0)
-    numbers = first + (free if len(free) else np.arange(last + 1 - first))
-    return [int(k) for k in numbers[np.linspace(0, len(numbers) - 1, count).astype(int)]]
+    indices = first + (free if len(free) else np.arange(last + 1 - first))
+    return [int(k) for k in indices[np.linspace(0, len(indices) - 1, count).astype(int)]]
 
 
 def _with(settings: Settings, name: str, value: float) -> Settings:
@@ -167,9 +169,9 @@ def _with(settings: Settings, name: str, value: float) -> Settings:
 
 def _tracking_score(rows: list[dict[str, Any]]) -> tuple[float, float]:
     """Share of scans tracked, and the negative median error (m) of those; larger is better."""
-    off = np.array([value for row in rows for value in row["error_m"]])
-    tracked = off < TRACKED_DISTANCE
-    return round(float(tracked.mean()), 2), -float(np.median(off[tracked])) if tracked.any() else -np.inf
+    errors = np.array([value for row in rows for value in row["error_m"]])
+    tracked = errors < TRACKED_DISTANCE
+    return round(float(tracked.mean()), 2), -float(np.median(errors[tracked])) if tracked.any() else -np.inf
 
 
 def _search_score(rows: list[dict[str, Any]]) -> tuple[float, float]:

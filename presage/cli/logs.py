@@ -72,13 +72,13 @@ def localize(
     """
     from common.runtime.config import load_section, load_settings  # noqa: PLC0415
     from presage.logs.options import LogSettings  # noqa: PLC0415
-    from presage.replay.localize import LocalizeOptions, choice_of  # noqa: PLC0415
+    from presage.replay.localize import LocalizeOptions, build_estimator_options  # noqa: PLC0415
     from presage.replay.localize import localize as run  # noqa: PLC0415
     from services.estimator.settings import EstimatorSettings  # noqa: PLC0415
 
     chosen = arguments(config=config, estimator=estimator, initial_pose=initial_pose, **model_setting(model))
     settings, log = load_settings(EstimatorSettings, chosen), load_section(LogSettings, config, "log", mount=mount)
-    choice = choice_of(
+    estimator_options = build_estimator_options(
         file,
         world,
         settings.estimator,
@@ -90,7 +90,7 @@ def localize(
     )
     options = LocalizeOptions.of(
         file,
-        choice,
+        estimator_options,
         "global" if mode == "single" else mode,
         log.frame,
         log.reading(),

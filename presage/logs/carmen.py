@@ -75,9 +75,9 @@ def open_carmen(path: Path, reading: Reading) -> Log:
         raise UserError(f"{path}: a CARMEN log without a scan (no FLASER, ROBOTLASER1, RAWLASER1 lines)")
     name = _choose_laser(path, survey.lasers, reading.scan_topic)
     if reading.odom_topic and (reading.odom_topic != "ODOM" or not len(survey.odom[0])):
-        there = "ODOM lines" if len(survey.odom[0]) else "no ODOM lines"
+        available = "ODOM lines" if len(survey.odom[0]) else "no ODOM lines"
         raise UserError(
-            f"{path}: odom_topic {reading.odom_topic}: for a CARMEN log it can only be ODOM, and this one has {there}"
+            f"{path}: odom_topic {reading.odom_topic}: a CARMEN log can only have ODOM, and this one has {available}"
         )
     if not survey.firsts.get(name):
         raise UserError(f"{path}: every {name} line is malformed")
@@ -169,7 +169,7 @@ def _range_max(survey: _Survey, name: str, reading: Reading, notes: list[str]) -
 
 
 def _clock(lines: list[LaserLine], reading: Reading, notes: list[str]) -> int:
-    """Which stamps to use: 0 for those of ipc, 1 for those of the logger; the latter also if ipc's do not advance."""
+    """Returns which stamps to use: 0 for those of ipc; 1 for those of the logger, also if ipc's do not advance."""
     if reading.clock == "logger":
         return 1
     if len(lines) > 1 and lines[0].ipc == lines[-1].ipc:
@@ -251,7 +251,7 @@ def _read_scans(
             if not LINE_TYPE.match(words[0]):
                 log.left_out["garbled lines"] += 1
             elif words[0] in POSE_LINES and not _is_pose(words):
-                log.left_out_beside[f"garbled {words[0]} lines"] += 1
+                log.left_out_other[f"garbled {words[0]} lines"] += 1
             continue
         try:
             line = laser_line(words)

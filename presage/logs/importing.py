@@ -68,8 +68,8 @@ def import_command(options: ImportOptions, json_file: Path | None, console: Cons
     world = load_world(options.world) if options.world else None
     with working(f"reading {options.file.name}", err_console):
         log = _open(options)
-    with closing(progress(log.sweeps(), "importing", log.scans, err_console)) as sweeps:
-        written = write_recording(options, log, world, sweeps)
+    with closing(progress(log.valid_scans(), "importing", log.scans, err_console)) as logged_scans:
+        written = write_recording(options, log, world, logged_scans)
     facts = written.facts(options, log)
     console.print(*_lines(options, log, facts), sep="\n", highlight=False, soft_wrap=True)
     write_json(json_file, {**facts, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:]})
@@ -87,11 +87,11 @@ def _open(options: ImportOptions) -> Log:
     def laser_pose(pose: Array | None) -> Array | None:
         return None if pose is None else np.asarray(se2.compose(pose, mount))
 
-    def sweeps() -> Iterator[LoggedScan]:
-        for sweep in log.read():
-            yield replace(sweep, odom=laser_pose(sweep.odom), reference=laser_pose(sweep.reference))
+    def logged_scans() -> Iterator[LoggedScan]:
+        for logged in log.read():
+            yield replace(logged, odom=laser_pose(logged.odom), reference=laser_pose(logged.reference))
 
-    return replace(log, mount=np.zeros(3), mount_assumed=False, read=sweeps)
+    return replace(log, mount=np.zeros(3), mount_assumed=False, read=logged_scans)
 
 
 @dataclass
@@ -120,17 +120,17 @@ class ImportCounts:
             "reference_poses": self.references,
             "mount": log.mount.tolist(),
             "mount_assumed": log.mount_assumed,
-            "left_out": dict(log.left_out + log.left_out_beside),
+            "left_out": dict(log.left_out + log.left_out_other),
             "notes": log.notes,
         }
 
 
 def write_recording(
-    options: ImportOptions, log: Log, world: World | None, sweeps: Iterator[LoggedScan] | Any
+    options: ImportOptions, log: Log, world: World | None, logged_scans: Iterator[LoggedScan] | Any
 ) -> ImportCounts:
     """Writes all scans and poses to the recording; removes the recording if that fails."""
     start, step = beam_spacing(log)
-    first_scans = list(itertools.islice(stamped := _stamped(log, sweeps, options.rate), RATE_SCANS))
+    first_scans = list(itertools.islice(stamped := _stamped(log, logged_scans, options.rate), RATE_SCANS))
     if not first_scans:
         left_out = log.describe_left_out()
         raise UserError(f"{log.path}: no usable scan in it" + (f"; left out: {left_out}" if left_out else ""))
@@ -152,8 +152,8 @@ def write_recording(
             scan_time=period,
             sigma=options.sigma or 0.0,
         )
-        for stamp_ns, sweep in itertools.chain(first_scans, stamped):
-            message_writer.write_scan(stamp_ns, sweep, template)
+        for stamp_ns, logged in itertools.chain(first_scans, stamped):
+            message_writer.write_scan(stamp_ns, logged, template)
         facts = written.facts(options, log)
         writer.metadata("log", {k: v if isinstance(v, str) else json.dumps(v) for k, v in facts.items()})
         counts = written.ledger.written
@@ -195,17 +195,17 @@ def scanner_of(log: Log, start: float, step: float, period: float, sigma: float 
         return None
 
 
-def _stamped(log: Log, sweeps: Iterator[LoggedScan], rate: float | None) -> Iterator[tuple[int, LoggedScan]]:
+def _stamped(log: Log, logged_scans: Iterator[LoggedScan], rate: float | None) -> Iterator[tuple[int, LoggedScan]]:
     """Yields the scans with their stamps; raises UserError if a stamp is missing or negative."""
-    for k, sweep in enumerate(sweeps):
-        if sweep.stamp_ns is None and rate is None:
+    for k, logged in enumerate(logged_scans):
+        if logged.stamp_ns is None and rate is None:
             raise UserError(
                 f"{log.path}: has no stamps: give the number of scans per second with rate in section log of --config"
             )
-        stamp_ns = round(k * 1e9 / (rate or 1.0)) if sweep.stamp_ns is None else sweep.stamp_ns
+        stamp_ns = round(k * 1e9 / (rate or 1.0)) if logged.stamp_ns is None else logged.stamp_ns
         if stamp_ns < 0:
             raise UserError(f"{log.path}: its stamps begin below 0 s: add a constant to all of them")
-        yield stamp_ns, sweep
+        yield stamp_ns, logged
 
 
 class _MessageWriter:
@@ -215,20 +215,20 @@ class _MessageWriter:
         self._writer, self._robot, self._written = writer, robot, written
         self._last: dict[Topic, tuple[int, Array]] = {}
 
-    def write_scan(self, stamp_ns: int, sweep: LoggedScan, template: Scan) -> None:
+    def write_scan(self, stamp_ns: int, logged: LoggedScan, template: Scan) -> None:
         """Writes odometry and reference pose before the scan, because the estimator needs the odometry first."""
         written = self._written
-        if sweep.odom is not None:
+        if logged.odom is not None:
             # Covariance zero means unknown; covariances in logs are not imported.
-            pose, twist = self._with_velocity(ODOM, stamp_ns, sweep.odom)
+            pose, twist = self._with_velocity(ODOM, stamp_ns, logged.odom)
             odom = Odom(stamp_ns=stamp_ns, seq=written.odoms, pose=pose, twist=twist, covariance=np.zeros((3, 3)))
             self._put(ODOM, odom, stamp_ns)
             written.odoms += 1
-        if sweep.reference is not None:
-            pose, twist = self._with_velocity(TRUTH, stamp_ns, sweep.reference)
+        if logged.reference is not None:
+            pose, twist = self._with_velocity(TRUTH, stamp_ns, logged.reference)
             self._put(TRUTH, Truth(stamp_ns=stamp_ns, seq=written.references, pose=pose, twist=twist), stamp_ns + 1)
             written.references += 1
-        ranges = np.asarray(sweep.ranges, np.float32)
+        ranges = np.asarray(logged.ranges, np.float32)
         scan = Scan(**{**dict(template), "stamp_ns": stamp_ns, "seq": written.scans, "ranges": ranges})
         self._put(SCAN, scan, stamp_ns + 2)
         written.scans += 1

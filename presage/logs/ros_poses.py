@@ -43,8 +43,8 @@ class Poses:
             for each in message.transforms:
                 with contextlib.suppress(ValueError):
                     transform = read_pose(each.transform.translation, each.transform.rotation)
-                    at = self._ns(each, logged_ns)
-                    self.frames.add(str(each.header.frame_id), str(each.child_frame_id), at, transform)
+                    stamp_ns = self._ns(each, logged_ns)
+                    self.frames.add(str(each.header.frame_id), str(each.child_frame_id), stamp_ns, transform)
             return
         pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
         if hasattr(message, "child_frame_id"):
@@ -110,7 +110,7 @@ class Poses:
         return np.zeros(3) if offset is None else offset
 
     def _fixed_transform(self, frame: str, base: str) -> Array | None:
-        """The base (3,) in another frame that is fixed to it; None if tf does not connect them so."""
+        """The base (3,) in another frame that is fixed to it; None if tf does not connect them or it changes."""
         for parent, child, invert in ((frame, base, False), (base, frame, True)):
             chain = self.frames.chain(parent, child)
             if chain and not any(edge.moves for edge in chain):

@@ -61,9 +61,9 @@ class Bag:
         except (UserError, KeyboardInterrupt, GeneratorExit):
             raise
         except Exception as error:  # noqa: BLE001 - damaged bags raise many kinds of errors
-            why = " ".join(str(error).split())[:160] or type(error).__name__
+            reason = " ".join(str(error).split())[:160] or type(error).__name__
             raise UserError(
-                f"{self.path}: a ROS bag that cannot be read ({why}): cut short, damaged or not finished; `rosbag "
+                f"{self.path}: a ROS bag that cannot be read ({reason}): cut short, damaged or not finished; `rosbag "
                 "reindex`, `ros2 bag reindex` or `mcap recover` repair some of them"
             ) from None
 

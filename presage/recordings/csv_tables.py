@@ -178,7 +178,7 @@ def _readme(recording: Recording, robot: str, layouts: dict[str, _TopicLayout], 
     lines = [
         f"# {recording.path.name}, robot {robot}",
         "",
-        "Written by `presage export --format csv`. Units are SI; poses are of base_link in map unless said otherwise.",
+        "Written by `presage export --format csv`. Units are SI; poses are of base_link in map unless noted otherwise.",
         "An empty cell means unknown. Ranges: inf is no return, -inf too close (REP-117), 0 not measured.",
         "`stamp_ns` is simulation or sensor time; `log_time_ns` and `publish_time_ns` are wall time.",
         "Lists and arrays have their own files (TOPIC.FIELD.csv; -N is the number of columns of an array), whose rows",

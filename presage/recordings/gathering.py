@@ -198,7 +198,7 @@ class _Gatherer:
 def _truth_at_beliefs(belief: StampedRows, truth: StampedRows) -> Array:
     """The true pose at the stamp of each belief (N, 3); NaN if there is none.
 
-    A restarted simulation uses stamps again: of several poses with the same stamp, takes the one received closest in
+    A restarted simulation uses stamps again: among several poses with the same stamp, takes the one received closest in
     time to the belief.
     """
     result = np.full((len(belief), 3), np.nan)

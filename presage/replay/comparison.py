@@ -108,7 +108,7 @@ class ReplayOutcome:
 
     imported: bool = field(default=False, kw_only=True)  # from a log, so without recorded beliefs to compare
     lockstep: bool  # the session and the replay ran in lockstep, so that equality is required
-    why: str = ""  # why equality is not required
+    tolerance_reason: str = ""  # why results may differ by the tolerance; empty if they must be identical
     beliefs: MessagePairs = field(default_factory=MessagePairs)
     commands: MessagePairs = field(default_factory=MessagePairs)
     scans: int = 0  # in the recording
@@ -121,7 +121,7 @@ class ReplayOutcome:
     damaged: str = ""  # why the recording could not be read to its end
 
     @property
-    def good(self) -> bool:
+    def agrees(self) -> bool:
         """Whether the results agree.
 
         In lockstep they must be identical; otherwise they may differ by the tolerance while tracking. For an imported
@@ -146,8 +146,8 @@ class ReplayOutcome:
             "imported": self.imported,
             "tracking": self.beliefs.new_tracking,
             "lockstep": self.lockstep,
-            "why_not": self.why,
-            "good": self.good,
+            "why_not": self.tolerance_reason,
+            "good": self.agrees,
             "damaged": self.damaged,
             "scans": self.scans,
             "scans_left_out": self.left_out,

@@ -58,7 +58,7 @@ class LocalizeOptions:
     """Options of `presage localize`."""
 
     file: Path
-    choice: Choice
+    estimator_options: Choice
     mode: Literal["global", "track"] = "global"
     fresh: bool = False
     prior: Prior = "odometry"
@@ -73,7 +73,7 @@ class LocalizeOptions:
     def of(
         cls,
         file: Path,
-        choice: Choice,
+        estimator_options: Choice,
         mode: str,
         frame: str,
         reading: Reading,
@@ -93,10 +93,10 @@ class LocalizeOptions:
         if out is not None and out.suffix not in (".csv", ".json"):
             raise UserError(f"{out}: the name of the result must end with .csv or .json")
         prior: Prior = "odometry" if odometry else "motion"
-        return cls(file, choice, mode, fresh, prior, frame, reading, out, start, end, every)  # type: ignore[arg-type]
+        return cls(file, estimator_options, mode, fresh, prior, frame, reading, out, start, end, every)  # type: ignore[arg-type]
 
 
-def choice_of(
+def build_estimator_options(
     file: Path,
     world: str,
     estimator: str,
@@ -145,17 +145,17 @@ def run(
         yield Localised(posterior, (time.perf_counter() - began) * 1e3)
 
 
-def prepare(choice: Choice, console: Console) -> Estimator:
+def prepare(estimator_options: Choice, console: Console) -> Estimator:
     """The chosen estimator, without its initial pose."""
-    with working(f"preparing {choice.estimator} for {choice.world_argument}", console):
+    with working(f"preparing {estimator_options.estimator} for {estimator_options.world_argument}", console):
         return Estimator(
-            choice.world,
-            choice.estimator,
-            model=choice.model,
-            models=choice.models,
-            sigma=choice.sigma,
-            seed=choice.seed,
-            descent=choice.descent,
+            estimator_options.world,
+            estimator_options.estimator,
+            model=estimator_options.model,
+            models=estimator_options.models,
+            sigma=estimator_options.sigma,
+            seed=estimator_options.seed,
+            descent=estimator_options.descent,
         )
 
 
@@ -165,13 +165,13 @@ def localize(options: LocalizeOptions, console: Console) -> list[dict[str, Any]]
     After Ctrl-C, prints the summary of the scans so far and raises KeyboardInterrupt.
     """
     check_file(options.out, "--out")
-    if options.choice.initial_pose is not None:
+    if options.estimator_options.initial_pose is not None:
         if options.mode == "global":
             raise UserError("--initial-pose is for mode track only: add --mode track, or leave it out")
-        world = options.choice.world
-        check_start(options.choice, load_world(world) if isinstance(world, str) else world)
+        world = options.estimator_options.world
+        check_start(options.estimator_options, load_world(world) if isinstance(world, str) else world)
     laser, kind = options.frame == "laser", kind_of(options.file)
-    estimator = prepare(options.choice, console)
+    estimator = prepare(options.estimator_options, console)
     with working(f"reading {options.file.name}", console):
         # With --frame laser, the poses in an .npz file are those of the laser, as if its mount were zero. For other
         # files, base_link is localised and the result transformed.
@@ -228,8 +228,8 @@ def _start(options: LocalizeOptions, scans: Scans) -> Array | None:
     """The start pose (3,) for mode track, from the command line, the file, or its reference; None for mode global."""
     if options.mode == "global":
         return None
-    if options.choice.initial_pose is not None:
-        return options.choice.initial_pose
+    if options.estimator_options.initial_pose is not None:
+        return options.estimator_options.initial_pose
     if scans.initial_pose is not None:
         return scans.initial_pose
     if scans.truth is not None and np.isfinite(scans.truth[0]).all():
@@ -283,9 +283,9 @@ def _output(options: LocalizeOptions, count: int) -> Iterator[Callable[[dict[str
 def _write_json(options: LocalizeOptions, out: Path, rows: list[dict[str, Any]], *, complete: bool) -> None:
     meta = {
         "file": str(options.file),
-        "world": options.choice.world_argument,
-        "estimator": options.choice.estimator,
-        "model": options.choice.model,
+        "world": options.estimator_options.world_argument,
+        "estimator": options.estimator_options.estimator,
+        "model": options.estimator_options.model,
         "frame": options.frame,
         "mode": options.mode,
         "fresh": options.fresh,
@@ -293,7 +293,7 @@ def _write_json(options: LocalizeOptions, out: Path, rows: list[dict[str, Any]],
         "end": options.end,
         "every": options.every,
         "complete": complete,
-        "seed": options.choice.seed,
+        "seed": options.estimator_options.seed,
         "commit": commit(),
         "versions": versions(),
         "arguments": sys.argv[1:],

@@ -77,8 +77,8 @@ def rerun_command(options: RerunOptions, json_file: Path | None, console: Consol
         out = options.target(settings.estimator)
         for beside in (".png", ".pdf", ".csv"):
             check_file(out.with_suffix(beside), "--out")
-        scans, choice = read_scans(options.file).with_prior(settings.prior), choice_of(settings)
-        localised = run(prepare(choice, console), scans, start=choice.initial_pose)
+        scans, chosen = read_scans(options.file).with_prior(settings.prior), choice_of(settings)
+        localised = run(prepare(chosen, console), scans, start=chosen.initial_pose)
         with closing(progress(localised, "localising", len(scans), console)) as shown:
             old, new = write_recording(recording, robot, settings, scans, shown, out)
     if foreign := sum(count for key, count in recording.counts().items() if topic_of(key) is None):

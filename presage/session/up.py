@@ -28,7 +28,7 @@ class UpOptions:
     estimator: list[str] = field(default_factory=list)  # further arguments of the estimator
     robots: int = 1
     record: Path | None = None
-    port: int = 7447  # 0 for a free one
+    port: int = 7447  # 0 chooses a free port
     without: frozenset[str] = frozenset()  # services that are not started
     open_page: bool = False
 
@@ -97,7 +97,7 @@ def _show_hints(stack: Stack, world: str, robots: list[str], console: Console) -
 
 
 def _watch(stack: Stack, console: Console) -> None:
-    """Reports services that end; returns never, and raises UserError when all have ended."""
+    """Reports services that end; never returns, and raises UserError when all have ended."""
     reported: set[str] = set()
     while True:
         for name in stack.ended():

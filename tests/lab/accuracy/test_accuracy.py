@@ -150,8 +150,8 @@ def test_both_rooms_must_have_a_hypothesis_from_scan_20_on(believe, kept, wrong)
 
 
 def test_the_short_table_shows_wrong_claims(capsys):
-    outcome = tasks.TaskOutcome(found=1, of=3, wrong=2, errors=[np.array([0.003, 0.004, 0.0])], misfits=[2.5])
-    nothing = tasks.TaskOutcome(of=3, wrong=1)
+    outcome = tasks.TaskOutcome(found=1, total=3, wrong=2, errors=[np.array([0.003, 0.004, 0.0])], nees=[2.5])
+    nothing = tasks.TaskOutcome(total=3, wrong=1)
     tim = scanners_of("tim571", "")[0]
     job = AccuracyJob("precise", "office", tim, 3, 1.0, 0)
     rows = [_row(job, "office", task, each) for task, each in (("kidnapped", outcome), ("blocked", nothing))]
@@ -165,7 +165,7 @@ def test_counts_of_independent_trials_have_an_interval():
     assert wilson_interval(0, 100) == pytest.approx([0.0, 0.0370], abs=1e-3)
     assert wilson_interval(100, 100) == pytest.approx([0.9630, 1.0], abs=1e-3)
     tim = scanners_of("tim571", "")[0]
-    along = tasks.TaskOutcome(found=9, of=9, independent=False)
+    along = tasks.TaskOutcome(found=9, total=9, independent=False)
     assert _row(AccuracyJob("precise", "office", tim, 3, 1.0, 0), "office", "tracking", along)["found_share_95"] is None
 
 

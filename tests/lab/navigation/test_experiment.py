@@ -399,7 +399,7 @@ def test_an_interrupted_run_continues_and_leaves_no_process(process, tmp_path):
     assert done < 3
     run = process(*args, env=one_worker)
     assert run.wait(120) == 0, run.output
-    assert f"going on after {done} of 3" in run.output
+    assert f"continuing after {done} of 3" in run.output
     rows = (tmp_path / "navigation-maze-holonomic.trials.jsonl").read_text().splitlines()
     assert [json.loads(row)["trial"] for row in rows] == [0, 1, 2]
 

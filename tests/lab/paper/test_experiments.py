@@ -231,8 +231,8 @@ def test_the_same_command_continues_after_ctrl_c(process, tmp_path):
     assert run.wait(30) == 130, run.output
     done = len(store.read_text().splitlines()) - 1
     run = process(*args, env={"PRESAGE_WORKERS": "2"})
-    assert wait_until(lambda: "going on after" in run.output, 60), run.output
-    found = re.search(r"going on after (\d+) of 40", run.output)
+    assert wait_until(lambda: "continuing after" in run.output, 60), run.output
+    found = re.search(r"continuing after (\d+) of 40", run.output)
     assert found
     assert int(found[1]) == done
     run.send(signal.SIGINT)
