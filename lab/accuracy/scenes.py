@@ -122,7 +122,7 @@ TWINS = World(
         {"circle": {"center": (10.5, 2.6), "radius": 0.3}},
         {"box": {"center": (0.4, 5.6), "size": (0.6, 0.5)}},
     ],
-)  # fmt: skip
+)
 
 
 def twin_path(scene: Scene) -> tuple[Array, int]:

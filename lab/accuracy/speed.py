@@ -25,7 +25,7 @@ SKIPPED_UPDATES = 5  # at the start of the path, while caches warm up
 
 
 def bench_speed(world: str, beams: str, seed: int, json_file: Path | None, console: Console) -> int:
-    """Run the benchmark, print the table and write it to ``json_file`` if given. Returns exit status 0."""
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
     load_world(world)
     jobs = [(name, world, int(count), seed) for count in beams.split(",") for name in ESTIMATORS]
@@ -38,10 +38,15 @@ def bench_speed(world: str, beams: str, seed: int, json_file: Path | None, conso
         table.add_column(column, justify="left" if column == "estimator" else "right")
     for row in rows:
         table.add_row(
-            row["estimator"], str(row["beams"]), f"{row['tracking_ms']:.2f}", f"{row['tracking_p95_ms']:.2f}",
-            f"{row['global_ms']:.0f}", f"{row['global_p95_ms']:.0f}", f"{row['ready_s']:.1f}",
+            row["estimator"],
+            str(row["beams"]),
+            f"{row['tracking_ms']:.2f}",
+            f"{row['tracking_p95_ms']:.2f}",
+            f"{row['global_ms']:.0f}",
+            f"{row['global_p95_ms']:.0f}",
+            f"{row['ready_s']:.1f}",
             f"{row['memory_mb']:.0f}",
-        )  # fmt: skip
+        )
     console.print(table)
     console.print(
         f"required of precise: {LIMITS['tracking']:g} ms tracking, {LIMITS['from nothing']:g} ms for a global search"
@@ -75,8 +80,12 @@ def measure(estimator: str, world_name: str, beams: int, seed: int) -> dict[str,
         updates.append((time.perf_counter() - began) * 1e3)
     updates = updates[SKIPPED_UPDATES:]
     return {
-        "estimator": estimator, "beams": beams, "tracking_ms": float(np.median(updates)),
-        "tracking_p95_ms": float(np.quantile(updates, 0.95)), "global_ms": float(np.median(searches)),
-        "global_p95_ms": float(np.quantile(searches, 0.95)), "ready_s": ready,
+        "estimator": estimator,
+        "beams": beams,
+        "tracking_ms": float(np.median(updates)),
+        "tracking_p95_ms": float(np.quantile(updates, 0.95)),
+        "global_ms": float(np.median(searches)),
+        "global_p95_ms": float(np.quantile(searches, 0.95)),
+        "ready_s": ready,
         "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-    }  # fmt: skip
+    }

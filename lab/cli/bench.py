@@ -16,7 +16,9 @@ app = typer.Typer(help="Benchmarks. Each compares with a baseline or a limit in 
 BEAMS = 622  # as in the paper
 Seconds = Annotated[float, typer.Option(min=0.1, help="Duration of one measurement, s.")]
 Rounds = Annotated[int, typer.Option(min=1, help="Number of rounds with and without what is measured.")]
-Kept = Annotated[Path | None, typer.Option("--out", "-o", help="Folder in which to keep the generated files.")]
+GeneratedFolder = Annotated[
+    Path | None, typer.Option("--out", "-o", help="Folder in which to keep the generated files.")
+]
 Seed = Annotated[int, typer.Option(min=0, max=2**31, help="Random seed.")]
 
 
@@ -47,7 +49,7 @@ def bench_viewer(seconds: Seconds = 20.0, rounds: Rounds = 3, json_file: Json = 
 
 @app.command("map")
 def bench_map(
-    world: Annotated[str, typer.Option(help="A ROS map.yaml or any world. Default: a generated map.")] = "",
+    world: Annotated[str, typer.Option(help="A ROS map.yaml or any world. Defaults to a generated map.")] = "",
     size: Annotated[int, typer.Option(min=200, max=4000, help="Cells per side of the generated map.")] = 1000,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder in which to keep the generated map.")] = None,
     json_file: Json = None,
@@ -95,7 +97,7 @@ def bench_accuracy(
     ] = "precise,precise-exact,particle-filter",
     tasks: Annotated[
         str,
-        typer.Option(help="Comma-separated: standing, blocked, kidnapped, tracking, odometry, twins. Default: all."),
+        typer.Option(help="Comma-separated: standing, blocked, kidnapped, tracking, odometry, twins. Defaults to all."),
     ] = "",
     scanner: Annotated[
         str, typer.Option(help=f"Comma-separated: {', '.join(SCANNERS)}, or scanner files (docs/scanners.md).")
@@ -122,9 +124,20 @@ def bench_accuracy(
     from lab.accuracy.report import bench_accuracy as run  # noqa: PLC0415
 
     code = run(
-        worlds, "", estimators, tasks, trials, minutes, seed, min(2, worker_count()), json_file, figure,
-        console, markdown=markdown, scanner=scanner,
-    )  # fmt: skip
+        worlds,
+        "",
+        estimators,
+        tasks,
+        trials,
+        minutes,
+        seed,
+        min(2, worker_count()),
+        json_file,
+        figure,
+        console,
+        markdown=markdown,
+        scanner=scanner,
+    )
     raise typer.Exit(code)
 
 
@@ -161,23 +174,23 @@ def bench_recorder(
         typer.Option(min=1, max=100_000, help="Messages per second; a normal session has about 100."),
     ] = 2000,
     seconds: Seconds = 60.0,
-    out: Kept = None,
+    out: GeneratedFolder = None,
     json_file: Json = None,
 ) -> None:
     """A real recorder under twenty times the normal load: lost or altered messages, memory and processor time.
 
     Examples: `presage bench recorder`; `presage bench recorder --seconds 10 --rate 5000 --json recorder.json`.
     """
-    from lab.benchmarks.recorder import Load  # noqa: PLC0415
+    from lab.benchmarks.recorder import RecorderLoad  # noqa: PLC0415
     from lab.benchmarks.recorder import bench_recorder as run  # noqa: PLC0415
 
-    raise typer.Exit(run(Load(rate, seconds), out, json_file, console))
+    raise typer.Exit(run(RecorderLoad(rate, seconds), out, json_file, console))
 
 
 @app.command("chaos")
 def bench_chaos(
     faults: Annotated[
-        list[str] | None, typer.Argument(help="Names of faults; 'killed*' selects several. Default: all.")
+        list[str] | None, typer.Argument(help="Names of faults; 'killed*' selects several. Defaults to all.")
     ] = None,
     repeats: Annotated[int, typer.Option(min=1, help="How often to inject each fault.")] = 1,
     one_host: Annotated[
@@ -186,7 +199,7 @@ def bench_chaos(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show the output of all processes.")] = False,
     json_file: Json = None,
 ) -> None:
-    """Injects faults into a running system: processes that die, freeze or start twice, bad networks, random payloads.
+    """Fault injection into a running system: processes that die, freeze or start twice, bad networks, random payloads.
 
     A real system drives back and forth, and each fault happens at full speed. Where this machine allows network
     namespaces (Linux; as root, or with user namespaces), the robot, the estimator and the rest run on three hosts.
@@ -213,10 +226,10 @@ def bench_fleet(
 
     Examples: `presage bench fleet`; `presage bench fleet --estimators precise --seconds 3 --most 8` (quick).
     """
-    from lab.benchmarks.fleet import Plan  # noqa: PLC0415
+    from lab.benchmarks.fleet import FleetPlan  # noqa: PLC0415
     from lab.benchmarks.fleet import bench_fleet as run  # noqa: PLC0415
 
-    plan = Plan("corridor", BEAMS, rate=15.0, seconds=seconds, max_robots=most, share=0.999, seed=1)
+    plan = FleetPlan("corridor", BEAMS, rate=15.0, seconds=seconds, max_robots=most, share=0.999, seed=1)
     raise typer.Exit(run(estimators, plan, json_file, console))
 
 

@@ -48,7 +48,7 @@ def e1(
     from lab.experiments.estimators import PAPER_DESCENT, parse_estimators  # noqa: PLC0415
     from lab.paper import e1_localisation as localisation  # noqa: PLC0415
 
-    job = localisation.Job(0, seed, iterations)
+    job = localisation.LocalisationJob(0, seed, iterations)
     job = replace(job, descent=replace(PAPER_DESCENT, alpha=alpha)) if alpha is not None else job
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
     show(localisation, lambda: localisation.run(job, trials, out, worker_count(), console), out)
@@ -68,7 +68,7 @@ def e2(
     from lab.experiments.estimators import parse_estimators  # noqa: PLC0415
     from lab.paper import e2_crossing as crossing  # noqa: PLC0415
 
-    job = crossing.Job(0, seed)
+    job = crossing.CrossingJob(0, seed)
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
     show(crossing, lambda: crossing.run(job, trials, out, worker_count(), console), out)
 
@@ -91,7 +91,7 @@ def e3(
     from lab.experiments.estimators import parse_estimators  # noqa: PLC0415
     from lab.paper import e3_navigation as navigation  # noqa: PLC0415
 
-    job = navigation.Job(0, seed, free=free)
+    job = navigation.NavigationJob(0, seed, free=free)
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
     show(navigation, lambda: navigation.run(job, trials, out, worker_count(), console), out)
 
@@ -109,7 +109,11 @@ def alpha_sweep(
     from lab.paper import alpha_sweep as step_size  # noqa: PLC0415
     from lab.paper import e1_localisation as localisation  # noqa: PLC0415
 
-    show(step_size, lambda: step_size.run(localisation.Job(0, seed, 50), trials, out, worker_count(), console), out)
+    show(
+        step_size,
+        lambda: step_size.run(localisation.LocalisationJob(0, seed, 50), trials, out, worker_count(), console),
+        out,
+    )
 
 
 @app.command("steps")
@@ -120,7 +124,7 @@ def step_sizes(trials: Trials = 10, seed: ExperimentSeed = 1, out: Out = OUT) ->
     """
     from lab.paper import step_sizes as stepping  # noqa: PLC0415
 
-    show(stepping, lambda: stepping.run(stepping.Job(0, seed), trials, out, worker_count(), console), out)
+    show(stepping, lambda: stepping.run(stepping.StepSizeJob(0, seed), trials, out, worker_count(), console), out)
 
 
 @app.command("samples")
@@ -134,7 +138,7 @@ def samples_needed(
     """
     from lab.paper import samples  # noqa: PLC0415
 
-    show(samples, lambda: samples.run(samples.Job(seed), out, worker_count(), console), out)
+    show(samples, lambda: samples.run(samples.SamplesJob(seed), out, worker_count(), console), out)
 
 
 @app.command("aliasing")
@@ -149,7 +153,7 @@ def similar_objects(
     """
     from lab.paper import aliasing  # noqa: PLC0415
 
-    show(aliasing, lambda: aliasing.run(aliasing.Job(seed, places=trials), out, worker_count(), console), out)
+    show(aliasing, lambda: aliasing.run(aliasing.AliasingJob(seed, places=trials), out, worker_count(), console), out)
 
 
 @app.command("prediction")
@@ -163,16 +167,16 @@ def predicted(
     """
     from lab.paper import prediction  # noqa: PLC0415
 
-    show(prediction, lambda: prediction.run(prediction.Job(seed), out, 1, console), out)
+    show(prediction, lambda: prediction.run(prediction.PredictionJob(seed), out, 1, console), out)
 
 
 @app.command("real")
 def real_drive(
     log: Annotated[Path, typer.Option(help="Recording or log with reference poses (docs/logs.md).")],
     world: Annotated[str, typer.Option(help="World file or ROS map.yaml of the training half.")],
-    name: Annotated[str, typer.Option(help="Results are named real-NAME. Default: the log's name.")] = "",
+    name: Annotated[str, typer.Option(help="Results are named real-NAME. Defaults to the log's name.")] = "",
     mount: Annotated[
-        str, typer.Option(help="Pose of the laser in base_link, x,y[,yaw_deg] (m, deg). Default: as in the log.")
+        str, typer.Option(help="Pose of the laser in base_link, x,y[,yaw_deg] (m, deg). Defaults to the log's.")
     ] = "",
     every: Annotated[int, typer.Option(min=1, help="Number of scans between the starts of tasks c and d.")] = 50,
     quick: Annotated[
@@ -199,7 +203,7 @@ def real_drive(
     if not re.fullmatch(r"[\w.-]*", name):
         raise UserError(f"--name {name!r}: use only letters, digits, '.', '_' and '-', as it becomes a file name")
     laser_pose: Any = tuple(pose_of_text(mount, "--mount").tolist()) if mount else None
-    job = real.Job(log, world, laser_pose, every, quick, seed, name, exchange)
+    job = real.RealLogJob(log, world, laser_pose, every, quick, seed, name, exchange)
     show(real, lambda: real.run(job, out, worker_count(), console), out)
 
 
@@ -227,7 +231,7 @@ def tables(
     out: Out = OUT,
     page: Annotated[Path | None, typer.Option(help="Markdown file in which to replace the marked tables.")] = None,
 ) -> None:
-    """Prints the tables of existing results as Markdown, or inserts them into a page.
+    """Tables of existing results, as Markdown or inserted into a page.
 
     Examples: `presage experiment tables`;
     `presage experiment tables --page docs/experiments.md --out docs/experiments`.

@@ -42,7 +42,7 @@ def navigate(
     """
     from lab.navigation import experiment as driving  # noqa: PLC0415
 
-    job = driving.Job(0, seed, start=start, people=people, estimator=estimator, epistemic=epistemic)
+    job = driving.NavigationJob(0, seed, start=start, people=people, estimator=estimator, epistemic=epistemic)
     world_names, drive_names = (
         tuple(part.strip() for part in text.split(",") if part.strip()) for text in (worlds, drives)
     )

@@ -19,9 +19,16 @@ from services.estimator.shared.interface import Estimator
 
 TEN_STEPS = "10 steps a scan"  # variant of the paper's estimator with the service's defaults, for a moving robot
 NAMES = (
-    "paper", f"paper, {TEN_STEPS}", "precise", "particle-filter", "particle-filter, heading known",
-    "amcl-defaults", "precise, odometry", "particle-filter, odometry", "amcl-defaults, odometry",
-)  # fmt: skip
+    "paper",
+    f"paper, {TEN_STEPS}",
+    "precise",
+    "particle-filter",
+    "particle-filter, heading known",
+    "amcl-defaults",
+    "precise, odometry",
+    "particle-filter, odometry",
+    "amcl-defaults, odometry",
+)
 # One gradient step per scan, as in the paper's algorithm 1. The default step size lies where the results of
 # `presage experiment alpha` hardly depend on it.
 PAPER_DESCENT = Descent(iterations=1)

@@ -96,14 +96,30 @@ def train_paper(scene: Scene, heading: float, samples: int, steps: int, seed: in
     took = time.process_time() - began
     error = np.abs(model.ranges(judge.poses) - judge.ranges)
     card = ModelCard(
-        preset="paper", world=scene.world, scanner=scene.scanner, heading=heading, samples=samples,
-        epochs=recipe.epochs, batch=BATCH_SIZE, learning_rate=LEARNING_RATE, seed=seed,
-        hidden=HIDDEN_UNITS, channels=CHANNELS,
-        center=norm.center, half_size=norm.half_size, range_scale=norm.range_scale, test_samples=TEST_SCANS,
-        test_l1_mean=float(error.mean()), test_l1_median=float(np.median(error)),
-        curve_train_l1=trainer.progress.train_l1, curve_test_l1=trainer.progress.test_l1, training_s=took,
-        commit=commit(), command="", versions=versions(),
-    )  # fmt: skip
+        preset="paper",
+        world=scene.world,
+        scanner=scene.scanner,
+        heading=heading,
+        samples=samples,
+        epochs=recipe.epochs,
+        batch=BATCH_SIZE,
+        learning_rate=LEARNING_RATE,
+        seed=seed,
+        hidden=HIDDEN_UNITS,
+        channels=CHANNELS,
+        center=norm.center,
+        half_size=norm.half_size,
+        range_scale=norm.range_scale,
+        test_samples=TEST_SCANS,
+        test_l1_mean=float(error.mean()),
+        test_l1_median=float(np.median(error)),
+        curve_train_l1=trainer.progress.train_l1,
+        curve_test_l1=trainer.progress.test_l1,
+        training_s=took,
+        commit=commit(),
+        command="",
+        versions=versions(),
+    )
     return TrainedDecoder(model, card)
 
 

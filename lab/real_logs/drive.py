@@ -32,7 +32,7 @@ ODOMETRY, LASER, GLOBAL, KIDNAPPED = "odometry", "laser", "global", "kidnapped"
 
 
 @dataclass(frozen=True)
-class Job:
+class StretchJob:
     """One estimator on one stretch of a drive; all values are plain, so that jobs can be compared and pickled."""
 
     log: str
@@ -79,27 +79,27 @@ def exchange_halves(drive: Drive) -> Drive:
     return replace(exchanged, stamps=np.concatenate([late.stamps, early.stamps + offset]))
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: StretchJob) -> dict[str, Any]:
     """Runs the job's estimator over its stretch. Returns errors, states and times of every scan."""
     drive, estimator = job.drive, create_estimator(job)
     if job.task in (ODOMETRY, LASER):
         estimator.restart(drive.poses[job.first], START_COVARIANCE)
-        numbers = np.arange(job.first, job.first + job.count)
+        indices = np.arange(job.first, job.first + job.count)
     elif job.task == GLOBAL:
-        numbers = np.arange(job.first, min(job.first + (job.count or MAX_SEARCH_SCANS), len(drive.ranges)))
+        indices = np.arange(job.first, min(job.first + (job.count or MAX_SEARCH_SCANS), len(drive.ranges)))
     else:
         estimator.restart(drive.poses[job.first], START_COVARIANCE)
         after = np.arange(job.to, min(job.to + MAX_SEARCH_SCANS, len(drive.ranges)))
-        numbers = np.concatenate([np.arange(job.first, job.first + SCANS_BEFORE_KIDNAPPING), after])
-    clock = drive.stamps[numbers]
-    odom = None if drive.odom is None or job.task == LASER else drive.odom[numbers]
+        indices = np.concatenate([np.arange(job.first, job.first + SCANS_BEFORE_KIDNAPPING), after])
+    clock = drive.stamps[indices]
+    odom = None if drive.odom is None or job.task == LASER else drive.odom[indices]
     if job.task == KIDNAPPED:  # the stamps have no gap at the kidnapping
         clock[SCANS_BEFORE_KIDNAPPING:] += (
             drive.stamps[job.first + SCANS_BEFORE_KIDNAPPING] - clock[SCANS_BEFORE_KIDNAPPING]
         )
         odom = None if odom is None else hide_kidnapping(odom, SCANS_BEFORE_KIDNAPPING)
     rows: dict[str, list[Any]] = {name: [] for name in ("stamp_s", "error_m", "yaw_error_rad", "state", "nees", "ms")}
-    for i, k in enumerate(numbers):
+    for i, k in enumerate(indices):
         odom_pose = None if odom is None else odom[i]
         observation = Observation(drive.ranges[k], drive.angles, drive.range_max, float(clock[i]), odom_pose)
         began = time.process_time()
@@ -128,7 +128,7 @@ def hide_kidnapping(odom: Array, carried: int) -> Array:
     return np.asarray(moved)
 
 
-def create_estimator(job: Job) -> Estimator:
+def create_estimator(job: StretchJob) -> Estimator:
     """A new estimator for the job's map, without a start pose."""
     drive = job.drive
     if job.estimator == "precise":

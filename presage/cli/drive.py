@@ -35,7 +35,9 @@ def _number(text: str) -> float:
 def goal(
     x: Annotated[float | None, typer.Argument(help="x of the goal in the map, m.")] = None,
     y: Annotated[float | None, typer.Argument(help="y of the goal in the map, m.")] = None,
-    yaw: Annotated[float | None, typer.Argument(parser=_number, help="Heading at the goal, deg. Default: any.")] = None,
+    yaw: Annotated[
+        float | None, typer.Argument(parser=_number, help="Heading at the goal, deg. Defaults to any heading.")
+    ] = None,
     yaw_option: Annotated[float | None, typer.Option("--yaw", hidden=True)] = None,
     tolerance: Annotated[float, typer.Option(min=0.01, help="Distance at which the goal counts as reached, m.")] = 0.2,
     wait: Annotated[

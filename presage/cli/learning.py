@@ -98,11 +98,14 @@ def train(
     make_folder(folder, "--out")
     if preset == "precise":
         recipe = Recipe(tuning.resolution or 0.04, seed=seed)
-        job = precise.TrainPreciseOptions(world, chosen, tuple(simulator), folder, samples or 5000, recipe)
-        precise.train_precise(job, link, console)
+        precise.train_precise(
+            precise.TrainPreciseOptions(world, chosen, tuple(simulator), folder, samples or 5000, recipe), link, console
+        )
     else:
-        descent = PaperRecipe(tuning.epochs, tuning.batch, tuning.learning_rate, seed)
-        options = paper.TrainPaperOptions(world, preset, chosen, tuple(simulator), folder, samples or 13_000, descent)
+        paper_recipe = PaperRecipe(tuning.epochs, tuning.batch, tuning.learning_rate, seed)
+        options = paper.TrainPaperOptions(
+            world, preset, chosen, tuple(simulator), folder, samples or 13_000, paper_recipe
+        )
         paper.train(options, link, console)
 
 

@@ -72,13 +72,13 @@ def localize(
     """
     from common.runtime.config import load_section, load_settings  # noqa: PLC0415
     from presage.logs.options import LogSettings  # noqa: PLC0415
-    from presage.replay.localize import LocalizeOptions, choice_of  # noqa: PLC0415
+    from presage.replay.localize import LocalizeOptions, build_estimator_options  # noqa: PLC0415
     from presage.replay.localize import localize as run  # noqa: PLC0415
     from services.estimator.settings import EstimatorSettings  # noqa: PLC0415
 
     chosen = arguments(config=config, estimator=estimator, initial_pose=initial_pose, **model_setting(model))
     settings, log = load_settings(EstimatorSettings, chosen), load_section(LogSettings, config, "log", mount=mount)
-    choice = choice_of(
+    estimator_options = build_estimator_options(
         file,
         world,
         settings.estimator,
@@ -88,9 +88,9 @@ def localize(
         settings.seed,
         settings.initial_pose,
     )
-    job = LocalizeOptions.of(
+    options = LocalizeOptions.of(
         file,
-        choice,
+        estimator_options,
         "global" if mode == "single" else mode,
         log.frame,
         log.reading(),
@@ -101,7 +101,7 @@ def localize(
         end=end,
         every=every,
     )
-    run(job, err_console)
+    run(options, err_console)
 
 
 @app.command("import", rich_help_panel="Data", short_help="Convert a log to a recording.")
@@ -133,5 +133,5 @@ def import_(
     log = load_section(LogSettings, config, "log", mount=mount)
     target = out or Path(f"{file.resolve().name.split('.')[0]}.mcap")
     laser = log.frame == "laser"
-    job = ImportOptions(file, target, log.reading(), world, laser=laser, rate=log.rate, sigma=log.sigma)
-    import_command(job, json_file, console, err_console)
+    options = ImportOptions(file, target, log.reading(), world, laser=laser, rate=log.rate, sigma=log.sigma)
+    import_command(options, json_file, console, err_console)

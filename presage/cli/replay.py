@@ -18,7 +18,7 @@ from presage.terminal.options import (
     ModelName,
     WorldName,
     console,
-    given,
+    given_options,
     model_setting,
 )
 
@@ -86,13 +86,15 @@ def replay(
     `presage replay run.mcap --rate 4 --start 10 --end -5 --loop`; `presage replay run.mcap --except belief,prediction`;
     `presage replay run.mcap --robot ghost` (beside a live robot); `presage replay run.mcap --with estimator`.
     """
-    from presage.replay.bus_replay import choice_of, run_replay  # noqa: PLC0415
+    from presage.replay.bus_replay import replay_options, run_replay  # noqa: PLC0415
 
-    choice = choice_of(only, leave_out, rate, start, end, robot, loop=loop, force=force, paused=paused, stay=paused)
+    bus_options = replay_options(
+        only, leave_out, rate, start, end, robot, loop=loop, force=force, paused=paused, stay=paused
+    )
     if not with_services:
         if json_file is not None or every_scan:
             raise UserError("--json and --every-scan go with --with: a plain replay compares nothing")
-        run_replay(file, link_of(connect, robot or "robot", ("replay",)), choice, console)
+        run_replay(file, link_of(connect, robot or "robot", ("replay",)), bus_options, console)
         return
     chosen = (rate, start, end)
     if only or leave_out or robot or force or loop or paused or any(value is not None for value in chosen):
@@ -132,5 +134,5 @@ def rerun(
     from presage.replay.rerun import RerunOptions, rerun_command  # noqa: PLC0415
 
     chosen = {} if config is None else read_section(config, "estimator")
-    chosen |= given(estimator=estimator, world=world, **model_setting(model))
+    chosen |= given_options(estimator=estimator, world=world, **model_setting(model))
     rerun_command(RerunOptions(file, chosen, out), json_file, console)

@@ -73,19 +73,19 @@ def test_error_and_bound():
 def test_covariance():
     """NEES of 100 scans: mean of chi squared with 3 degrees of freedom, 99.9 % band."""
     made, scene = estimator(ROOM)
-    outcome = tasks.Outcome()
+    outcome = tasks.TaskOutcome()
     for pose in scene.poses(100):
         made.restart(pose, np.diag([1.0, 1.0, 1.0]))
         outcome.add(feed(made, scene, pose, 1)[0], pose, None)
-    assert len(outcome.misfits) >= 99
-    assert np.mean(outcome.misfits) == pytest.approx(3, abs=3.3 * np.sqrt(6 / 100))
+    assert len(outcome.nees) >= 99
+    assert np.mean(outcome.nees) == pytest.approx(3, abs=3.3 * np.sqrt(6 / 100))
 
 
 @pytest.mark.parametrize("odometry", [False, True])
 def test_tracking(odometry):
     made, scene = estimator(ROOM)
     (outcome,) = tasks.tracking(made, scene, 20.0, iter, odometry=odometry).values()
-    assert outcome.found == outcome.of == 300
+    assert outcome.found == outcome.total == 300
     rms = np.sqrt(np.mean(np.square(np.array(outcome.errors)[:, :2]).sum(1)))
     assert rms < 1.3 * np.sqrt(np.mean(np.square(outcome.bounds)))
 

@@ -14,7 +14,7 @@ from common.geometry.world import load_world
 from common.robot.base import Robot
 from lab.accuracy import bound, tasks
 from lab.accuracy.report import _markdown, bench_accuracy, scanners_of
-from lab.accuracy.runner import Job, _row, wilson_interval
+from lab.accuracy.runner import AccuracyJob, _row, wilson_interval
 from lab.accuracy.scenes import TWINS, Scene, alike, twin_of, twin_path
 from services.estimator.shared.interface import Hypothesis, Posterior
 from services.simulator.odometry import Drift
@@ -150,10 +150,10 @@ def test_both_rooms_kept(believe, kept, wrong):
 
 
 def test_short_table(capsys):
-    outcome = tasks.Outcome(found=1, of=3, wrong=2, errors=[np.array([0.003, 0.004, 0.0])], misfits=[2.5])
-    nothing = tasks.Outcome(of=3, wrong=1)
+    outcome = tasks.TaskOutcome(found=1, total=3, wrong=2, errors=[np.array([0.003, 0.004, 0.0])], nees=[2.5])
+    nothing = tasks.TaskOutcome(total=3, wrong=1)
     tim = scanners_of("tim571", "")[0]
-    job = Job("precise", "office", tim, 3, 1.0, 0)
+    job = AccuracyJob("precise", "office", tim, 3, 1.0, 0)
     rows = [_row(job, "office", task, each) for task, each in (("kidnapped", outcome), ("blocked", nothing))]
     assert "| kidnapped | 5.00/5.00 mm, 1/3, 2 wrong, NEES 2.50 |" in _markdown(rows, "office")
     assert "| blocked | 0/3, 1 wrong |" in _markdown(rows, "office")
@@ -165,8 +165,8 @@ def test_confidence_intervals():
     assert wilson_interval(0, 100) == pytest.approx([0.0, 0.0370], abs=1e-3)
     assert wilson_interval(100, 100) == pytest.approx([0.9630, 1.0], abs=1e-3)
     tim = scanners_of("tim571", "")[0]
-    along = tasks.Outcome(found=9, of=9, independent=False)
-    assert _row(Job("precise", "office", tim, 3, 1.0, 0), "office", "tracking", along)["found_share_95"] is None
+    along = tasks.TaskOutcome(found=9, total=9, independent=False)
+    assert _row(AccuracyJob("precise", "office", tim, 3, 1.0, 0), "office", "tracking", along)["found_share_95"] is None
 
 
 def test_rows_and_files(tmp_path):

@@ -13,7 +13,7 @@ from common.geometry.world import load_world
 from common.messages.definitions import Belief, Pose
 from common.messages.topics import BELIEF, SCAN
 from lab.benchmarks.fleet import max_robots_served
-from lab.benchmarks.fleet_load import CLEARANCE, RADIUS, Load
+from lab.benchmarks.fleet_load import CLEARANCE, RADIUS, FleetLoad
 
 
 @pytest.mark.parametrize("limit", [0, 1, 2, 3, 7, 8, 9, 15, 16, 31, 32])
@@ -31,7 +31,7 @@ def test_largest_number_served(limit):
 
 def test_load(bus):
     world = load_world("corridor")
-    load = Load(bus, world, 16, 15.0, 3, 1)
+    load = FleetLoad(bus, world, 16, 15.0, 3, 1)
     inbox = Inbox()
     bus.subscribe(SCAN, inbox, keep_all=True, robot="*")
     assert load.wait_matching(3, 10)
@@ -59,7 +59,7 @@ def test_load(bus):
 
 def test_counted_answers(bus, link):
     """A peer answers every scan of the first robot twice, and once with an unknown stamp."""
-    load = Load(bus, load_world("corridor"), 16, 15.0, 2, 1)
+    load = FleetLoad(bus, load_world("corridor"), 16, 15.0, 2, 1)
     with open_bus(link) as other:
         answering = other.for_robot(load.robots[0].name)
         inbox = Inbox()

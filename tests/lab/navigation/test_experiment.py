@@ -310,7 +310,7 @@ def test_end_of_a_drive():
 
 
 def test_result_names():
-    job = driving.Job(0, 1)
+    job = driving.NavigationJob(0, 1)
     assert driving.result_name(job, driving.WORLDS, driving.DRIVES) == "navigation"
     assert driving.result_name(replace(job, seed=7, limit=9.0), driving.WORLDS, driving.DRIVES) == "navigation"
     odd = replace(job, start="unknown", people=10, epistemic=False, estimator="particle-filter", prior="odometry")
@@ -322,7 +322,9 @@ def test_result_names():
 
 
 def test_options_of_services():
-    job = driving.Job(3, 2, "office", "differential", "unknown", 4, 0.5, "particle-filter", "odometry", epistemic=False)
+    job = driving.NavigationJob(
+        3, 2, "office", "differential", "unknown", 4, 0.5, "particle-filter", "odometry", epistemic=False
+    )
     lockstep_run = job.lockstep_run(Journey((1.0, 1.0), (5.0, 1.0)), 0.5)
     assert lockstep_run.controller == ("--preset", "geodesic", "--drive", "differential", "--no-epistemic")
     assert lockstep_run.simulator == ("--drive", "differential", "--people", "4", "--people-speed", "0.5")
@@ -354,7 +356,7 @@ def test_invalid_options(args, says):
 
 
 def test_small_run(tmp_path, monkeypatch):
-    job = driving.Job(0, 1, beams=101, limit=30.0)
+    job = driving.NavigationJob(0, 1, beams=101, limit=30.0)
     result = driving.run(job, 1, tmp_path, 1, QUIET, worlds=("maze",))
     assert {path.name for path in tmp_path.iterdir()} == {
         f"navigation-maze-beams101{suffix}" for suffix in (".json", ".csv", ".trials.jsonl", ".pdf", ".png")
@@ -398,7 +400,7 @@ def test_interrupted_and_killed_runs(process, tmp_path):
     assert run.wait(30) == 130, run.output
     done = len(store.read_text().splitlines()) - 1
     run = process(*args, env={"PRESAGE_WORKERS": "2"})
-    run.wait_for(f"going on after {done} of 9", 90)
+    run.wait_for(f"continuing after {done} of 9", 90)
 
     def services():
         return [

@@ -16,7 +16,7 @@ from lab.accuracy.scenes import Scene
 from lab.experiments import results
 from lab.experiments import tables_page as page
 from lab.experiments.estimators import PAPER_DESCENT, ExperimentWorld, parse_estimators
-from lab.experiments.trials import Store, run_trials
+from lab.experiments.trials import TrialStore, run_trials
 from lab.paper import alpha_sweep as step_size
 from lab.paper import e1_localisation as localisation
 from lab.paper import e2_crossing as crossing
@@ -58,7 +58,7 @@ def test_interrupted_run(tmp_path):
         run_trials("count", count, jobs(tmp_path, fails_at=4), tmp_path, 1, QUIET)
     ran = set((tmp_path / "ran").read_text().split())
     assert "4" not in ran
-    kept = Store(tmp_path / ".count.unfinished.jsonl", jobs(tmp_path, fails_at=4)).read()
+    kept = TrialStore(tmp_path / ".count.unfinished.jsonl", jobs(tmp_path, fails_at=4)).read()
     (tmp_path / "ran").unlink()
     (tmp_path / "mended").touch()
     rows = run_trials("count", count, jobs(tmp_path, fails_at=4), tmp_path, 1, QUIET)
@@ -70,14 +70,14 @@ def test_interrupted_run(tmp_path):
 
 def test_results_of_other_jobs(tmp_path):
     path = tmp_path / "store"
-    Store(path, jobs(tmp_path)).add(0, {"square": 99})
-    assert Store(path, jobs(tmp_path, fails_at=3)).read() == {}
+    TrialStore(path, jobs(tmp_path)).add(0, {"square": 99})
+    assert TrialStore(path, jobs(tmp_path, fails_at=3)).read() == {}
     assert not path.exists()
 
 
 def test_incomplete_last_line(tmp_path):
     path = tmp_path / "store"
-    store = Store(path, jobs(tmp_path))
+    store = TrialStore(path, jobs(tmp_path))
     store.add(0, {"square": 0})
     store.add(1, {"square": 1})
     path.write_text(path.read_text()[:-5])
@@ -87,7 +87,7 @@ def test_incomplete_last_line(tmp_path):
 
 
 def small(index, **more):
-    return localisation.Job(index, 5, 4, ("paper", "precise"), **more)
+    return localisation.LocalisationJob(index, 5, 4, ("paper", "precise"), **more)
 
 
 def test_reproducible_trials():
@@ -139,7 +139,7 @@ def test_world_without_a_free_line():
 
 
 def test_crossing_with_precise():
-    job = crossing.Job(0, 2, 0.2, ("precise", "precise, odometry"))
+    job = crossing.CrossingJob(0, 2, 0.2, ("precise", "precise, odometry"))
     found = crossing.trial(job)
     assert found == crossing.trial(job)
     assert max(found["error_m"]["precise, odometry"]) < 0.02

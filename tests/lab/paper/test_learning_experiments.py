@@ -18,8 +18,8 @@ from lab.paper import aliasing, prediction, samples
 from services.estimator.shared.interface import Hypothesis, Posterior
 
 QUIET = Console(quiet=True)
-SMALL = samples.Job(3, steps=6, places=2, iterations=3, held_out=20, field=ExperimentWorld("corridor", 60))
-FEW = aliasing.Job(3, places=2, iterations=3, beams=120, samples=60, steps=5, scans=200)
+SMALL = samples.SamplesJob(3, steps=6, places=2, iterations=3, held_out=20, field=ExperimentWorld("corridor", 60))
+FEW = aliasing.AliasingJob(3, places=2, iterations=3, beams=120, samples=60, steps=5, scans=200)
 
 
 def timeless(row):
@@ -117,7 +117,7 @@ def test_small_aliasing(tmp_path):
 
 
 def test_calibrated_precision(tmp_path):
-    job = prediction.Job(2, scans=25)
+    job = prediction.PredictionJob(2, scans=25)
     result = prediction.run(job, tmp_path, 1, QUIET)
     precise, row = result.summary["precise"], result.trials[0]
     for k, (low, high) in {1: (0.65, 0.72), 2: (0.93, 0.97), 3: (0.98, 0.999)}.items():
@@ -137,4 +137,4 @@ def test_calibrated_precision(tmp_path):
 
 def test_prediction_without_weights(tmp_path):
     with pytest.raises(UserError, match="presage train"):
-        prediction.run(prediction.Job(1, field=ExperimentWorld("maze")), tmp_path, 1, QUIET)
+        prediction.run(prediction.PredictionJob(1, field=ExperimentWorld("maze")), tmp_path, 1, QUIET)

@@ -115,13 +115,13 @@ def test_missing_message():
 
 
 def test_estimator_without_a_service(tmp_path):
-    job = navigation.Job(0, 1, estimators=("particle-filter, heading known",))
+    job = navigation.NavigationJob(0, 1, estimators=("particle-filter, heading known",))
     with pytest.raises(UserError, match="heading known"):
         navigation.run(job, 1, tmp_path, 1, QUIET)
 
 
 def test_e3_through_real_processes(tmp_path):
-    job = navigation.Job(0, 7, apart=3.0, estimators=("precise",), field=ExperimentWorld(beams=101))
+    job = navigation.NavigationJob(0, 7, apart=3.0, estimators=("precise",), field=ExperimentWorld(beams=101))
     result = navigation.run(job, 1, tmp_path, 1, QUIET)
     summary = result.summary["precise"]
     assert (summary["reached"], summary["trials_with_contact"]) == (1, 0)
@@ -201,12 +201,12 @@ def test_small_step_sizes(tmp_path, monkeypatch):
         stepping.Setting("velocity", teleports.Steps(beta=0.0, gamma=0.3)),
     ]
     monkeypatch.setattr(stepping, "settings", lambda: few)
-    job = stepping.Job(0, 1, limit=60, velocity_limit=40)
+    job = stepping.StepSizeJob(0, 1, limit=60, velocity_limit=40)
     result = stepping.run(job, 2, tmp_path, 1, QUIET)
     quick, slow, driven = (result.summary[each.name] for each in few)
     assert quick["reached"] == slow["reached"] == 2
     assert 8 < quick["iterations_mean"] < 20 < slow["iterations_mean"]
     assert driven["reached"] == 0  # not in 40 scans
-    again = stepping.trial(stepping.Job(1, 1, limit=60, setting=few[0]))
+    again = stepping.trial(stepping.StepSizeJob(1, 1, limit=60, setting=few[0]))
     assert again == result.trials[1]
     assert "nearest to the paper's 12.5" in result.notes[0]

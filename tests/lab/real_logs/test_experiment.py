@@ -19,7 +19,7 @@ from lab.real_logs.drive import (
     KIDNAPPED,
     LASER,
     MAX_SEARCH_SCANS,
-    Job,
+    StretchJob,
     create_estimator,
     drive_at,
     exchange_halves,
@@ -74,7 +74,7 @@ def test_too_few_reference_poses(tmp_path):
 
 @pytest.mark.parametrize("estimator", ["precise", "particle-filter"])
 def test_kidnapped_robot(folder, estimator):
-    job = Job(
+    job = StretchJob(
         str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), estimator, KIDNAPPED, 100, to=155,
         model=str(folder / "before-precise.safetensors"),
         particles=(
@@ -101,7 +101,9 @@ def test_scans_used_for_tuning(folder, tmp_path, monkeypatch):
         return {"task": job.task, "error_m": error, "state": ["tracking"] * 20}
 
     monkeypatch.setattr(real_tuning, "trial", fake)
-    job = Job(str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "particle-filter", LASER, 0)
+    job = StretchJob(
+        str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "particle-filter", LASER, 0
+    )
     tuned = real_tuning.tune(job, 100, starting_point(MotionNoise()), tmp_path, lambda *_: None)
     for each in (tuned.odometry, tuned.laser):
         assert dict(each).get("keep_initial_pose", 1.0) == 1.0  # recovery was tried and rejected
@@ -117,7 +119,9 @@ def test_scans_used_for_tuning(folder, tmp_path, monkeypatch):
 
 
 def test_motion_model_of_amcl(folder):
-    job = Job(str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "amcl-defaults", LASER, 100)
+    job = StretchJob(
+        str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "amcl-defaults", LASER, 100
+    )
     assert create_estimator(job).settings == ParticleSettings(robot_model_type="omni")
 
 
@@ -131,7 +135,7 @@ def test_odometry_of_a_kidnapping():
 
 
 def test_time_of_a_kidnapping(folder):
-    job = Job(
+    job = StretchJob(
         str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "precise", KIDNAPPED, 155, to=100,
         model=str(folder / "before-precise.safetensors"),
     )  # fmt: skip
@@ -167,7 +171,7 @@ def test_scans_of_training(tmp_path, count, exchanged):
     real_drive.save(log, real_drive.drive(count))
     first, second = split(drive_at(str(log), None))
     learned, localised = (second, first) if exchanged else (first, second)
-    job = Job(str(log), "", None, "precise", LASER, 0, exchanged=exchanged)
+    job = StretchJob(str(log), "", None, "precise", LASER, 0, exchanged=exchanged)
     assert job.drive.poses[: job.learned] == pytest.approx(learned.poses)
     assert job.drive.poses[job.learned :] == pytest.approx(localised.poses)
     assert job.drive.odom[job.learned :] == pytest.approx(localised.odom)
@@ -177,14 +181,14 @@ def test_scans_of_training(tmp_path, count, exchanged):
 
 def test_localised_half(folder):
     where, mount = str(folder / "drive.npz"), (0.0, 0.0, 0.0)
-    job = Job(
+    job = StretchJob(
         where, str(folder / "before.yaml"), mount, "precise", LASER, 100, 30,
         model=str(folder / "before-precise.safetensors"), exchanged=True,
     )  # fmt: skip
     found = real.summarise([one_trial(job)])  # by a model of these very scans
     assert found["error_median_m"] < 0.05
     assert job.drive.poses[100] == pytest.approx(drive_at(where, mount).poses[0])
-    assert real.Job(folder / "drive.npz", "map.yaml", exchange=True).result == "real-drive_exchanged"
+    assert real.RealLogJob(folder / "drive.npz", "map.yaml", exchange=True).result == "real-drive_exchanged"
 
 
 def row(task, error, state, stamps=None):
@@ -215,13 +219,13 @@ def test_table(tmp_path):
 
 def test_short_log(folder, tmp_path):
     real_drive.save(tmp_path / "few.npz", real_drive.drive(100))
-    job = real.Job(tmp_path / "few.npz", str(folder / "before.yaml"))
+    job = real.RealLogJob(tmp_path / "few.npz", str(folder / "before.yaml"))
     with pytest.raises(UserError, match="100 posed scans; at least 160"):
         real.run(job, tmp_path, 1, Console(quiet=True))
 
 
 def test_map_of_another_place(folder, tmp_path):
-    job = real.Job(folder / "drive.npz", "office", (0.0, 0.0, 0.0))
+    job = real.RealLogJob(folder / "drive.npz", "office", (0.0, 0.0, 0.0))
     elsewhere = World(name="elsewhere", boundary=[(50, 50), (60, 50), (60, 60), (50, 60)])
     (tmp_path / "elsewhere.yaml").write_text(save_world(elsewhere), encoding="utf-8")
     with pytest.raises(UserError, match=r"only 0% of the reference poses .* in free space"):
