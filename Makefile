@@ -1,4 +1,4 @@
-# `make` lists what there is. Needs GNU make, a POSIX shell and Python >= 3.10; everything else goes into .venv.
+# `make` lists the targets. Needs GNU make, a POSIX shell and Python >= 3.10; everything else goes into .venv.
 
 PYTHON ?=
 WHEEL_INDEX ?=
@@ -12,14 +12,14 @@ PIP := $(BIN)/python -m pip install --disable-pip-version-check --quiet
 .PHONY: help install demo test bless check bench chaos screenshots images clean FORCE
 .DELETE_ON_ERROR:
 
-help: ## this list
+help: ## list the targets
 	@echo 'make TARGET [PYTHON=python3.11] [WHEEL_INDEX=URL] [ARGS="..."]'
 	@sed -n 's/^\([a-z]*\):[^#]*## /  \1	/p' $(firstword $(MAKEFILE_LIST)) | expand -t 16
 	@echo 'PyTorch without gigabytes of CUDA: WHEEL_INDEX is the URL of its index of CPU wheels (see pytorch.org)'
 
-install: $(STAMP) ## make .venv with everything in it; does nothing where nothing changed
+install: $(STAMP) ## create .venv with all packages; does nothing if it is up to date
 
-# The stamp is written last, so an install that was interrupted is done again.
+# The stamp is written last, so that an interrupted installation is repeated.
 $(STAMP): pyproject.toml constraints.txt
 	@rm -f $@
 	@$(find_venv)
@@ -27,15 +27,15 @@ $(STAMP): pyproject.toml constraints.txt
 	$(PIP) $(if $(WHEEL_INDEX),--extra-index-url '$(WHEEL_INDEX)') -c constraints.txt -e '.[dev]'
 	@touch $@
 
-# A Python that is asked for is taken, though the files are older than the stamp.
+# Installs again if PYTHON names another version than the one in .venv, although the stamp is up to date.
 ifneq ($(PYTHON),)
 ifneq ($(shell $(BIN)/python --version 2>&1),$(shell '$(PYTHON)' --version 2>&1))
 $(STAMP): FORCE
 endif
 endif
 
-# A name on the path may be a stub that fails (pyenv), and Debian ships Python without venv: each is tried, not believed.
-# PyBullet has wheels for 3.10 and 3.11 alone, so these come first.
+# A Python on the path may be a stub that fails (pyenv) or lack venv (Debian), so each is run before it is used.
+# PyBullet has wheels for 3.10 and 3.11 only, so these are tried first.
 define find_venv
 if $(BIN)/python -m pip --version >/dev/null 2>&1 \
   && { test -z '$(PYTHON)' || test "$$($(BIN)/python --version)" = "$$('$(PYTHON)' --version 2>&1)"; }; then exit 0; fi; \
@@ -59,12 +59,12 @@ demo: install ## localise and drive in the corridor: every service, a live page,
 	$(BIN)/presage demo --open $(ARGS)
 
 test: install ## all tests
-	@# Hundreds of processes are started: each would compile all modules anew where Python is told to write none (PYTHONDONTWRITEBYTECODE).
+	@# Hundreds of processes are started: with PYTHONDONTWRITEBYTECODE set, each would compile all modules again.
 	@$(BIN)/python -m compileall -q common services presage lab worlds models tests
-	@# Three workers keep two cores busy, because tests of processes wait much; one core for each, as more threads only disturb others.
+	@# Three workers keep two cores busy, because tests of processes mostly wait. More than one thread each would slow the others.
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder $(ARGS)
 
-bless: install ## show what services answer differently than their references, and accept it
+bless: install ## show how the outputs of services differ from the stored references, and accept them
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.process_replay.bless $(ARGS)
 
 check: install ## style, format and types
@@ -72,16 +72,16 @@ check: install ## style, format and types
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
-bench: install ## latency from scan to command beside the raw zenoh round trip
+bench: install ## measure the latency from scan to command and zenoh's own round trip
 	$(BIN)/presage bench latency $(ARGS)
 
-chaos: install ## inject faults into a system on three hosts: times of detection, stop and recovery
+chaos: install ## inject faults into a system on three hosts; measure detection, stop and recovery
 	$(BIN)/presage bench chaos $(ARGS)
 
 screenshots: install ## docs/page.png and docs/page.webp of the live page; needs Chromium
 	$(BIN)/python -m tests.viewer.screenshots $(ARGS)
 
-images: ## build every container image, and say what each adds to its base, python:3.11-slim
+images: ## build all container images, and print how much each adds to its base, python:3.11-slim
 	docker compose build $(if $(WHEEL_INDEX),--build-arg WHEEL_INDEX='$(WHEEL_INDEX)')
 	for scanner in replay none bridge_ros2; do PRESAGE_SCANNER=$$scanner docker compose build simulator || exit 1; done
 	@base=$$(docker image inspect --format '{{.Size}}' python:3.11-slim); \
@@ -90,6 +90,6 @@ images: ## build every container image, and say what each adds to its base, pyth
 	  echo "presage-$$name: $$(( ($$size - $$base) / 1000000 )) MB"; \
 	done
 
-clean: ## remove .venv and what tools leave behind; recordings stay
+clean: ## remove .venv and caches; recordings are kept
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist
 	find common services presage lab tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -146,7 +146,7 @@ def test_both_rooms_kept(believe, kept, wrong):
     scene = Scene.of(TWINS, 60, 4)
     scene.observe = lambda clean, stamp: None  # the noise would change the paths drawn after it
     found = tasks.twins(ScriptedEstimator(paths, believe), scene, 2, iter)["two rooms alike: both kept"]
-    assert (found.found, found.of, found.wrong) == (kept, 2, wrong)
+    assert (found.found, found.total, found.wrong) == (kept, 2, wrong)
 
 
 def test_short_table(capsys):

@@ -68,7 +68,7 @@ def test_too_few_reference_poses(tmp_path):
     with pytest.raises(UserError, match="no reference poses"):
         train_from_drive(Training(tmp_path / "bare.npz", out=tmp_path, reading=HERE), Console(quiet=True))
     real_drive.save(tmp_path / "short.npz", real_drive.drive(60))
-    with pytest.raises(UserError, match="30 scans with a reference pose; at least 50 are needed"):
+    with pytest.raises(UserError, match="30 scans with a reference pose; training needs at least 50"):
         train_from_drive(Training(tmp_path / "short.npz", out=tmp_path, share=0.5, reading=HERE), Console(quiet=True))
 
 
