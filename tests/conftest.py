@@ -267,7 +267,7 @@ def processes(tmp_path):
 @pytest.fixture
 def presage(monkeypatch, capsys):
     """A function that runs a command of the command line in this process. Returns its exit status and its output."""
-    from presage.cli.main import main  # noqa: PLC0415 - most tests do not need its many imports
+    from presage.cli.main import main  # most tests do not need its many imports
 
     def run(*args):
         monkeypatch.setattr(sys, "argv", ["presage", *args])

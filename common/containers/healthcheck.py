@@ -66,10 +66,10 @@ def _check_page() -> None:
 def _reach_router() -> None:
     """Open a session like a service's, but without listening on a port."""
     # Imported here because these imports take as long as all others together.
-    from dataclasses import replace  # noqa: PLC0415
+    from dataclasses import replace
 
-    from common.bus.bus import open_bus, wait_until  # noqa: PLC0415
-    from common.runtime.config import ServiceSettings, load_settings  # noqa: PLC0415
+    from common.bus.bus import open_bus, wait_until
+    from common.runtime.config import ServiceSettings, load_settings
 
     link = replace(load_settings(ServiceSettings, ["--role", "router"]).link(), listen=())
     with open_bus(link, connect_timeout=CONNECT_TIMEOUT_S) as bus:

@@ -239,7 +239,7 @@ class World(Model):
 
         They are +inf if nothing is hit.
         """
-        from common.geometry.ray_casting import cast_rays  # noqa: PLC0415 - numba, which most services do not need
+        from common.geometry.ray_casting import cast_rays  # numba, which most services do not need
 
         return cast_rays(self, poses, angles)
 

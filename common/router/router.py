@@ -94,8 +94,8 @@ def route(link: Link, log: Logger, metrics: str = "") -> None:
             bus = stack.enter_context(open_bus(link, log_filter=LOG_FILTER))
             facts["lets_in"] = [member.name for member in link.security.members]
         if metrics:
-            from common.router.metrics import router_metrics  # noqa: PLC0415
-            from common.runtime.metrics_server import serve  # noqa: PLC0415
+            from common.router.metrics import router_metrics
+            from common.runtime.metrics_server import serve
 
             log.info("metrics", address=stack.enter_context(serve(router_metrics(bus), metrics)))
         log.info("router listens", endpoints=", ".join(link.listen), **facts)

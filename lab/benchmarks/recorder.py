@@ -60,7 +60,7 @@ def publish_main() -> None:
         Scan(stamp_ns=0, angle_min=0, angle_increment=0, range_min=0, range_max=25, ranges=r).model_dump()
         for r in ranges
     ]
-    from common.bus.bus import Link  # noqa: PLC0415
+    from common.bus.bus import Link
 
     with open_bus(Link(robot=ROBOT, connect=(os.environ["PRESAGE_CONNECT"],))) as bus:
         for topic in LOAD_TOPICS:

@@ -31,7 +31,7 @@ def bench_latency(
 
     Examples: `presage bench latency --json latency.json`; `PRESAGE_SECURITY=keys presage bench latency` (TLS, roles).
     """
-    from lab.benchmarks.latency import bench_latency as run  # noqa: PLC0415
+    from lab.benchmarks.latency import bench_latency as run
 
     raise typer.Exit(run(scans, 15.0, BEAMS, json_file, console))
 
@@ -42,7 +42,7 @@ def bench_viewer(seconds: Seconds = 20.0, rounds: Rounds = 3, json_file: Json = 
 
     Example: `presage bench viewer --json viewer.json`.
     """
-    from lab.benchmarks.viewer import bench_viewer as run  # noqa: PLC0415
+    from lab.benchmarks.viewer import bench_viewer as run
 
     raise typer.Exit(run(seconds, rounds, BEAMS, json_file, console))
 
@@ -58,7 +58,7 @@ def bench_map(
 
     Examples: `presage bench map`; `presage bench map --world my/map.yaml`; `presage bench map --size 2000 --out made`.
     """
-    from lab.benchmarks.maps import bench_map as run  # noqa: PLC0415
+    from lab.benchmarks.maps import bench_map as run
 
     raise typer.Exit(run(world, size, BEAMS, out, 0, json_file, console))
 
@@ -69,7 +69,7 @@ def bench_metrics(seconds: Seconds = 20.0, rounds: Rounds = 3, json_file: Json =
 
     Examples: `presage bench metrics`; `presage bench metrics --seconds 5 --rounds 1 --json metrics.json`.
     """
-    from lab.benchmarks.metrics import bench_metrics as run  # noqa: PLC0415
+    from lab.benchmarks.metrics import bench_metrics as run
 
     raise typer.Exit(run(seconds, rounds, json_file, console))
 
@@ -84,7 +84,7 @@ def bench_localisation(
 
     Example: `presage bench localisation --trials 20`.
     """
-    from lab.accuracy.paper_localisation import bench_localisation as run  # noqa: PLC0415
+    from lab.accuracy.paper_localisation import bench_localisation as run
 
     raise typer.Exit(run(world, BEAMS, trials, 25, 1, json_file, console))
 
@@ -121,7 +121,7 @@ def bench_accuracy(
     `presage bench accuracy --worlds office,corridor,maze --json accuracy.json --figure accuracy.png`;
     `presage bench accuracy --scanner lms200,rplidar-a1 --tasks standing,tracking --markdown`.
     """
-    from lab.accuracy.report import bench_accuracy as run  # noqa: PLC0415
+    from lab.accuracy.report import bench_accuracy as run
 
     code = run(
         worlds,
@@ -147,7 +147,7 @@ def bench_speed(world: WorldName = "office", json_file: Json = None) -> None:
 
     Example: `presage bench speed --json speed.json`.
     """
-    from lab.accuracy.speed import bench_speed as run  # noqa: PLC0415
+    from lab.accuracy.speed import bench_speed as run
 
     raise typer.Exit(run(world, "622,811", 1, json_file, console))
 
@@ -162,7 +162,7 @@ def bench_decoders(
 
     Example: `presage bench decoders --steps 300 --json decoders.json`.
     """
-    from lab.accuracy.decoders import bench_decoders as run  # noqa: PLC0415
+    from lab.accuracy.decoders import bench_decoders as run
 
     raise typer.Exit(run(world, 5000, steps, 0, json_file, console))
 
@@ -181,8 +181,8 @@ def bench_recorder(
 
     Examples: `presage bench recorder`; `presage bench recorder --seconds 10 --rate 5000 --json recorder.json`.
     """
-    from lab.benchmarks.recorder import RecorderLoad  # noqa: PLC0415
-    from lab.benchmarks.recorder import bench_recorder as run  # noqa: PLC0415
+    from lab.benchmarks.recorder import RecorderLoad
+    from lab.benchmarks.recorder import bench_recorder as run
 
     raise typer.Exit(run(RecorderLoad(rate, seconds), out, json_file, console))
 
@@ -206,7 +206,7 @@ def bench_chaos(
 
     Examples: `presage bench chaos`; `presage bench chaos 'killed*' --repeats 3 --json chaos.json`.
     """
-    from lab.fault_injection.bench import bench_chaos as run  # noqa: PLC0415
+    from lab.fault_injection.bench import bench_chaos as run
 
     raise typer.Exit(run(faults or [], repeats, json_file, console, one_host=one_host, quiet=not verbose))
 
@@ -226,8 +226,8 @@ def bench_fleet(
 
     Examples: `presage bench fleet`; `presage bench fleet --estimators precise --seconds 3 --most 8` (quick).
     """
-    from lab.benchmarks.fleet import FleetPlan  # noqa: PLC0415
-    from lab.benchmarks.fleet import bench_fleet as run  # noqa: PLC0415
+    from lab.benchmarks.fleet import FleetPlan
+    from lab.benchmarks.fleet import bench_fleet as run
 
     plan = FleetPlan("corridor", BEAMS, rate=15.0, seconds=seconds, max_robots=most, share=0.999, seed=1)
     raise typer.Exit(run(estimators, plan, json_file, console))
@@ -241,6 +241,6 @@ def bench_hosts(seconds: Seconds = 30.0, json_file: Json = None) -> None:
 
     Example: `presage bench hosts --json hosts.json`.
     """
-    from lab.fault_injection.links import bench_hosts as run  # noqa: PLC0415
+    from lab.fault_injection.links import bench_hosts as run
 
     raise typer.Exit(run(seconds, BEAMS, json_file, console))

@@ -45,8 +45,8 @@ def e1(
     Examples: `presage experiment e1 --trials 5`; `presage experiment e1 --alpha 5e-4 --out slow`;
     `presage experiment e1 --estimators "paper,precise" --iterations 200`.
     """
-    from lab.experiments.estimators import PAPER_DESCENT, parse_estimators  # noqa: PLC0415
-    from lab.paper import e1_localisation as localisation  # noqa: PLC0415
+    from lab.experiments.estimators import PAPER_DESCENT, parse_estimators
+    from lab.paper import e1_localisation as localisation
 
     job = localisation.LocalisationJob(0, seed, iterations)
     job = replace(job, descent=replace(PAPER_DESCENT, alpha=alpha)) if alpha is not None else job
@@ -65,8 +65,8 @@ def e2(
 
     Examples: `presage experiment e2 --trials 2`; `presage experiment e2 --estimators precise`.
     """
-    from lab.experiments.estimators import parse_estimators  # noqa: PLC0415
-    from lab.paper import e2_crossing as crossing  # noqa: PLC0415
+    from lab.experiments.estimators import parse_estimators
+    from lab.paper import e2_crossing as crossing
 
     job = crossing.CrossingJob(0, seed)
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
@@ -88,8 +88,8 @@ def e3(
     Examples: `presage experiment e3 --trials 2`; `presage experiment e3 --estimators precise --out near`;
     `presage experiment e3 --any --trials 20 --estimators precise --out any`.
     """
-    from lab.experiments.estimators import parse_estimators  # noqa: PLC0415
-    from lab.paper import e3_navigation as navigation  # noqa: PLC0415
+    from lab.experiments.estimators import parse_estimators
+    from lab.paper import e3_navigation as navigation
 
     job = navigation.NavigationJob(0, seed, free=free)
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
@@ -106,8 +106,8 @@ def alpha_sweep(
 
     Example: `presage experiment alpha --trials 10`.
     """
-    from lab.paper import alpha_sweep as step_size  # noqa: PLC0415
-    from lab.paper import e1_localisation as localisation  # noqa: PLC0415
+    from lab.paper import alpha_sweep as step_size
+    from lab.paper import e1_localisation as localisation
 
     show(
         step_size,
@@ -122,7 +122,7 @@ def step_sizes(trials: Trials = 10, seed: ExperimentSeed = 1, out: Out = OUT) ->
 
     Example: `presage experiment steps --trials 2`.
     """
-    from lab.paper import step_sizes as stepping  # noqa: PLC0415
+    from lab.paper import step_sizes as stepping
 
     show(stepping, lambda: stepping.run(stepping.StepSizeJob(0, seed), trials, out, worker_count(), console), out)
 
@@ -136,7 +136,7 @@ def samples_needed(
 
     Example: `presage experiment samples`.
     """
-    from lab.paper import samples  # noqa: PLC0415
+    from lab.paper import samples
 
     show(samples, lambda: samples.run(samples.SamplesJob(seed), out, worker_count(), console), out)
 
@@ -151,7 +151,7 @@ def similar_objects(
 
     Example: `presage experiment aliasing --trials 5`.
     """
-    from lab.paper import aliasing  # noqa: PLC0415
+    from lab.paper import aliasing
 
     show(aliasing, lambda: aliasing.run(aliasing.AliasingJob(seed, places=trials), out, worker_count(), console), out)
 
@@ -165,7 +165,7 @@ def predicted(
 
     Example: `presage experiment prediction --seed 7 --out other`.
     """
-    from lab.paper import prediction  # noqa: PLC0415
+    from lab.paper import prediction
 
     show(prediction, lambda: prediction.run(prediction.PredictionJob(seed), out, 1, console), out)
 
@@ -197,8 +197,8 @@ def real_drive(
     `presage experiment real --log drive.npz --mount 0,0,0 --world first_half.yaml --quick`;
     `presage experiment real --log fr079.mcap --world fr079.yaml --name fr079 --every 50 --out mine`.
     """
-    from common.geometry.pose_text import pose_of_text  # noqa: PLC0415
-    from lab.real_logs import experiment as real  # noqa: PLC0415
+    from common.geometry.pose_text import pose_of_text
+    from lab.real_logs import experiment as real
 
     if not re.fullmatch(r"[\w.-]*", name):
         raise UserError(f"--name {name!r}: use only letters, digits, '.', '_' and '-', as it becomes a file name")
@@ -220,7 +220,7 @@ def all_experiments(
 
     Examples: `presage experiment all`; `presage experiment all --trials 3 --out look`.
     """
-    from lab.paper.suite import run_all  # noqa: PLC0415
+    from lab.paper.suite import run_all
 
     make_folder(out, "--out")
     run_all(trials, seed, out, worker_count(), console)
@@ -236,7 +236,7 @@ def tables(
     Examples: `presage experiment tables`;
     `presage experiment tables --page docs/experiments.md --out docs/experiments`.
     """
-    from lab.experiments.tables_page import MODULES, fill_tables, table_of  # noqa: PLC0415
+    from lab.experiments.tables_page import MODULES, fill_tables, table_of
 
     if page is not None:
         page.write_text(fill_tables(page.read_text(encoding="utf-8"), out), encoding="utf-8")

@@ -40,7 +40,7 @@ def navigate(
     `presage experiment navigation --worlds twins --start unknown --trials 50 --no-epistemic`;
     `presage experiment navigation --worlds my.yaml --drives differential --seed 7 --out mine`.
     """
-    from lab.navigation import experiment as driving  # noqa: PLC0415
+    from lab.navigation import experiment as driving
 
     job = driving.NavigationJob(0, seed, start=start, people=people, estimator=estimator, epistemic=epistemic)
     world_names, drive_names = (

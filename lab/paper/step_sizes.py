@@ -122,7 +122,7 @@ def _run_displacement(job: StepSizeJob, world: World, journey: Journey) -> dict[
 
 def _run_velocity(job: StepSizeJob, world: World, journey: Journey) -> dict[str, Any]:
     """Runs the journey as in E3, but in one process and with the job's step sizes."""
-    from services.simulator.simulation import Setup, Simulation  # noqa: PLC0415 - pybullet, for this alone
+    from services.simulator.simulation import Setup, Simulation  # pybullet, for this alone
 
     scanner, steps = job.field.scene(0).scanner, job.setting.steps
     pose, goal = (*journey.start, job.field.heading), np.array([*journey.goal, job.field.heading])

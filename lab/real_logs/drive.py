@@ -63,7 +63,7 @@ class StretchJob:
 @functools.lru_cache(maxsize=2)
 def drive_at(log: str, mount: tuple[float, float, float] | None, exchanged: bool = False) -> Drive:
     """The scans of a log that have reference poses; cached per process. ``exchanged`` puts the second half first."""
-    from presage.logs.log import Reading  # noqa: PLC0415
+    from presage.logs.log import Reading
 
     if exchanged:
         return exchange_halves(drive_at(log, mount))

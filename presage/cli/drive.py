@@ -51,8 +51,8 @@ def goal(
 
     Examples: `presage goal 15 1.5 --wait`; `presage goal 15 1.5 90`; `presage goal --cancel`.
     """
-    from common.messages.definitions import Goal  # noqa: PLC0415
-    from presage.live.commands import send_goal  # noqa: PLC0415
+    from common.messages.definitions import Goal
+    from presage.live.commands import send_goal
 
     if not cancel and (x is None or y is None):
         raise UserError("a goal is two numbers, X Y in m (or --cancel)")
@@ -86,7 +86,7 @@ def teleport(
     Example: `presage teleport 9 1.5`. Preset paper can only localise at the heading it was trained for, 90 deg in
     corridor.
     """
-    from presage.live.commands import teleport as run  # noqa: PLC0415
+    from presage.live.commands import teleport as run
 
     run(link_of(connect, robot), _pose(x, y, yaw), console)
 
@@ -109,7 +109,7 @@ def relocalise(
 
     Examples: `presage relocalise`; `presage relocalise 3 1.5`.
     """
-    from presage.live.commands import relocalise as run  # noqa: PLC0415
+    from presage.live.commands import relocalise as run
 
     if (x is None) != (y is None):
         raise UserError("a position is two numbers, X Y in m")
@@ -119,7 +119,7 @@ def relocalise(
 
 def _pose(x: float, y: float, yaw: float = 0.0) -> Pose:
     """A pose from m and deg; raises UserError if a value is not finite or too far from the origin."""
-    from common.messages.definitions import Pose  # noqa: PLC0415
+    from common.messages.definitions import Pose
 
     if not np.isfinite([x, y, yaw]).all():
         given = f"{x:g} {y:g}" + (f" {yaw:g}" if yaw else "")

@@ -66,17 +66,17 @@ def train(
     `presage train --from drive.npz --mount 0,0,0 --world map.yaml --out mine`, then
     `presage localize drive.npz --mount 0,0,0 --world map.yaml --model mine`.
     """
-    from common.runtime.config import load_section, load_settings  # noqa: PLC0415
-    from presage.learning import train_precise as precise  # noqa: PLC0415
-    from presage.learning import train_simulated as paper  # noqa: PLC0415
-    from presage.learning.options import TrainSettings  # noqa: PLC0415
-    from presage.learning.train_drive import TrainDriveOptions, train_from_drive  # noqa: PLC0415
-    from presage.logs.options import LogSettings  # noqa: PLC0415
-    from presage.session.running import link_of  # noqa: PLC0415
-    from services.estimator.paper.training import Recipe as PaperRecipe  # noqa: PLC0415
-    from services.estimator.precise.learning.field_learning import Recipe  # noqa: PLC0415
-    from services.estimator.precise.learning.weights import FOLDER  # noqa: PLC0415
-    from services.simulator.settings import SimulatorSettings  # noqa: PLC0415
+    from common.runtime.config import load_section, load_settings
+    from presage.learning import train_precise as precise
+    from presage.learning import train_simulated as paper
+    from presage.learning.options import TrainSettings
+    from presage.learning.train_drive import TrainDriveOptions, train_from_drive
+    from presage.logs.options import LogSettings
+    from presage.session.running import link_of
+    from services.estimator.paper.training import Recipe as PaperRecipe
+    from services.estimator.precise.learning.field_learning import Recipe
+    from services.estimator.precise.learning.weights import FOLDER
+    from services.simulator.settings import SimulatorSettings
 
     if preset not in ("precise", "paper"):
         raise UserError(f"no preset {preset!r}: choose precise or paper")
@@ -131,9 +131,9 @@ def map_(
     Examples: `presage map run.mcap`; `presage map fr079.npz --mount 0,0,0 --half first -o first_half.yaml`, then
     `presage experiment real --log fr079.npz --mount 0,0,0 --world first_half.yaml`.
     """
-    from common.runtime.config import load_section  # noqa: PLC0415
-    from presage.learning.map_of_log import MapOptions, map_command  # noqa: PLC0415
-    from presage.logs.options import LogSettings  # noqa: PLC0415
+    from common.runtime.config import load_section
+    from presage.learning.map_of_log import MapOptions, map_command
+    from presage.logs.options import LogSettings
 
     target = out or Path(f"{log.resolve().name.split('.')[0]}.yaml")
     reading = load_section(LogSettings, config, "log", mount=mount).reading()

@@ -70,11 +70,11 @@ def localize(
     `presage localize drive.log.bz2 --world map.yaml --start 60 --end 120` (the second minute);
     `presage localize drive.log.bz2 --world map.yaml --every 10 --mode track --initial-pose 3,1.5,90`.
     """
-    from common.runtime.config import load_section, load_settings  # noqa: PLC0415
-    from presage.logs.options import LogSettings  # noqa: PLC0415
-    from presage.replay.localize import LocalizeOptions, build_estimator_options  # noqa: PLC0415
-    from presage.replay.localize import localize as run  # noqa: PLC0415
-    from services.estimator.settings import EstimatorSettings  # noqa: PLC0415
+    from common.runtime.config import load_section, load_settings
+    from presage.logs.options import LogSettings
+    from presage.replay.localize import LocalizeOptions, build_estimator_options
+    from presage.replay.localize import localize as run
+    from services.estimator.settings import EstimatorSettings
 
     chosen = arguments(config=config, estimator=estimator, initial_pose=initial_pose, **model_setting(model))
     settings, log = load_settings(EstimatorSettings, chosen), load_section(LogSettings, config, "log", mount=mount)
@@ -126,9 +126,9 @@ def import_(
     `presage import drive.bag`; `presage import bag_folder --mount 0.2,0,0`;
     `presage import gfs.log --config gfs.yaml`, which contains `log: {reference: true}`.
     """
-    from common.runtime.config import load_section  # noqa: PLC0415
-    from presage.logs.importing import ImportOptions, import_command  # noqa: PLC0415
-    from presage.logs.options import LogSettings  # noqa: PLC0415
+    from common.runtime.config import load_section
+    from presage.logs.importing import ImportOptions, import_command
+    from presage.logs.options import LogSettings
 
     log = load_section(LogSettings, config, "log", mount=mount)
     target = out or Path(f"{file.resolve().name.split('.')[0]}.mcap")

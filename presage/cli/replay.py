@@ -86,7 +86,7 @@ def replay(
     `presage replay run.mcap --rate 4 --start 10 --end -5 --loop`; `presage replay run.mcap --except belief,prediction`;
     `presage replay run.mcap --robot ghost` (beside a live robot); `presage replay run.mcap --with estimator`.
     """
-    from presage.replay.bus_replay import replay_options, run_replay  # noqa: PLC0415
+    from presage.replay.bus_replay import replay_options, run_replay
 
     bus_options = replay_options(
         only, leave_out, rate, start, end, robot, loop=loop, force=force, paused=paused, stay=paused
@@ -101,7 +101,7 @@ def replay(
         raise UserError(
             "--with sends all recorded inputs as fast as possible: leave out the options that choose what to replay"
         )
-    from presage.replay.service_replay import ServiceReplayOptions, service_replay_command  # noqa: PLC0415
+    from presage.replay.service_replay import ServiceReplayOptions, service_replay_command
 
     options = ServiceReplayOptions(file, with_services, every_scan)
     raise typer.Exit(service_replay_command(options, json_file, console))
@@ -131,7 +131,7 @@ def rerun(
     `presage rerun run.mcap --model exact --out exact.mcap`;
     `presage rerun run.mcap --config global.yaml`, which contains `estimator: {prior: odometry, initial_pose: ''}`.
     """
-    from presage.replay.rerun import RerunOptions, rerun_command  # noqa: PLC0415
+    from presage.replay.rerun import RerunOptions, rerun_command
 
     chosen = {} if config is None else read_section(config, "estimator")
     chosen |= given_options(estimator=estimator, world=world, **model_setting(model))

@@ -36,7 +36,7 @@ def check_installation(world: str) -> Iterator[Finding]:
 
 
 def _check_weights(used_world: str) -> Iterator[Finding]:
-    from services.estimator.precise.learning import weights as precise  # noqa: PLC0415 - needs the estimator's packages
+    from services.estimator.precise.learning import weights as precise  # needs the estimator's packages
 
     where = str(precise.FOLDER)
     try:

@@ -60,7 +60,7 @@ def open_log(path: Path, reading: Reading) -> Log:
         raise UserError(f"{path}: {IS_A_RECORDING}")
     if kind == "ros1" or kind == "ros2":  # noqa: PLR1714 - mypy narrows the type only this way
         try:
-            from presage.logs.rosbag import open_rosbag  # noqa: PLC0415 - rosbags takes a moment to import
+            from presage.logs.rosbag import open_rosbag  # rosbags takes a moment to import
         except ModuleNotFoundError as error:
             raise UserError(f"{path}: ROS bags need the package {error.name}: pip install 'presage[logs]'") from None
 

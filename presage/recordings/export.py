@@ -61,16 +61,16 @@ def run_export(options: ExportOptions, json_file: Path | None, console: Console)
 def _write(options: ExportOptions, recording: Recording, out: Path, console: Console) -> dict[str, int]:
     """Writes the export and returns the number of rows or messages by name; imports only the format's module."""
     if options.format == "csv":
-        from presage.recordings.csv_tables import export_csv  # noqa: PLC0415
+        from presage.recordings.csv_tables import export_csv
 
         return export_csv(recording, out, options.robot, console, arrays=options.arrays, force=options.force)
     if options.format == "tum":
-        from presage.recordings.tum import export_tum  # noqa: PLC0415
+        from presage.recordings.tum import export_tum
 
         only = options.localised_only
         return export_tum(recording, out, options.robot, console, localised_only=only, force=options.force)
     try:
-        from presage.recordings.foxglove import export_foxglove  # noqa: PLC0415
+        from presage.recordings.foxglove import export_foxglove
     except ModuleNotFoundError as error:
         raise UserError(f"{error.name} is not installed: run pip install 'presage[export]'") from None
     return export_foxglove(recording, out, options.robot, console, force=options.force)

@@ -92,9 +92,9 @@ def estimator_settings(
 
 def check_mount(recording: Recording, settings: EstimatorSettings) -> None:
     """Raises UserError if the recording's mount is only assumed and the weights were trained with another mount."""
-    from presage.logs.scan_files import mount_assumed  # noqa: PLC0415 - slow import of numba
-    from services.estimator.factory import Geometry  # noqa: PLC0415
-    from services.estimator.service import Models  # noqa: PLC0415
+    from presage.logs.scan_files import mount_assumed  # slow import of numba
+    from services.estimator.factory import Geometry
+    from services.estimator.service import Models
 
     if mount_assumed(recording):
         scan = next(message for _, message, _ in recording.messages(SCAN) if isinstance(message, Scan))
@@ -134,7 +134,7 @@ def _extract_weights(recording: Recording, folder: Path, model: dict[str, str]) 
 
 def _find_weights(recording: Recording, values: dict[str, Any], model: dict[str, str]) -> Path:
     """The recorded weights in the recorded folder or among the shipped ones; raises UserError if they are not there."""
-    from services.estimator.precise.learning.weights import FOLDER  # noqa: PLC0415 - slow import of numba
+    from services.estimator.precise.learning.weights import FOLDER  # slow import of numba
 
     folders = [Path(values["models"])] if values.get("models") else []
     recorded_file = Path(str(values.get("model", "")))

@@ -82,7 +82,7 @@ class ControllerService(Service):
         world = load_world(settings.world) if settings.world else None
         if settings.preset == "geodesic" and world is not None:
             # scipy takes a third of a second to import, and preset paper does not need it.
-            from services.controller.policies.planner import GeodesicPolicy  # noqa: PLC0415
+            from services.controller.policies.planner import GeodesicPolicy
 
             keep_heading = settings.heading == "keep"
             self.geodesic = GeodesicPolicy(robot, world, keep_heading=keep_heading, epistemic=settings.epistemic)

@@ -243,10 +243,10 @@ def _compile(model: GenerativeModel, seeds: Seeds, likelihood: Likelihood) -> No
 
 def _paper(options: EstimatorOptions, world: World) -> Factory:
     # Imported only here, because torch takes a second to import and the other estimators do not need it.
-    from services.estimator.paper import weights as paper_weights  # noqa: PLC0415
-    from services.estimator.paper.beam_fitting import fit  # noqa: PLC0415
-    from services.estimator.paper.decoder import use_one_core  # noqa: PLC0415
-    from services.estimator.paper.estimator import PaperPerception  # noqa: PLC0415
+    from services.estimator.paper import weights as paper_weights
+    from services.estimator.paper.beam_fitting import fit
+    from services.estimator.paper.decoder import use_one_core
+    from services.estimator.paper.estimator import PaperPerception
 
     use_one_core()
     folder, files, remedy = _paper_weights(options, world)
@@ -275,7 +275,7 @@ def _paper_weights(options: EstimatorOptions, world: World) -> tuple[Path, dict[
 
     Raises UserError if there are none.
     """
-    from services.estimator.paper import weights as paper_weights  # noqa: PLC0415 - torch, as above
+    from services.estimator.paper import weights as paper_weights  # torch, as above
 
     folder = options.models or paper_weights.FOLDER
     files = paper_weights.available(folder, world.name, "paper")

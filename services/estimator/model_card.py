@@ -61,7 +61,7 @@ def model_in_use(options: EstimatorOptions, beams: int | None) -> ModelInUse:
         if beams is None:
             raise UserError("no scan has come yet: how many beams, and so which weights, is not known")
         # Imported only here, because torch takes a second to import and the other estimators do not need it.
-        from services.estimator.paper import weights as paper_weights  # noqa: PLC0415
+        from services.estimator.paper import weights as paper_weights
 
         path = paper_weights.nearest(options.models or paper_weights.FOLDER, world.name, "paper", beams)
         return _learned(options.estimator, world, path, path.name)

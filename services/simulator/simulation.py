@@ -56,7 +56,7 @@ class Simulation:
         self.people: People | None = None
         if setup.people:
             # scipy takes half a second to import, and a world without people does not need it.
-            from services.simulator.people import People  # noqa: PLC0415
+            from services.simulator.people import People
 
             people_rng = np.random.default_rng(people_seed)
             self.people = People(self.world, setup.people, setup.people_speed, people_rng, pose[:2], robot.radius)

@@ -131,7 +131,7 @@ def describe_file(path: Path) -> dict[str, Any]:
     row = {"name": path.name, "size": status.st_size, "modified": status.st_mtime}
     # Without the package mcap, or for an unfinished file, the duration stays unknown. A list is no place for an error.
     with suppress(Exception):
-        from mcap.reader import make_reader  # noqa: PLC0415 - optional for the viewer
+        from mcap.reader import make_reader  # optional for the viewer
 
         with path.open("rb") as stream:
             summary = make_reader(stream).get_summary()

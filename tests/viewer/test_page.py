@@ -60,7 +60,7 @@ def system(tmp_path_factory):
 @pytest.fixture
 def page(browser, system):
     """A visitor who sees the robot tracked."""
-    from tests.viewer.browser import visit  # noqa: PLC0415 - without playwright these tests are skipped
+    from tests.viewer.browser import visit  # without playwright these tests are skipped
 
     seen = visit(browser, system.address)
     seen.wait("store.frame?.belief?.state === 'tracking' && store.world", 60)

@@ -97,8 +97,8 @@ def test_clearance_and_no_shortcut(seed):
 
 def test_grid_paths_are_longer():
     """Compares with an independent computation: paths on a 5 cm grid with 16 neighbours are never shorter."""
-    from services.controller.policies.free_space import FreeSpace  # noqa: PLC0415
-    from services.controller.policies.geodesic_field import FreeSpaceGraph  # noqa: PLC0415
+    from services.controller.policies.free_space import FreeSpace
+    from services.controller.policies.geodesic_field import FreeSpaceGraph
 
     world, paths = load_shortest_paths("office")
     graph = FreeSpaceGraph(FreeSpace.of(world), ROBOT.radius)
@@ -345,9 +345,9 @@ def test_options_of_services():
     ],
 )
 def test_invalid_options(args, says):
-    from typer.testing import CliRunner  # noqa: PLC0415
+    from typer.testing import CliRunner
 
-    from lab.cli import experiment as cli_experiment  # noqa: PLC0415
+    from lab.cli import experiment as cli_experiment
 
     result = CliRunner().invoke(cli_experiment.app, ["navigation", *args])
     assert isinstance(result.exception, UserError)
