@@ -63,7 +63,7 @@ def test_error_and_bound():
     made, scene = estimator(ROOM)
     outcome = tasks.standing(made, scene, 40, iter)
     one, many = outcome["from nothing, 1 scan"], outcome["standing, 20 scans"]
-    assert one.found == one.of == 40
+    assert one.found == one.total == 40
     rms = [np.sqrt(np.mean(np.square(np.array(o.errors)[:, :2]).sum(1))) for o in (one, many)]
     limit = [np.sqrt(np.mean(np.square(o.bounds))) for o in (one, many)]
     assert 0.7 * limit[0] < rms[0] < 1.4 * limit[0]  # less would be an error of the test
