@@ -59,7 +59,7 @@ ALSO_SHELL = {
     "services/recorder/files/parts.py",
     "services/recorder/files/writer.py",
     "services/bridge_ros2/ros_session.py",
-    "services/simulator/physics.py",  # pybullet reads the robot's URDF from a file
+    "services/simulator/pybullet_physics.py",  # pybullet reads the robot's URDF from a file
 }
 INPUT_AND_OUTPUT = {
     "common.bus.bus", "common.bus.session", "common.bus.liveliness", "common.bus.leader_election", "common.bus.inbox",

@@ -28,9 +28,13 @@ MAX_CLEAR_RADIUS = 255  # cells; fits into a byte
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
-def cast_rays(world: World, poses: npt.ArrayLike, angles: npt.ArrayLike) -> Array:
-    """(N, B) distances in m from poses (N, 3) in map along ``angles`` (B,); +inf if nothing is hit."""
-    return _cast_rays(world, poses, angles, derivatives=False)[0]
+def cast_rays(world: World, poses: npt.ArrayLike, angles: npt.ArrayLike, people: Array | None = None) -> Array:
+    """(N, B) distances in m from poses (N, 3) in map along ``angles`` (B,); +inf if nothing is hit.
+
+    Rays also end at ``people`` (P, 3), circles of x, y and radius in m.
+    """
+    circles = world.circles if people is None else np.concatenate([world.circles, people])
+    return _cast_rays(world, circles, poses, angles, derivatives=False)[0]
 
 
 def cast_rays_with_jacobian(world: World, poses: npt.ArrayLike, angles: npt.ArrayLike) -> tuple[Array, Array]:
@@ -39,15 +43,17 @@ def cast_rays_with_jacobian(world: World, poses: npt.ArrayLike, angles: npt.Arra
     The derivative of a distance is dr = -(n . dp + r n . u' dyaw) / (n . u), with the surface's normal n and the ray's
     direction u. It is 0 if nothing is hit.
     """
-    return _cast_rays(world, poses, angles, derivatives=True)
+    return _cast_rays(world, world.circles, poses, angles, derivatives=True)
 
 
-def _cast_rays(world: World, poses: npt.ArrayLike, angles: npt.ArrayLike, *, derivatives: bool) -> tuple[Array, Array]:
+def _cast_rays(
+    world: World, circles: Array, poses: npt.ArrayLike, angles: npt.ArrayLike, *, derivatives: bool
+) -> tuple[Array, Array]:
     # Copied, because numba compiles again for arrays that are read-only or not contiguous.
     poses, angles = np.array(poses, float).reshape(-1, 3), np.array(angles, float).ravel()
     shape = (len(poses), len(angles))
     ranges, jacobian = np.empty(shape), np.zeros((*(shape if derivatives else (0, 0)), 3))
-    _cast(world.outlines, world.circles, *_cells_of(world.grid), poses, angles, ranges, jacobian)
+    _cast(world.outlines, circles, *_cells_of(world.grid), poses, angles, ranges, jacobian)
     return ranges, jacobian
 
 

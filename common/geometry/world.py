@@ -137,6 +137,13 @@ class World(Model):
             return self._free_area.signed(points)
         return self._limit_by_obstacles(points, 0.0 - self.grid.shapes.distance(FREE, points))
 
+    def surface_distance(self, points: npt.ArrayLike) -> Array:
+        """(N,) distances in m from points (N, 2) to the nearest surface, negative behind; unknown cells have none."""
+        points = np.asarray(points, float).reshape(-1, 2)
+        if self.grid is None:
+            return self._free_area.signed(points)
+        return self._limit_by_obstacles(points, self.grid.shapes.distance(OCCUPIED, points))
+
     def has_room(self, place: Array, radius: float) -> bool:
         """Whether a robot of ``radius`` m can stand at a point (2,) or pose (3,)."""
         return bool(self.clearance(place[:2])[0] >= radius)

@@ -42,6 +42,7 @@ from common.messages.topics import (
     Topic,
 )
 from common.runtime.service import Service
+from services.simulator.physics import choose_engine
 from services.simulator.settings import SimulatorSettings
 from services.simulator.simulation import Setup, Simulation
 
@@ -90,6 +91,9 @@ class SimulatorService(Service):
         robot = settings.build_robot()
         self.log.info("loading the world", world=settings.world)
         scanner = settings.build_scanner()
+        engine = choose_engine(settings.physics)
+        if settings.physics == "auto" and engine == "kinematic":
+            self.log.warning("pybullet is not installed: the simulation is kinematic, contacts just stop the robot")
         self.setup = Setup(
             world=load_world(settings.world),
             scanner=scanner,
@@ -99,6 +103,7 @@ class SimulatorService(Service):
             obstacle_stop=settings.obstacle_stop,
             people=settings.people,
             people_speed=settings.people_speed,
+            engine=engine,
         )
         self._create_simulation()
         if not settings.obstacle_stop:

@@ -14,7 +14,7 @@ from common.runtime.robot_settings import RobotSettings
 
 
 class SimulatorSettings(RobotSettings):
-    """Simulator: a mobile base with a laser scanner in a world, in pybullet.
+    """Simulator: a mobile base with a laser scanner in a world.
 
     Examples:
       python -m services.simulator                                   the corridor, in real time
@@ -70,6 +70,10 @@ class SimulatorSettings(RobotSettings):
             "lockstep, otherwise to none"
         ),
     ] = None
+    physics: Annotated[
+        Literal["auto", "pybullet", "kinematic"],
+        Field(description="auto: pybullet if it is installed; kinematic: contacts stop the robot"),
+    ] = "auto"
     people: Annotated[int, Field(ge=0, le=100, description="number of walking people, who are not in the map")] = 0
     people_speed: Annotated[float, Field(ge=0, le=3, description="walking speed of the people, m/s")] = 1.0
     obstacle_stop: Annotated[

@@ -18,7 +18,7 @@ from common.robot.base import Robot
 from common.robot.scanner import Scanner
 from common.runtime import safety
 from services.simulator.odometry import Drift, Odometer
-from services.simulator.physics import SUBSTEP_S, Physics
+from services.simulator.physics import SUBSTEP_S, Engine, Physics, choose_engine
 
 if TYPE_CHECKING:
     from services.simulator.people import People
@@ -39,6 +39,7 @@ class Setup:
     obstacle_stop: bool = True  # off only for fault injection
     people: int = 0
     people_speed: float = 1.0  # m/s
+    engine: Engine = field(default_factory=lambda: choose_engine("auto"))
 
 
 class Simulation:
@@ -60,7 +61,7 @@ class Simulation:
 
             people_rng = np.random.default_rng(people_seed)
             self.people = People(self.world, setup.people, setup.people_speed, people_rng, pose[:2], robot.radius)
-        self.physics = Physics(self.world, robot, pose)
+        self.physics = _create_physics(setup.engine, self.world, robot, pose)
         for obstacle in self.world.obstacles:
             self.physics.add(obstacle.name, obstacle)
         if self.people is not None:
@@ -78,7 +79,7 @@ class Simulation:
         self._scan_points = np.zeros((0, 2))  # m in base_link
 
     def close(self) -> None:
-        """Disconnect from pybullet."""
+        """Free what the physics engine holds."""
         self.physics.close()
 
     @property
@@ -266,6 +267,17 @@ class Simulation:
             raise UserError("the obstacle would stand outside the world")
         if shapely.distance(shape, shapely.Point(self.physics.pose()[:2])) < self.setup.robot.radius:
             raise UserError("the obstacle would stand on the robot")
+
+
+def _create_physics(engine: Engine, world: World, robot: Robot, pose: Array) -> Physics:
+    """Build the boundary or the map of ``world`` without its furniture, and put the robot at ``pose`` (3,)."""
+    if engine == "kinematic":
+        from services.simulator.kinematics import Kinematics  # compiles its rays
+
+        return Kinematics(world, robot, pose)
+    from services.simulator.pybullet_physics import PybulletPhysics  # has no wheels on some platforms
+
+    return PybulletPhysics(world, robot, pose)
 
 
 def _name_obstacles(world: World) -> World:

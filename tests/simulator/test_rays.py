@@ -14,7 +14,7 @@ from common.geometry import se2
 from common.geometry.occupancy_grid import OCCUPIED, UNKNOWN, OccupancyGrid
 from common.geometry.world import Obstacle, World, known_worlds
 from common.robot.scanner import SCANNERS
-from services.simulator import physics
+from services.simulator import pybullet_physics
 from services.simulator.simulation import Setup, Simulation
 from tests.common.geometry.maps import rooms
 from tests.simulator.driving import FORWARD, drive, shipped
@@ -86,9 +86,11 @@ def test_sample_does_not_disturb_the_run(make):
         disturbed.advance()
 
 
-@pytest.mark.parametrize("walls_per_body", [200, physics.MAX_WALLS_PER_BODY])
+@pytest.mark.parametrize("walls_per_body", [200, pybullet_physics.MAX_WALLS_PER_BODY])
 def test_map_rays_match_to_a_millimetre(make, rooms_map, monkeypatch, walls_per_body):
-    monkeypatch.setattr(physics, "MAX_WALLS_PER_BODY", walls_per_body)  # 200 splits the map into several bodies
+    monkeypatch.setattr(
+        pybullet_physics, "MAX_WALLS_PER_BODY", walls_per_body
+    )  # 200 splits the map into several bodies
     rng = np.random.default_rng(0)
     poses = np.column_stack([rooms_map.sample_free(40, rng, 0.27), rng.uniform(-np.pi, np.pi, 40)])
     exact, seen = SCANNER.limit(exact_ranges(rooms_map, poses)), make(rooms_map, SCANNER).sample(poses, None, None)
