@@ -1,4 +1,4 @@
-# `make` lists the targets. Needs GNU make, a POSIX shell and Python 3.10 or later, or uv; the rest is installed in .venv.
+# `make` lists the targets. Needs GNU make, a POSIX shell and Python >= 3.10; everything else goes into .venv.
 
 PYTHON ?=
 WHEEL_INDEX ?=
@@ -15,13 +15,13 @@ UV ?= $(if $(WHEEL_INDEX),,$(shell command -v uv 2>/dev/null))
 .PHONY: help install demo test bless check bench chaos screenshots images lock platforms clean FORCE
 .DELETE_ON_ERROR:
 
-help: ## this list
+help: ## list the targets
 	@echo 'make TARGET [PYTHON=python3.11] [WHEEL_INDEX=URL] [ARGS="..."]'
 	@sed -n 's/^\([a-z]*\):[^#]*## /  \1	/p' $(firstword $(MAKEFILE_LIST)) | expand -t 16
 	@echo 'With uv, PyTorch is the CPU build (TORCH_BACKEND=auto: for your GPU). With pip, WHEEL_INDEX is the URL of an'
 	@echo 'index of CPU builds (see pytorch.org); without it, pip downloads gigabytes of CUDA on Linux.'
 
-install: $(STAMP) ## create .venv with everything, including PyTorch and development tools
+install: $(STAMP) ## create .venv with all packages, including PyTorch and development tools
 
 # Each stamp is written last, so that an interrupted installation is repeated.
 $(STAMP): pyproject.toml constraints.txt
@@ -37,20 +37,20 @@ $(DEMO_STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 define install
-$(if $(UV),'$(UV)' pip install --quiet --python $(BIN)/python --torch-backend $(TORCH_BACKEND),\
+$(if $(UV),'$(UV)' pip install --quiet --python $(BIN)/python $(if $(TORCH_BACKEND),--torch-backend $(TORCH_BACKEND)),\
 $(BIN)/python -m pip install --disable-pip-version-check --quiet \
 $(if $(WHEEL_INDEX),--extra-index-url '$(WHEEL_INDEX)')) -c constraints.txt -e '$(1)'
 endef
 
-# Another Python that was asked for replaces the one in .venv.
+# Installs again if PYTHON names another version than the one in .venv, although the stamps are up to date.
 ifneq ($(PYTHON),)
 ifneq ($(shell $(BIN)/python --version 2>&1),$(shell '$(PYTHON)' --version 2>&1))
 $(STAMP) $(DEMO_STAMP): FORCE
 endif
 endif
 
-# A name on the path may be a stub that fails (pyenv), and Debian ships Python without venv, so each is tried.
-# pybullet has wheels for 3.10 and 3.11 only, so these come first.
+# A Python on the path may be a stub that fails (pyenv) or lack venv (Debian), so each is run before it is used.
+# pybullet has wheels for 3.10 and 3.11 only, so these are tried first.
 define find_venv
 if $(BIN)/python -m pip --version >/dev/null 2>&1 \
   && { test -z '$(PYTHON)' || test "$$($(BIN)/python --version)" = "$$('$(PYTHON)' --version 2>&1)"; }; then exit 0; fi; \
@@ -71,12 +71,13 @@ endef
 demo: $(DEMO_STAMP) ## localise and drive in the corridor: every service, a live page, a recording, a picture
 	$(BIN)/presage demo --open $(ARGS)
 
-test: install ## all tests, the fast ones first
-	@# Tests start hundreds of processes; with PYTHONDONTWRITEBYTECODE each would compile all modules again.
+test: install ## all tests
+	@# Hundreds of processes are started: with PYTHONDONTWRITEBYTECODE set, each would compile all modules again.
 	@$(BIN)/python -m compileall -q common services presage lab worlds models tests
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+	@# Three workers keep two cores busy, because tests of processes mostly wait. More than one thread each would slow the others.
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder $(ARGS)
 
-bless: install ## show how services differ from the stored references, and accept it
+bless: install ## show how the outputs of services differ from the stored references, and accept them
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.process_replay.bless $(ARGS)
 
 check: install ## style, format and types
@@ -84,16 +85,16 @@ check: install ## style, format and types
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
-bench: install ## latency from scan to command beside the raw zenoh round trip
+bench: install ## measure the latency from scan to command and zenoh's own round trip
 	$(BIN)/presage bench latency $(ARGS)
 
-chaos: install ## inject faults into a system on three hosts: times of detection, stop and recovery
+chaos: install ## inject faults into a system on three hosts; measure detection, stop and recovery
 	$(BIN)/presage bench chaos $(ARGS)
 
 screenshots: install ## docs/page.png and docs/page.webp of the live page; needs Chromium
 	$(BIN)/python -m tests.viewer.screenshots $(ARGS)
 
-images: ## build every container image, and print what each adds to its base, python:3.11-slim
+images: ## build all container images, and print how much each adds to its base, python:3.11-slim
 	docker compose build $(if $(WHEEL_INDEX),--build-arg WHEEL_INDEX='$(WHEEL_INDEX)')
 	for scanner in replay none bridge_ros2; do PRESAGE_SCANNER=$$scanner docker compose build simulator || exit 1; done
 	PRESAGE_ESTIMATOR=paper docker compose build $(if $(WHEEL_INDEX),--build-arg WHEEL_INDEX='$(WHEEL_INDEX)') estimator
@@ -110,6 +111,6 @@ lock: install ## pin every dependency in constraints.txt, for all platforms; ARG
 platforms: install ## check that every dependency has a wheel for each platform and Python; print the size of the download
 	$(BIN)/python -m tests.platforms
 
-clean: ## remove .venv and what tools leave behind; recordings stay
+clean: ## remove .venv and caches; recordings are kept
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist
 	find common services presage lab tests -name __pycache__ -type d -prune -exec rm -rf {} +

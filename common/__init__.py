@@ -1,1 +1,1 @@
-"""What the services share. Imports no service."""
+"""Code that the services share. Imports no service."""

@@ -11,7 +11,7 @@ from typing import Annotated
 from pydantic import Field
 
 MAX_COORDINATE_M = 10_000.0  # absolute value, from the frame's origin
-MAX_DISTANCE_M = 30_000.0  # more than the diagonal of the square of all positions
+MAX_DISTANCE_M = 30_000.0  # more than the diagonal of the square of all valid positions
 MAX_ANGLE_RAD = 10_000.0  # about 1500 turns, because headings need not be wrapped
 MAX_SPEED = 1_000.0  # m/s or rad/s
 MAX_BEAMS = 32_768  # in a scan; the 2-D scanners with the finest resolution measure 25 200 points per turn

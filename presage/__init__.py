@@ -37,10 +37,27 @@ _MODULES = {
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = [
-    "SCANNERS", "Estimator", "Evidence", "Expected", "GaussNewton", "GenerativeModel", "Hypothesis", "LaserScan",
-    "Likelihood", "Optimiser", "Posterior", "Predicted", "RayCaster", "Reading", "Scanner", "Scans", "UserError",
-    "World", "load_world", "read_scans",
-]  # fmt: skip
+    "SCANNERS",
+    "Estimator",
+    "Evidence",
+    "Expected",
+    "GaussNewton",
+    "GenerativeModel",
+    "Hypothesis",
+    "LaserScan",
+    "Likelihood",
+    "Optimiser",
+    "Posterior",
+    "Predicted",
+    "RayCaster",
+    "Reading",
+    "Scanner",
+    "Scans",
+    "UserError",
+    "World",
+    "load_world",
+    "read_scans",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -9,7 +9,7 @@ def main() -> None:
     """Entry point of the command `presage`."""
     try:
         # Importing the commands takes a moment, during which Ctrl-C should end the program without a traceback.
-        from presage.cli.main import main as run  # noqa: PLC0415
+        from presage.cli.main import main as run
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)

@@ -13,7 +13,7 @@ from common.geometry.world import World
 from common.robot.ranges import normalise_driver_ranges
 from common.robot.scanner import SCANNERS, Scanner
 from presage.laser_scan import LaserScan
-from services.estimator.factory import Choice, Geometry, Name, prepare
+from services.estimator.factory import EstimatorOptions, Geometry, Name, prepare
 from services.estimator.paper.perception import Descent
 from services.estimator.precise.gauss_newton import Optimiser
 from services.estimator.precise.likelihood import Likelihood
@@ -66,7 +66,7 @@ class Estimator:
             descent: parameters of preset "paper".
 
         """
-        choice = Choice(
+        options = EstimatorOptions(
             world if isinstance(world, World) else str(world),
             preset,
             model=str(model) if isinstance(model, str | Path) else "",
@@ -79,7 +79,7 @@ class Estimator:
             initial_pose=None if initial_pose is None else np.asarray(initial_pose, float),
             descent=descent or Descent(),
         )
-        self._make = prepare(choice)
+        self._make = prepare(options)
         self._bound_to_beams = preset == "paper"
         if isinstance(scanner, str) and scanner not in SCANNERS:
             raise UserError(f"no scanner {scanner!r}: give a Scanner, or one of {', '.join(SCANNERS)}")
@@ -88,7 +88,7 @@ class Estimator:
         self._geometry: Geometry | None = None  # of the scans
         self._core: EstimatorCore | None = None  # made for this geometry
         if self.scanner is not None:
-            self._fit(Geometry.of(self.scanner))
+            self._core_for(Geometry.of(self.scanner))
 
     def update(
         self, scan: LaserScan | Numbers, *, stamp: float | None = None, odom: Numbers | None = None
@@ -101,7 +101,7 @@ class Estimator:
         """
         if not isinstance(scan, LaserScan):
             scan = self._scan_of(scan, stamp, odom)
-        return self._fit(scan.geometry).update(scan)
+        return self._core_for(scan.geometry).update(scan)
 
     def predict(self, poses: Numbers, angles: Numbers | None = None) -> Predicted:
         """Returns the scans that the model expects at ``poses`` (3,) or (N, 3): ranges and sigma (B,) or (N, B) in m.
@@ -132,7 +132,7 @@ class Estimator:
 
     def check(self, scan: LaserScan) -> None:
         """Raises UserError if the estimator cannot process the scan."""
-        self._fit(scan.geometry)
+        self._core_for(scan.geometry)
 
     def _scan_of(self, ranges: Numbers, stamp: float | None, odom: Numbers | None) -> LaserScan:
         scanner, measured = self.scanner, np.asarray(ranges, float)
@@ -145,13 +145,13 @@ class Estimator:
             scanner.angles(),
             scanner.range_max,
             stamp,
-            odom,  # type: ignore[arg-type] # converted there
+            odom,  # type: ignore[arg-type] # LaserScan converts it
             mount=scanner.mount,  # type: ignore[arg-type]
             sigma=scanner.sigma,
             sigma_relative=scanner.sigma_relative,
         )
 
-    def _fit(self, geometry: Geometry) -> EstimatorCore:
+    def _core_for(self, geometry: Geometry) -> EstimatorCore:
         """The estimator for scans of this geometry; made for that of the first scan."""
         if self._mount is not None:
             geometry = replace(geometry, mount=self._mount, mount_assumed=False)

@@ -25,7 +25,7 @@ class LaserScan(Observation):
     mount: Array = field(default_factory=lambda: np.zeros(3))  # (3,) laser in base_link: m, m, rad
     sigma: float = 0.0  # m, standard deviation of a range; unknown if this and sigma_relative are 0
     sigma_relative: float = 0.0  # its part that grows with the range, as a share
-    mount_assumed: bool = False  # nothing states the mount
+    mount_assumed: bool = False  # whether neither the file nor the user states the mount
     reference: Array | None = None  # (3,) true or reference pose, base_link in map; estimators do not use it
 
     def __post_init__(self) -> None:

@@ -19,12 +19,12 @@ import pytest
 from common.bus.bus import Link, open_bus, wait_until
 from common.bus.inbox import Sample
 from common.errors import UserError
-from tests.fork_server import Child, ForkServer, end_with_parent
+from common.processes import end_with_this_process
+from tests.fork_server import Child
 
 ROOT = Path(__file__).resolve().parent.parent
 WAIT_TIMEOUT_S = 30.0  # for events that take well under a second on an idle machine
 numbers = itertools.count(1)
-fork_servers: list[ForkServer] = []  # at most one in each of xdist's workers, started when it is needed
 
 # Tests of what is not installed: PyTorch for preset paper, and pybullet for the simulator's physics.
 TESTS_OF = {
@@ -70,22 +70,25 @@ def skip_without_package():
 
 
 def pytest_collection_modifyitems(items):
-    """Runs fast tests first. Tests in tests/system, which start processes, come last and get the marker `system`."""
+    """Marks tests/system. Runs files that start processes first, those that need Docker before all others.
+
+    They take longest and wait much, so that in the end short files without waits fill the gaps.
+    """
     for item in items:
         if (ROOT / "tests" / "system") in item.path.parents:
             item.add_marker(pytest.mark.system)
-    # Among the system tests, those that need Docker come first: they take longest, but little processor time.
-    items.sort(key=lambda item: ("system" in item.keywords, item.get_closest_marker("docker") is None))
+    waiting = {item.path for item in items if {"processes", "router", "browser"} & set(item.fixturenames)}
+    items.sort(key=lambda item: (item.get_closest_marker("docker") is None, item.path not in waiting))
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _nothing_left_behind():
     """Fails if a test run leaves a process behind. Set up first and so torn down last, in each of xdist's workers."""
     yield
-    while fork_servers:
-        fork_servers.pop().close()
-    # Python's resource tracker, which runs once a process pool was used, ends with this process.
-    left = [c for c in psutil.Process().children(recursive=True) if "resource_tracker" not in " ".join(c.cmdline())]
+    # The fork server and the resource tracker of multiprocessing end with this process; their children must be gone.
+    own = psutil.Process().children()
+    helpers = [child for child in own if "from multiprocessing." in " ".join(child.cmdline())]
+    left = [child for child in own if child not in helpers] + [c for h in helpers for c in h.children(recursive=True)]
     for child in left:
         print(f"\nleft behind: {child}", file=sys.stderr)
         child.kill()
@@ -135,6 +138,14 @@ def wait_for_message(inbox, kind, condition, timeout=60.0):
 
     assert wait_until(check, timeout), f"no matching {kind.__name__} within {timeout:g} s"
     return matches[0]
+
+
+def ended(process: psutil.Process) -> bool:
+    """Whether a process that is no child of this one has ended; some machines reap such processes late."""
+    try:
+        return process.status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
 
 
 class Running:
@@ -201,15 +212,17 @@ class Processes:
 
     def _child(self, what: list[str], environment: dict[str, str], log: Path, *, fresh: bool):
         if not fresh and sys.platform == "linux":
-            if not fork_servers:
-                fork_servers.append(ForkServer())
-            return fork_servers[0].start(what, environment, log, self.folder)
-        parent = os.getpid()  # pytest-timeout ends this process without a teardown
+            return Child(what, environment, log, self.folder)
         with log.open("wb") as file:
             return subprocess.Popen(
-                [sys.executable, *what], env=environment, cwd=self.folder, stdin=subprocess.DEVNULL, stdout=file,
-                stderr=subprocess.STDOUT, preexec_fn=lambda: end_with_parent(parent),  # noqa: PLW1509 - as in the server
-            )  # fmt: skip
+                [sys.executable, *what],
+                env=environment,
+                cwd=self.folder,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                preexec_fn=end_with_this_process(signal.SIGKILL),  # pytest-timeout ends this process without a teardown
+            )
 
     def start_router(self) -> tuple[Running, int]:
         """Starts a router. Returns it and its port; tries another port if a process has just taken the first one."""
@@ -283,3 +296,17 @@ def processes(tmp_path):
         yield started
     finally:
         started.close()
+
+
+@pytest.fixture
+def presage(monkeypatch, capsys):
+    """A function that runs a command of the command line in this process. Returns its exit status and its output."""
+    from presage.cli.main import main  # most tests do not need its many imports
+
+    def run(*args):
+        monkeypatch.setattr(sys, "argv", ["presage", *args])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return end.value.code or 0, "".join(capsys.readouterr())
+
+    return run

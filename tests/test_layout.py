@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -44,7 +45,7 @@ ALSO_SHELL = {
     "services/estimator/precise/learning/weights.py",
     "services/estimator/shared/model_folder.py",
     "services/viewer/control.py",
-    "services/viewer/desk.py",
+    "services/viewer/request_handler.py",
     "services/viewer/playback.py",
     "services/viewer/server.py",
     "services/viewer/visitor_session.py",
@@ -77,6 +78,12 @@ def module(path: Path) -> str:
     return name(path).removesuffix(".py").removesuffix("/__init__").replace("/", ".")
 
 
+@cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
 def imports(path: Path) -> set[str]:
     """Modules a file imports when it runs; those under TYPE_CHECKING are no dependency of the program."""
     found: set[str] = set()
@@ -93,7 +100,7 @@ def imports(path: Path) -> set[str]:
         for child in ast.iter_child_nodes(node):
             walk(child)
 
-    walk(ast.parse(path.read_text()))
+    walk(tree(path))
     return found
 
 
@@ -129,7 +136,7 @@ def module_edges() -> dict[str, set[str]]:
     return {own: (imports(path) & files.keys()) - {own} for own, path in files.items()}
 
 
-def test_there_is_something_to_check():
+def test_sources_found():
     assert set(SERVICES) >= {"simulator", "estimator", "controller", "recorder"}
     assert len(cores()) >= 5
     assert {"zenoh", "common.messages.topics.Topic"} <= imports(ROOT / "common" / "bus" / "bus.py")
@@ -139,11 +146,7 @@ def test_there_is_something_to_check():
 @pytest.mark.parametrize("path", cores(), ids=name)
 def test_core_uses_no_bus_clock_or_files(path):
     assert not reaches(path, *INPUT_AND_OUTPUT)
-    calls = [
-        n.func.id
-        for n in ast.walk(ast.parse(path.read_text()))
-        if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)
-    ]
+    calls = [n.func.id for n in ast.walk(tree(path)) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]
     assert "open" not in calls
 
 
@@ -191,7 +194,7 @@ def test_zenoh_stays_in_the_bus():
     ]
 
 
-def test_heavy_packages_stay_where_they_are_used():
+def test_heavy_packages():
     for path in SOURCES:
         package = path.relative_to(ROOT).parts[:2]
         if package[0] != "lab":
@@ -212,7 +215,7 @@ def test_heavy_packages_stay_where_they_are_used():
         ("common.messages.reference", ["torch", "pybullet", "mcap"]),
     ],
 )
-def test_process_loads_only_its_own_packages(module, absent):
+def test_packages_of_a_process(module, absent):
     program = f"import sys, {module}; print(sorted(set({absent}) & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
@@ -224,12 +227,12 @@ def test_no_pickle():
         assert "allow_pickle=True" not in path.read_text(), name(path)
 
 
-def test_architecture_page_lists_every_file():
+def test_architecture_page():
     page = file_list.PAGE.read_text(encoding="utf-8")
     assert file_list.fill(page) == page, "run: python -m tests.file_list"
 
 
-def test_imports_are_read_from_source(tmp_path):
+def test_imports(tmp_path):
     path = tmp_path / "x.py"
     path.write_text(
         "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import torch\n"

@@ -39,18 +39,18 @@ def install(tmp_path):
 pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="no make here")
 
 
-def test_nothing_is_done_where_nothing_changed(install, tmp_path):
+def test_nothing_changed(install, tmp_path):
     assert "pip install" not in install()
     same = python(tmp_path / "bin/python3.11", "3.11.9")
     assert "pip install" not in install(f"PYTHON={same}")
 
 
-def test_another_python_that_is_asked_for_is_taken(install, tmp_path):
+def test_another_python(install, tmp_path):
     other = python(tmp_path / "bin/python3.10", "3.10.14")
     assert f"names='{other}'" in install(f"PYTHON={other}")
     assert "pip install" in install("PYTHON=/nowhere/python")
 
 
-def test_changed_requirements_are_installed(install, tmp_path):
+def test_changed_requirements(install, tmp_path):
     os.utime(tmp_path / "pyproject.toml")
     assert "pip install" in install()

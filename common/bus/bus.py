@@ -239,13 +239,14 @@ def _decode_reply(key: str, reply: type[R], payload: bytes) -> R:
 def open_bus(
     link: Link,
     *,
-    patience: float | None = None,
+    connect_timeout: float | None = None,
     give_up: Callable[[], bool] = lambda: False,
     log_filter: str = LOG_FILTER,
 ) -> Iterator[Bus]:
     """Open a session, and close it at the end of the ``with`` block.
 
-    With credentials, waits until a router accepts them: for ``patience`` s, then raises UserError, or without limit if
+    With credentials, waits until a router accepts them: for ``connect_timeout`` s, then raises UserError, or without
+    limit if
     it is None. Exits the process if ``give_up()`` returns true while waiting. Raises UserError if the endpoints cannot
     be used, or if a session without credentials would be reachable from other machines.
     """
@@ -253,15 +254,15 @@ def open_bus(
         refuse_exposure(link.listen)
     zenoh.init_log_from_env_or(log_filter)
     began, waiting = time.monotonic(), False
-    join_timeout = JOIN_TIMEOUT_S if patience is None else min(patience, JOIN_TIMEOUT_S)
+    join_timeout = JOIN_TIMEOUT_S if connect_timeout is None else min(connect_timeout, JOIN_TIMEOUT_S)
     while (session := open_session(link, join_timeout)) is None:
         assert link.security is not None  # noqa: S101 - open_session returns None only with credentials
         rejection = explain_rejection(link.security.member.name, link.connect)
         if give_up():
             raise SystemExit(0)
-        if patience is not None and time.monotonic() - began > patience:
+        if connect_timeout is not None and time.monotonic() - began > connect_timeout:
             raise UserError(rejection)
-        if patience is None and not waiting:
+        if connect_timeout is None and not waiting:
             logging.getLogger(__name__).warning("%s; waiting", rejection)
         waiting = True
         time.sleep(JOIN_PAUSE_S)

@@ -1,4 +1,4 @@
-"""Checks endpoints, and explains the ones that do not answer."""
+"""Checks network endpoints, and explains connections that fail."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from common.errors import UserError
 NETWORK_PROTOCOLS = frozenset({"tcp", "udp", "tls", "quic", "ws", "vsock"})  # zenoh refuses unknown protocols
 
 
-def over_tls(endpoint: str) -> str:
-    """Replace tcp by tls: a session with credentials sends nothing unencrypted."""
+def with_tls(endpoint: str) -> str:
+    """Replace tcp by tls in an endpoint, because sessions with credentials send nothing unencrypted."""
     return endpoint.replace("tcp/", "tls/", 1) if endpoint.startswith("tcp/") else endpoint
 
 
@@ -38,9 +38,9 @@ def on_loopback(endpoint: str) -> bool:
 
 
 def explain_rejection(name: str, connect: Sequence[str]) -> str:
-    """Error message for the case that no router accepts the credentials ``name``."""
+    """Error message for when no router accepts the credentials ``name``."""
     return (
-        f"no router at {', '.join(map(over_tls, connect)) or 'no endpoint'} lets {name!r} in: "
+        f"no router at {', '.join(map(with_tls, connect)) or 'no endpoint'} lets {name!r} in: "
         "is a router running there, with --security and credentials of the same authority? "
         "Its log lists the connections it refuses"
     )

@@ -60,7 +60,7 @@ class Answer:
 class Inbox:
     """A bounded, thread-safe queue that counts every dropped entry.
 
-    Of a topic with queue policy "newest", at most one sample of each source waits.
+    Of a topic with queue policy "newest", it holds at most one sample of each source.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Inbox:
             if old is not None:
                 self._bytes -= len(old.payload)
                 self.dropped[key] += 1
-            elif full and not isinstance(entry, Answer):  # answers are never more than the requests sent
+            elif full and not isinstance(entry, Answer):  # there are never more answers than requests that were sent
                 self.dropped[key] += 1
                 if isinstance(entry, Call):
                     entry.refuse("too many requests are waiting")
@@ -126,7 +126,7 @@ class Inbox:
         return key
 
     def tally(self) -> tuple[Counter[str], Counter[str], Counter[str]]:
-        """Counts by key at one moment: taken from the queue or dropped, dropped, oversized."""
+        """Counts by key at one moment: samples that have left the queue (taken or dropped), dropped, oversized."""
         with self._lock:
             taken = self.received.copy()
             taken.subtract(self.counted_as(entry.key) for entry in self._entries.values() if isinstance(entry, Sample))

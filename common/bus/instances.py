@@ -24,7 +24,7 @@ class Instance:
 
     @classmethod
     def parse(cls, name: str) -> Instance | None:
-        """Returns None if ``name`` is not an instance name."""
+        """Parse an instance name; returns None if ``name`` is not one."""
         match = re.fullmatch(r"([0-9a-f]{12})~(.+)~(\d+)~([0-9a-f]*)", name)
         return cls(int(match[1], 16), match[2], int(match[3]), match[4]) if match else None
 
@@ -44,9 +44,9 @@ def describe_instance(name: str) -> str:
 class Instances:
     """The other instances of one service that are alive; updated by zenoh's threads and read by the service's loop."""
 
-    def __init__(self, me: str) -> None:
-        """``me`` is the name of this instance, which is not counted as another one."""
-        self.me = me
+    def __init__(self, own_name: str) -> None:
+        """``own_name`` is the name of this instance, which is not counted as another one."""
+        self.own_name = own_name
         self.refresh: Callable[[], None] = lambda: None  # queries the active instances again, without waiting
         self._leading: set[str] = set()
         self._waiting: set[str] = set()
@@ -54,8 +54,8 @@ class Instances:
 
     def update(self, name: str, *, leads: bool, alive: bool) -> None:
         """Record that an instance that leads, or waits, is now alive or no longer alive."""
-        # Ignore this session, also with an earlier start time: zenoh may repeat a token from when it led before.
-        if name.partition("~")[2] == self.me.partition("~")[2]:
+        # Ignore this session, also with an earlier start time: zenoh may repeat an old token of it.
+        if name.partition("~")[2] == self.own_name.partition("~")[2]:
             return
         with self._lock:
             group = self._leading if leads else self._waiting
@@ -69,12 +69,12 @@ class Instances:
     def may_lead(self) -> bool:
         """Whether no other instance leads and none that waits is older."""
         with self._lock:
-            return not self._leading and self.me <= min(self._waiting, default=self.me)
+            return not self._leading and self.own_name <= min(self._waiting, default=self.own_name)
 
     def must_yield(self) -> bool:
         """Whether an older instance leads too, as after two parts of a network were joined."""
         leaders = self.leaders()
-        return bool(leaders) and leaders[0] < self.me
+        return bool(leaders) and leaders[0] < self.own_name
 
 
 class SourceSelector:

@@ -22,7 +22,7 @@ class LeaderElection:
         self._end_standby: Callable[[], None] | None = None  # set while this instance stands by
 
     def try_activate(self) -> bool:
-        """Returns whether this instance is active now; if not, it stands by and the caller has to try again."""
+        """Become active, or stand by if another instance is active; returns whether this instance is active now."""
         if self._others is None:
             wait_until(self._bus.linked, LINK_TIMEOUT_S)  # without a link, other instances cannot be found
             self._others = self._bus.instances(self._service, self._wake)

@@ -10,7 +10,7 @@ from typing import Any
 
 import zenoh
 
-from common.bus.endpoints import on_loopback, over_tls
+from common.bus.endpoints import on_loopback, with_tls
 from common.bus.security import Credentials
 from common.errors import UserError
 
@@ -59,7 +59,7 @@ def _config(link: Link, join_timeout: float = JOIN_TIMEOUT_S) -> zenoh.Config:
         "timestamping/enabled": True,
         # Time in ms after which a silent session (frozen, disconnected) counts as gone; zenoh's default is 10 s.
         "transport/link/tx/lease": 3000,
-        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 5000,  # us
+        "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 5000,  # microseconds
     }
     if not all(map(on_loopback, link.listen)):
         # Only one of two peers that discover each other may connect: if both try, both may be refused, and neither
@@ -67,8 +67,8 @@ def _config(link: Link, join_timeout: float = JOIN_TIMEOUT_S) -> zenoh.Config:
         settings["scouting/gossip/autoconnect_strategy"] = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
     if link.security is not None:
         settings |= {**link.security.zenoh(), "mode": "router" if link.router else "client"}
-        settings["connect/endpoints"] = [over_tls(each) for each in link.connect]
-        settings["listen/endpoints"] = [over_tls(each) for each in link.listen] if link.router else []
+        settings["connect/endpoints"] = [with_tls(each) for each in link.connect]
+        settings["listen/endpoints"] = [with_tls(each) for each in link.listen] if link.router else []
         if not link.router:  # a single attempt; the caller repeats it, so that it can stop trying
             settings |= {
                 "connect/timeout_ms": 0,

@@ -1,4 +1,4 @@
-"""Exit status 0 where a service is healthy: `python -m common.containers.healthcheck NAME`.
+"""Exits with status 0 if a service is healthy: `python -m common.containers.healthcheck NAME`.
 
 A service is healthy if its heartbeat is recent, it is connected to another session, and it publishes its results while
 its inputs arrive. An open port or a running loop alone would not show that it works.
@@ -22,28 +22,28 @@ from common.containers.run_per_robot import robot_names
 from common.runtime.heartbeat import read_beats
 from common.runtime.liveness import Report, find_problem
 
-CONNECT_TIMEOUT_S = 4.0  # for the router or the page
+CONNECT_TIMEOUT_S = 4.0  # for the router or the live page
 PAGE = ("127.0.0.1", 8080)
 SINGLE_PROCESS = {"viewer"}  # one process for all robots, whose heartbeat has the first robot's name
 
 
 def main(service: str) -> None:
-    """Raise ValueError, OSError or UserError, with the reason, if the service is not healthy."""
+    """Check a service; raises ValueError, OSError or UserError, with the reason, if it is not healthy."""
     if service == "router":
         _reach_router()
         return
     folder = Path(os.environ.get("PRESAGE_HEARTBEAT") or "/tmp")  # noqa: S108 - the folder used in the images
     robots = robot_names(os.environ)
-    if fault := fault_of(service, read_beats(folder, service), robots, time.monotonic()):
+    if fault := find_fault(service, read_beats(folder, service), robots, time.monotonic()):
         raise ValueError(fault)
     if service == "viewer":
         _check_page()
 
 
-def fault_of(service: str, beats: dict[str, Report], robots: Collection[str], now: float) -> str:
-    """What is wrong with a service at ``now`` s (monotonic clock), by its heartbeats; empty if nothing is.
+def find_fault(service: str, beats: dict[str, Report], robots: Collection[str], now: float) -> str:
+    """The problem of a service at ``now`` s (monotonic clock), by its heartbeats; empty if it is healthy.
 
-    ``beats`` are by the name of the robot, one for each process.
+    ``beats`` has the heartbeat of each process, by the name of its robot.
     """
     for robot in robots:
         beat = beats.get(next(iter(robots)) if service in SINGLE_PROCESS else robot)
@@ -66,13 +66,13 @@ def _check_page() -> None:
 def _reach_router() -> None:
     """Open a session like a service's, but without listening on a port."""
     # Imported here because these imports take as long as all others together.
-    from dataclasses import replace  # noqa: PLC0415
+    from dataclasses import replace
 
-    from common.bus.bus import open_bus, wait_until  # noqa: PLC0415
-    from common.runtime.config import ServiceSettings, load_settings  # noqa: PLC0415
+    from common.bus.bus import open_bus, wait_until
+    from common.runtime.config import ServiceSettings, load_settings
 
     link = replace(load_settings(ServiceSettings, ["--role", "router"]).link(), listen=())
-    with open_bus(link, patience=CONNECT_TIMEOUT_S) as bus:
+    with open_bus(link, connect_timeout=CONNECT_TIMEOUT_S) as bus:
         if not wait_until(bus.linked, CONNECT_TIMEOUT_S):
             raise ValueError(f"no session through {', '.join(link.connect)} within {CONNECT_TIMEOUT_S:g} s")
 

@@ -107,7 +107,7 @@ class ProcessGroup:
         self._stop_requested = True
 
     def _supervise(self, process: RobotProcess, now: float) -> None:
-        """Start a process when it is time to, and handle its end."""
+        """Start a process when it is due, and handle its end."""
         if process.child is None:
             if process.next_start is not None and now >= process.next_start:
                 self._start(process, now)
@@ -158,6 +158,7 @@ class ProcessGroup:
 
 
 def _refuse(error: str) -> int:
+    """Print an error; returns the exit status for invalid arguments."""
     print(f"fleet: {error}", file=sys.stderr)
     return 2
 

@@ -11,7 +11,7 @@ from common.geometry.se2 import Array
 from common.limits import MAX_COORDINATE_M
 
 NUMBER = r"-?(\d{1,9}\.?\d*|\.\d+)"
-POSE_TEXT = rf"^$|^{NUMBER},{NUMBER}(,{NUMBER})?$"  # or empty
+POSE_TEXT = rf"^$|^{NUMBER},{NUMBER}(,{NUMBER})?$"  # the empty text is allowed, too
 
 
 def pose_of_text(text: str, option: str) -> Array:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import World
 
-MIN_COSINE = 0.02  # of the angle of incidence in divisions, so that derivatives of grazing rays stay finite
+MIN_COSINE = 0.02  # of the angle of incidence, so that the derivatives of grazing rays stay finite
 MAX_CLEAR_RADIUS = 255  # cells; fits into a byte
 
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -191,7 +191,7 @@ def _nearest_cell(
 
 @jit
 def _cross_grid(x: float, y: float, ux: float, uy: float, columns: int, rows: int) -> tuple[float, float]:
-    """Distances at which a ray enters (0 inside) and leaves the grid; the first is not smaller if it misses it."""
+    """Distances at which a ray enters (0 inside) and leaves the grid; the second is not larger if the ray misses it."""
     first, last = 0.0, np.inf
     for start, along, size in ((x, ux, columns), (y, uy, rows)):
         if along == 0.0:

@@ -122,7 +122,7 @@ def _pixels(path: Path) -> tuple[Array, Array | None]:
     """Colours (H, W, C) and alpha (H, W) of an image file, from 0 to 1; alpha is None if it has none."""
     try:
         # Imported here because Pillow is an optional dependency.
-        from PIL import Image, UnidentifiedImageError  # noqa: PLC0415
+        from PIL import Image, UnidentifiedImageError
     except ImportError:
         raise UserError(f"map image {path}: reading it needs the package Pillow: pip install pillow") from None
     if path.exists() and not path.is_file():  # opening a pipe would block

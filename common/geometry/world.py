@@ -149,7 +149,7 @@ class World(Model):
         return bool(self.clearance(place[:2])[0] >= radius)
 
     def placement_error(self, place: Array, radius: float) -> str | None:
-        """Why a robot of ``radius`` m cannot stand at a point (2,) or pose (3,). None if it can."""
+        """The reason why a robot of ``radius`` m cannot stand at a point (2,) or pose (3,), or None if it can."""
         if self.has_room(place, radius):
             return None
         clearance = float(self.clearance(place[:2])[0])
@@ -246,7 +246,7 @@ class World(Model):
 
         They are +inf if nothing is hit.
         """
-        from common.geometry.ray_casting import cast_rays  # noqa: PLC0415 - numba, which most services do not need
+        from common.geometry.ray_casting import cast_rays  # numba, which most services do not need
 
         return cast_rays(self, poses, angles)
 

@@ -1,4 +1,4 @@
-"""What a range value means (REP-117): distance, no return, too close, not measured.
+"""Special values of ranges (REP-117): no return, too close, not measured.
 
 0 < range     distance to a surface
 +inf          no surface within range_max
@@ -33,11 +33,11 @@ def normalise_driver_ranges(ranges: npt.NDArray[Numbers], range_min: float, rang
     return np.where(unmeasured, dtype(NOT_MEASURED), known)
 
 
-def surfaces(ranges: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
+def is_surface(ranges: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
     """Mask, of the same shape, of the ranges that are distances to a surface."""
     return np.asarray(np.isfinite(ranges) & (ranges > 0))
 
 
 def ranges_for_localisation(ranges: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     """Ranges in m as estimators use them: -inf replaces those that are too close or not measured."""
-    return np.where(surfaces(ranges) | np.isposinf(ranges), ranges, -np.inf).astype(np.float64)
+    return np.where(is_surface(ranges) | np.isposinf(ranges), ranges, -np.inf).astype(np.float64)

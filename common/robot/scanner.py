@@ -73,8 +73,8 @@ class Scanner(BaseModel):
             return np.full(np.shape(ranges), self.sigma)
         return np.hypot(self.sigma, self.sigma_relative * np.asarray(ranges))
 
-    def noisy(self, ranges: Array, rng: np.random.Generator) -> Array:
-        """Exact ``ranges`` in m plus this scanner's noise; +inf stays +inf."""
+    def add_noise(self, ranges: Array, rng: np.random.Generator) -> Array:
+        """Add this scanner's noise to exact ``ranges`` in m; +inf stays +inf."""
         draws = rng.standard_normal(np.shape(ranges))
         finite = np.isfinite(ranges)
         return np.asarray(ranges + np.where(finite, self.deviation(np.where(finite, ranges, 0.0)), 0.0) * draws)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from common.log import Logger, LogRateLimiter
 from common.messages.topics import QUERIES, TOPICS
 
-# Errors, as in every session, and the lines from which refusals are read.
+# Zenoh logs errors, as in every session, and the lines from which refusals are read.
 LOG_FILTER = (
     "error,zenoh::api::session=off,zenoh::net::protocol::gossip=off,zenoh::net::routing::hat=off,"
     "zenoh::net::routing::interceptor::access_control=trace,"
@@ -27,11 +27,11 @@ LOG_FILTER = (
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 LINE = re.compile(r"^\S+Z +(?P<level>[A-Z]+) .*?(?P<thread>ThreadId\(\d+\)) (?P<target>\S+): (?P<text>.*)$")
 DENIED = re.compile(
-    r"(?P<zid>[0-9a-f]+)(?: on \S+)? is unauthorized to (?P<what>.+?) \((?P<flow>\w+)\) on (?P<key>\S+)"
+    r"(?P<zid>[0-9a-f]+)(?: on \S+)? is unauthorized to (?P<action>.+?) \((?P<flow>\w+)\) on (?P<key>\S+)"
 )
-SHOWN = re.compile(r"Accepted TLS connection on \S+: (?P<address>\S+)\. Common Name: (?P<name>.+)\.$")
+CERTIFICATE = re.compile(r"Accepted TLS connection on \S+: (?P<address>\S+)\. Common Name: (?P<name>.+)\.$")
 ACCEPTED = re.compile(r"New transport link accepted from (?P<zid>[0-9a-f]+) to .*?dst: tls/(?P<address>[^,]+),")
-CACHING_LINES = 9  # log lines in which zenoh computes the rights for a new key in one direction, without any message
+CACHING_LINES = 9  # log lines about computing the access rights of a new key in one direction; they are no refusals
 HANDSHAKE_FAULTS = (  # text in the log of zenoh or rustls, reason of the refusal
     ("Invalid password", "wrong password"),
     ("UsrPwd extension", "no password"),
@@ -48,8 +48,8 @@ MAX_NAMES = 1000  # repeated connections from new addresses must not fill memory
 class Refusal:
     """A message or connection that the router refused."""
 
-    why: str  # reason, under which it is counted
-    who: str = ""  # name on the certificate
+    reason: str  # refusals are counted by it
+    name: str = ""  # on the certificate; empty if unknown
     key: str = ""
 
 
@@ -59,29 +59,30 @@ class ZenohLogParser:
 
     _names: dict[str, str] = field(default_factory=dict)  # certificate names, by address, then by session id
     _last_name: str = ""  # on the certificate presented last
-    _caching: dict[str, int] = field(default_factory=dict)  # by thread: remaining lines that are not refusals
+    _caching: dict[str, int] = field(default_factory=dict)  # by thread: number of following lines to ignore
 
     def read(self, line: str) -> Refusal | str | None:
-        """Returns a refusal, or the text of another error or warning, or None for other lines."""
+        """Read a line; returns a refusal, the text of another error or warning, or None for any other line."""
         plain = COLOUR.sub("", line).rstrip()
         match = LINE.match(plain)
         if match is None:
             return plain or None
         thread, target, text = match["thread"], match["target"], match["text"].split(" at /", maxsplit=1)[0]
         if target.endswith("access_control"):
-            return self._access(thread, text)
-        if (shown := SHOWN.match(text)) is not None:
-            self._remember(shown["address"], shown["name"])
-            self._last_name = shown["name"]
+            return self._read_access_line(thread, text)
+        if (certificate := CERTIFICATE.match(text)) is not None:
+            self._store_name(certificate["address"], certificate["name"])
+            self._last_name = certificate["name"]
         elif (accepted := ACCEPTED.match(text)) is not None:
-            self._remember(accepted["zid"], self._names.pop(accepted["address"], ""))
-        elif why := next((why for words, why in HANDSHAKE_FAULTS if words in text), ""):
-            return Refusal(why, self._last_name if "password" in why else "")
-        elif match["level"] in {"ERROR", "WARN"} and "handshake eof" not in text:  # eof: only a check of the port
+            self._store_name(accepted["zid"], self._names.pop(accepted["address"], ""))
+        elif reason := next((reason for words, reason in HANDSHAKE_FAULTS if words in text), ""):
+            return Refusal(reason, self._last_name if "password" in reason else "")
+        elif match["level"] in {"ERROR", "WARN"} and "handshake eof" not in text:  # eof: a port scan or health check
             return plain
         return None
 
-    def _access(self, thread: str, text: str) -> Refusal | None:
+    def _read_access_line(self, thread: str, text: str) -> Refusal | None:
+        """Read a line of zenoh's access control; returns a refusal, or None if the line is about something else."""
         if "caching permissions" in text:
             self._caching[thread] = CACHING_LINES
             return None
@@ -91,12 +92,12 @@ class ZenohLogParser:
         denied = DENIED.search(text)
         if denied is None or denied["flow"] != "ingress":
             return None
-        return Refusal(denied["what"].lower(), self._names.get(denied["zid"], ""), denied["key"])
+        return Refusal(denied["action"].lower(), self._names.get(denied["zid"], ""), denied["key"])
 
-    def _remember(self, what: str, name: str) -> None:
+    def _store_name(self, address_or_zid: str, name: str) -> None:
         if len(self._names) >= MAX_NAMES:
             self._names.clear()
-        self._names[what] = name
+        self._names[address_or_zid] = name
 
 
 class Refusals:
@@ -107,25 +108,25 @@ class Refusals:
         self.counts: Counter[str] = Counter()  # by reason
         self._log, self._may_log, self._parser = log, LogRateLimiter(), ZenohLogParser()
 
-    def take(self, line: str) -> None:
+    def process_line(self, line: str) -> None:
         """Process one line of zenoh's log."""
         found = self._parser.read(line)
         if isinstance(found, str):
             self._log.warning("zenoh", said=found)
         elif found is not None:
-            self.counts[found.why] += 1
+            self.counts[found.reason] += 1
             # Only known topics, because a peer may invent keys.
             topic = next((name for name in found.key.split("/")[2:3] if name in NAMES), "")
-            if self._may_log(f"{found.why} {found.who} {topic}"):
-                named = {name: value for name, value in (("who", found.who), ("key", found.key)) if value}
-                self._log.warning("refused", why=found.why, **named, so_far=self.counts[found.why])
+            if self._may_log(f"{found.reason} {found.name} {topic}"):
+                named = {name: value for name, value in (("who", found.name), ("key", found.key)) if value}
+                self._log.warning("refused", why=found.reason, **named, so_far=self.counts[found.reason])
 
 
 @contextmanager
-def listening_to_zenoh(refusals: Refusals) -> Iterator[None]:
-    """Pass zenoh's log, which it writes to standard output, to ``refusals`` for the block.
+def capture_zenoh_log(refusals: Refusals) -> Iterator[None]:
+    """Pass zenoh's log, which it writes to standard output, to ``refusals`` until the block ends.
 
-    The process must not print meanwhile.
+    The process must not print to standard output during this time.
     """
     if os.environ.pop("RUST_LOG", None):
         refusals._log.warning("RUST_LOG is ignored, because refusals are read from zenoh's log")  # noqa: SLF001
@@ -136,7 +137,7 @@ def listening_to_zenoh(refusals: Refusals) -> Iterator[None]:
     def read() -> None:
         with os.fdopen(reading, encoding="utf-8", errors="replace") as lines:
             for line in lines:
-                refusals.take(line)
+                refusals.process_line(line)
 
     thread = threading.Thread(target=read, name="refusals", daemon=True)
     thread.start()

@@ -17,7 +17,7 @@ from pydantic_settings import CliSuppress
 from common.bus.bus import DEFAULT_ENDPOINT, Link, open_bus
 from common.errors import UserError
 from common.log import Logger, begin_logging, logger, report_failure, set_up_logging
-from common.router.refusals import LOG_FILTER, Refusals, listening_to_zenoh
+from common.router.refusals import LOG_FILTER, Refusals, capture_zenoh_log
 from common.runtime.config import ServiceSettings, load_settings, split_endpoints
 
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
@@ -90,12 +90,12 @@ def route(link: Link, log: Logger, metrics: str = "") -> None:
         if link.security is None:
             bus = stack.enter_context(open_bus(link))
         else:
-            stack.enter_context(listening_to_zenoh(refusals))
+            stack.enter_context(capture_zenoh_log(refusals))
             bus = stack.enter_context(open_bus(link, log_filter=LOG_FILTER))
             facts["lets_in"] = [member.name for member in link.security.members]
         if metrics:
-            from common.router.metrics import router_metrics  # noqa: PLC0415
-            from common.runtime.metrics_server import serve  # noqa: PLC0415
+            from common.router.metrics import router_metrics
+            from common.runtime.metrics_server import serve
 
             log.info("metrics", address=stack.enter_context(serve(router_metrics(bus), metrics)))
         log.info("router listens", endpoints=", ".join(link.listen), **facts)

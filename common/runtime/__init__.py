@@ -1,1 +1,1 @@
-"""What every service process needs besides its algorithm."""
+"""The service loop, and the settings, safety limits, health and metrics of every service."""

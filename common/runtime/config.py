@@ -1,8 +1,8 @@
 """Settings from defaults, a YAML file, the environment and the command line.
 
 Each service has one settings class. Environment variables, command-line options and their help are derived from its
-fields. The command `presage` passes what it is given on to these classes, as arguments; it is written with typer,
-because a command is an action with arguments of its own, and a container of one service needs no typer.
+fields. The command `presage` passes its options on to these classes as arguments. It uses typer for its sub-commands;
+services have none, so a container of one service needs no typer.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ def join_negative_values(argv: list[str]) -> list[str]:
 
 
 def load_settings(cls: type[S], argv: list[str] | None = None) -> S:
-    """Returns the settings of a service from all sources.
+    """Load the settings of a service from all sources.
 
     ``argv`` defaults to the arguments of the process. With ``--print-config``, prints the settings and exits. Raises
     UserError for an invalid setting or file.
@@ -197,7 +197,7 @@ class _HelpFormatter(argparse.RawDescriptionHelpFormatter):
 
 
 def _read_file(cls: type[ServiceSettings], path: Path) -> dict[str, Any]:
-    """Returns one service's settings: top-level keys apply to all services, the section of a service only to it."""
+    """Read one service's settings: top-level keys apply to all services, the section of a service only to it."""
     data = _load_mapping(path)
     known = cls.model_fields.keys() - cls.private
     shared = {k: v for k, v in data.items() if not isinstance(v, dict) and k in known}
@@ -213,7 +213,7 @@ def read_section(path: Path, name: str) -> dict[str, Any]:
 
 
 def load_section(cls: type[M], path: Path | None, name: str, **options: object) -> M:
-    """The section ``name`` of a settings file as ``cls``; the ``options`` that are not empty take precedence.
+    """Load the section ``name`` of a settings file as ``cls``; ``options`` that are not empty take precedence.
 
     Raises UserError if a setting is unknown or invalid.
     """

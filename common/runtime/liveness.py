@@ -1,4 +1,4 @@
-"""Which services of a robot are alive, since when, and what is wrong with them.
+"""Tracks which services of a robot are alive, since when, and their problems.
 
 `presage top`, `presage doctor`, the page and the health checks of containers all use this model and only show its
 results. It imports only the standard library, so that a health check starts in 20 ms. Times are s of a monotonic clock.
@@ -42,9 +42,9 @@ State = Literal["alive", "late", "absent"]
 
 @dataclass(frozen=True)
 class Report:
-    """What a service last reported about itself, in a health message or a heartbeat file."""
+    """The last report of a service about itself, from a health message or a heartbeat file."""
 
-    time: float  # when it was made
+    time: float  # of the report
     linked: bool = True  # connected to at least one other session
     note: str = ""
     idle: bool = False  # publishes no results on purpose
@@ -74,10 +74,10 @@ class ServiceLiveness:
         return f"{self.problem} ({note})" if self.problem and note else self.problem or note
 
 
-def find_problem(service: str, robot: str, report: Report, now: float, never: float = -math.inf) -> str:
-    """What is wrong with a connected service by its last report; empty if nothing is.
+def find_problem(service: str, robot: str, report: Report, now: float, default_time: float = -math.inf) -> str:
+    """The problem of a connected service by its last report; empty if it is healthy.
 
-    ``never`` is the time from which the age of a result is counted that was not seen yet.
+    ``default_time`` stands in for the time of the last result while there is none.
     """
     if (age := now - report.time) > REPORT_TIMEOUT_S:
         return f"no sign of life for {age:.0f} s: it is stopped, hangs, or gets no processor time"
@@ -88,7 +88,7 @@ def find_problem(service: str, robot: str, report: Report, now: float, never: fl
     needed, (topic, kind) = RESULTS[service]
     if needed is not None and now - _last_time(report, robot, *needed) > INPUT_TIMEOUT_S:
         return ""
-    age = now - max(never, _last_time(report, robot, topic, kind))
+    age = now - max(default_time, _last_time(report, robot, topic, kind))
     if age <= RESULT_TIMEOUT_S:
         return ""
     how_long = f"for {age:.0f} s" if math.isfinite(age) else "so far"
@@ -118,7 +118,7 @@ class CountTimes:
         self._counts: dict[tuple[str, str], int] = {}
 
     def update(self, counts: Mapping[str, Mapping[str, int]], now: float) -> None:
-        """Takes the totals so far, by key and kind."""
+        """Store the totals so far, by key and kind."""
         for key, row in counts.items():
             for kind in COUNT_KINDS:
                 count = row.get(kind, 0)
@@ -134,7 +134,7 @@ def counts_of(health: Health) -> dict[str, dict[str, int]]:
 
 @dataclass
 class _Service:
-    """What is known about one run of a service."""
+    """Observations of one run of a service."""
 
     began: float  # first sign of life
     report: Report  # a first one without contents, until a health message comes
@@ -157,7 +157,7 @@ class RobotLiveness:
         self._scan_at = -math.inf
 
     def set_alive(self, names: Collection[str], now: float) -> None:
-        """Takes the names of all services that have a liveliness token; to be called about once a second."""
+        """Store the names of all services that have a liveliness token. Call it about once a second."""
         for name in names:
             if (service := self._service(name, now)) is not None:
                 service.has_token, service.token_at = True, now
@@ -167,7 +167,7 @@ class RobotLiveness:
                 del self._services[name]
 
     def add_health(self, health: Health, now: float) -> None:
-        """Takes a health message."""
+        """Store a health message."""
         service = self._service(health.service, now)
         if service is not None and service.health is not None and health.uptime < service.health.uptime:
             self._services.pop(health.service)  # the service was restarted
@@ -179,7 +179,7 @@ class RobotLiveness:
         service.report = Report(now, note=health.note, idle=health.idle, last=service.times.last)
 
     def add_scan(self, now: float) -> None:
-        """Takes the arrival of a scan: while scans arrive, as from a robot's own driver, no simulator is needed."""
+        """Store the arrival of a scan. While scans arrive, as from a robot's own driver, no simulator is needed."""
         self._scan_at = now
 
     def services(self, now: float) -> list[ServiceLiveness]:
@@ -220,7 +220,7 @@ class RobotLiveness:
         if not service.present(now):
             since = max(service.token_at, service.report.time)
             return ServiceLiveness(name, "absent", f"gone for {now - since:.0f} s", since, health, age)
-        problem = find_problem(name, self.robot, report, now, never=service.began)
+        problem = find_problem(name, self.robot, report, now, default_time=service.began)
         if now - report.time > REPORT_TIMEOUT_S:
             return ServiceLiveness(name, "late", problem, report.time + REPORT_TIMEOUT_S, health, age)
         return ServiceLiveness(name, "alive", problem, service.began, health, age)

@@ -21,10 +21,10 @@ from common.messages.topics import CONFIG
 from common.versions import PROTOCOL, versions
 
 COMPARED_PACKAGES = ("presage", "eclipse-zenoh")  # their versions should be the same everywhere
-START_TIMEOUT_S = 0.3  # at the start, for the first link and then for replies; later replies are checked by `poll`
+START_TIMEOUT_S = 0.3  # for the first link, and then for replies; `poll` checks later replies
 REPLY_TIMEOUT_S = 5.0  # while the service runs
 MAX_ATTEMPTS = 3
-SIMULTANEOUS_START_S = 1.0  # with start times closer than this, the order of two starts is not certain
+SIMULTANEOUS_START_S = 1.0  # if two start times are closer than this, their order is uncertain
 
 
 def build_config_reply(name: str, config: str, uptime: float = 0.0) -> ConfigReply:
@@ -35,7 +35,7 @@ def build_config_reply(name: str, config: str, uptime: float = 0.0) -> ConfigRep
 
 
 def same_protocol(mine: ConfigReply, other: ConfigReply) -> bool:
-    """Whether both speak the same protocol; assumed if one of them does not state it."""
+    """Whether both speak the same protocol. True if one of them does not state its protocol."""
     return not other.protocol or not mine.protocol or other.protocol == mine.protocol
 
 

@@ -56,7 +56,7 @@ class RobotSettings(ServiceSettings):
     ] = 3.0
 
     def build_robot(self) -> Robot:
-        """Returns a robot with these limits; raises UserError if it would take too long to stop."""
+        """Build a robot with these limits; raises UserError if it would take too long to stop."""
         for speed_name, acceleration_name, unit in (
             ("max_speed", "acceleration", "m/s"),
             ("max_turn", "turn_acceleration", "rad/s"),
@@ -80,7 +80,7 @@ class RobotSettings(ServiceSettings):
         )
 
 
-class SeenRobotSettings(RobotSettings):
+class SelfFilterSettings(RobotSettings):
     """Settings of a robot whose scanner sees parts of the robot. Controller and bridge have to get the same values."""
 
     ignore_angles: Annotated[

@@ -8,7 +8,7 @@ from common.geometry import se2
 from common.geometry.se2 import Array
 from common.messages.definitions import Scan
 from common.robot.base import Robot
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 
 REACTION_TIME_S = 2 / 15  # the scan is up to one 15 Hz period old, and the command holds for another
 FOOTPRINT_MARGIN_M = 0.01  # must be free around the footprint
@@ -18,7 +18,7 @@ PATH_STEP_S = 1 / 60  # between the points of a stopping path: 17 mm at 1 m/s, w
 def scan_points(scan: Scan) -> Array:
     """(K, 2) end points in m in base_link of the beams that hit something; too close (-inf) counts as at range_min."""
     close = np.isneginf(scan.ranges)
-    hit = surfaces(scan.ranges) | close
+    hit = is_surface(scan.ranges) | close
     ranges = np.where(close, scan.range_min, scan.ranges.astype(np.float64))
     angles, ranges = scan.angles()[hit], ranges[hit]
     in_laser = np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=-1)
@@ -41,13 +41,13 @@ def clip_twist(twist: Array, robot: Robot) -> Array:
     return np.array([*linear, np.clip(twist[2], -robot.max_turn, robot.max_turn)])
 
 
-def ramp(current: Array, wanted: Array, robot: Robot, dt: float, *, hard: bool = False) -> Array:
-    """(3,) velocity after ``dt`` s of changing from ``current`` to ``wanted`` within the acceleration limits.
+def ramp(current: Array, target: Array, robot: Robot, dt: float, *, hard: bool = False) -> Array:
+    """(3,) velocity after ``dt`` s of changing from ``current`` to ``target`` within the acceleration limits.
 
     With ``hard``, brakes as hard as the base can (``robot.braking``); use it only to stop.
     """
     # Never below 1, in case the base's acceleration exceeds its braking.
-    change, factor = wanted - current, max(1.0, robot.braking / robot.acceleration) if hard else 1.0
+    change, factor = target - current, max(1.0, robot.braking / robot.acceleration) if hard else 1.0
     linear, max_linear = float(np.hypot(change[0], change[1])), robot.acceleration * factor * dt
     scale = min(1.0, max_linear / linear) if linear > 0 else 1.0
     max_turn = robot.turn_acceleration * factor * dt
@@ -72,8 +72,8 @@ def limit_velocity(
         return allowed, bool((allowed != twist).any())
 
     def clear(scale: float) -> bool:
-        wanted = allowed * [scale, scale, 1.0]
-        return _clear(wanted if current is None else current, wanted, points, robot, hold)
+        target = allowed * [scale, scale, 1.0]
+        return _clear(target if current is None else current, target, points, robot, hold)
 
     if clear(1.0):
         return allowed, bool((allowed != twist).any())
@@ -103,15 +103,15 @@ def _straight_scale(twist: Array, points: Array, robot: Robot) -> float:
     return min(1.0, float(allowed) / speed)
 
 
-def stopping_path(current: Array, wanted: Array, robot: Robot, hold: float) -> Array:
+def stopping_path(current: Array, target: Array, robot: Robot, hold: float) -> Array:
     """(T, 2) positions in m, in the present base_link, until the robot stands.
 
-    The velocity changes from ``current`` (3,) towards ``wanted`` for ``hold`` s and then to zero, both within the
+    The velocity changes from ``current`` (3,) towards ``target`` for ``hold`` s and then to zero, both within the
     acceleration limits of `ramp`. A twist turns with the robot, so the path is curved.
     """
     dt = PATH_STEP_S
-    ramp_up = _ramp_velocities(current, wanted, robot, np.arange(0, hold, dt) + dt / 2)
-    at_end = _ramp_velocities(current, wanted, robot, np.array([hold]))[0]
+    ramp_up = _ramp_velocities(current, target, robot, np.arange(0, hold, dt) + dt / 2)
+    at_end = _ramp_velocities(current, target, robot, np.array([hold]))[0]
     braking_time = max(float(np.hypot(at_end[0], at_end[1])) / robot.acceleration, dt)
     braking = _ramp_velocities(at_end, np.zeros(3), robot, np.arange(0, braking_time, dt) + dt / 2)
     velocity = np.concatenate([ramp_up, braking])
@@ -122,18 +122,18 @@ def stopping_path(current: Array, wanted: Array, robot: Robot, hold: float) -> A
     return np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
 
 
-def _ramp_velocities(current: Array, wanted: Array, robot: Robot, times: Array) -> Array:
-    """(T, 3) velocities at ``times`` (T,) s of a `ramp` from ``current`` to ``wanted``."""
-    change = wanted - current
+def _ramp_velocities(current: Array, target: Array, robot: Robot, times: Array) -> Array:
+    """(T, 3) velocities at ``times`` (T,) s of a `ramp` from ``current`` to ``target``."""
+    change = target - current
     linear = max(float(np.hypot(change[0], change[1])), 1e-12)
     scale = np.minimum(1.0, robot.acceleration * times / linear)
     turn = robot.turn_acceleration * times
     return np.column_stack([current[:2] + change[:2] * scale[:, None], current[2] + np.clip(change[2], -turn, turn)])
 
 
-def _clear(current: Array, wanted: Array, points: Array, robot: Robot, hold: float) -> bool:
+def _clear(current: Array, target: Array, points: Array, robot: Robot, hold: float) -> bool:
     """Whether the footprint approaches no point to contact on the stopping path."""
-    path, contact = stopping_path(current, wanted, robot, hold), robot.radius + FOOTPRINT_MARGIN_M
+    path, contact = stopping_path(current, target, robot, hold), robot.radius + FOOTPRINT_MARGIN_M
     travelled = float(np.hypot(*np.diff(path, axis=0).T).sum())
     points = points[np.hypot(points[:, 0], points[:, 1]) < contact + travelled]
     distance = np.hypot(path[:, None, 0] - points[:, 0], path[:, None, 1] - points[:, 1])

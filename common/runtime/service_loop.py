@@ -60,7 +60,7 @@ class Loop:
             self._run()
             return
         # Imported here because the Prometheus client is slow to import and rarely used.
-        from common.runtime.metrics_server import measure  # noqa: PLC0415
+        from common.runtime.metrics_server import measure
 
         with measure(self, address) as self._metrics:
             self._run()

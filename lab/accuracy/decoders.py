@@ -27,18 +27,18 @@ from services.estimator.precise.learning.field_learning import Recipe, learn_fie
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import GenerativeModel
 
-COLUMNS = ("learning s", "numbers", "range median mm", "mean mm", "> 5 cm %", "position median mm", "RMS mm")
+COLUMNS = ("training s", "parameters", "range median mm", "mean mm", "> 5 cm %", "position median mm", "RMS mm")
 PAPER = "the paper's decoder, L1, one heading"
 HEADING = np.pi / 2  # rad, of all scans for the paper's decoder, which has no heading input
 TEST_SCANS, CALIBRATION_SCANS = 200, 300
-Learn = Callable[["Scans"], tuple[GenerativeModel, int]]  # returns the model and how many numbers it stores
+Learn = Callable[["TrainingScans"], tuple[GenerativeModel, int]]  # returns the model and its number of parameters
 
 
-class Scans:
+class TrainingScans:
     """Noisy scans for training, and noise-free ones for calibration and testing; the laser is at base_link's origin."""
 
     def __init__(self, world: str, samples: int, seed: int, heading: float | None = None) -> None:
-        """Cast scans at random poses: all with the given ``heading`` (rad), or by default with random headings."""
+        """Casts scans at random poses: all with the given ``heading`` (rad), or by default with random headings."""
         self.world, self.seed = load_world(world), seed
         self.scanner = SCANNERS["tim571"].model_copy(update={"mount": (0.0, 0.0, 0.0)})
         scene = Scene(self.world, self.scanner, np.random.default_rng(seed))
@@ -57,7 +57,7 @@ class Scans:
 def field(resolution: float, share: float = 1.0, sweeps: int = 10) -> Learn:
     """Returns a function that learns a distance field from the given share of the scans."""
 
-    def learn(scans: Scans) -> tuple[GenerativeModel, int]:
+    def learn(scans: TrainingScans) -> tuple[GenerativeModel, int]:
         count, mount = int(share * len(scans.poses)), np.zeros(3)
         beams = Beams.of(scans.poses[:count], mount, scans.angles, scans.ranges[:count])
         learned = learn_field(beams, Recipe(resolution=resolution, sweeps=sweeps))
@@ -70,7 +70,7 @@ def field(resolution: float, share: float = 1.0, sweeps: int = 10) -> Learn:
 def panorama(steps: int, **shape: Any) -> Learn:
     """Returns a function that trains a panorama network for ``steps`` batches of 256 scans."""
 
-    def learn(scans: Scans) -> tuple[GenerativeModel, int]:
+    def learn(scans: TrainingScans) -> tuple[GenerativeModel, int]:
         model = train_panorama(Shape(**shape), scans.poses, scans.angles, scans.ranges, steps, 0)
         return model, sum(x.numel() for x in model.network.parameters())
 
@@ -80,7 +80,7 @@ def panorama(steps: int, **shape: Any) -> Learn:
 def paper(epochs: int) -> Learn:
     """Returns a function that trains the paper's decoder on scans of one heading."""
 
-    def learn(scans: Scans) -> tuple[GenerativeModel, int]:
+    def learn(scans: TrainingScans) -> tuple[GenerativeModel, int]:
         norm = Normalisation.of(scans.world.bounds, float(scans.ranges.max()))
         recipe = training.Recipe(epochs=epochs, learning_rate=3e-3)
         data = training.Data(scans.poses, scans.ranges)
@@ -94,7 +94,7 @@ def paper(epochs: int) -> Learn:
 
 
 def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: Path | None, console: Console) -> int:
-    """Train and evaluate every model, print the table and write it to ``json_file`` if given. Returns exit status 0."""
+    """Trains and evaluates the models, prints a table and writes ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
     learners: dict[str, Learn] = {
         PAPER: paper(max(1, steps // 50)),
@@ -109,7 +109,7 @@ def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: P
         "distance field, 0.04 m": field(0.04),
         "distance field, 0.02 m": field(0.02),
     }
-    any_heading, one_heading = Scans(world, samples, seed), Scans(world, samples, seed, HEADING)
+    any_heading, one_heading = TrainingScans(world, samples, seed), TrainingScans(world, samples, seed, HEADING)
     rows: list[dict[str, Any]] = []
     for name, learn in track(list(learners.items()), "learning", console=console, transient=True):
         scans = one_heading if name == PAPER else any_heading
@@ -117,27 +117,37 @@ def bench_decoders(world: str, samples: int, steps: int, seed: int, json_file: P
         model, size = learn(scans)
         took = time.monotonic() - began
         quality = evaluate(model, scans.test, np.zeros(3), scans.angles, scans.test_ranges, 25.0, scans.sigma)
-        rows.append({
-            "decoder": name, "learning_s": round(took, 1), "numbers": size,
-            "range_error_median_m": quality.range_error_median, "range_error_mean_m": quality.range_error_mean,
-            "share_above_5_cm": quality.share_above_5_cm, "position_error_median_m": quality.position_error_median,
-            "position_error_rms_m": quality.position_error_rms,
-        })  # fmt: skip
+        rows.append(
+            {
+                "decoder": name,
+                "learning_s": round(took, 1),
+                "numbers": size,
+                "range_error_median_m": quality.range_error_median,
+                "range_error_mean_m": quality.range_error_mean,
+                "share_above_5_cm": quality.share_above_5_cm,
+                "position_error_median_m": quality.position_error_median,
+                "position_error_rms_m": quality.position_error_rms,
+            }
+        )
     table = Table(title=f"{world}, {samples} scans of 811 beams with noise of 0.02 m", title_justify="left")
     table.add_column("decoder")
     for column in COLUMNS:
         table.add_column(column, justify="right")
     for row in rows:
         table.add_row(
-            row["decoder"], f"{row['learning_s']:.0f}", f"{row['numbers'] / 1e6:.2f} M",
-            f"{row['range_error_median_m'] * 1e3:.2f}", f"{row['range_error_mean_m'] * 1e3:.1f}",
-            f"{row['share_above_5_cm'] * 100:.1f}", f"{row['position_error_median_m'] * 1e3:.2f}",
+            row["decoder"],
+            f"{row['learning_s']:.0f}",
+            f"{row['numbers'] / 1e6:.2f} M",
+            f"{row['range_error_median_m'] * 1e3:.2f}",
+            f"{row['range_error_mean_m'] * 1e3:.1f}",
+            f"{row['share_above_5_cm'] * 100:.1f}",
+            f"{row['position_error_median_m'] * 1e3:.2f}",
             f"{row['position_error_rms_m'] * 1e3:.2f}",
-        )  # fmt: skip
+        )
     console.print(table)
     console.print(
-        "position: error of the pose estimated from noise-free scans, starting at the true pose. It is due to the "
-        "model alone"
+        "position: error of the pose estimated from noise-free scans, starting at the true pose. Only the model "
+        "causes it"
     )
     write_json(json_file, {"rows": rows, "samples": samples, "network_steps": steps, **provenance(seed)})
     return 0

@@ -72,8 +72,8 @@ class Grids(nn.Module):
 
     def forward(self, p: torch.Tensor) -> torch.Tensor:
         """Maps positions (N, 2) to features (N, features * grids + 2)."""
-        at = (p * self.stretch)[None, :, None, :]
-        features = [nn.functional.grid_sample(g, at, align_corners=True)[0, :, :, 0].T for g in self.grids]
+        points = (p * self.stretch)[None, :, None, :]
+        features = [nn.functional.grid_sample(g, points, align_corners=True)[0, :, :, 0].T for g in self.grids]
         return torch.cat([p, *features], -1)
 
 
@@ -111,7 +111,7 @@ class PanoramaModel:
     ripple: float = 0.0  # not measured for this model
 
     def expect(self, lasers: Array, angles: Array) -> Expected:
-        """See GenerativeModel. Interpolates linearly interpolate the network's directions."""
+        """See GenerativeModel. Interpolates linearly between the directions of the network."""
         lasers = np.asarray(lasers, float).reshape(-1, 3)
         offsets = np.array(
             [[0, 0], [DIFFERENCE_STEP, 0], [-DIFFERENCE_STEP, 0], [0, DIFFERENCE_STEP], [0, -DIFFERENCE_STEP]]
@@ -138,7 +138,7 @@ class PanoramaModel:
 
 
 def train_panorama(shape: Shape, lasers: Array, angles: Array, ranges: Array, steps: int, seed: int) -> PanoramaModel:
-    """Train on scans ``ranges`` (N, B), m, taken at ``lasers`` (N, 3), the laser's poses.
+    """Trains on scans ``ranges`` (N, B), m, taken at ``lasers`` (N, 3), the laser's poses.
 
     Takes ``steps`` steps of 256 scans each; the learning rate decays to zero along a cosine.
     """

@@ -72,7 +72,7 @@ def localisation(world: str, beams: int, trials: int, scans: int, seed: int, con
 def bench_localisation(
     world: str, beams: int, trials: int, scans: int, seed: int, json_file: Path | None, console: Console
 ) -> int:
-    """Run the benchmark, print the result and write it to ``json_file`` if given. Returns exit status 0."""
+    """Runs the benchmark, prints the result and writes it to ``json_file`` if given. Returns exit status 0."""
     result = localisation(world, beams, trials, scans, seed, console)
     mean, std = (result[f"position_error_of_found_{k}_m"] for k in ("mean", "std"))
     console.print(

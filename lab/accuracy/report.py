@@ -16,15 +16,17 @@ from common.errors import UserError
 from common.geometry.world import load_world
 from common.robot.scanner import Scanner
 from common.robot.scanner_options import chosen_scanner
-from lab.accuracy.runner import ESTIMATORS, TASKS, Job, provenance, run_all
+from lab.accuracy.runner import ESTIMATORS, TASKS, AccuracyJob, provenance, run_all
 from lab.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW, TWINS_REQUIRED_FROM_SCAN
 from presage.terminal.output import check_file, write_json
 
 # Colour-blind safe colours (Okabe & Ito), marker, and the vertical offset of the annotation in points.
 MARKS = {
-    "precise": ("#0072B2", "o", 7), "precise-exact": ("#56B4E9", "s", -14), "particle-filter": ("#D55E00", "^", 7),
+    "precise": ("#0072B2", "o", 7),
+    "precise-exact": ("#56B4E9", "s", -14),
+    "particle-filter": ("#D55E00", "^", 7),
     "amcl-defaults": ("#CC79A7", "v", -14),
-}  # fmt: skip
+}
 # Printed below each --markdown table, because the errors alone would hide the trials that failed.
 LEGEND = f"""Each cell: median/RMS position error of the trials that were found, i.e. within {FOUND_DISTANCE:g} m and
 {np.rad2deg(FOUND_YAW):g}° of the true pose; how many of all trials were found; wrong: how many of all trials published
@@ -35,11 +37,22 @@ at the wrong place during that time."""
 
 
 def bench_accuracy(
-    worlds: str, beams: str, estimators: str, tasks: str, trials: int, minutes: float, seed: int,
-    workers: int, json_file: Path | None, figure: Path | None, console: Console, *, markdown: bool = False,
+    worlds: str,
+    beams: str,
+    estimators: str,
+    tasks: str,
+    trials: int,
+    minutes: float,
+    seed: int,
+    workers: int,
+    json_file: Path | None,
+    figure: Path | None,
+    console: Console,
+    *,
+    markdown: bool = False,
     scanner: str = "tim571",
-) -> int:  # fmt: skip
-    """Run the benchmark, print a table per world and scanner, and write ``json_file`` and ``figure`` if given."""
+) -> int:
+    """Runs the benchmark, prints a table per world and scanner, and writes ``json_file`` and ``figure`` if given."""
     chosen = estimators.split(",")
     unknown = [name for name in chosen if name not in ESTIMATORS]
     if unknown:
@@ -54,9 +67,11 @@ def bench_accuracy(
     check_file(json_file, "--json")
     check_file(figure, "--figure")
     jobs = [
-        Job(estimator, world, each, trials, minutes * 60, seed, wanted)
-        for world in names for each in scanners for estimator in chosen
-    ]  # fmt: skip
+        AccuracyJob(estimator, world, each, trials, minutes * 60, seed, wanted)
+        for world in names
+        for each in scanners
+        for estimator in chosen
+    ]
     rows = run_all(jobs, workers, console)
     for title, own in _by_title(rows).items():
         if markdown:
@@ -109,12 +124,20 @@ def _table(rows: list[dict[str, Any]], title: str) -> Table:
     for row in sorted(rows, key=lambda r: [q["task"] for q in rows].index(r["task"])):
         band = row["nees_band"]
         table.add_row(
-            row["task"], row["estimator"], f"{row['found']}/{row['of']}", str(row["tracking_but_wrong"]),
-            _number(row["position_error_median_m"], 1e3), _number(row["position_error_rms_m"], 1e3),
-            _number(row["position_error_p95_m"], 1e3), _number(row["heading_error_median_deg"], 1, 3),
-            _number(row["bound_rms_m"], 1e3), _number(row["rms_over_bound"]), _number(row["nees_mean"]),
-            "" if band is None else f"{band[0]:.2f}-{band[1]:.2f}", _number(row["update_ms_median"], 1, 1),
-        )  # fmt: skip
+            row["task"],
+            row["estimator"],
+            f"{row['found']}/{row['of']}",
+            str(row["tracking_but_wrong"]),
+            _number(row["position_error_median_m"], 1e3),
+            _number(row["position_error_rms_m"], 1e3),
+            _number(row["position_error_p95_m"], 1e3),
+            _number(row["heading_error_median_deg"], 1, 3),
+            _number(row["bound_rms_m"], 1e3),
+            _number(row["rms_over_bound"]),
+            _number(row["nees_mean"]),
+            "" if band is None else f"{band[0]:.2f}-{band[1]:.2f}",
+            _number(row["update_ms_median"], 1, 1),
+        )
     return table
 
 
@@ -151,26 +174,42 @@ def _draw(rows: list[dict[str, Any]], file: Path) -> None:
         own = [row for row in rows if row["estimator"] == name]
         colour, mark, above = MARKS[name]
         axes.scatter(
-            [row["position_error_rms_m"] * 1e3 for row in own], [tasks.index(row["task"]) for row in own],
-            color=colour, marker=mark, s=50, label=name, zorder=3,
-        )  # fmt: skip
+            [row["position_error_rms_m"] * 1e3 for row in own],
+            [tasks.index(row["task"]) for row in own],
+            color=colour,
+            marker=mark,
+            s=50,
+            label=name,
+            zorder=3,
+        )
         for row in own:
             if row["found"] < row["of"]:
                 axes.annotate(
-                    f"{row['found']}/{row['of']}", (row["position_error_rms_m"] * 1e3, tasks.index(row["task"])),
-                    textcoords="offset points", xytext=(0, above), ha="center", fontsize=7, color=colour,
-                )  # fmt: skip
+                    f"{row['found']}/{row['of']}",
+                    (row["position_error_rms_m"] * 1e3, tasks.index(row["task"])),
+                    textcoords="offset points",
+                    xytext=(0, above),
+                    ha="center",
+                    fontsize=7,
+                    color=colour,
+                )
     bounds = [row for row in rows if row["bound_rms_m"] is not None]
     axes.scatter(
-        [row["bound_rms_m"] * 1e3 for row in bounds], [tasks.index(row["task"]) for row in bounds],
-        color="black", marker="|", s=300, label="Cramér-Rao bound", zorder=4,
-    )  # fmt: skip
+        [row["bound_rms_m"] * 1e3 for row in bounds],
+        [tasks.index(row["task"]) for row in bounds],
+        color="black",
+        marker="|",
+        s=300,
+        label="Cramér-Rao bound",
+        zorder=4,
+    )
     axes.set_yticks(np.arange(len(tasks)), tasks)
     axes.invert_yaxis()
     axes.set(
-        xscale="log", xlabel="position error, RMS (mm)",
+        xscale="log",
+        xlabel="position error, RMS (mm)",
         title=f"{title}; numbers: trials found, where some were not",
-    )  # fmt: skip
+    )
     axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter("{x:g}")

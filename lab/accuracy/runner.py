@@ -19,13 +19,13 @@ from common.versions import commit, versions
 from lab.accuracy import tasks
 from lab.accuracy.scenes import TWINS, Scene
 from lab.workers import pool
-from services.estimator.factory import Choice, Geometry, Name, prepare
+from services.estimator.factory import EstimatorOptions, Geometry, Name, prepare
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_places
-from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_ripple, learn_scales
+from services.estimator.precise.learning.field_learning import Recipe, learn_field, learn_scales, measure_ripple
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.generative_models import RayCaster
 from services.estimator.shared.interface import Estimator
@@ -42,7 +42,7 @@ TASKS = ("standing", "blocked", "kidnapped", "tracking", "odometry", "twins")
 
 
 @dataclass(frozen=True)
-class Job:
+class AccuracyJob:
     """One estimator in one world with one scanner."""
 
     estimator: str
@@ -54,7 +54,7 @@ class Job:
     tasks: tuple[str, ...] = TASKS
 
 
-def run_all(jobs: list[Job], workers: int, console: Console) -> list[dict[str, Any]]:
+def run_all(jobs: list[AccuracyJob], workers: int, console: Console) -> list[dict[str, Any]]:
     """Rows of all jobs, in the order of the jobs; shows a progress bar."""
     if workers == 1:
         return [row for job in track(jobs, "measuring", console=console, transient=True) for row in run(job)]
@@ -63,13 +63,13 @@ def run_all(jobs: list[Job], workers: int, console: Console) -> list[dict[str, A
         return [row for rows in done for row in rows]
 
 
-def run(job: Job) -> list[dict[str, Any]]:
+def run(job: AccuracyJob) -> list[dict[str, Any]]:
     """Runs the job's tasks. Returns one row for each result."""
     world = load_world(job.world)
     geometry = Geometry.of(job.scanner)
     name, model = ESTIMATORS[job.estimator]
-    estimator = prepare(Choice(job.world, name, model, seed=job.seed))(geometry)
-    outcomes: dict[str, tasks.Outcome] = {}
+    estimator = prepare(EstimatorOptions(job.world, name, model, seed=job.seed))(geometry)
+    outcomes: dict[str, tasks.TaskOutcome] = {}
     for number, task in enumerate((tasks.standing, tasks.blocked, tasks.kidnapped)):
         if task.__name__ in job.tasks:
             outcomes |= task(estimator, _scene(job, world, number), job.trials, _no_progress)
@@ -89,11 +89,11 @@ def _no_progress(poses: Iterable[Array]) -> Iterator[Array]:
     return iter(poses)
 
 
-def _scene(job: Job, world: World, number: int) -> Scene:
+def _scene(job: AccuracyJob, world: World, number: int) -> Scene:
     return Scene.of(world, None, job.seed * 100 + number, job.scanner)
 
 
-def _estimator_for_twins(job: Job, geometry: Geometry) -> Estimator:
+def _estimator_for_twins(job: AccuracyJob, geometry: Geometry) -> Estimator:
     """The job's estimator for the world of two identical rooms; trains its field from 2000 scans if it needs one."""
     name, model = ESTIMATORS[job.estimator]
     mount = (float(geometry.mount[0]), float(geometry.mount[1]), float(geometry.mount[2]))
@@ -125,29 +125,29 @@ def quick_field(
         clean, noisy = (np.where(ranges > geometry.range_max, np.inf, ranges) for ranges in (clean, noisy))
     field = learn_field(Beams.of(poses[split:], geometry.mount, geometry.angles, noisy), Recipe(sweeps=6))
     scales = learn_scales(field, poses[:split], geometry.mount, geometry.angles, clean[:split], 0.0)
-    ripple = learn_ripple(field, se2.compose(poses[:split], geometry.mount), geometry.angles)
+    ripple = measure_ripple(field, se2.compose(poses[:split], geometry.mount), geometry.angles)
     return FieldModel(field, scales, ripple)
 
 
-def _row(job: Job, world: str, task: str, outcome: tasks.Outcome) -> dict[str, Any]:
+def _row(job: AccuracyJob, world: str, task: str, outcome: tasks.TaskOutcome) -> dict[str, Any]:
     """Row of the report; None where a quantity is not defined for this task."""
     errors = np.array(outcome.errors).reshape(-1, 3)
     position = np.hypot(errors[:, 0], errors[:, 1])
-    count, misfits = len(position), np.array(outcome.misfits)
+    count, nees = len(position), np.array(outcome.nees)
     rms = float(np.sqrt(np.mean(position**2))) if count else None
     limit = float(np.sqrt(np.mean(np.square(outcome.bounds)))) if outcome.bounds else None
-    half = 1.96 * np.sqrt(2 * DEGREES_OF_FREEDOM / max(len(misfits), 1))
+    half = 1.96 * np.sqrt(2 * DEGREES_OF_FREEDOM / max(len(nees), 1))
     return {
         "world": world,
         "scanner": job.scanner.name,
         "beams": job.scanner.beams,
         "estimator": job.estimator,
         "task": task,
-        "of": outcome.of,
+        "of": outcome.total,
         "found": outcome.found,
         "tracking_but_wrong": outcome.wrong,
-        "found_share_95": wilson_interval(outcome.found, outcome.of) if outcome.independent else None,
-        "tracking_but_wrong_share_95": wilson_interval(outcome.wrong, outcome.of) if outcome.independent else None,
+        "found_share_95": wilson_interval(outcome.found, outcome.total) if outcome.independent else None,
+        "tracking_but_wrong_share_95": wilson_interval(outcome.wrong, outcome.total) if outcome.independent else None,
         "position_error_median_m": float(np.median(position)) if count else None,
         "position_error_rms_m": rms,
         "position_error_p95_m": float(np.quantile(position, 0.95)) if count else None,
@@ -155,8 +155,8 @@ def _row(job: Job, world: str, task: str, outcome: tasks.Outcome) -> dict[str, A
         "heading_error_median_deg": float(np.rad2deg(np.median(np.abs(errors[:, 2])))) if count else None,
         "bound_rms_m": limit,
         "rms_over_bound": rms / limit if rms is not None and limit else None,
-        "nees_mean": float(misfits.mean()) if len(misfits) else None,
-        "nees_band": [DEGREES_OF_FREEDOM - half, DEGREES_OF_FREEDOM + half] if len(misfits) else None,
+        "nees_mean": float(nees.mean()) if len(nees) else None,
+        "nees_band": [DEGREES_OF_FREEDOM - half, DEGREES_OF_FREEDOM + half] if len(nees) else None,
         "update_ms_median": float(np.median(outcome.update_ms)) if outcome.update_ms else None,
     }
 
@@ -169,5 +169,5 @@ def wilson_interval(count: int, of: int) -> list[float]:
 
 
 def provenance(seed: int) -> dict[str, Any]:
-    """What one needs to reproduce a result: seed, commit, versions and command-line arguments."""
+    """The information needed to reproduce a result: seed, commit, versions and command-line arguments."""
     return {"seed": seed, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:]}

@@ -48,7 +48,7 @@ class Scene:
         """Observation of noise-free ranges (B,) with fresh noise added."""
         scanner = self.scanner
         return Observation(
-            scanner.limit(scanner.noisy(clean, self.rng)), scanner.angles(), scanner.range_max, stamp, odom
+            scanner.limit(scanner.add_noise(clean, self.rng)), scanner.angles(), scanner.range_max, stamp, odom
         )
 
     def blocked(self, clean: Array, share: float) -> Array:
@@ -122,7 +122,7 @@ TWINS = World(
         {"circle": {"center": (10.5, 2.6), "radius": 0.3}},
         {"box": {"center": (0.4, 5.6), "size": (0.6, 0.5)}},
     ],
-)  # fmt: skip
+)
 
 
 def twin_path(scene: Scene) -> tuple[Array, int]:

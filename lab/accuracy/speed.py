@@ -17,7 +17,7 @@ from lab.accuracy.runner import ESTIMATORS, provenance
 from lab.accuracy.scenes import Scene
 from lab.workers import pool
 from presage.terminal.output import check_file, write_json
-from services.estimator.factory import Choice, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, Geometry, prepare
 
 LIMITS = {"tracking": 5.0, "from nothing": 500.0}  # ms per update, the requirement for preset precise
 TRACKING_UPDATES = 300
@@ -25,7 +25,7 @@ SKIPPED_UPDATES = 5  # at the start of the path, while caches warm up
 
 
 def bench_speed(world: str, beams: str, seed: int, json_file: Path | None, console: Console) -> int:
-    """Run the benchmark, print the table and write it to ``json_file`` if given. Returns exit status 0."""
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
     load_world(world)
     jobs = [(name, world, int(count), seed) for count in beams.split(",") for name in ESTIMATORS]
@@ -38,10 +38,15 @@ def bench_speed(world: str, beams: str, seed: int, json_file: Path | None, conso
         table.add_column(column, justify="left" if column == "estimator" else "right")
     for row in rows:
         table.add_row(
-            row["estimator"], str(row["beams"]), f"{row['tracking_ms']:.2f}", f"{row['tracking_p95_ms']:.2f}",
-            f"{row['global_ms']:.0f}", f"{row['global_p95_ms']:.0f}", f"{row['ready_s']:.1f}",
+            row["estimator"],
+            str(row["beams"]),
+            f"{row['tracking_ms']:.2f}",
+            f"{row['tracking_p95_ms']:.2f}",
+            f"{row['global_ms']:.0f}",
+            f"{row['global_p95_ms']:.0f}",
+            f"{row['ready_s']:.1f}",
             f"{row['memory_mb']:.0f}",
-        )  # fmt: skip
+        )
     console.print(table)
     console.print(
         f"required of precise: {LIMITS['tracking']:g} ms tracking, {LIMITS['from nothing']:g} ms for a global search"
@@ -56,7 +61,7 @@ def measure(estimator: str, world_name: str, beams: int, seed: int) -> dict[str,
     scene = Scene.of(load_world(world_name), beams, seed)
     began = time.perf_counter()
     geometry = Geometry.of(scene.scanner)
-    estimator_under_test = prepare(Choice(world_name, name, model, seed=seed))(geometry)
+    estimator_under_test = prepare(EstimatorOptions(world_name, name, model, seed=seed))(geometry)
     ready = time.perf_counter() - began
     searches = []
     for clean in scene.clean(scene.poses(20)):
@@ -75,8 +80,12 @@ def measure(estimator: str, world_name: str, beams: int, seed: int) -> dict[str,
         updates.append((time.perf_counter() - began) * 1e3)
     updates = updates[SKIPPED_UPDATES:]
     return {
-        "estimator": estimator, "beams": beams, "tracking_ms": float(np.median(updates)),
-        "tracking_p95_ms": float(np.quantile(updates, 0.95)), "global_ms": float(np.median(searches)),
-        "global_p95_ms": float(np.quantile(searches, 0.95)), "ready_s": ready,
+        "estimator": estimator,
+        "beams": beams,
+        "tracking_ms": float(np.median(updates)),
+        "tracking_p95_ms": float(np.quantile(updates, 0.95)),
+        "global_ms": float(np.median(searches)),
+        "global_p95_ms": float(np.quantile(searches, 0.95)),
+        "ready_s": ready,
         "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-    }  # fmt: skip
+    }

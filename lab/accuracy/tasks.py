@@ -29,26 +29,24 @@ def is_at(believed: Array, pose: Array) -> bool:
 
 
 @dataclass
-class Outcome:
+class TaskOutcome:
     """Results of one estimator in one task."""
 
     errors: list[Array] = field(default_factory=list)  # (3,) m, m, rad
-    misfits: list[float] = field(
-        default_factory=list
-    )  # NEES: error' covariance^-1 error, with the estimate's covariance
+    nees: list[float] = field(default_factory=list)  # NEES: error' covariance^-1 error, with the estimate's covariance
     bounds: list[float] = field(default_factory=list)  # m, Cramér-Rao bound of the position
     update_ms: list[float] = field(default_factory=list)
     found: int = 0
-    of: int = 0
+    total: int = 0
     wrong: int = 0  # estimates in state `tracking` while the robot was elsewhere
     independent: bool = True  # whether the counts are of separate trials, not of scans along one path
 
     def add(self, posterior: Posterior, pose: Array, limit: float | None) -> bool:
-        """Record an estimate. Returns whether it is at the true ``pose``; ``limit`` is the position bound in m."""
+        """Records an estimate. Returns whether it is at the true ``pose``; ``limit`` is the position bound in m."""
         error = posterior.pose - pose
         error[2] = se2.wrap(error[2])
         found_here = is_at(posterior.pose, pose)
-        self.of += 1
+        self.total += 1
         self.found += found_here
         self.wrong += posterior.state == "tracking" and not found_here
         if found_here:
@@ -56,11 +54,11 @@ class Outcome:
             if limit is not None:
                 self.bounds.append(limit)
             if posterior.covariance is not None:
-                self.misfits.append(float(error @ np.linalg.solve(posterior.covariance, error)))
+                self.nees.append(float(error @ np.linalg.solve(posterior.covariance, error)))
         return found_here
 
 
-def _timed_update(estimator: Estimator, observation: Observation, outcome: Outcome | None = None) -> Posterior:
+def _timed_update(estimator: Estimator, observation: Observation, outcome: TaskOutcome | None = None) -> Posterior:
     began = time.perf_counter()
     posterior = estimator.update(observation)
     if outcome is not None:
@@ -68,9 +66,9 @@ def _timed_update(estimator: Estimator, observation: Observation, outcome: Outco
     return posterior
 
 
-def standing(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, Outcome]:
+def standing(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
     """Global localisation of a standing robot, without odometry: after one scan and after twenty."""
-    one, many = Outcome(), Outcome()
+    one, many = TaskOutcome(), TaskOutcome()
     poses = scene.poses(trials)
     limits = bound.position(bound.single(scene, poses))
     for pose, clean, limit in zip(progress(poses), scene.clean(poses), limits, strict=True):
@@ -84,12 +82,12 @@ def standing(estimator: Estimator, scene: Scene, trials: int, progress: Progress
     return {"from nothing, 1 scan": one, "standing, 20 scans": many}
 
 
-def blocked(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, Outcome]:
+def blocked(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
     """Global localisation with 30 % of the beams shortened by unknown obstacles: after one scan and after twenty.
 
     The obstacles are drawn once per trial.
     """
-    one, many = Outcome(), Outcome()
+    one, many = TaskOutcome(), TaskOutcome()
     poses = scene.poses(trials)
     for pose, clean in zip(progress(poses), scene.clean(poses), strict=True):
         estimator.restart()
@@ -104,9 +102,9 @@ def blocked(estimator: Estimator, scene: Scene, trials: int, progress: ProgressW
 
 def tracking(
     estimator: Estimator, scene: Scene, seconds: float, progress: ProgressWrapper, *, odometry: bool
-) -> dict[str, Outcome]:
+) -> dict[str, TaskOutcome]:
     """Tracking along a path from a known start, with the simulator's odometry or without."""
-    outcome, path = Outcome(independent=False), scene.path(seconds)
+    outcome, path = TaskOutcome(independent=False), scene.path(seconds)
     # Without odometry the motion is unknown, so the bound is that of each scan alone.
     limits = bound.recursive(scene, path, Drift()) if odometry else bound.single(scene, path)
     odometer = Odometer(Drift(), scene.rng)
@@ -121,9 +119,9 @@ def tracking(
     return {"tracking, odometry" if odometry else "tracking, no odometry": outcome}
 
 
-def kidnapped(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, Outcome]:
+def kidnapped(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
     """Teleports of a standing robot every 20 scans: whether it is found after one, three and twenty scans."""
-    after = {1: Outcome(), 3: Outcome(), 20: Outcome()}
+    after = {1: TaskOutcome(), 3: TaskOutcome(), 20: TaskOutcome()}
     poses, stamp = scene.poses(trials + 1), 0
     estimator.restart()
     for number, (pose, clean) in enumerate(zip(progress(poses), scene.clean(poses), strict=True)):
@@ -140,14 +138,14 @@ def holds_both(posterior: Posterior, pose: Array) -> bool:
     return all(any(is_at(h.pose, place) for h in posterior.hypotheses) for place in (pose, twin_of(pose)))
 
 
-def twins(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, Outcome]:
+def twins(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWrapper) -> dict[str, TaskOutcome]:
     """A path out of one of two identical rooms: both kept while ambiguous, and the right one believed at the end.
 
     "Both kept" counts trials in which every belief from the 20th scan until the first scan that distinguishes the rooms
     has a hypothesis at the true pose and one at its twin, of any weight. Its ``wrong`` counts trials that published
     `tracking` at the wrong place during that time.
     """
-    kept, right = Outcome(), Outcome()
+    kept, right = TaskOutcome(), TaskOutcome()
     for _ in progress(np.arange(float(trials))):
         path, same = twin_path(scene)
         estimator.restart()
@@ -159,6 +157,6 @@ def twins(estimator: Estimator, scene: Scene, trials: int, progress: ProgressWra
             wrong |= posterior.state == "tracking" and not is_at(posterior.pose, pose)
             if k + 1 >= TWINS_REQUIRED_FROM_SCAN:
                 both &= holds_both(posterior, pose)
-        kept.of, kept.found, kept.wrong = kept.of + 1, kept.found + both, kept.wrong + wrong
+        kept.total, kept.found, kept.wrong = kept.total + 1, kept.found + both, kept.wrong + wrong
         right.add(posterior, pose, None)
     return {"two rooms alike: both kept": kept, "two rooms alike: right after": right}

@@ -18,7 +18,7 @@ from common.bus.bus import open_bus
 from common.errors import UserError
 from common.geometry.world import load_world
 from common.versions import commit, versions
-from lab.benchmarks.fleet_load import Load, Window
+from lab.benchmarks.fleet_load import FleetLoad, Window
 from lab.benchmarks.fleet_table import DEPLOYMENTS, show
 from presage.session.stack import Stack
 from presage.terminal.output import check_file, write_json
@@ -31,7 +31,7 @@ MAX_SETTLING_ROUNDS = 5
 
 
 @dataclass(frozen=True)
-class Plan:
+class FleetPlan:
     """Parameters of the benchmark."""
 
     world: str
@@ -48,7 +48,7 @@ class DeploymentResult:
     """Measurements of one estimator in one deployment: one process for all robots, or one process per robot."""
 
     estimator: str
-    way: str
+    deployment: str
     rate: float  # Hz
     windows: list[dict[str, Any]] = field(default_factory=list)
     served: int = 0  # largest number of robots that was served
@@ -64,31 +64,39 @@ class DeploymentResult:
         cpu_ms = min(window["cpu_ms_per_scan"] for window in self.windows if window["robots"] == busiest)
         fewest, most = min(self.memory_mb), max(self.memory_mb)
         per_robot = self.memory_mb[most] / most
-        if self.way == DEPLOYMENTS[0]:
+        if self.deployment == DEPLOYMENTS[0]:
             per_robot = (self.memory_mb[most] - self.memory_mb[fewest]) / max(1, most - fewest)
         return {
-            "estimator": self.estimator, "way": self.way, "robots_served": self.served,
-            "at_most_tried": most, "memory_per_robot_mb": per_robot, "memory_mb": self.memory_mb[most],
-            "p50_ms": best and best["p50_ms"], "p99_ms": best and best["p99_ms"],
-            "cpu_ms_per_scan": cpu_ms, "robots_by_cpu": 1e3 / self.rate / cpu_ms, "windows": self.windows,
-            "while_one_searches": self.searching, "message_bytes": self.bytes,
-        }  # fmt: skip
+            "estimator": self.estimator,
+            "way": self.deployment,
+            "robots_served": self.served,
+            "at_most_tried": most,
+            "memory_per_robot_mb": per_robot,
+            "memory_mb": self.memory_mb[most],
+            "p50_ms": best and best["p50_ms"],
+            "p99_ms": best and best["p99_ms"],
+            "cpu_ms_per_scan": cpu_ms,
+            "robots_by_cpu": 1e3 / self.rate / cpu_ms,
+            "windows": self.windows,
+            "while_one_searches": self.searching,
+            "message_bytes": self.bytes,
+        }
 
 
 class EstimatorDeployment:
     """The running estimators of one deployment, pinned to one core."""
 
-    def __init__(self, stack: Stack, load: Load, plan: Plan, result: DeploymentResult, core: int) -> None:
-        """Start no process yet."""
+    def __init__(self, stack: Stack, load: FleetLoad, plan: FleetPlan, result: DeploymentResult, core: int) -> None:
+        """Does not start any process yet."""
         self.stack, self.load, self.plan, self.result, self.core = stack, load, plan, result, core
         self.ready = 0  # number of robots that are localised
 
     def prepare(self, count: int) -> None:
-        """Start estimators for the first ``count`` robots and let them localise (preset paper may fail to)."""
+        """Starts estimators for the first ``count`` robots and lets them localise (preset paper may fail to)."""
         if count <= self.ready:
             return
         arguments = ["--world", self.plan.world, "--estimator", self.result.estimator]
-        if self.result.way == DEPLOYMENTS[0]:
+        if self.result.deployment == DEPLOYMENTS[0]:
             if not self.ready:
                 names = ",".join(robot.name for robot in self.load.robots)
                 self.stack.start("estimator", *arguments, "--robots", names)
@@ -113,7 +121,7 @@ class EstimatorDeployment:
         """The estimator processes."""
         return [psutil.Process(p.child.pid) for name, p in self.stack.processes.items() if name != "router"]
 
-    def served(self, count: int) -> bool:
+    def can_serve(self, count: int) -> bool:
         """Whether ``count`` robots are answered in time. Measures a second time if the first fails."""
         self.prepare(count)
         for _ in range(2):
@@ -128,8 +136,8 @@ class EstimatorDeployment:
                 return True
         return False
 
-    def search(self) -> None:
-        """Measure how one robot's global searches delay the others. Skips preset paper, which has no global search."""
+    def measure_search(self) -> None:
+        """Measures how one robot's global searches delay the others. Skips preset paper, which has no global search."""
         count = max(2, self.result.served // 2)
         if self.result.estimator != "paper" and count <= self.plan.max_robots:
             self.prepare(count)
@@ -146,13 +154,19 @@ class EstimatorDeployment:
         return sum(t.user + t.system for t in (process.cpu_times() for process in self.processes()))
 
 
-def _row(window: Window, cpu_s: float, plan: Plan) -> dict[str, Any]:
+def _row(window: Window, cpu_s: float, plan: FleetPlan) -> dict[str, Any]:
     return {
-        "robots": window.robots, "sent": window.sent, "answered_share": window.answered / window.sent,
-        "in_time_share": window.in_time_share, "p50_ms": window.percentile(50), "p99_ms": window.percentile(99),
-        "cpu_ms_per_scan": 1e3 * cpu_s / max(1, window.answered), "core_share": cpu_s / plan.seconds,
-        "tracking": window.tracking, "served": window.in_time_share >= plan.share,
-    }  # fmt: skip
+        "robots": window.robots,
+        "sent": window.sent,
+        "answered_share": window.answered / window.sent,
+        "in_time_share": window.in_time_share,
+        "p50_ms": window.percentile(50),
+        "p99_ms": window.percentile(99),
+        "cpu_ms_per_scan": 1e3 * cpu_s / max(1, window.answered),
+        "core_share": cpu_s / plan.seconds,
+        "tracking": window.tracking,
+        "served": window.in_time_share >= plan.share,
+    }
 
 
 def max_robots_served(served: Callable[[int], bool], most: int) -> int:
@@ -169,40 +183,39 @@ def max_robots_served(served: Callable[[int], bool], most: int) -> int:
     return good
 
 
-def measure(estimator: str, way: str, plan: Plan, console: Console) -> DeploymentResult:
-    """Measure one estimator in one deployment, with its own router."""
-    result, cores = DeploymentResult(estimator, way, plan.rate), sorted(os.sched_getaffinity(0))
+def measure(estimator: str, deployment: str, plan: FleetPlan, console: Console) -> DeploymentResult:
+    """Measures one estimator in one deployment, with its own router."""
+    result, cores = DeploymentResult(estimator, deployment, plan.rate), sorted(os.sched_getaffinity(0))
     with Stack("bench", quiet=True) as stack:
         stack.start_router()
         with open_bus(stack.link()) as bus:
-            load = Load(bus, load_world(plan.world), plan.beams, plan.rate, plan.max_robots, plan.seed)
-            deployment = EstimatorDeployment(stack, load, plan, result, cores[-1])
-            deployment.prepare(1)
-            if way == DEPLOYMENTS[0]:
-                deployment.prepare(
-                    plan.max_robots
-                )  # for the memory of all robots; a robot without scans takes no processor time
+            load = FleetLoad(bus, load_world(plan.world), plan.beams, plan.rate, plan.max_robots, plan.seed)
+            estimators = EstimatorDeployment(stack, load, plan, result, cores[-1])
+            estimators.prepare(1)
+            if deployment == DEPLOYMENTS[0]:
+                # Measures the memory of all robots; a robot without scans takes no processor time.
+                estimators.prepare(plan.max_robots)
             result.bytes = load.message_sizes()
-            with _harness_on_other_cores(cores), console.status(f"{estimator}, {way}") as status:
+            with _harness_on_other_cores(cores), console.status(f"{estimator}, {deployment}") as status:
 
                 def served(count: int) -> bool:
-                    status.update(f"{estimator}, {way}: {count} robots")
-                    answer = deployment.served(count)
+                    status.update(f"{estimator}, {deployment}: {count} robots")
+                    answer = estimators.can_serve(count)
                     last = result.windows[-1]
                     console.print(
-                        f"{estimator}, {way}: {count} robots, {100 * last['in_time_share']:.2f} % in time",
+                        f"{estimator}, {deployment}: {count} robots, {100 * last['in_time_share']:.2f} % in time",
                         highlight=False,
                     )
                     return answer
 
                 result.served = max_robots_served(served, plan.max_robots)
-                deployment.search()
+                estimators.measure_search()
     return result
 
 
 @contextmanager
 def _harness_on_other_cores(cores: list[int]) -> Iterator[None]:
-    """Keep the threads of this process off the last core, if there are several cores."""
+    """Keeps the threads of this process off the last core, if there are several cores."""
     _pin_threads(psutil.Process(), set(cores[:-1] or cores))
     try:
         yield
@@ -211,22 +224,32 @@ def _harness_on_other_cores(cores: list[int]) -> Iterator[None]:
 
 
 def _pin_threads(process: psutil.Process, cores: set[int]) -> None:
-    """Pin every thread of the process to the cores; threads that are created later inherit the setting."""
+    """Pins every thread of the process to the cores; threads that are created later inherit the setting."""
     for thread in process.threads():
         with suppress(ProcessLookupError):  # the thread has just ended
             os.sched_setaffinity(thread.id, cores)
 
 
-def bench_fleet(estimators: str, plan: Plan, json_file: Path | None, console: Console) -> int:
-    """Run the benchmark, print the table and write it to ``json_file`` if given. Returns exit status 0."""
+def bench_fleet(estimators: str, plan: FleetPlan, json_file: Path | None, console: Console) -> int:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
-    rows = [measure(name, way, plan, console).row() for name in estimators.split(",") for way in DEPLOYMENTS]
+    rows = [
+        measure(name, deployment, plan, console).row() for name in estimators.split(",") for deployment in DEPLOYMENTS
+    ]
     ratios = show(rows, plan, console)
     load_average = os.getloadavg()[0]
     console.print(f"load of the machine at the end: {load_average:.1f} on {os.cpu_count()} cores", highlight=False)
-    write_json(json_file, {
-        "rows": rows, "ratio_one_process_to_one_each": ratios, "load_average_1min": load_average,
-        "arguments": sys.argv[1:], "seed": plan.seed, "commit": commit(), "versions": versions(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-    })  # fmt: skip
+    write_json(
+        json_file,
+        {
+            "rows": rows,
+            "ratio_one_process_to_one_each": ratios,
+            "load_average_1min": load_average,
+            "arguments": sys.argv[1:],
+            "seed": plan.seed,
+            "commit": commit(),
+            "versions": versions(),
+            "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        },
+    )
     return 0

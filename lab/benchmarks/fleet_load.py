@@ -60,11 +60,11 @@ class Window:
         return float(np.percentile(self.latency_ms, q)) if len(self.latency_ms) else None
 
 
-class Load:
+class FleetLoad:
     """Simulated robots. Their scans are computed before they are sent, so that sending takes little processor time."""
 
     def __init__(self, bus: Bus, world: World, beams: int, rate: float, count: int, seed: int) -> None:
-        """Place ``count`` robots at random in the world; each sends scans at ``rate`` Hz."""
+        """Places ``count`` robots at random in the world; each sends scans at ``rate`` Hz."""
         self.world, self.rate = world, rate
         self.scanner: Scanner = SCANNERS["tim571"].with_beams(beams)
         self._rng = np.random.default_rng(seed)
@@ -96,16 +96,20 @@ class Load:
         return found
 
     def play(self, count: int, seconds: float, rate: float | None = None, *, searching: bool = False) -> Window:
-        """Send scans of the first ``count`` robots for ``seconds`` s, and return how they were answered.
+        """Sends scans of the first ``count`` robots for ``seconds`` s, and returns how they were answered.
 
         ``rate`` in Hz defaults to the load's rate. With ``searching``, the first robot requests a global localisation
         once a second and is left out of the result.
         """
         rate = rate or self.rate
         schedule = sorted(
-            (((k + robot.phase) / rate, robot, robot.scans + k) for robot in self.robots[:count]
-             for k in range(max(1, int(seconds * rate)))), key=lambda row: row[0],
-        )  # fmt: skip
+            (
+                ((k + robot.phase) / rate, robot, robot.scans + k)
+                for robot in self.robots[:count]
+                for k in range(max(1, int(seconds * rate)))
+            ),
+            key=lambda row: row[0],
+        )
         payloads = [self._payload(robot, k) for _, robot, k in schedule]
         while self._inbox.get(0) is not None:
             pass  # discard late answers to the previous measurement
@@ -129,14 +133,19 @@ class Load:
         scanner, laser = self.scanner, se2.compose(robot.pose(k, self.rate), self.scanner.mount)
         clean = self.world.ray_distances(laser[None], scanner.angles())[0]
         return Scan(
-            stamp_ns=self._stamp(k), seq=k, angle_min=scanner.angle_min, angle_increment=scanner.angle_increment,
-            range_min=scanner.range_min, range_max=scanner.range_max,
+            stamp_ns=self._stamp(k),
+            seq=k,
+            angle_min=scanner.angle_min,
+            angle_increment=scanner.angle_increment,
+            range_min=scanner.range_min,
+            range_max=scanner.range_max,
             ranges=clean + scanner.sigma * self._rng.standard_normal(len(clean)),
-            mount=Pose.of(scanner.mount), scan_time=1 / self.rate,
-        ).encode()  # fmt: skip
+            mount=Pose.of(scanner.mount),
+            scan_time=1 / self.rate,
+        ).encode()
 
     def _window(self, count: int, sent: dict[tuple[str, int], int]) -> Window:
-        """Match the received answers to the scans in ``sent``, waiting up to `ANSWER_TIMEOUT_S` for the last ones."""
+        """Matches the received answers to the scans in ``sent``, waiting up to `ANSWER_TIMEOUT_S` for the last ones."""
         deadline, latency, states = (
             time.monotonic() + ANSWER_TIMEOUT_S,
             dict[tuple[str, int], float](),

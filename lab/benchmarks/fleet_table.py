@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from lab.benchmarks.fleet import Plan
+    from lab.benchmarks.fleet import FleetPlan
 
 DEPLOYMENTS = ("one process", "one each")
 LARGE_FLEET = 1000  # robots, for the extrapolation
@@ -29,8 +29,8 @@ def _large_fleet_note(row: dict[str, Any], rate: float) -> str:
     )
 
 
-def show(rows: list[dict[str, Any]], plan: Plan, console: Console) -> dict[str, dict[str, float | None]]:
-    """Print the table. Returns, by estimator, the ratios of one process for all robots to one process per robot."""
+def show(rows: list[dict[str, Any]], plan: FleetPlan, console: Console) -> dict[str, dict[str, float | None]]:
+    """Prints the table. Returns, by estimator, the ratios of one process for all robots to one process per robot."""
     table = Table(
         title=f"{plan.world}, {plan.beams} beams at {plan.rate:g} Hz, one core, "
         f"{100 * plan.share:g} % of the scans answered within {1e3 / plan.rate:.1f} ms",
@@ -38,24 +38,27 @@ def show(rows: list[dict[str, Any]], plan: Plan, console: Console) -> dict[str, 
     )
     for column in (
         "estimator",
-        "way",
+        "deployment",
         "robots",
         "p50 ms",
         "p99 ms",
-        "CPU ms a scan",
+        "CPU ms/scan",
         "robots by CPU",
-        "MB a robot",
-        "MB in all",
+        "MB/robot",
+        "MB total",
     ):
-        table.add_column(column, justify="left" if column in {"estimator", "way"} else "right")
+        table.add_column(column, justify="left" if column in {"estimator", "deployment"} else "right")
     for row in rows:
         table.add_row(
-            row["estimator"], row["way"], f"{row['robots_served']}",
+            row["estimator"],
+            row["way"],
+            f"{row['robots_served']}",
             *(f"{row[name]:.1f}" if row[name] is not None else "" for name in ("p50_ms", "p99_ms")),
             f"{row['cpu_ms_per_scan']:.2f}",
             f"{row['robots_by_cpu']:.1f}",
-            f"{row['memory_per_robot_mb']:.1f}", f"{row['memory_mb']:.0f}",
-        )  # fmt: skip
+            f"{row['memory_per_robot_mb']:.1f}",
+            f"{row['memory_mb']:.0f}",
+        )
     console.print(table)
     for row in rows:
         if (other := row["while_one_searches"]) is not None and other["p99_ms"] is not None:
@@ -67,9 +70,9 @@ def show(rows: list[dict[str, Any]], plan: Plan, console: Console) -> dict[str, 
             )
     size = rows[0]["message_bytes"]
     console.print(
-        "bytes a message: "
+        "bytes per message: "
         + ", ".join(f"{name} {count}" for name, count in size.items())
-        + f"; scans to the estimator: {size['scan'] * plan.rate / 1e3:.1f} kB/s a robot",
+        + f"; scans to the estimator: {size['scan'] * plan.rate / 1e3:.1f} kB/s per robot",
         highlight=False,
     )
     for row in rows:
@@ -84,7 +87,9 @@ def show(rows: list[dict[str, Any]], plan: Plan, console: Console) -> dict[str, 
         )
     ratios: dict[str, dict[str, float | None]] = {}
     for name in dict.fromkeys(row["estimator"] for row in rows):
-        one, each = (next(r for r in rows if r["estimator"] == name and r["way"] == way) for way in DEPLOYMENTS)
+        one, each = (
+            next(r for r in rows if r["estimator"] == name and r["way"] == deployment) for deployment in DEPLOYMENTS
+        )
         ratios[name] = {
             "robots_served": one["robots_served"] / each["robots_served"] if each["robots_served"] else None,
             "robots_by_cpu": one["robots_by_cpu"] / each["robots_by_cpu"],
@@ -92,8 +97,8 @@ def show(rows: list[dict[str, Any]], plan: Plan, console: Console) -> dict[str, 
         }
         served = f"{ratios[name]['robots_served']:.2f}" if each["robots_served"] else "an unknown number of"
         console.print(
-            f"{name}: one process serves {served} times the robots of one each; "
-            f"by processor time {ratios[name]['robots_by_cpu']:.2f} times",
+            f"{name}: one process for all serves {served} times as many robots as one process per robot; "
+            f"extrapolated from processor time, {ratios[name]['robots_by_cpu']:.2f} times",
             highlight=False,
         )
     return ratios

@@ -98,9 +98,16 @@ def _measure(
         stamp = int(number / rate * 1e9)
         noisy = clean + scanner.sigma * rng.standard_normal(len(clean))
         payload = Scan(
-            stamp_ns=stamp, seq=number, angle_min=scanner.angle_min, angle_increment=scanner.angle_increment,
-            range_min=scanner.range_min, range_max=scanner.range_max, ranges=noisy, mount=mount, scan_time=1 / rate,
-        ).encode()  # fmt: skip
+            stamp_ns=stamp,
+            seq=number,
+            angle_min=scanner.angle_min,
+            angle_increment=scanner.angle_increment,
+            range_min=scanner.range_min,
+            range_max=scanner.range_max,
+            ranges=noisy,
+            mount=mount,
+            scan_time=1 / rate,
+        ).encode()
         began = time.perf_counter()
         bus.put(SCAN, payload)
         answered = _wait_for(commands, lambda p, s=stamp: CmdVel.decode(p).stamp_ns == s)
@@ -118,10 +125,17 @@ def _measure(
         "scan_to_command_p99_ms": float(np.percentile(loop_ms, 99)),
         "zenoh_round_trip_median_ms": float(np.median(raw_ms)),
         "zenoh_round_trip_p99_ms": float(np.percentile(raw_ms, 99)),
-        "payload_bytes": len(payload), "beams": len(clean), "scans": scans, "rate_hz": rate, "unanswered": lost,
-        "seed": 0, "commit": commit(), "versions": versions(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores", "arguments": sys.argv[1:],
-    }  # fmt: skip
+        "payload_bytes": len(payload),
+        "beams": len(clean),
+        "scans": scans,
+        "rate_hz": rate,
+        "unanswered": lost,
+        "seed": 0,
+        "commit": commit(),
+        "versions": versions(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "arguments": sys.argv[1:],
+    }
 
 
 def _wait_for(inbox: Inbox, wanted: Any) -> bool:
@@ -134,7 +148,7 @@ def _wait_for(inbox: Inbox, wanted: Any) -> bool:
 
 
 def bench_latency(scans: int, rate: float, beams: int, json_file: Path | None, console: Console) -> int:
-    """Run the benchmark, print the table and write it to ``json_file`` if given.
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given.
 
     Returns exit status 1 if a payload was not answered.
     """

@@ -32,7 +32,7 @@ SCANS = 100
 def bench_map(
     world: str, size: int, beams: int, out: Path | None, seed: int, json_file: Path | None, console: Console
 ) -> int:
-    """Run the benchmark, print the table and write it to ``json_file`` if given. Returns exit status 0."""
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
     if out is not None:
         make_folder(out, "--out")
@@ -57,7 +57,7 @@ def measure(path: str, beams: int, seed: int) -> list[tuple[str, float, str]]:
         began = time.process_time()
         result = work()
         seconds = (time.process_time() - began) / times
-        rows.append((name, seconds * 1e3, "ms a scan") if times > 1 else (name, seconds, "s"))
+        rows.append((name, seconds * 1e3, "ms per scan") if times > 1 else (name, seconds, "s"))
         return result
 
     world: World = timed("load", lambda: load_world(path))

@@ -98,7 +98,7 @@ def observation_us() -> float:
 
 
 def bench_metrics(seconds: float, rounds: int, json_file: Path | None, console: Console) -> int:
-    """Run the benchmark, print the table and write it to ``json_file`` if given. Returns exit status 0."""
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
     unscraped, scraped = measure(seconds, rounds, console)
     table = Table(title=f"{rounds} x {seconds:g} s each, one scrape a second", title_justify="left")
@@ -112,10 +112,15 @@ def bench_metrics(seconds: float, rounds: int, json_file: Path | None, console: 
         **{f"{name}_cpu_share_with": scraped.share(name) for name in SERVICES},
         "scrape_median_ms": float(np.median(scraped.scrape_ms)),
         "scrape_p99_ms": float(np.percentile(scraped.scrape_ms, 99)),
-        "scrape_bytes": scraped.scrape_bytes, "observation_us": observation_us(),
-        "seconds": seconds, "rounds": rounds, "commit": commit(), "versions": versions(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores", "arguments": sys.argv[1:],
-    }  # fmt: skip
+        "scrape_bytes": scraped.scrape_bytes,
+        "observation_us": observation_us(),
+        "seconds": seconds,
+        "rounds": rounds,
+        "commit": commit(),
+        "versions": versions(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "arguments": sys.argv[1:],
+    }
     console.print(
         f"a scrape: {result['scrape_median_ms']:.1f} ms median, {result['scrape_p99_ms']:.1f} ms p99, "
         f"{result['scrape_bytes'] / 1e3:.1f} kB; a message's two histograms: {result['observation_us']:.1f} µs",

@@ -38,7 +38,7 @@ ROBOT = "bench"
 
 
 @dataclass(frozen=True)
-class Load:
+class RecorderLoad:
     """Messages sent to the recorder."""
 
     rate: float = 20 * NORMAL_RATE  # messages/s, over all topics
@@ -54,11 +54,13 @@ class Load:
 def publish_main() -> None:
     """Entry point of the publisher process: sends the load, then writes message counts and checksums by key."""
     job = json.loads(os.environ["BENCH_RECORDER"])
-    load, rng = Load(**job["load"]), np.random.default_rng(0)
+    load, rng = RecorderLoad(**job["load"]), np.random.default_rng(0)
     ranges = rng.uniform(0.1, 25.0, (64, load.beams)).astype(np.float32)
-    bodies = [Scan(stamp_ns=0, angle_min=0, angle_increment=0, range_min=0, range_max=25, ranges=r).model_dump()
-              for r in ranges]  # fmt: skip
-    from common.bus.bus import Link  # noqa: PLC0415
+    bodies = [
+        Scan(stamp_ns=0, angle_min=0, angle_increment=0, range_min=0, range_max=25, ranges=r).model_dump()
+        for r in ranges
+    ]
+    from common.bus.bus import Link
 
     with open_bus(Link(robot=ROBOT, connect=(os.environ["PRESAGE_CONNECT"],))) as bus:
         for topic in LOAD_TOPICS:
@@ -73,8 +75,8 @@ def publish_main() -> None:
             time.sleep(60)
 
 
-def _send(bus: Bus, load: Load, bodies: list[dict[str, Any]]) -> tuple[dict[Topic, int], float]:
-    """Send the load. Returns each topic's checksum over its payloads in order, and the last message's delay in s."""
+def _send(bus: Bus, load: RecorderLoad, bodies: list[dict[str, Any]]) -> tuple[dict[Topic, int], float]:
+    """Sends the load. Returns each topic's checksum over its payloads in order, and the last message's delay in s."""
     sums, began = dict.fromkeys(LOAD_TOPICS, 0), time.monotonic()
     for number in range(load.count // len(LOAD_TOPICS) * len(LOAD_TOPICS)):
         due = began + number / load.rate
@@ -88,8 +90,8 @@ def _send(bus: Bus, load: Load, bodies: list[dict[str, Any]]) -> tuple[dict[Topi
     return sums, time.monotonic() - due
 
 
-def measure(load: Load, folder: Path, console: Console) -> dict[str, Any]:
-    """Run the benchmark and return its results. The recording stays in ``folder``."""
+def measure(load: RecorderLoad, folder: Path, console: Console) -> dict[str, Any]:
+    """Runs the benchmark and returns its results. The recording stays in ``folder``."""
     result = folder / "sent.json"
     job = json.dumps({"load": asdict(load), "result": str(result)})
     with Stack(ROBOT, quiet=True, environment={**os.environ, "BENCH_RECORDER": job}) as stack:
@@ -107,7 +109,7 @@ def measure(load: Load, folder: Path, console: Console) -> dict[str, Any]:
 
 
 def _observe(
-    stack: Stack, watch: Watch, recorder: psutil.Process, load: Load, result: Path, console: Console
+    stack: Stack, watch: Watch, recorder: psutil.Process, load: RecorderLoad, result: Path, console: Console
 ) -> dict[str, Any]:
     """Processor share and memory of the recorder until its health message reports that it received everything."""
     columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
@@ -129,13 +131,15 @@ def _observe(
                 after, ended = recorder.cpu_times(), time.monotonic()
     spent = after.user + after.system - before.user - before.system
     return {
-        "core_share": spent / (ended - began), "memory_mb": memory / 1e6, "memory_before_mb": first_mb,
+        "core_share": spent / (ended - began),
+        "memory_mb": memory / 1e6,
+        "memory_before_mb": first_mb,
         "seconds": ended - began,
-    }  # fmt: skip
+    }
 
 
 def _compare(sent: dict[str, Any], file: Path) -> dict[str, Any]:
-    """Compare the recording with what was sent: counts, and checksums over the payloads."""
+    """Compares the recording with what was sent: counts, and checksums over the payloads."""
     recording = read_recording(file)
     sums, numbers, intact = dict.fromkeys(sent["sent"], 0), dict.fromkeys(sent["sent"], 0), True
     for raw in recording.payloads(sent["sent"].keys()):
@@ -158,8 +162,8 @@ def _compare(sent: dict[str, Any], file: Path) -> dict[str, Any]:
     }
 
 
-def bench_recorder(load: Load, out: Path | None, json_file: Path | None, console: Console) -> int:
-    """Run the benchmark, print the table and write it to ``json_file`` if given.
+def bench_recorder(load: RecorderLoad, out: Path | None, json_file: Path | None, console: Console) -> int:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given.
 
     Returns exit status 1 if a message was lost or altered, or if a limit was exceeded.
     """

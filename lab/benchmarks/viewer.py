@@ -39,7 +39,7 @@ class Visitor:
     """A client that receives every frame, as a browser would, and only counts them."""
 
     def __init__(self, port: int) -> None:
-        """Connect and watch the robot. Raises UserError if the viewer's web socket does not answer."""
+        """Connects, and subscribes to the robot. Raises UserError if the viewer's web socket does not answer."""
         self.frames = self.bytes = 0
         try:
             origin, where = Origin(f"http://127.0.0.1:{port}"), f"ws://127.0.0.1:{port}/ws"
@@ -60,7 +60,7 @@ class Visitor:
             return
 
     def close(self) -> None:
-        """Close the web socket."""
+        """Closes the web socket."""
         self._socket.close()
         self._thread.join(5)
 
@@ -79,7 +79,7 @@ class Cost:
 
 
 def measure(seconds: float, rounds: int, beams: int, console: Console) -> dict[str, Any]:
-    """Run rounds of ``seconds`` s without and with the viewer, alternating, in one session. Returns the results."""
+    """Runs rounds of ``seconds`` s without and with the viewer, alternating, in one session. Returns the results."""
     without, viewed = Cost(), Cost()
     with Stack(ROBOT, quiet=True) as stack:
         stack.start_router()
@@ -131,7 +131,7 @@ def _with_viewer(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None:
 
 
 def _measure_latency(bus: Bus, stack: Stack, seconds: float, cost: Cost) -> None:
-    """Record the time from each scan's publication to its command's. All publishers use this machine's clock."""
+    """Records the time from each scan's publication to its command's. All publishers use this machine's clock."""
     inbox, scans = Inbox(), dict[int, int]()
     ends = [bus.subscribe(topic, inbox, keep_all=True) for topic in (SCAN, CMD_VEL)]
     began = time.monotonic()
@@ -161,15 +161,22 @@ def _report(without: Cost, viewed: Cost, seconds: float, rounds: int, beams: int
         numbers[f"unanswered_{name}"] = cost.unanswered
     return {
         **numbers,
-        "viewer_cpu_share": viewed.cpu_s / viewed.seconds, "viewer_memory_mb": viewed.memory_mb,
-        "frames_hz": viewed.frames / viewed.seconds, "frame_bytes": viewed.bytes / max(1, viewed.frames),
-        "seconds": seconds, "rounds": rounds, "beams": beams, "commit": commit(), "versions": versions(),
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores", "arguments": sys.argv[1:],
-    }  # fmt: skip
+        "viewer_cpu_share": viewed.cpu_s / viewed.seconds,
+        "viewer_memory_mb": viewed.memory_mb,
+        "frames_hz": viewed.frames / viewed.seconds,
+        "frame_bytes": viewed.bytes / max(1, viewed.frames),
+        "seconds": seconds,
+        "rounds": rounds,
+        "beams": beams,
+        "commit": commit(),
+        "versions": versions(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "arguments": sys.argv[1:],
+    }
 
 
 def bench_viewer(seconds: float, rounds: int, beams: int, json_file: Path | None, console: Console) -> int:
-    """Run the benchmark, print the table and write it to ``json_file`` if given. Returns exit status 0."""
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
     check_file(json_file, "--json")
     result = measure(seconds, rounds, beams, console)
     table = Table(title=f"{beams} beams, {rounds} x {seconds:g} s each, one visitor", title_justify="left")

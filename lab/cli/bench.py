@@ -16,7 +16,9 @@ app = typer.Typer(help="Benchmarks. Each compares with a baseline or a limit in 
 BEAMS = 622  # as in the paper
 Seconds = Annotated[float, typer.Option(min=0.1, help="Duration of one measurement, s.")]
 Rounds = Annotated[int, typer.Option(min=1, help="Number of rounds with and without what is measured.")]
-Kept = Annotated[Path | None, typer.Option("--out", "-o", help="Folder in which to keep the generated files.")]
+GeneratedFolder = Annotated[
+    Path | None, typer.Option("--out", "-o", help="Folder in which to keep the generated files.")
+]
 Seed = Annotated[int, typer.Option(min=0, max=2**31, help="Random seed.")]
 
 
@@ -29,7 +31,7 @@ def bench_latency(
 
     Examples: `presage bench latency --json latency.json`; `PRESAGE_SECURITY=keys presage bench latency` (TLS, roles).
     """
-    from lab.benchmarks.latency import bench_latency as run  # noqa: PLC0415
+    from lab.benchmarks.latency import bench_latency as run
 
     raise typer.Exit(run(scans, 15.0, BEAMS, json_file, console))
 
@@ -40,14 +42,14 @@ def bench_viewer(seconds: Seconds = 20.0, rounds: Rounds = 3, json_file: Json = 
 
     Example: `presage bench viewer --json viewer.json`.
     """
-    from lab.benchmarks.viewer import bench_viewer as run  # noqa: PLC0415
+    from lab.benchmarks.viewer import bench_viewer as run
 
     raise typer.Exit(run(seconds, rounds, BEAMS, json_file, console))
 
 
 @app.command("map")
 def bench_map(
-    world: Annotated[str, typer.Option(help="A ROS map.yaml or any world. Default: a generated map.")] = "",
+    world: Annotated[str, typer.Option(help="A ROS map.yaml or any world. Defaults to a generated map.")] = "",
     size: Annotated[int, typer.Option(min=200, max=4000, help="Cells per side of the generated map.")] = 1000,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder in which to keep the generated map.")] = None,
     json_file: Json = None,
@@ -56,7 +58,7 @@ def bench_map(
 
     Examples: `presage bench map`; `presage bench map --world my/map.yaml`; `presage bench map --size 2000 --out made`.
     """
-    from lab.benchmarks.maps import bench_map as run  # noqa: PLC0415
+    from lab.benchmarks.maps import bench_map as run
 
     raise typer.Exit(run(world, size, BEAMS, out, 0, json_file, console))
 
@@ -67,7 +69,7 @@ def bench_metrics(seconds: Seconds = 20.0, rounds: Rounds = 3, json_file: Json =
 
     Examples: `presage bench metrics`; `presage bench metrics --seconds 5 --rounds 1 --json metrics.json`.
     """
-    from lab.benchmarks.metrics import bench_metrics as run  # noqa: PLC0415
+    from lab.benchmarks.metrics import bench_metrics as run
 
     raise typer.Exit(run(seconds, rounds, json_file, console))
 
@@ -82,7 +84,7 @@ def bench_localisation(
 
     Example: `presage bench localisation --trials 20`.
     """
-    from lab.accuracy.paper_localisation import bench_localisation as run  # noqa: PLC0415
+    from lab.accuracy.paper_localisation import bench_localisation as run
 
     raise typer.Exit(run(world, BEAMS, trials, 25, 1, json_file, console))
 
@@ -95,7 +97,7 @@ def bench_accuracy(
     ] = "precise,precise-exact,particle-filter",
     tasks: Annotated[
         str,
-        typer.Option(help="Comma-separated: standing, blocked, kidnapped, tracking, odometry, twins. Default: all."),
+        typer.Option(help="Comma-separated: standing, blocked, kidnapped, tracking, odometry, twins. Defaults to all."),
     ] = "",
     scanner: Annotated[
         str, typer.Option(help=f"Comma-separated: {', '.join(SCANNERS)}, or scanner files (docs/scanners.md).")
@@ -119,12 +121,23 @@ def bench_accuracy(
     `presage bench accuracy --worlds office,corridor,maze --json accuracy.json --figure accuracy.png`;
     `presage bench accuracy --scanner lms200,rplidar-a1 --tasks standing,tracking --markdown`.
     """
-    from lab.accuracy.report import bench_accuracy as run  # noqa: PLC0415
+    from lab.accuracy.report import bench_accuracy as run
 
     code = run(
-        worlds, "", estimators, tasks, trials, minutes, seed, min(2, worker_count()), json_file, figure,
-        console, markdown=markdown, scanner=scanner,
-    )  # fmt: skip
+        worlds,
+        "",
+        estimators,
+        tasks,
+        trials,
+        minutes,
+        seed,
+        min(2, worker_count()),
+        json_file,
+        figure,
+        console,
+        markdown=markdown,
+        scanner=scanner,
+    )
     raise typer.Exit(code)
 
 
@@ -134,7 +147,7 @@ def bench_speed(world: WorldName = "office", json_file: Json = None) -> None:
 
     Example: `presage bench speed --json speed.json`.
     """
-    from lab.accuracy.speed import bench_speed as run  # noqa: PLC0415
+    from lab.accuracy.speed import bench_speed as run
 
     raise typer.Exit(run(world, "622,811", 1, json_file, console))
 
@@ -149,7 +162,7 @@ def bench_decoders(
 
     Example: `presage bench decoders --steps 300 --json decoders.json`.
     """
-    from lab.accuracy.decoders import bench_decoders as run  # noqa: PLC0415
+    from lab.accuracy.decoders import bench_decoders as run
 
     raise typer.Exit(run(world, 5000, steps, 0, json_file, console))
 
@@ -161,23 +174,23 @@ def bench_recorder(
         typer.Option(min=1, max=100_000, help="Messages per second; a normal session has about 100."),
     ] = 2000,
     seconds: Seconds = 60.0,
-    out: Kept = None,
+    out: GeneratedFolder = None,
     json_file: Json = None,
 ) -> None:
     """A real recorder under twenty times the normal load: lost or altered messages, memory and processor time.
 
     Examples: `presage bench recorder`; `presage bench recorder --seconds 10 --rate 5000 --json recorder.json`.
     """
-    from lab.benchmarks.recorder import Load  # noqa: PLC0415
-    from lab.benchmarks.recorder import bench_recorder as run  # noqa: PLC0415
+    from lab.benchmarks.recorder import RecorderLoad
+    from lab.benchmarks.recorder import bench_recorder as run
 
-    raise typer.Exit(run(Load(rate, seconds), out, json_file, console))
+    raise typer.Exit(run(RecorderLoad(rate, seconds), out, json_file, console))
 
 
 @app.command("chaos")
 def bench_chaos(
     faults: Annotated[
-        list[str] | None, typer.Argument(help="Names of faults; 'killed*' selects several. Default: all.")
+        list[str] | None, typer.Argument(help="Names of faults; 'killed*' selects several. Defaults to all.")
     ] = None,
     repeats: Annotated[int, typer.Option(min=1, help="How often to inject each fault.")] = 1,
     one_host: Annotated[
@@ -186,14 +199,14 @@ def bench_chaos(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show the output of all processes.")] = False,
     json_file: Json = None,
 ) -> None:
-    """Injects faults into a running system: processes that die, freeze or start twice, bad networks, random payloads.
+    """Fault injection into a running system: processes that die, freeze or start twice, bad networks, random payloads.
 
     A real system drives back and forth, and each fault happens at full speed. Where this machine allows network
     namespaces (Linux; as root, or with user namespaces), the robot, the estimator and the rest run on three hosts.
 
     Examples: `presage bench chaos`; `presage bench chaos 'killed*' --repeats 3 --json chaos.json`.
     """
-    from lab.fault_injection.bench import bench_chaos as run  # noqa: PLC0415
+    from lab.fault_injection.bench import bench_chaos as run
 
     raise typer.Exit(run(faults or [], repeats, json_file, console, one_host=one_host, quiet=not verbose))
 
@@ -213,10 +226,10 @@ def bench_fleet(
 
     Examples: `presage bench fleet`; `presage bench fleet --estimators precise --seconds 3 --most 8` (quick).
     """
-    from lab.benchmarks.fleet import Plan  # noqa: PLC0415
-    from lab.benchmarks.fleet import bench_fleet as run  # noqa: PLC0415
+    from lab.benchmarks.fleet import FleetPlan
+    from lab.benchmarks.fleet import bench_fleet as run
 
-    plan = Plan("corridor", BEAMS, rate=15.0, seconds=seconds, max_robots=most, share=0.999, seed=1)
+    plan = FleetPlan("corridor", BEAMS, rate=15.0, seconds=seconds, max_robots=most, share=0.999, seed=1)
     raise typer.Exit(run(estimators, plan, json_file, console))
 
 
@@ -228,6 +241,6 @@ def bench_hosts(seconds: Seconds = 30.0, json_file: Json = None) -> None:
 
     Example: `presage bench hosts --json hosts.json`.
     """
-    from lab.fault_injection.links import bench_hosts as run  # noqa: PLC0415
+    from lab.fault_injection.links import bench_hosts as run
 
     raise typer.Exit(run(seconds, BEAMS, json_file, console))

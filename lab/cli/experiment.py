@@ -45,10 +45,10 @@ def e1(
     Examples: `presage experiment e1 --trials 5`; `presage experiment e1 --alpha 5e-4 --out slow`;
     `presage experiment e1 --estimators "paper,precise" --iterations 200`.
     """
-    from lab.experiments.estimators import PAPER_DESCENT, parse_estimators  # noqa: PLC0415
-    from lab.paper import e1_localisation as localisation  # noqa: PLC0415
+    from lab.experiments.estimators import PAPER_DESCENT, parse_estimators
+    from lab.paper import e1_localisation as localisation
 
-    job = localisation.Job(0, seed, iterations)
+    job = localisation.LocalisationJob(0, seed, iterations)
     job = replace(job, descent=replace(PAPER_DESCENT, alpha=alpha)) if alpha is not None else job
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
     show(localisation, lambda: localisation.run(job, trials, out, worker_count(), console), out)
@@ -65,10 +65,10 @@ def e2(
 
     Examples: `presage experiment e2 --trials 2`; `presage experiment e2 --estimators precise`.
     """
-    from lab.experiments.estimators import parse_estimators  # noqa: PLC0415
-    from lab.paper import e2_crossing as crossing  # noqa: PLC0415
+    from lab.experiments.estimators import parse_estimators
+    from lab.paper import e2_crossing as crossing
 
-    job = crossing.Job(0, seed)
+    job = crossing.CrossingJob(0, seed)
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
     show(crossing, lambda: crossing.run(job, trials, out, worker_count(), console), out)
 
@@ -88,10 +88,10 @@ def e3(
     Examples: `presage experiment e3 --trials 2`; `presage experiment e3 --estimators precise --out near`;
     `presage experiment e3 --any --trials 20 --estimators precise --out any`.
     """
-    from lab.experiments.estimators import parse_estimators  # noqa: PLC0415
-    from lab.paper import e3_navigation as navigation  # noqa: PLC0415
+    from lab.experiments.estimators import parse_estimators
+    from lab.paper import e3_navigation as navigation
 
-    job = navigation.Job(0, seed, free=free)
+    job = navigation.NavigationJob(0, seed, free=free)
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
     show(navigation, lambda: navigation.run(job, trials, out, worker_count(), console), out)
 
@@ -106,10 +106,14 @@ def alpha_sweep(
 
     Example: `presage experiment alpha --trials 10`.
     """
-    from lab.paper import alpha_sweep as step_size  # noqa: PLC0415
-    from lab.paper import e1_localisation as localisation  # noqa: PLC0415
+    from lab.paper import alpha_sweep as step_size
+    from lab.paper import e1_localisation as localisation
 
-    show(step_size, lambda: step_size.run(localisation.Job(0, seed, 50), trials, out, worker_count(), console), out)
+    show(
+        step_size,
+        lambda: step_size.run(localisation.LocalisationJob(0, seed, 50), trials, out, worker_count(), console),
+        out,
+    )
 
 
 @app.command("steps")
@@ -118,9 +122,9 @@ def step_sizes(trials: Trials = 10, seed: ExperimentSeed = 1, out: Out = OUT) ->
 
     Example: `presage experiment steps --trials 2`.
     """
-    from lab.paper import step_sizes as stepping  # noqa: PLC0415
+    from lab.paper import step_sizes as stepping
 
-    show(stepping, lambda: stepping.run(stepping.Job(0, seed), trials, out, worker_count(), console), out)
+    show(stepping, lambda: stepping.run(stepping.StepSizeJob(0, seed), trials, out, worker_count(), console), out)
 
 
 @app.command("samples")
@@ -132,9 +136,9 @@ def samples_needed(
 
     Example: `presage experiment samples`.
     """
-    from lab.paper import samples  # noqa: PLC0415
+    from lab.paper import samples
 
-    show(samples, lambda: samples.run(samples.Job(seed), out, worker_count(), console), out)
+    show(samples, lambda: samples.run(samples.SamplesJob(seed), out, worker_count(), console), out)
 
 
 @app.command("aliasing")
@@ -147,9 +151,9 @@ def similar_objects(
 
     Example: `presage experiment aliasing --trials 5`.
     """
-    from lab.paper import aliasing  # noqa: PLC0415
+    from lab.paper import aliasing
 
-    show(aliasing, lambda: aliasing.run(aliasing.Job(seed, places=trials), out, worker_count(), console), out)
+    show(aliasing, lambda: aliasing.run(aliasing.AliasingJob(seed, places=trials), out, worker_count(), console), out)
 
 
 @app.command("prediction")
@@ -161,18 +165,18 @@ def predicted(
 
     Example: `presage experiment prediction --seed 7 --out other`.
     """
-    from lab.paper import prediction  # noqa: PLC0415
+    from lab.paper import prediction
 
-    show(prediction, lambda: prediction.run(prediction.Job(seed), out, 1, console), out)
+    show(prediction, lambda: prediction.run(prediction.PredictionJob(seed), out, 1, console), out)
 
 
 @app.command("real")
 def real_drive(
     log: Annotated[Path, typer.Option(help="Recording or log with reference poses (docs/logs.md).")],
     world: Annotated[str, typer.Option(help="World file or ROS map.yaml of the training half.")],
-    name: Annotated[str, typer.Option(help="Results are named real-NAME. Default: the log's name.")] = "",
+    name: Annotated[str, typer.Option(help="Results are named real-NAME. Defaults to the log's name.")] = "",
     mount: Annotated[
-        str, typer.Option(help="Pose of the laser in base_link, x,y[,yaw_deg] (m, deg). Default: as in the log.")
+        str, typer.Option(help="Pose of the laser in base_link, x,y[,yaw_deg] (m, deg). Defaults to the log's.")
     ] = "",
     every: Annotated[int, typer.Option(min=1, help="Number of scans between the starts of tasks c and d.")] = 50,
     quick: Annotated[
@@ -193,13 +197,13 @@ def real_drive(
     `presage experiment real --log drive.npz --mount 0,0,0 --world first_half.yaml --quick`;
     `presage experiment real --log fr079.mcap --world fr079.yaml --name fr079 --every 50 --out mine`.
     """
-    from common.geometry.pose_text import pose_of_text  # noqa: PLC0415
-    from lab.real_logs import experiment as real  # noqa: PLC0415
+    from common.geometry.pose_text import pose_of_text
+    from lab.real_logs import experiment as real
 
     if not re.fullmatch(r"[\w.-]*", name):
         raise UserError(f"--name {name!r}: use only letters, digits, '.', '_' and '-', as it becomes a file name")
     laser_pose: Any = tuple(pose_of_text(mount, "--mount").tolist()) if mount else None
-    job = real.Job(log, world, laser_pose, every, quick, seed, name, exchange)
+    job = real.RealLogJob(log, world, laser_pose, every, quick, seed, name, exchange)
     show(real, lambda: real.run(job, out, worker_count(), console), out)
 
 
@@ -216,7 +220,7 @@ def all_experiments(
 
     Examples: `presage experiment all`; `presage experiment all --trials 3 --out look`.
     """
-    from lab.paper.suite import run_all  # noqa: PLC0415
+    from lab.paper.suite import run_all
 
     make_folder(out, "--out")
     run_all(trials, seed, out, worker_count(), console)
@@ -227,12 +231,12 @@ def tables(
     out: Out = OUT,
     page: Annotated[Path | None, typer.Option(help="Markdown file in which to replace the marked tables.")] = None,
 ) -> None:
-    """Prints the tables of existing results as Markdown, or inserts them into a page.
+    """Tables of existing results, as Markdown or inserted into a page.
 
     Examples: `presage experiment tables`;
     `presage experiment tables --page docs/experiments.md --out docs/experiments`.
     """
-    from lab.experiments.tables_page import MODULES, fill_tables, table_of  # noqa: PLC0415
+    from lab.experiments.tables_page import MODULES, fill_tables, table_of
 
     if page is not None:
         page.write_text(fill_tables(page.read_text(encoding="utf-8"), out), encoding="utf-8")

@@ -40,9 +40,9 @@ def navigate(
     `presage experiment navigation --worlds twins --start unknown --trials 50 --no-epistemic`;
     `presage experiment navigation --worlds my.yaml --drives differential --seed 7 --out mine`.
     """
-    from lab.navigation import experiment as driving  # noqa: PLC0415
+    from lab.navigation import experiment as driving
 
-    job = driving.Job(0, seed, start=start, people=people, estimator=estimator, epistemic=epistemic)
+    job = driving.NavigationJob(0, seed, start=start, people=people, estimator=estimator, epistemic=epistemic)
     world_names, drive_names = (
         tuple(part.strip() for part in text.split(",") if part.strip()) for text in (worlds, drives)
     )

@@ -26,12 +26,14 @@ Estimators = Annotated[
     str,
     typer.Option(
         help="Comma-separated names as in the table, but without the commas inside a name "
-        "('particle-filter odometry'). Default: all."
+        "('particle-filter odometry'). Defaults to all."
     ),
 ]
 Alpha = Annotated[
     float | None,
-    typer.Option(min=1e-8, max=1.0, help="Step size of estimator paper in m². Default: the best value of the sweep."),
+    typer.Option(
+        min=1e-8, max=1.0, help="Step size of estimator paper in m². Defaults to the best value of the sweep."
+    ),
 ]
 OUT = Path("experiments")
 
@@ -42,7 +44,7 @@ def worker_count(extra: int = 0) -> int:
 
 
 def show(experiment: ModuleType, run: Callable[[], Result], out: Path) -> None:
-    """Run the experiment, then print its table, its notes and the files it wrote."""
+    """Runs the experiment, then prints its table, its notes and the files it wrote."""
     make_folder(out, "--out")
     result = run()
     print(f"\n{experiment.table(result.summary)}\n")

@@ -11,7 +11,7 @@ import shapely
 from common.errors import UserError
 from common.geometry.world import load_world
 from lab.accuracy.scenes import Scene
-from services.estimator.factory import Choice, Factory, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
 from services.estimator.paper.perception import Descent
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
@@ -19,9 +19,16 @@ from services.estimator.shared.interface import Estimator
 
 TEN_STEPS = "10 steps a scan"  # variant of the paper's estimator with the service's defaults, for a moving robot
 NAMES = (
-    "paper", f"paper, {TEN_STEPS}", "precise", "particle-filter", "particle-filter, heading known",
-    "amcl-defaults", "precise, odometry", "particle-filter, odometry", "amcl-defaults, odometry",
-)  # fmt: skip
+    "paper",
+    f"paper, {TEN_STEPS}",
+    "precise",
+    "particle-filter",
+    "particle-filter, heading known",
+    "amcl-defaults",
+    "precise, odometry",
+    "particle-filter, odometry",
+    "amcl-defaults, odometry",
+)
 # One gradient step per scan, as in the paper's algorithm 1. The default step size lies where the results of
 # `presage experiment alpha` hardly depend on it.
 PAPER_DESCENT = Descent(iterations=1)
@@ -91,6 +98,6 @@ def create_estimator(
 @functools.lru_cache(maxsize=8)
 def _factory(world: str, name: str, descent: Descent) -> Factory:
     try:
-        return prepare(Choice(world, name, descent=descent))  # type: ignore[arg-type]
+        return prepare(EstimatorOptions(world, name, descent=descent))  # type: ignore[arg-type]
     except UserError as error:
         raise UserError(f"{error}; or leave {name} out with --estimators") from None

@@ -117,9 +117,19 @@ def run(params: LockstepRun, stack: Stack) -> RunTrace:
         stack.start("controller", *world, *params.controller, "--belief-timeout", "60")
         stack.start("estimator", *world, *seed, *start_pose, *params.estimator)
         stack.start(
-            "simulator", *world, *seed, "--start", pose, "--beams", str(params.beams), "--pace", "lockstep",
-            "--wait-for", f"estimator,controller,{HARNESS_NAME}", *params.simulator,
-        )  # fmt: skip
+            "simulator",
+            *world,
+            *seed,
+            "--start",
+            pose,
+            "--beams",
+            str(params.beams),
+            "--pace",
+            "lockstep",
+            "--wait-for",
+            f"estimator,controller,{HARNESS_NAME}",
+            *params.simulator,
+        )
         stack.wait_alive(bus)
         answer = _send_goal(
             watch,

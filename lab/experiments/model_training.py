@@ -23,8 +23,8 @@ from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_
 from services.estimator.precise.learning.field_learning import (
     Recipe,
     learn_field,
-    learn_ripple,
     learn_scales,
+    measure_ripple,
     reachable,
 )
 from services.estimator.precise.learning.surfaces import Beams
@@ -96,14 +96,30 @@ def train_paper(scene: Scene, heading: float, samples: int, steps: int, seed: in
     took = time.process_time() - began
     error = np.abs(model.ranges(judge.poses) - judge.ranges)
     card = ModelCard(
-        preset="paper", world=scene.world, scanner=scene.scanner, heading=heading, samples=samples,
-        epochs=recipe.epochs, batch=BATCH_SIZE, learning_rate=LEARNING_RATE, seed=seed,
-        hidden=HIDDEN_UNITS, channels=CHANNELS,
-        center=norm.center, half_size=norm.half_size, range_scale=norm.range_scale, test_samples=TEST_SCANS,
-        test_l1_mean=float(error.mean()), test_l1_median=float(np.median(error)),
-        curve_train_l1=trainer.progress.train_l1, curve_test_l1=trainer.progress.test_l1, training_s=took,
-        commit=commit(), command="", versions=versions(),
-    )  # fmt: skip
+        preset="paper",
+        world=scene.world,
+        scanner=scene.scanner,
+        heading=heading,
+        samples=samples,
+        epochs=recipe.epochs,
+        batch=BATCH_SIZE,
+        learning_rate=LEARNING_RATE,
+        seed=seed,
+        hidden=HIDDEN_UNITS,
+        channels=CHANNELS,
+        center=norm.center,
+        half_size=norm.half_size,
+        range_scale=norm.range_scale,
+        test_samples=TEST_SCANS,
+        test_l1_mean=float(error.mean()),
+        test_l1_median=float(np.median(error)),
+        curve_train_l1=trainer.progress.train_l1,
+        curve_test_l1=trainer.progress.test_l1,
+        training_s=took,
+        commit=commit(),
+        command="",
+        versions=versions(),
+    )
     return TrainedDecoder(model, card)
 
 
@@ -117,7 +133,7 @@ def learn_precise(scene: Scene, samples: int, recipe: Recipe | None = None) -> T
     field = learn_field(Beams.of(data.poses[split:], mount, angles, data.ranges[split:]), recipe)
     held, scans = data.poses[:split], data.ranges[:split]
     model = FieldModel(field, learn_scales(field, held, mount, angles, scans, scanner.sigma))
-    model = replace(model, ripple=learn_ripple(field, se2.compose(held, mount), angles))
+    model = replace(model, ripple=measure_ripple(field, se2.compose(held, mount), angles))
     visited = se2.compose(data.poses, mount)[:, :2]
     places = thin_places(np.concatenate([visited, reachable(field, visited)]), SEED_SPACING_M)
     return TrainedField(model, Seeds.at(model, places), time.process_time() - began)

@@ -30,14 +30,17 @@ def run_trials(
     ``trial`` must be a module-level function whose result depends on its job alone. Finished trials are stored in
     ``out`` until all are done, so that after Ctrl-C the same command continues.
     """
-    store = Store(out / f".{name}.unfinished.jsonl", jobs)
+    store = TrialStore(out / f".{name}.unfinished.jsonl", jobs)
     done = store.read()
     if done:
-        console.print(f"{name}: going on after {len(done)} of {len(jobs)} trials of an interrupted run")
+        console.print(f"{name}: continuing after {len(done)} of {len(jobs)} trials of an interrupted run")
     columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
         TimeRemainingColumn(),
-    )  # fmt: skip
+    )
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(name, total=len(jobs), completed=len(done))
 
@@ -61,9 +64,12 @@ def run_trials(
 
 
 def _run_in_parallel(
-    trial: Callable[[Job], Result], jobs: Sequence[Job], remaining: list[int], workers: int,
+    trial: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    remaining: list[int],
+    workers: int,
     store_result: Callable[[int, Result], None],
-) -> None:  # fmt: skip
+) -> None:
     try:
         with pool(workers) as executor:
             futures = {executor.submit(trial, jobs[index]): index for index in remaining}
@@ -72,15 +78,15 @@ def _run_in_parallel(
     except BrokenProcessPool:
         raise UserError(
             "a worker process was killed, perhaps for lack of memory; run the same command again to continue, with "
-            "fewer --workers if memory is short"
+            "a smaller PRESAGE_WORKERS if memory is short"
         ) from None
 
 
-class Store:
+class TrialStore:
     """A file with the results of an unfinished run, one per line, valid for the same jobs and commit only."""
 
     def __init__(self, path: Path, jobs: Sequence[Any]) -> None:
-        """Remember the path and the jobs' key; the file is neither read nor written yet."""
+        """Stores the path and the jobs' key; the file is neither read nor written yet."""
         self.path = path
         plain = json.dumps([commit(), [asdict(job) for job in jobs]], sort_keys=True, default=str)
         self.key = hashlib.sha256(plain.encode()).hexdigest()
@@ -104,7 +110,7 @@ class Store:
         return done
 
     def add(self, index: int, result: Result) -> None:
-        """Append a result."""
+        """Appends a result."""
         first = "" if self.path.exists() else self.key + "\n"
         with self.path.open("a", encoding="utf-8") as file:
             file.write(first + json.dumps([index, result]) + "\n")

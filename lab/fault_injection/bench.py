@@ -39,7 +39,7 @@ def bench_chaos(
     one_host: bool = False,
     quiet: bool = True,
 ) -> int:
-    """Inject the faults, print the table and write it to ``json_file`` if given.
+    """Injects the faults, prints the table and writes it to ``json_file`` if given.
 
     Returns exit status 0 if the system reacted to every fault as expected, otherwise 1.
     """
@@ -67,17 +67,22 @@ def bench_chaos(
             for repeat in range(repeats):
                 with console.status(f"{fault.name} ({repeat + 1} of {repeats}): {fault.about}"):
                     outcomes.append(measure(system, fault))
-                problem = outcomes[-1].why
+                problem = outcomes[-1].deviations
                 console.print(f"{'[red]no[/]' if problem else '[green]ok[/]'} {fault.name} {problem}", highlight=False)
     print(markdown(outcomes))
     data = {
-        "command": "presage bench chaos", "arguments": {"faults": list(names), "repeats": repeats},
-        "hosts": not missing, "rows": [outcome.row() for outcome in outcomes], "skipped": skipped,
+        "command": "presage bench chaos",
+        "arguments": {"faults": list(names), "repeats": repeats},
+        "hosts": not missing,
+        "rows": [outcome.row() for outcome in outcomes],
+        "skipped": skipped,
         "limits": {"stopped_s": MAX_STOP_TIME_S, "again_s": MAX_RECOVERY_TIME_S},
-        "versions": versions(), "commit": commit(), "machine": platform.processor() or platform.machine(),
-    }  # fmt: skip
+        "versions": versions(),
+        "commit": commit(),
+        "machine": platform.processor() or platform.machine(),
+    }
     write_json(json_file, data)
-    return 1 if any(outcome.why for outcome in outcomes) else 0
+    return 1 if any(outcome.deviations for outcome in outcomes) else 0
 
 
 HEAD = ("fault", "detected (s)", "stopped (s)", "restarted (s)", "recovered (s)", "lowest speed (m/s)", "as expected")
@@ -94,7 +99,7 @@ def rows_of(outcomes: Sequence[FaultOutcome]) -> list[tuple[str, ...]]:
             return f"{max(known):.2f}" if known else ""
 
         speeds = [row.least_speed for row in rows if row.least_speed is not None]
-        as_expected = sum(not row.why for row in rows)
+        as_expected = sum(not row.deviations for row in rows)
         speed = f"{min(speeds):.2f}" if speeds else ""
         times = [worst(what) for what in ("detected_s", "stopped_s", "start_s", "again_s")]
         table_rows.append((name, *times, speed, f"{as_expected}/{len(rows)}"))

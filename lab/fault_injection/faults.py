@@ -12,10 +12,12 @@ from typing import Literal
 from common.errors import UserError
 from lab.fault_injection.hosts import run
 from lab.fault_injection.system import System
+from lab.fault_injection.timeline import Row, is_error, is_standing_by
 
 SESSION_LEASE_S = 3.0  # zenoh closes a silent session after this time (common/bus/bus.py)
 FAKETIME_PATTERNS = ("/usr/lib/*/faketime/libfaketimeMT.so.1", "/usr/lib64/faketime/libfaketimeMT.so.1")
 FULL_DISK_SIZE = "2m"  # for mount: 2 MiB
+FULL_DISK_RECORDER = "recorder on a full disk"  # name of the process
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,8 @@ class Fault:
     restarts_process: bool = False  # whether a new process replaces the affected one
     needs_hosts: bool = False  # whether it needs several hosts
     unavailable_reason: Callable[[], str] = lambda: ""  # why it cannot be injected here; empty if it can
+    # Whether an event shows that the system noticed the fault, besides those that `measure` knows for every fault.
+    is_detection: Callable[[Row], bool] = lambda _: False
 
 
 def killed(*names: str, stops: bool = True) -> Fault:
@@ -124,6 +128,7 @@ def second_instance(service: str) -> Fault:
         lambda system: system.kill(f"second {service}"),
         "goes on",
         6.0,
+        is_detection=is_standing_by(f"second {service}"),
     )
 
 
@@ -144,17 +149,17 @@ def _misbehaving_peer(what: str, *args: str) -> tuple[Callable[[System], None], 
 
 
 def _start_recorder_on_full_disk(system: System) -> None:
-    """Start a second recorder on a disk that soon is full."""
+    """Starts a second recorder on a disk that is soon full."""
     disk = system.folder / "full"
     disk.mkdir(exist_ok=True)
     run("mount", "-t", "tmpfs", "-o", f"size={FULL_DISK_SIZE}", "tmpfs", str(disk))
     (disk / "others").write_bytes(bytes(1_900_000))
-    system.start_module("recorder on a full disk", "recorder", "--directory", str(disk))
+    system.start_module(FULL_DISK_RECORDER, "recorder", "--directory", str(disk))
 
 
 def _free_disk(system: System) -> None:
-    if "recorder on a full disk" in system.processes:
-        system.kill("recorder on a full disk")
+    if FULL_DISK_RECORDER in system.processes:
+        system.kill(FULL_DISK_RECORDER)
     disk = system.folder / "full"
     (disk / "others").unlink()
     written = sorted(disk.iterdir())
@@ -227,6 +232,7 @@ FAULTS: tuple[Fault, ...] = (
         "goes on",
         8.0,
         needs_hosts=True,
+        is_detection=is_error(FULL_DISK_RECORDER),
     ),
     Fault(
         "slow subscriber", "a subscriber to all topics takes 0.2 s for each message", *SLOW_SUBSCRIBER, "goes on", 8.0

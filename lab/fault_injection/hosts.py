@@ -26,7 +26,7 @@ NETWORK = "10.77.0"  # cannot collide with other networks, because the namespace
 
 
 def missing_for_namespaces() -> str:
-    """Why this process cannot create network namespaces; empty if it can."""
+    """Returns why this process cannot create network namespaces; an empty string if it can."""
     for tool, package in (("unshare", "util-linux"), ("nsenter", "util-linux"), ("ip", "iproute2")):
         if shutil.which(tool) is None:
             return f"{tool} is not installed (package {package})"
@@ -76,7 +76,7 @@ class Network:
     here = f"{NETWORK}.1"
 
     def __init__(self) -> None:
-        """Call `enter_own_namespaces` first."""
+        """Needs namespaces of its own: call `enter_own_namespaces` first."""
         self.hosts: dict[str, Host] = {}
 
     def __enter__(self) -> Self:
@@ -94,7 +94,7 @@ class Network:
         run("ip", "link", "delete", SWITCH)
 
     def add(self, name: str) -> Host:
-        """Create a host that is connected to all others."""
+        """Creates a host that is connected to all others."""
         holder = _child("unshare", "--net", "sleep", "infinity")
         mine = Path("/proc/self/ns/net").stat().st_ino
         if not wait_until(lambda: Path(f"/proc/{holder.pid}/ns/net").stat().st_ino != mine, 10):
@@ -106,11 +106,11 @@ class Network:
         return host
 
     def cut(self, name: str) -> None:
-        """Cut the host's link; packets are lost without notice."""
+        """Cuts the host's link; packets are lost without notice."""
         run("ip", "link", "set", port_of(name), "down")
 
     def restore(self, name: str) -> None:
-        """Restore the host's link to its original state."""
+        """Restores the host's link to its original state."""
         host = self.hosts[name]
         if host.relay is None:
             run("ip", "link", "set", port_of(name), "up")
@@ -121,7 +121,7 @@ class Network:
         self._wire(host)
 
     def degrade(self, name: str, *, delay_ms: float, jitter_ms: float, loss: float) -> None:
-        """Delay the packets to and from the host, and lose a share ``loss`` (0 to 1) of them.
+        """Delays the packets to and from the host, and drops a share ``loss`` (0 to 1) of them.
 
         A relay process passes the packets on, because not every kernel has netem.
         """
@@ -164,6 +164,8 @@ def port_of(name: str) -> str:
 def _child(*command: str) -> subprocess.Popen[bytes]:
     parent = os.getpid()
     return subprocess.Popen(  # noqa: S603 - fixed commands
-        command, stdin=subprocess.DEVNULL, start_new_session=True,
+        command,
+        stdin=subprocess.DEVNULL,
+        start_new_session=True,
         preexec_fn=lambda: end_with_parent(parent, signal.SIGKILL),  # noqa: PLW1509 - one call, before any thread of the child
-    )  # fmt: skip
+    )

@@ -34,7 +34,7 @@ SERVICES_ON_HOST = {"robot": "simulator, controller", "brain": "estimator"}
 
 
 def bench_hosts(seconds: float, beams: int, json_file: Path | None, console: Console) -> int:
-    """Run the benchmark, print traffic and delays and write them to ``json_file`` if given. Returns exit status 0.
+    """Runs the benchmark, prints traffic and delays and writes them to ``json_file`` if given. Returns exit status 0.
 
     Raises UserError if this machine permits no network namespaces.
     """
@@ -70,9 +70,13 @@ def bench_hosts(seconds: float, beams: int, json_file: Path | None, console: Con
     for what, each in delays_by_topic.items():
         console.print(f"scan to {what}, at the robot: {each['median_ms']:.1f} ms median, {each['p99_ms']:.1f} ms p99")
     data: dict[str, Any] = {
-        "command": "presage bench hosts", "arguments": {"seconds": seconds, "beams": beams},
-        "links_bytes_per_s": links, "delays": delays_by_topic, "versions": versions(), "commit": commit(),
-    }  # fmt: skip
+        "command": "presage bench hosts",
+        "arguments": {"seconds": seconds, "beams": beams},
+        "links_bytes_per_s": links,
+        "delays": delays_by_topic,
+        "versions": versions(),
+        "commit": commit(),
+    }
     write_json(json_file, data)
     return 0
 

@@ -26,17 +26,19 @@ class FaultOutcome:
     fault: str
     about: str
     expect: str
-    detected_s: float | None = None  # from the fault until a token disappears, the status is `lost` or the robot brakes
+    detected_s: float | None = None  # from the fault until the system reacts, see `_evaluate`
     stopped_s: float | None = None  # from the fault until the robot stands
     start_s: float | None = None  # from the restart of a killed service until its liveliness token appears
     again_s: float | None = None  # from a service's return until the robot drives, or the service works, again
     least_speed: float | None = None  # m/s, during a fault in which the robot should keep driving
     contact: bool = False
-    why: str = ""  # deviations from the expectation; empty if there are none
+    deviations: str = ""  # deviations from the expectation; empty if there are none
 
     def row(self) -> dict[str, Any]:
         """The result as a row of the JSON file."""
-        return asdict(self)
+        row = asdict(self)
+        row["why"] = row.pop("deviations")
+        return row
 
 
 def measure(system: System, fault: Fault) -> FaultOutcome:
@@ -63,12 +65,12 @@ def measure(system: System, fault: Fault) -> FaultOutcome:
     _measure_recovery(system, fault, returned, outcome)
     time.sleep(OBSERVATION_TIME_S)
     _evaluate(timeline, injected, before["speed"], fault, outcome)
-    outcome.why = judge(outcome, fault)
+    outcome.deviations = judge(outcome, fault)
     return outcome
 
 
 def _measure_recovery(system: System, fault: Fault, returned: float, outcome: FaultOutcome) -> None:
-    """Measure when the robot drives again, or when the affected services work again."""
+    """Measures when the robot drives again, or when the affected services work again."""
     timeline = system.timeline
     if fault.expect == "goes on":
         works = [
@@ -97,12 +99,10 @@ def _wait_for(timeline: Timeline, since: float, wanted: Any, timeout: float) -> 
 
 
 def _evaluate(timeline: Timeline, injected: float, speed: float, fault: Fault, outcome: FaultOutcome) -> None:
-    """Derive detection, contact and lowest speed from the recorded events."""
+    """Derives detection, contact and lowest speed from the recorded events."""
 
     def is_detection(row: Row) -> bool:
-        if any(is_gone(name)(row) for name in fault.services) or is_lost(row):
-            return True
-        if row["what"] == "line" and any(word in row["line"] for word in ("standing by", "No space left", "full")):
+        if any(is_gone(name)(row) for name in fault.services) or is_lost(row) or fault.is_detection(row):
             return True
         return fault.expect == "stops" and is_truth(row) and row["speed"] < BRAKING_RATIO * speed
 

@@ -18,7 +18,7 @@ PROCESSING_TIME_S = 0.2  # per message
 
 
 def main(arguments: list[str]) -> None:
-    """Run one kind of misbehaviour until killed: "repeater", "slow subscriber", or "malformed" with a count."""
+    """Runs one kind of misbehaviour until killed: "repeater", "slow subscriber", or "malformed" with a count."""
     what, *rest = arguments
     robot, connect = os.environ["PRESAGE_ROBOT"], os.environ["PRESAGE_CONNECT"]
     listen = os.environ.get("PRESAGE_LISTEN") or "tcp/127.0.0.1:0"
@@ -34,7 +34,7 @@ def main(arguments: list[str]) -> None:
 
 
 def repeat(bus: Bus) -> None:
-    """Repeat every received message at once and again after a delay, except its own repetitions."""
+    """Repeats every received message at once and again after a delay, except its own repetitions."""
     inbox, late = Inbox(), []
     for topic in (SCAN, BELIEF, CMD_VEL):
         bus.subscribe(topic, inbox, keep_all=True)
@@ -50,7 +50,7 @@ def repeat(bus: Bus) -> None:
 
 
 def listen_slowly(bus: Bus) -> None:
-    """Subscribe to all topics and block zenoh's callback thread for each message, as a badly written peer might."""
+    """Subscribes to all topics and blocks zenoh's callback thread for each message, as a badly written peer might."""
 
     class Slow(Inbox):
         def put(self, entry: object, *, newest_only: bool = False) -> None:  # noqa: ARG002
@@ -63,7 +63,7 @@ def listen_slowly(bus: Bus) -> None:
 
 
 def send_noise(bus: Bus, count: int) -> None:
-    """Send ``count`` random payloads, on all topics in turn."""
+    """Sends ``count`` random payloads, on all topics in turn."""
     rng = np.random.default_rng(0)
     payloads = [rng.bytes(int(size)) for size in rng.integers(0, 600, 997)]
     for topic in TOPICS:

@@ -32,9 +32,12 @@ def describe(message: Message) -> dict[str, Any]:
         return {"what": "truth", "speed": speed, "stamp": message.stamp_ns, "contact": message.contact, "place": place}
     if isinstance(message, Status):
         return {
-            "what": "status", "state": message.state, "reason": message.reason, "goal_seq": message.goal_seq,
+            "what": "status",
+            "state": message.state,
+            "reason": message.reason,
+            "goal_seq": message.goal_seq,
             "distance": message.distance,
-        }  # fmt: skip
+        }
     if isinstance(message, Belief):
         return {
             "what": "belief",
@@ -56,7 +59,7 @@ def describe(message: Message) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Print events until the process is ended."""
+    """Prints events until the process is ended."""
     connect, robot = os.environ["PRESAGE_CONNECT"], os.environ["PRESAGE_ROBOT"]
     listen = os.environ.get("PRESAGE_LISTEN") or "tcp/127.0.0.1:0"
     inbox = Inbox()

@@ -79,7 +79,7 @@ class System(Stack):
 
     def child_environment(self, name: str) -> Mapping[str, str]:
         """Environment variables of a process; with several hosts it listens on its host's address."""
-        more = {"PRESAGE_INSECURE": "1", **self.extra.get(name, {})}
+        more = {"PRESAGE_INSECURE": "1", "PRESAGE_LOG_JSON": "true", **self.extra.get(name, {})}
         if self.network is None or name == "router":
             return more
         host = self.network.hosts[HOST_OF[name]].address if name in HOST_OF else self.network.here
@@ -107,31 +107,31 @@ class System(Stack):
     # ---- processes
 
     def begin(self, service: str) -> None:
-        """Start a service with its arguments."""
+        """Starts a service with its arguments."""
         if service == "router":
             self.start_router()
         else:
             self.start(service, *self.arguments[service])
 
     def start_module(self, name: str, service: str, *args: str) -> None:
-        """Start one more instance of a service under another name."""
+        """Starts one more instance of a service under another name."""
         self._spawn(name, ["-m", f"services.{service}", *args])
 
     def signal(self, name: str, number: int) -> None:
-        """Send a signal to a process if it still runs."""
+        """Sends a signal to a process if it still runs."""
         process = self.processes.get(name)
         if process is not None and process.child.poll() is None:
             process.child.send_signal(number)
 
     def kill(self, *names: str) -> None:
-        """Kill processes with SIGKILL and wait until they have ended."""
+        """Kills processes with SIGKILL and waits until they have ended."""
         for name in names:
             self.processes[name].child.kill()
         for name in names:
             self.stop(name)
 
     def restart(self, *names: str) -> None:
-        """Restart killed services and wait until their liveliness tokens appear."""
+        """Restarts killed services and waits until their liveliness tokens appear."""
         since = time.monotonic()
         for name in names:
             self.begin(name)
@@ -142,7 +142,7 @@ class System(Stack):
     # ---- the robot
 
     def drive_fast(self) -> Row:
-        """Drive until the robot is fast and far from its goal. Returns the event that shows it.
+        """Drives until the robot is fast and far from its goal. Returns the event that shows it.
 
         Raises UserError if that does not happen in time.
         """
@@ -163,7 +163,7 @@ class System(Stack):
         raise UserError(f"the robot did not reach {FAULT_SPEED:g} m/s; the last status: {self._latest('status')}")
 
     def set_far_goal(self) -> None:
-        """Send the goal that is farther from the robot."""
+        """Sends the goal that is farther from the robot."""
         here = self._latest("truth")
         x = here["place"][0] if here is not None else 0.0
         goal = max(GOALS, key=lambda end: abs(end[0] - x))
@@ -176,9 +176,11 @@ class System(Stack):
         return next((row for row in reversed(self.timeline.rows) if row["what"] == what), None)
 
     def on_output(self, name: str, line: str) -> None:
-        """Add a process's output line to the timeline: the observer's lines as events, others as text."""
-        row: Row = {"t": time.monotonic(), "what": "line", "name": name, "line": line}
-        if name == "observer":
-            with suppress(json.JSONDecodeError):  # zenoh may print lines of its own
-                row = json.loads(line)
-        self.timeline.add(row)
+        """Adds a line to the timeline: one of the observer as it is, a log line of another process with its fields."""
+        now, fields = time.monotonic(), None
+        with suppress(json.JSONDecodeError):  # zenoh may print lines of its own
+            fields = json.loads(line)
+        if isinstance(fields, dict):
+            self.timeline.add(
+                fields if name == "observer" else {"t": now, "what": "log", "name": name, "fields": fields}
+            )

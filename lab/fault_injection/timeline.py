@@ -18,13 +18,13 @@ class Timeline:
     """Events from the observer in the order of arrival; one thread adds them, another reads them."""
 
     def __init__(self) -> None:
-        """Start without events."""
+        """Starts with an empty list of events."""
         self.rows: list[Row] = []
         self._lock = threading.RLock()  # entered directly, because Ctrl-C in Condition.__enter__ would leave it locked
         self._changed = threading.Condition(self._lock)
 
     def add(self, row: Row) -> None:
-        """Append an event and wake up waiting threads."""
+        """Appends an event and wake up waiting threads."""
         with self._lock:
             self.rows.append(row)
             self._changed.notify_all()
@@ -54,7 +54,7 @@ class Timeline:
                     raise UserError(f"{what}: did not happen within {timeout:g} s")
 
     def forget(self, before: float) -> None:
-        """Remove events before the time ``before`` (s)."""
+        """Removes events before the time ``before`` (s)."""
         with self._lock:
             self.rows = [row for row in self.rows if row["t"] >= before]
 
@@ -82,6 +82,16 @@ def is_gone(service: str) -> Callable[[Row], bool]:
 def is_back(service: str) -> Callable[[Row], bool]:
     """Returns a predicate: whether an event shows that the service's liveliness token appeared."""
     return lambda row: row["what"] == "alive" and row["service"] == service and bool(row["there"])
+
+
+def is_standing_by(process: str) -> Callable[[Row], bool]:
+    """Returns a predicate: whether an event is the log line of a process that waits for the active instance to end."""
+    return lambda row: row["what"] == "log" and row["name"] == process and "leads" in row["fields"]
+
+
+def is_error(process: str) -> Callable[[Row], bool]:
+    """Returns a predicate: whether an event is an error that the process logged."""
+    return lambda row: row["what"] == "log" and row["name"] == process and row["fields"].get("level") == "error"
 
 
 def is_lost(row: Row) -> bool:

@@ -36,20 +36,20 @@ MAX_EVENTS = 200  # stored per trial
 def measure(trace: RunTrace, trip: Trip, world: World, robot: Robot) -> dict[str, Any]:
     """Statistics of a drive as a row of the results; None where a value is unknown."""
     path, seconds = trace.path(), _seconds(trace)
-    left = float(np.hypot(*(path[-1, :2] - np.array(trip.goal))))
+    distance_left = float(np.hypot(*(path[-1, :2] - np.array(trip.goal))))
     shortest, driven = length(np.array(trip.shortest)), length(path)
     holonomic_robot = robot.model_copy(update={"drive": "holonomic"})
     least, bound = (least_trip(trip.shortest, trip.start[2], each, TOLERANCE) for each in (robot, holonomic_robot))
-    outcome = _outcome(trace, left)
+    outcome = _outcome(trace, distance_left)
     return {
         "outcome": outcome,
         "reached": outcome == "reached",
-        "why": _why(trace, outcome, left),
+        "why": _failure_reason(trace, outcome, distance_left),
         "seconds": seconds,
-        "left_m": left,
+        "left_m": distance_left,
         "shortest_m": shortest,
         "driven_m": driven,
-        "path_over_shortest": (driven + left) / shortest,
+        "path_over_shortest": (driven + distance_left) / shortest,
         "least_s": least,
         "time_over_least": seconds / least,
         "time_over_bound": seconds / bound,
@@ -71,22 +71,22 @@ def _seconds(trace: RunTrace) -> float:
     return trace.truths[-1].stamp_ns * 1e-9
 
 
-def _outcome(trace: RunTrace, left: float) -> str:
+def _outcome(trace: RunTrace, distance_left: float) -> str:
     last = trace.statuses[max(trace.statuses)] if trace.statuses else None
     if trace.failure:
         return "failed"
     if last is not None and last.state == "reached":
-        return "reached" if left <= MAX_REACHED_DISTANCE else "claimed elsewhere"
+        return "reached" if distance_left <= MAX_REACHED_DISTANCE else "claimed elsewhere"
     return "refused" if last is not None and last.refused else "too late"
 
 
-def _why(trace: RunTrace, outcome: str, left: float) -> str:
-    """One line why the goal was not reached; empty if it was."""
+def _failure_reason(trace: RunTrace, outcome: str, distance_left: float) -> str:
+    """Why the goal was not reached, in one line; empty if it was reached."""
     if outcome == "reached":
         return ""
     last = trace.statuses[max(trace.statuses)] if trace.statuses else None
     last_status = f"; at last {last.state}: {last.reason}" if last is not None else ""
-    return trace.failure or f"{left:.2f} m from the goal after {_seconds(trace):.1f} s{last_status}"
+    return trace.failure or f"{distance_left:.2f} m from the goal after {_seconds(trace):.1f} s{last_status}"
 
 
 def _contacts(trace: RunTrace) -> dict[str, Any]:
@@ -120,8 +120,10 @@ def _clearance(world: World, path: Array) -> Array:
 
 
 def _clearance_to_people(trace: RunTrace, robot: Robot) -> float | None:
-    apart = [np.hypot(*(truth.people - truth.pose.array()[:2]).T).min() for truth in trace.truths if len(truth.people)]
-    return float(min(apart)) - robot.radius - PERSON_RADIUS if apart else None
+    distances = [
+        np.hypot(*(truth.people - truth.pose.array()[:2]).T).min() for truth in trace.truths if len(truth.people)
+    ]
+    return float(min(distances)) - robot.radius - PERSON_RADIUS if distances else None
 
 
 def _localisation(trace: RunTrace) -> dict[str, Any]:
@@ -171,10 +173,10 @@ def strip_numbers(reason: str) -> str:
 def _steps(trace: RunTrace) -> dict[str, Any]:
     """Processor time of the controller's steps, from the counters in its health message."""
     counters = trace.health.counters if trace.health is not None else {}
-    steps, us, most = (counters.get(name) for name in ("steps", "step_us", "step_us_max"))
+    steps, us, us_max = (counters.get(name) for name in ("steps", "step_us", "step_us_max"))
     return {
         "step_mean_ms": us / steps * 1e-3 if steps and us is not None else None,
-        "step_max_ms": most * 1e-3 if most is not None else None,
+        "step_max_ms": us_max * 1e-3 if us_max is not None else None,
     }
 
 

@@ -31,21 +31,29 @@ from lab.navigation.shortest_path import MIN_TRIP_LENGTH, START_GOAL_MARGIN, WAL
 EXPERIMENT_ID = 7  # part of the random seeds
 WORLDS, DRIVES = ("maze", "office"), ("holonomic", "differential")
 OPTION_VALUES = {
-    "drives": DRIVES, "start": ("known", "unknown"), "estimator": ("precise", "particle-filter"),
+    "drives": DRIVES,
+    "start": ("known", "unknown"),
+    "estimator": ("precise", "particle-filter"),
     "prior": ("motion", "odometry"),
-}  # fmt: skip
+}
 WORST_TRIALS = 5  # trials named in the summary
 QUANTITIES = {  # statistics over the trials that reached the goal; the other trials are listed under `worst`
-    "path_over_shortest": ("median", "max"), "time_over_least": ("median", "max"), "seconds": ("median", "max"),
-    "time_over_bound": ("median", "max"), "untracked_s": ("median", "max"), "claimed_error_max_m": ("max",),
-    "error_median_m": ("median",), "error_max_m": ("max",), "tracking_s": ("median", "max"),
+    "path_over_shortest": ("median", "max"),
+    "time_over_least": ("median", "max"),
+    "seconds": ("median", "max"),
+    "time_over_bound": ("median", "max"),
+    "untracked_s": ("median", "max"),
+    "claimed_error_max_m": ("max",),
+    "error_median_m": ("median",),
+    "error_max_m": ("max",),
+    "tracking_s": ("median", "max"),
     "replans": ("median", "max"),
-}  # fmt: skip
+}
 STATISTICS: dict[str, Callable[[Any], Any]] = {"median": np.median, "max": np.max, "min": np.min}
 
 
 @dataclass(frozen=True)
-class Job:
+class NavigationJob:
     """One start and goal in one world, with one drive."""
 
     index: int
@@ -71,17 +79,21 @@ class Job:
         epistemic_option = "--epistemic" if self.epistemic else "--no-epistemic"
         people = ("--people", str(self.people), "--people-speed", repr(self.people_speed)) if self.people else ()
         return LockstepRun(
-            journey, yaw, self.world, self.beams, (self.seed * 100_003 + self.index) % 2**31,
+            journey,
+            yaw,
+            self.world,
+            self.beams,
+            (self.seed * 100_003 + self.index) % 2**31,
             ("--estimator", self.estimator, "--prior", self.prior),
             round(self.limit * SCANNERS["tim571"].rate),
             controller=("--preset", "geodesic", "--drive", self.drive, epistemic_option),
             simulator=("--drive", self.drive, *people),
             start_known=self.start == "known",
             ends_with_status=True,
-        )  # fmt: skip
+        )
 
 
-def check(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> None:
+def check(job: NavigationJob, worlds: Sequence[str], drives: Sequence[str]) -> None:
     """Checks the options before anything runs. Raises UserError for unknown or repeated values."""
     for world in worlds:
         load_world(world)
@@ -97,7 +109,7 @@ def check(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> None:
         raise UserError("--worlds: two of the files have the same name; rename one, because results are named after it")
 
 
-def result_name(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> str:
+def result_name(job: NavigationJob, worlds: Sequence[str], drives: Sequence[str]) -> str:
     """Name of the result: `navigation` and the options that differ from the defaults.
 
     Results of different options therefore do not overwrite each other.
@@ -107,16 +119,16 @@ def result_name(job: Job, worlds: Sequence[str], drives: Sequence[str]) -> str:
         *([] if tuple(drives) == DRIVES else drives),
         *(["unknown"] if job.start == "unknown" else []),
         *([f"people{job.people}"] if job.people else []),
-        *([f"{job.people_speed:g}mps"] if job.people and job.people_speed != Job.people_speed else []),
-        *([job.estimator] if job.estimator != Job.estimator else []),
-        *([job.prior] if job.prior != Job.prior else []),
+        *([f"{job.people_speed:g}mps"] if job.people and job.people_speed != NavigationJob.people_speed else []),
+        *([job.estimator] if job.estimator != NavigationJob.estimator else []),
+        *([job.prior] if job.prior != NavigationJob.prior else []),
         *([] if job.epistemic else ["no-epistemic"]),
-        *([f"beams{job.beams}"] if job.beams != Job.beams else []),
+        *([f"beams{job.beams}"] if job.beams != NavigationJob.beams else []),
     ]
     return "-".join(["navigation", *parts])
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: NavigationJob) -> dict[str, Any]:
     """Runs one drive. Returns its statistics."""
     robot = Robot.model_validate({"drive": job.drive})
     trip = draw_trip(job.world, np.random.default_rng((job.seed, EXPERIMENT_ID, job.index)), robot)
@@ -169,10 +181,12 @@ def worst(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     order = sorted(
         rows, key=lambda r: (r["reached"], -r["contacts_moving"], -r["contacts_standing"], -r["time_over_least"])
     )
-    return [{"trial": row["trial"], "outcome": row["outcome"], "why": _why(row)} for row in order[:WORST_TRIALS]]
+    return [
+        {"trial": row["trial"], "outcome": row["outcome"], "why": _describe_trial(row)} for row in order[:WORST_TRIALS]
+    ]
 
 
-def _why(row: dict[str, Any]) -> str:
+def _describe_trial(row: dict[str, Any]) -> str:
     parts = [row["why"]] if row["why"] else []
     if touched := row["contacts_moving"] + row["contacts_standing"]:
         first = row["contact_at"][0]
@@ -188,10 +202,16 @@ def _why(row: dict[str, Any]) -> str:
 
 
 def run(
-    job: Job, trials: int, out: Path, workers: int, console: Console, *, worlds: Sequence[str] = WORLDS,
+    job: NavigationJob,
+    trials: int,
+    out: Path,
+    workers: int,
+    console: Console,
+    *,
+    worlds: Sequence[str] = WORLDS,
     drives: Sequence[str] = DRIVES,
-) -> results.Result:  # fmt: skip
-    """All trials of all worlds and drives; writes NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
+) -> results.Result:
+    """Runs all trials of all worlds and drives. Writes NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
     check(job, worlds, drives)
     name = result_name(job, worlds, drives)
     groups = [replace(job, world=world, drive=drive) for world in worlds for drive in drives]
@@ -212,14 +232,20 @@ def run(
         "robot": Robot().model_dump(exclude={"drive"}),
     }
     result = results.Result(
-        name, f"Navigation: {driving_figure.describe(job)}", job.seed, parameters,
-        {group: summarise(of) for group, of in by_group.items()}, columns(rows), rows, [_note(job, trials)],
-    )  # fmt: skip
+        name,
+        f"Navigation: {driving_figure.describe(job)}",
+        job.seed,
+        parameters,
+        {group: summarise(group_rows) for group, group_rows in by_group.items()},
+        columns(rows),
+        rows,
+        [_note(job, trials)],
+    )
     result.write(out, driving_figure.draw(by_group, {group.group: group.world for group in groups}, result.title))
     return result
 
 
-def _note(job: Job, trials: int) -> str:
+def _note(job: NavigationJob, trials: int) -> str:
     return f"{trials} pairs at random in each world, the same for every drive; {driving_figure.describe(job)}."
 
 

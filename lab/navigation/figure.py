@@ -14,14 +14,14 @@ from lab.experiments import results
 from presage.plotting import style as drawing
 
 if TYPE_CHECKING:
-    from lab.navigation.experiment import Job
+    from lab.navigation.experiment import NavigationJob
 
 Rows = Sequence[dict[str, Any]]
 LINES = ("-", "--", ":", "-.")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 
 
-def describe(job: Job) -> str:
+def describe(job: NavigationJob) -> str:
     """The options that differ between experiments, in words."""
     parts = [f"start {job.start}", f"estimator {job.estimator}"]
     parts += [f"{job.people} people at {job.people_speed:g} m/s"] if job.people else []
@@ -91,9 +91,13 @@ def _distribution(axes: Axes, by_group: Mapping[str, Rows], quantity: str, label
         last = max(last, float(ratios.max(initial=0.0)))
         style = LINES[number // len(COLOURS) % len(LINES)]
         axes.step(
-            [0.0, *ratios, 1e3], [0.0, *share, share[-1] if len(share) else 0.0], style, where="post",
-            color=COLOURS[number % len(COLOURS)], label=group,
-        )  # fmt: skip
+            [0.0, *ratios, 1e3],
+            [0.0, *share, share[-1] if len(share) else 0.0],
+            style,
+            where="post",
+            color=COLOURS[number % len(COLOURS)],
+            label=group,
+        )
     axes.set(xlabel=label, ylabel="share of trials", xlim=(0.95, last * 1.03), ylim=(0, 1.02))
 
 
@@ -102,21 +106,32 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     number, mm = results.number, results.millimetres
     people = any(row["min_clearance_to_people_m"] is not None for row in summary.values())
     heads = [
-        "world, drive", "reached", "reported elsewhere", "contacts moving; standing", "path / shortest", "time / least",
-        "gap (m)", *(["to people (m)"] if people else []), "error (mm)", "step (ms)",
-    ]  # fmt: skip
+        "world, drive",
+        "reached",
+        "reported elsewhere",
+        "contacts moving; standing",
+        "path / shortest",
+        "time / least",
+        "gap (m)",
+        *(["to people (m)"] if people else []),
+        "error (mm)",
+        "step (ms)",
+    ]
     rows = [
         [
-            name, f"{row['reached']}/{row['trials']}", str(row["trials_claimed_elsewhere"]),
+            name,
+            f"{row['reached']}/{row['trials']}",
+            str(row["trials_claimed_elsewhere"]),
             f"{row['trials_with_contact_moving']}; {row['trials_with_contact_standing']}",
             f"{number(row['median_path_over_shortest'])}; {number(row['max_path_over_shortest'])}",
             f"{number(row['median_time_over_least'])}; {number(row['max_time_over_least'])}",
-            number(row["min_clearance_m"]), *([number(row["min_clearance_to_people_m"])] if people else []),
+            number(row["min_clearance_m"]),
+            *([number(row["min_clearance_to_people_m"])] if people else []),
             f"{mm(row['median_error_median_m'])}; {mm(row['max_error_max_m'])}",
             f"{number(row['median_step_mean_ms'], 1)}; {number(row['max_step_max_ms'], 1)}",
         ]
         for name, row in summary.items()
-    ]  # fmt: skip
+    ]
     bad = [
         f"- {name}, trial {each['trial']}, {each['outcome']}: {each['why']}"
         for name, row in summary.items()

@@ -58,22 +58,22 @@ class ShortestPaths:
                 place, places, np.concatenate([[True, True], self._bend_corners(place)])
             )
         _, before = dijkstra(csr_matrix(lengths), directed=False, indices=1, return_predecessors=True)
-        numbers = [0]
-        while numbers[-1] != 1:
-            if before[numbers[-1]] < 0:
+        indices = [0]
+        while indices[-1] != 1:
+            if before[indices[-1]] < 0:
                 return np.zeros((0, 2))
-            numbers.append(int(before[numbers[-1]]))
-        return places[numbers]
+            indices.append(int(before[indices[-1]]))
+        return places[indices]
 
-    def _visible_distances(self, place: Array, others: Array, which: npt.NDArray[np.bool_]) -> Array:
-        """Distances (N,), m, from ``place`` to those of the ``others`` (N, 2) that ``which`` selects.
+    def _visible_distances(self, place: Array, others: Array, mask: npt.NDArray[np.bool_]) -> Array:
+        """Distances (N,), m, from ``place`` to those of the ``others`` (N, 2) that ``mask`` selects.
 
         0, which means no edge in the visibility graph, where the line between them is not free.
         """
         apart = np.zeros(len(others))
-        ends = others[which]
+        ends = others[mask]
         lines = shapely.linestrings(np.stack([np.broadcast_to(place, ends.shape), ends], axis=1))
-        apart[which] = np.where(shapely.covers(self.room, lines), np.hypot(*(ends - place).T), 0.0)
+        apart[mask] = np.where(shapely.covers(self.room, lines), np.hypot(*(ends - place).T), 0.0)
         return apart
 
     def _bend_corners(self, place: Array) -> npt.NDArray[np.bool_]:
@@ -107,10 +107,11 @@ def _protruding_corners(room: shapely.Geometry) -> tuple[Array, Array]:
     for polygon in shapely.get_parts(shapely.orient_polygons(room)):
         for ring in shapely.get_rings(polygon):
             here = shapely.get_coordinates(ring)[:-1]
-            back, on = np.roll(here, 1, axis=0) - here, np.roll(here, -1, axis=0) - here
-            bulges = back[:, 0] * on[:, 1] - back[:, 1] * on[:, 0] > 0  # free space lies to the left
+            to_previous, to_next = np.roll(here, 1, axis=0) - here, np.roll(here, -1, axis=0) - here
+            # Free space lies to the left of each edge.
+            bulges = to_previous[:, 0] * to_next[:, 1] - to_previous[:, 1] * to_next[:, 0] > 0
             corners.append(here[bulges])
-            edges.append(np.stack([back, on], axis=1)[bulges])
+            edges.append(np.stack([to_previous, to_next], axis=1)[bulges])
     return np.concatenate(corners), np.concatenate(edges)
 
 

@@ -32,22 +32,23 @@ from services.estimator.shared.interface import Estimator, Posterior
 
 EXPERIMENT_ID = 5  # part of the random seeds
 PLACES_SEED, LEARNING_SEED, SCANS_SEED = 0, 1, 2  # parts of the random seeds
-HEADING = float(np.pi / 2)  # rad, of all places; only the paper's estimator is given it
+HEADING = float(np.pi / 2)  # rad, of all places; only the paper's estimator knows it
 ALIKE = World(
     name="alike",
     boundary=[(0, 0), (18, 0), (18, 4.5), (0, 4.5)],
     obstacles=[{"box": {"center": (x, 3.9), "size": (0.7, 0.7)}} for x in (3.6, 7.2, 10.8, 14.4)],
 )
 TITLES = {
-    "corridor": "corridor: four different objects", "alike": "alike: four equal boxes",
+    "corridor": "corridor: four different objects",
+    "alike": "alike: four equal boxes",
     "twins": "twins: two rooms alike",
-}  # fmt: skip
+}
 ESTIMATORS = ("paper", "precise", "particle-filter")
 MOMENTS = (1, 10, 50)  # numbers of scans after which the results are evaluated
 
 
 @dataclass(frozen=True)
-class Job:
+class AliasingJob:
     """One estimator in one world, at all places."""
 
     seed: int
@@ -67,7 +68,7 @@ def world_of(name: str) -> World:
     return {"alike": ALIKE, "twins": TWINS}.get(name) or load_world(name)
 
 
-def scene_of(job: Job, *seed: int) -> Scene:
+def scene_of(job: AliasingJob, *seed: int) -> Scene:
     """The job's world with random numbers that do not depend on the estimator."""
     return Scene.of(world_of(job.world), job.beams, (job.seed, EXPERIMENT_ID, list(TITLES).index(job.world), *seed))
 
@@ -91,7 +92,7 @@ def sample_places(scene: Scene, count: int) -> Array:
     return np.asarray(poses)
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: AliasingJob) -> dict[str, Any]:
     """Trains the job's estimator, then runs it at each place."""
     make = _estimator_factory(job)
     rows = []
@@ -104,7 +105,7 @@ def trial(job: Job) -> dict[str, Any]:
     return {"world": job.world, "estimator": job.estimator, "places": rows}
 
 
-def _estimator_factory(job: Job) -> Callable[[int], Estimator]:
+def _estimator_factory(job: AliasingJob) -> Callable[[int], Estimator]:
     """Trains the model. Returns a function that makes a new estimator, without start pose, for a place's number."""
     scene = scene_of(job, LEARNING_SEED, ESTIMATORS.index(job.estimator))
     if job.estimator == "paper":
@@ -135,7 +136,7 @@ def _row(pose: Array, posteriors: Sequence[Posterior], *, twins: bool) -> dict[s
     if not twins:
         return statistics
     twin = twin_of(pose)
-    near = [any(np.hypot(*(h.pose - at)[:2]) < CLOSE_DISTANCE for h in last.hypotheses) for at in (pose, twin)]
+    near = [any(np.hypot(*(h.pose - place)[:2]) < CLOSE_DISTANCE for h in last.hypotheses) for place in (pose, twin)]
     either = min(off[-1], float(np.hypot(*(last.pose - twin)[:2])))
     return {**statistics, "both_kept": int(last.state == "ambiguous" and all(near)), "either_error_m": round(either, 6)}
 
@@ -161,8 +162,10 @@ def summarise(row: dict[str, Any]) -> dict[str, Any]:
     return statistics
 
 
-def run(job: Job, out: Path, workers: int, console: Console, worlds: Sequence[str] = tuple(TITLES)) -> results.Result:
-    """Every estimator in every world; writes aliasing.json, .csv, .pdf and .png into ``out``."""
+def run(
+    job: AliasingJob, out: Path, workers: int, console: Console, worlds: Sequence[str] = tuple(TITLES)
+) -> results.Result:
+    """Runs every estimator in every world. Writes aliasing.json, .csv, .pdf and .png into ``out``."""
     # The longest jobs first: the training of the paper's decoders.
     jobs = [replace(job, world=world, estimator=name) for name in ESTIMATORS for world in worlds]
     rows = run_trials("aliasing", trial, jobs, out, workers, console)
@@ -175,9 +178,15 @@ def run(job: Job, out: Path, workers: int, console: Console, worlds: Sequence[st
         curves[f"{key} share within 0.2 m"] = (errors < CLOSE_DISTANCE).mean(axis=0).tolist()
     summary = {f"{row['world']}, {row['estimator']}": summarise(row) for row in rows}
     result = results.Result(
-        "aliasing", "Similar objects", job.seed, asdict(job) | {"worlds": list(worlds)}, summary, curves, rows,
-        ["twins: only places of which no scan says which room it is; to know the place is then luck, one in two"],
-    )  # fmt: skip
+        "aliasing",
+        "Similar objects",
+        job.seed,
+        asdict(job) | {"worlds": list(worlds)},
+        summary,
+        curves,
+        rows,
+        ["twins: only places whose scans are the same in both rooms, so that an estimator can only guess the room"],
+    )
     result.write(out, draw(rows, summary))
     return result
 
@@ -225,13 +234,13 @@ def _bars(axes: Axes, summary: dict[str, dict[str, Any]]) -> None:
     groups.append((f"`tracking`, but\n> {FOUND_DISTANCE} m off", f"tracking_but_wrong_after_{last}"))
     if "both_kept" in one:
         groups.append(("both places\nkept", "both_kept"))
-    at, width = np.arange(len(groups)) + 0.35 * (np.arange(len(groups)) >= good), 0.8 / len(summary)
+    positions, width = np.arange(len(groups)) + 0.35 * (np.arange(len(groups)) >= good), 0.8 / len(summary)
     for number, (name, row) in enumerate(summary.items()):
         shares = [row[quantity] / row["places"] for _, quantity in groups]
-        x = at + (number - (len(summary) - 1) / 2) * width
+        x = positions + (number - (len(summary) - 1) / 2) * width
         bars = axes.bar(x, shares, 0.92 * width, color=drawing.COLOURS[name], label=name)
         axes.bar_label(bars, [f"{row[quantity]}" for _, quantity in groups], fontsize=9, padding=1)
-    axes.set_xticks(at, [label for label, _ in groups])
+    axes.set_xticks(positions, [label for label, _ in groups])
     axes.grid(visible=False, axis="x")
     axes.axvline(good - 0.5 + 0.17, color="#AAAAAA", linewidth=0.8)
     if "both_kept" in one:
@@ -246,15 +255,24 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     moments = [name for name in next(iter(summary.values())) if name.startswith("within")]
     scans = "; ".join(name.rsplit("_", 1)[1] for name in moments)
     heads = (
-        "world", "estimator", f"within 0.2 m after {scans} scans", "median error (m)",
-        "wrong `tracking`, at the end; ever", "both places kept",
-    )  # fmt: skip
+        "world",
+        "estimator",
+        f"within 0.2 m after {scans} scans",
+        "median error (m)",
+        "wrong `tracking`, at the end; ever",
+        "both places kept",
+    )
     rows = []
     for row in summary.values():
         wrong = next(value for name, value in reversed(row.items()) if name.startswith("tracking_but_wrong_after"))
-        rows.append([
-            row["world"], row["estimator"], "; ".join(f"{row[name]}/{row['places']}" for name in moments),
-            results.number(row["final_error_median_m"], 4), f"{wrong}; {row['tracking_but_wrong_ever']}",
-            f"{row['both_kept']}/{row['places']}" if "both_kept" in row else "",
-        ])  # fmt: skip
+        rows.append(
+            [
+                row["world"],
+                row["estimator"],
+                "; ".join(f"{row[name]}/{row['places']}" for name in moments),
+                results.number(row["final_error_median_m"], 4),
+                f"{wrong}; {row['tracking_but_wrong_ever']}",
+                f"{row['both_kept']}/{row['places']}" if "both_kept" in row else "",
+            ]
+        )
     return results.markdown(heads, rows)

@@ -21,26 +21,31 @@ STEPS_PER_SCAN = (1, 10)  # gradient steps a scan: the paper's, and the service'
 
 
 @dataclass(frozen=True)
-class Job:
+class AlphaJob:
     """One place at one step size."""
 
     alpha: float
     steps: int
-    place: localisation.Job
+    place: localisation.LocalisationJob
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: AlphaJob) -> dict[str, Any]:
     """E1's trial with the job's step size."""
     descent = Descent(alpha=job.alpha, iterations=job.steps)
     return localisation.trial(replace(job.place, estimators=("paper",), descent=descent))
 
 
 def run(
-    job: localisation.Job, trials: int, out: Path, workers: int, console: Console, alphas: tuple[float, ...] = ALPHAS
+    job: localisation.LocalisationJob,
+    trials: int,
+    out: Path,
+    workers: int,
+    console: Console,
+    alphas: tuple[float, ...] = ALPHAS,
 ) -> results.Result:
     """Runs all step sizes at the places of E1. Writes alpha.json, .csv, .pdf and .png into ``out``."""
     grid = [(steps, alpha) for steps in STEPS_PER_SCAN for alpha in alphas]
-    jobs = [Job(alpha, steps, replace(job, index=k)) for steps, alpha in grid for k in range(trials)]
+    jobs = [AlphaJob(alpha, steps, replace(job, index=k)) for steps, alpha in grid for k in range(trials)]
     rows = run_trials("alpha", trial, jobs, out, workers, console)
     summary: dict[str, dict[str, Any]] = {}
     for number, (steps, alpha) in enumerate(grid):
@@ -51,9 +56,14 @@ def run(
     curves = {name: [row[name] for row in summary.values()] for name in columns}
     parameters = {"alphas": alphas, "steps": STEPS_PER_SCAN, "trials": trials, "e1": asdict(job)}
     result = results.Result(
-        "alpha", "Step size of the paper's perception", job.seed, parameters, summary, curves,
+        "alpha",
+        "Step size of the paper's perception",
+        job.seed,
+        parameters,
+        summary,
+        curves,
         notes=[f"best with {each} a scan: {best(summary, each):g} m² (most within 0.2 m)" for each in STEPS_PER_SCAN],
-    )  # fmt: skip
+    )
     result.write(out, draw(summary, trials))
     return result
 

@@ -39,7 +39,7 @@ CLOSE_DISTANCE = 0.2  # m; an error below it counts as close
 
 
 @dataclass(frozen=True)
-class Job:
+class LocalisationJob:
     """One trial: one place, with the same scans for every estimator."""
 
     index: int
@@ -50,7 +50,7 @@ class Job:
     descent: Descent = PAPER_DESCENT
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: LocalisationJob) -> dict[str, Any]:
     """Runs one trial. Returns each estimator's error (m) after every iteration and its final state, and the bound."""
     scene = job.field.scene(job.seed, EXPERIMENT_ID, job.index)
     pose = scene.poses(1)[0]
@@ -59,9 +59,12 @@ def trial(job: Job) -> dict[str, Any]:
     scans = [scene.observe(clean, k / scene.scanner.rate) for k in range(job.iterations)]
     one_scan = bound.single(scene, pose[None])
     outcome: dict[str, Any] = {
-        "pose": pose.tolist(), "in_front": bool(pose[1] < job.field.front()), "bound": one_scan[0].tolist(),
-        "error_m": {}, "claim": {},
-    }  # fmt: skip
+        "pose": pose.tolist(),
+        "in_front": bool(pose[1] < job.field.front()),
+        "bound": one_scan[0].tolist(),
+        "error_m": {},
+        "claim": {},
+    }
     for name in job.estimators:
         estimator = create_estimator(name, job.field, scene, job.seed * 100_003 + job.index, job.descent)
         posteriors = [estimator.update(scan) for scan in scans]
@@ -102,7 +105,7 @@ def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
     }
 
 
-def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
+def run(job: LocalisationJob, trials: int, out: Path, workers: int, console: Console) -> results.Result:
     """Runs all trials. Writes e1.json, .csv, .pdf and .png into ``out``."""
     jobs = [replace(job, index=index) for index in range(trials)]
     rows = run_trials("e1", trial, jobs, out, workers, console)
@@ -117,9 +120,14 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
             curves[f"bound{text} {what} m"] = [value / float(np.sqrt(k)) for k in range(1, job.iterations + 1)]
     parameters = asdict(job) | {"trials": trials, "bound_end_m": curves["bound RMS m"][-1]}
     result = results.Result(
-        "e1", "E1: a standing robot localised", job.seed, parameters,
-        {name: summarise(rows, name) for name in job.estimators}, curves, rows,
-    )  # fmt: skip
+        "e1",
+        "E1: a standing robot localised",
+        job.seed,
+        parameters,
+        {name: summarise(rows, name) for name in job.estimators},
+        curves,
+        rows,
+    )
     result.write(out, draw(rows, job.estimators, result.curves))
     return result
 
@@ -150,16 +158,24 @@ def draw(rows: Sequence[dict[str, Any]], names: Sequence[str], curves: dict[str,
 def table(summary: dict[str, dict[str, Any]]) -> str:
     """The Markdown table of docs/experiments.md."""
     heads = (
-        "estimator", "error, mean ± std (m)", "median (mm)", "RMS / bound", "within 0.5 m", "iterations to 0.2 m",
+        "estimator",
+        "error, mean ± std (m)",
+        "median (mm)",
+        "RMS / bound",
+        "within 0.5 m",
+        "iterations to 0.2 m",
         "reports `tracking`; wrongly",
-    )  # fmt: skip
+    )
     rows = [
         [
-            name, results.mean_std(row, "final_error", 4), results.millimetres(row["final_error_median_m"]),
+            name,
+            results.mean_std(row, "final_error", 4),
+            results.millimetres(row["final_error_median_m"]),
             results.ratio(row["final_rms_over_bound"]),
-            f"{row['found_within_0.5_m']}/{row['trials']}", results.number(row["iterations_to_0.2_m_median"], 0),
+            f"{row['found_within_0.5_m']}/{row['trials']}",
+            results.number(row["iterations_to_0.2_m_median"], 0),
             f"{row['claimed_tracking']}; {row['claimed_tracking_but_wrong']}",
         ]
         for name, row in summary.items()
-    ]  # fmt: skip
+    ]
     return results.markdown(heads, rows)

@@ -38,9 +38,16 @@ from services.simulator.odometry import Drift, Odometer
 
 EXPERIMENT_ID = 2  # part of the random seeds
 ESTIMATORS = (
-    "paper", f"paper, {TEN_STEPS}", "precise", "particle-filter", "particle-filter, heading known",
-    "amcl-defaults", "precise, odometry", "particle-filter, odometry", "amcl-defaults, odometry",
-)  # fmt: skip
+    "paper",
+    f"paper, {TEN_STEPS}",
+    "precise",
+    "particle-filter",
+    "particle-filter, heading known",
+    "amcl-defaults",
+    "precise, odometry",
+    "particle-filter, odometry",
+    "amcl-defaults, odometry",
+)
 START_COVARIANCE = np.diag([0.01, 0.01, 0.01])  # m², m², rad²: 10 cm and 6 degrees
 LOST_DISTANCE = 0.5  # m; a larger error counts as lost
 BOUND_NAMES = ("one scan", "one scan, heading known", "all scans, odometry")
@@ -48,7 +55,7 @@ MARGIN = 0.1  # m, between the robot and any obstacle
 
 
 @dataclass(frozen=True)
-class Job:
+class CrossingJob:
     """One crossing, with the same scans for every estimator."""
 
     index: int
@@ -79,7 +86,7 @@ def path_of(scene: Scene, heading: float, step: float) -> Array:
     raise UserError(f"world {scene.world.name!r} has no free straight line from one side to the other: take another")
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: CrossingJob) -> dict[str, Any]:
     """Runs one crossing. Returns each estimator's error (m) at every scan, and the bounds."""
     scene = job.field.scene(job.seed, EXPERIMENT_ID, job.index)
     path = path_of(scene, job.field.heading, job.step)
@@ -122,7 +129,7 @@ def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
     }
 
 
-def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
+def run(job: CrossingJob, trials: int, out: Path, workers: int, console: Console) -> results.Result:
     """Runs all crossings. Writes e2.json, .csv, .pdf and .png into ``out``."""
     jobs = [replace(job, index=index) for index in range(trials)]
     rows = run_trials("e2", trial, jobs, out, workers, console)
@@ -138,9 +145,14 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
         curves[f"bound, {name} RMS m"] = _rms(limits)
         parameters[f"bound, {name}, rms_m"] = float(np.sqrt(np.mean(np.square(limits))))
     result = results.Result(
-        "e2", "E2: crossing the map by small teleports", job.seed, parameters,
-        {name: summarise(rows, name) for name in job.estimators}, curves, rows,
-    )  # fmt: skip
+        "e2",
+        "E2: crossing the map by small teleports",
+        job.seed,
+        parameters,
+        {name: summarise(rows, name) for name in job.estimators},
+        curves,
+        rows,
+    )
     result.write(out, draw(job.estimators, result.curves))
     return result
 
@@ -176,10 +188,12 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     heads = ("estimator", "median (mm)", "RMS (mm)", "RMS / bound", "max (mm)", "crossings lost")
     rows = [
         [
-            name, *(results.millimetres(row[f"error_{kind}_m"]) for kind in ("median", "rms")),
-            results.ratio(row["rms_over_bound"]), results.millimetres(row["error_max_m"]),
+            name,
+            *(results.millimetres(row[f"error_{kind}_m"]) for kind in ("median", "rms")),
+            results.ratio(row["rms_over_bound"]),
+            results.millimetres(row["error_max_m"]),
             f"{row['crossings_ever_0.5_m_off']}/{row['crossings']}",
         ]
         for name, row in summary.items()
-    ]  # fmt: skip
+    ]
     return results.markdown(heads, rows)

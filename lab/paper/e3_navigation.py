@@ -44,7 +44,7 @@ ESTIMATORS = (f"paper, {TEN_STEPS}", "precise", "particle-filter")
 
 
 @dataclass(frozen=True)
-class Job:
+class NavigationJob:
     """One start and goal, the same for every estimator."""
 
     index: int
@@ -69,7 +69,7 @@ def arguments(name: str, descent: Descent) -> tuple[str, ...]:
     return ("--estimator", kind, *(("--prior", "odometry") if uses_odometry(name) else ()), *steps)
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: NavigationJob) -> dict[str, Any]:
     """Runs one journey with every estimator. Returns the journey and each estimator's results."""
     world = load_world(job.field.world)
     journey = draw_journey(
@@ -81,9 +81,14 @@ def trial(job: Job) -> dict[str, Any]:
     with session() as stack:
         for name in job.estimators:
             lockstep_run = LockstepRun(
-                journey, job.field.heading, job.field.world, job.field.beams, seed, arguments(name, job.descent),
+                journey,
+                job.field.heading,
+                job.field.world,
+                job.field.beams,
+                seed,
+                arguments(name, job.descent),
                 job.limit,
-            )  # fmt: skip
+            )
             outcome["estimators"][name] = _run(lockstep_run, stack)
     return outcome
 
@@ -116,15 +121,15 @@ def measure(trace: RunTrace, journey: Journey) -> dict[str, Any]:
 def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
     """Statistics of one estimator over all trials; times and paths only of trials that reached the goal."""
     every = [each["estimators"][name] for each in trials]
-    there = [each for each in every if each["reached"]]
+    reached = [each for each in every if each["reached"]]
     error = np.concatenate([each["error_m"] for each in every])
 
     def of(quantity: str, statistic: Any) -> float | None:
-        return float(statistic([each[quantity] for each in there])) if there else None
+        return float(statistic([each[quantity] for each in reached])) if reached else None
 
     return {
         "trials": len(every),
-        "reached": len(there),
+        "reached": len(reached),
         "trials_with_contact": sum(each["contacts"] > 0 for each in every),
         "scans_held_back": sum(each["held_back"] for each in every),
         "iterations_mean": of("iterations", np.mean),
@@ -141,7 +146,7 @@ def summarise(trials: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:
     }
 
 
-def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
+def run(job: NavigationJob, trials: int, out: Path, workers: int, console: Console) -> results.Result:
     """Runs all trials. Writes e3.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
     for name in job.estimators:
         arguments(name, job.descent)
@@ -156,10 +161,15 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
     straight = [row["straight_m"] for row in rows]
     drawn = {name: sum(row[name] for row in rows) for name in ("too_near", "obstructed")}
     parameters = asdict(job) | {
-        "trials": trials, "close_m": ARRIVAL_DISTANCE, "clearance_m": CLEARANCE, "robot": Robot().model_dump(),
-        "straight_mean_m": float(np.mean(straight)), "straight_max_m": float(np.max(straight)),
-        "pairs_redrawn_too_near": drawn["too_near"], "pairs_redrawn_obstructed": drawn["obstructed"],
-    }  # fmt: skip
+        "trials": trials,
+        "close_m": ARRIVAL_DISTANCE,
+        "clearance_m": CLEARANCE,
+        "robot": Robot().model_dump(),
+        "straight_mean_m": float(np.mean(straight)),
+        "straight_max_m": float(np.max(straight)),
+        "pairs_redrawn_too_near": drawn["too_near"],
+        "pairs_redrawn_obstructed": drawn["obstructed"],
+    }
     note = f"{trials} pairs at random, though this controller goes straight: what stands between holds the robot."
     if job.free:
         note = (
@@ -169,10 +179,15 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
         )
     note += f" On average the goal is {np.mean(straight):.1f} m from the start (the paper: about 11 to 13.5 m)."
     result = results.Result(
-        "e3", "E3: navigation through the real processes", job.seed, parameters,
-        {name: summarise(rows, name) for name in job.estimators}, curves, rows,
+        "e3",
+        "E3: navigation through the real processes",
+        job.seed,
+        parameters,
+        {name: summarise(rows, name) for name in job.estimators},
+        curves,
+        rows,
         [note],
-    )  # fmt: skip
+    )
     result.write(out, draw(rows, job))
     return result
 
@@ -183,7 +198,7 @@ def _rows(rows: Sequence[dict[str, Any]], name: str, quantity: str, names: Seque
     return drawing.pad_with_last([row["estimators"][name][quantity] for row in rows], longest)
 
 
-def draw(rows: Sequence[dict[str, Any]], job: Job) -> Figure:
+def draw(rows: Sequence[dict[str, Any]], job: NavigationJob) -> Figure:
     """Distance to the goal and error over iterations, as in the paper's figure 3, and the paths below."""
     figure = drawing.empty_figure(13.0, 7.2)
     grid = figure.add_gridspec(2, 2, height_ratios=(1.25, 1))
@@ -222,16 +237,24 @@ def draw(rows: Sequence[dict[str, Any]], job: Job) -> Figure:
 def table(summary: dict[str, dict[str, Any]]) -> str:
     """The Markdown table of docs/experiments.md."""
     heads = (
-        "estimator", "reached", "trials with contact", "scans with obstacle stop", "iterations, mean",
-        "time / least, median; max", "error, mean ± std (m)",
-    )  # fmt: skip
+        "estimator",
+        "reached",
+        "trials with contact",
+        "scans with obstacle stop",
+        "iterations, mean",
+        "time / least, median; max",
+        "error, mean ± std (m)",
+    )
     rows = [
         [
-            name, f"{row['reached']}/{row['trials']}", str(row["trials_with_contact"]), str(row["scans_held_back"]),
+            name,
+            f"{row['reached']}/{row['trials']}",
+            str(row["trials_with_contact"]),
+            str(row["scans_held_back"]),
             results.number(row["iterations_mean"], 1),
             f"{results.number(row['time_over_least_median'])}; {results.number(row['time_over_least_max'])}",
             results.mean_std(row, "error", 4),
         ]
         for name, row in summary.items()
-    ]  # fmt: skip
+    ]
     return results.markdown(heads, rows)

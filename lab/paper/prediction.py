@@ -35,7 +35,8 @@ SAMPLE_SEED, TEST_SEED = 0, 1  # parts of the random seeds
 PAPER_SIGMA = 1.0  # m, the paper's Σ_o
 SIGMA_FACTORS = tuple(np.round(np.arange(0.25, 4.01, 0.25), 2).tolist())  # multiples of the predicted deviation
 GAUSSIAN = {1: 0.6827, 2: 0.9545, 3: 0.9973}  # share of a Gaussian within k deviations
-# A beam counts as unsure if its deviation exceeds the scanner's noise by this factor, that is if m > σ.
+# A beam counts as imprecise (`unsure` in the results) if its deviation exceeds the scanner's noise by this factor, that
+# is if m > σ.
 IMPRECISE_FACTOR = float(np.sqrt(2))
 FRONT_MARGIN = 0.3  # m between the sample's robot and the line of the objects
 FAR_RESIDUAL = 0.1  # m; larger residuals are counted in the figure
@@ -43,7 +44,7 @@ ESTIMATORS = ("paper", "precise")
 
 
 @dataclass(frozen=True)
-class Job:
+class PredictionJob:
     """One sample scan for the figure, and ``scans`` test scans."""
 
     seed: int
@@ -51,15 +52,18 @@ class Job:
     field: ExperimentWorld = ExperimentWorld()  # noqa: RUF009 - frozen
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: PredictionJob) -> dict[str, Any]:
     """The sample scan as measured and predicted; shares of test beams within multiples of the predicted deviation."""
     use_one_core()
     sample, test = (job.field.scene(job.seed, EXPERIMENT_ID, part) for part in (SAMPLE_SEED, TEST_SEED))
     pose = in_front(job.field, sample)
     noisy = sample.observe(sample.clean(pose[None])[0], 0.0).ranges
     outcome: dict[str, Any] = {
-        "pose": pose.tolist(), "angle_rad": sample.scanner.angles().tolist(), "measured_m": noisy.tolist(), "models": {}
-    }  # fmt: skip
+        "pose": pose.tolist(),
+        "angle_rad": sample.scanner.angles().tolist(),
+        "measured_m": noisy.tolist(),
+        "models": {},
+    }
     poses = test.poses(job.scans)
     clean = test.clean(poses)
     for name in ESTIMATORS:
@@ -73,18 +77,23 @@ def trial(job: Job) -> dict[str, Any]:
         unsure = sigma > IMPRECISE_FACTOR * test.scanner.sigma
         one, deviation = _expected(name, job.field, sample, pose[None])
         outcome["models"][name] = {
-            "expected_m": one[0].tolist(), "sigma_m": deviation[0].tolist(), "beams": error.size,
-            "within": _shares(error, sigma), "unsure_share": float(unsure.mean()),
+            "expected_m": one[0].tolist(),
+            "sigma_m": deviation[0].tolist(),
+            "beams": error.size,
+            "within": _shares(error, sigma),
+            "unsure_share": float(unsure.mean()),
             "unsure_within": _shares(error[unsure], sigma[unsure]),
             "unsure_within_noise_alone": _shares(error[unsure], np.full(unsure.sum(), test.scanner.sigma)),
-            "range_error_median_m": float(np.median(error)), "range_error_mean_m": float(error.mean()),
-            "stated_sigma_median_m": float(np.median(sigma)), "stated_sigma_p99_m": float(np.quantile(sigma, 0.99)),
-        }  # fmt: skip
+            "range_error_median_m": float(np.median(error)),
+            "range_error_mean_m": float(error.mean()),
+            "stated_sigma_median_m": float(np.median(sigma)),
+            "stated_sigma_p99_m": float(np.quantile(sigma, 0.99)),
+        }
     return outcome
 
 
 def _shares(error: Array, sigma: Array) -> dict[str, float]:
-    """Of absolute errors within so many deviations; of none, none."""
+    """Shares of the absolute errors within each of `SIGMA_FACTORS` deviations; empty if there are no errors."""
     return {f"{k:g}": float((error <= k * sigma).mean()) for k in SIGMA_FACTORS} if error.size else {}
 
 
@@ -107,7 +116,7 @@ def _expected(name: str, field: ExperimentWorld, scene: Scene, poses: Array) -> 
     return ranges, np.sqrt(expected.scale**2 + scene.scanner.sigma**2)
 
 
-def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
+def run(job: PredictionJob, out: Path, workers: int, console: Console) -> results.Result:
     """Runs the experiment. Writes prediction.json, .csv, .pdf and .png into ``out``."""
     rows = run_trials("prediction", trial, [job], out, workers, console)
     row = rows[0]
@@ -122,10 +131,18 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
         curves |= {f"{name} expected m": model_row["expected_m"], f"{name} sigma m": model_row["sigma_m"]}
     x, y, yaw = row["pose"]
     result = results.Result(
-        "prediction", "Predicted against measured scan", job.seed, asdict(job), summary, curves, rows,
-        [f"sample: seed {job.seed}, robot at ({x:.2f}, {y:.2f}) m, heading {np.rad2deg(yaw):.0f}°; drawn at random",
-         f"paper states no precision: Σ_o = 1, taken as {PAPER_SIGMA:g} m² for every beam"],
-    )  # fmt: skip
+        "prediction",
+        "Predicted against measured scan",
+        job.seed,
+        asdict(job),
+        summary,
+        curves,
+        rows,
+        [
+            f"sample: seed {job.seed}, robot at ({x:.2f}, {y:.2f}) m, heading {np.rad2deg(yaw):.0f}°; drawn at random",
+            f"the paper predicts no precision: Σ_o = 1, taken as {PAPER_SIGMA:g} m² for every beam",
+        ],
+    )
     result.write(out, draw(result))
     return result
 
@@ -138,7 +155,7 @@ def draw(result: results.Result) -> Figure:
     tops = [drawing.style_axes(figure.add_subplot(grid[0, k])) for k in range(2)]
     bottoms = [drawing.style_axes(figure.add_subplot(grid[1, k], sharex=tops[k])) for k in range(2)]
     angle, measured = np.rad2deg(row["angle_rad"]), np.array(row["measured_m"])
-    titles = {"paper": "paper: states no precision (Σ_o = 1)", "precise": "precise: states ± 2σ of every beam"}
+    titles = {"paper": "paper: no predicted precision (Σ_o = 1)", "precise": "precise: predicted ± 2σ of every beam"}
     for name, top, bottom in zip(ESTIMATORS, tops, bottoms, strict=True):
         model_row = row["models"][name]
         expected, sigma = np.array(model_row["expected_m"]), np.array(model_row["sigma_m"])
@@ -172,20 +189,25 @@ def draw(result: results.Result) -> Figure:
 
 def _band(axes: Axes, angle: Array, middle: Array, sigma: Array) -> None:
     axes.fill_between(
-        angle, middle - 2 * sigma, middle + 2 * sigma, color=drawing.PREDICTED, alpha=0.25, linewidth=0,
-        label="stated ± 2σ",
-    )  # fmt: skip
+        angle,
+        middle - 2 * sigma,
+        middle + 2 * sigma,
+        color=drawing.PREDICTED,
+        alpha=0.25,
+        linewidth=0,
+        label="predicted ± 2σ",
+    )
 
 
 def _calibration(axes: Axes, model_row: dict[str, Any], scans: int) -> None:
     """Plots the share of beams within k predicted deviations, and that of a Gaussian."""
     factors = np.array(SIGMA_FACTORS)
-    axes.plot(factors, _gaussian(factors), "-", color=drawing.BOUND, label="Gaussian: a true statement")
+    axes.plot(factors, _gaussian(factors), "-", color=drawing.BOUND, label="Gaussian: perfect calibration")
     unsure = f"{model_row['unsure_share']:.1%} of beams: m > σ"
     for key, colour, mark, label in (
-        ("within", drawing.COLOURS["precise"], "o", "all beams, stated √(σ² + m²)"),
-        ("unsure_within", drawing.GOAL, "^", f"{unsure}, stated √(σ² + m²)"),
-        ("unsure_within_noise_alone", drawing.COLOURS["particle-filter"], "s", f"{unsure}, were it σ alone"),
+        ("within", drawing.COLOURS["precise"], "o", "all beams, predicted √(σ² + m²)"),
+        ("unsure_within", drawing.GOAL, "^", f"{unsure}, predicted √(σ² + m²)"),
+        ("unsure_within_noise_alone", drawing.COLOURS["particle-filter"], "s", f"{unsure}, σ alone"),
     ):
         if model_row[key]:
             axes.plot(
@@ -194,7 +216,7 @@ def _calibration(axes: Axes, model_row: dict[str, Any], scans: int) -> None:
     text = "\n".join(f"± {k}σ: {model_row['within'][str(k)]:.1%}  ({share:.1%})" for k, share in GAUSSIAN.items())
     axes.text(0.98, 0.3, "all beams (Gaussian)\n" + text, transform=axes.transAxes, ha="right", fontsize=10)
     axes.set(xlabel="deviations k", ylabel="share of beams within ± kσ", ylim=(0, 1.03))
-    axes.set_title(f"precise: is it true? {scans} test scans")
+    axes.set_title(f"precise: calibration on {scans} test scans")
     axes.legend(fontsize=9, frameon=False, loc="lower right")
 
 
@@ -214,7 +236,7 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
             *(f"{row[f'within_{k}_sigma']:.1%}" for k in GAUSSIAN),
         ]
         for name, row in summary.items()
-    ]  # fmt: skip
+    ]
     for name, row in summary.items():
         if 0 < row["unsure_share"] < 1:
             shares = (f"{row[f'unsure_within_{k}_sigma']:.1%}" for k in GAUSSIAN)

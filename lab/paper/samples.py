@@ -36,7 +36,7 @@ SHARED_SEED, LEARNING_SEED = 0, 1  # parts of the random seeds: of the common te
 
 
 @dataclass(frozen=True)
-class Job:
+class SamplesJob:
     """One model, trained on a number of samples."""
 
     seed: int
@@ -50,7 +50,7 @@ class Job:
     descent: Descent = PAPER_DESCENT
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: SamplesJob) -> dict[str, Any]:
     """Trains a model. Returns the errors of its predicted ranges, and of the poses estimated with it."""
     training_scene = job.field.scene(
         job.seed, EXPERIMENT_ID, LEARNING_SEED, ESTIMATORS.index(job.estimator), job.samples
@@ -70,13 +70,17 @@ def trial(job: Job) -> dict[str, Any]:
     poses = test_scene.poses(job.places)
     poses[:, 2] = job.field.heading
     return {
-        "estimator": job.estimator, "samples": job.samples, "gradient_steps": steps, "learning_s": seconds,
-        "range_error_mean_m": float(np.nanmean(ranges)), "range_error_median_m": float(np.nanmedian(ranges)),
+        "estimator": job.estimator,
+        "samples": job.samples,
+        "gradient_steps": steps,
+        "learning_s": seconds,
+        "range_error_mean_m": float(np.nanmean(ranges)),
+        "range_error_median_m": float(np.nanmedian(ranges)),
         "no_prediction_share": float(np.isnan(ranges).mean()),
         "position_error_m": [round(_position_error(make(), test_scene, pose, scans), 6) for pose in poses],
         "same_scan_everywhere_m": float(np.abs(held_out.ranges - np.median(held_out.ranges, axis=0)).mean()),
         "bound_median_m": bound.median(bound.single(test_scene, poses)),
-    }  # fmt: skip
+    }
 
 
 def _position_error(estimator: Estimator, scene: Scene, pose: Array, scans: int) -> float:
@@ -100,7 +104,7 @@ def summarise(row: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def run(job: Job, out: Path, workers: int, console: Console, sizes: Sequence[int] = SIZES) -> results.Result:
+def run(job: SamplesJob, out: Path, workers: int, console: Console, sizes: Sequence[int] = SIZES) -> results.Result:
     """Runs every estimator with every number of samples. Writes samples.json, .csv, .pdf and .png into ``out``."""
     jobs = [replace(job, estimator=name, samples=size) for name in ESTIMATORS for size in sizes]
     rows = run_trials("samples", trial, jobs, out, workers, console)
@@ -111,19 +115,27 @@ def run(job: Job, out: Path, workers: int, console: Console, sizes: Sequence[int
             curves[f"{name} {quantity}"] = [summary[f"{name}, {size}"][quantity] for size in sizes]
     nothing = [
         f"{name}: nothing was learned, one scan for everywhere is as good; another seed may do better"
-        for name, row in summary.items() if row["range_error_mean_m"] > 0.9 * row["same_scan_everywhere_m"]
-    ]  # fmt: skip
+        for name, row in summary.items()
+        if row["range_error_mean_m"] > 0.9 * row["same_scan_everywhere_m"]
+    ]
     reading = (
         f"paper: {job.steps} gradient steps (batches of {learning.BATCH_SIZE}) from any number of samples; 520 are 20 "
         'epochs of 13 000, our reading of its "20 batches of 500 samples"'
     )
     result = results.Result(
-        "samples", "Error against the number of training samples", job.seed, asdict(job) | {"sizes": list(sizes)},
-        summary, curves, rows,
-        [reading,
-         f"position: paper {job.iterations} scans from the map's centre, heading known; precise one, nothing known",
-         *nothing],
-    )  # fmt: skip
+        "samples",
+        "Error against the number of training samples",
+        job.seed,
+        asdict(job) | {"sizes": list(sizes)},
+        summary,
+        curves,
+        rows,
+        [
+            reading,
+            f"position: paper {job.iterations} scans from the map's centre, heading known; precise one, nothing known",
+            *nothing,
+        ],
+    )
     result.write(out, draw(result))
     return result
 
@@ -138,7 +150,7 @@ def draw(result: results.Result) -> Figure:
             errors = curves[f"{name} range_error_{quantity}_m"]
             left.plot(curves["samples"], errors, style + mark, color=colour, label=f"{name}, {quantity} range error")
         errors = curves[f"{name} position_error_median_m"]
-        right.plot(curves["samples"], errors, "-" + mark, color=colour, label=_how(name, result.parameters))
+        right.plot(curves["samples"], errors, "-" + mark, color=colour, label=_describe(name, result.parameters))
         offset = 10 if name == "paper" else -16  # points
         for size, error, count in zip(curves["samples"], errors, curves[f"{name} found_within_0.2_m"], strict=True):
             text = f"{count / places:.0%}"
@@ -155,9 +167,9 @@ def draw(result: results.Result) -> Figure:
     return figure
 
 
-def _how(name: str, parameters: dict[str, Any]) -> str:
+def _describe(name: str, parameters: dict[str, Any]) -> str:
     if name == "precise":
-        return "precise, position: 1 scan, nothing known"
+        return "precise, position: 1 scan, unknown start"
     return f"paper, position: {parameters['iterations']} scans from the centre"
 
 
@@ -173,15 +185,22 @@ def _decades(axes: Axes, sizes: Sequence[int]) -> None:
 def table(summary: dict[str, dict[str, Any]]) -> str:
     """The Markdown table of docs/experiments.md."""
     heads = (
-        "estimator", "samples", "range error, median (m)", "learning (CPU s)", "position error, median (m)",
+        "estimator",
+        "samples",
+        "range error, median (m)",
+        "learning (CPU s)",
+        "position error, median (m)",
         "within 0.2 m",
-    )  # fmt: skip
+    )
     rows = [
         [
-            row["estimator"], str(row["samples"]), results.number(row["range_error_median_m"], 4),
-            results.number(row["learning_s"], 0), results.number(row["position_error_median_m"], 4),
+            row["estimator"],
+            str(row["samples"]),
+            results.number(row["range_error_median_m"], 4),
+            results.number(row["learning_s"], 0),
+            results.number(row["position_error_median_m"], 4),
             f"{row['found_within_0.2_m']}/{row['places']}",
         ]
         for row in summary.values()
-    ]  # fmt: skip
+    ]
     return results.markdown(heads, rows)

@@ -69,7 +69,7 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Job:
+class StepSizeJob:
     """One journey with one setting."""
 
     index: int
@@ -91,7 +91,7 @@ def settings() -> list[Setting]:
     return [Setting("displacement", each) for each in every] + [Setting("velocity", each) for each in driven]
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: StepSizeJob) -> dict[str, Any]:
     """Runs one journey. Returns its number of iterations, and in the velocity loop its time over the minimum."""
     world = job.field.scene(0).world
     journey = draw_journey(world, np.random.default_rng((job.seed, navigation.EXPERIMENT_ID, job.index)), Robot())
@@ -105,7 +105,7 @@ def _model(field: ExperimentWorld) -> tuple[PaperModel, weights.ModelCard]:
     return weights.load(weights.find(SHIPPED, field.world, "paper", field.beams))
 
 
-def _run_displacement(job: Job, world: World, journey: Journey) -> dict[str, Any]:
+def _run_displacement(job: StepSizeJob, world: World, journey: Journey) -> dict[str, Any]:
     scene = job.field.scene(job.seed, EXPERIMENT_ID, job.index)
 
     def look(pose: Array) -> Array:
@@ -121,9 +121,9 @@ def _run_displacement(job: Job, world: World, journey: Journey) -> dict[str, Any
     }
 
 
-def _run_velocity(job: Job, world: World, journey: Journey) -> dict[str, Any]:
+def _run_velocity(job: StepSizeJob, world: World, journey: Journey) -> dict[str, Any]:
     """Runs the journey as in E3, but in one process and with the job's step sizes."""
-    from services.simulator.simulation import Setup, Simulation  # noqa: PLC0415 - pybullet, for this alone
+    from services.simulator.simulation import Setup, Simulation  # pybullet, for this alone
 
     scanner, steps = job.field.scene(0).scanner, job.setting.steps
     pose, goal = (*journey.start, job.field.heading), np.array([*journey.goal, job.field.heading])
@@ -170,19 +170,19 @@ def _run_velocity(job: Job, world: World, journey: Journey) -> dict[str, Any]:
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Statistics of one setting; iterations and times only of journeys that reached the goal."""
-    there = [row for row in rows if row["reached"]]
-    over = [row["time_over_least"] for row in there if "time_over_least" in row]
+    reached = [row for row in rows if row["reached"]]
+    over = [row["time_over_least"] for row in reached if "time_over_least" in row]
     return {
         "journeys": len(rows),
-        "reached": len(there),
-        "iterations_mean": float(np.mean([row["iterations"] for row in there])) if there else None,
+        "reached": len(reached),
+        "iterations_mean": float(np.mean([row["iterations"] for row in reached])) if reached else None,
         "time_over_least_median": float(np.median(over)) if over else None,
         "stopped_by_walls": sum(row.get("stopped", 0) for row in rows),
         "error_mean_m": float(np.mean([row["error_m"] for row in rows])),
     }
 
 
-def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> results.Result:
+def run(job: StepSizeJob, trials: int, out: Path, workers: int, console: Console) -> results.Result:
     """Runs every setting over the first ``trials`` journeys of E3.
 
     Writes steps.json, .csv, .trials.jsonl, .pdf and .png into ``out``.
@@ -202,8 +202,9 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
     }
     nearest = min(
         (each for each in grid if each.loop == "displacement" and summary[each.name]["reached"] == trials),
-        key=lambda each: abs(summary[each.name]["iterations_mean"] - PAPER_ITERATIONS), default=None,
-    )  # fmt: skip
+        key=lambda each: abs(summary[each.name]["iterations_mean"] - PAPER_ITERATIONS),
+        default=None,
+    )
     note = "no setting reached every goal"
     if nearest is not None:
         mean = summary[nearest.name]["iterations_mean"]
@@ -212,9 +213,15 @@ def run(job: Job, trials: int, out: Path, workers: int, console: Console) -> res
             f"{nearest.name}: {mean:.1f}"
         )
     result = results.Result(
-        "steps", "Step sizes of action and goal", job.seed, {**asdict(job), "trials": trials, "alpha": ALPHA}, summary,
-        curves, rows, [note],
-    )  # fmt: skip
+        "steps",
+        "Step sizes of action and goal",
+        job.seed,
+        {**asdict(job), "trials": trials, "alpha": ALPHA},
+        summary,
+        curves,
+        rows,
+        [note],
+    )
     result.write(out, draw(grid, summary))
     return result
 
@@ -274,9 +281,11 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     heads = ("step sizes", "reached", "iterations, mean", "error, mean (m)")
     rows = [
         [
-            name, f"{row['reached']}/{row['journeys']}", results.number(row["iterations_mean"], 1),
+            name,
+            f"{row['reached']}/{row['journeys']}",
+            results.number(row["iterations_mean"], 1),
             results.number(row["error_mean_m"]),
         ]
         for name, row in summary.items()
-    ]  # fmt: skip
+    ]
     return results.markdown(heads, rows)

@@ -39,20 +39,20 @@ def run_all(trials: int, seed: int, out: Path, workers: int, console: Console) -
         return subfolder
 
     # Two variants: the paper's estimator with enough iterations to converge, and journeys without a free straight line.
-    converged = localisation.Job(0, seed, 200, ("paper",))
-    any_pair = navigation.Job(0, seed, limit=450, free=False, estimators=("precise",))
+    converged = localisation.LocalisationJob(0, seed, 200, ("paper",))
+    any_pair = navigation.NavigationJob(0, seed, limit=450, free=False, estimators=("precise",))
     runs: dict[str, Run] = {
-        "e1": lambda: localisation.run(localisation.Job(0, seed, 50), limited(100), out, workers, console),
+        "e1": lambda: localisation.run(localisation.LocalisationJob(0, seed, 50), limited(100), out, workers, console),
         "converged/e1": lambda: localisation.run(converged, limited(100), folder("converged"), workers, console),
-        "e2": lambda: crossing.run(crossing.Job(0, seed), limited(12), out, workers, console),
+        "e2": lambda: crossing.run(crossing.CrossingJob(0, seed), limited(12), out, workers, console),
         # One worker more, because processes in lockstep also wait for one another.
-        "e3": lambda: navigation.run(navigation.Job(0, seed), limited(50), out, workers + 1, console),
+        "e3": lambda: navigation.run(navigation.NavigationJob(0, seed), limited(50), out, workers + 1, console),
         "any/e3": lambda: navigation.run(any_pair, limited(10), folder("any"), workers, console),
-        "alpha": lambda: step_size.run(localisation.Job(0, seed, 50), limited(25), out, workers, console),
-        "steps": lambda: stepping.run(stepping.Job(0, seed), limited(10), out, workers, console),
-        "samples": lambda: samples.run(samples.Job(seed, places=limited(50)), out, workers, console),
-        "aliasing": lambda: aliasing.run(aliasing.Job(seed, places=limited(30)), out, workers, console),
-        "prediction": lambda: prediction.run(prediction.Job(seed), out, 1, console),
+        "alpha": lambda: step_size.run(localisation.LocalisationJob(0, seed, 50), limited(25), out, workers, console),
+        "steps": lambda: stepping.run(stepping.StepSizeJob(0, seed), limited(10), out, workers, console),
+        "samples": lambda: samples.run(samples.SamplesJob(seed, places=limited(50)), out, workers, console),
+        "aliasing": lambda: aliasing.run(aliasing.AliasingJob(seed, places=limited(30)), out, workers, console),
+        "prediction": lambda: prediction.run(prediction.PredictionJob(seed), out, 1, console),
     }
     done = FinishedExperiments(out / ".all.unfinished.json", [trials, seed])
     began = time.monotonic()
@@ -72,7 +72,7 @@ class FinishedExperiments:
     """A file with the experiments that an interrupted run of the same command and commit has finished."""
 
     def __init__(self, path: Path, parameters: list[int]) -> None:
-        """Read the file if it exists and has the same ``parameters`` and commit."""
+        """Reads the file if it exists and has the same ``parameters`` and commit."""
         self.path, self.key = path, [commit(), *parameters]
         self._done: dict[str, str] = {}  # by name, the digest of its result
         with suppress(OSError, ValueError, KeyError, TypeError):  # treat a damaged file as a missing one
@@ -84,7 +84,7 @@ class FinishedExperiments:
         return name in self._done and self._digest(name) == self._done[name]
 
     def add(self, name: str) -> None:
-        """Record that the experiment is finished."""
+        """Records that the experiment is finished."""
         self._done[name] = self._digest(name)
         fresh = self.path.with_suffix(".new")
         fresh.write_text(json.dumps({"key": self.key, "done": self._done}) + "\n", encoding="utf-8")

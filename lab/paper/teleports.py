@@ -42,7 +42,7 @@ class Steps:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class JourneyOutcome:
     """Result of a journey; entry k of the arrays is from before iteration k + 1."""
 
     distance: Array  # (K,) m, robot to goal
@@ -61,9 +61,14 @@ class Outcome:
 
 
 def travel(
-    journey: Journey, steps: Steps, model: PaperModel, look: Callable[[Array], Array], world: World, yaw: float,
+    journey: Journey,
+    steps: Steps,
+    model: PaperModel,
+    look: Callable[[Array], Array],
+    world: World,
+    yaw: float,
     limit: int,
-) -> Outcome:  # fmt: skip
+) -> JourneyOutcome:
     """Runs algorithm 1 with the belief starting at the true start, for at most ``limit`` iterations.
 
     ``look`` returns usable ranges (B,), m, with fresh noise at a pose (3,).
@@ -85,7 +90,7 @@ def travel(
             action, stopped = np.zeros(2), stopped + 1
         distances.append(float(np.hypot(*(robot - goal))))
         errors.append(float(np.hypot(*(robot - belief))))
-    return Outcome(np.array(distances), np.array(errors), stopped)
+    return JourneyOutcome(np.array(distances), np.array(errors), stopped)
 
 
 def _perceive(o: Array, belief: Array, g_goal: Array, model: PaperModel, steps: Steps, yaw: float) -> Array:

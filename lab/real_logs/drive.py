@@ -15,7 +15,7 @@ from common.geometry.se2 import Array
 from common.geometry.world import load_world
 from presage.learning.train_drive import drive_of, split
 from presage.logs.scan_files import read_scans
-from services.estimator.factory import Choice, Factory, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
 from services.estimator.particle_filter.filter import ParticleFilter
 from services.estimator.particle_filter.sensor import Sensor
 from services.estimator.particle_filter.settings import Settings as ParticleSettings
@@ -32,7 +32,7 @@ ODOMETRY, LASER, GLOBAL, KIDNAPPED = "odometry", "laser", "global", "kidnapped"
 
 
 @dataclass(frozen=True)
-class Job:
+class StretchJob:
     """One estimator on one stretch of a drive; all values are plain, so that jobs can be compared and pickled."""
 
     log: str
@@ -63,7 +63,7 @@ class Job:
 @functools.lru_cache(maxsize=2)
 def drive_at(log: str, mount: tuple[float, float, float] | None, exchanged: bool = False) -> Drive:
     """The scans of a log that have reference poses; cached per process. ``exchanged`` puts the second half first."""
-    from presage.logs.log import Reading  # noqa: PLC0415
+    from presage.logs.log import Reading
 
     if exchanged:
         return exchange_halves(drive_at(log, mount))
@@ -79,27 +79,27 @@ def exchange_halves(drive: Drive) -> Drive:
     return replace(exchanged, stamps=np.concatenate([late.stamps, early.stamps + offset]))
 
 
-def trial(job: Job) -> dict[str, Any]:
+def trial(job: StretchJob) -> dict[str, Any]:
     """Runs the job's estimator over its stretch. Returns errors, states and times of every scan."""
     drive, estimator = job.drive, create_estimator(job)
     if job.task in (ODOMETRY, LASER):
         estimator.restart(drive.poses[job.first], START_COVARIANCE)
-        numbers = np.arange(job.first, job.first + job.count)
+        indices = np.arange(job.first, job.first + job.count)
     elif job.task == GLOBAL:
-        numbers = np.arange(job.first, min(job.first + (job.count or MAX_SEARCH_SCANS), len(drive.ranges)))
+        indices = np.arange(job.first, min(job.first + (job.count or MAX_SEARCH_SCANS), len(drive.ranges)))
     else:
         estimator.restart(drive.poses[job.first], START_COVARIANCE)
         after = np.arange(job.to, min(job.to + MAX_SEARCH_SCANS, len(drive.ranges)))
-        numbers = np.concatenate([np.arange(job.first, job.first + SCANS_BEFORE_KIDNAPPING), after])
-    clock = drive.stamps[numbers]
-    odom = None if drive.odom is None or job.task == LASER else drive.odom[numbers]
+        indices = np.concatenate([np.arange(job.first, job.first + SCANS_BEFORE_KIDNAPPING), after])
+    clock = drive.stamps[indices]
+    odom = None if drive.odom is None or job.task == LASER else drive.odom[indices]
     if job.task == KIDNAPPED:  # the stamps have no gap at the kidnapping
         clock[SCANS_BEFORE_KIDNAPPING:] += (
             drive.stamps[job.first + SCANS_BEFORE_KIDNAPPING] - clock[SCANS_BEFORE_KIDNAPPING]
         )
         odom = None if odom is None else hide_kidnapping(odom, SCANS_BEFORE_KIDNAPPING)
     rows: dict[str, list[Any]] = {name: [] for name in ("stamp_s", "error_m", "yaw_error_rad", "state", "nees", "ms")}
-    for i, k in enumerate(numbers):
+    for i, k in enumerate(indices):
         odom_pose = None if odom is None else odom[i]
         observation = Observation(drive.ranges[k], drive.angles, drive.range_max, float(clock[i]), odom_pose)
         began = time.process_time()
@@ -128,7 +128,7 @@ def hide_kidnapping(odom: Array, carried: int) -> Array:
     return np.asarray(moved)
 
 
-def create_estimator(job: Job) -> Estimator:
+def create_estimator(job: StretchJob) -> Estimator:
     """A new estimator for the job's map, without a start pose."""
     drive = job.drive
     if job.estimator == "precise":
@@ -149,7 +149,7 @@ def particle_settings(changed: tuple[tuple[str, float], ...]) -> ParticleSetting
 
 @functools.lru_cache(maxsize=2)
 def _precise(world: str, model: str) -> Factory:
-    return prepare(Choice(world, "precise", model))
+    return prepare(EstimatorOptions(world, "precise", model))
 
 
 @functools.lru_cache(maxsize=4)

@@ -31,11 +31,11 @@ from lab.real_logs.drive import (
     ODOMETRY,
     SCANS_BEFORE_KIDNAPPING,
     TRACKED_DISTANCE,
+    StretchJob,
     trial,
 )
-from lab.real_logs.drive import Job as Stretch
 from lab.real_logs.figure import draw
-from lab.real_logs.filter_tuning import Settings, Tuned, starting_point, tune
+from lab.real_logs.filter_tuning import Settings, TunedSettings, starting_point, tune
 from presage.learning.train_drive import TrainDriveOptions as Training
 from presage.learning.train_drive import card_of
 from services.estimator.precise.learning import weights
@@ -45,9 +45,11 @@ from services.estimator.precise.learning.field_learning import Recipe
 
 ESTIMATORS = ("precise", "particle-filter", "amcl-defaults")
 TASKS = {
-    ODOMETRY: "a: tracking with odometry", LASER: "b: tracking without", GLOBAL: "c: from nothing",
+    ODOMETRY: "a: tracking with odometry",
+    LASER: "b: tracking without",
+    GLOBAL: "c: from nothing",
     KIDNAPPED: "d: carried off",
-}  # fmt: skip
+}
 MIN_FREE_SHARE = 0.5  # of the reference poses in free space; the map may lack places that the drive saw
 # Within this heading error (rad) and TRACKED_DISTANCE of the reference a scan counts as tracked. Otherwise state
 # `tracking` is a wrong claim.
@@ -56,7 +58,7 @@ QUICK_SCANS = 120  # scans of (a) and (b) with --quick
 
 
 @dataclass(frozen=True)
-class Job:
+class RealLogJob:
     """Parameters of the experiment."""
 
     log: Path
@@ -75,10 +77,10 @@ class Job:
         return f"real-{self.name or stem}"
 
 
-def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
+def run(job: RealLogJob, out: Path, workers: int, console: Console) -> results.Result:
     """Trains, tunes and localises. Writes real-NAME.json, .csv, .trials.jsonl, .pdf and .png into ``out``."""
     world = load_world(job.map)
-    plain = Stretch(str(job.log), job.map, job.mount, "precise", ODOMETRY, 0, seed=job.seed, exchanged=job.exchange)
+    plain = StretchJob(str(job.log), job.map, job.mount, "precise", ODOMETRY, 0, seed=job.seed, exchanged=job.exchange)
     drive = plain.drive
     half = plain.learned
     x, y, yaw = drive.mount
@@ -108,14 +110,23 @@ def run(job: Job, out: Path, workers: int, console: Console) -> results.Result:
         if any(r["task"] == task for r in rows)
     }
     result = results.Result(
-        job.result, f"A real drive: {job.log.name}", job.seed,
-        {**{k: str(v) if isinstance(v, Path) else v for k, v in asdict(job).items()}, "scans": len(drive.ranges),
-         "particle_filter": {
-             **{name: dict(each) for name, each in _settings_by_task(tuned).items()}, "tried": tuned.tried
-         },
-         "calibration": asdict(card.calibration) if card.calibration else None},
-        summary, curves_of(rows), rows, notes(job, card, tuned),
-    )  # fmt: skip
+        job.result,
+        f"A real drive: {job.log.name}",
+        job.seed,
+        {
+            **{k: str(v) if isinstance(v, Path) else v for k, v in asdict(job).items()},
+            "scans": len(drive.ranges),
+            "particle_filter": {
+                **{name: dict(each) for name, each in _settings_by_task(tuned).items()},
+                "tried": tuned.tried,
+            },
+            "calibration": asdict(card.calibration) if card.calibration else None,
+        },
+        summary,
+        curves_of(rows),
+        rows,
+        notes(job, card, tuned),
+    )
     result.write(out, draw(card.calibration, rows, TASKS))
     return result
 
@@ -131,8 +142,8 @@ def _check_map(world: World, learned: Drive, name: str) -> None:
 
 
 def _train_and_tune(
-    job: Job, stretch: Stretch, half: int, out: Path, console: Console
-) -> tuple[Path, weights.FieldCard, Tuned]:
+    job: RealLogJob, stretch: StretchJob, half: int, out: Path, console: Console
+) -> tuple[Path, weights.FieldCard, TunedSettings]:
     """The model trained on the training half, and the settings of the particle filter tuned on it.
 
     An interrupted run's model and settings are reused if the command and the commit are the same.
@@ -145,7 +156,7 @@ def _train_and_tune(
         before = json.loads(kept.read_text(encoding="utf-8"))
         if before["key"] == key:
             odometry, laser, finding = (tuple(before[what].items()) for what in ("odometry", "laser", "finding"))
-            return path, weights.load(path)[2], Tuned(odometry, laser, finding, before["tried"])
+            return path, weights.load(path)[2], TunedSettings(odometry, laser, finding, before["tried"])
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("learning", total=1.0)
@@ -160,7 +171,7 @@ def _train_and_tune(
         weights.save(path, learned.model, learned.places, card)
         start = starting_point(learned.calibration.motion)
         tuned = (
-            Tuned(start, start, (*start, ("keep_initial_pose", 0.0)), [])
+            TunedSettings(start, start, (*start, ("keep_initial_pose", 0.0)), [])
             if job.quick
             else tune(replace(stretch, estimator="particle-filter"), half, start, path.parent, report)
         )
@@ -169,15 +180,15 @@ def _train_and_tune(
     return path, card, tuned
 
 
-def _settings(tuned: Tuned, task: str) -> Settings:
+def _settings(tuned: TunedSettings, task: str) -> Settings:
     return _settings_by_task(tuned).get(task, tuned.finding)
 
 
-def _settings_by_task(tuned: Tuned) -> dict[str, Settings]:
+def _settings_by_task(tuned: TunedSettings) -> dict[str, Settings]:
     return {ODOMETRY: tuned.odometry, LASER: tuned.laser, "finding": tuned.finding}
 
 
-def stretches(plain: Stretch, half: int, count: int, job: Job, *, odometry: bool) -> list[Stretch]:
+def stretches(plain: StretchJob, half: int, count: int, job: RealLogJob, *, odometry: bool) -> list[StretchJob]:
     """The trials of one estimator, the longest first."""
     length = min(QUICK_SCANS, count - half) if job.quick else count - half
     whole = [replace(plain, task=task, count=length) for task in ((ODOMETRY, LASER) if odometry else (LASER,))]
@@ -205,17 +216,24 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     reached = [k for k in first if k is not None]
     known = np.array([value for value in nees[tracked_scans & claims] if value is not None], float)
     return {
-        "trials": len(rows), "scans": len(error), "error_median_m": float(np.median(error)),
-        "error_rms_m": float(np.sqrt(np.mean(error**2))), "error_95_m": float(np.quantile(error, 0.95)),
+        "trials": len(rows),
+        "scans": len(error),
+        "error_median_m": float(np.median(error)),
+        "error_rms_m": float(np.sqrt(np.mean(error**2))),
+        "error_95_m": float(np.quantile(error, 0.95)),
         "tracked_error_rms_m": float(np.sqrt(np.mean(error[tracked_scans] ** 2))) if tracked_scans.any() else None,
-        "yaw_error_median_rad": float(np.median(yaw)), "tracked_share": float(tracked_scans.mean()),
-        "claimed_share": float(claims.mean()), "wrong_claims_share": float((claims & ~tracked_scans).mean()),
+        "yaw_error_median_rad": float(np.median(yaw)),
+        "tracked_share": float(tracked_scans.mean()),
+        "claimed_share": float(claims.mean()),
+        "wrong_claims_share": float((claims & ~tracked_scans).mean()),
         "wrong_claim_longest_s": max(_longest_wrong(row, skip) for row, skip in zip(rows, after, strict=True)),
-        "found": len(reached), "scans_until_found_median": float(np.median(reached)) if reached else None,
+        "found": len(reached),
+        "scans_until_found_median": float(np.median(reached)) if reached else None,
         "scans_until_found_mean": float(np.mean(reached)) if reached else None,
         "nees_median": float(np.median(known)) if len(known) else None,
-        "ms_median": float(np.median(ms)), "ms_95": float(np.quantile(ms, 0.95)),
-    }  # fmt: skip
+        "ms_median": float(np.median(ms)),
+        "ms_95": float(np.quantile(ms, 0.95)),
+    }
 
 
 def _is_tracked(row: dict[str, Any], skip: int) -> np.ndarray[Any, np.dtype[np.bool_]]:
@@ -249,7 +267,7 @@ def curves_of(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
     return curves
 
 
-def notes(job: Job, card: weights.FieldCard, tuned: Tuned) -> list[str]:
+def notes(job: RealLogJob, card: weights.FieldCard, tuned: TunedSettings) -> list[str]:
     """Notes below the table: definitions, tuned settings and calibration."""
     found, learned = card.calibration, "second" if job.exchange else "first"
     lines = [
@@ -266,14 +284,14 @@ def notes(job: Job, card: weights.FieldCard, tuned: Tuned) -> list[str]:
     if found is not None:
         shares = found.likelihood
         lines.append(
-            f"held out of the {learned} half, {found.scans} scans: {found.log_likelihood:.2f} nats a beam; "
+            f"held out of the {learned} half, {found.scans} scans: {found.log_likelihood:.2f} nats per beam; "
             f"{shares.short:.1%} of the beams end early, {shares.random:.1%} anywhere; pose within "
             f"{found.floor_position * 1e3:.0f} mm and {np.rad2deg(found.floor_heading):.2f} deg of the reference "
             f"beyond the scan's covariance; NEES "
-            f"{found.nees_median:.2f} median (honest 2.37), {found.nees_mean:.1f} mean (3)"
+            f"{found.nees_median:.2f} median (ideal 2.37), {found.nees_mean:.1f} mean (3)"
         )
     if job.quick:
-        lines.append("quick: a look; few scans, and of the particle filter's settings only its motion noise is learned")
+        lines.append("quick run: few scans, and the particle filter is not tuned except for its motion noise")
     return lines
 
 
@@ -286,11 +304,13 @@ def table(summary: dict[str, dict[str, Any]]) -> str:
     heads = ("task, estimator", "median (mm)", "tracked", "wrong claims; longest (s)", "found", "NEES, median")
     rows = [
         [
-            f"{name[0]},{name.rpartition(',')[2]}", results.millimetres(row["error_median_m"]),
-            f"{row['tracked_share']:.1%}", f"{row['wrong_claims_share']:.1%}; {row['wrong_claim_longest_s']:.1f}",
+            f"{name[0]},{name.rpartition(',')[2]}",
+            results.millimetres(row["error_median_m"]),
+            f"{row['tracked_share']:.1%}",
+            f"{row['wrong_claims_share']:.1%}; {row['wrong_claim_longest_s']:.1f}",
             "–" if name.startswith(("a:", "b:")) else f"{row['found']}/{row['trials']}",
             results.number(row["nees_median"], 2),
         ]
         for name, row in summary.items()
-    ]  # fmt: skip
+    ]
     return results.markdown(heads, rows)

@@ -29,7 +29,7 @@ from lab.real_logs.drive import (
     ODOMETRY,
     SCANS_BEFORE_KIDNAPPING,
     TRACKED_DISTANCE,
-    Job,
+    StretchJob,
     trial,
 )
 from presage.learning.grid_map import write_map
@@ -62,7 +62,7 @@ Settings = tuple[tuple[str, float], ...]
 
 
 @dataclass(frozen=True)
-class Tuned:
+class TunedSettings:
     """Tuned settings of the particle filter."""
 
     odometry: Settings  # for tracking with odometry
@@ -80,12 +80,17 @@ def starting_point(motion: MotionNoise) -> Settings:
     # AMCL's standard deviation grows with the path, the learned variance does; they are equal over a decimetre.
     along = float(np.sqrt(motion.path_by_path / 0.1))
     return (
-        ("alpha1", motion.path_by_turn), ("alpha2", motion.turn_by_path / 0.1), ("alpha3", along**2),
-        ("alpha4", motion.turn_by_turn / 0.1), ("alpha5", along**2),
-    )  # fmt: skip
+        ("alpha1", motion.path_by_turn),
+        ("alpha2", motion.turn_by_path / 0.1),
+        ("alpha3", along**2),
+        ("alpha4", motion.turn_by_turn / 0.1),
+        ("alpha5", along**2),
+    )
 
 
-def tune(job: Job, half: int, start: Settings, folder: Path, report: Callable[[str, float], None]) -> Tuned:
+def tune(
+    job: StretchJob, half: int, start: Settings, folder: Path, report: Callable[[str, float], None]
+) -> TunedSettings:
     """Tunes the settings by coordinate search. Writes the map of the first quarter into ``folder``.
 
     ``job`` gives the log, the map and the mount; ``half`` is the number of scans in the first half, ``start`` the
@@ -117,16 +122,16 @@ def tune(job: Job, half: int, start: Settings, folder: Path, report: Callable[[s
         tried: dict[str, tuple[float, ...]],
         score: Callable[[Settings], tuple[float, float]],
     ) -> Settings:
-        best, most = settings, score(settings)
-        lines.append(f"{title}, as it begins: {most[0]:.0%}, {-most[1]:.3g}")
+        best, best_score = settings, score(settings)
+        lines.append(f"{title}, initial settings: {best_score[0]:.0%}, {-best_score[1]:.3g}")
         for name, values in tried.items():
             base = best
             for value in values:
                 changed = _with(base, name, value)
-                found = score(changed)
-                lines.append(f"{title}, {name} {value:g}: {found[0]:.0%}, {-found[1]:.3g}")
-                if found > most:
-                    best, most = changed, found
+                changed_score = score(changed)
+                lines.append(f"{title}, {name} {value:g}: {changed_score[0]:.0%}, {-changed_score[1]:.3g}")
+                if changed_score > best_score:
+                    best, best_score = changed, changed_score
                 report(f"particle filter, {title}: {name}", len(lines) / total)
         return best
 
@@ -134,11 +139,13 @@ def tune(job: Job, half: int, start: Settings, folder: Path, report: Callable[[s
     if job.drive.odom is not None:
         odometry = coordinate_search(ODOMETRY, start, TRACKING_CANDIDATES, partial(tracking, ODOMETRY))
     # A kidnapped robot must give up its given pose, and nav2's default number of particles is too small for a search.
-    found = _with(_with(odometry, "keep_initial_pose", 0.0), "amcl_defaults", 0.0)
-    return Tuned(odometry, laser, coordinate_search("finding", found, SEARCH_CANDIDATES, finding), lines)
+    start_finding = _with(_with(odometry, "keep_initial_pose", 0.0), "amcl_defaults", 0.0)
+    return TunedSettings(
+        odometry, laser, coordinate_search("finding", start_finding, SEARCH_CANDIDATES, finding), lines
+    )
 
 
-def _map_of_quarter(job: Job, quarter: int, folder: Path) -> Path:
+def _map_of_quarter(job: StretchJob, quarter: int, folder: Path) -> Path:
     """Writes a ROS map of the first ``quarter`` scans, with the cell size of the job's map. Returns its path."""
     grid = load_world(job.map).grid
     cell = grid.resolution if grid is not None else CELL_SIZE
@@ -146,11 +153,11 @@ def _map_of_quarter(job: Job, quarter: int, folder: Path) -> Path:
     return write_map(folder, values, name="quarter", image="quarter.pgm", resolution=cell, origin=[x, y, 0.0])
 
 
-def _evenly_spaced(job: Job, first: int, last: int, count: int) -> list[int]:
+def _evenly_spaced(job: StretchJob, first: int, last: int, count: int) -> list[int]:
     """Indices of ``count`` scans from ``first`` to ``last``, evenly spaced among those with a pose in free space."""
     free = np.flatnonzero(load_world(job.map).clearance(job.drive.poses[first : last + 1, :2]) > 0)
-    numbers = first + (free if len(free) else np.arange(last + 1 - first))
-    return [int(k) for k in numbers[np.linspace(0, len(numbers) - 1, count).astype(int)]]
+    indices = first + (free if len(free) else np.arange(last + 1 - first))
+    return [int(k) for k in indices[np.linspace(0, len(indices) - 1, count).astype(int)]]
 
 
 def _with(settings: Settings, name: str, value: float) -> Settings:
@@ -162,9 +169,9 @@ def _with(settings: Settings, name: str, value: float) -> Settings:
 
 def _tracking_score(rows: list[dict[str, Any]]) -> tuple[float, float]:
     """Share of scans tracked, and the negative median error (m) of those; larger is better."""
-    off = np.array([value for row in rows for value in row["error_m"]])
-    tracked = off < TRACKED_DISTANCE
-    return round(float(tracked.mean()), 2), -float(np.median(off[tracked])) if tracked.any() else -np.inf
+    errors = np.array([value for row in rows for value in row["error_m"]])
+    tracked = errors < TRACKED_DISTANCE
+    return round(float(tracked.mean()), 2), -float(np.median(errors[tracked])) if tracked.any() else -np.inf
 
 
 def _search_score(rows: list[dict[str, Any]]) -> tuple[float, float]:

@@ -19,7 +19,7 @@ def topics() -> None:
 
     Example: `presage topics`.
     """
-    from presage.live.commands import list_topics  # noqa: PLC0415
+    from presage.live.commands import list_topics
 
     list_topics("ROBOT", console)
 
@@ -35,7 +35,7 @@ def hz(
 
     Examples: `presage hz`; `presage hz scan --seconds 10`.
     """
-    from presage.live.commands import show_rates  # noqa: PLC0415
+    from presage.live.commands import show_rates
 
     raise typer.Exit(show_rates(link_of(connect, robot, OBSERVER), topic, seconds, console))
 
@@ -55,7 +55,7 @@ def top(
 
     Examples: `presage top`; `presage top --once`; `presage top --robot one --robot two`.
     """
-    from presage.diagnosis.top import run_top  # noqa: PLC0415
+    from presage.diagnosis.top import run_top
 
     robots = list(dict.fromkeys(robot or find_session(connect).robots))
     raise typer.Exit(run_top(link_of(connect, robots[0], OBSERVER), robots, console, once=once))
@@ -82,9 +82,9 @@ def doctor(
     Examples: `presage doctor`; `presage doctor --seconds 10 --json findings.json`; `presage doctor --world my.yaml`;
     `presage doctor --connect tcp/192.168.0.10:7447 --robot two`.
     """
-    from common.runtime.config import load_settings  # noqa: PLC0415
-    from presage.diagnosis.doctor import run_doctor  # noqa: PLC0415
-    from services.recorder.settings import RecorderSettings  # noqa: PLC0415
+    from common.runtime.config import load_settings
+    from presage.diagnosis.doctor import run_doctor
+    from services.recorder.settings import RecorderSettings
 
     link, recordings = link_of(connect, robot, OBSERVER), load_settings(RecorderSettings, []).directory
     raise typer.Exit(run_doctor(link, seconds, console, world=world, recordings=recordings, json_file=json_file))
@@ -115,7 +115,7 @@ def echo(
     `presage echo run.mcap`; `presage echo run.mcap belief -n 3 --start 10`;
     `presage echo run.mcap belief | jq .free_energy`.
     """
-    from presage.recordings.printing import echo_either  # noqa: PLC0415
+    from presage.recordings.printing import echo_either
 
     def link() -> Link:  # a recording needs no session
         return link_of(connect, robot, OBSERVER)

@@ -35,7 +35,9 @@ def _number(text: str) -> float:
 def goal(
     x: Annotated[float | None, typer.Argument(help="x of the goal in the map, m.")] = None,
     y: Annotated[float | None, typer.Argument(help="y of the goal in the map, m.")] = None,
-    yaw: Annotated[float | None, typer.Argument(parser=_number, help="Heading at the goal, deg. Default: any.")] = None,
+    yaw: Annotated[
+        float | None, typer.Argument(parser=_number, help="Heading at the goal, deg. Defaults to any heading.")
+    ] = None,
     yaw_option: Annotated[float | None, typer.Option("--yaw", hidden=True)] = None,
     tolerance: Annotated[float, typer.Option(min=0.01, help="Distance at which the goal counts as reached, m.")] = 0.2,
     wait: Annotated[
@@ -49,8 +51,8 @@ def goal(
 
     Examples: `presage goal 15 1.5 --wait`; `presage goal 15 1.5 90`; `presage goal --cancel`.
     """
-    from common.messages.definitions import Goal  # noqa: PLC0415
-    from presage.live.commands import send_goal  # noqa: PLC0415
+    from common.messages.definitions import Goal
+    from presage.live.commands import send_goal
 
     if not cancel and (x is None or y is None):
         raise UserError("a goal is two numbers, X Y in m (or --cancel)")
@@ -84,7 +86,7 @@ def teleport(
     Example: `presage teleport 9 1.5`. Preset paper can only localise at the heading it was trained for, 90 deg in
     corridor.
     """
-    from presage.live.commands import teleport as run  # noqa: PLC0415
+    from presage.live.commands import teleport as run
 
     run(link_of(connect, robot), _pose(x, y, yaw), console)
 
@@ -107,7 +109,7 @@ def relocalise(
 
     Examples: `presage relocalise`; `presage relocalise 3 1.5`.
     """
-    from presage.live.commands import relocalise as run  # noqa: PLC0415
+    from presage.live.commands import relocalise as run
 
     if (x is None) != (y is None):
         raise UserError("a position is two numbers, X Y in m")
@@ -117,7 +119,7 @@ def relocalise(
 
 def _pose(x: float, y: float, yaw: float = 0.0) -> Pose:
     """A pose from m and deg; raises UserError if a value is not finite or too far from the origin."""
-    from common.messages.definitions import Pose  # noqa: PLC0415
+    from common.messages.definitions import Pose
 
     if not np.isfinite([x, y, yaw]).all():
         given = f"{x:g} {y:g}" + (f" {yaw:g}" if yaw else "")

@@ -32,7 +32,7 @@ def info(
     Examples: `presage info run.mcap`; `presage info long.mcap --check --json facts.json`;
     `presage info run.mcap.active` (an unfinished recording: shows the part that can be read).
     """
-    from presage.recordings.printing import info as show  # noqa: PLC0415
+    from presage.recordings.printing import info as show
 
     raise typer.Exit(show(file, json_file, check, console))
 
@@ -49,8 +49,8 @@ def plot(
 
     Examples: `presage plot recordings/run.mcap --out run.png`; `presage plot run.mcap.active --json run.json`.
     """
-    from presage.recordings.selection import stem_of  # noqa: PLC0415
-    from presage.session.demo import plot_command  # noqa: PLC0415
+    from presage.recordings.selection import stem_of
+    from presage.session.demo import plot_command
 
     plot_command(file, out or file.with_name(stem_of(file) + ".png"), json_file, console)
 
@@ -86,6 +86,6 @@ def export(
     `presage export run.mcap --format tum --out run-tum`, then `evo_ape tum run-tum/truth.tum run-tum/belief.tum`;
     `presage export run.mcap --format foxglove --out view.mcap`.
     """
-    from presage.recordings.export import ExportOptions, run_export  # noqa: PLC0415
+    from presage.recordings.export import ExportOptions, run_export
 
     run_export(ExportOptions(file, to, out, robot, arrays, localised_only, force), json_file, console)

@@ -66,15 +66,15 @@ def train(
     `presage train --from drive.npz --mount 0,0,0 --world map.yaml --out mine`, then
     `presage localize drive.npz --mount 0,0,0 --world map.yaml --model mine`.
     """
-    from common.runtime.config import load_section, load_settings  # noqa: PLC0415
-    from presage.learning import train_precise as precise  # noqa: PLC0415
-    from presage.learning.options import TrainSettings  # noqa: PLC0415
-    from presage.learning.train_drive import TrainDriveOptions, train_from_drive  # noqa: PLC0415
-    from presage.logs.options import LogSettings  # noqa: PLC0415
-    from presage.session.running import link_of  # noqa: PLC0415
-    from services.estimator.precise.learning.field_learning import Recipe  # noqa: PLC0415
-    from services.estimator.shared.model_folder import training_folder  # noqa: PLC0415
-    from services.simulator.settings import SimulatorSettings  # noqa: PLC0415
+    from common.runtime.config import load_section, load_settings
+    from presage.learning import train_precise as precise
+    from presage.learning.options import TrainSettings
+    from presage.learning.train_drive import TrainDriveOptions, train_from_drive
+    from presage.logs.options import LogSettings
+    from presage.session.running import link_of
+    from services.estimator.precise.learning.field_learning import Recipe
+    from services.estimator.shared.model_folder import training_folder
+    from services.simulator.settings import SimulatorSettings
 
     if preset not in ("precise", "paper"):
         raise UserError(f"no preset {preset!r}: choose precise or paper")
@@ -96,14 +96,17 @@ def train(
     make_folder(folder, "--out")
     if preset == "precise":
         recipe = Recipe(tuning.resolution or 0.04, seed=seed)
-        job = precise.TrainPreciseOptions(world, chosen, tuple(simulator), folder, samples or 5000, recipe)
-        precise.train_precise(job, link, console)
+        precise.train_precise(
+            precise.TrainPreciseOptions(world, chosen, tuple(simulator), folder, samples or 5000, recipe), link, console
+        )
     else:
-        from presage.learning import train_paper as paper  # noqa: PLC0415 - torch, which need not be installed
-        from services.estimator.paper.training import Recipe as PaperRecipe  # noqa: PLC0415
+        from presage.learning import train_paper as paper  # imports torch, which need not be installed
+        from services.estimator.paper.training import Recipe as PaperRecipe
 
-        descent = PaperRecipe(tuning.epochs, tuning.batch, tuning.learning_rate, seed)
-        options = paper.TrainPaperOptions(world, preset, chosen, tuple(simulator), folder, samples or 13_000, descent)
+        paper_recipe = PaperRecipe(tuning.epochs, tuning.batch, tuning.learning_rate, seed)
+        options = paper.TrainPaperOptions(
+            world, preset, chosen, tuple(simulator), folder, samples or 13_000, paper_recipe
+        )
         paper.train(options, link, console)
 
 
@@ -129,9 +132,9 @@ def map_(
     Examples: `presage map run.mcap`; `presage map fr079.npz --mount 0,0,0 --half first -o first_half.yaml`, then
     `presage experiment real --log fr079.npz --mount 0,0,0 --world first_half.yaml`.
     """
-    from common.runtime.config import load_section  # noqa: PLC0415
-    from presage.learning.map_of_log import MapOptions, map_command  # noqa: PLC0415
-    from presage.logs.options import LogSettings  # noqa: PLC0415
+    from common.runtime.config import load_section
+    from presage.learning.map_of_log import MapOptions, map_command
+    from presage.logs.options import LogSettings
 
     target = out or Path(f"{log.resolve().name.split('.')[0]}.yaml")
     reading = load_section(LogSettings, config, "log", mount=mount).reading()

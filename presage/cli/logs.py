@@ -70,15 +70,15 @@ def localize(
     `presage localize drive.log.bz2 --world map.yaml --start 60 --end 120` (the second minute);
     `presage localize drive.log.bz2 --world map.yaml --every 10 --mode track --initial-pose 3,1.5,90`.
     """
-    from common.runtime.config import load_section, load_settings  # noqa: PLC0415
-    from presage.logs.options import LogSettings  # noqa: PLC0415
-    from presage.replay.localize import LocalizeOptions, choice_of  # noqa: PLC0415
-    from presage.replay.localize import localize as run  # noqa: PLC0415
-    from services.estimator.settings import EstimatorSettings  # noqa: PLC0415
+    from common.runtime.config import load_section, load_settings
+    from presage.logs.options import LogSettings
+    from presage.replay.localize import LocalizeOptions, build_estimator_options
+    from presage.replay.localize import localize as run
+    from services.estimator.settings import EstimatorSettings
 
     chosen = arguments(config=config, estimator=estimator, initial_pose=initial_pose, **model_setting(model))
     settings, log = load_settings(EstimatorSettings, chosen), load_section(LogSettings, config, "log", mount=mount)
-    choice = choice_of(
+    estimator_options = build_estimator_options(
         file,
         world,
         settings.estimator,
@@ -88,9 +88,9 @@ def localize(
         settings.seed,
         settings.initial_pose,
     )
-    job = LocalizeOptions.of(
+    options = LocalizeOptions.of(
         file,
-        choice,
+        estimator_options,
         "global" if mode == "single" else mode,
         log.frame,
         log.reading(),
@@ -101,7 +101,7 @@ def localize(
         end=end,
         every=every,
     )
-    run(job, err_console)
+    run(options, err_console)
 
 
 @app.command("import", rich_help_panel="Data", short_help="Convert a log to a recording.")
@@ -126,12 +126,12 @@ def import_(
     `presage import drive.bag`; `presage import bag_folder --mount 0.2,0,0`;
     `presage import gfs.log --config gfs.yaml`, which contains `log: {reference: true}`.
     """
-    from common.runtime.config import load_section  # noqa: PLC0415
-    from presage.logs.importing import ImportOptions, import_command  # noqa: PLC0415
-    from presage.logs.options import LogSettings  # noqa: PLC0415
+    from common.runtime.config import load_section
+    from presage.logs.importing import ImportOptions, import_command
+    from presage.logs.options import LogSettings
 
     log = load_section(LogSettings, config, "log", mount=mount)
     target = out or Path(f"{file.resolve().name.split('.')[0]}.mcap")
     laser = log.frame == "laser"
-    job = ImportOptions(file, target, log.reading(), world, laser=laser, rate=log.rate, sigma=log.sigma)
-    import_command(job, json_file, console, err_console)
+    options = ImportOptions(file, target, log.reading(), world, laser=laser, rate=log.rate, sigma=log.sigma)
+    import_command(options, json_file, console, err_console)

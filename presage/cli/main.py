@@ -49,7 +49,7 @@ app = typer.Typer(
 
 def _print_version(requested: bool) -> None:
     if requested:
-        from common.versions import versions  # noqa: PLC0415
+        from common.versions import versions
 
         console.print(", ".join(f"{name} {version}" for name, version in versions().items()), soft_wrap=True)
         raise typer.Exit
@@ -102,7 +102,7 @@ def up(
     `presage up --world office --people 10 --record recordings --seed 7`; `presage up --estimator particle-filter`;
     `presage up --robots 3`, then `presage goal 15 1.5 --robot robot-2`; `presage up --config turtlebot.yaml`.
     """
-    from presage.session.up import UpOptions, run_up  # noqa: PLC0415
+    from presage.session.up import UpOptions, run_up
 
     left_out = {
         "simulator": no_simulator,
@@ -149,7 +149,7 @@ def demo(
 
     Examples: `presage demo`; `presage demo --goal 12 2 --seed 3 --json run.json`; `presage demo --world office`.
     """
-    from presage.session.demo import DemoOptions, demo_command  # noqa: PLC0415
+    from presage.session.demo import DemoOptions, demo_command
 
     chosen = DemoOptions(config, world, goal, out, seed or 0, estimator, quiet, open_page)
     raise typer.Exit(demo_command(chosen, json_file))

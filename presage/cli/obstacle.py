@@ -80,9 +80,9 @@ def list_(robot: RobotName = "", connect: Connect = "") -> None:
 
 
 def _obstacles(connect: str, robot: str) -> list[Obstacle]:
-    from common.messages.requests import Request, WorldReply  # noqa: PLC0415
-    from common.messages.topics import WORLD  # noqa: PLC0415
-    from presage.live.bus_watch import session  # noqa: PLC0415
+    from common.messages.requests import Request, WorldReply
+    from common.messages.topics import WORLD
+    from presage.live.bus_watch import session
 
     with session(link_of(connect, robot, OBSERVER)) as bus:
         reply = bus.ask(WORLD, Request(), WorldReply)
@@ -102,7 +102,7 @@ def _moved(obstacle: Obstacle, x: float, y: float) -> Obstacle:
 
 
 def _shape(x: float, y: float, size: tuple[float, float], yaw: float, radius: float) -> Obstacle:
-    from common.geometry.world import Obstacle  # noqa: PLC0415
+    from common.geometry.world import Obstacle
 
     centre = {"center": (x, y)}
     shape = {"circle": {**centre, "radius": radius}} if radius else {"box": {**centre, "size": size, "yaw_deg": yaw}}
@@ -113,9 +113,9 @@ def _shape(x: float, y: float, size: tuple[float, float], yaw: float, radius: fl
 
 
 def _change(action: str, name: str, obstacle: Obstacle | None, connect: str, robot: str) -> None:
-    from common.messages.requests import ObstacleRequest, Reply  # noqa: PLC0415
-    from common.messages.topics import OBSTACLE  # noqa: PLC0415
-    from presage.live.bus_watch import session  # noqa: PLC0415
+    from common.messages.requests import ObstacleRequest, Reply
+    from common.messages.topics import OBSTACLE
+    from presage.live.bus_watch import session
 
     try:
         request = ObstacleRequest.model_validate({"action": action, "name": name, "obstacle": obstacle})

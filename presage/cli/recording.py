@@ -30,9 +30,9 @@ def record(
     Examples: `presage record`; `presage record --out logs --topics scan,odom`;
     `presage record --split-minutes 10`.
     """
-    from common.runtime.service import main as serve  # noqa: PLC0415
-    from services.recorder.service import RecorderService  # noqa: PLC0415
-    from services.recorder.settings import RecorderSettings  # noqa: PLC0415
+    from common.runtime.service import main as serve
+    from services.recorder.service import RecorderService
+    from services.recorder.settings import RecorderSettings
 
     def make(settings: RecorderSettings) -> RecorderService:
         # The live page controls the session's own recorder, not this one.
@@ -60,9 +60,9 @@ def recover(
 
     Examples: `presage recover recordings/run.mcap.active`; `presage recover damaged.mcap --out whole.mcap`.
     """
-    from rich.progress import Progress  # noqa: PLC0415
+    from rich.progress import Progress
 
-    from services.recorder.recover import recover as run  # noqa: PLC0415
+    from services.recorder.recover import recover as run
 
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task(file.name, total=1.0)

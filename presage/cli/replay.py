@@ -18,7 +18,7 @@ from presage.terminal.options import (
     ModelName,
     WorldName,
     console,
-    given,
+    given_options,
     model_setting,
 )
 
@@ -76,30 +76,32 @@ def replay(
     Keys in a terminal: space pauses, `.` steps one scan, left and right (or h and l) jump 5 s, up and down change the
     speed, q quits. The queryable presage/ROBOT/player offers the same over the bus.
 
-    `--with estimator` needs only the file. It starts a router and the named services with the recorded configuration,
-    world and model, sends them their recorded inputs, and compares their outputs with the recording. Each scan waits
-    for the belief of the scan before (unless `--rate` is given). If the session ran in lockstep, the outputs must be
-    identical; otherwise they must agree within 0.01 m and 0.01 rad while tracking, because a recording does not contain
-    requests (`presage relocalise`), restarts, or what happened before it began. Exits with status 1 if they differ.
+    `--with estimator` needs only the file. It runs the named services in this process with the recorded configuration,
+    world and model, on their recorded inputs, and compares their outputs with the recording. If the session ran in
+    lockstep, the outputs must be identical; otherwise they must agree within 0.01 m and 0.01 rad while tracking,
+    because a recording does not contain requests (`presage relocalise`), restarts, or what happened before it began.
+    Exits with status 1 if they differ.
 
     Examples: `presage replay run.mcap --only scan,odom` (with `python -m services.estimator` beside it);
     `presage replay run.mcap --rate 4 --start 10 --end -5 --loop`; `presage replay run.mcap --except belief,prediction`;
     `presage replay run.mcap --robot ghost` (beside a live robot); `presage replay run.mcap --with estimator`.
     """
-    from presage.replay.bus_replay import choice_of, run_replay  # noqa: PLC0415
+    from presage.replay.bus_replay import replay_options, run_replay
 
-    choice = choice_of(only, leave_out, rate, start, end, robot, loop=loop, force=force, paused=paused, stay=paused)
+    bus_options = replay_options(
+        only, leave_out, rate, start, end, robot, loop=loop, force=force, paused=paused, stay=paused
+    )
     if not with_services:
         if json_file is not None or every_scan:
             raise UserError("--json and --every-scan go with --with: a plain replay compares nothing")
-        run_replay(file, link_of(connect, robot or "robot", ("replay",)), choice, console)
+        run_replay(file, link_of(connect, robot or "robot", ("replay",)), bus_options, console)
         return
     chosen = (rate, start, end)
     if only or leave_out or robot or force or loop or paused or any(value is not None for value in chosen):
         raise UserError(
             "--with sends all recorded inputs as fast as possible: leave out the options that choose what to replay"
         )
-    from presage.replay.service_replay import ServiceReplayOptions, service_replay_command  # noqa: PLC0415
+    from presage.replay.service_replay import ServiceReplayOptions, service_replay_command
 
     options = ServiceReplayOptions(file, with_services, every_scan)
     raise typer.Exit(service_replay_command(options, json_file, console))
@@ -129,8 +131,8 @@ def rerun(
     `presage rerun run.mcap --model exact --out exact.mcap`;
     `presage rerun run.mcap --config global.yaml`, which contains `estimator: {prior: odometry, initial_pose: ''}`.
     """
-    from presage.replay.rerun import RerunOptions, rerun_command  # noqa: PLC0415
+    from presage.replay.rerun import RerunOptions, rerun_command
 
     chosen = {} if config is None else read_section(config, "estimator")
-    chosen |= given(estimator=estimator, world=world, **model_setting(model))
+    chosen |= given_options(estimator=estimator, world=world, **model_setting(model))
     rerun_command(RerunOptions(file, chosen, out), json_file, console)

@@ -38,7 +38,7 @@ def init(
 
     Examples: `presage secure init keys`; `presage secure init keys --robots one,two --days 90`.
     """
-    from presage.session import credentials as secure  # noqa: PLC0415
+    from presage.session import credentials as secure
 
     members = secure.init(folder, _names(hosts), _names(robots), days, force=force)
     console.print(
@@ -65,8 +65,8 @@ def add(
     Examples: `presage secure add keys operator anna`; `presage secure add keys estimator region --robots one,two`;
     `presage secure add keys controller controller --force` (a new certificate before the old one expires).
     """
-    from common.bus.security import ROUTER  # noqa: PLC0415
-    from presage.session import credentials as secure  # noqa: PLC0415
+    from common.bus.security import ROUTER
+    from presage.session import credentials as secure
 
     member = secure.add(folder, role, name, _names(robots), days, hosts=_names(hosts), force=force)
     console.print(
@@ -83,8 +83,8 @@ def remove(folder: Folder, name: Annotated[str, typer.Argument(help="Name of the
 
     Example: `presage secure remove keys anna`.
     """
-    from common.bus.security import ROUTER  # noqa: PLC0415
-    from presage.session import credentials as secure  # noqa: PLC0415
+    from common.bus.security import ROUTER
+    from presage.session import credentials as secure
 
     secure.remove(folder, name)
     console.print(
@@ -107,8 +107,8 @@ def show(
 
     Examples: `presage secure show keys`; `presage secure show keys --zenoh observer`.
     """
-    from common.bus.security import ROUTER, credentials, read_members  # noqa: PLC0415
-    from presage.session.access_tables import members_table, rights_table  # noqa: PLC0415
+    from common.bus.security import ROUTER, credentials, read_members
+    from presage.session.access_tables import members_table, rights_table
 
     if zenoh:
         of_member = credentials(folder, (zenoh,))
@@ -146,7 +146,7 @@ def _names(text: str) -> list[str]:
 
 
 def _expiry_date(folder: Path, name: str) -> dt.datetime:
-    from common.bus.security import CERTIFICATE  # noqa: PLC0415
-    from presage.session.credentials import expiry  # noqa: PLC0415
+    from common.bus.security import CERTIFICATE
+    from presage.session.credentials import expiry
 
     return expiry(folder / name / CERTIFICATE)

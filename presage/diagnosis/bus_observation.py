@@ -61,7 +61,7 @@ def check_endpoint(endpoint: str) -> Finding | None:
 
 def observe_bus(link: Link, seconds: float) -> BusObservation | list[Finding]:
     """Observes the bus for ``seconds`` s; returns findings that say why if there is no session."""
-    with open_bus(link, patience=3.0) as bus:
+    with open_bus(link, connect_timeout=3.0) as bus:
         if not wait_until(bus.linked, ZENOH_TIMEOUT_S):
             problems = [problem for endpoint in link.connect if (problem := check_endpoint(endpoint)) is not None]
             return problems or [_no_zenoh(", ".join(link.connect))]

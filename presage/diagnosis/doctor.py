@@ -49,8 +49,10 @@ def run_doctor(
     for finding in findings:
         table.add_row(MARKS[finding.ok], *(escape(_printable(text)) for text in (finding.what, finding.advice)))
     console.print(table)
-    here = {"protocol": str(PROTOCOL), **versions()}
-    console.print("versions: " + ", ".join(f"{name} {version}" for name, version in here.items()), highlight=False)
+    local_versions = {"protocol": str(PROTOCOL), **versions()}
+    console.print(
+        "versions: " + ", ".join(f"{name} {version}" for name, version in local_versions.items()), highlight=False
+    )
     write_json(
         json_file,
         {
@@ -67,5 +69,5 @@ def run_doctor(
 
 
 def _printable(text: str) -> str:
-    """Text from the bus without control characters, which could change the state of the terminal."""
+    """Removes control characters, which could change the state of the terminal, from text received on the bus."""
     return "".join(c if c.isprintable() else "?" for c in text)

@@ -42,8 +42,8 @@ def check_installation(world: str) -> Iterator[Finding]:
 
 
 def _check_weights(used_world: str) -> Iterator[Finding]:
-    from services.estimator.precise.learning import weights as precise  # noqa: PLC0415 - needs the estimator's packages
-    from services.estimator.shared.model_folder import SHIPPED, find_folder  # noqa: PLC0415
+    from services.estimator.precise.learning import weights as precise  # needs the estimator's packages
+    from services.estimator.shared.model_folder import SHIPPED, find_folder
 
     try:
         world = load_world(used_world)

@@ -30,8 +30,18 @@ COLOURS = {
     "not running": "dim",
 }
 COLUMNS = (
-    "service", "state", "age", "up", "sends, Hz", "gets, Hz", "dropped", "invalid", "failed", "latency", "note",
-)  # fmt: skip
+    "service",
+    "state",
+    "age",
+    "up",
+    "sends, Hz",
+    "gets, Hz",
+    "dropped",
+    "invalid",
+    "failed",
+    "latency",
+    "note",
+)
 LEFT_ALIGNED = {"service", "state", "sends, Hz", "gets, Hz", "note"}
 
 
@@ -134,7 +144,7 @@ def _cells(row: Row) -> list[Text]:
 
 
 def _counts(health: Health | None) -> list[Text]:
-    """Dropped and undecodable messages, and failed steps."""
+    """Numbers of dropped and undecodable messages and of failed steps, as cells."""
     if health is None:
         return [Text("")] * 3
     dropped, undecodable = (sum(getattr(row, kind) for row in health.topics) for kind in ("dropped", "undecodable"))
@@ -143,7 +153,7 @@ def _counts(health: Health | None) -> list[Text]:
 
 
 def _plain(text: str) -> Text:
-    """Text from the bus without control characters, which could change the state of the terminal."""
+    """Removes control characters, which could change the state of the terminal, from text received on the bus."""
     return Text("".join(c if c.isprintable() else "?" for c in text))
 
 

@@ -34,9 +34,11 @@ def _draw_field(axes: Axes, model: FieldModel, name: str) -> None:
     image = axes.imshow(phi, origin="lower", extent=extent, cmap="viridis", vmin=0)
     axes.contour(x0 + h * np.arange(nx), y0 + h * np.arange(ny), field.phi, levels=[0.0], colors="#D55E00")
     axes.set(
-        xlabel="x (m)", ylabel="y (m)", aspect="equal",
+        xlabel="x (m)",
+        ylabel="y (m)",
+        aspect="equal",
         title=f"{name}: learned distance (m) and its zero; white: not observed",
-    )  # fmt: skip
+    )
     axes.figure.colorbar(image, ax=axes, shrink=0.8)
 
 
@@ -46,7 +48,11 @@ def calibration_curve(axes: Axes, calibration: Calibration) -> None:
     axes.plot((0, 1), (0, 1), "--", color="#444444", linewidth=1, label="perfect calibration")
     axes.plot(predicted, observed, "o-", color="#0072B2", markersize=4, label=f"{calibration.scans} held-out scans")
     axes.set(
-        xlabel="predicted probability", ylabel="share of ranges below that quantile", xlim=(0, 1), ylim=(0, 1),
-        title=f"{calibration.log_likelihood:.2f} nats per beam", aspect="equal",
-    )  # fmt: skip
+        xlabel="predicted probability",
+        ylabel="share of ranges below that quantile",
+        xlim=(0, 1),
+        ylim=(0, 1),
+        title=f"{calibration.log_likelihood:.2f} nats per beam",
+        aspect="equal",
+    )
     axes.legend(frameon=False)

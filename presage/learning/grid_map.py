@@ -46,7 +46,7 @@ def write_map(folder: Path, values: Cells, *, name: str = "map", image: str = "m
 
     ``values`` has the shape (rows, columns), with the lowest row first; ``keys`` replace the defaults in map.yaml.
     """
-    from PIL import Image  # noqa: PLC0415 - needed only to write a map
+    from PIL import Image  # needed only to write a map
 
     grey = np.select([values == FREE, values == OCCUPIED], [254, 0], 205)
     Image.fromarray(grey[::-1].astype(np.uint8)).save(folder / image)

@@ -19,7 +19,7 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.occupancy_grid import FREE, MAX_CELLS, OCCUPIED, UNKNOWN, Cells
 from common.geometry.se2 import Array
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 from presage.learning.grid_map import write_map
 from presage.learning.train_drive import drive_of, split
 from presage.logs.log import Reading
@@ -44,29 +44,29 @@ class MapOptions:
     reading: Reading | None = None
 
 
-def map_command(job: MapOptions, console: Console, progress: Console) -> Path:
+def map_command(options: MapOptions, console: Console, progress: Console) -> Path:
     """Writes the map and its image, and returns its path; raises UserError if that fails."""
-    if job.half not in ("", "first", "second"):
-        raise UserError(f"no half {job.half!r}: choose first or second, or leave out --half")
-    if job.out.suffix != ".yaml":
-        raise UserError(f"--out {job.out}: give NAME.yaml; the image is written beside it")
-    image = job.out.with_suffix(".pgm")
-    if existing := next((path for path in (job.out, image) if path.exists()), None):
+    if options.half not in ("", "first", "second"):
+        raise UserError(f"no half {options.half!r}: choose first or second, or leave out --half")
+    if options.out.suffix != ".yaml":
+        raise UserError(f"--out {options.out}: give NAME.yaml; the image is written beside it")
+    image = options.out.with_suffix(".pgm")
+    if existing := next((path for path in (options.out, image) if path.exists()), None):
         raise UserError(f"{existing} exists already: choose another name with --out, or remove it")
-    make_folder(job.out.parent, "--out")
-    scans = read_scans(job.log, reading=job.reading)
+    make_folder(options.out.parent, "--out")
+    scans = read_scans(options.log, reading=options.reading)
     scans.print_notes(progress)
     if scans.stamps is None:  # not needed for a map, but for a drive
         scans = replace(scans, stamps=np.arange(len(scans.ranges), dtype=np.float64))
-    drive = drive_of(scans, job.log)
-    if job.half:
-        drive = split(drive)[0 if job.half == "first" else 1]
-    values, origin = cells_of(drive, job.cell, progress)
-    keys = {"resolution": job.cell, "origin": [round(origin[0], 6), round(origin[1], 6), 0.0]}
-    path = write_map(job.out.parent, values, name=job.out.stem, image=image.name, **keys)
+    drive = drive_of(scans, options.log)
+    if options.half:
+        drive = split(drive)[0 if options.half == "first" else 1]
+    values, origin = cells_of(drive, options.cell, progress)
+    keys = {"resolution": options.cell, "origin": [round(origin[0], 6), round(origin[1], 6), 0.0]}
+    path = write_map(options.out.parent, values, name=options.out.stem, image=image.name, **keys)
     rows, columns = values.shape
     console.print(
-        f"{path}: {columns} x {rows} cells of {job.cell:g} m from {len(drive.ranges)} scans; "
+        f"{path}: {columns} x {rows} cells of {options.cell:g} m from {len(drive.ranges)} scans; "
         f"{(values == OCCUPIED).mean():.0%} occupied, {(values == FREE).mean():.0%} free",
         soft_wrap=True,
     )
@@ -90,9 +90,12 @@ def cells_of(drive: Drive, cell: float, progress: Console | None = None) -> tupl
     hits, passes = np.zeros(rows * columns, np.int64), np.zeros(rows * columns, np.int64)
     lasers = se2.compose(drive.poses, drive.mount)
     for laser, ranges in track(
-        list(zip(lasers, drive.ranges, strict=True)), "mapping", console=progress, transient=True,
+        list(zip(lasers, drive.ranges, strict=True)),
+        "mapping",
+        console=progress,
+        transient=True,
         disable=progress is None,
-    ):  # fmt: skip
+    ):
         hit, passed = (
             _cell_indices(points, corner, cell, rows, columns) for points in _beam_points(laser, ranges, drive, cell)
         )
@@ -105,7 +108,7 @@ def cells_of(drive: Drive, cell: float, progress: Console | None = None) -> tupl
 
 def _beam_points(laser: Array, ranges: Array, drive: Drive, cell: float) -> tuple[Array, Array]:
     """Ends of the beams (K, 2) m in map, and points (L, 2) along them, half a cell apart."""
-    hit = surfaces(ranges) & (ranges < drive.range_max)
+    hit = is_surface(ranges) & (ranges < drive.range_max)
     ranges = ranges[hit]
     angles = laser[2] + drive.angles[hit]
     unit = np.stack([np.cos(angles), np.sin(angles)], axis=-1)

@@ -35,7 +35,7 @@ def scanner_on_bus(
 
     Uses the running session if it has this scanner and world, otherwise starts a simulator.
     """
-    with open_bus(link, patience=3.0) as bus:
+    with open_bus(link, connect_timeout=3.0) as bus:
         if wait_until(bus.linked, 1.0) and _is_suitable(bus, world, scanner, console):
             yield bus
             return

@@ -16,7 +16,7 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.world import World, load_world
 from common.robot.base import Robot
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 from common.robot.scanner import Scanner
 from common.versions import commit, versions
 from presage.learning.drive_figure import draw_learned
@@ -46,21 +46,21 @@ class TrainDriveOptions:
     reading: Reading | None = None  # properties of the log that the file does not state
 
 
-def train_from_drive(job: TrainDriveOptions, console: Console) -> Path:
+def train_from_drive(options: TrainDriveOptions, console: Console) -> Path:
     """Trains a model on the drive, saves and draws it, and returns the path of the weights.
 
     Raises UserError if the log cannot be used or the weights cannot be saved.
     """
-    scans = read_scans(job.log, reading=job.reading)
+    scans = read_scans(options.log, reading=options.reading)
     scans.print_notes(console)
-    drive = drive_of(scans, job.log)
-    drive, _ = split(drive, job.share)
+    drive = drive_of(scans, options.log)
+    drive, _ = split(drive, options.share)
     if len(drive.ranges) < MIN_SCANS:
         raise UserError(
-            f"{job.log}: {len(drive.ranges)} scans with a reference pose; at least {MIN_SCANS} are needed for training"
+            f"{options.log}: {len(drive.ranges)} scans with a reference pose; training needs at least {MIN_SCANS}"
         )
-    world = load_world(job.world) if job.world else rectangle(drive, job.log)
-    path = weights.path_of(job.out, world.name)
+    world = load_world(options.world) if options.world else rectangle(drive, options.log)
+    path = weights.path_of(options.out, world.name)
     weights.refuse_to_overwrite(path, world)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     start = time.monotonic()
@@ -70,9 +70,9 @@ def train_from_drive(job: TrainDriveOptions, console: Console) -> Path:
         def report(title: str, done: float) -> None:
             bar.update(task, description=f"training: {title}", completed=done)
 
-        simulated = simulated_beams(world, drive, job.samples, job.recipe.seed) if job.world else None
-        learned = learn_drive(drive, job.recipe, simulated, report)
-    card = card_of(job, world, drive, learned, time.monotonic() - start)
+        simulated = simulated_beams(world, drive, options.samples, options.recipe.seed) if options.world else None
+        learned = learn_drive(drive, options.recipe, simulated, report)
+    card = card_of(options, world, drive, learned, time.monotonic() - start)
     weights.save(path, learned.model, learned.places, card)
     draw_learned(weights.load(path)[0], card, path.with_suffix(".png"))
     console.print(f"{path}: {path.stat().st_size / 1e6:.2f} MB, trained in {card.learning_s:.0f} s on {card.source}")
@@ -92,13 +92,18 @@ def drive_of(scans: Scans, log: Path) -> Drive:
         raise UserError(f"{log}: no stamps, but they are needed to compute the velocity of the robot")
     latest = np.maximum.accumulate(scans.stamps)  # stamps begin again where a simulation was restarted
     use = np.flatnonzero(np.isfinite(scans.truth).all(axis=1) & (scans.stamps == latest))
-    if not surfaces(scans.ranges[use]).any():
+    if not is_surface(scans.ranges[use]).any():
         raise UserError(f"{log}: no beam of the scans with a reference pose hit a surface")
     odom = None if scans.odom is None or not np.isfinite(scans.odom[use]).all() else scans.odom
     whole = Drive(
-        scans.stamps, scans.truth, scans.ranges, scans.geometry.angles, scans.geometry.mount,
-        scans.geometry.range_max, odom,
-    )  # fmt: skip
+        scans.stamps,
+        scans.truth,
+        scans.ranges,
+        scans.geometry.angles,
+        scans.geometry.mount,
+        scans.geometry.range_max,
+        odom,
+    )
     return whole.part(use)
 
 
@@ -136,26 +141,35 @@ def scanner_of(drive: Drive, sigma: float, name: str) -> Scanner:
     fov = float(abs(angles[-1] - angles[0]))
     x, y, yaw = map(float, drive.mount)
     return Scanner(
-        name=name, beams=len(angles), fov=min(fov, 2 * np.pi), rate=float(1 / np.median(np.diff(drive.stamps))),
-        range_min=0.0, range_max=drive.range_max, sigma=sigma, mount=(x, y, yaw),
-        first=float(-angles[0] if angles[-1] < angles[0] else angles[0]), upside_down=bool(angles[-1] < angles[0]),
-    )  # fmt: skip
+        name=name,
+        beams=len(angles),
+        fov=min(fov, 2 * np.pi),
+        rate=float(1 / np.median(np.diff(drive.stamps))),
+        range_min=0.0,
+        range_max=drive.range_max,
+        sigma=sigma,
+        mount=(x, y, yaw),
+        first=float(-angles[0] if angles[-1] < angles[0] else angles[0]),
+        upside_down=bool(angles[-1] < angles[0]),
+    )
 
 
-def card_of(job: TrainDriveOptions, world: World, drive: Drive, learned: Learned, seconds: float) -> weights.FieldCard:
+def card_of(
+    options: TrainDriveOptions, world: World, drive: Drive, learned: Learned, seconds: float
+) -> weights.FieldCard:
     """The model card: the origin of the model and the results of its calibration."""
     calibration, errors = learned.calibration, learned.errors
-    source = f"{len(drive.ranges)} posed scans of {job.log.name}"
-    if job.world:
-        source = f"{source}; elsewhere {job.samples} simulated scans in map {world.name}"
+    source = f"{len(drive.ranges)} posed scans of {options.log.name}"
+    if options.world:
+        source = f"{source}; elsewhere {options.samples} simulated scans in map {world.name}"
     return weights.FieldCard(
         world=world,
-        scanner=scanner_of(drive, calibration.likelihood.sigma, job.log.stem),
+        scanner=scanner_of(drive, calibration.likelihood.sigma, options.log.stem),
         samples=len(drive.ranges),
-        seed=job.recipe.seed,
-        resolution=job.recipe.resolution,
+        seed=options.recipe.seed,
+        resolution=options.recipe.resolution,
         origin=learned.model.field.origin,
-        sweeps=job.recipe.sweeps,
+        sweeps=options.recipe.sweeps,
         ripple=learned.model.ripple,
         inflation=calibration.inflation,
         test_samples=calibration.scans,

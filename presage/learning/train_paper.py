@@ -42,33 +42,37 @@ class TrainPaperOptions:
     shape_channels: int = 8
 
 
-def train(job: TrainPaperOptions, link: Link, console: Console) -> Path:
+def train(options: TrainPaperOptions, link: Link, console: Console) -> Path:
     """Trains the decoder of preset paper, saves it, and returns the path of the weights.
 
     An interrupted training with the same options is resumed. Raises UserError if the scanner cannot be sampled.
     """
-    world, scanner = load_world(job.world), job.scanner
-    path = weights.path_of(job.out, world.name, job.preset, scanner.beams)
-    described = {"world": world.model_dump(mode="json"), "scanner": scanner.model_dump(mode="json"), "n": job.samples}
-    checkpoint = Checkpoint(job.out / f".{path.stem}.unfinished", {**described, **asdict(job.recipe)})
+    world, scanner = load_world(options.world), options.scanner
+    path = weights.path_of(options.out, world.name, options.preset, scanner.beams)
+    described = {
+        "world": world.model_dump(mode="json"),
+        "scanner": scanner.model_dump(mode="json"),
+        "n": options.samples,
+    }
+    checkpoint = Checkpoint(options.out / f".{path.stem}.unfinished", {**described, **asdict(options.recipe)})
     heading = float(world.start_pose(Robot().radius)[2])
-    rng = np.random.default_rng(job.recipe.seed)
+    rng = np.random.default_rng(options.recipe.seed)
     with Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console
     ) as bar:
         data = {}
-        for name, count in (("train", job.samples), ("test", TEST_SAMPLES)):
+        for name, count in (("train", options.samples), ("test", TEST_SAMPLES)):
             poses = np.column_stack([world.sample_free(count, rng, Robot().radius), np.full(count, heading)])
             samples = checkpoint.samples(name)
             if samples is None:
-                with scanner_on_bus(link, job.world, job.simulator_arguments, world, scanner, console) as bus:
-                    noise_seed = job.recipe.seed if name == "train" else None  # test scans have no noise
+                with scanner_on_bus(link, options.world, options.simulator_arguments, world, scanner, console) as bus:
+                    noise_seed = options.recipe.seed if name == "train" else None  # test scans have no noise
                     ranges = collect(bus, poses, scanner, noise_seed, bar, f"{name} samples")
                 samples = Data(poses, usable_ranges(ranges, scanner.range_max))
                 checkpoint.keep_samples(name, samples)
             data[name] = samples
-        trainer, seconds = _fit(job, world, scanner, data, checkpoint, bar)
-    _save(job, world, scanner, heading, data, trainer, seconds, path)
+        trainer, seconds = _fit(options, world, scanner, data, checkpoint, bar)
+    _save(options, world, scanner, heading, data, trainer, seconds, path)
     checkpoint.finish()
     _warn_if_nothing_learned(data, trainer, console)
     card = weights.load(path)[1]
@@ -80,14 +84,19 @@ def train(job: TrainPaperOptions, link: Link, console: Console) -> Path:
 
 
 def _fit(
-    job: TrainPaperOptions, world: World, scanner: Scanner, data: dict[str, Data], checkpoint: Checkpoint, bar: Progress
+    options: TrainPaperOptions,
+    world: World,
+    scanner: Scanner,
+    data: dict[str, Data],
+    checkpoint: Checkpoint,
+    bar: Progress,
 ) -> tuple[Trainer, float]:
     norm = Normalisation.of(world.bounds, float(data["train"].ranges.max()))
-    shape = Shape(scanner.beams, job.shape_hidden, job.shape_channels)
-    trainer = Trainer(shape, norm, job.recipe, data["train"], data["test"])
+    shape = Shape(scanner.beams, options.shape_hidden, options.shape_channels)
+    trainer = Trainer(shape, norm, options.recipe, data["train"], data["test"])
     if checkpoint.restore(trainer):
         bar.console.print(f"resuming an interrupted run after epoch {trainer.progress.epoch}")
-    task = bar.add_task("epochs", total=job.recipe.epochs, completed=trainer.progress.epoch)
+    task = bar.add_task("epochs", total=options.recipe.epochs, completed=trainer.progress.epoch)
     start = time.monotonic()
 
     def report(progress: training.Progress) -> None:
@@ -111,7 +120,7 @@ def _warn_if_nothing_learned(data: dict[str, Data], trainer: Trainer, console: C
 
 
 def _save(
-    job: TrainPaperOptions,
+    options: TrainPaperOptions,
     world: World,
     scanner: Scanner,
     heading: float,
@@ -125,16 +134,32 @@ def _save(
     trainer.decoder.load_state_dict(model_state)
     predicted = PaperModel(trainer.decoder, trainer.norm).ranges(data["test"].poses)
     error = np.abs(predicted - data["test"].ranges)
-    recipe = job.recipe
+    recipe = options.recipe
     card = weights.ModelCard(
-        preset=job.preset, world=world, scanner=scanner, heading=heading, samples=job.samples, epochs=recipe.epochs,
-        batch=recipe.batch, learning_rate=recipe.learning_rate, seed=recipe.seed, hidden=job.shape_hidden,
-        channels=job.shape_channels, center=trainer.norm.center, half_size=trainer.norm.half_size,
-        range_scale=trainer.norm.range_scale, test_samples=TEST_SAMPLES, test_l1_mean=float(error.mean()),
-        test_l1_median=float(np.median(error)), curve_train_l1=[round(v, 5) for v in trainer.progress.train_l1],
-        curve_test_l1=[round(v, 5) for v in trainer.progress.test_l1], training_s=round(seconds, 1), commit=commit(),
-        command="presage " + " ".join(sys.argv[1:]), versions=versions(),
-    )  # fmt: skip
+        preset=options.preset,
+        world=world,
+        scanner=scanner,
+        heading=heading,
+        samples=options.samples,
+        epochs=recipe.epochs,
+        batch=recipe.batch,
+        learning_rate=recipe.learning_rate,
+        seed=recipe.seed,
+        hidden=options.shape_hidden,
+        channels=options.shape_channels,
+        center=trainer.norm.center,
+        half_size=trainer.norm.half_size,
+        range_scale=trainer.norm.range_scale,
+        test_samples=TEST_SAMPLES,
+        test_l1_mean=float(error.mean()),
+        test_l1_median=float(np.median(error)),
+        curve_train_l1=[round(v, 5) for v in trainer.progress.train_l1],
+        curve_test_l1=[round(v, 5) for v in trainer.progress.test_l1],
+        training_s=round(seconds, 1),
+        commit=commit(),
+        command="presage " + " ".join(sys.argv[1:]),
+        versions=versions(),
+    )
     weights.save(path, trainer.decoder, card)
     _draw_curve(card, path.with_suffix(".png"))
 
@@ -147,9 +172,11 @@ def _draw_curve(card: weights.ModelCard, png: Path) -> None:
     axes.plot(epochs, card.curve_train_l1, color="#0072B2", label=f"{card.samples} training samples")
     axes.plot(epochs, card.curve_test_l1, color="#D55E00", label=f"{card.test_samples} test samples")
     axes.set(
-        xlabel="epoch", ylabel="L1 error (m, mean over beams)", yscale="log",
+        xlabel="epoch",
+        ylabel="L1 error (m, mean over beams)",
+        yscale="log",
         title=f"{card.preset} in {card.world.name}, {card.scanner.beams} beams",
-    )  # fmt: skip
+    )
     axes.grid(alpha=0.3, which="both")
     axes.legend()
     figure.savefig(png, dpi=120)

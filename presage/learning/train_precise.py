@@ -28,8 +28,8 @@ from services.estimator.precise.learning.evaluation import Quality, evaluate
 from services.estimator.precise.learning.field_learning import (
     Recipe,
     learn_field,
-    learn_ripple,
     learn_scales,
+    measure_ripple,
     reachable,
 )
 from services.estimator.precise.learning.surfaces import Beams
@@ -50,27 +50,29 @@ class TrainPreciseOptions:
     recipe: Recipe = Recipe()  # noqa: RUF009 - frozen
 
 
-def train_precise(job: TrainPreciseOptions, link: Link, console: Console) -> Path:
+def train_precise(options: TrainPreciseOptions, link: Link, console: Console) -> Path:
     """Trains the distance field of a world, saves and draws it, and returns the path of the weights.
 
     Raises UserError if the scanner cannot be sampled or the weights cannot be saved.
     """
-    world, scanner = load_world(job.world), job.scanner
-    path = weights.path_of(job.out, world.name)
+    world, scanner = load_world(options.world), options.scanner
+    path = weights.path_of(options.out, world.name)
     weights.refuse_to_overwrite(path, world)
-    rng = np.random.default_rng(job.recipe.seed)
-    poses = {name: _random_poses(world, count, rng) for name, count in (("train", job.samples), ("test", TEST_SAMPLES))}
+    rng = np.random.default_rng(options.recipe.seed)
+    poses = {
+        name: _random_poses(world, count, rng) for name, count in (("train", options.samples), ("test", TEST_SAMPLES))
+    }
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as bar:
-        with scanner_on_bus(link, job.world, job.simulator_arguments, world, scanner, console) as bus:
-            train = collect(bus, poses["train"], scanner, job.recipe.seed, bar, "training scans")
+        with scanner_on_bus(link, options.world, options.simulator_arguments, world, scanner, console) as bus:
+            train = collect(bus, poses["train"], scanner, options.recipe.seed, bar, "training scans")
             test = collect(bus, poses["test"], scanner, None, bar, "test scans")
         start = time.monotonic()
-        model, quality = _train(job, scanner, poses, {"train": train, "test": test}, bar)
+        model, quality = _train(options, scanner, poses, {"train": train, "test": test}, bar)
     seconds = time.monotonic() - start
     visited = se2.compose(poses["train"], np.array(scanner.mount))[:, :2]
     places = thin_places(np.concatenate([visited, reachable(model.field, visited)]), SEED_SPACING_M)
-    card = _card(job, world, scanner, model, quality, seconds)
+    card = _card(options, world, scanner, model, quality, seconds)
     weights.save(path, model, places, card)
     _draw(weights.load(path)[0], card, path.with_suffix(".png"))
     console.print(
@@ -87,7 +89,11 @@ def _random_poses(world: World, count: int, rng: np.random.Generator) -> se2.Arr
 
 
 def _train(
-    job: TrainPreciseOptions, scanner: Scanner, poses: dict[str, se2.Array], scans: dict[str, se2.Array], bar: Progress
+    options: TrainPreciseOptions,
+    scanner: Scanner,
+    poses: dict[str, se2.Array],
+    scans: dict[str, se2.Array],
+    bar: Progress,
 ) -> tuple[FieldModel, Quality]:
     mount, angles = np.array(scanner.mount), scanner.angles()
     task: TaskID = bar.add_task("training", total=1.0)
@@ -95,7 +101,7 @@ def _train(
     def report(title: str, done: float) -> None:
         bar.update(task, description=f"training: {title}", completed=0.9 * done)
 
-    field = learn_field(Beams.of(poses["train"], mount, angles, scans["train"]), job.recipe, report)
+    field = learn_field(Beams.of(poses["train"], mount, angles, scans["train"]), options.recipe, report)
     # The weights are stored in half precision, so that the model is evaluated with the same precision.
     field = replace(field, phi=field.phi.astype(np.float16).astype(np.float32))
     report("precision", 1.0)
@@ -103,7 +109,7 @@ def _train(
         TEST_SAMPLES // 2
     )  # the precision is learned from one half of the test scans, the errors are computed from the other
     scales = learn_scales(field, poses["test"][:half], mount, angles, scans["test"][:half], 0.0)
-    ripple = learn_ripple(field, se2.compose(poses["test"][:half], mount), angles)
+    ripple = measure_ripple(field, se2.compose(poses["test"][:half], mount), angles)
     model = FieldModel(field, scales, ripple)
     quality = evaluate(
         model,
@@ -120,16 +126,28 @@ def _train(
 
 
 def _card(
-    job: TrainPreciseOptions, world: World, scanner: Scanner, model: FieldModel, quality: Quality, seconds: float
+    options: TrainPreciseOptions, world: World, scanner: Scanner, model: FieldModel, quality: Quality, seconds: float
 ) -> weights.FieldCard:
     return weights.FieldCard(
-        world=world, scanner=scanner, samples=job.samples, seed=job.recipe.seed, resolution=job.recipe.resolution,
-        origin=model.field.origin, sweeps=job.recipe.sweeps, ripple=model.ripple, inflation=round(quality.inflation, 3),
-        test_samples=TEST_SAMPLES // 2, test_range_error_median_m=quality.range_error_median,
-        test_range_error_mean_m=quality.range_error_mean, test_share_above_5_cm=quality.share_above_5_cm,
-        test_position_error_rms_m=quality.position_error_rms, learning_s=round(seconds, 1), commit=commit(),
-        command="presage " + " ".join(sys.argv[1:]), versions=versions(),
-    )  # fmt: skip
+        world=world,
+        scanner=scanner,
+        samples=options.samples,
+        seed=options.recipe.seed,
+        resolution=options.recipe.resolution,
+        origin=model.field.origin,
+        sweeps=options.recipe.sweeps,
+        ripple=model.ripple,
+        inflation=round(quality.inflation, 3),
+        test_samples=TEST_SAMPLES // 2,
+        test_range_error_median_m=quality.range_error_median,
+        test_range_error_mean_m=quality.range_error_mean,
+        test_share_above_5_cm=quality.share_above_5_cm,
+        test_position_error_rms_m=quality.position_error_rms,
+        learning_s=round(seconds, 1),
+        commit=commit(),
+        command="presage " + " ".join(sys.argv[1:]),
+        versions=versions(),
+    )
 
 
 def _draw(model: FieldModel, card: weights.FieldCard, png: Path) -> None:
@@ -146,8 +164,10 @@ def _draw(model: FieldModel, card: weights.FieldCard, png: Path) -> None:
         x0 + h * np.arange(nx), y0 + h * np.arange(ny), field.phi, levels=[0.0], colors="#D55E00", linewidths=0.8
     )
     axes.set(
-        xlabel="x (m)", ylabel="y (m)", aspect="equal",
+        xlabel="x (m)",
+        ylabel="y (m)",
+        aspect="equal",
         title=f"{card.world.name}: learned distance (m) to the nearest surface, and its zero",
-    )  # fmt: skip
+    )
     figure.colorbar(image, ax=axes, shrink=0.8)
     figure.savefig(png, dpi=120)

@@ -52,7 +52,7 @@ class Watch:
 @contextmanager
 def session(link: Link, timeout: float = 3.0) -> Iterator[Bus]:
     """Opens the bus of a running session; raises UserError if no router answers within ``timeout`` s."""
-    with open_bus(link, patience=timeout) as bus:
+    with open_bus(link, connect_timeout=timeout) as bus:
         if link.connect and not wait_until(bus.linked, timeout):
             raise UserError(
                 f"nothing answers at {', '.join(link.connect)}: start a session with `presage up`, "

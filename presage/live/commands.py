@@ -20,6 +20,12 @@ from common.messages.topics import GOAL, LOCALISE, QUERIES, STATUS, TELEPORT, TO
 from common.messages.wire import DecodeError, Message
 from presage.live.bus_watch import Watch, session
 
+# Measured with the stamps of the messages. A person in the way usually moves on sooner.
+BLOCKED_TIMEOUT_S = 30.0
+# Without statuses from the controller: time until a note is printed, and until the command gives up.
+STATUS_WARNING_S, STATUS_TIMEOUT_S = 3.0, 30.0
+MIN_PROGRESS_M = 0.3  # a smaller decrease of the distance to the goal does not end a blockage
+
 
 def topic_named(name: str) -> Topic:
     """The row of the table of topics with this name; raises UserError if there is none."""
@@ -51,13 +57,6 @@ def send_goal(link: Link, goal: Goal, console: Console, *, wait: bool) -> int:
             raise UserError(status.reason)
         console.print(f"going to ({goal.pose.x:g}, {goal.pose.y:g})")
         return _follow(watch, goal, console) if wait else 0
-
-
-# Measured with the stamps of the messages. A person in the way usually moves on sooner.
-BLOCKED_TIMEOUT_S = 30.0
-# Without statuses from the controller: time until a note is printed, and until the command gives up.
-STATUS_WARNING_S, STATUS_TIMEOUT_S = 3.0, 30.0
-MIN_PROGRESS_M = 0.3  # a smaller decrease of the distance to the goal does not end a blockage
 
 
 def _follow(watch: Watch, goal: Goal, console: Console) -> int:
@@ -165,7 +164,7 @@ def show_rates(link: Link, name: str | None, seconds: float, console: Console) -
     return 0 if times else 1
 
 
-def plain(message: Message, *, full: bool) -> dict[str, Any]:
+def to_plain_values(message: Message, *, full: bool) -> dict[str, Any]:
     """A message as values that JSON can hold; long arrays are shortened to both ends unless ``full``."""
 
     def convert(value: Any) -> Any:
@@ -202,7 +201,7 @@ def echo(link: Link, name: str, count: int, console: Console, *, full: bool) -> 
                 continue
             printed += 1
             try:
-                line = json.dumps(plain(topic.message.decode(sample.payload), full=full))
+                line = json.dumps(to_plain_values(topic.message.decode(sample.payload), full=full))
             except DecodeError as error:
                 line = f"undecodable, {len(sample.payload)} bytes: {error}"
             console.print(line, markup=False, highlight=False, soft_wrap=True)

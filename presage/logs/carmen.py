@@ -20,7 +20,7 @@ from common.geometry.se2 import Array
 from common.robot.ranges import normalise_driver_ranges
 from presage.logs.carmen_lines import LINE_TYPE, LaserLine, is_laser, laser_line, pose_line
 from presage.logs.log import Log, LoggedScan, Reading
-from presage.logs.poses import Track
+from presage.logs.poses import PoseTrack
 from presage.logs.resampling import resample
 
 MAX_LINE_CHARACTERS = 1 << 22  # far more than the lines of real logs; limits the memory for other files
@@ -32,9 +32,16 @@ DECOMPRESSION_ERRORS = (EOFError, OSError, lzma.LZMAError, zlib.error)  # for a 
 # Angles of the first and last beam in degrees, by number of beams, for lines that only state the number. 180 and 360
 # are scans of 181 and 361 beams without the last.
 SPANS_DEG = {
-    101: (-50, 50), 180: (-90, 89), 181: (-90, 90), 201: (-50, 50), 360: (-90, 89.5), 361: (-90, 90), 401: (-50, 50),
-    541: (-135, 135), 1081: (-135, 135),
-}  # fmt: skip
+    101: (-50, 50),
+    180: (-90, 89),
+    181: (-90, 90),
+    201: (-50, 50),
+    360: (-90, 89.5),
+    361: (-90, 90),
+    401: (-50, 50),
+    541: (-135, 135),
+    1081: (-135, 135),
+}
 # A SICK LMS reports "no return" as a code of 81.83 m and more, or in its millimetre mode as 8.183 m and more. All in m.
 LMS_FAR_RANGE_MAX, LMS_NEAR_RANGE_MAX = 80.0, 8.18
 LMS_NEAR_CODES = (8.18, 8.192)
@@ -55,8 +62,10 @@ class _Survey:
     lasers: Counter[str] = field(default_factory=Counter)  # lines by name
     firsts: dict[str, list[LaserLine]] = field(default_factory=dict)  # the first lines of each laser
     mounts: dict[str, tuple[Array, Array]] = field(default_factory=dict)  # minimum and maximum of laser in base_link
-    odom: tuple[Track, Track] = field(default_factory=lambda: (Track(), Track()))  # by ipc stamp, by logger stamp
-    true: tuple[Track, Track] = field(default_factory=lambda: (Track(), Track()))  # likewise
+    odom: tuple[PoseTrack, PoseTrack] = field(
+        default_factory=lambda: (PoseTrack(), PoseTrack())
+    )  # by ipc stamp, by logger stamp
+    true: tuple[PoseTrack, PoseTrack] = field(default_factory=lambda: (PoseTrack(), PoseTrack()))  # likewise
 
 
 def open_carmen(path: Path, reading: Reading) -> Log:
@@ -66,9 +75,9 @@ def open_carmen(path: Path, reading: Reading) -> Log:
         raise UserError(f"{path}: a CARMEN log without a scan (no FLASER, ROBOTLASER1, RAWLASER1 lines)")
     name = _choose_laser(path, survey.lasers, reading.scan_topic)
     if reading.odom_topic and (reading.odom_topic != "ODOM" or not len(survey.odom[0])):
-        there = "ODOM lines" if len(survey.odom[0]) else "no ODOM lines"
+        available = "ODOM lines" if len(survey.odom[0]) else "no ODOM lines"
         raise UserError(
-            f"{path}: odom_topic {reading.odom_topic}: for a CARMEN log it can only be ODOM, and this one has {there}"
+            f"{path}: odom_topic {reading.odom_topic}: a CARMEN log can only have ODOM, and this one has {available}"
         )
     if not survey.firsts.get(name):
         raise UserError(f"{path}: every {name} line is malformed")
@@ -122,8 +131,8 @@ def _angles(path: Path, name: str, first: LaserLine, reading: Reading, notes: li
         return header.angles()
     if count not in SPANS_DEG:
         raise UserError(
-            f"{path}: {name} does not state the angles of its {count} beams: give the first and the last one, such as "
-            "--angles -90,90"
+            f"{path}: {name} does not state the angles of its {count} beams: give the first and the last one in "
+            "a settings file, such as log: {angles: '-90,90'}"
         )
     first_deg, last_deg = SPANS_DEG[count]
     notes.append(
@@ -160,7 +169,7 @@ def _range_max(survey: _Survey, name: str, reading: Reading, notes: list[str]) -
 
 
 def _clock(lines: list[LaserLine], reading: Reading, notes: list[str]) -> int:
-    """Which stamps to use: 0 for those of ipc, 1 for those of the logger; the latter also if ipc's do not advance."""
+    """Returns which stamps to use: 0 for those of ipc; 1 for those of the logger, also if ipc's do not advance."""
     if reading.clock == "logger":
         return 1
     if len(lines) > 1 and lines[0].ipc == lines[-1].ipc:
@@ -234,7 +243,7 @@ def _note_laser(survey: _Survey, words: list[str]) -> None:
 
 
 def _read_scans(
-    log: Log, first: LaserLine, clock: int, odom: Track | None, true: Track | None, name: str, *, fixed: bool
+    log: Log, first: LaserLine, clock: int, odom: PoseTrack | None, true: PoseTrack | None, name: str, *, fixed: bool
 ) -> Iterator[LoggedScan]:
     resampled_scans = 0
     for words in _read_words(log.path):
@@ -242,7 +251,7 @@ def _read_scans(
             if not LINE_TYPE.match(words[0]):
                 log.left_out["garbled lines"] += 1
             elif words[0] in POSE_LINES and not _is_pose(words):
-                log.left_out_beside[f"garbled {words[0]} lines"] += 1
+                log.left_out_other[f"garbled {words[0]} lines"] += 1
             continue
         try:
             line = laser_line(words)

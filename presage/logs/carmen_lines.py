@@ -86,13 +86,13 @@ def pose_line(words: list[str]) -> tuple[Array, float, float]:
     return _pose(words[1:]), *_times(words[7:])
 
 
-def _readings(words: list[str], at: int, *, wanted: bool) -> tuple[Array, list[str]]:
+def _readings(words: list[str], index: int, *, wanted: bool) -> tuple[Array, list[str]]:
     """Returns the ranges (B,) m, empty unless ``wanted``, and the words after them."""
-    count = _count(words[at])
-    if len(words) < at + 1 + count or count < 3:
+    count = _count(words[index])
+    if len(words) < index + 1 + count or count < 3:
         raise ValueError("readings are missing")
-    ranges = np.array(words[at + 1 : at + 1 + count] if wanted else (), np.float64)
-    return ranges, words[at + 1 + count :]
+    ranges = np.array(words[index + 1 : index + 1 + count] if wanted else (), np.float64)
+    return ranges, words[index + 1 + count :]
 
 
 def _count(word: str) -> int:
@@ -110,7 +110,7 @@ def _pose(words: list[str]) -> Array:
 
 
 def _times(words: list[str]) -> tuple[float, float]:
-    """Returns the ipc and logger times, s; without a logger time, the ipc time stands for both."""
+    """Returns the ipc and logger times, s; without a logger time, returns the ipc time twice."""
     if len(words) not in (2, 3):
         raise ValueError(f"{len(words)} words instead of the times")
     ipc, logger = float(words[0]), float(words[-1]) if len(words) == 3 else float(words[0])

@@ -10,7 +10,7 @@ from common.errors import UserError
 from common.geometry import se2
 from common.geometry.se2 import Array
 from common.messages.ros_messages import IDENTITY, Mount, Transform, mount_of
-from presage.logs.poses import Track
+from presage.logs.poses import PoseTrack
 
 FIXED_TOLERANCE = 0.01  # m and rad; a frame that changes more moves against its parent
 
@@ -21,7 +21,7 @@ class Edge:
 
     parent: str
     first: Transform
-    track: Track = field(default_factory=Track)
+    track: PoseTrack = field(default_factory=PoseTrack)
     moves: bool = False
 
     def add(self, stamp_ns: int, transform: Transform) -> None:

@@ -53,49 +53,49 @@ class ImportOptions:
     sigma: float | None = None  # m, range noise; None leaves it unknown
 
 
-def import_command(job: ImportOptions, json_file: Path | None, console: Console, err_console: Console) -> None:
+def import_command(options: ImportOptions, json_file: Path | None, console: Console, err_console: Console) -> None:
     """Imports the log and prints a summary, with progress on ``err_console``.
 
     Raises UserError if the log cannot be imported; no file is left then.
     """
     check_file(json_file, "--json")
-    if kind_of(job.file) == "recording":
-        raise UserError(f"{job.file}: {IS_A_RECORDING}")
-    if job.out.suffix != ".mcap":
-        raise UserError(f"{job.out}: the name of a recording must end with .mcap")
-    if job.out.exists():
-        raise UserError(f"{job.out}: exists already; choose another name with --out")
-    world = load_world(job.world) if job.world else None
-    with working(f"reading {job.file.name}", err_console):
-        log = _open(job)
-    with closing(progress(log.sweeps(), "importing", log.scans, err_console)) as sweeps:
-        written = write_recording(job, log, world, sweeps)
-    facts = written.facts(job, log)
-    console.print(*_lines(job, log, facts), sep="\n", highlight=False, soft_wrap=True)
+    if kind_of(options.file) == "recording":
+        raise UserError(f"{options.file}: {IS_A_RECORDING}")
+    if options.out.suffix != ".mcap":
+        raise UserError(f"{options.out}: the name of a recording must end with .mcap")
+    if options.out.exists():
+        raise UserError(f"{options.out}: exists already; choose another name with --out")
+    world = load_world(options.world) if options.world else None
+    with working(f"reading {options.file.name}", err_console):
+        log = _open(options)
+    with closing(progress(log.valid_scans(), "importing", log.scans, err_console)) as logged_scans:
+        written = write_recording(options, log, world, logged_scans)
+    facts = written.facts(options, log)
+    console.print(*_lines(options, log, facts), sep="\n", highlight=False, soft_wrap=True)
     write_json(json_file, {**facts, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:]})
 
 
-def _open(job: ImportOptions) -> Log:
+def _open(options: ImportOptions) -> Log:
     """Opens the log; its poses are those of the frame that the options choose."""
-    if not job.laser:
-        return open_log(job.file, job.reading)
-    if kind_of(job.file) == "npz":  # with mount zero, the poses of an .npz file are taken as the laser's
-        return open_log(job.file, replace(job.reading, mount=np.zeros(3)))
-    log = open_log(job.file, job.reading)
+    if not options.laser:
+        return open_log(options.file, options.reading)
+    if kind_of(options.file) == "npz":  # with mount zero, the poses of an .npz file are taken as the laser's
+        return open_log(options.file, replace(options.reading, mount=np.zeros(3)))
+    log = open_log(options.file, options.reading)
     mount = log.mount
 
     def laser_pose(pose: Array | None) -> Array | None:
         return None if pose is None else np.asarray(se2.compose(pose, mount))
 
-    def sweeps() -> Iterator[LoggedScan]:
-        for sweep in log.read():
-            yield replace(sweep, odom=laser_pose(sweep.odom), reference=laser_pose(sweep.reference))
+    def logged_scans() -> Iterator[LoggedScan]:
+        for logged in log.read():
+            yield replace(logged, odom=laser_pose(logged.odom), reference=laser_pose(logged.reference))
 
-    return replace(log, mount=np.zeros(3), mount_assumed=False, read=sweeps)
+    return replace(log, mount=np.zeros(3), mount_assumed=False, read=logged_scans)
 
 
 @dataclass
-class Written:
+class ImportCounts:
     """Counts of what was written to the recording."""
 
     scans: int = 0
@@ -105,40 +105,56 @@ class Written:
     last_ns: int = 0
     ledger: Ledger = field(default_factory=Ledger)
 
-    def facts(self, job: ImportOptions, log: Log) -> dict[str, Any]:
+    def facts(self, options: ImportOptions, log: Log) -> dict[str, Any]:
         """Facts about the import, for --json and the metadata of the recording."""
         return {
-            "file": str(job.file), "out": str(job.out), "format": log.format, "scans": self.scans,
-            "beams": len(log.angles), "duration_s": (self.last_ns - (self.first_ns or 0)) * 1e-9,
-            "odometry": log.odometry, "odometry_poses": self.odoms,
-            "reference": log.reference, "reference_poses": self.references,
-            "mount": log.mount.tolist(), "mount_assumed": log.mount_assumed,
-            "left_out": dict(log.left_out + log.left_out_beside), "notes": log.notes,
-        }  # fmt: skip
+            "file": str(options.file),
+            "out": str(options.out),
+            "format": log.format,
+            "scans": self.scans,
+            "beams": len(log.angles),
+            "duration_s": (self.last_ns - (self.first_ns or 0)) * 1e-9,
+            "odometry": log.odometry,
+            "odometry_poses": self.odoms,
+            "reference": log.reference,
+            "reference_poses": self.references,
+            "mount": log.mount.tolist(),
+            "mount_assumed": log.mount_assumed,
+            "left_out": dict(log.left_out + log.left_out_other),
+            "notes": log.notes,
+        }
 
 
-def write_recording(job: ImportOptions, log: Log, world: World | None, sweeps: Iterator[LoggedScan] | Any) -> Written:
+def write_recording(
+    options: ImportOptions, log: Log, world: World | None, logged_scans: Iterator[LoggedScan] | Any
+) -> ImportCounts:
     """Writes all scans and poses to the recording; removes the recording if that fails."""
     start, step = beam_spacing(log)
-    first_scans = list(itertools.islice(stamped := _stamped(log, sweeps, job.rate), RATE_SCANS))
+    first_scans = list(itertools.islice(stamped := _stamped(log, logged_scans, options.rate), RATE_SCANS))
     if not first_scans:
         left_out = log.describe_left_out()
         raise UserError(f"{log.path}: no usable scan in it" + (f"; left out: {left_out}" if left_out else ""))
     period = float(np.median(np.diff([stamp for stamp, _ in first_scans])) * 1e-9) if len(first_scans) > 1 else 0.0
-    writer, written = RecordingWriter(job.out), Written(first_ns=first_scans[0][0])
+    writer, written = RecordingWriter(options.out), ImportCounts(first_ns=first_scans[0][0])
     try:
-        writer.metadata("presage", {"robot": job.robot, "command": " ".join(sys.argv), **versions()})
-        scanner = scanner_of(log, start, step, period, job.sigma)
+        writer.metadata("presage", {"robot": options.robot, "command": " ".join(sys.argv), **versions()})
+        scanner = scanner_of(log, start, step, period, options.sigma)
         write_description(writer, "simulator", WorldReply(world=world, scanner=scanner))
-        message_writer = _MessageWriter(writer, job.robot, written)
+        message_writer = _MessageWriter(writer, options.robot, written)
         template = Scan(
-            stamp_ns=0, angle_min=start, angle_increment=step, range_min=log.range_min, range_max=log.range_max,
-            ranges=np.zeros(0, np.float32), mount=Pose.of(log.mount), scan_time=period,
-            sigma=job.sigma or 0.0,
-        )  # fmt: skip
-        for stamp_ns, sweep in itertools.chain(first_scans, stamped):
-            message_writer.write_scan(stamp_ns, sweep, template)
-        facts = written.facts(job, log)
+            stamp_ns=0,
+            angle_min=start,
+            angle_increment=step,
+            range_min=log.range_min,
+            range_max=log.range_max,
+            ranges=np.zeros(0, np.float32),
+            mount=Pose.of(log.mount),
+            scan_time=period,
+            sigma=options.sigma or 0.0,
+        )
+        for stamp_ns, logged in itertools.chain(first_scans, stamped):
+            message_writer.write_scan(stamp_ns, logged, template)
+        facts = written.facts(options, log)
         writer.metadata("log", {k: v if isinstance(v, str) else json.dumps(v) for k, v in facts.items()})
         counts = written.ledger.written
         writer.metadata("counters", as_metadata(written.ledger.counts(counts, {}, {})))
@@ -165,48 +181,54 @@ def scanner_of(log: Log, start: float, step: float, period: float, sigma: float 
     fov = min(step * (len(log.angles) - 1), 2 * np.pi)  # in single precision, a full turn may exceed 2 pi
     try:
         return Scanner(
-            name="log", beams=len(log.angles), fov=fov, rate=1 / period if period else 0.0,
-            range_min=log.range_min, range_max=log.range_max, sigma=DEFAULT_SIGMA_M if sigma is None else sigma,
-            mount=(x, y, yaw), first=start,
-        )  # fmt: skip
+            name="log",
+            beams=len(log.angles),
+            fov=fov,
+            rate=1 / period if period else 0.0,
+            range_min=log.range_min,
+            range_max=log.range_max,
+            sigma=DEFAULT_SIGMA_M if sigma is None else sigma,
+            mount=(x, y, yaw),
+            first=start,
+        )
     except ValidationError:
         return None
 
 
-def _stamped(log: Log, sweeps: Iterator[LoggedScan], rate: float | None) -> Iterator[tuple[int, LoggedScan]]:
+def _stamped(log: Log, logged_scans: Iterator[LoggedScan], rate: float | None) -> Iterator[tuple[int, LoggedScan]]:
     """Yields the scans with their stamps; raises UserError if a stamp is missing or negative."""
-    for k, sweep in enumerate(sweeps):
-        if sweep.stamp_ns is None and rate is None:
+    for k, logged in enumerate(logged_scans):
+        if logged.stamp_ns is None and rate is None:
             raise UserError(
                 f"{log.path}: has no stamps: give the number of scans per second with rate in section log of --config"
             )
-        stamp_ns = round(k * 1e9 / (rate or 1.0)) if sweep.stamp_ns is None else sweep.stamp_ns
+        stamp_ns = round(k * 1e9 / (rate or 1.0)) if logged.stamp_ns is None else logged.stamp_ns
         if stamp_ns < 0:
             raise UserError(f"{log.path}: its stamps begin below 0 s: add a constant to all of them")
-        yield stamp_ns, sweep
+        yield stamp_ns, logged
 
 
 class _MessageWriter:
     """Writes scans, odometry and reference poses as the messages that services publish."""
 
-    def __init__(self, writer: RecordingWriter, robot: str, written: Written) -> None:
+    def __init__(self, writer: RecordingWriter, robot: str, written: ImportCounts) -> None:
         self._writer, self._robot, self._written = writer, robot, written
         self._last: dict[Topic, tuple[int, Array]] = {}
 
-    def write_scan(self, stamp_ns: int, sweep: LoggedScan, template: Scan) -> None:
+    def write_scan(self, stamp_ns: int, logged: LoggedScan, template: Scan) -> None:
         """Writes odometry and reference pose before the scan, because the estimator needs the odometry first."""
         written = self._written
-        if sweep.odom is not None:
+        if logged.odom is not None:
             # Covariance zero means unknown; covariances in logs are not imported.
-            pose, twist = self._with_velocity(ODOM, stamp_ns, sweep.odom)
+            pose, twist = self._with_velocity(ODOM, stamp_ns, logged.odom)
             odom = Odom(stamp_ns=stamp_ns, seq=written.odoms, pose=pose, twist=twist, covariance=np.zeros((3, 3)))
             self._put(ODOM, odom, stamp_ns)
             written.odoms += 1
-        if sweep.reference is not None:
-            pose, twist = self._with_velocity(TRUTH, stamp_ns, sweep.reference)
+        if logged.reference is not None:
+            pose, twist = self._with_velocity(TRUTH, stamp_ns, logged.reference)
             self._put(TRUTH, Truth(stamp_ns=stamp_ns, seq=written.references, pose=pose, twist=twist), stamp_ns + 1)
             written.references += 1
-        ranges = np.asarray(sweep.ranges, np.float32)
+        ranges = np.asarray(logged.ranges, np.float32)
         scan = Scan(**{**dict(template), "stamp_ns": stamp_ns, "seq": written.scans, "ranges": ranges})
         self._put(SCAN, scan, stamp_ns + 2)
         written.scans += 1
@@ -230,7 +252,7 @@ class _MessageWriter:
         self._written.ledger.see(key, payload)
 
 
-def _lines(job: ImportOptions, log: Log, facts: dict[str, Any]) -> list[str]:
+def _lines(options: ImportOptions, log: Log, facts: dict[str, Any]) -> list[str]:
     """The summary of the import, one line each."""
     first, last = np.rad2deg(log.angles[[0, -1]])
     x, y, yaw = np.round([*log.mount[:2], np.rad2deg(log.mount[2])], 4) + 0.0  # avoids 1e-17 and -0
@@ -243,4 +265,4 @@ def _lines(job: ImportOptions, log: Log, facts: dict[str, Any]) -> list[str]:
     ]
     if left_out := log.describe_left_out():
         lines.append(f"left out: {left_out}")
-    return [*lines, f"wrote {job.out}"]
+    return [*lines, f"wrote {options.out}"]

@@ -14,7 +14,7 @@ from common.geometry.se2 import Array
 
 @dataclass(frozen=True)
 class Reading:
-    """The user's options for reading a log. A field that is None or empty defaults to what the log states."""
+    """The user's options for reading a log. If a field is None or empty, the value in the log is used."""
 
     mount: Array | None = None  # (3,) laser in base_link
     scan_topic: str = ""  # for CARMEN logs the type of line, such as RLASER
@@ -56,28 +56,28 @@ class Log:
     scans: int  # number of scans in the file, including unusable ones
     read: Callable[[], Iterator[LoggedScan]]  # reads from the beginning; raises UserError if the file is damaged
     range_min: float = 0.0  # m
-    mount_assumed: bool = False  # neither the log nor the user states the mount
+    mount_assumed: bool = False  # whether neither the log nor the user states the mount
     odometry: str = ""  # source of the odometry; empty if there is none
     reference: str = ""  # source of the reference poses; empty if there are none
     initial_pose: Array | None = None  # (3,) in map
     notes: list[str] = field(default_factory=list)  # assumptions that were made
     left_out: Counter[str] = field(default_factory=Counter)  # scans left out in the last pass, by reason
-    left_out_beside: Counter[str] = field(default_factory=Counter)  # other lines or messages left out, by reason
+    left_out_other: Counter[str] = field(default_factory=Counter)  # other lines or messages left out, by reason
 
-    def sweeps(self) -> Iterator[LoggedScan]:
+    def valid_scans(self) -> Iterator[LoggedScan]:
         """Yields the scans with increasing stamps and counts the others in `left_out`.
 
         Raises UserError at the end if more scans were left out than used.
         """
         self.left_out.clear()
-        self.left_out_beside.clear()
+        self.left_out_other.clear()
         last, used = None, 0
-        for sweep in self.read():
-            if last is not None and sweep.stamp_ns is not None and sweep.stamp_ns <= last:
-                self.left_out["scans twice" if sweep.stamp_ns == last else "scans older than the one before"] += 1
+        for scan in self.read():
+            if last is not None and scan.stamp_ns is not None and scan.stamp_ns <= last:
+                self.left_out["scans twice" if scan.stamp_ns == last else "scans older than the one before"] += 1
                 continue
-            last, used = sweep.stamp_ns, used + 1
-            yield sweep
+            last, used = scan.stamp_ns, used + 1
+            yield scan
         if self.left_out.total() > used:
             raise UserError(f"{self.path}: too few usable scans: {used}; left out: {self.describe_left_out()}")
 
@@ -88,5 +88,5 @@ class Log:
             self.notes.append(note)
 
     def describe_left_out(self) -> str:
-        """What was left out and how often, for messages; empty if nothing was."""
-        return ", ".join(f"{what}: {count}" for what, count in (self.left_out + self.left_out_beside).items())
+        """What was left out and how often, as text for messages; empty if nothing was left out."""
+        return ", ".join(f"{what}: {count}" for what, count in (self.left_out + self.left_out_other).items())

@@ -61,8 +61,12 @@ def open_npz(path: Path, reading: Reading) -> Log:
 def _check_arrays(path: Path, data: dict[str, Array], ranges: Array) -> None:
     count, beams = ranges.shape[0], ranges.shape[-1]
     shapes = {
-        "angles": (beams,), "stamps": (count,), "odom": (count, 3), "initial_pose": (3,), "reference": (count, 3),
-    }  # fmt: skip
+        "angles": (beams,),
+        "stamps": (count,),
+        "odom": (count, 3),
+        "initial_pose": (3,),
+        "reference": (count, 3),
+    }
     if ranges.ndim != 2 or beams < 3 or not count:
         raise UserError(f"{path}: ranges has the shape {data['ranges'].shape}, not (N, B) with at least 3 beams")
     for name, shape in shapes.items():

@@ -59,7 +59,7 @@ def open_log(path: Path, reading: Reading) -> Log:
     if kind == "recording":
         raise UserError(f"{path}: {IS_A_RECORDING}")
     if kind == "ros1" or kind == "ros2":  # noqa: PLR1714 - mypy narrows the type only this way
-        from presage.logs.rosbag import open_rosbag  # noqa: PLC0415 - rosbags takes a moment to import
+        from presage.logs.rosbag import open_rosbag  # rosbags takes a moment to import
 
         return open_rosbag(path, kind, reading)
     log = open_npz(path, reading) if kind == "npz" else open_carmen(path, reading)
@@ -67,7 +67,7 @@ def open_log(path: Path, reading: Reading) -> Log:
 
 
 def with_reversed_beams(log: Log) -> Log:
-    """The log of a scanner that is mounted upside down: its left is the robot's right."""
+    """Returns the log of a scanner that is mounted upside down, with the beams of each scan in reverse order."""
     # The list is shared with the returned log, so that notes made while reading appear in both.
     log.notes.append("the scanner is mounted upside down: the order of its beams is reversed")
     return replace(log, angles=-log.angles[::-1], read=lambda: (replace(s, ranges=s.ranges[::-1]) for s in log.read()))

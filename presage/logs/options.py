@@ -14,15 +14,17 @@ from presage.logs.log import Reading
 
 
 class LogSettings(BaseModel):
-    """What is empty or None defaults to what the log states."""
+    """If a setting is empty or None, the value in the log is used."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     mount: Annotated[str, Field(pattern=POSE_TEXT)] = ""  # x,y[,yaw_deg] of the laser in base_link, m and deg
     upside_down: bool | None = None  # the scanner is mounted with a roll of 180 deg
-    frame: Literal["base_link", "laser"] = "base_link"  # whose poses are estimated or recorded; in an .npz, given
-    scan_topic: str = ""  # of several; in a CARMEN log the type of line, such as RLASER
-    odom_topic: str = ""  # of several; in a CARMEN log ODOM reads the ODOM lines
+    frame: Literal["base_link", "laser"] = (
+        "base_link"  # whose poses are estimated or recorded, and which the poses in an .npz file are of
+    )
+    scan_topic: str = ""  # if there are several; in a CARMEN log the type of line, such as RLASER
+    odom_topic: str = ""  # if there are several; in a CARMEN log ODOM reads the ODOM lines
     odometry: bool = True  # whether `presage localize` uses the odometry
     base_frame: str = ""  # frame of the robot in tf
     reference: bool | None = None  # false reads no reference poses; true also those of corrected CARMEN scans

@@ -13,7 +13,7 @@ from common.geometry.se2 import Array
 MAX_GAP_NS = 1_000_000_000  # between two poses; over a longer gap there is no interpolation
 
 
-class Track:
+class PoseTrack:
     """Poses over time, added in any order; 32 bytes each, and a pose that does not change is stored only twice."""
 
     def __init__(self) -> None:

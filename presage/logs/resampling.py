@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from common.geometry.se2 import Array, wrap
-from common.robot.ranges import NOT_MEASURED, surfaces
+from common.robot.ranges import NOT_MEASURED, is_surface
 
 ANGLE_TOLERANCE = 1e-4  # rad, below which two beams have the same angle
 MAX_SPACING_RATIO = 4.0  # of the scan to the wanted angles, as in services/estimator/paper/beam_fitting.py
@@ -35,7 +35,7 @@ def resample(ranges: Array, angles: Array, wanted: Array) -> Array | None:
     gap = ring[after] - ring[after - 1]
     share = (targets - ring[after - 1]) / np.maximum(gap, 1e-12)
     result = np.where(share < 0.5, left, right)
-    same = surfaces(left) & surfaces(right) & (gap < 2 * spacing)
+    same = is_surface(left) & is_surface(right) & (gap < 2 * spacing)
     same[same] = np.abs(left[same] - right[same]) < SAME_SURFACE_SHARE * np.minimum(left[same], right[same])
     result[same] = left[same] + share[same] * (right[same] - left[same])
     covered = np.minimum(share, 1 - share) * gap <= spacing

@@ -14,7 +14,7 @@ from common.geometry.se2 import Array
 from common.messages.ros_messages import read_pose, stamp_of
 from presage.logs.frame_history import FrameHistory
 from presage.logs.log import Reading
-from presage.logs.poses import Track
+from presage.logs.poses import PoseTrack
 
 Lookup = Callable[[int], Array | None]  # pose (3,) at a stamp in ns, or None
 
@@ -34,7 +34,7 @@ class Poses:
         """With ``by_logger``, uses the times of logging instead of the stamps in the headers."""
         self.frames = FrameHistory()
         self._by_logger = by_logger
-        self._tracks: dict[str, Track] = {}  # by topic
+        self._tracks: dict[str, PoseTrack] = {}  # by topic
         self._bases: dict[str, str] = {}  # child_frame_id of Odometry, by topic
 
     def add(self, topic: str, logged_ns: int, message: Any) -> None:
@@ -43,13 +43,13 @@ class Poses:
             for each in message.transforms:
                 with contextlib.suppress(ValueError):
                     transform = read_pose(each.transform.translation, each.transform.rotation)
-                    at = self._ns(each, logged_ns)
-                    self.frames.add(str(each.header.frame_id), str(each.child_frame_id), at, transform)
+                    stamp_ns = self._ns(each, logged_ns)
+                    self.frames.add(str(each.header.frame_id), str(each.child_frame_id), stamp_ns, transform)
             return
         pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
         if hasattr(message, "child_frame_id"):
             self._bases[topic] = str(message.child_frame_id).lstrip("/")
-        track = self._tracks.setdefault(topic, Track())
+        track = self._tracks.setdefault(topic, PoseTrack())
         with contextlib.suppress(ValueError):
             track.add(self._ns(message, logged_ns), read_pose(pose.position, pose.orientation).planar())
 
@@ -91,7 +91,7 @@ class Poses:
             return "", no_poses
         return f"the log's own localisation (tf {MAP} -> {base})", lambda stamp: self.frames.at(chain, stamp)
 
-    def _lookup(self, track: Track, offset: Array) -> Lookup:
+    def _lookup(self, track: PoseTrack, offset: Array) -> Lookup:
         def look(stamp: int) -> Array | None:
             pose = track.at(stamp)
             return None if pose is None else np.asarray(se2.compose(pose, offset))
@@ -110,7 +110,7 @@ class Poses:
         return np.zeros(3) if offset is None else offset
 
     def _fixed_transform(self, frame: str, base: str) -> Array | None:
-        """The base (3,) in another frame that is fixed to it; None if tf does not connect them so."""
+        """The base (3,) in another frame that is fixed to it; None if tf does not connect them or it changes."""
         for parent, child, invert in ((frame, base, False), (base, frame, True)):
             chain = self.frames.chain(parent, child)
             if chain and not any(edge.moves for edge in chain):

@@ -61,9 +61,9 @@ class Bag:
         except (UserError, KeyboardInterrupt, GeneratorExit):
             raise
         except Exception as error:  # noqa: BLE001 - damaged bags raise many kinds of errors
-            why = " ".join(str(error).split())[:160] or type(error).__name__
+            reason = " ".join(str(error).split())[:160] or type(error).__name__
             raise UserError(
-                f"{self.path}: a ROS bag that cannot be read ({why}): cut short, damaged or not finished; `rosbag "
+                f"{self.path}: a ROS bag that cannot be read ({reason}): cut short, damaged or not finished; `rosbag "
                 "reindex`, `ros2 bag reindex` or `mcap recover` repair some of them"
             ) from None
 
@@ -99,9 +99,16 @@ def open_rosbag(path: Path, kind: Literal["ros1", "ros2"], reading: Reading) -> 
     except ValueError as error:
         raise UserError(f"{path}: {error}") from None
     log = Log(
-        path, f"ROS {1 if kind == 'ros1' else 2} bag ({topics.scan[0].topic})", angles, np.array(mount.pose),
-        reading.range_max or float(first.range_max), scans, lambda: iter(()), float(first.range_min), notes=notes,
-    )  # fmt: skip
+        path,
+        f"ROS {1 if kind == 'ros1' else 2} bag ({topics.scan[0].topic})",
+        angles,
+        np.array(mount.pose),
+        reading.range_max or float(first.range_max),
+        scans,
+        lambda: iter(()),
+        float(first.range_min),
+        notes=notes,
+    )
     if not 0 < log.range_max < np.inf:
         raise UserError(
             f"{path}: the stated maximum range is {log.range_max:g} m: give range_max in section log of --config"

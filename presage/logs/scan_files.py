@@ -137,11 +137,11 @@ def scans_of_log(log: Log) -> Scans:
     """Reads all scans of a log; raises UserError if none is usable."""
     unknown = np.full(3, np.nan)
     ranges, stamps, odoms, references = [], [], [], []
-    for sweep in log.sweeps():
-        ranges.append(ranges_for_localisation(sweep.ranges))
-        stamps.append(sweep.stamp_ns)
-        odoms.append(unknown if sweep.odom is None else sweep.odom)
-        references.append(unknown if sweep.reference is None else sweep.reference)
+    for logged in log.valid_scans():
+        ranges.append(ranges_for_localisation(logged.ranges))
+        stamps.append(logged.stamp_ns)
+        odoms.append(unknown if logged.odom is None else logged.odom)
+        references.append(unknown if logged.reference is None else logged.reference)
     left_out = log.describe_left_out()
     if not ranges:
         raise UserError(f"{log.path}: no usable scan in it" + (f"; left out: {left_out}" if left_out else ""))

@@ -31,7 +31,14 @@ def draw_cells(axes: Axes, grid: OccupancyGrid, wall: str) -> None:
     kinds = np.select([grid.values == OCCUPIED, grid.values == UNKNOWN], [1, 2], 0)
     place = Affine2D().scale(grid.resolution).rotate(grid.origin[2]).translate(*grid.origin[:2])
     image = axes.imshow(
-        kinds, cmap=ListedColormap(["white", wall, UNKNOWN_COLOUR]), vmin=0, vmax=2, origin="lower", aspect="equal",
-        interpolation="nearest", extent=(0, grid.width, 0, grid.height), zorder=0.2,
-    )  # fmt: skip
+        kinds,
+        cmap=ListedColormap(["white", wall, UNKNOWN_COLOUR]),
+        vmin=0,
+        vmax=2,
+        origin="lower",
+        aspect="equal",
+        interpolation="nearest",
+        extent=(0, grid.width, 0, grid.height),
+        zorder=0.2,
+    )
     image.set_transform(place + axes.transData)

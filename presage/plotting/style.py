@@ -18,10 +18,16 @@ from presage.plotting.maps import draw_cells
 
 # Palette of Okabe and Ito, the same in every figure. Green is the colour of the distance to the goal in the paper.
 COLOURS = {
-    "paper": "#E69F00", "paper, 10 steps a scan": "#E69F00", "precise": "#0072B2", "particle-filter": "#D55E00",
-    "amcl-defaults": "#CC79A7", "particle-filter, heading known": "#000000", "precise, odometry": "#56B4E9",
-    "particle-filter, odometry": "#999999", "amcl-defaults, odometry": "#CC79A7",
-}  # fmt: skip
+    "paper": "#E69F00",
+    "paper, 10 steps a scan": "#E69F00",
+    "precise": "#0072B2",
+    "particle-filter": "#D55E00",
+    "amcl-defaults": "#CC79A7",
+    "particle-filter, heading known": "#000000",
+    "precise, odometry": "#56B4E9",
+    "particle-filter, odometry": "#999999",
+    "amcl-defaults, odometry": "#CC79A7",
+}
 DASHED = ("paper, 10 steps a scan",)  # estimators that share a colour with another
 MEASURED, PREDICTED, GOAL, BOUND = "#0072B2", "#D55E00", "#009E73", "#444444"
 MIN_LOG_VALUE = 1e-4  # m, lower limit of bands on logarithmic axes

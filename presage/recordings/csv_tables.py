@@ -176,13 +176,14 @@ def export_csv(
 def _readme(recording: Recording, robot: str, layouts: dict[str, _TopicLayout], rows: dict[str, int]) -> str:
     """Text of the README: the meaning of all columns."""
     lines = [
-        f"# {recording.path.name}, robot {robot}", "",
-        "Written by `presage export --format csv`. Units are SI; poses are of base_link in map unless said otherwise.",
+        f"# {recording.path.name}, robot {robot}",
+        "",
+        "Written by `presage export --format csv`. Units are SI; poses are of base_link in map unless noted otherwise.",
         "An empty cell means unknown. Ranges: inf is no return, -inf too close (REP-117), 0 not measured.",
         "`stamp_ns` is simulation or sensor time; `log_time_ns` and `publish_time_ns` are wall time.",
         "Lists and arrays have their own files (TOPIC.FIELD.csv; -N is the number of columns of an array), whose rows",
         "belong to the message with the same `log_time_ns` and `seq`.",
-    ]  # fmt: skip
+    ]
     for layout in layouts.values():
         lines += ["", f"## {layout.name}.csv ({rows.get(f'{layout.name}.csv', 0)} rows)", ""]
         lines += ["| column | meaning |", "|---|---|"]

@@ -30,39 +30,45 @@ class ExportOptions:
     force: bool = False
 
 
-def run_export(job: ExportOptions, json_file: Path | None, console: Console) -> None:
+def run_export(options: ExportOptions, json_file: Path | None, console: Console) -> None:
     """Exports the recording and prints what was written; raises UserError if that fails."""
-    if job.format not in DEFAULT_SUFFIXES:
-        raise UserError(f"no format {job.format!r}: choose {', '.join(DEFAULT_SUFFIXES)}")
+    if options.format not in DEFAULT_SUFFIXES:
+        raise UserError(f"no format {options.format!r}: choose {', '.join(DEFAULT_SUFFIXES)}")
     check_file(json_file, "--json")
-    out = job.out or job.file.with_name(stem_of(job.file) + DEFAULT_SUFFIXES[job.format])
-    recording = read_recording(job.file)
+    out = options.out or options.file.with_name(stem_of(options.file) + DEFAULT_SUFFIXES[options.format])
+    recording = read_recording(options.file)
     start = time.monotonic()
-    written = _write(job, recording, out, console)
+    written = _write(options, recording, out, console)
     seconds = time.monotonic() - start
     if recording.warning:
         print(f"warning: {recording.warning}", file=sys.stderr)
     if undecodable := sum(recording.undecodable.values()):
         print(f"warning: {undecodable} messages could not be decoded and are left out", file=sys.stderr)
-    unit = "messages" if job.format == "foxglove" else "rows"
+    unit = "messages" if options.format == "foxglove" else "rows"
     for name, rows in written.items():
         console.print(f"{rows:9d} {unit}  {name}", markup=False, highlight=False)
     console.print(f"written to {out} in {seconds:.1f} s", markup=False, highlight=False, soft_wrap=True)
-    numbers = {"file": str(job.file), "format": job.format, "out": str(out), "written": written, "seconds": seconds}
+    numbers = {
+        "file": str(options.file),
+        "format": options.format,
+        "out": str(out),
+        "written": written,
+        "seconds": seconds,
+    }
     write_json(json_file, {**numbers, "complete": recording.complete, "undecodable": undecodable})
 
 
-def _write(job: ExportOptions, recording: Recording, out: Path, console: Console) -> dict[str, int]:
+def _write(options: ExportOptions, recording: Recording, out: Path, console: Console) -> dict[str, int]:
     """Writes the export and returns the number of rows or messages by name; imports only the format's module."""
-    if job.format == "csv":
-        from presage.recordings.csv_tables import export_csv  # noqa: PLC0415
+    if options.format == "csv":
+        from presage.recordings.csv_tables import export_csv
 
-        return export_csv(recording, out, job.robot, console, arrays=job.arrays, force=job.force)
-    if job.format == "tum":
-        from presage.recordings.tum import export_tum  # noqa: PLC0415
+        return export_csv(recording, out, options.robot, console, arrays=options.arrays, force=options.force)
+    if options.format == "tum":
+        from presage.recordings.tum import export_tum
 
-        only = job.localised_only
-        return export_tum(recording, out, job.robot, console, localised_only=only, force=job.force)
-    from presage.recordings.foxglove import export_foxglove  # noqa: PLC0415
+        only = options.localised_only
+        return export_tum(recording, out, options.robot, console, localised_only=only, force=options.force)
+    from presage.recordings.foxglove import export_foxglove
 
-    return export_foxglove(recording, out, job.robot, console, force=job.force)
+    return export_foxglove(recording, out, options.robot, console, force=options.force)

@@ -115,10 +115,19 @@ class SessionConverter:
         self._goal: Array | None = None
         self._last_log: dict[str, str] = {}  # key of the last log line, by topic and name
         self._converters: dict[type[Stamped], Callable[[Any, int, int], Iterator[tuple[str, Any]]]] = {
-            Scan: self._scan, Odom: self._odom, Truth: self._truth, Belief: self._belief, Prediction: self._prediction,
-            Goal: self._new_goal, CmdVel: self._command, Status: self._status, Health: self._health,
-            Drive: self._drive, Plan: self._plan, Preference: self._preference,
-        }  # fmt: skip
+            Scan: self._scan,
+            Odom: self._odom,
+            Truth: self._truth,
+            Belief: self._belief,
+            Prediction: self._prediction,
+            Goal: self._new_goal,
+            CmdVel: self._command,
+            Status: self._status,
+            Health: self._health,
+            Drive: self._drive,
+            Plan: self._plan,
+            Preference: self._preference,
+        }
 
     def convert(self, topic: Topic, message: Stamped, raw: Raw) -> Iterator[FoxgloveMessage]:
         """Yields the Foxglove messages for one message; counts messages of unsupported topics in `left_out`."""
@@ -128,57 +137,57 @@ class SessionConverter:
             return
         logged = raw.logged_ns
         sensor = isinstance(message, Scan | Odom | Truth)
-        at = (
+        ns = (
             self._clock.add_sensor_message(topic.name, message.stamp_ns, logged)
             if sensor
             else self._clock.time_of(message.stamp_ns, logged)
         )
-        for name, content in converter(message, at, logged):
+        for name, content in converter(message, ns, logged):
             yield FoxgloveMessage(name, content, logged, raw.published_ns)
 
-    def _scan(self, scan: Scan, at: int, _: int) -> Iterator[tuple[str, Any]]:
+    def _scan(self, scan: Scan, ns: int, _: int) -> Iterator[tuple[str, Any]]:
         if "laser" not in self._chain or not np.array_equal(self._chain["laser"][1], scan.mount.array()):
-            yield self._transforms("base_link", "laser", scan.mount.array(), at)
-        yield "/scan", shapes.laser_scan(scan, at)
+            yield self._transforms("base_link", "laser", scan.mount.array(), ns)
+        yield "/scan", shapes.laser_scan(scan, ns)
 
-    def _prediction(self, prediction: Prediction, at: int, _: int) -> Iterator[tuple[str, Any]]:
-        yield "/prediction", shapes.laser_scan(prediction, at)
+    def _prediction(self, prediction: Prediction, ns: int, _: int) -> Iterator[tuple[str, Any]]:
+        yield "/prediction", shapes.laser_scan(prediction, ns)
 
-    def _odom(self, odom: Odom, at: int, _: int) -> Iterator[tuple[str, Any]]:
+    def _odom(self, odom: Odom, ns: int, _: int) -> Iterator[tuple[str, Any]]:
         pose = odom.pose.array()
         self._odoms.keep(odom.stamp_ns, pose)
         if self.driver == "odom" and "odom" not in self._chain:
-            self._chain["odom"] = ("map", np.zeros(3), at)
+            self._chain["odom"] = ("map", np.zeros(3), ns)
         stamp, driver_pose = self._driver_pose
         if stamp == odom.stamp_ns:  # the driver's pose of this stamp came before the odometry
-            self._chain["odom"] = ("map", compose(driver_pose, between(pose, np.zeros(3))), at)
-        yield self._transforms("odom", "base_link", pose, at)
-        yield "/odom", shapes.pose_in("odom", pose, at)
+            self._chain["odom"] = ("map", compose(driver_pose, between(pose, np.zeros(3))), ns)
+        yield self._transforms("odom", "base_link", pose, ns)
+        yield "/odom", shapes.pose_in("odom", pose, ns)
 
-    def _truth(self, truth: Truth, at: int, _: int) -> Iterator[tuple[str, Any]]:
+    def _truth(self, truth: Truth, ns: int, _: int) -> Iterator[tuple[str, Any]]:
         self._truths.keep(truth.stamp_ns, truth.pose.array())
-        yield "/truth", shapes.pose_in("map", truth.pose.array(), at)
+        yield "/truth", shapes.pose_in("map", truth.pose.array(), ns)
         yield "/truth/numbers", numbers.of_truth(truth)
         if self.driver == "truth":
-            yield self._correction(truth.pose.array(), truth.stamp_ns, at)
+            yield self._correction(truth.pose.array(), truth.stamp_ns, ns)
 
-    def _belief(self, belief: Belief, at: int, logged: int) -> Iterator[tuple[str, Any]]:
+    def _belief(self, belief: Belief, ns: int, logged: int) -> Iterator[tuple[str, Any]]:
         pose = belief.pose.array()
-        yield self._correction(pose, belief.stamp_ns, at)
-        yield "/belief", shapes.pose_in("map", pose, at)
+        yield self._correction(pose, belief.stamp_ns, ns)
+        yield "/belief", shapes.pose_in("map", pose, ns)
         poses = [shapes.pose(each.pose.array()) for each in shapes.hypotheses(belief)]
-        yield "/hypotheses", PosesInFrame(timestamp=shapes.time_of(at), frame_id="map", poses=poses)
-        yield "/belief/shape", SceneUpdate(entities=[shapes.belief_entity(belief, at)])
+        yield "/hypotheses", PosesInFrame(timestamp=shapes.time_of(ns), frame_id="map", poses=poses)
+        yield "/belief/shape", SceneUpdate(entities=[shapes.belief_entity(belief, ns)])
         yield "/belief/numbers", numbers.of_belief(belief)
         if (truth := self._truths.get(belief.stamp_ns)) is not None:
             yield "/error", numbers.of_error(belief, truth, self._goal)
         yield from self._log("estimator", belief.state, f"belief is {belief.state}", logged)
 
     def _new_goal(self, goal: Goal, _: int, logged: int) -> Iterator[tuple[str, Any]]:
-        at = shapes.time_of(logged)  # a goal's own stamp may be of another clock
+        time = shapes.time_of(logged)  # a goal's own stamp may be of another clock
         if goal.cancel:
             self._goal = None
-            yield "/goal/shape", SceneUpdate(deletions=[SceneEntityDeletion(timestamp=at, id="goal")])
+            yield "/goal/shape", SceneUpdate(deletions=[SceneEntityDeletion(timestamp=time, id="goal")])
             yield from self._log("goal", f"cancelled {logged}", "the goal was cancelled", logged)
             return
         self._goal = goal.pose.array()
@@ -194,12 +203,12 @@ class SessionConverter:
     def _drive(self, drive: Drive, _at: int, _logged: int) -> Iterator[tuple[str, Any]]:
         yield "/drive", numbers.of_command(drive)
 
-    def _plan(self, plan: Plan, at: int, _: int) -> Iterator[tuple[str, Any]]:
-        yield "/plan", SceneUpdate(entities=[shapes.plan_entity(plan, at)])
-        yield "/plan/obstacles", shapes.obstacle_points(plan, at)
+    def _plan(self, plan: Plan, ns: int, _: int) -> Iterator[tuple[str, Any]]:
+        yield "/plan", SceneUpdate(entities=[shapes.plan_entity(plan, ns)])
+        yield "/plan/obstacles", shapes.obstacle_points(plan, ns)
 
-    def _preference(self, preference: Preference, at: int, _: int) -> Iterator[tuple[str, Any]]:
-        yield "/preference", shapes.preference_grid(preference, at)
+    def _preference(self, preference: Preference, ns: int, _: int) -> Iterator[tuple[str, Any]]:
+        yield "/preference", shapes.preference_grid(preference, ns)
 
     def _status(self, status: Status, _: int, logged: int) -> Iterator[tuple[str, Any]]:
         yield "/status", numbers.of_status(status)
@@ -223,23 +232,23 @@ class SessionConverter:
         level = Log.WARNING if (key in WARNING_STATES if warn is None else warn) else Log.INFO
         yield "/log", Log(timestamp=shapes.time_of(ns), level=level, message=text, name=name)
 
-    def _transforms(self, parent: str, child: str, pose: Array, at: int) -> tuple[str, FrameTransforms]:
+    def _transforms(self, parent: str, child: str, pose: Array, ns: int) -> tuple[str, FrameTransforms]:
         """Updates one transform; returns all known transforms, each with the time of its own measurement."""
-        self._chain[child] = (parent, pose, at)
+        self._chain[child] = (parent, pose, ns)
         links = [shapes.transform(start, end, pose, ns) for end, (start, pose, ns) in self._chain.items()]
         return "/tf", FrameTransforms(transforms=links)
 
-    def _correction(self, pose: Array, stamp: int, at: int) -> tuple[str, FrameTransforms]:
+    def _correction(self, pose: Array, stamp: int, ns: int) -> tuple[str, FrameTransforms]:
         """Sets map → odom so that base_link has ``pose`` (3,) in map with the odometry of the same stamp."""
         self._driver_pose = (stamp, pose)
         odom = self._odoms.get(stamp)
         if odom is None:
             odom = next(reversed(self._odoms.values()), None)
         if odom is None:  # without odometry, map and odom are the same frame
-            self._chain["odom"] = ("map", np.zeros(3), at)
-            return self._transforms("odom", "base_link", pose, at)
+            self._chain["odom"] = ("map", np.zeros(3), ns)
+            return self._transforms("odom", "base_link", pose, ns)
         correction = compose(pose, between(odom, np.zeros(3)))
-        return self._transforms("map", "odom", correction, at)
+        return self._transforms("map", "odom", correction, ns)
 
 
 def static_messages(

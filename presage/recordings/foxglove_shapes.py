@@ -33,7 +33,7 @@ from common.geometry import rasterize as raster
 from common.geometry.se2 import Array
 from common.geometry.world import World
 from common.messages.definitions import Belief, Hypothesis, Plan, Prediction, Preference, Scan
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 
 TRUTH, BELIEF, GOAL = (0.0, 0.0, 0.0), (0.84, 0.37, 0.0), (0.0, 0.62, 0.45)  # RGB, as in `presage plot`
 WALL, FURNITURE = (0.55, 0.55, 0.55), (0.78, 0.78, 0.78)
@@ -84,7 +84,7 @@ def transform(parent: str, child: str, xyyaw: Array, ns: int) -> FrameTransform:
 
 def laser_scan(scan: Scan | Prediction, ns: int) -> LaserScan:
     """Measured or predicted ranges in frame laser; values that are not distances (±inf, 0) become NaN, not drawn."""
-    ranges = np.where(surfaces(scan.ranges), scan.ranges, np.nan).astype(float)
+    ranges = np.where(is_surface(scan.ranges), scan.ranges, np.nan).astype(float)
     return LaserScan(
         timestamp=time_of(ns),
         frame_id="laser",
@@ -133,10 +133,10 @@ def belief_entity(belief: Belief, ns: int) -> SceneEntity:
     entity = SceneEntity(timestamp=time_of(ns), frame_id="map", id="belief", frame_locked=True)
     for hypothesis in hypotheses(belief):
         alpha = 0.15 + 0.85 * hypothesis.weight
-        at = hypothesis.pose.array()
+        xyyaw = hypothesis.pose.array()
         entity.arrows.append(
             ArrowPrimitive(
-                pose=pose(at, 0.05),
+                pose=pose(xyyaw, 0.05),
                 shaft_length=0.35,
                 shaft_diameter=0.06,
                 head_length=0.15,
@@ -145,18 +145,18 @@ def belief_entity(belief: Belief, ns: int) -> SceneEntity:
             )
         )
         if hypothesis.covariance is not None:
-            outline = ellipse(at, hypothesis.covariance)
+            outline = ellipse(xyyaw, hypothesis.covariance)
             entity.lines.append(line(outline, BELIEF, alpha, closed=True, z=0.06))
     return entity
 
 
 def disc(
-    frame: str, name: str, at: Array, radius: float, height: float, rgb: Sequence[float], alpha: float, ns: int
+    frame: str, name: str, centre: Array, radius: float, height: float, rgb: Sequence[float], alpha: float, ns: int
 ) -> SceneEntity:
-    """A flat cylinder at the pose ``at`` (3,), for the robot's body, the goal and its tolerance."""
+    """A flat cylinder at the pose ``centre`` (3,), for the robot's body, the goal and its tolerance."""
     size = Vector3(x=2 * radius, y=2 * radius, z=height)
     shape = CylinderPrimitive(
-        pose=pose(at, height / 2), size=size, bottom_scale=1, top_scale=1, color=color(rgb, alpha)
+        pose=pose(centre, height / 2), size=size, bottom_scale=1, top_scale=1, color=color(rgb, alpha)
     )
     return SceneEntity(timestamp=time_of(ns), frame_id=frame, id=name, frame_locked=True, cylinders=[shape])
 
@@ -177,7 +177,10 @@ def obstacle_points(plan: Plan, ns: int) -> PointCloud:
         frame_id="map",
         pose=pose((0, 0, 0), 0.1),
         point_stride=8,
-        fields=[PackedElementField(name=name, offset=at, type=PackedElementField.FLOAT32) for name, at in POINT_FIELDS],
+        fields=[
+            PackedElementField(name=name, offset=offset, type=PackedElementField.FLOAT32)
+            for name, offset in POINT_FIELDS
+        ],
         data=np.asarray(plan.obstacles, "<f4").tobytes(),
     )
 
@@ -219,23 +222,23 @@ def world_entities(world: World, ns: int) -> list[SceneEntity]:
     for number, obstacle in enumerate(world.obstacles):
         name = f"obstacle {number} {obstacle.name}".rstrip()
         if obstacle.circle is not None:
-            at = np.array([*obstacle.circle.center, 0.0])
-            found.append(disc("map", name, at, obstacle.circle.radius, WALL_HEIGHT, FURNITURE, 1.0, ns))
+            centre = np.array([*obstacle.circle.center, 0.0])
+            found.append(disc("map", name, centre, obstacle.circle.radius, WALL_HEIGHT, FURNITURE, 1.0, ns))
             continue
         entity = SceneEntity(timestamp=time_of(ns), frame_id="map", id=name, frame_locked=True)
         if obstacle.box is not None:
-            at = np.array([*obstacle.box.center, np.deg2rad(obstacle.box.yaw_deg)])
-            entity.cubes.append(_cube(at, obstacle.box.size, FURNITURE))
+            centre = np.array([*obstacle.box.center, np.deg2rad(obstacle.box.yaw_deg)])
+            entity.cubes.append(_cube(centre, obstacle.box.size, FURNITURE))
         elif (ring := obstacle.ring()) is not None:
             entity.cubes.extend(_slabs(ring, FURNITURE, outside=False))
         found.append(entity)
     return found
 
 
-def _cube(at: Array, size: Iterable[float], rgb: Sequence[float]) -> CubePrimitive:
+def _cube(centre: Array, size: Iterable[float], rgb: Sequence[float]) -> CubePrimitive:
     x, y = size
     return CubePrimitive(
-        pose=pose(at, WALL_HEIGHT / 2), size=Vector3(x=float(x), y=float(y), z=WALL_HEIGHT), color=color(rgb)
+        pose=pose(centre, WALL_HEIGHT / 2), size=Vector3(x=float(x), y=float(y), z=WALL_HEIGHT), color=color(rgb)
     )
 
 
@@ -269,7 +272,8 @@ def grid(world: World, ns: int) -> Grid:
         row_stride=columns * len(names),
         cell_stride=len(names),
         fields=[
-            PackedElementField(name=name, offset=at, type=PackedElementField.UINT8) for at, name in enumerate(names)
+            PackedElementField(name=name, offset=offset, type=PackedElementField.UINT8)
+            for offset, name in enumerate(names)
         ],
         data=data.tobytes(),
     )

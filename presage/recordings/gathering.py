@@ -146,9 +146,14 @@ class _Gatherer:
         self._last_stamp_ns = 0  # of scan or truth
         self._waiting: dict[int, Scan] = {}  # scans whose prediction may still come, by stamp
         self._handlers: dict[type[Stamped], Callable[[Any, int], None]] = {
-            Goal: self._goal, Status: self._status, Health: self._health, Scan: self._scan,
-            Prediction: self._prediction, Truth: self._truth, Belief: self._belief,
-        }  # fmt: skip
+            Goal: self._goal,
+            Status: self._status,
+            Health: self._health,
+            Scan: self._scan,
+            Prediction: self._prediction,
+            Truth: self._truth,
+            Belief: self._belief,
+        }
 
     def add(self, message: Stamped, logged: int) -> None:
         """Adds a message with the time of its reception, ns of wall time."""
@@ -193,7 +198,7 @@ class _Gatherer:
 def _truth_at_beliefs(belief: StampedRows, truth: StampedRows) -> Array:
     """The true pose at the stamp of each belief (N, 3); NaN if there is none.
 
-    A restarted simulation uses stamps again: of several poses with the same stamp, takes the one received closest in
+    A restarted simulation uses stamps again: among several poses with the same stamp, takes the one received closest in
     time to the belief.
     """
     result = np.full((len(belief), 3), np.nan)

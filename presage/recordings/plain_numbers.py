@@ -91,7 +91,7 @@ def schema_of(topic: str) -> tuple[str, dict[str, Any]]:
 
 
 def _known(values: dict[str, Any]) -> dict[str, Any]:
-    """Without values that are None or not finite, which JSON cannot represent."""
+    """Removes values that are None or not finite, which JSON cannot represent."""
     return {k: v for k, v in values.items() if v is not None and not (isinstance(v, float) and not np.isfinite(v))}
 
 

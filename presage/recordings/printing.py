@@ -15,7 +15,7 @@ from common.bus.bus import Link
 from common.errors import UserError
 from common.messages.topics import TOPICS, topic_of
 from common.messages.wire import DecodeError
-from presage.live.commands import echo, plain, topic_named
+from presage.live.commands import echo, to_plain_values, topic_named
 from presage.recordings.info import Facts, survey
 from presage.terminal.output import check_file, write_json
 from services.recorder.reader import Recording, read_recording
@@ -124,7 +124,9 @@ def echo_file(file: Path, name: str | None, count: int, start_s: float, console:
         topic = topic_of(raw.key)
         head = {"key": raw.key, "time_s": round((raw.logged_ns - recording.start_ns) * 1e-9, 6)}
         try:
-            rest = plain(topic.message.decode(raw.payload), full=full) if topic else {"bytes": len(raw.payload)}
+            rest = (
+                to_plain_values(topic.message.decode(raw.payload), full=full) if topic else {"bytes": len(raw.payload)}
+            )
         except DecodeError as error:
             rest = {"undecodable": str(error), "bytes": len(raw.payload)}
         line = json.dumps({**head, **rest})

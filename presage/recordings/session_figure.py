@@ -17,7 +17,7 @@ from common.errors import UserError
 from common.geometry.se2 import Array, compose
 from common.geometry.world import World
 from common.messages.definitions import Goal, Scan
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 from common.runtime import safety
 from presage.plotting.maps import draw_walls
 from presage.recordings.gathering import RecordedSession, load_session
@@ -181,7 +181,7 @@ def _draw_scan(axes: Axes, session: RecordedSession) -> None:
         return
     scan, prediction = session.predicted
     expected = np.where(np.isfinite(prediction.ranges), prediction.ranges, np.nan).astype(np.float64)
-    measured = np.where(surfaces(scan.ranges), scan.ranges, np.nan)
+    measured = np.where(is_surface(scan.ranges), scan.ranges, np.nan)
     angles = np.rad2deg(prediction.angle_min + prediction.angle_increment * np.arange(len(expected)))
     axes.plot(np.rad2deg(scan.angles()), measured, color=MEASURED, lw=1.4, label="measured")
     axes.plot(angles, expected, color=BELIEF, lw=1.2, label="predicted")

@@ -22,12 +22,12 @@ REFRESH_PERIOD_S = 0.1  # of the progress bar
 ROBOT_NAME = r"[A-Za-z0-9_.-]{1,64}"
 
 
-def run_replay(file: Path, link: Link, choice: ReplayOptions, console: Console) -> None:
+def run_replay(file: Path, link: Link, options: ReplayOptions, console: Console) -> None:
     """Replays the recording onto the bus until its end, the key q, or Ctrl-C."""
 
     @contextmanager
-    def steering(remote: ReplayControl) -> Iterator[None]:
-        with keyboard(remote) as available:
+    def show_progress(control: ReplayControl) -> Iterator[None]:
+        with keyboard(control) as available:
             if available:
                 console.print(HELP, style="dim", highlight=False)
             with bar:
@@ -42,7 +42,7 @@ def run_replay(file: Path, link: Link, choice: ReplayOptions, console: Console) 
             shown = now
             bar.update(task, completed=state.position_s, total=max(state.duration_s, 1e-9), status=describe(state))
 
-    counts = replay(file, link, choice, on_progress=show, opening=session, steering=steering)
+    counts = replay(file, link, options, on_progress=show, open_session=session, control_context=show_progress)
     console.print("replayed " + (", ".join(f"{key} {count}" for key, count in sorted(counts.items())) or "nothing"))
 
 
@@ -60,7 +60,7 @@ def checked_robot(name: str) -> str:
     return name
 
 
-def choice_of(
+def replay_options(
     only: str,
     leave_out: str,
     rate: float | None,

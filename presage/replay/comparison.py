@@ -89,15 +89,17 @@ class MessagePairs:
 
         left = self.unmatched()
         return {
-            "compared": self.compared, "equal": self.equal,
-            "recorded_without_new": left["recorded"], "new_without_recorded": left["new"],
+            "compared": self.compared,
+            "equal": self.equal,
+            "recorded_without_new": left["recorded"],
+            "new_without_recorded": left["new"],
             "position_difference_median_m": reduce(np.median, position),
             "position_difference_max_m": reduce(np.max, position),
             "heading_difference_max_rad": reduce(np.max, heading),
             "both_tracking": int(both.sum()),
             "position_difference_tracking_max_m": reduce(np.max, position[both] if len(both) else position),
             "heading_difference_tracking_max_rad": reduce(np.max, heading[both] if len(both) else heading),
-        }  # fmt: skip
+        }
 
 
 @dataclass
@@ -106,7 +108,7 @@ class ReplayOutcome:
 
     imported: bool = field(default=False, kw_only=True)  # from a log, so without recorded beliefs to compare
     lockstep: bool  # the session and the replay ran in lockstep, so that equality is required
-    why: str = ""  # why equality is not required
+    tolerance_reason: str = ""  # why results may differ by the tolerance; empty if they must be identical
     beliefs: MessagePairs = field(default_factory=MessagePairs)
     commands: MessagePairs = field(default_factory=MessagePairs)
     scans: int = 0  # in the recording
@@ -119,7 +121,7 @@ class ReplayOutcome:
     damaged: str = ""  # why the recording could not be read to its end
 
     @property
-    def good(self) -> bool:
+    def agrees(self) -> bool:
         """Whether the results agree.
 
         In lockstep they must be identical; otherwise they may differ by the tolerance while tracking. For an imported
@@ -141,15 +143,22 @@ class ReplayOutcome:
     def as_dict(self) -> dict[str, Any]:
         """The results as values that JSON can hold."""
         return {
-            "imported": self.imported, "tracking": self.beliefs.new_tracking,
-            "lockstep": self.lockstep, "why_not": self.why, "good": self.good, "damaged": self.damaged,
-            "scans": self.scans, "scans_left_out": self.left_out,
-            "scans_unanswered": self.unanswered, "beliefs": self.beliefs.as_dict(),
+            "imported": self.imported,
+            "tracking": self.beliefs.new_tracking,
+            "lockstep": self.lockstep,
+            "why_not": self.tolerance_reason,
+            "good": self.agrees,
+            "damaged": self.damaged,
+            "scans": self.scans,
+            "scans_left_out": self.left_out,
+            "scans_unanswered": self.unanswered,
+            "beliefs": self.beliefs.as_dict(),
             "commands": {
-                "compared": self.commands.compared, "equal": self.commands.equal,
+                "compared": self.commands.compared,
+                "equal": self.commands.equal,
                 "difference_max_m_s": self.commands.max_speed_difference,
             },
             "tolerance_m": 0.0 if self.lockstep else TOLERANCE_M,
             "tolerance_rad": 0.0 if self.lockstep else TOLERANCE_RAD,
             "notes": self.notes,
-        }  # fmt: skip
+        }

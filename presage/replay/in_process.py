@@ -52,17 +52,17 @@ class InProcessServices:
     # The part of `common.bus.bus.Bus` that services use while they handle messages.
 
     def put(self, topic: Topic, payload: bytes, service: str = "*", key: str | None = None) -> None:  # noqa: ARG002
-        """Queue a message of a service."""
+        """Queues a message of a service."""
         self._outbox.append((topic, payload))
 
     def request(self, query: Query, request: Request, number: int, inbox: Inbox, timeout: float) -> None:  # noqa: ARG002
-        """Let the service that answers the query reply at once."""
+        """Passes a query to the service that answers it, which replies at once."""
 
         def reply(payload: bytes) -> None:
             inbox.put(Answer(query, number, payload))
 
-        def refuse(why: str) -> None:
-            inbox.put(Answer(query, number, b"", why))
+        def refuse(reason: str) -> None:
+            inbox.put(Answer(query, number, b"", reason))
 
         server = next((loop for loop in self._loops if query in loop.service.queries), None)
         if server is None:
@@ -71,4 +71,4 @@ class InProcessServices:
             server.handle(Call(query, request.encode(), reply, refuse))
 
     def publisher(self, topic: Topic, service: str) -> None:
-        """Nothing needs to be declared."""
+        """Does nothing: within one process, publishers need not be declared."""

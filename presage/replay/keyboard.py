@@ -22,7 +22,7 @@ ARROWS = {b"\x1b[A": "up", b"\x1b[B": "down", b"\x1b[C": "l", b"\x1b[D": "h"}
 ARROWS |= {code.replace(b"[", b"O"): key for code, key in ARROWS.items()}
 
 
-def pressed(data: bytes) -> list[str]:
+def parse_keys(data: bytes) -> list[str]:
     """Parses the bytes sent by a terminal as keys; arrows get a name, all others are their character."""
     keys: list[str] = []
     while data:
@@ -81,7 +81,7 @@ def _listen(terminal: int, wake: int, remote: ReplayControl) -> None:
         data = b"" if wake in ready else os.read(terminal, 64)
         if not data:  # the replay has ended, or the terminal was closed
             return
-        for key in pressed(data):
+        for key in parse_keys(data):
             if key == QUIT:
                 remote.quit()
             elif (request := request_of(key, remote.state())) is not None:

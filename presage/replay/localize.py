@@ -29,15 +29,26 @@ from presage.logs.scan_files import Prior, Scans, read_scans
 from presage.session.stack import ignoring_interrupts
 from presage.terminal.output import check_file
 from presage.terminal.progress import progress, working
-from services.estimator.factory import Choice, Name, check_start
+from services.estimator.factory import EstimatorOptions, Name, check_start
 from services.estimator.shared.interface import Posterior
 from services.recorder.reader import read_recording
 from services.recorder.replaying.player import span
 
 COLUMNS = (
-    "stamp", "x", "y", "yaw", "cov_xx", "cov_xy", "cov_xyaw", "cov_yy", "cov_yyaw", "cov_yawyaw",
-    "free_energy", "state", "update_ms",
-)  # fmt: skip
+    "stamp",
+    "x",
+    "y",
+    "yaw",
+    "cov_xx",
+    "cov_xy",
+    "cov_xyaw",
+    "cov_yy",
+    "cov_yyaw",
+    "cov_yawyaw",
+    "free_energy",
+    "state",
+    "update_ms",
+)
 STAMP_ROUNDING_S = 1e-6  # precision of a double for a stamp of the year 2020
 UPPER_TRIANGLE = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
 
@@ -47,7 +58,7 @@ class LocalizeOptions:
     """Options of `presage localize`."""
 
     file: Path
-    choice: Choice
+    estimator_options: EstimatorOptions
     mode: Literal["global", "track"] = "global"
     fresh: bool = False
     prior: Prior = "odometry"
@@ -62,7 +73,7 @@ class LocalizeOptions:
     def of(
         cls,
         file: Path,
-        choice: Choice,
+        estimator_options: EstimatorOptions,
         mode: str,
         frame: str,
         reading: Reading,
@@ -82,10 +93,10 @@ class LocalizeOptions:
         if out is not None and out.suffix not in (".csv", ".json"):
             raise UserError(f"{out}: the name of the result must end with .csv or .json")
         prior: Prior = "odometry" if odometry else "motion"
-        return cls(file, choice, mode, fresh, prior, frame, reading, out, start, end, every)  # type: ignore[arg-type]
+        return cls(file, estimator_options, mode, fresh, prior, frame, reading, out, start, end, every)  # type: ignore[arg-type]
 
 
-def choice_of(
+def build_estimator_options(
     file: Path,
     world: str,
     estimator: str,
@@ -94,7 +105,7 @@ def choice_of(
     sigma: float | None,
     seed: int,
     initial_pose: str,
-) -> Choice:
+) -> EstimatorOptions:
     """The estimator chosen on the command line; the world defaults to that of the recording.
 
     Raises UserError if the estimator is unknown or there is no world.
@@ -108,8 +119,8 @@ def choice_of(
         recorded = read_recording(file).world()
         if recorded is None:
             raise UserError(f"{file}: no world was recorded: give one with --world")
-        return Choice(recorded, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
-    return Choice(world, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
+        return EstimatorOptions(recorded, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
+    return EstimatorOptions(world, estimator, model, models, sigma, seed, pose)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -134,46 +145,46 @@ def run(
         yield Localised(posterior, (time.perf_counter() - began) * 1e3)
 
 
-def prepare(choice: Choice, console: Console) -> Estimator:
+def prepare(estimator_options: EstimatorOptions, console: Console) -> Estimator:
     """The chosen estimator, without its initial pose."""
-    with working(f"preparing {choice.estimator} for {choice.world_argument}", console):
+    with working(f"preparing {estimator_options.estimator} for {estimator_options.world_argument}", console):
         return Estimator(
-            choice.world,
-            choice.estimator,
-            model=choice.model,
-            models=choice.models,
-            sigma=choice.sigma,
-            seed=choice.seed,
-            descent=choice.descent,
+            estimator_options.world,
+            estimator_options.estimator,
+            model=estimator_options.model,
+            models=estimator_options.models,
+            sigma=estimator_options.sigma,
+            seed=estimator_options.seed,
+            descent=estimator_options.descent,
         )
 
 
-def localize(job: LocalizeOptions, console: Console) -> list[dict[str, Any]]:
+def localize(options: LocalizeOptions, console: Console) -> list[dict[str, Any]]:
     """Localises each scan; writes the rows as they are computed, prints a summary and returns the rows.
 
     After Ctrl-C, prints the summary of the scans so far and raises KeyboardInterrupt.
     """
-    check_file(job.out, "--out")
-    if job.choice.initial_pose is not None:
-        if job.mode == "global":
+    check_file(options.out, "--out")
+    if options.estimator_options.initial_pose is not None:
+        if options.mode == "global":
             raise UserError("--initial-pose is for mode track only: add --mode track, or leave it out")
-        world = job.choice.world
-        check_start(job.choice, load_world(world) if isinstance(world, str) else world)
-    laser, kind = job.frame == "laser", kind_of(job.file)
-    estimator = prepare(job.choice, console)
-    with working(f"reading {job.file.name}", console):
-        # With --frame laser, the poses in an .npz file are those of the laser, as if its mount were zero. For other
+        world = options.estimator_options.world
+        check_start(options.estimator_options, load_world(world) if isinstance(world, str) else world)
+    laser, kind = options.frame == "laser", kind_of(options.file)
+    estimator = prepare(options.estimator_options, console)
+    with working(f"reading {options.file.name}", console):
+        # With frame laser, the poses in an .npz file are those of the laser, as if its mount were zero. For other
         # files, base_link is localised and the result transformed.
         mount = np.zeros(3) if laser and kind == "npz" else None
-        all_scans = read_scans(job.file, mount, job.reading)
+        all_scans = read_scans(options.file, mount, options.reading)
     all_scans.print_notes(console)
-    scans = select_scans(job, all_scans).with_prior(job.prior)
-    start, count = _start(job, scans), len(scans)
+    scans = select_scans(options, all_scans).with_prior(options.prior)
+    start, count = _start(options, scans), len(scans)
     estimator.check(scans[0])
     rows: list[dict[str, Any]] = []
     try:
-        found = run(estimator, scans, fresh=job.fresh, start=start)
-        with _output(job, count) as write, closing(_with_progress(job, found, count, console)) as localised:
+        found = run(estimator, scans, fresh=options.fresh, start=start)
+        with _output(options, count) as write, closing(_with_progress(options, found, count, console)) as localised:
             for k, one in enumerate(localised):
                 row = _row(scans, k, one, laser=laser)
                 write(row)
@@ -181,50 +192,50 @@ def localize(job: LocalizeOptions, console: Console) -> list[dict[str, Any]]:
     except KeyboardInterrupt:
         with ignoring_interrupts():
             _summarise(scans, rows, len(all_scans), console, laser=laser)
-            where = "" if job.out is None else f"; their rows are in {job.out}"
+            where = "" if options.out is None else f"; their rows are in {options.out}"
             console.print(f"interrupted after {len(rows)} of {count} scans{where}", highlight=False, soft_wrap=True)
         raise
     _summarise(scans, rows, len(all_scans), console, laser=laser)
     return rows
 
 
-def select_scans(job: LocalizeOptions, scans: Scans) -> Scans:
+def select_scans(options: LocalizeOptions, scans: Scans) -> Scans:
     """The scans selected by --start, --end and --every; raises UserError if there are none."""
-    if job.start is None and job.end is None and job.every == 1:
+    if options.start is None and options.end is None and options.every == 1:
         return scans
     # Without stamps, an estimator assumes that each scan follows the one before at a usual rate.
     if scans.stamps is None:
-        raise UserError(f"{job.file}: its scans have no stamps, which --start, --end and --every need")
+        raise UserError(f"{options.file}: its scans have no stamps, which --start, --end and --every need")
     since = scans.stamps - scans.stamps[0]
-    first, last = span(float(since[-1]), job.start, job.end)
+    first, last = span(float(since[-1]), options.start, options.end)
     between = (since >= first - STAMP_ROUNDING_S) & (since <= last + STAMP_ROUNDING_S)
     if not between.any():
-        raise UserError(f"{job.file}: no scan between {first:g} and {last:g} s (--start, --end)")
-    return scans.part(np.flatnonzero(between)[:: job.every])
+        raise UserError(f"{options.file}: no scan between {first:g} and {last:g} s (--start, --end)")
+    return scans.part(np.flatnonzero(between)[:: options.every])
 
 
 def _with_progress(
-    job: LocalizeOptions, found: Iterator[Localised], count: int, console: Console
+    options: LocalizeOptions, found: Iterator[Localised], count: int, console: Console
 ) -> Generator[Localised]:
     """Shows the progress, unless the rows themselves are printed to the same terminal."""
-    if job.out is None and sys.stdout.isatty() and console.is_terminal:
+    if options.out is None and sys.stdout.isatty() and console.is_terminal:
         yield from found
         return
     yield from progress(found, "localising", count, console)
 
 
-def _start(job: LocalizeOptions, scans: Scans) -> Array | None:
+def _start(options: LocalizeOptions, scans: Scans) -> Array | None:
     """The start pose (3,) for mode track, from the command line, the file, or its reference; None for mode global."""
-    if job.mode == "global":
+    if options.mode == "global":
         return None
-    if job.choice.initial_pose is not None:
-        return job.choice.initial_pose
+    if options.estimator_options.initial_pose is not None:
+        return options.estimator_options.initial_pose
     if scans.initial_pose is not None:
         return scans.initial_pose
     if scans.truth is not None and np.isfinite(scans.truth[0]).all():
         return np.asarray(scans.truth[0])
     raise UserError(
-        f"{job.file}: mode track needs the pose of the first scan: give --initial-pose x,y,deg, or a file with a "
+        f"{options.file}: mode track needs the pose of the first scan: give --initial-pose x,y,deg, or a file with a "
         "reference (its initial_pose is used only without --start)"
     )
 
@@ -244,17 +255,17 @@ def _row(scans: Scans, k: int, localised: Localised, *, laser: bool) -> dict[str
 
 
 @contextmanager
-def _output(job: LocalizeOptions, count: int) -> Iterator[Callable[[dict[str, Any]], None]]:
+def _output(options: LocalizeOptions, count: int) -> Iterator[Callable[[dict[str, Any]], None]]:
     """Yields the function that writes a row: at once for CSV; at the end for JSON, also after an interruption."""
-    if job.out is not None and job.out.suffix == ".json":
+    if options.out is not None and options.out.suffix == ".json":
         rows: list[dict[str, Any]] = []
         try:
             yield rows.append
         finally:
             with ignoring_interrupts():
-                _write_json(job, job.out, rows, complete=len(rows) == count)
+                _write_json(options, options.out, rows, complete=len(rows) == count)
         return
-    stream = sys.stdout if job.out is None else job.out.open("w", newline="", encoding="utf-8")
+    stream = sys.stdout if options.out is None else options.out.open("w", newline="", encoding="utf-8")
     try:
         writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
         writer.writeheader()
@@ -265,17 +276,28 @@ def _output(job: LocalizeOptions, count: int) -> Iterator[Callable[[dict[str, An
 
         yield write
     finally:
-        if job.out is not None:
+        if options.out is not None:
             stream.close()
 
 
-def _write_json(job: LocalizeOptions, out: Path, rows: list[dict[str, Any]], *, complete: bool) -> None:
+def _write_json(options: LocalizeOptions, out: Path, rows: list[dict[str, Any]], *, complete: bool) -> None:
     meta = {
-        "file": str(job.file), "world": job.choice.world_argument, "estimator": job.choice.estimator,
-        "model": job.choice.model, "frame": job.frame, "mode": job.mode, "fresh": job.fresh,
-        "start": job.start, "end": job.end, "every": job.every, "complete": complete,
-        "seed": job.choice.seed, "commit": commit(), "versions": versions(), "arguments": sys.argv[1:],
-    }  # fmt: skip
+        "file": str(options.file),
+        "world": options.estimator_options.world_argument,
+        "estimator": options.estimator_options.estimator,
+        "model": options.estimator_options.model,
+        "frame": options.frame,
+        "mode": options.mode,
+        "fresh": options.fresh,
+        "start": options.start,
+        "end": options.end,
+        "every": options.every,
+        "complete": complete,
+        "seed": options.estimator_options.seed,
+        "commit": commit(),
+        "versions": versions(),
+        "arguments": sys.argv[1:],
+    }
     out.write_text(json.dumps({**meta, "rows": rows}, indent=1) + "\n", encoding="utf-8")
 
 

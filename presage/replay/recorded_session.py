@@ -93,9 +93,9 @@ def estimator_settings(
 
 def check_mount(recording: Recording, settings: EstimatorSettings) -> None:
     """Raises UserError if the recording's mount is only assumed and the weights were trained with another mount."""
-    from presage.logs.scan_files import mount_assumed  # noqa: PLC0415 - slow import of numba
-    from services.estimator.factory import Geometry  # noqa: PLC0415
-    from services.estimator.service import Models  # noqa: PLC0415
+    from presage.logs.scan_files import mount_assumed  # slow import of numba
+    from services.estimator.factory import Geometry
+    from services.estimator.service import Models
 
     if mount_assumed(recording):
         scan = next(message for _, message, _ in recording.messages(SCAN) if isinstance(message, Scan))

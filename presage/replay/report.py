@@ -153,13 +153,16 @@ class Comparison:
         difference = self.difference()
         position = np.hypot(difference[:, 0], difference[:, 1])
         return {
-            "scans_answered": self.answered, "scans_compared": len(self.stamps),
-            "recorded": self.old.as_dict(), "new": self.new.as_dict(),
+            "scans_answered": self.answered,
+            "scans_compared": len(self.stamps),
+            "recorded": self.old.as_dict(),
+            "new": self.new.as_dict(),
             "difference": {
-                "position_median_m": _reduce(np.median, position), "position_max_m": _reduce(np.max, position),
+                "position_median_m": _reduce(np.median, position),
+                "position_max_m": _reduce(np.max, position),
                 "heading_max_rad": _reduce(np.max, difference[:, 2]),
             },
-        }  # fmt: skip
+        }
 
 
 def table(comparison: Comparison) -> Table:

@@ -36,7 +36,7 @@ from presage.replay.recorded_session import estimator_settings, recorded_setting
 from presage.replay.report import BeliefSeries, compare, draw, table
 from presage.terminal.output import check_file, write_json
 from presage.terminal.progress import progress
-from services.estimator.service import belief_message, choice_of, prediction_message
+from services.estimator.service import belief_message, estimator_options, prediction_message
 from services.estimator.settings import EstimatorSettings
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.reader import Raw, Recording, read_recording
@@ -63,22 +63,22 @@ class RerunOptions:
         return out
 
 
-def rerun_command(job: RerunOptions, json_file: Path | None, console: Console) -> None:
+def rerun_command(options: RerunOptions, json_file: Path | None, console: Console) -> None:
     """Runs the estimator, writes the new recording, and prints and draws the comparison.
 
     Raises UserError if the recording lacks something or a file cannot be written.
     """
     check_file(json_file, "--json")
     set_up_logging("warning")
-    recording = read_recording(job.file)
+    recording = read_recording(options.file)
     robot = robot_of(recording)
     with tempfile.TemporaryDirectory(prefix="presage-") as folder:
-        settings = settings_of(recording, job.chosen, Path(folder), console)
-        out = job.target(settings.estimator)
+        settings = settings_of(recording, options.chosen, Path(folder), console)
+        out = options.target(settings.estimator)
         for beside in (".png", ".pdf", ".csv"):
             check_file(out.with_suffix(beside), "--out")
-        scans, choice = read_scans(job.file).with_prior(settings.prior), choice_of(settings)
-        localised = run(prepare(choice, console), scans, start=choice.initial_pose)
+        scans, chosen = read_scans(options.file).with_prior(settings.prior), estimator_options(settings)
+        localised = run(prepare(chosen, console), scans, start=chosen.initial_pose)
         with closing(progress(localised, "localising", len(scans), console)) as shown:
             old, new = write_recording(recording, robot, settings, scans, shown, out)
     if foreign := sum(count for key, count in recording.counts().items() if topic_of(key) is None):
@@ -87,7 +87,7 @@ def rerun_command(job: RerunOptions, json_file: Path | None, console: Console) -
     console.print(table(comparison))
     for path in (out, *draw(comparison, out)):
         console.print(f"wrote {path}", highlight=False, soft_wrap=True)
-    about = {"file": str(job.file), "out": str(out), "robot": robot, "settings": settings.effective()}
+    about = {"file": str(options.file), "out": str(out), "robot": robot, "settings": settings.effective()}
     meta = {"commit": commit(), "versions": versions(), "arguments": sys.argv[1:]}
     write_json(json_file, {**about, **comparison.as_dict(), **meta})
 

@@ -69,7 +69,7 @@ def service_replay_command(options: ServiceReplayOptions, json_file: Path | None
         console.print(line, highlight=False, soft_wrap=True)
     about = {"file": str(options.file), "services": options.names(), "every_scan": options.every_scan}
     write_json(json_file, {**about, **outcome.as_dict(), "commit": commit(), "arguments": sys.argv[1:]})
-    return 0 if outcome.good else 1
+    return 0 if outcome.agrees else 1
 
 
 def run_service_replay(options: ServiceReplayOptions, console: Console) -> ReplayOutcome:
@@ -85,8 +85,8 @@ def run_service_replay(options: ServiceReplayOptions, console: Console) -> Repla
         if names != ("estimator",):
             raise UserError(f"{options.file}: an imported log has no goals for a controller: use --with estimator")
         options = replace(options, every_scan=True)  # a log contains no beliefs that could select scans
-    why = why_not_exact(recording, options)
-    outcome = ReplayOutcome(not why, why, scans=scans, imported=imported)
+    tolerance_reason = find_tolerance_reason(recording, options)
+    outcome = ReplayOutcome(not tolerance_reason, tolerance_reason, scans=scans, imported=imported)
     with tempfile.TemporaryDirectory(prefix="presage-") as folder:
         services = build_services(recording, names, Path(folder), outcome.notes)
         outputs = {BELIEF, CMD_VEL} if "controller" in names else {BELIEF}
@@ -98,7 +98,7 @@ def run_service_replay(options: ServiceReplayOptions, console: Console) -> Repla
         outcome.notes.append(
             f"{lost} scans are missing in the recording, as their sequence numbers show: results may differ after them"
         )
-    if not outcome.good:
+    if not outcome.agrees:
         outcome.notes += differences(recording, names)
     return outcome
 
@@ -136,8 +136,8 @@ def build_services(recording: Recording, names: tuple[str, ...], folder: Path, n
     return services
 
 
-def why_not_exact(recording: Recording, options: ServiceReplayOptions) -> str:
-    """Why the results need not be identical; "" if they must be."""
+def find_tolerance_reason(recording: Recording, options: ServiceReplayOptions) -> str:
+    """Returns why the results may differ by a tolerance; an empty string if they must be identical."""
     if options.every_scan:
         return "--every-scan was given"
     estimator = recorded_settings(recording, "estimator")
@@ -201,10 +201,10 @@ def _verdict(outcome: ReplayOutcome) -> str:
     if outcome.imported:
         tracking = f"{outcome.beliefs.new_tracking} beliefs of {outcome.given} scans are in state tracking"
         return f"{tracking}; the log has no beliefs to compare with (`presage rerun` stores the new ones)"
-    if outcome.lockstep and outcome.good:
+    if outcome.lockstep and outcome.agrees:
         return "[bold green]the session ran in lockstep, and the results are identical[/]"
     if outcome.lockstep:
         return "[bold red]the session ran in lockstep: the results should be identical, but are not[/]"
     limit = f"within {TOLERANCE_M:g} m and {TOLERANCE_RAD:g} rad while tracking"
-    agreement = f"[bold green]{limit}[/]" if outcome.good else f"[bold red]not {limit}[/]"
-    return f"{outcome.why}, so the results need not be identical: {agreement}"
+    agreement = f"[bold green]{limit}[/]" if outcome.agrees else f"[bold red]not {limit}[/]"
+    return f"{outcome.tolerance_reason}, so the results need not be identical: {agreement}"

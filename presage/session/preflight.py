@@ -14,7 +14,7 @@ from common.runtime.config import load_settings
 from presage.terminal.options import arguments
 from services.controller.settings import ControllerSettings
 from services.estimator.factory import check
-from services.estimator.service import choice_of
+from services.estimator.service import estimator_options
 from services.estimator.settings import EstimatorSettings
 from services.simulator.settings import SimulatorSettings
 
@@ -22,7 +22,7 @@ LOCKSTEP_BELIEF_TIMEOUT_S = 20.0  # in lockstep time waits for the slowest servi
 
 
 @dataclass(frozen=True)
-class Plan:
+class SessionPlan:
     """Command-line arguments of the services of a session, and the settings that follow from them."""
 
     config: tuple[str, ...]  # argument of every service
@@ -41,7 +41,7 @@ def plan_session(
     estimator: Sequence[str] = (),
     *,
     simulated: bool = True,
-) -> Plan:
+) -> SessionPlan:
     """Checks options, environment and settings file as the services would, so that a mistake is reported once.
 
     Models are read, but nothing is compiled and no bus is used. Raises UserError for a mistake.
@@ -65,8 +65,8 @@ def plan_session(
         pose = loaded_world.start_pose(radius) if start is None else np.array(start)
         if (error := loaded_world.placement_error(pose, radius)) is not None:
             raise UserError(f"start {error} (settings start and radius)")
-    check(choice_of(estimator_settings), loaded_world)
-    return Plan(
+    check(estimator_options(estimator_settings), loaded_world)
+    return SessionPlan(
         tuple(common),
         tuple(simulator_args),
         tuple(estimator_args),

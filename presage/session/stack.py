@@ -62,7 +62,7 @@ class Stack:
         environment: Mapping[str, str] | None = None,
         security: Credentials | None = None,
     ) -> None:
-        """Starts nothing yet.
+        """Does not start any process yet.
 
         ``port`` is the router's port on loopback; it defaults to a free port. ``environment`` is the children's
         environment; it defaults to that of this process. ``security`` are the credentials of this process; the children

@@ -11,7 +11,7 @@ from rich.console import Console
 from common.bus.bus import open_bus
 from common.errors import UserError
 from presage.session.page import show_page_link
-from presage.session.preflight import Plan, plan_session
+from presage.session.preflight import SessionPlan, plan_session
 from presage.session.running import announced, credentials_for
 from presage.session.stack import Stack
 from presage.terminal.options import arguments
@@ -28,7 +28,7 @@ class UpOptions:
     estimator: list[str] = field(default_factory=list)  # further arguments of the estimator
     robots: int = 1
     record: Path | None = None
-    port: int = 7447  # 0 for a free one
+    port: int = 7447  # 0 chooses a free port
     without: frozenset[str] = frozenset()  # services that are not started
     open_page: bool = False
 
@@ -66,7 +66,7 @@ def run_up(options: UpOptions, console: Console) -> None:
             _watch(stack, console)
 
 
-def _start_services(stack: Stack, options: UpOptions, plan: Plan, robots: list[str], *, page: bool) -> None:
+def _start_services(stack: Stack, options: UpOptions, plan: SessionPlan, robots: list[str], *, page: bool) -> None:
     record, without = options.record, options.without
     if (page or record is not None) and len(robots) == 1:  # an idle recorder starts from a button on the page
         stack.start("recorder", *plan.config, *arguments(directory=record, idle=record is None))
@@ -99,7 +99,7 @@ def _show_hints(stack: Stack, world: str, robots: list[str], console: Console) -
 
 
 def _watch(stack: Stack, console: Console) -> None:
-    """Reports services that end; returns never, and raises UserError when all have ended."""
+    """Reports services that end; never returns, and raises UserError when all have ended."""
     reported: set[str] = set()
     while True:
         for name in stack.ended():

@@ -52,17 +52,17 @@ Json = Annotated[Path | None, typer.Option("--json", help="Also write the result
 OpenPage = Annotated[bool, typer.Option("--open", help="Open the live page in a browser, if there is one.")]
 
 
-def given(**options: object) -> dict[str, object]:
+def given_options(**options: object) -> dict[str, object]:
     """The options that are neither None, empty nor False."""
     return {name: value for name, value in options.items() if value is not None and value != "" and value is not False}
 
 
 def arguments(**options: object) -> list[str]:
     """Command-line arguments of a service for the options that are given."""
-    names = {f"--{name.replace('_', '-')}": value for name, value in given(**options).items()}
+    names = {f"--{name.replace('_', '-')}": value for name, value in given_options(**options).items()}
     return [name if value is True else f"{name}={value}" for name, value in names.items()]
 
 
 def model_setting(model: str) -> dict[str, object]:
     """The estimator's setting for `--model`: a folder is its setting ``models``, anything else ``model``."""
-    return given(models=model) if model and Path(model).is_dir() else given(model=model)
+    return given_options(models=model) if model and Path(model).is_dir() else given_options(model=model)

@@ -78,7 +78,7 @@ def dead_reckoning_of(message: Any, child_in_base: Transform | None) -> DeadReck
 
 
 def _covariance(six: Any) -> Array:
-    """Covariance (3, 3) of x, y, yaw. Zeros, which mean unknown in ROS, if a value is not finite."""
+    """Covariance (3, 3) of x, y, yaw; zeros, which mean unknown in ROS, if a value is not finite."""
     found = np.asarray(six, float).reshape(6, 6)[np.ix_(PLANE, PLANE)]
     return found if np.isfinite(found).all() else np.zeros((3, 3))
 

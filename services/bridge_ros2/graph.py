@@ -1,4 +1,4 @@
-"""Which nodes and topics exist on the ROS side."""
+"""Tracks which nodes and topics exist on the ROS side."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ class Graph:
     """
 
     def __init__(self, names: Names | None = None) -> None:
-        """``names``: how the bridge itself names topics on zenoh."""
+        """``names`` are the bridge's own keys on zenoh."""
         self._names = names or Names()
         self._tokens: dict[str, Endpoint] = {}
 
-    def change(self, token: str, *, there: bool) -> None:
+    def change(self, token: str, *, alive: bool) -> None:
         """Records that a token appeared or disappeared."""
-        if there and (endpoint := read_token(token)) is not None:
+        if alive and (endpoint := read_token(token)) is not None:
             self._tokens[token] = endpoint
         else:
             self._tokens.pop(token, None)
@@ -91,12 +91,12 @@ class Graph:
         return sorted({each.topic for each in self.endpoints() if each.publishes and each.kind == kind})
 
     def publishers(self, topic: str) -> str:
-        """Names of other nodes that publish a topic. Empty if there are none."""
+        """Names of other nodes that publish a topic; empty if there are none."""
         publishers = [each for each in self.endpoints() if each.publishes and each.topic == topic]
         return _nodes(publishers) if publishers else ""
 
     def expected_twist_type(self, topic: str) -> str:
-        """Message type of the subscriptions to the command topic. Empty if there are none, or of both types."""
+        """Message type of the subscriptions to the command topic; empty if there are none, or if both types occur."""
         kinds = {e.kind for e in self.endpoints() if not e.publishes and e.topic == topic}
         found = kinds & {TWIST, TWIST_STAMPED}
         return found.pop() if len(found) == 1 else ""

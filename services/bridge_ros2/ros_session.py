@@ -44,9 +44,9 @@ def open_ros_session(endpoint: str, config: Path | None = None) -> zenoh.Session
         if "Unable to connect" in text:
             return None
         # zenoh appends its own source line, and wraps some messages in the name of a Rust enum.
-        why = " ".join(text.split(" at /", maxsplit=1)[0].split()).removeprefix('Json5Err(Message { msg: "')
+        reason = " ".join(text.split(" at /", maxsplit=1)[0].split()).removeprefix('Json5Err(Message { msg: "')
         advice = "--ros-config needs a zenoh configuration" if config else "write --ros-connect like tcp/ROBOT:7447"
-        raise UserError(f"no session with {config or endpoint}: {why}; {advice}") from None
+        raise UserError(f"no session with {config or endpoint}: {reason}; {advice}") from None
 
 
 def _settings(endpoint: str) -> dict[str, Any]:
@@ -65,7 +65,7 @@ def _settings(endpoint: str) -> dict[str, Any]:
 class RosPublisher:
     """A publisher on the ROS side."""
 
-    kind: str  # message type
+    kind: str  # message type, such as sensor_msgs/msg/LaserScan
     publisher: Any
     gid: bytes  # for the attachment; empty if the flavour has none
     sequence: itertools.count[int]
@@ -90,27 +90,30 @@ class RosSession:
         self._node: Node | None = None
         if names.flavor == "rmw_zenoh":
             self._node = Node(names, str(session.zid()), namespace, name)
-            self._token(self._node.token())
+            self._declare_token(self._node.token())
         for key in TOKENS:
             self._declared.append(session.liveliness().declare_subscriber(key, self._on_token, history=True))
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
-        if self._node is None or f"/{self._node.zid}/" not in key:  # skips the bridge's own tokens
-            self._graph.change(key, there=sample.kind == zenoh.SampleKind.PUT)
+        if self._node is None or f"/{self._node.zid}/" not in key:  # not the bridge's own
+            self._graph.change(key, alive=sample.kind == zenoh.SampleKind.PUT)
 
-    def _token(self, key: str) -> None:
+    def _declare_token(self, key: str) -> None:
         self._declared.append(self._session.liveliness().declare_token(key))
 
-    def subscribe(self, row: Topic, topic: str, kind: str, qos: Qos, inbox: Inbox) -> None:
-        """Subscribes to a ROS topic. Its messages, latched ones included, go to ``inbox`` as samples of ``row``."""
+    def subscribe(self, inbox_topic: Topic, topic: str, kind: str, qos: Qos, inbox: Inbox) -> None:
+        """Subscribes to a ROS topic.
+
+        Its messages, also latched ones, are put into ``inbox`` as samples of ``inbox_topic``.
+        """
 
         def on_sample(sample: zenoh.Sample) -> None:
             data = sample.attachment
             fields = read_attachment(data.to_bytes()) if data is not None else None
             published_ns = fields[1] if fields is not None else 0
-            entry = Sample(row, str(sample.key_expr), sample.payload.to_bytes(), published_ns, time.time_ns())
-            inbox.put(entry, newest_only=row.queue == "newest")
+            entry = Sample(inbox_topic, str(sample.key_expr), sample.payload.to_bytes(), published_ns, time.time_ns())
+            inbox.put(entry, newest_only=inbox_topic.queue == "newest")
 
         key = self._names.subscribe(topic, kind)
         options: dict[str, Any] = {}
@@ -122,9 +125,9 @@ class RosSession:
             }
         self._declared.append(zenoh.ext.declare_advanced_subscriber(self._session, key, on_sample, **options))
         if self._node is not None:
-            self._token(self._node.endpoint_token("MS", next(self._numbers), topic, kind, qos))
+            self._declare_token(self._node.endpoint_token("MS", next(self._numbers), topic, kind, qos))
 
-    def fetch(self, row: Topic, topic: str, inbox: Inbox) -> None:
+    def fetch(self, inbox_topic: Topic, topic: str, inbox: Inbox) -> None:
         """Queries zenoh-bridge-ros2dds for the messages of a latched topic, without waiting for the reply.
 
         Does nothing with rmw_zenoh, where `subscribe` receives them.
@@ -134,7 +137,7 @@ class RosSession:
 
         def on_reply(reply: zenoh.Reply) -> None:
             if (sample := reply.ok) is not None:
-                inbox.put(Sample(row, topic.strip("/"), sample.payload.to_bytes(), 0, time.time_ns()))
+                inbox.put(Sample(inbox_topic, topic.strip("/"), sample.payload.to_bytes(), 0, time.time_ns()))
 
         for key in self._names.caches(topic):
             self._session.get(
@@ -164,7 +167,7 @@ class RosSession:
         gid = b""
         if self._node is not None:
             token = self._node.endpoint_token("MP", next(self._numbers), topic, kind, qos)
-            self._token(token)
+            self._declare_token(token)
             gid = publisher_gid(token)
         return RosPublisher(kind, publisher, gid, itertools.count(1))
 

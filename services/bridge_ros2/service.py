@@ -1,4 +1,4 @@
-"""The process: two zenoh sessions."""
+"""The bridge service, with one zenoh session for presage and one for ROS."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class BridgeRos2Service(Service):
         self.note, self.idle = f"waiting for the zenoh router at {settings.ros_connect}", True
         self._ros: RosSession | None = None
         self._publishers: dict[str, RosPublisher] = {}  # by the option's topic name
-        # Subscribed ROS topics by the name of their row: message type and handler.
+        # Message type and handler of each subscribed ROS topic, by the name of its inbox topic.
         self._handlers: dict[str, tuple[str, Callable[[Any], None]]] = {}
         self._check_at = 0.0
         self._scan_at: float | None = None  # when the last scan was passed on
@@ -132,9 +132,9 @@ class BridgeRos2Service(Service):
         }
         for name, kind, qos, handler in subscribed:
             if name:
-                row = _row(name, newest=name == options.scan_topic)
-                self._handlers[row.name] = (kind, handler)
-                ros.subscribe(row, options.topic(name), kind, qos, self.loop.inbox)
+                inbox_topic = _inbox_topic(name, newest=name == options.scan_topic)
+                self._handlers[inbox_topic.name] = (kind, handler)
+                ros.subscribe(inbox_topic, options.topic(name), kind, qos, self.loop.inbox)
         self.note = f"no scan on {options.topic(options.scan_topic)} yet"
         self.log.info("connected to the robot's router", endpoint=options.ros_connect, flavor=options.flavor)
 
@@ -169,7 +169,7 @@ class BridgeRos2Service(Service):
             self._publish_map(now)
             static = self.options.topic(TF_TOPIC + "_static")
             if self.motion.mount() is None:
-                self._ros.fetch(_row(TF_TOPIC + "_static"), static, self.loop.inbox)
+                self._ros.fetch(_inbox_topic(TF_TOPIC + "_static"), static, self.loop.inbox)
             since = self._scan_at if self._scan_at is not None else self._began
             self.note = diagnose(
                 self.options,
@@ -210,7 +210,8 @@ class BridgeRos2Service(Service):
             self._problem = str(error)
             self.counters["scans_without_mount"] += 1
         except (CdrError, ValueError, OverflowError) as error:
-            self._problem = str(error) if sample.topic == _row(self.options.scan_topic, newest=True) else self._problem
+            if sample.topic == _inbox_topic(self.options.scan_topic, newest=True):
+                self._problem = str(error)
             self.loop.reject(sample.key, str(error))
 
     def _on_tf(self, message: Any) -> None:
@@ -313,8 +314,8 @@ class BridgeRos2Service(Service):
         publisher.put(message, kind)
 
 
-def _row(name: str, *, newest: bool = False) -> Topic:
-    """A ROS topic as a row of the table of topics, for the inbox."""
+def _inbox_topic(name: str, *, newest: bool = False) -> Topic:
+    """A `Topic` with which the inbox queues the messages of a ROS topic."""
     return Topic(
         f"ros {name}", Stamped, "ros", 0, "newest" if newest else "all", recorded=False, multiple_publishers=True
     )

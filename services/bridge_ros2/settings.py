@@ -10,7 +10,7 @@ from pydantic import Field
 from common.errors import UserError
 from common.geometry.pose_text import POSE_TEXT, pose_of_text
 from common.messages.ros_messages import Mount
-from common.runtime.robot_settings import SeenRobotSettings
+from common.runtime.robot_settings import SelfFilterSettings
 from services.bridge_ros2.keys import NAME, Names, full_name
 
 TOPIC = rf"^$|^{NAME}$"
@@ -30,7 +30,7 @@ MAP_TOPIC = "map"
 TRANSFORM_TOLERANCE_S = 1.0  # by which the transform is stamped ahead, as in AMCL
 
 
-class BridgeRos2Settings(SeenRobotSettings):
+class BridgeRos2Settings(SelfFilterSettings):
     """Bridge to ROS 2: a robot, or Gazebo, replaces the simulator, and presage replaces AMCL. ROS is not needed here.
 
     On the robot: RMW_IMPLEMENTATION=rmw_zenoh_cpp and `ros2 run rmw_zenoh_cpp rmw_zenohd`, or zenoh-bridge-ros2dds.

@@ -30,12 +30,12 @@ Shown = Literal["idle", "navigating", "reached", "blocked", "lost", "exploring"]
 
 
 class Phase(Enum):
-    """What happens to the goal at present."""
+    """Phase of the current goal."""
 
     IDLE = auto()  # there is no goal
     NAVIGATING = auto()  # the robot drives to the goal
     BLOCKED = auto()  # an obstacle is in the way, which may go away
-    UNLOCALISED = auto()  # the belief cannot be used for navigation, or none comes
+    UNLOCALISED = auto()  # the belief cannot be used for navigation, or no beliefs arrive
     REACHED = auto()  # the robot stands at the goal
     REFUSED = auto()  # the goal cannot be reached: it is inside a wall, or in another room
 
@@ -67,7 +67,7 @@ class GoalState:
         return self.phase in {Phase.NAVIGATING, Phase.BLOCKED, Phase.UNLOCALISED}
 
     def start(self, goal: Goal, refusal: str | None) -> None:
-        """Replace the goal, and refuse the new one if ``refusal`` is a reason to."""
+        """Replace the goal. If ``refusal`` is not None, it is the reason to refuse the new one."""
         self.goal = goal
         self._enter(Phase.NAVIGATING if refusal is None else Phase.REFUSED, refusal or "")
 
@@ -77,7 +77,7 @@ class GoalState:
         self._enter(Phase.IDLE, "cancelled")
 
     def refuse(self, reason: str) -> None:
-        """The goal has turned out to be unreachable."""
+        """Refuse the goal, because it has turned out to be unreachable."""
         self._enter(Phase.REFUSED, reason)
 
     def reach(self, reason: str) -> None:
@@ -91,7 +91,7 @@ class GoalState:
             self._enter(Phase.UNLOCALISED, reason)
 
     def lose_belief(self, reason: str) -> None:
-        """No belief comes."""
+        """Beliefs no longer arrive."""
         self.lose_pose("lost", reason)
 
     def find_pose(self) -> None:

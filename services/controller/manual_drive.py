@@ -22,10 +22,10 @@ class ManualDrive:
     def __init__(self) -> None:
         self._twist = np.zeros(3)
         self._last_message_ns: int | None = None
-        self._zero_since_ns: int | None = None  # first of the latest run of messages that command zero velocity
+        self._zero_since_ns: int | None = None  # first of the latest uninterrupted messages that command zero velocity
 
     def update(self, drive: Drive, now_ns: int) -> None:
-        """Take a drive message that arrived at ``now_ns``, the stamp of the latest scan or command."""
+        """Store a drive message that arrived at ``now_ns``, the stamp of the latest scan or command."""
         self._twist = drive.twist.array()
         if self._twist.any():
             self._zero_since_ns = None

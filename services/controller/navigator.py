@@ -1,4 +1,4 @@
-"""From a belief to a command and a status: the goal, manual driving and the limits around a policy."""
+"""Turns beliefs into commands: handles the goal and manual driving, calls the policy, and applies the limits."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Navigator:
     robot: Robot = field(default_factory=Robot)
     parameters: ActionParameters = field(default_factory=ActionParameters)  # of preset `paper`
     world: World | None = None  # lets preset `paper` refuse goals inside walls; without it any goal is accepted
-    preset: Policy | None = None  # defaults to preset `paper`
+    preset: Policy | None = None  # the policy; defaults to preset `paper`
 
     def __post_init__(self) -> None:
         self.policy: Policy = self.preset or StraightLinePolicy(self.robot, self.parameters, self.world)
@@ -47,7 +47,7 @@ class Navigator:
         self._scan_points, self._scan = safety.scan_points(scan), scan
 
     def on_drive(self, drive: Drive) -> None:
-        """Take a manual velocity command, which has priority over the goal."""
+        """Store a manual velocity command, which has priority over the goal."""
         self._manual.update(drive, max(self.scan_stamp or 0, self._command.stamp_ns or 0))
 
     def on_goal(self, goal: Goal) -> None:
@@ -61,7 +61,7 @@ class Navigator:
 
     @property
     def scan_stamp(self) -> int | None:
-        """Stamp of the latest scan in ns. None before the first scan."""
+        """Stamp of the latest scan in ns; None before the first scan."""
         return None if self._scan is None else self._scan.stamp_ns
 
     def step(self, belief: Belief) -> tuple[CmdVel, Status]:
@@ -104,7 +104,7 @@ class Navigator:
         return command, self.goal_state.status(stamp_ns, None)
 
     def stop_without_belief(self, stamp_ns: int, reason: str) -> tuple[CmdVel, Status]:
-        """Zero command and its status, for when no belief came in time. Keeps the goal for when beliefs come again."""
+        """Zero command and its status, if no belief came in time. Keeps the goal, to resume it with the next belief."""
         # If every scan was answered, the simulation may be paused; otherwise the estimator is late.
         paused = self._scan is not None and self._scan.stamp_ns == self._command.stamp_ns
         command = self._command.stop(stamp_ns, paused=paused)
@@ -150,7 +150,7 @@ class Navigator:
         return self.decision.action
 
     def _turn_to_goal_heading(self, pose: Array, goal: Goal) -> Array | None:
-        """Turn (3,) in base_link towards the goal's heading. None if the heading is within tolerance or free."""
+        """Turn (3,) in base_link towards the goal's heading; None if the heading is within tolerance or free."""
         if goal.yaw_tolerance is None:
             return None
         error = float(se2.wrap(goal.pose.yaw - pose[2]))

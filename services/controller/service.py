@@ -25,7 +25,7 @@ PREDICTED_BEAMS = 61  # beams of a predicted scan
 FIELD_PERIOD_NS = 5_000_000_000  # an unchanged cost field is published again after this time
 SCAN_TIMEOUT_S = 0.2  # how long a belief waits for its scan
 PREDICTION_TIMEOUT_S = 0.3  # how long a belief waits for predictions, which are requested once a second at most
-NO_REQUEST = -1  # no number of a request
+NO_REQUEST = -1  # differs from the number of every request
 
 
 def preference_message(field: CostField, goal: Goal, stamp_ns: int) -> Preference:
@@ -82,7 +82,7 @@ class ControllerService(Service):
         world = load_world(settings.world) if settings.world else None
         if settings.preset == "geodesic" and world is not None:
             # scipy takes a third of a second to import, and preset paper does not need it.
-            from services.controller.policies.planner import GeodesicPolicy  # noqa: PLC0415
+            from services.controller.policies.planner import GeodesicPolicy
 
             keep_heading = settings.heading == "keep"
             self.geodesic = GeodesicPolicy(robot, world, keep_heading=keep_heading, epistemic=settings.epistemic)
@@ -146,7 +146,7 @@ class ControllerService(Service):
         self._wait = AwaitsScan(belief, self._belief_received_s + SCAN_TIMEOUT_S)
 
     def _process(self, belief: Belief) -> None:
-        """Answers a belief, or requests predictions first if the policy needs them."""
+        """Answer a belief, or request predictions first if the policy needs them."""
         self._wait = Answered()  # set first, so that a belief whose step raises an exception is not processed again
         began, motions = time.thread_time_ns(), None
         if self.geodesic is not None and self.navigator.goal_state.active:
@@ -160,7 +160,7 @@ class ControllerService(Service):
         self._wait = AwaitsPredictions(belief, cpu_ns)
 
     def on_reply(self, query: Query, number: int, reply: Reply) -> None:  # noqa: ARG002 - PREDICT is the only query
-        """Pass predictions on to the policy, and answer the belief that waits for them, whether they came or not."""
+        """Pass predictions to the policy, and answer the belief that waits for them, even if the request failed."""
         if number != self._latest_request or self.geodesic is None:
             return
         if isinstance(reply, PredictReply) and reply.ok:
@@ -171,7 +171,7 @@ class ControllerService(Service):
             self._step(self._wait.belief, self._wait.cpu_ns)
 
     def _step(self, belief: Belief, cpu_ns: int) -> None:
-        """Answers a belief by a command; ``cpu_ns`` is the CPU time that this thread has spent on it so far."""
+        """Answer a belief by a command; ``cpu_ns`` is the CPU time that this thread has spent on it so far."""
         self._wait = Answered()
         began = time.thread_time_ns()
         answer = self.navigator.step(belief)
@@ -189,7 +189,7 @@ class ControllerService(Service):
         self._publish_plan(command.stamp_ns)
 
     def due(self) -> float | None:
-        """Seconds until the deadline of the present wait. None before the first belief, and after a timeout."""
+        """Seconds until the deadline of the present wait; None before the first belief, and after a timeout."""
         if isinstance(self._wait, NoBelief):
             return None
         deadline_s = self._belief_received_s + self.settings.belief_timeout
@@ -198,7 +198,7 @@ class ControllerService(Service):
         return deadline_s - time.monotonic()
 
     def on_timer(self) -> None:
-        """Process the belief that has waited too long for its scan; otherwise stop, because no belief comes."""
+        """Process the belief that has waited too long for its scan; otherwise stop the robot, as no belief comes."""
         if isinstance(self._wait, AwaitsScan):
             self._process(self._wait.belief)
             return
@@ -214,7 +214,7 @@ class ControllerService(Service):
         self.publish(CMD_VEL, command)
 
     def _publish_plan(self, stamp_ns: int) -> None:
-        """Publishes path, predicted motion, obstacles and cost field for the page and for recordings."""
+        """Publish path, predicted motion, obstacles and cost field for the page and for recordings."""
         if self.geodesic is None:
             return
         decision, obstacles = self.navigator.decision, self.geodesic.obstacles.points().astype(np.float32)

@@ -7,10 +7,10 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from common.errors import UserError
-from common.runtime.robot_settings import SeenRobotSettings
+from common.runtime.robot_settings import SelfFilterSettings
 
 
-class ControllerSettings(SeenRobotSettings):
+class ControllerSettings(SelfFilterSettings):
     """Controller: turns each belief, and the current goal, into a velocity command.
 
     Examples:

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 def make(settings: EstimatorSettings) -> Service:
     """Builds the service; imports torch only here, so that --help is fast."""
     if settings.robots:
-        from services.estimator.multi_robot import FleetService  # noqa: PLC0415
+        from services.estimator.multi_robot import FleetService
 
         return FleetService(settings)
-    from services.estimator.service import EstimatorService  # noqa: PLC0415
+    from services.estimator.service import EstimatorService
 
     return EstimatorService(settings)
 

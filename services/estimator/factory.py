@@ -33,26 +33,26 @@ from services.estimator.shared.model_folder import find_folder
 
 DEFAULT_SIGMA_M = 0.02  # noise of a scanner whose scans state none
 MOUNT_TOLERANCE = 1e-3  # m and rad
-MIN_SIGMA_M = 1e-3  # used if scans state less, because no surface is known more exactly
+MIN_SIGMA_M = 1e-3  # lower limit of the noise that scans state, because no surface is known more exactly
 TYPICAL_WALL_DISTANCE_M = 5.0  # an error of the map at this distance rotates the pose by error / distance
 Name = Literal["precise", "paper", "particle-filter", "amcl-defaults"]
 
 
 @dataclass(frozen=True)
-class Choice:
-    """The user's choice of an estimator, its model and its parameters."""
+class EstimatorOptions:
+    """Selects an estimator, its model and its parameters."""
 
     world: str | World = "corridor"  # name of a shipped world, path of a file, or the world itself
     estimator: Name = "precise"
     model: str = "learned"  # for precise: learned, exact, or a file of weights
-    models: Path | None = None  # folder of weights; None for the shipped ones
-    sigma: float | None = None  # m, the scanner's noise; None: as the scans state it, or DEFAULT_SIGMA_M
+    models: Path | None = None  # folder of weights; defaults to the shipped ones
+    sigma: float | None = None  # m, the scanner's noise; defaults to what the scans state, else DEFAULT_SIGMA_M
     seed: int = 0
-    initial_pose: Array | None = None  # (3,); None if unknown (paper: the centre of the map)
+    initial_pose: Array | None = None  # (3,); None if unknown (paper then starts at the map's centre)
     descent: Descent = Descent()  # noqa: RUF009 - frozen; for paper
     generative_model: GenerativeModel | None = None  # for precise: used instead of `model`
-    likelihood: Likelihood | None = None  # for precise; None: of the weights' calibration, or of the scanner's noise
-    optimiser: Optimiser | None = None  # for precise; None: Gauss-Newton
+    likelihood: Likelihood | None = None  # for precise; defaults to the weights' calibration or the noise
+    optimiser: Optimiser | None = None  # for precise; defaults to Gauss-Newton
 
     @property
     def world_argument(self) -> str:
@@ -70,15 +70,14 @@ class Geometry:
     mount: Array  # (3,) laser in base_link
     range_max: float  # m
     sigma: float = 0.0  # m, the scanner's noise
-    sigma_relative: float = 0.0  # its part that grows with the range, as a share; both 0 if not stated
-    mount_assumed: bool = False  # neither the file nor the user states the mount
+    sigma_relative: float = 0.0  # the part that grows with the range, as a share of it; both 0 if not stated
+    mount_assumed: bool = False  # neither the scans nor the user state the mount
 
     @classmethod
     def of(cls, scanner: Scanner) -> Geometry:
         """The geometry of a scanner's scans."""
-        return cls(
-            scanner.angles(), np.array(scanner.mount), scanner.range_max, scanner.sigma, scanner.sigma_relative
-        )  # fmt: skip
+        mount = np.array(scanner.mount)
+        return cls(scanner.angles(), mount, scanner.range_max, scanner.sigma, scanner.sigma_relative)
 
     @classmethod
     def of_scan(cls, scan: Scan) -> Geometry:
@@ -114,20 +113,20 @@ class Geometry:
 Factory = Callable[[Geometry], Estimator]
 
 
-def prepare(choice: Choice) -> Factory:
+def prepare(options: EstimatorOptions) -> Factory:
     """Loads the world and the weights, and returns a factory of estimators for the geometry of the first scan.
 
     Raises UserError now, and not at the first scan, if something is missing or wrong.
     """
-    if choice.estimator not in get_args(Name):
-        raise UserError(f"no estimator {choice.estimator!r}: choose one of {', '.join(get_args(Name))}")
-    world = choice.world if isinstance(choice.world, World) else load_world(choice.world)
-    check_start(choice, world)
-    if choice.estimator == "paper":
-        return _paper(choice, world)
-    if choice.estimator == "precise":
-        return _precise(choice, world)
-    tuned = choice.estimator == "particle-filter"
+    if options.estimator not in get_args(Name):
+        raise UserError(f"no estimator {options.estimator!r}: choose one of {', '.join(get_args(Name))}")
+    world = options.world if isinstance(options.world, World) else load_world(options.world)
+    check_start(options, world)
+    if options.estimator == "paper":
+        return _paper(options, world)
+    if options.estimator == "precise":
+        return _precise(options, world)
+    tuned = options.estimator == "particle-filter"
     RayCaster(world).expect(np.zeros((1, 3)), np.zeros(1))  # compile now, so that no request has to wait
     sensor = functools.cache(functools.partial(Sensor, world))  # all filters share one field
 
@@ -135,82 +134,86 @@ def prepare(choice: Choice) -> Factory:
         settings = ParticleSettings.tuned() if tuned else ParticleSettings()
         if tuned:
             settings = replace(settings, robot_model_type="omni")  # this model also covers a differential base
-        made = ParticleFilter(world, settings, (*map(float, geometry.mount),), choice.seed, sensor=sensor(settings))  # type: ignore[arg-type]
-        made.name = choice.estimator
-        if choice.initial_pose is not None:
-            made.restart(choice.initial_pose)
-        return made
+        x, y, yaw = map(float, geometry.mount)
+        estimator = ParticleFilter(world, settings, (x, y, yaw), options.seed, sensor=sensor(settings))
+        estimator.name = options.estimator
+        if options.initial_pose is not None:
+            estimator.restart(options.initial_pose)
+        return estimator
 
     return make
 
 
-def _precise(choice: Choice, world: World) -> Factory:
-    model, places, card = load_model(choice, world)
+def _precise(options: EstimatorOptions, world: World) -> Factory:
+    model, places, card = load_model(options, world)
     calibration = card.calibration if card else None
     settings = calibration.settings() if calibration else Settings(inflation=card.inflation if card else 1.0)
     if not calibration and (error := map_error(world)):
         # Errors of neighbouring cells are correlated, so they average out neither over beams nor over scans.
         settings = replace(settings, floor_position=error, floor_heading=error / TYPICAL_WALL_DISTANCE_M)
     seeds, bounds = Seeds.at(model, places), (card.world if card else world).bounds
-    _compile(model, seeds, choice.likelihood or Likelihood())
+    _compile(model, seeds, options.likelihood or Likelihood())
 
     def make(geometry: Geometry) -> Estimator:
         if card:
             check_mount(geometry, card.scanner)
-        if choice.likelihood is not None:
-            likelihood = choice.likelihood
-        elif calibration and choice.sigma is None:
+        if options.likelihood is not None:
+            likelihood = options.likelihood
+        elif calibration and options.sigma is None:
             likelihood = calibration.likelihood
         else:
-            likelihood = geometry.likelihood(choice.sigma)
-        rng = np.random.default_rng(choice.seed)
-        made = PreciseEstimator(
-            model, seeds, geometry.mount, likelihood, settings, rng, bounds, optimiser=choice.optimiser
+            likelihood = geometry.likelihood(options.sigma)
+        rng = np.random.default_rng(options.seed)
+        estimator = PreciseEstimator(
+            model, seeds, geometry.mount, likelihood, settings, rng, bounds, optimiser=options.optimiser
         )
-        if choice.initial_pose is not None:
-            made.restart(choice.initial_pose)
-        return made
+        if options.initial_pose is not None:
+            estimator.restart(options.initial_pose)
+        return estimator
 
     return make
 
 
-def load_model(choice: Choice, world: World) -> tuple[GenerativeModel, Array, weights.FieldCard | None]:
+def load_model(options: EstimatorOptions, world: World) -> tuple[GenerativeModel, Array, weights.FieldCard | None]:
     """Returns the model, places (S, 2) m where the laser can be, and the card of a learned model, else None."""
-    if choice.generative_model is None and choice.model != "exact":
-        return weights.load(field_path(choice, world))
+    if options.generative_model is None and options.model != "exact":
+        return weights.load(field_path(options, world))
     places = world.sample_free(max(4000, int(60 * world.free_area)), np.random.default_rng(0), 0.05)
-    return choice.generative_model or RayCaster(world), thin_places(places, SEED_SPACING_M), None
+    return options.generative_model or RayCaster(world), thin_places(places, SEED_SPACING_M), None
 
 
-def field_path(choice: Choice, world: World) -> Path:
+def field_path(options: EstimatorOptions, world: World) -> Path:
     """The weights file of the learned field. Raises UserError if there is none."""
-    if choice.model == "learned":
-        return weights.find(choice.models or find_folder(world.name, "precise"), world, choice.world_argument)
-    if (path := Path(choice.model)).suffix != ".safetensors":
-        raise UserError(f"no model {choice.model!r}: give learned, exact, or a file of weights (.safetensors)")
+    if options.model == "learned":
+        return weights.find(options.models or find_folder(world.name, "precise"), world, options.world_argument)
+    if (path := Path(options.model)).suffix != ".safetensors":
+        raise UserError(f"no model {options.model!r}: give learned, exact, or a file of weights (.safetensors)")
     if not path.exists():
-        command = weights.train_command(choice.world_argument, path.parent)
+        command = weights.train_command(options.world_argument, path.parent)
         raise UserError(
             f"--model {path}: there is no such file. Train it with: {command}; or use --model exact, which needs none"
         )
     return path
 
 
-def check(choice: Choice, world: World) -> None:
-    """Raises UserError if `prepare` would, because a model is missing; it is fast, because it compiles nothing."""
-    check_start(choice, world)
-    if choice.estimator == "precise" and choice.model != "exact":
-        weights.load(field_path(choice, world))
-    elif choice.estimator == "paper":
-        _paper_weights(choice, world)
+def check(options: EstimatorOptions, world: World) -> None:
+    """Raises UserError if a model is missing, as `prepare` does, but without compiling anything."""
+    check_start(options, world)
+    if options.estimator == "precise" and options.model != "exact":
+        weights.load(field_path(options, world))
+    elif options.estimator == "paper":
+        _paper_weights(options, world)
 
 
-def check_start(choice: Choice, world: World) -> None:
-    """Raises UserError if the initial pose is off the map; it may be inside a wall, which may have been moved."""
-    if choice.initial_pose is None:
+def check_start(options: EstimatorOptions, world: World) -> None:
+    """Raises UserError if the initial pose is off the map.
+
+    A pose inside a wall is accepted, because the wall may have been moved.
+    """
+    if options.initial_pose is None:
         return
     x0, y0, x1, y1 = world.bounds
-    x, y = map(float, choice.initial_pose[:2])
+    x, y = map(float, options.initial_pose[:2])
     if not (x0 <= x <= x1 and y0 <= y <= y1):
         raise UserError(
             f"initial pose ({x:g}, {y:g}) is off the map: {world.name} goes from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g})"
@@ -241,15 +244,15 @@ def _compile(model: GenerativeModel, seeds: Seeds, likelihood: Likelihood) -> No
 
 
 @explain_missing_packages()
-def _paper(choice: Choice, world: World) -> Factory:
+def _paper(options: EstimatorOptions, world: World) -> Factory:
     # Imported only here, because torch takes a second to import and the other estimators do not need it.
-    from services.estimator.paper import weights as paper_weights  # noqa: PLC0415
-    from services.estimator.paper.beam_fitting import fit  # noqa: PLC0415
-    from services.estimator.paper.decoder import use_one_core  # noqa: PLC0415
-    from services.estimator.paper.estimator import PaperPerception  # noqa: PLC0415
+    from services.estimator.paper import weights as paper_weights
+    from services.estimator.paper.beam_fitting import fit
+    from services.estimator.paper.decoder import use_one_core
+    from services.estimator.paper.estimator import PaperPerception
 
     use_one_core()
-    folder, files, remedy = _paper_weights(choice, world)
+    folder, files, remedy = _paper_weights(options, world)
     train_command = remedy.rpartition(" --scanner")[0]
     for path in files.values():  # find damaged files now, and warm up torch for the first scan
         model, card = paper_weights.load(path)
@@ -265,22 +268,22 @@ def _paper(choice: Choice, world: World) -> Factory:
         model, card = load(paper_weights.nearest(folder, world.name, "paper", len(geometry.angles)))
         check_mount(geometry, card.scanner)
         converted = fit(card.scanner, geometry.angles, geometry.mount, f"{train_command} {_train_options(geometry)}")
-        return PaperPerception(model, card, choice.descent, choice.initial_pose, converted)
+        return PaperPerception(model, card, options.descent, options.initial_pose, converted)
 
     return make
 
 
 @explain_missing_packages()
-def _paper_weights(choice: Choice, world: World) -> tuple[Path, dict[int, Path], str]:
+def _paper_weights(options: EstimatorOptions, world: World) -> tuple[Path, dict[int, Path], str]:
     """Returns the folder, its files by number of beams, and the command that trains them.
 
     Raises UserError if there are none.
     """
-    from services.estimator.paper import weights as paper_weights  # noqa: PLC0415 - torch, as above
+    from services.estimator.paper import weights as paper_weights  # torch, as above
 
-    folder = choice.models or find_folder(world.name, "paper")
+    folder = options.models or find_folder(world.name, "paper")
     files = paper_weights.available(folder, world.name, "paper")
-    remedy = paper_weights.train_command(choice.world_argument, "paper")
+    remedy = paper_weights.train_command(options.world_argument, "paper")
     if not files:
         raise UserError(
             f"no weights of preset paper for world {world.name!r} in {folder}; train them with: {remedy}; "
@@ -292,14 +295,9 @@ def _paper_weights(choice: Choice, world: World) -> tuple[Path, dict[int, Path],
 def _train_options(geometry: Geometry) -> str:
     """Options of `presage train` for the scanner of these scans."""
     beams, (x, y, yaw) = len(geometry.angles), geometry.mount
-    known = (
+    matching = (
         name
-        for name, one in SCANNERS.items()
-        if np.allclose(one.with_beams(beams).angles(), geometry.angles, atol=1e-3)
+        for name, scanner in SCANNERS.items()
+        if np.allclose(scanner.with_beams(beams).angles(), geometry.angles, atol=1e-3)
     )
-    return f"--scanner {next(known, 'FILE')} --beams {beams} --mount {x:g},{y:g},{np.rad2deg(yaw):g}"
-
-
-def default_geometry(beams: int | None = None) -> Geometry:
-    """The geometry of the default scanner, with ``beams`` beams if given."""
-    return Geometry.of(SCANNERS["tim571"].with_beams(beams))
+    return f"--scanner {next(matching, 'FILE')} --beams {beams} --mount {x:g},{y:g},{np.rad2deg(yaw):g}"

@@ -1,4 +1,4 @@
-"""Which map and weights an estimator uses, for recordings."""
+"""Describes the map and the weights that an estimator uses, for recordings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from common.errors import UserError
 from common.geometry.world import World, load_world
 from common.messages.requests import ModelReply
-from services.estimator.factory import Choice, field_path
+from services.estimator.factory import EstimatorOptions, field_path
 from services.estimator.precise.learning import weights as precise_weights
 from services.estimator.shared.model_folder import find_folder
 
@@ -47,26 +47,26 @@ class ModelInUse:
         )
 
 
-def model_in_use(choice: Choice, beams: int | None) -> ModelInUse:
-    """Describes the model of a choice, for scans of ``beams`` beams, or None before the first scan.
+def model_in_use(options: EstimatorOptions, beams: int | None) -> ModelInUse:
+    """Describes the model that the options select, for scans of ``beams`` beams, or None before the first scan.
 
     Raises UserError if the model is unknown.
     """
-    world = choice.world if isinstance(choice.world, World) else load_world(choice.world)
-    if choice.estimator == "precise" and choice.model != "exact":
-        path = field_path(choice, world)
-        if choice.model != "learned":  # any file; its map is the world in its card
+    world = options.world if isinstance(options.world, World) else load_world(options.world)
+    if options.estimator == "precise" and options.model != "exact":
+        path = field_path(options, world)
+        if options.model != "learned":  # any file; its map is the world in its card
             world = World.model_validate(json.loads(_card(path))["world"])
-        return _learned(choice.estimator, world, path, precise_weights.path_of(Path(), world.name).name)
-    if choice.estimator == "paper":
+        return _learned(options.estimator, world, path, precise_weights.path_of(Path(), world.name).name)
+    if options.estimator == "paper":
         if beams is None:
             raise UserError("no scan has come yet: how many beams, and so which weights, is not known")
         # Imported only here, because torch takes a second to import and the other estimators do not need it.
-        from services.estimator.paper import weights as paper_weights  # noqa: PLC0415
+        from services.estimator.paper import weights as paper_weights
 
-        path = paper_weights.nearest(choice.models or find_folder(world.name, "paper"), world.name, "paper", beams)
-        return _learned(choice.estimator, world, path, path.name)
-    return ModelInUse(choice.estimator, world)
+        path = paper_weights.nearest(options.models or find_folder(world.name, "paper"), world.name, "paper", beams)
+        return _learned(options.estimator, world, path, path.name)
+    return ModelInUse(options.estimator, world)
 
 
 def _learned(estimator: str, world: World, path: Path, file: str) -> ModelInUse:

@@ -27,11 +27,13 @@ if TYPE_CHECKING:
     from common.messages.definitions import Scan
     from services.estimator.shared.interface import Estimator, Observation, Posterior
 
-DISCOVERY_PERIOD_S = 0.5  # between two checks which robots have appeared or gone
-HEALTH_CHECK_PERIOD_S = 0.05  # between two checks whose health message is due
-MAX_MESSAGES_PER_TURN = 20  # of one robot, before the next one's turn
+DISCOVERY_PERIOD_S = 0.5  # between two checks for new and absent robots
+HEALTH_CHECK_PERIOD_S = 0.05  # between two checks for due health messages
+MAX_MESSAGES_PER_TURN = 20  # handled for one robot before the next one
 INBOX_MESSAGES, INBOX_BYTES = 1000, 1 << 24  # of one robot
-THREAD_SWITCH_INTERVAL_S = 5e-4  # a tenth of Python's, because tracking waits so long for the thread that searches
+THREAD_SWITCH_INTERVAL_S = (
+    5e-4  # a tenth of Python's default, because tracking waits up to this time for the search thread
+)
 StartSearch = Callable[[Callable[[], "Posterior"]], "Future[Posterior]"]
 
 
@@ -47,7 +49,7 @@ class FleetRobot(EstimatorService):
         """
         super().__init__(settings.model_copy(update={"robot": robot, "robots": ""}), models)
         self.robot, self.named = robot, named
-        self.active = False  # while it is not, another process serves this robot, and this one stands by
+        self.active = False  # if false, another process serves this robot, and this one stands by
         self.last_seen = time.monotonic()
         self.scans = 0  # received when it was last seen
         self.log = logger(self.name).bind(robot=robot)
@@ -66,7 +68,7 @@ class FleetRobot(EstimatorService):
             self.search, self._searched_scan = self._start_search(estimator.search), scan
 
     def publish_search(self) -> None:
-        """Publishes the result of the search, if there is one, and waits for it. Raises what the search raised."""
+        """Waits for the search, if there is one, and publishes its result. Raises the exception of a failed search."""
         search, self.search = self.search, None
         if search is not None and self._searched_scan is not None and self.estimator is not None:
             self.publish_posterior(self._searched_scan, search.result(), self.estimator.name)

@@ -22,7 +22,7 @@ def answer_prediction(estimator: Estimator, request: PredictRequest, angles: Arr
 
     Raises UserError if the request is too large, or the model cannot predict the poses.
     """
-    chosen = angles[evenly(len(angles), request.beams)]
+    chosen = angles[evenly_spaced_indices(len(angles), request.beams)]
     count = len(request.poses)
     if count > MAX_POSES:
         raise UserError(f"{count} poses are too many to predict at once: ask for {MAX_POSES} at most")
@@ -41,13 +41,13 @@ def answer_prediction(estimator: Estimator, request: PredictRequest, angles: Arr
     )
 
 
-def evenly(count: int, wanted: int | None) -> np.ndarray[tuple[int, ...], np.dtype[np.intp]]:
-    """Indices (wanted,) out of ``count`` beams, evenly spaced, including the first and the last; None for all.
+def evenly_spaced_indices(count: int, selected: int | None) -> np.ndarray[tuple[int, ...], np.dtype[np.intp]]:
+    """Indices (selected,) of evenly spaced beams out of ``count``, including the first and the last.
 
-    Raises UserError if there are fewer beams.
+    If ``selected`` is None, all indices. Raises UserError if there are fewer beams.
     """
-    if wanted is None:
+    if selected is None:
         return np.arange(count)
-    if wanted > count:
-        raise UserError(f"the scanner has {count} beams, not {wanted}: ask for that many at most")
-    return np.round(np.linspace(0, count - 1, wanted)).astype(np.intp)
+    if selected > count:
+        raise UserError(f"the scanner has {count} beams, not {selected}: ask for that many at most")
+    return np.round(np.linspace(0, count - 1, selected)).astype(np.intp)

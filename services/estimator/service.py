@@ -26,7 +26,7 @@ from common.messages.topics import (
 )
 from common.robot.ranges import ranges_for_localisation
 from common.runtime.service import Service
-from services.estimator.factory import Choice, Factory, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, Factory, Geometry, prepare
 from services.estimator.model_card import ModelInUse, model_in_use
 from services.estimator.paper.perception import Descent
 from services.estimator.prediction_query import answer_prediction
@@ -34,13 +34,18 @@ from services.estimator.settings import EstimatorSettings
 from services.estimator.shared.interface import Estimator, Observation, Posterior
 
 
-def choice_of(settings: EstimatorSettings) -> Choice:
-    """The estimator that the settings select."""
-    return Choice(
-        settings.world, settings.estimator, settings.model, settings.models, settings.sigma, settings.seed,
+def estimator_options(settings: EstimatorSettings) -> EstimatorOptions:
+    """Converts the settings to options of the factory."""
+    return EstimatorOptions(
+        world=settings.world,
+        estimator=settings.estimator,
+        model=settings.model,
+        models=settings.models,
+        sigma=settings.sigma,
+        seed=settings.seed,
         initial_pose=pose_of_text(settings.initial_pose, "--initial-pose") if settings.initial_pose else None,
         descent=Descent(alpha=settings.alpha, iterations=settings.iterations),
-    )  # fmt: skip
+    )
 
 
 class Models:
@@ -48,15 +53,15 @@ class Models:
 
     def __init__(self, settings: EstimatorSettings) -> None:
         """Raises UserError if there are no weights for the world."""
-        self.choice = choice_of(settings)
-        self.factory: Factory = prepare(self.choice)
+        self.options = estimator_options(settings)
+        self.factory: Factory = prepare(self.options)
         self._described: dict[int | None, ModelInUse | str] = {}
 
-    def in_use(self, beams: int | None) -> ModelInUse | str:
-        """Describes the model for scans of ``beams`` beams, as first loaded; if unknown, returns the reason as text."""
+    def describe(self, beams: int | None) -> ModelInUse | str:
+        """Describes the model for scans of ``beams`` beams, or returns the reason why it is unknown. Cached."""
         if beams not in self._described:
             try:
-                self._described[beams] = model_in_use(self.choice, beams)
+                self._described[beams] = model_in_use(self.options, beams)
             except UserError as error:
                 self._described[beams] = str(error)
         return self._described[beams]
@@ -73,13 +78,13 @@ class EstimatorService(Service):
     queries: ClassVar[tuple[Query, ...]] = (LOCALISE, MODEL, PREDICT)
 
     def __init__(self, settings: EstimatorSettings, models: Models | None = None) -> None:
-        """``models`` are given if several robots share them, else they are loaded in `open`.
+        """``models`` are shared by several robots; by default they are loaded in `open`.
 
-        The estimator is built at the first scan, for its geometry.
+        The estimator is built at the first scan, for the geometry of that scan.
         """
         super().__init__(settings)
-        more = {"odometry": (ODOM,), "command": (CMD_VEL,)}.get(settings.prior, ())
-        self.inputs = (SCAN, GOAL, *more)  # type: ignore[misc]
+        motion_inputs = {"odometry": (ODOM,), "command": (CMD_VEL,)}.get(settings.prior, ())
+        self.inputs = (SCAN, GOAL, *motion_inputs)  # type: ignore[misc]
         self.models = models
         self.geometry: Geometry | None = None
         self.estimator: Estimator | None = None
@@ -88,7 +93,7 @@ class EstimatorService(Service):
         self.odom: Odom | None = None
         self.command: CmdVel | None = None
         self.waiting_scan: Scan | None = None  # a scan that waits for the odometry of its stamp
-        self.last: tuple[int, Belief, Prediction] | None = None
+        self.last: tuple[int, Belief, Prediction] | None = None  # stamp in ns and results of the latest scan
 
     def open(self) -> None:
         """Loads the models, so that missing weights are an error now and not at the first scan."""
@@ -96,7 +101,7 @@ class EstimatorService(Service):
         if self.models is None:
             self.log.info("loading the world", world=settings.world)
             self.models = Models(settings)
-        self.model = self.models.in_use(None)
+        self.model = self.models.describe(None)
         self.log.info("estimator", name=settings.estimator, world=settings.world, prior=settings.prior)
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
@@ -110,7 +115,7 @@ class EstimatorService(Service):
             if self.waiting_scan is not None and message.stamp_ns >= self.waiting_scan.stamp_ns:
                 self._update_waiting()
         elif isinstance(message, Scan):
-            self._update_waiting()  # its odometry has not come in time
+            self._update_waiting()  # without its odometry, which did not come in time
             if self.settings.prior == "odometry" and (self.odom is None or self.odom.stamp_ns < message.stamp_ns):
                 self.waiting_scan = message
             else:
@@ -157,7 +162,7 @@ class EstimatorService(Service):
         self.publish(BELIEF, belief)
 
     def _estimator_for(self, scan: Scan) -> Estimator | None:
-        """Returns the estimator, a new one if the scanner has changed.
+        """Returns the estimator for a scan, and builds a new one if the scanner has changed.
 
         If there is no model for the scanner, logs the reason, puts it into the health note, and returns None.
         """
@@ -166,12 +171,12 @@ class EstimatorService(Service):
         try:
             paper = self.settings.estimator == "paper"
             if self.geometry is None or not self.geometry.same(geometry, bound_to_beams=paper):
-                made = self.models.factory(geometry)
+                estimator = self.models.factory(geometry)
                 if self.geometry is not None:
                     self.log.warning("the scanner or its mount has changed: localisation starts again")
-                self.estimator, self.geometry = made, geometry
+                self.estimator, self.geometry = estimator, geometry
                 if paper:  # its weights depend on the number of beams
-                    self.model = self.models.in_use(len(geometry.angles))
+                    self.model = self.models.describe(len(geometry.angles))
         except UserError as error:
             self.counters["unfit_scans"] += 1
             if self.note != str(error):

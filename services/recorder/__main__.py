@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 def make(settings: RecorderSettings) -> Service:
     """Returns the service. Imports mcap only here, so that --help answers at once."""
-    from services.recorder.service import RecorderService  # noqa: PLC0415
+    from services.recorder.service import RecorderService
 
     return RecorderService(settings)
 

@@ -23,7 +23,7 @@ from common.messages.wire import DecodeError
 from common.robot.base import Robot
 from common.robot.scanner import Scanner
 from services.recorder.files.chunks import MAGIC, records_of
-from services.recorder.files.index import in_order, summary_of
+from services.recorder.files.index import messages_in_order, summary_of
 from services.recorder.files.writer import PROFILE
 
 
@@ -157,7 +157,7 @@ class Recording:
     ) -> Iterator[tuple[Channel, McapMessage]]:
         try:
             if (summary := SeekingReader(stream).get_summary()) is not None:
-                yield from in_order(stream, summary, keys, start_ns, end_ns)
+                yield from messages_in_order(stream, summary, keys, start_ns, end_ns)
         except OSError:
             raise
         except Exception as error:  # noqa: BLE001 - each decompressor raises its own error types

@@ -89,11 +89,6 @@ class OpenRecording:
         return {"counters": as_metadata(self._counts())}
 
 
-def open_writer(options: RecorderSettings) -> RecordingWriter:
-    """Opens one file, named as in `parts_of`."""
-    return parts_of(options)(1)
-
-
 def parts_of(options: RecorderSettings, *, numbered: bool = False) -> Callable[[int], RecordingWriter]:
     """Returns a function that opens part k: NAME.mcap, or NAME-001.mcap, NAME-002.mcap, ... if the recording is split.
 

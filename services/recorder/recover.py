@@ -54,11 +54,11 @@ class Recovered:
     skipped: int = 0  # messages in intact chunks whose channel declaration is lost
     damages: list[Damage] = field(default_factory=list)
     altered: bool = False  # no chunk or length is damaged, but the file's checksum is wrong
-    whole: bool = False  # the source file was finished: only the damaged parts are missing
+    source_finished: bool = False  # the source file was finished: only the damaged parts are missing
     ledger: Ledger = field(default_factory=Ledger)
 
     def lines(self) -> list[str]:
-        """Report for the user."""
+        """Lines of a report for the user."""
         seconds = ((self.end_ns or 0) - (self.start_ns or 0)) * 1e-9
         lines = [f"{self.path}: {self.messages.total()} messages over {seconds:.1f} s, from {self.chunks} chunks"]
         for damage in self.damages:
@@ -68,7 +68,7 @@ class Recovered:
             lines.append(f"missing: {self.skipped} messages whose channels are declared only in the damaged part")
         if self.altered:
             lines.append("altered: metadata or indexes, outside of the chunks; the file's checksum does not show where")
-        if not self.whole:
+        if not self.source_finished:
             lines.append("missing: the end of the file; messages after the last flush were never written")
         lines += [
             f"missing: {numbers.missing} messages of {key} by their sequence numbers, in {numbers.gaps} gaps"
@@ -228,7 +228,7 @@ def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[list[McapRecord],
             continue
         opcode, length = PREFIX.unpack_from(data, offset)
         if opcode == Opcode.DATA_END:
-            found.whole = True
+            found.source_finished = True
             found.altered = not found.damages and not _is_checksum(data, offset, records[0])
             return
         offset += PREFIX.size + length

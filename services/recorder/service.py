@@ -1,4 +1,4 @@
-"""The process: records all topics."""
+"""The recorder service: writes the messages of all topics to files."""
 
 from __future__ import annotations
 
@@ -8,17 +8,15 @@ from typing import ClassVar
 
 from common.bus.inbox import OTHERS, Sample
 from common.errors import UserError
-from common.messages.requests import RecordReply, RecordRequest, Reply, Request, WorldReply
-from common.messages.topics import RECORDING, TOPICS, WORLD, Query, Topic
+from common.messages.requests import RecordReply, RecordRequest, Reply, Request
+from common.messages.topics import RECORDING, TOPICS, Query, Topic
 from common.runtime.service import Service
 from services.recorder.files.message_counts import MAX_COUNT
-from services.recorder.files.parts import PartsWriter
-from services.recorder.files.writer import RecordingWriter
-from services.recorder.recording import OpenRecording, warn_about_unfinished, write_description
+from services.recorder.recording import OpenRecording, warn_about_unfinished
 from services.recorder.session_description import DescriptionCollector, DescriptionReply
 from services.recorder.settings import RecorderSettings
 
-LINK_WARNING_DELAY_S = 3.0  # the recorder may start before the router, but then warns that it is waiting
+LINK_WARNING_DELAY_S = 3.0  # the recorder may start before the router, but warns if this lasts longer
 INBOX_CAPACITY = 20_000  # messages that wait to be written
 
 
@@ -36,7 +34,7 @@ class RecorderService(Service):
         if not remote:
             self.queries = ()  # type: ignore[misc]
         self.options = settings
-        self.inputs = chosen_topics(settings.topics)  # type: ignore[misc]
+        self.inputs = parse_topics(settings.topics)  # type: ignore[misc]
         self.recording: OpenRecording | None = None
         self.describer: DescriptionCollector | None = None
         # By service and type: the last description of each.
@@ -64,7 +62,7 @@ class RecorderService(Service):
         """Writes the sample if a recording is open."""
         if self.recording is None:
             return
-        if self.loop.inbox.counted_as(sample.key) != sample.key:  # more keys than a recording may have
+        if self.loop.inbox.counted_as(sample.key) != sample.key:  # there are already MAX_KEYS other keys
             self.loop.inbox.dropped[OTHERS] += 1
             self.counters["turned_away"] += 1
             return
@@ -200,15 +198,10 @@ class RecorderService(Service):
                 self.recording.describe(service, answer)
 
 
-def chosen_topics(names: str) -> tuple[Topic, ...]:
+def parse_topics(names: str) -> tuple[Topic, ...]:
     """Topics of the comma-separated names. Defaults to all recorded topics; raises UserError for an unknown name."""
     recorded = {topic.name: topic for topic in TOPICS if topic.recorded}
     wanted = [part.strip() for part in names.split(",") if part.strip()]
     if unknown := [name for name in wanted if name not in recorded]:
         raise UserError(f"no topic {', '.join(unknown)}: choose from {', '.join(recorded)}")
     return tuple(recorded[name] for name in dict.fromkeys(wanted)) if wanted else tuple(recorded.values())
-
-
-def write_world(writer: RecordingWriter | PartsWriter, reply: WorldReply) -> None:
-    """Writes the world as an attachment that `load_world` reads, and scanner and robot as JSON metadata."""
-    write_description(writer, WORLD.server, reply)

@@ -1,7 +1,7 @@
 """Walking people as moving discs.
 
 The model. A person is a disc that walks at a given speed along a shortest path over free space (`WalkableGrid`) to a
-random place, then to the next one. A person knows the positions of everyone at any time, also behind walls. The rules:
+random place, then to the next one. A person always knows the positions of all others, also behind walls. The rules:
 
 - A person takes no step that brings them closer to another person than ``PERSON_GAP_M`` between the two bodies.
 - A person takes no step towards the robot, or towards the segment that it covers within ``ROBOT_FORESIGHT_S`` at its
@@ -16,7 +16,7 @@ each other for ever: each waits for a random time, and a jam ends with the first
 Limits. People start and stop within one step, do not talk, sit or form groups, and do not swerve around a person who
 comes towards them: they stop first. The robot's motion is predicted as straight, so a robot in a curve may come closer.
 A robot that drives backwards without seeing is trusted as much as one that sees. A passage narrower than the body,
-margins and the spacing of `WalkableGrid` together is closed to people, and no one starts in an area of less than one
+margins and the spacing of `WalkableGrid` together is closed to people, and no person starts in an area of less than one
 square metre.
 """
 
@@ -141,7 +141,7 @@ class People:
         return _Walk(np.stack([place, place]), max_wait=float(self._rng.uniform(*WAIT_RANGE_S)))
 
     def _start_walk(self, number: int, robot: Array | None) -> _Walk:
-        """Starts a new walk, if there is a path, and returns the present one.
+        """Start a new walk if there is a path; returns the walk in effect.
 
         With ``robot`` (2,) the path leads around all people and the robot.
         """

@@ -92,11 +92,11 @@ class PybulletPhysics:
             pybullet.resetBasePositionAndOrientation(body, [x, y, 0.0], [0, 0, 0, 1], physicsClientId=self.client)
 
     def _add_ring(self, name: str, ring: Array) -> None:
-        """Adds walls along a closed ring (V, 2) m."""
+        """Add walls along a closed ring (V, 2) m."""
         self.shapes[name] = self._body(self._shape(ring))
 
     def _add_walls(self, segments: Array) -> None:
-        """Adds walls along segments (S, 4) x0, y0, x1, y1 m, as a few bodies of walls that are near each other."""
+        """Add walls along segments (S, 4) x0, y0, x1, y1 m, as a few bodies of walls that are near each other."""
         pieces = _split_ends(segments)
         tile = np.floor((pieces[:, :2] + pieces[:, 2:]) / 2 / TILE_M)
         pieces = pieces[np.lexsort((tile[:, 0], tile[:, 1]))]

@@ -47,7 +47,7 @@ from services.simulator.settings import SimulatorSettings
 from services.simulator.simulation import Setup, Simulation
 
 MAX_SAMPLE_RANGES = 4_000_000  # in one reply, 16 MB
-MAX_LAG_S = 1.0  # farther behind real time, the lost time is not caught up
+MAX_LAG_S = 1.0  # a simulation farther behind real time does not catch up
 
 
 class SimulatorService(Service):
@@ -69,7 +69,7 @@ class SimulatorService(Service):
         super().__init__(settings)
         self.paused = False
         self.speed = 1.0  # simulated time over wall time, in pace realtime
-        # The measurements at the present simulated time. None before the first ones, and after a reset.
+        # The measurements at the present simulated time; None before the first ones, and after a reset.
         self._published: tuple[Stamped, Stamped, Stamped] | None = None
         self._next_step_s = 0.0  # time.monotonic() of the next step; in lockstep, of publishing the same scan again
         self._alive: set[str] = set()  # services, updated from zenoh's thread
@@ -119,7 +119,7 @@ class SimulatorService(Service):
         self._update_clock_factor()
 
     def _update_clock_factor(self) -> None:
-        """Makes the command timeout longer if simulated time runs faster than the controller's clock.
+        """Make the command timeout longer if simulated time runs faster than the controller's clock.
 
         At pace fast, the timeout is as long as the age up to which commands are accepted.
         """
@@ -166,7 +166,7 @@ class SimulatorService(Service):
             self._observe()
 
     def on_message(self, topic: Topic, message: Stamped) -> None:  # noqa: ARG002
-        """Take a command. In lockstep, time advances if it answers the present scan."""
+        """Store a command. In lockstep, time advances if it answers the present scan."""
         if not isinstance(message, CmdVel):
             return
         if self.lockstep and message.stamp_ns != self.simulation.stamp_ns:
@@ -188,7 +188,7 @@ class SimulatorService(Service):
         self._publish()
 
     def _publish(self) -> None:
-        """Publishes odometry and truth before the scan, so that they are there when a service receives the scan."""
+        """Publish odometry and truth before the scan, so that services have them when the scan arrives."""
         assert self._published is not None  # noqa: S101 - set by all callers
         for topic, message in zip((ODOM, TRUTH, SCAN), self._published, strict=True):
             self.publish(topic, message)
@@ -233,14 +233,14 @@ class SimulatorService(Service):
         self._next_step_s = time.monotonic()
 
     def _update_note(self) -> None:
-        """Sets the note shown in health: whether and how fast time runs."""
+        """Set the note shown in health: whether and how fast time runs."""
         waits = f"waits for {', '.join(sorted(self._required_services))}" if self._required_services else ""
         speed = f"runs at {self.speed:g} x real time" if self.speed != 1 else ""
         self.note = "paused" if self.paused else waits or speed
         self.idle = self.paused or bool(waits)
 
     def _step(self) -> Reply:
-        """Advances by one scan while paused. In lockstep the present scan must have its command first."""
+        """Advance by one scan while paused. In lockstep the present scan must have its command first."""
         if not self.paused:
             return Reply(ok=False, reason="time runs: pause first, then step")
         if self._required_services:
@@ -255,7 +255,7 @@ class SimulatorService(Service):
         return Reply()
 
     def _set_speed(self, factor: float) -> Reply:
-        """Sets the speed relative to real time."""
+        """Set the speed relative to real time."""
         if self.settings.pace != "realtime":
             reason = "each scan waits for its command" if self.lockstep else "it goes as fast as it can"
             return Reply(ok=False, reason=f"the pace is {self.settings.pace}: {reason}; a speed needs --pace realtime")

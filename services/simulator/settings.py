@@ -90,7 +90,7 @@ class SimulatorSettings(RobotSettings):
         return {name.strip() for name in text.split(",") if name.strip()}
 
     def start_pose(self) -> tuple[float, float, float] | None:
-        """Start in m, m and rad. None if the world's start is to be used."""
+        """Start x m, y m, yaw rad; None if the world's start is to be used."""
         if not self.start:
             return None
         x, y, yaw = map(float, pose_of_text(self.start, "--start"))

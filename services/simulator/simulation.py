@@ -57,7 +57,7 @@ class Simulation:
         self.people: People | None = None
         if setup.people:
             # scipy takes half a second to import, and a world without people does not need it.
-            from services.simulator.people import People  # noqa: PLC0415
+            from services.simulator.people import People
 
             people_rng = np.random.default_rng(people_seed)
             self.people = People(self.world, setup.people, setup.people_speed, people_rng, pose[:2], robot.radius)
@@ -73,7 +73,7 @@ class Simulation:
         self._velocity = np.zeros(3)  # set at the wheels, within the acceleration limits
         self._command: tuple[int, Array] | None = None  # stamp and velocity of the latest command
         self._last_command_step = 0  # value of `steps` when a command with a new stamp last arrived
-        # How much faster than a controller's clock time may pass here; the command timeout is longer by this factor.
+        # How much faster simulated time may pass than the controller's clock; multiplies the command timeout.
         self.clock_factor = 1.0
         self._contact = self._stopped = False
         self._scan_points = np.zeros((0, 2))  # m in base_link
@@ -98,7 +98,7 @@ class Simulation:
         return self._command is not None and self._command[0] == self.stamp_ns
 
     def command(self, stamp_ns: int, twist: Twist) -> bool:
-        """Take a command. Returns False if its stamp is in the future, too old, or older than the latest command's."""
+        """Store a command. Returns False if its stamp is in the future, too old, or older than the latest command's."""
         age_ns, latest_ns = self.stamp_ns - stamp_ns, -1 if self._command is None else self._command[0]
         if age_ns < 0 or age_ns > self.setup.robot.command_age * 1e9 or stamp_ns < latest_ns:
             return False
@@ -122,7 +122,7 @@ class Simulation:
         self.steps += 1
 
     def _move_people(self, pose: Array) -> None:
-        """Moves the people by one scan period; the robot is at ``pose`` (3,)."""
+        """Move the people by one scan period; the robot is at ``pose`` (3,)."""
         if self.people is not None:
             velocity = se2.rotate(float(pose[2]), self.physics.twist()[:2])
             self.people.step(self.period_ns * 1e-9, pose[:2], velocity)
@@ -135,8 +135,8 @@ class Simulation:
             return np.zeros(3)
         if not self.setup.obstacle_stop:
             return self._command[1]
-        # Each period ends with a velocity from which the robot can brake without contact. If nothing else is left, it
-        # does so.
+        # Each period ends with a velocity from which the robot can brake without contact. If no other velocity does, it
+        # brakes.
         target, self._stopped = safety.limit_velocity(
             self._command[1], self._scan_points, self.setup.robot, self._velocity, self.period_ns * 1e-9
         )
@@ -146,7 +146,7 @@ class Simulation:
         """Measurements at the present time. Each call draws new noise for the scan."""
         pose, twist, scanner = self.physics.pose(), self.physics.twist(), self.setup.scanner
         exact = self._cast_rays(pose[None])[0]
-        ranges = scanner.limit(scanner.noisy(exact, self._noise))
+        ranges = scanner.limit(scanner.add_noise(exact, self._noise))
         velocity = Twist(vx=float(twist[0]), vy=float(twist[1]), wz=float(twist[2]))
         odometer = self.odometer
         odom = Odom(
@@ -209,11 +209,11 @@ class Simulation:
         ]
         ranges = np.concatenate(blocks) if blocks else np.zeros((0, scanner.beams))
         if noise_seed is not None:
-            ranges = scanner.noisy(ranges, np.random.default_rng(noise_seed))
+            ranges = scanner.add_noise(ranges, np.random.default_rng(noise_seed))
         return scanner.limit(ranges)
 
     def placement_error(self, pose: Array) -> str | None:
-        """Why the robot cannot stand at a pose (3,). None if it can."""
+        """The reason why the robot cannot stand at a pose (3,), or None if it can."""
         return self.world.placement_error(pose, self.setup.robot.radius)
 
     def teleport(self, pose: Array) -> None:
@@ -272,10 +272,10 @@ class Simulation:
 def _create_physics(engine: Engine, world: World, robot: Robot, pose: Array) -> Physics:
     """Build the boundary or the map of ``world`` without its furniture, and put the robot at ``pose`` (3,)."""
     if engine == "kinematic":
-        from services.simulator.kinematics import Kinematics  # noqa: PLC0415 - compiles its rays
+        from services.simulator.kinematics import Kinematics  # compiles its rays
 
         return Kinematics(world, robot, pose)
-    from services.simulator.pybullet_physics import PybulletPhysics  # noqa: PLC0415 - has no wheels on some platforms
+    from services.simulator.pybullet_physics import PybulletPhysics  # has no wheels on some platforms
 
     return PybulletPhysics(world, robot, pose)
 

@@ -68,7 +68,7 @@ class WalkableGrid:
         return self._first_node(place, self.nodes, NO_DISCS) is not None
 
     def random_path(self, place: Array, rng: np.random.Generator, blocked: Array = NO_DISCS) -> Array | None:
-        """Path (W, 2) m, W >= 2, from ``place`` (2,) m to a random node that can be reached. None if there is no path.
+        """Path (W, 2) m, W >= 2, from ``place`` (2,) m to a random node that can be reached; None if there is no path.
 
         The path stays out of the discs ``blocked`` (M, 3: x, y, radius, in m). If it begins inside a disc, it comes no
         closer to its centre.
@@ -90,7 +90,7 @@ class WalkableGrid:
         return self._shorten(place, nodes[reversed_path[::-1]], blocked)
 
     def _first_node(self, place: Array, nodes: Array, blocked: Array) -> int | None:
-        """Index of the nearest node to which a straight line from ``place`` is clear. None if there is none."""
+        """Index of the nearest node to which a straight line from ``place`` is clear; None if there is none."""
         distance = np.hypot(*(nodes - place).T)
         near = np.argsort(distance, kind="stable")[:MAX_START_CANDIDATES]
         visible = near[self._clear_lines(place, nodes[near], blocked)]

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 def make(settings: ViewerSettings) -> Service:
     """Returns the service. Imports the web server only here, so that --help answers at once."""
-    from services.viewer.service import ViewerService  # noqa: PLC0415
+    from services.viewer.service import ViewerService
 
     return ViewerService(settings)
 

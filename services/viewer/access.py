@@ -1,4 +1,4 @@
-"""Which requests may connect: host, origin, token."""
+"""Decides which requests may connect, by host, origin and token."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def known_host(host: str | None, names: Collection[str]) -> bool:
 
 
 def token_of(cookie: str | None, query: str) -> str:
-    """The visitor's token, from the query string or else from the cookie. Empty if there is none."""
+    """The visitor's token, from the query string or else from the cookie; empty if there is none."""
     given = parse_qs(query).get("token")
     if given:
         return given[0]

@@ -48,7 +48,7 @@ from services.viewer.state.roster import Roster
 
 ANSWER_TIMEOUT_S = 3.0
 YAW_TOLERANCE_RAD = 0.15  # for goals with a heading
-SUBSCRIBER_TIMEOUT_S = 2.0  # wait for the subscriber, because a message before that is lost
+SUBSCRIBER_TIMEOUT_S = 2.0  # to wait for a subscriber, because messages sent before it exists are lost
 CLOCK_QUERIES = {"pause": PAUSE, "resume": RESUME, "step": STEP}
 CLOCK_RESULTS = {"pause": "paused", "resume": "running", "step": "one scan further"}
 R = TypeVar("R", bound=Reply)
@@ -75,7 +75,7 @@ class Control:
     """Carries out actions on robots."""
 
     def __init__(self, bus: Bus, roster: Roster, lookup: RobotLookup, connect: str = "") -> None:
-        """``connect``: endpoints for the advice how to start a missing service; empty if they are the default."""
+        """``connect`` are the endpoints shown in the command that starts a missing service; empty for the default."""
         self._bus, self._roster, self._lookup, self._connect = bus, roster, lookup, connect
         self._numbers: defaultdict[str, Iterator[int]] = defaultdict(itertools.count)  # of drive messages, by robot
         self._handlers: dict[type[requests.Action], Callable[[str, Any], ActionResult]] = {
@@ -101,7 +101,7 @@ class Control:
             return ActionResult(ok=False, reason=str(error))
 
     def ask(self, robot: str, query: Query, request: Request, reply: type[R]) -> R:
-        """A service's answer. Raises UserError if the service is not running, does not answer or refuses."""
+        """Returns a service's answer. Raises UserError if the service is not running, does not answer or refuses."""
         self._check_running(robot, query.server)
         answer = self._bus.ask(query, request, reply, ANSWER_TIMEOUT_S, robot=robot)
         if not answer.ok:
@@ -109,7 +109,7 @@ class Control:
         return answer
 
     def query(self, robot: str, query: Query, request: Request, reply: type[R]) -> R:
-        """The answer of any service, which may be a refusal. Raises UserError if none answers."""
+        """Returns the answer of any service, which may be a refusal. Raises UserError if none answers."""
         return self._bus.ask(query, request, reply, ANSWER_TIMEOUT_S, robot=robot)
 
     def _check_running(self, robot: str, service: str) -> None:

@@ -1,4 +1,4 @@
-"""Opens a recording as a robot of its own."""
+"""Opens a recording and replays it as a separate robot."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Playback:
 
     @property
     def name(self) -> str:
-        """File name of the open recording. Empty if none is open."""
+        """File name of the open recording; empty if none is open."""
         child = self._child
         return child.name if child is not None else ""
 
@@ -72,8 +72,8 @@ class Playback:
             started_or_failed = lambda: alive() or self._leaving or child.process.poll() is not None  # noqa: E731
             if wait_until(started_or_failed, START_TIMEOUT_S) and alive():
                 return
-            why = self._end() or f"it did not start within {START_TIMEOUT_S:g} s"
-        raise UserError(f"{name} cannot be played: {why}")
+            reason = self._end() or f"it did not start within {START_TIMEOUT_S:g} s"
+        raise UserError(f"{name} cannot be played: {reason}")
 
     def close(self) -> None:
         """Ends the replay, if there is one."""
@@ -131,7 +131,7 @@ def describe_file(path: Path) -> dict[str, Any]:
     row = {"name": path.name, "size": status.st_size, "modified": status.st_mtime}
     # Without the package mcap, or for an unfinished file, the duration stays unknown. A list is no place for an error.
     with suppress(Exception):
-        from mcap.reader import make_reader  # noqa: PLC0415 - optional for the viewer
+        from mcap.reader import make_reader  # optional for the viewer
 
         with path.open("rb") as stream:
             summary = make_reader(stream).get_summary()

@@ -25,7 +25,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from common.bus.bus import wait_until
 from common.errors import UserError
 from services.viewer.access import COOKIE, is_token, known_host, same_origin, token_of
-from services.viewer.desk import Desk
+from services.viewer.request_handler import RequestHandler
 from services.viewer.settings import FIRST_PORT, ViewerSettings
 from services.viewer.visitor_session import Session
 
@@ -105,23 +105,23 @@ class UnbufferedWebSocketProtocol(WebSocketsSansIOProtocol):
             transport.set_write_buffer_limits(high=0)
 
 
-def create_app(desk: Desk, token: str, started: Callable[[asyncio.AbstractEventLoop], None]) -> Starlette:
+def create_app(handler: RequestHandler, token: str, started: Callable[[asyncio.AbstractEventLoop], None]) -> Starlette:
     """Returns the web application. Calls ``started`` with its event loop."""
 
     @asynccontextmanager
     async def lifespan(_app: Starlette) -> AsyncIterator[None]:
         started(asyncio.get_running_loop())
-        work = asyncio.create_task(desk.run())
+        work = asyncio.create_task(handler.run())
         yield
         work.cancel()
         with suppress(asyncio.CancelledError):
             await work
 
     async def connect(websocket: WebSocket) -> None:
-        if len(desk.context.hub) >= MAX_VISITORS:
+        if len(handler.context.hub) >= MAX_VISITORS:
             await websocket.send_denial_response(PlainTextResponse("too many visitors\n", 503))
             return
-        await Session(websocket, desk).run()
+        await Session(websocket, handler).run()
 
     routes = [WebSocketRoute("/ws", connect), Mount("/", StaticFiles(directory=PAGE_FOLDER, html=True))]
     return Starlette(routes=routes, middleware=[Middleware(AccessMiddleware, token=token)], lifespan=lifespan)

@@ -1,4 +1,4 @@
-"""The process: messages in, frames out to the web server's thread.
+"""The viewer service: receives messages, and passes frames to the web server's thread.
 
 The service's thread encodes frames and passes the bytes to the hub, which runs in the web server's thread and knows
 which robots are watched. For a robot that no visitor watches, only the messages for the charts and the log are decoded.
@@ -23,8 +23,8 @@ from common.runtime.liveness import RobotLiveness, start_command
 from common.runtime.service import Service
 from common.versions import versions
 from services.viewer.control import Control, RobotLookup
-from services.viewer.desk import Desk, DeskContext
 from services.viewer.playback import Playback
+from services.viewer.request_handler import RequestContext, RequestHandler
 from services.viewer.server import WebServer, create_app, link, listen
 from services.viewer.settings import ViewerSettings
 from services.viewer.state.health_rows import rows_of
@@ -74,7 +74,7 @@ class ViewerService(Service):
         self._follow(options.robot)
         self.loop.bus.watch_robots(self._on_liveliness)
         lookup = RobotLookup(self._status, self._stamp_ns)
-        context = DeskContext(
+        context = RequestContext(
             hub=self.hub,
             control=Control(self.loop.bus, self.roster, lookup, self._connect),
             playback=self.playback,
@@ -84,8 +84,8 @@ class ViewerService(Service):
             version=versions().get("presage", versions()["commit"]),
             on_new_recording=self._reopened.add,
         )
-        self.desk = Desk(context)
-        self._web = WebServer(create_app(self.desk, options.token, self.hub.set_loop), listener)
+        self.request_handler = RequestHandler(context)
+        self._web = WebServer(create_app(self.request_handler, options.token, self.hub.set_loop), listener)
         self._web.start()
         where = f"page: {link(options, listener)}"
         if options.log_json:
@@ -171,7 +171,7 @@ class ViewerService(Service):
             if (followed := self.robots.get(robot := self._reopened.pop())) is not None:
                 followed.view, followed.unread = RobotView(robot, live=False), {}
         if changed := {self._changed.popleft() for _ in range(len(self._changed))}:
-            self.hub.call_soon(partial(self.desk.robots_changed, frozenset(changed)))
+            self.hub.call_soon(partial(self.request_handler.robots_changed, frozenset(changed)))
         while self.hub.newcomers:
             self._welcome(*self.hub.newcomers.popleft())
         for robot, followed in self.robots.items():

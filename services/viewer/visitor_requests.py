@@ -1,4 +1,4 @@
-"""Parses what a browser asks for."""
+"""Parses requests from browsers."""
 
 from __future__ import annotations
 

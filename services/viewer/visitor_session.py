@@ -13,7 +13,7 @@ from uvicorn.protocols.utils import ClientDisconnected
 
 from services.viewer import visitor_requests as requests
 from services.viewer.control import ActionResult
-from services.viewer.desk import Desk
+from services.viewer.request_handler import RequestHandler
 from services.viewer.visitors import TooSlowError, Visitor
 
 T = TypeVar("T")
@@ -25,9 +25,9 @@ CLOSE_CODE_TOO_SLOW = 1008  # web socket close code: policy violation
 class Session:
     """Handles one web socket from its opening to its end."""
 
-    def __init__(self, websocket: WebSocket, desk: Desk) -> None:
-        self._websocket, self._desk = websocket, desk
-        self._counters = desk.context.hub.counters
+    def __init__(self, websocket: WebSocket, handler: RequestHandler) -> None:
+        self._websocket, self._handler = websocket, handler
+        self._counters = handler.context.hub.counters
         self._visitor = Visitor(_sender(websocket.send_text), _sender(websocket.send_bytes))
         self._queue: asyncio.Queue[tuple[int | None, requests.Action]] = asyncio.Queue(MAX_QUEUED)
         self._allowed, self._allowed_at = MAX_BURST, asyncio.get_running_loop().time()
@@ -35,9 +35,9 @@ class Session:
     async def run(self) -> None:
         """Accepts the socket and serves it until either side closes it."""
         await self._websocket.accept()
-        hub = self._desk.context.hub
+        hub = self._handler.context.hub
         tasks = [asyncio.create_task(work()) for work in (self._visitor.run, self._read, self._work)]
-        self._desk.show_robot(self._visitor, self._desk.context.roster.robot)
+        self._handler.show_robot(self._visitor, self._handler.context.roster.robot)
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
@@ -72,7 +72,7 @@ class Session:
 
     async def _take(self, number: int | None, action: requests.Action) -> None:
         if isinstance(action, requests.DriveByHand):  # not queued, so that it does not wait for a slow action
-            self._answer(number, await self._desk.act(self._visitor, action))
+            self._answer(number, await self._handler.act(self._visitor, action))
             return
         try:
             self._queue.put_nowait((number, action))
@@ -83,7 +83,7 @@ class Session:
     async def _work(self) -> None:
         while True:
             number, action = await self._queue.get()
-            self._answer(number, await self._desk.act(self._visitor, action))
+            self._answer(number, await self._handler.act(self._visitor, action))
 
     def _answer(self, number: int | None, answer: ActionResult) -> None:
         self._counters["answers"] += 1

@@ -7,7 +7,7 @@ import pytest
 
 from common.messages.definitions import Scan
 from common.messages.topics import SCAN
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 from services.bridge_ros2.ros_types import LASER_SCAN, decode
 from services.bridge_ros2.service import BridgeRos2Service
 from services.bridge_ros2.settings import BridgeRos2Settings
@@ -37,7 +37,7 @@ def test_the_bridge(monkeypatch, told, near):
     ((topic, scan),) = said
     assert topic is SCAN
     assert not np.isnan(Scan.decode(scan.encode()).ranges).any()
-    assert surfaces(scan.ranges).sum() == (2 if told else 4)
+    assert is_surface(scan.ranges).sum() == (2 if told else 4)
     assert (~np.isnan(shown[0].ranges)).sum() == near
 
 

@@ -29,7 +29,7 @@ def driving(at=0.0, stamp_ms=1000, **more):
     return gate
 
 
-def test_a_fresh_command_passes_and_an_old_one_does_not():
+def test_fresh_and_old_commands():
     gate = driving()
     np.testing.assert_array_equal(gate.command(command(1000), 0.01), [0.5, 0, 0])
     gate.add_scan(scan(1066), 0.066)
@@ -44,7 +44,7 @@ def test_a_fresh_command_passes_and_an_old_one_does_not():
     assert CommandGate(Robot()).command(command(0), 0.0) is None  # no scan at all
 
 
-def test_a_stop_is_said_when_commands_end():
+def test_stop_when_commands_end():
     gate = driving()
     assert not gate.moving
     gate.command(command(1000), 0.0)
@@ -54,7 +54,7 @@ def test_a_stop_is_said_when_commands_end():
     assert gate.stop_for_silence(0.2) is None
 
 
-def test_a_stop_for_silence_is_said_again_until_a_command_comes():
+def test_repeated_stop():
     gate = driving()
     gate.command(command(1000), 0.0)
     gate.stop_for_silence(0.2)
@@ -70,14 +70,14 @@ def test_a_stop_for_silence_is_said_again_until_a_command_comes():
     assert gate.repeat_stop(1.7) is None
 
 
-def test_one_gap_between_scans_gives_nobody_longer():
+def test_gap_between_scans():
     gate = driving()
     for stamp in (1100, 1200, 1300, 2200, 2300):  # 10 Hz, 0.9 s missing
         gate.add_scan(scan(stamp), stamp * 1e-3 - 1)
         assert gate.timeout == pytest.approx(0.2)
 
 
-def test_a_command_said_again_keeps_nothing_going():
+def test_repeated_command():
     gate = driving()
     gate.command(command(1000), 0.0)
     np.testing.assert_array_equal(gate.command(command(1000), 0.15), [0.5, 0, 0])
@@ -86,13 +86,13 @@ def test_a_command_said_again_keeps_nothing_going():
     assert gate.command(command(1000), 0.3) is None
 
 
-def test_a_slow_scanner_has_longer():
+def test_slow_scanner():
     gate = driving()
     gate.add_scan(scan(1200), 0.2)  # 5 Hz
     assert gate.timeout == pytest.approx(0.3)
 
 
-def test_a_robot_that_stands_is_told_for_a_while_and_then_left_to_others():
+def test_standing_robot():
     gate = driving()
     assert gate.command(command(1000, vx=0.0), 0.0) is None  # the robot has not moved
     gate.add_scan(scan(1066), 0.066)
@@ -108,7 +108,7 @@ def test_a_robot_that_stands_is_told_for_a_while_and_then_left_to_others():
     assert not gate.moving
 
 
-def test_no_faster_than_the_robot_and_not_into_what_the_scan_shows():
+def test_limits_and_obstacle_stop():
     gate = CommandGate(Robot(drive="differential", max_speed=0.3))
     gate.add_scan(scan(1000), 0.0)
     np.testing.assert_allclose(gate.command(command(1000, vx=5.0, wz=9.0), 0.0), [0.3, 0, 2.0])
@@ -121,7 +121,7 @@ def test_no_faster_than_the_robot_and_not_into_what_the_scan_shows():
     assert blind.command(command(1000, vx=1.0), 0.0)[0] == 1.0
 
 
-def test_time_that_begins_anew():
+def test_time_set_back():
     gate = driving(stamp_ms=9000)
     gate.command(command(9000), 0.0)
     gate.add_scan(scan(100), 0.1)

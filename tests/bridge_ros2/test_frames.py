@@ -38,7 +38,7 @@ def tf(*each):
 
 
 @pytest.mark.parametrize(("roll", "upside_down"), [(0.0, False), (np.pi, True)])
-def test_the_mounting_is_found_over_several_joints(roll, upside_down):
+def test_mounting_over_joints(roll, upside_down):
     motion = MountAndOdometry("base_link", "odom")
     motion.add_tf(tf(
         ("base_footprint", "base_link", (0, 0, 0.1), turned(), 0),
@@ -51,14 +51,14 @@ def test_the_mounting_is_found_over_several_joints(roll, upside_down):
     assert motion.mount() == mount
 
 
-def test_of_an_inclined_scanner_nothing_is_made():
+def test_inclined_scanner():
     motion = MountAndOdometry("base_link", "odom")
     motion.add_tf(tf(("base_link", "laser", (0, 0, 0), turned(pitch=np.deg2rad(20)), 0)))
     with pytest.raises(ValueError, match="inclined by 20"):
         motion.mount_for("laser")
 
 
-def test_where_tf_does_not_say_it_is_said_what_there_is():
+def test_unconnected_laser():
     motion = MountAndOdometry("base_link", "odom")
     motion.add_tf(tf(("base_footprint", "rplidar_link", (0, 0, 0), turned(), 0)))
     with pytest.raises(
@@ -67,7 +67,7 @@ def test_where_tf_does_not_say_it_is_said_what_there_is():
         motion.mount_for("laser")
 
 
-def test_odometry_of_a_frame_that_tf_does_not_know_is_noticed():
+def test_unconnected_odometry():
     motion = MountAndOdometry("base_link", "odom")
     assert motion.child_in_base("base_link") is None
     assert motion.unconnected_frame == ""
@@ -78,7 +78,7 @@ def test_odometry_of_a_frame_that_tf_does_not_know_is_noticed():
     assert motion.unconnected_frame == ""
 
 
-def test_nonsense_in_tf_is_left_out():
+def test_invalid_transforms():
     motion = MountAndOdometry("base_link", "odom")
     motion.add_tf(tf(
         ("base_link", "a", (np.nan, 0, 0), turned(), 0), ("base_link", "b", (0, 0, 0), other.quaternion(w=0.0), 0),
@@ -93,7 +93,7 @@ def dead(stamp, pose, twist=(0.0, 0.0, 0.0)):
     return DeadReckoning(stamp, np.array(pose, float), np.array(twist, float), np.zeros((3, 3)))
 
 
-def test_odometry_between_two_and_a_little_beyond():
+def test_interpolated_odometry():
     odometer = OdometryBuffer()
     assert odometer.at(0) is None
     odometer.add(dead(0, [0, 0, 0]))
@@ -113,7 +113,7 @@ def test_odometry_between_two_and_a_little_beyond():
 
 
 @pytest.mark.parametrize("ran", [1.5, 5.0, 9.9, 3600.0])
-def test_odometry_goes_on_after_the_clock_is_set_back(ran):
+def test_clock_set_back(ran):
     """Independent of how long the simulation ran before its restart."""
     odometer, motion = OdometryBuffer(), MountAndOdometry("base_link", "odom")
     for k in range(int(min(ran, 12) * 20)):
@@ -128,7 +128,7 @@ def test_odometry_goes_on_after_the_clock_is_set_back(ran):
     assert abs(odometer.at(SECOND // 5).pose[0] - 0.4) < 1e-9  # the odometry before the restart has no influence
 
 
-def test_odometry_by_tf_with_its_velocity():
+def test_odometry_by_tf():
     """The base is 0.5 m ahead of the child frame of the odometry."""
     motion = MountAndOdometry("base_link", "odom")
     motion.add_tf(tf(("wheels", "base_link", (0.5, 0, 0), turned(), 0)))

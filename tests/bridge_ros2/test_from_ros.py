@@ -22,7 +22,7 @@ def laser(ranges, first=-1.0, step=0.5, last=1.0, nearest=0.1, farthest=10.0, sc
     return decode(LASER_SCAN, payload)
 
 
-def test_a_scan_as_it_is():
+def test_plain_scan():
     scan = scan_of(laser([1, 2, 3, 4, 5]), Mount((0.2, 0.1, 0.3)), 77)
     np.testing.assert_allclose(scan.angles(), [-1, -0.5, 0, 0.5, 1])
     np.testing.assert_array_equal(scan.ranges, np.array([1, 2, 3, 4, 5], np.float32))
@@ -31,7 +31,7 @@ def test_a_scan_as_it_is():
     assert scan.scan_time == pytest.approx(0.1)
 
 
-def test_ranges_by_the_one_rule():
+def test_unmeasured_ranges():
     inf, nan = np.inf, np.nan
     scan = scan_of(laser([0.0, nan, inf, -inf, 0.05, 11.0, -1.0, 10.0, 0.1]), Mount(), 0)
     expected = np.array([0, 0, inf, -inf, -inf, inf, 0, inf, 0.1], np.float32)
@@ -40,7 +40,7 @@ def test_ranges_by_the_one_rule():
 
 @pytest.mark.parametrize("upside_down", [False, True])
 @pytest.mark.parametrize("step", [0.5, -0.5])
-def test_beams_point_where_they_pointed(upside_down, step):
+def test_directions_of_beams(upside_down, step):
     """Whatever the order of beams and the side that is up: the same points in base_link."""
     ranges, mount = np.array([1.0, 2.0, 3.0, 4.0], np.float32), Mount((0.5, -0.2, 0.7), upside_down)
     scan = scan_of(laser(ranges.tolist(), first=0.2, step=step), mount, 0)
@@ -55,7 +55,7 @@ def test_beams_point_where_they_pointed(upside_down, step):
     np.testing.assert_allclose(found[order], expected, atol=1e-6)
 
 
-def test_a_full_circle_from_0_to_2_pi():
+def test_full_circle():
     scan = scan_of(laser([1.0] * 360, first=0.0, step=np.deg2rad(1), last=np.deg2rad(359)), Mount(), 0)
     assert scan.angle_min == 0
     assert len(scan.ranges) == 360
@@ -63,7 +63,7 @@ def test_a_full_circle_from_0_to_2_pi():
     assert missing.angle_increment == pytest.approx(0.5)
 
 
-def test_the_largest_float_as_range_max_is_no_limit():
+def test_largest_range_max():
     scan = scan_of(laser([1.0, 2.0, np.inf], farthest=float(np.finfo(np.float32).max)), Mount(), 0)
     assert scan.range_max == MAX_DISTANCE_M
     assert scan.ranges.tolist() == [1.0, 2.0, np.inf]
@@ -81,7 +81,7 @@ def test_the_largest_float_as_range_max_is_no_limit():
     ],
     ids=lambda wrong: str(wrong)[:40],
 )
-def test_what_no_scanner_says_is_refused(wrong):
+def test_invalid_scans(wrong):
     with pytest.raises(ValueError, match="scan"):
         scan_of(laser(**{"ranges": [1.0, 1.0], **wrong}), Mount(), 0)
 
@@ -99,7 +99,7 @@ def odometry(x=1.0, y=2.0, yaw=0.0, twist=(0.3, 0.0, 0.5), covariance=None):
     return decode(ODOMETRY, payload)
 
 
-def test_odometry_with_the_plane_of_its_covariance():
+def test_covariance_of_odometry():
     six = np.arange(36.0)
     odom = odom_of(dead_reckoning_of(odometry(yaw=0.4, covariance=six.tolist()), None))
     np.testing.assert_allclose(odom.pose.array(), [1, 2, 0.4])
@@ -112,7 +112,7 @@ def test_odometry_with_the_plane_of_its_covariance():
         dead_reckoning_of(odometry(x=5e5), None)
 
 
-def test_odometry_of_a_frame_off_the_base():
+def test_odometry_of_another_frame():
     """The child frame is 1 m ahead of the base: it swings where the base only turns."""
     ahead = Transform(np.array([1.0, 0, 0]), np.eye(3))
     dead = dead_reckoning_of(odometry(x=0.0, y=1.0, yaw=np.pi / 2, twist=(0.0, 0.5, 0.5)), ahead)
@@ -121,7 +121,7 @@ def test_odometry_of_a_frame_off_the_base():
     np.testing.assert_allclose(dead_reckoning_of(odometry(), IDENTITY).pose, [1, 2, 0])
 
 
-def test_a_pose_is_of_the_map():
+def test_frame_of_a_pose():
     pose = {"position": other.vector(3, 4), "orientation": other.quaternion(z=np.sin(0.5), w=np.cos(0.5))}
 
     def message(frame):

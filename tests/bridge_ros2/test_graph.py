@@ -18,7 +18,7 @@ def token(kind, topic, message, number=1):
 def why(*tokens):
     graph = Graph()
     for each in tokens:
-        graph.change(each, there=True)
+        graph.change(each, alive=True)
     return graph.explain_silence("/scan", LASER_SCAN, "--scan-topic", no_endpoints="NOBODY")
 
 
@@ -41,17 +41,17 @@ def test_nobody_another_topic_another_type_another_hash_or_just_silence():
 
 def test_whoever_goes_is_forgotten():
     graph = Graph()
-    graph.change(token("MP", "/scan", LASER_SCAN), there=True)
-    graph.change(token("MP", "/scan", LASER_SCAN), there=False)
+    graph.change(token("MP", "/scan", LASER_SCAN), alive=True)
+    graph.change(token("MP", "/scan", LASER_SCAN), alive=False)
     assert graph.endpoints() == []
 
 
 def test_the_kind_of_command_that_the_robot_listens_for():
     graph = Graph()
     assert graph.expected_twist_type("/cmd_vel") == ""
-    graph.change(token("MS", "/cmd_vel", TWIST_STAMPED), there=True)
+    graph.change(token("MS", "/cmd_vel", TWIST_STAMPED), alive=True)
     assert graph.expected_twist_type("/cmd_vel") == TWIST_STAMPED
-    graph.change(token("MS", "/cmd_vel", TWIST, 2), there=True)
+    graph.change(token("MS", "/cmd_vel", TWIST, 2), alive=True)
     assert graph.expected_twist_type("/cmd_vel") == ""  # both types have a subscriber
 
 
@@ -74,16 +74,16 @@ def test_a_complaint_names_the_option_that_mends_it():
     assert "on /r1/scan for 3 s" in said(graph, scan_age=4.0, namespace="r1")
     assert said(graph, "too odd", scan_age=4.0) == "scans on /scan cannot be used: too odd"
     assert "on /odom or in tf" in said(graph, with_odometry=False)
-    graph.change(token("MP", "/odom", ODOMETRY, 9), there=True)
+    graph.change(token("MP", "/odom", ODOMETRY, 9), alive=True)
     assert (
         said(graph, odom_topic="odm")
         == "no odometry on /odm; set --odom-topic: nav_msgs/msg/Odometry is published on /odom"
     )
     assert said(graph, odom_topic="odom") == ""
-    graph.change(token("MP", "/odom", ODOMETRY, 9), there=False)
+    graph.change(token("MP", "/odom", ODOMETRY, 9), alive=False)
     assert said(graph, odom_topic="odm") == ""  # no other odometry topic exists, so tf is used
     assert said(graph, with_odometry=False, tf="map-base") == ""
-    graph.change(token("MS", "/cmd_vel", TWIST_STAMPED), there=True)
+    graph.change(token("MS", "/cmd_vel", TWIST_STAMPED), alive=True)
     assert said(graph) == "the robot expects geometry_msgs/msg/TwistStamped on /cmd_vel; set --stamped"
     assert said(graph, stamped=True) == said(graph, commands=False) == ""
 
@@ -96,7 +96,7 @@ def silent(*tokens, **options):
     settings = BridgeRos2Settings(**options)
     graph = Graph(settings.names())
     for each in tokens:
-        graph.change(each, there=True)
+        graph.change(each, alive=True)
     return diagnose(settings, graph, "", linked=True, scan_age=4.0, received=False, with_odometry=False)
 
 
@@ -122,7 +122,7 @@ def test_a_distro_that_does_not_fit_is_named_though_scans_come():
         settings = BridgeRos2Settings(distro=distro)
         graph = Graph(settings.names())
         for each in tokens:
-            graph.change(each, there=True)
+            graph.change(each, alive=True)
         return diagnose(settings, graph, "", linked=True, scan_age=0.0, received=True, with_odometry=True)
 
     scans, listens = (humble.endpoint_token(*each, Qos()) for each in (
@@ -141,7 +141,7 @@ def test_a_distro_that_does_not_fit_is_named_though_scans_come():
 
 def test_a_second_map_is_named():
     graph = Graph()
-    graph.change(token("MP", "/map", OCCUPANCY_GRID), there=True)
+    graph.change(token("MP", "/map", OCCUPANCY_GRID), alive=True)
     for publish, says in ((True, "/driver also publishes a map on /map; leave out --publish-map"), (False, "")):
         settings = BridgeRos2Settings(publish_map=publish)
         said = diagnose(settings, graph, "", linked=True, scan_age=0.0, received=True, with_odometry=True)
@@ -151,5 +151,5 @@ def test_a_second_map_is_named():
 
 def test_a_token_of_a_domain_that_is_no_number_is_nobodys():
     graph = Graph()
-    graph.change(token("MP", "/scan", LASER_SCAN).replace("@ros2_lv/0/", "@ros2_lv/x/"), there=True)
+    graph.change(token("MP", "/scan", LASER_SCAN).replace("@ros2_lv/0/", "@ros2_lv/x/"), alive=True)
     assert len(graph.other_endpoints()) + len(graph.endpoints()) == 1

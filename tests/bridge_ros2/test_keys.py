@@ -43,14 +43,14 @@ def test_keys_of_rmw_zenoh():
     assert not heard.intersects(KeyExpr(Names().publish("/scan_raw", LASER_SCAN)))
 
 
-def test_keys_of_zenoh_bridge_ros2dds_are_names():
+def test_keys_of_ros2dds():
     names = Names("ros2dds", domain=3)
     assert names.publish("/robot1/scan", LASER_SCAN) == names.subscribe("/robot1/scan", LASER_SCAN) == "robot1/scan"
     assert KeyExpr(names.caches("/tf_static")[0]).includes(KeyExpr("@/a1/@ros2_pub_cache/tf_static"))
     assert any(KeyExpr(k).includes(KeyExpr("@/a1/@ros2_lv/MP/scan/sensor_msgs§msg§LaserScan/:::")) for k in TOKENS)
 
 
-def test_tokens_are_those_of_others():
+def test_tokens():
     qos = Qos(depth=42)  # what rmw_zenoh takes unless told
     assert NODE.endpoint_token("MS", 16, "/nucleo/cmd_vel", TWIST, qos) == TOKEN
     assert NODE.token() == "@ros2_lv/0/100f0e0d0c0b0a090807060504030201/0/0/NN/%/%/nucleo_h743zi2"
@@ -60,11 +60,11 @@ def test_tokens_are_those_of_others():
     assert any(KeyExpr(k).includes(KeyExpr(TOKEN)) for k in TOKENS)
 
 
-def test_quality_of_service_says_what_is_not_usual():
+def test_quality_of_service():
     assert (SENSOR.text(), LATCHED.text(), Qos().text()) == ("2::,5:,:,:,,", ":1:,1:,:,:,,", "::,10:,:,:,,")
 
 
-def test_tokens_are_read():
+def test_read_tokens():
     assert read_token(TOKEN) == Endpoint(False, "/nucleo/cmd_vel", TWIST, type_hash(TWIST), "/nucleo_h743zi2", domain=0)
     for key in ("@/a1/@ros2_lv/MP/robot1§scan/sensor_msgs§msg§LaserScan/:::", "@ros2_lv/a1/MP/robot1§scan/sensor_msgs§msg§LaserScan/:::"):  # fmt: skip  # noqa: E501
         assert read_token(key) == Endpoint(True, "/robot1/scan", LASER_SCAN, flavor="ros2dds")
@@ -79,7 +79,7 @@ def test_tokens_are_read():
         assert read_token(key) is None
 
 
-def test_an_attachment_is_33_bytes():
+def test_attachment():
     gid = bytes(range(16))
     data = attachment(3, 1_700_000_000_123_456_789, gid)
     assert data == struct.pack("<qq", 3, 1_700_000_000_123_456_789) + b"\x10" + gid
@@ -92,7 +92,7 @@ def test_an_attachment_is_33_bytes():
         assert read_attachment(none) is None
 
 
-def test_a_gid_is_the_hash_of_the_token():
+def test_gid():
     """XXH3 of 128 bits: of nothing, by its specification, 99aa06d3014798d8 6001c324468d497f, the higher half first."""
     assert publisher_gid("") == bytes.fromhex("99aa06d3014798d86001c324468d497f")[::-1]
     assert publisher_gid(TOKEN) != publisher_gid(TOKEN + "x")
@@ -107,11 +107,11 @@ def test_a_gid_is_the_hash_of_the_token():
         ("/tf", "robot1", "/tf"),
     ],
 )
-def test_relative_names_are_in_the_namespace(topic, namespace, name):
+def test_names_in_a_namespace(topic, namespace, name):
     assert full_name(topic, namespace) == name
 
 
-def test_another_definition_of_a_type_is_refused():
+def test_other_type_hash():
     names = Names()
     names.check_type_hash(names.publish("/scan", LASER_SCAN), LASER_SCAN)
     names.check_type_hash(Names(hashes=False).publish("/scan", LASER_SCAN), LASER_SCAN)

@@ -30,7 +30,7 @@ PUBLISHED = {
 }
 
 
-def test_hashes_are_those_that_ros_publishes():
+def test_published_hashes():
     assert {name: r.type_hash(name) for name in r.USED} == PUBLISHED
 
 
@@ -40,20 +40,20 @@ def test_names_of_types():
     assert r.ros_name("something else") == "something else"
 
 
-def test_a_twist_by_the_specification():
+def test_bytes_of_a_twist():
     """Plain CDR (OMG DDS-RTPS 2.5, 10.2): representation 00 01, options 00 00, then six little-endian doubles."""
     _, message = twist_message(np.array([0.5, -0.25, 1.5]), None, "base_link")
     assert r.encode(r.TWIST, message) == b"\0\1\0\0" + struct.pack("<6d", 0.5, -0.25, 0, 0, 0, 1.5)
 
 
-def test_a_header_by_the_specification():
+def test_bytes_of_a_header():
     """A string is its length with the final 0, its bytes and the 0; what follows is aligned to its own size."""
     _, message = twist_message(np.zeros(3), 5_000_000_007, "base")
     begins = b"\0\1\0\0" + struct.pack("<iI", 5, 7) + struct.pack("<I", 5) + b"base\0" + b"\0" * 7
     assert r.encode(r.TWIST_STAMPED, message) == begins + struct.pack("<6d", *[0.0] * 6)
 
 
-def test_another_implementation_reads_what_we_write():
+def test_bytes_read_elsewhere():
     kind, twist = twist_message(np.array([0.5, 0.1, -0.2]), 3_000_000_001, "base_link")
     read = other.decode(kind, r.encode(kind, twist))
     assert (read.header.stamp.sec, read.header.stamp.nanosec, read.header.frame_id) == (3, 1, "base_link")
@@ -75,7 +75,7 @@ def test_another_implementation_reads_what_we_write():
     st.text(st.characters(codec="ascii", exclude_characters="\0"), max_size=9),
     st.integers(0, 2**31 - 1),
 )
-def test_we_read_and_write_as_another_implementation_does(ranges, frame, sec):
+def test_bytes_written_elsewhere(ranges, frame, sec):
     """Of every length of the frame's name, which moves what follows."""
     payload = other.encode(r.LASER_SCAN, {
         "header": other.header(sec * 10**9 + 5, frame), "angle_min": -1.5, "angle_max": 1.5, "angle_increment": 0.25,
@@ -90,7 +90,7 @@ def test_we_read_and_write_as_another_implementation_does(ranges, frame, sec):
 
 
 @pytest.mark.parametrize("name", [r.LASER_SCAN, r.ODOMETRY, r.TF_MESSAGE, r.POSE_STAMPED])
-def test_bytes_that_are_none_are_an_error(name):
+def test_invalid_bytes(name):
     for payload in (b"", b"\0\1\0\0", b"\0\1\0\0" + b"\xff" * 64, b"\x06\1\0\0" + b"\0" * 500, b"not CDR at all"):
         with pytest.raises(r.CdrError, match=name):
             r.decode(name, payload)

@@ -15,7 +15,7 @@ from common.bus.inbox import Inbox, Sample
 from common.geometry import se2
 from common.geometry.rasterize import rasterise
 from common.geometry.world import load_world
-from common.messages.definitions import CmdVel, Goal, Health, Odom, Scan, Twist
+from common.messages.definitions import Goal, Health, Odom, Scan
 from common.messages.requests import LocaliseRequest, Reply
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, LOCALISE, ODOM, SCAN
 from tests.bridge_ros2 import independent as other
@@ -129,19 +129,6 @@ def beside(tmp_path_factory, router):
         processes.close()
 
 
-def test_a_scan_comes_with_the_odometry_of_its_moment(beside):
-    seen = []
-
-    def carried_on():  # extrapolated by 50 ms; the scan may arrive before the odometry of its period
-        seen.append(beside.sweep())
-        return seen[-1][0].pose.x == pytest.approx(2.025)
-
-    assert wait_until(carried_on, WAIT_TIMEOUT_S), seen
-    _, scan = seen[-1]
-    np.testing.assert_array_equal(scan.ranges, np.array([1, 2, 3, 0, 5], np.float32))
-    assert scan.mount.x == pytest.approx(0.3)
-
-
 def test_the_belief_is_said_only_while_it_tracks(beside):
     for number, state in enumerate(("localising", "ambiguous", "lost"), 1):
         beside.believe(state)
@@ -158,24 +145,6 @@ def test_the_belief_is_said_only_while_it_tracks(beside):
     np.testing.assert_allclose(se2.compose(odom_in_map, [2.025, 0, 0]), [3.0, -1.5, 0.5], atol=1e-9)
     stamps = [each.stamp.sec * 10**9 + each.stamp.nanosec for each in (pose.header, said.header)]
     assert stamps == [beside.stamp, beside.stamp + 10**9]  # the transform is stamped ahead, as in AMCL
-
-
-def test_commands_pass_and_are_followed_by_a_stop(beside):
-    heard, last = beside.heard["cmd_vel"], [0.0]
-
-    def driven():  # on a busy machine a command may be too late for its scan, so try again
-        if not heard and time.monotonic() - last[0] > 0.5:
-            last[0] = time.monotonic()
-            beside.sweep()
-            beside.bus.put(CMD_VEL, CmdVel(stamp_ns=beside.stamp, twist=Twist(vx=0.2)).encode())
-        return bool(heard)
-
-    assert wait_until(driven, WAIT_TIMEOUT_S)
-    assert heard[0].linear.x == pytest.approx(0.2)
-    assert wait_until(lambda: heard[-1].linear.x == 0, WAIT_TIMEOUT_S)
-    beside.bus.put(CMD_VEL, CmdVel(stamp_ns=beside.stamp - 10**9, twist=Twist(vx=0.2)).encode())
-    beside.counts("stale_commands", 1)
-    assert heard[-1].linear.x == 0
 
 
 def test_rvizs_two_buttons(beside):
@@ -249,22 +218,3 @@ def test_it_says_what_it_waits_for_and_what_is_wrong(processes, router):
     theirs.kill()
     bridge.wait_for("the connection is lost")
     assert nowhere.stop()[0] == bridge.stop()[0] == 0
-
-
-def test_it_says_which_distro_and_flavor_fit_and_that_nobody_is_there(processes, router):
-    (_, port), (_, empty) = processes.start_router(), processes.start_router()
-
-    def bridge(name, at, *args):
-        ours = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{router}", "PRESAGE_ROBOT": name}
-        return processes.start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{at}", *args, env=ours)
-
-    with Ros(port, "rmw_zenoh", "jazzy") as node:
-        node.publisher("scan", LASER)
-        humble, dds = bridge("humble", port, "--distro", "humble"), bridge("dds", port, "--flavor", "ros2dds")
-        far, alone = bridge("far", port, "--domain", "7"), bridge("alone", empty)
-        humble.wait_for("types of /robot have hashes, as since Iron; set --distro jazzy")
-        dds.wait_for("the robot uses rmw_zenoh, not zenoh-bridge-ros2dds; set --flavor rmw_zenoh")
-        far.wait_for("there are no nodes in ROS domain 7, but in 0; set --domain 0")
-        alone.wait_for(f"there are no ROS nodes at tcp/127.0.0.1:{empty}")
-    for each in (humble, dds, far, alone):
-        assert each.stop()[0] == 0

@@ -13,19 +13,19 @@ from services.bridge_ros2.settings import BridgeRos2Settings
 @pytest.mark.parametrize(
     ("said", "pose"), [("0.1,-2", (0.1, -2, 0)), ("0.1,0,180", (0.1, 0, np.pi)), ("-1,0,-90", None)]
 )
-def test_a_mount_with_or_without_its_yaw(said, pose):
+def test_mount(said, pose):
     mount = load_settings(BridgeRos2Settings, ["--mount", said]).build_mount()
     np.testing.assert_allclose(mount.pose, pose or (-1, 0, -np.pi / 2))
 
 
 @pytest.mark.parametrize("said", ["1", "1;2", "1,2,3,4", "a,b"])
-def test_a_wrong_mount_says_what_is_expected(said):
+def test_invalid_mount(said):
     with pytest.raises(UserError, match=r"mount: '.*' is not valid; expected: x,y\[,yaw_deg\] \(m, m, degrees\)"):
         load_settings(BridgeRos2Settings, ["--mount", said])
 
 
 @pytest.mark.parametrize("said", ["nonsense", "tcp/127.0.0.1", "tcp/127.0.0.1:99999", "tcp/127.0.0.1:0", "tcp/a:1,b"])
-def test_a_router_has_a_port(said):
+def test_router_without_a_port(said):
     with pytest.raises(UserError, match="ros_connect"):
         load_settings(BridgeRos2Settings, ["--ros-connect", said])
 
@@ -39,11 +39,11 @@ def test_a_router_has_a_port(said):
         (["--ros-config", "no/such.json5"], "there is no such file"),
     ],
 )
-def test_what_does_not_go_together_is_said(said, why):
+def test_contradictions(said, why):
     settings = load_settings(BridgeRos2Settings, said)
     with pytest.raises(UserError, match=why):
         settings.check()
 
 
-def test_what_is_taken_for_granted_goes_together():
+def test_defaults():
     load_settings(BridgeRos2Settings, []).check()

@@ -14,37 +14,37 @@ from tests.bridge_ros2 import independent as other
 from tests.bridge_ros2.made import belief
 
 
-def test_the_covariance_has_x_y_and_yaw_and_nothing_else():
+def test_covariance():
     six = to_ros.pose_message(belief(), "map").pose.covariance.reshape(6, 6)
     assert (six[0, 0], six[0, 1], six[1, 1], six[0, 5], six[1, 5], six[5, 5]) == (0.01, 0.002, 0.04, 0.003, 0.005, 0.09)
     assert np.count_nonzero(six) == 9
     np.testing.assert_array_equal(six, six.T)
 
 
-def test_without_a_covariance_there_is_no_pose():
+def test_no_covariance():
     assert to_ros.pose_message(belief(covariance=False), "map") is None
 
 
 @pytest.mark.parametrize("state", ["localising", "ambiguous", "lost"])
-def test_of_a_robot_that_is_not_tracked_nothing_is_said(state):
+def test_untracked_robot(state):
     assert not to_ros.is_publishable(belief(state))
     assert to_ros.is_publishable(belief())
 
 
-def test_map_to_odom_leads_from_odometry_to_the_belief():
+def test_map_to_odom():
     odometry, there = np.array([1.0, 2.0, 3.0]), Pose(x=-4.0, y=5.0, yaw=-2.0)
     np.testing.assert_allclose(se2.compose(to_ros.correction(there, odometry), odometry), there.array())
     np.testing.assert_array_equal(to_ros.correction(there, None), there.array())
 
 
-def test_a_yaw_is_a_quaternion():
+def test_quaternion():
     (each,) = to_ros.transform_message(np.array([1.0, 2.0, -2.5]), 3 * 10**9 + 4, "map", "odom").transforms
     turn = each.transform.rotation
     assert 2 * np.arctan2(turn.z, turn.w) == pytest.approx(-2.5)
     assert (each.header.stamp.sec, each.header.stamp.nanosec) == (3, 4)
 
 
-def test_a_map_is_as_map_server_says_it():
+def test_map():
     """Row by row from the lower left: 0 free, 100 occupied, -1 unknown; the origin is that corner's pose."""
     grid = OccupancyGrid.of(np.array([[0, 100, 255], [0, 0, 0]], np.uint8), 0.05, (-1.0, 2.0, np.pi / 2))
     read = other.decode(OCCUPANCY_GRID, encode(OCCUPANCY_GRID, to_ros.map_message(grid, "map")))

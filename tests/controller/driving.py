@@ -49,7 +49,7 @@ def scan(stamp_ns, pose, world, scanner=SCANNER, rng=None) -> Scan:
     laser = se2.compose(np.asarray(pose, float), np.array(scanner.mount))
     ranges = world.ray_distances(laser[None], scanner.angles())[0]
     if rng is not None:
-        ranges = scanner.noisy(ranges, rng)
+        ranges = scanner.add_noise(ranges, rng)
     return Scan(
         stamp_ns=stamp_ns,
         angle_min=scanner.angle_min,

@@ -15,7 +15,7 @@ from common.messages.definitions import Belief, Health, Pose, Scan
 from common.messages.requests import LocaliseRequest, Reply
 from common.messages.topics import BELIEF, HEALTH, LOCALISE, SCAN
 from services.estimator import multi_robot
-from services.estimator.factory import Choice, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, Geometry, prepare
 from services.estimator.settings import EstimatorSettings
 from services.estimator.shared.interface import Hypothesis, Observation, Posterior
 from tests.conftest import WAIT_TIMEOUT_S, received_messages
@@ -37,7 +37,7 @@ def results(posteriors):
 
 
 def test_robots_in_two_threads():
-    factory, scans = prepare(Choice(ROOM, model="exact")), [drive(1), drive(2)]
+    factory, scans = prepare(EstimatorOptions(ROOM, model="exact")), [drive(1), drive(2)]
     alone = []
     for each in scans:
         estimator = factory(Geometry.of(SCANNER))
@@ -56,7 +56,7 @@ def test_robots_in_two_threads():
 
 
 def test_track_and_search_are_update():
-    factory, scans, searches = prepare(Choice(ROOM, model="exact")), drive(1), []
+    factory, scans, searches = prepare(EstimatorOptions(ROOM, model="exact")), drive(1), []
     one, other = factory(Geometry.of(SCANNER)), factory(Geometry.of(SCANNER))
     with pytest.raises(RuntimeError, match="track first"):
         one.search()
@@ -120,7 +120,7 @@ class Robot:
 @pytest.fixture
 def fleet(bus, link, monkeypatch):
     """A function that runs the loop for robots, and returns it and the robots."""
-    models = SimpleNamespace(factory=lambda _: SearchingStub(), in_use=lambda _: "none")
+    models = SimpleNamespace(factory=lambda _: SearchingStub(), describe=lambda _: "none")
     monkeypatch.setattr(multi_robot, "Models", lambda _: models)
     SearchingStub.proceed.clear()
     running = []

@@ -12,7 +12,7 @@ from common.robot.scanner import SCANNERS, Scanner
 from lab.accuracy import bound, tasks
 from lab.accuracy.runner import quick_field
 from lab.accuracy.scenes import Scene
-from services.estimator.factory import DEFAULT_SIGMA_M, Choice, Geometry, prepare
+from services.estimator.factory import DEFAULT_SIGMA_M, EstimatorOptions, Geometry, prepare
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
 from services.estimator.precise.gauss_newton import View, polish
@@ -110,7 +110,7 @@ def test_field_of_another_scanner():
 @pytest.mark.parametrize("name", ["lms200", "tim571, upside down", "backwards, from 0 to 359 deg"])
 def test_particle_filter(name):
     scanner = EVERY[name]
-    made = prepare(Choice(ROOM, "particle-filter"))(Geometry.of(scanner))
+    made = prepare(EstimatorOptions(ROOM, "particle-filter"))(Geometry.of(scanner))
     scene = Scene(ROOM, scanner, np.random.default_rng(3))
     for pose, clean in zip(poses := scene.poses(3), scene.clean(poses), strict=True):
         made.restart(pose + np.array([0.05, -0.05, 0.03]))

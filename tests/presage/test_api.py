@@ -29,7 +29,7 @@ def world():
 
 @pytest.fixture(scope="module")
 def ranges(world):
-    return SCANNER.noisy(
+    return SCANNER.add_noise(
         world.ray_distances(se2.compose(POSE, np.array(SCANNER.mount))[None], SCANNER.angles())[0],
         np.random.default_rng(0),
     )

@@ -66,6 +66,6 @@ def test_the_bench_measures_and_keeps_what_it_made(tmp_path):
     assert run.exit_code == 0, run.output
     assert load_world(str(out / "map.yaml")).grid.width == 300
     rows = {row["name"]: row for row in json.loads(numbers.read_text())["rows"]}
-    assert rows["exact rays"]["unit"] == "ms a scan"
+    assert rows["exact rays"]["unit"] == "ms per scan"
     assert rows["straight walls"]["value"] == len(load_world(str(out / "map.yaml")).segments)
     assert all(row["value"] > 0 for row in rows.values())

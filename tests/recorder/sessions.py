@@ -26,7 +26,7 @@ from common.messages.topics import BELIEF, GOAL, HEALTH, PREDICTION, SCAN, STATU
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
 from services.recorder.files.writer import RecordingWriter
-from services.recorder.service import write_world
+from services.recorder.recording import write_description
 
 WORLD = World(
     name="hall",
@@ -112,7 +112,7 @@ def write(path: Path, *leave_out: Topic, world: bool = True) -> Path:
     writer = RecordingWriter(path)
     writer.metadata("presage", {"robot": "robot"})
     if world:
-        write_world(writer, WorldReply(world=WORLD, scanner=SCANNER, robot=Robot(radius=0.3)))
+        write_description(writer, "simulator", WorldReply(world=WORLD, scanner=SCANNER, robot=Robot(radius=0.3)))
     for topic, service, message, at in events():
         if topic not in leave_out:
             writer.write(topic, topic.key("robot", service), message.encode(), at, at)

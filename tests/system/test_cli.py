@@ -1,142 +1,135 @@
-"""The command line: invalid input gives one clear line with advice and a non-zero status, without a traceback."""
+"""The command line: one clear line and status 2 for invalid input, and the tools beside a running session."""
 
 from __future__ import annotations
 
+import re
 import socket
 
 import pytest
+import typer
 
 from common.bus.bus import wait_until
-from tests.conftest import Processes
+from presage.cli.main import app
 from tests.recorder import sessions as made
+from tests.system.test_diagnosis import row_of
 
-MAX_PARALLEL = 4
 NO_SESSION = ("--connect", "tcp/127.0.0.1:9")  # the discard port, on which nothing listens
 
 
-INVALID_COMMANDS = [
-    (("up", "--world", "nowhere"), "give a file or one of corridor, maze, office"),
-    (("up", "--model", "exakt", "--port", "0"), "presage: no model 'exakt': give learned, exact"),
-    (("up", "--drive", "sideways", "--port", "0"), "presage: drive: Input should be 'holonomic' or 'differential'"),
-    (("up", "--config", "{tmp}/wrong.yaml", "--port", "0"), "presage: speed: Extra inputs are not permitted"),
-    (("demo", "--world", "{tmp}/no.yaml"), "give a file or one of"),
-    (("demo", "--goal", "6.8", "3.95"), "goal (6.80, 3.95) is inside a wall or outside 'corridor'"),
-    (("up", "--world", "maze", "--estimator", "paper", "--port", "0"), "presage train --world maze"),
-    (("goal", "1", "1", *NO_SESSION), "start a session with `presage up`"),
-    (("goal",), "X Y in m"),
-    (("goal", "-1", "2", *NO_SESSION), "start a session"),
-    (("goal", "nan", "1"), "nan 1: a place is finite numbers"),
-    (("goal", "1", "1", "--tolerance", "inf"), "--tolerance inf"),
-    (("goal", "1", "2", "--wiat"), "--wiat"),
-    (("goal", "1e300", "1"), "1e+300 1: X and Y must be within 10000 m of the origin"),
-    (("teleport", "inf", "1"), "inf 1 90: a place is finite numbers"),
-    (("teleport", "-1", "-1.5", "-90", *NO_SESSION), "start a session"),
-    (("obstacle", "add", "crate", "-1", "2", "--radius", "-1"), "the obstacle: circle.radius"),
-    (("obstacle", "add", "crate", "1", "2", *NO_SESSION), "start a session"),
-    (("relocalise", "nan", "1"), "a place is finite numbers"),
-    (("relocalise", "-1", "-.5", *NO_SESSION), "start a session"),
-    (("relocalise", "1"), "a position is two numbers"),
-    (("demo", "--goal", "nan", "1"), "two finite numbers"),
-    (("demo", "--out", "/dev/null/x"), "/dev/null/x: cannot be written to"),
-    (("demo", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
-    (("demo", "--seed", "99999999999999999999"), "--seed"),
-    (("demo", "--world", "{tmp}/bad.yaml"), "bad.yaml: not valid YAML"),
-    (("plot", "{tmp}/run.mcap", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
-    (("plot", "{tmp}/run.mcap", "--out", "/proc/no.png"), "/proc/no.png: cannot be written to"),
-    (("train", "--out", "/dev/null/m"), "/dev/null/m: cannot be written to"),
-    (("record", "--out", "/dev/null"), "/dev/null: cannot be written to"),
-    (("teleport", "1", "1", *NO_SESSION), "start a session"),
-    (("echo", "nothing"), "no topic 'nothing': choose one of scan"),
-    (("hz", *NO_SESSION), "start a session"),
-    (("replay", "{tmp}/no.mcap"), "no.mcap"),
-    (("replay", "{tmp}/run.mcap", *NO_SESSION), "start a session"),
-    (("plot", "{tmp}/foreign.mcap"), "foreign.mcap"),
-    (("train", "--preset", "better"), "no preset 'better'"),
-    (("train", "--scanner", "sonar", "--out", "{tmp}/m"), "no scanner 'sonar': choose one of tim571"),
-    (("doctor", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
-    (("record", "--topics", "smell", "--out", "{tmp}/r"), "smell"),
-]
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory, router):
-    """All `INVALID_COMMANDS`, run to their end; several in parallel, because most wait for a missing session."""
-    folder = tmp_path_factory.mktemp("wrong")
-    (folder / "foreign.mcap").write_bytes(b"no recording at all, but long enough to be looked at twice")
-    (folder / "wrong.yaml").write_text("controller: {speed: 1}")
-    (folder / "bad.yaml").write_text("since: 2020-13-45")
-    made.write(folder / "run.mcap")
-    children = Processes(folder)
-    environment = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{router}", "PRESAGE_ROBOT": "wrong"}
-    try:
-        for number, (args, _) in enumerate(INVALID_COMMANDS):
-            if number >= MAX_PARALLEL:
-                children.started[number - MAX_PARALLEL].wait(90)
-            children.start("presage.__main__", *[a.format(tmp=folder) for a in args], env=environment)
-        yield children.started
-    finally:
-        children.close()
-
-
 @pytest.mark.parametrize(
-    "number", range(len(INVALID_COMMANDS)), ids=lambda number: " ".join(INVALID_COMMANDS[number][0])[:40]
+    ("args", "says"),
+    [
+        (("up", "--world", "nowhere"), "give a file or one of corridor, maze, office"),
+        (("up", "--model", "exakt", "--port", "0"), "no model 'exakt': give learned, exact"),
+        (("up", "--drive", "sideways", "--port", "0"), "drive: Input should be 'holonomic' or 'differential'"),
+        (("up", "--config", "{tmp}/wrong.yaml", "--port", "0"), "speed: Extra inputs are not permitted"),
+        (("up", "--world", "maze", "--estimator", "paper", "--port", "0"), "presage train --world maze"),
+        (("demo", "--world", "{tmp}/bad.yaml"), "bad.yaml: not valid YAML"),
+        (("demo", "--goal", "6.8", "3.95"), "goal (6.80, 3.95) is inside a wall or outside 'corridor'"),
+        (("demo", "--goal", "nan", "1"), "two finite numbers"),
+        (("demo", "--out", "/dev/null/x"), "/dev/null/x: cannot be written to"),
+        (("demo", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
+        (("demo", "--seed", "99999999999999999999"), "--seed"),
+        (("goal",), "X Y in m"),
+        (("goal", "-1", "2", *NO_SESSION), "start a session with `presage up`"),
+        (("goal", "nan", "1"), "nan 1: a place is finite numbers"),
+        (("goal", "1", "1", "--tolerance", "inf"), "--tolerance inf"),
+        (("goal", "1", "2", "--wiat"), "--wiat"),
+        (("goal", "1e300", "1"), "1e+300 1: X and Y must be within 10000 m of the origin"),
+        (("obstacle", "add", "crate", "-1", "2", "--radius", "-1"), "the obstacle: circle.radius"),
+        (("relocalise", "1"), "a position is two numbers"),
+        (("plot", "{tmp}/run.mcap", "--out", "/proc/no.png"), "/proc/no.png: cannot be written to"),
+        (("plot", "{tmp}/bad.yaml"), "bad.yaml"),
+        (("bench", "latency", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to (No such file or directory)"),
+        (("train", "--preset", "better"), "no preset 'better'"),
+        (("train", "--scanner", "sonar", "--out", "{tmp}/m"), "no scanner 'sonar': choose one of tim571"),
+        (("record", "--topics", "smell", "--out", "{tmp}/r"), "smell"),
+        (("echo", "nothing"), "no topic 'nothing': choose one of scan"),
+        (("doctor", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
+        (("replay", "{tmp}/no.mcap"), "no.mcap"),
+        (("replay", "{tmp}/run.mcap", "--robot", "a/b"), "--robot 'a/b'"),
+        (("replay", "{tmp}/run.mcap", "--every-scan"), "go with --with"),
+        (("replay", "{tmp}/run.mcap", "--with", "simulator"), "give estimator, or estimator,controller"),
+        (("replay", "{tmp}/run.mcap", "--with", "estimator"), "the estimator's configuration was not recorded"),
+        (
+            ("replay", "{tmp}/run.mcap", "--with", "estimator", "--loop"),
+            "leave out the options that choose what to replay",
+        ),
+        (("experiment", "e1", "--alpha", "nan", "--out", "{tmp}/e"), "--alpha"),
+        (("experiment", "e1", "--trials", "0", "--out", "{tmp}/e"), "--trials"),
+    ],
+    ids=lambda value: " ".join(value)[:40] if isinstance(value, tuple) else "",
 )
-def test_bad_input_is_one_line(finished, number):
-    running, says = finished[number], INVALID_COMMANDS[number][1]
-    assert running.wait(90) not in {0, None}
-    assert "Traceback" not in running.output, running.output
-    messages = [line for line in running.output.splitlines() if says in line]
-    assert messages, running.output
+def test_invalid_input(presage, tmp_path, args, says):
+    (tmp_path / "bad.yaml").write_text("since: 2020-13-45")
+    (tmp_path / "wrong.yaml").write_text("controller: {speed: 1}")
+    if "{tmp}/run.mcap" in args:
+        made.write(tmp_path / "run.mcap")
+    status, output = presage(*[arg.format(tmp=tmp_path) for arg in args])
+    assert status == 2
+    assert [line for line in output.splitlines() if says in line], output
+    assert "Usage" in output or len(output.splitlines()) == 1
 
 
-def test_port_in_use_is_reported(process):
+def test_port_in_use(presage):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        running = process("presage.__main__", "up", "--port", str(taken.getsockname()[1]))
-        assert running.wait(60) == 2
-    assert "cannot be used" in running.output
-    assert "--port" in running.output
-    assert "Traceback" not in running.output
+        status, output = presage("up", "--port", str(taken.getsockname()[1]))
+    assert (status, "cannot be used" in output, "--port" in output) == (2, True, True)
 
 
-def test_tools_on_a_running_session(process, bus, link):
-    process("simulator")
-    process("estimator")
-    process("controller")
-    assert wait_until(lambda: {"simulator", "estimator", "controller"} <= bus.alive(), 60)
+@pytest.mark.parametrize(
+    "name", [name for name, c in typer.main.get_command(app).commands.items() if not hasattr(c, "commands")]
+)
+def test_help_with_an_example(presage, name):
+    status, output = presage(name, "--help")
+    assert (status, "Example" in output, f"presage {name}" in output) == (0, True, True), output
 
-    def run(*args):
-        running = process("presage.__main__", *args)
-        return running.wait(60), running.output
 
-    assert run("echo", "belief", "-n", "2")[1].count('"estimator": "') == 2
-    status, text = run("hz", "scan", "--seconds", "2")
-    assert status == 0
-    assert "presage/" in text
-    assert run("teleport", "3.5", "1.5")[0] == 0
-    status, text = run("teleport", "0.1", "0.1")
-    assert status == 2
-    assert "from a wall of 'corridor'" in text
-    assert run("obstacle", "add", "crate", "12", "1.5", "--yaw", "30")[0] == 0
-    assert run("obstacle", "move", "crate", "13", "1.5")[0] == 0
-    assert 'crate: {"box":{"center":[13.0,1.5],"size":[0.5,0.5],"yaw_deg":30.0}}' in run("obstacle", "list")[1]
-    status, text = run("obstacle", "add", "crate", "13", "1.5")
-    assert status == 2
-    assert "already an obstacle 'crate'" in text
-    assert run("obstacle", "remove", "crate")[0] == 0
-    status, text = run("goal", "0.1", "0.1")
-    assert status == 2
-    assert "the nearest place that can be reached is" in text
-    assert run("relocalise", "3.5", "1.5")[0] == 0
-    assert run("goal", "4", "1.5", "90", "--wait")[0] == 0
-    assert run("goal", "--cancel")[0] == 0
-    status, text = run("doctor")
-    faults = [line for line in text.splitlines() if line.split()[:1] == ["no"]]
-    assert all(" Hz" in line for line in faults), text  # a machine under load may be slow
+def test_tools_beside_a_session(presage, process, bus, link, monkeypatch):
+    monkeypatch.setenv("PRESAGE_CONNECT", link.connect[0])
+    monkeypatch.setenv("PRESAGE_ROBOT", link.robot)
+    names = ("simulator", "estimator", "controller")
+    for name in names:
+        process(name)
+    assert wait_until(lambda: set(names) <= bus.alive(), 60)
+    for command, status, says in (
+        ("echo belief -n 2", 0, '"estimator": "'),
+        ("hz scan --seconds 1", 0, "presage/"),
+        ("teleport 3.5 1.5 -90", 0, ""),
+        ("teleport 0.1 0.1", 2, "from a wall of 'corridor'"),
+        ("obstacle add crate 12 1.5 --yaw 30", 0, ""),
+        ("obstacle move crate 13 1.5", 0, ""),
+        ("obstacle list", 0, 'crate: {"box":{"center":[13.0,1.5],"size":[0.5,0.5],"yaw_deg":30.0}}'),
+        ("obstacle add crate 13 1.5", 2, "already an obstacle 'crate'"),
+        ("obstacle remove crate", 0, ""),
+        ("goal 0.1 0.1", 2, "the nearest place that can be reached is"),
+        ("relocalise 3.5 1.5", 0, ""),
+        ("goal 4 1.5 90 --wait", 0, "reached"),
+        ("goal --cancel", 0, ""),
+        ("topics", 0, "presage/ROBOT/scan"),
+    ):
+        found, output = presage(*command.split())
+        assert (found, says in output) == (status, True), (command, output)
+    outputs = []
+
+    def healthy():
+        status, output = presage("top", "--once")
+        outputs.append(output)
+        return status == 0 and "ms" in row_of(output, "controller")
+
+    assert wait_until(healthy, 60), outputs[-1]  # the first scans take longer
+    assert f"robot {link.robot}" in outputs[-1]
+    for name, sends in zip(names, ("scan", "belief", "cmd_vel"), strict=True):
+        assert re.search(rf"^{name} alive.* {sends} [0-9.]*[1-9]", row_of(outputs[-1], name)), outputs[-1]
+    assert "ms" in row_of(outputs[-1], "estimator")
+    assert "not running" in row_of(outputs[-1], "recorder")
+    status, output = presage("doctor")
+    faults = [line for line in output.splitlines() if line.split()[:1] == ["no"]]
+    assert all(" Hz" in line for line in faults), output  # a machine under load may be slow
     assert status == (1 if faults else 0)
-    for there in ("simulator", "estimator", "controller"):
-        assert f"{there} of '{link.robot}': alive" in text
-    assert f"recorder of '{link.robot}': not running" in text
-    assert "python -m services.recorder" in text
-    assert "presage/ROBOT/scan" in run("topics")[1]
+    for name in names:
+        assert f"{name} of '{link.robot}': alive" in output
+    assert f"recorder of '{link.robot}': not running" in output
+    assert "python -m services.recorder" in output

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import uuid
 from itertools import pairwise
 
@@ -70,33 +71,39 @@ print(f"user{{os.getuid()}}", *found)
 """
 
 
-@pytest.mark.parametrize("target", HOLDS)
-def test_an_image_contains_only_what_its_service_needs(image, target):
-    how = ("--rm", "--read-only", "--tmpfs", "/tmp", "--network", "none")
-    done = docker("run", *how, f"{image}-{target}", "python", "-c", LIST_PACKAGES)
-    assert done.returncode == 0, done.stderr
-    words = set(done.stdout.split())  # pybullet prints more
-    assert "user1000" in words
-    assert words & set(HEAVY) == HOLDS[target]
+def test_packages_of_each_image(image):
+    how = ("docker", "run", "--rm", "--read-only", "--tmpfs", "/tmp", "--network", "none")
+    started = {
+        target: subprocess.Popen(
+            [*how, f"{image}-{target}", "python", "-c", LIST_PACKAGES], stdout=subprocess.PIPE, text=True
+        )
+        for target in HOLDS
+    }
+    for target, running in started.items():
+        words = set(running.communicate(timeout=TIMEOUT_S)[0].split())  # pybullet prints more
+        assert running.returncode == 0, target
+        assert "user1000" in words
+        assert words & set(HEAVY) == HOLDS[target], target
 
 
-def test_up_drives_the_robot_to_its_goal(compose):
-    project = compose()
+def test_up_drives_two_robots_to_the_goal(compose):
+    project = compose(ROBOTS="2", GOAL_X="6")
     up = project("up", "--exit-code-from", "goal", timeout=300)
     assert up.returncode == 0, up.stdout[-5000:] + up.stderr[-2000:]
-    assert "reached: within 0.2 m of the goal" in up.stdout
+    for robot in ("robot-1", "robot-2"):
+        assert f"{robot} | reached: within 0.2 m of the goal" in up.stdout
     for service in (*SERVICES, "viewer"):
         assert f"{service}-1 exited with code 0" in up.stdout + up.stderr
     project.down()
-    (file,) = project.recordings()
-    recording = read_recording(file)
+    first, second = project.recordings()
+    assert (first.name[:15], second.name[:15]) == ("presage-robot-1", "presage-robot-2")
+    recording = read_recording(first)
     counts = {key.split("/")[-1]: count for key, count in recording.counts().items()}
-    assert counts["scan"] > 100
-    assert counts["belief"] > 100
+    assert min(counts["scan"], counts["belief"]) > 50
     assert recording.world().name == "corridor"
 
 
-def test_secure_mode_reaches_the_goal_and_hides_it_from_unauthenticated_clients(compose, tmp_path):
+def test_secure_mode_and_health(compose, tmp_path):
     keys = tmp_path / "keys"
     secure.init(keys)
     both = os.pathsep.join(["docker-compose.yml", "docker-compose.secure.yml"])
@@ -112,6 +119,27 @@ def test_secure_mode_reaches_the_goal_and_hides_it_from_unauthenticated_clients(
         assert "reached: within 0.2 m of the goal" in project.do("logs", "goal")
         assert not stranger.linked()
     assert "refused" in project.do("logs", "router")
+
+    # A frozen service is unhealthy until it continues, a killed one is restarted by the engine.
+    for service in ("router", "simulator", "estimator"):
+        project.becomes(service, "healthy")
+    send_signal(project, "STOP")
+    project.becomes("estimator", "unhealthy")
+    assert "no heartbeat for" in project.state("estimator")["Health"]["Log"][-1]["Output"]
+    assert project.health("simulator") == "healthy"
+    send_signal(project, "CONT")
+    project.becomes("estimator", "healthy")
+    began = project.state("estimator")["StartedAt"]
+    send_signal(project, "KILL")
+    assert wait_until(lambda: project.state("estimator")["StartedAt"] > began, TIMEOUT_S, 0.5)
+    project.becomes("estimator", "healthy")
+
+
+def send_signal(project, number):
+    """Sends a signal to the service itself, because the container's init process does not forward it."""
+    find = "for p in /proc/[0-9]*; do [ $p = /proc/1 ] || [ $p = /proc/$$ ] || "
+    find += "! grep -qs services.estimator $p/cmdline || "
+    project.do("exec", "-T", "estimator", "sh", "-c", f"{find} kill -{number} ${{p#/proc/}}; done")
 
 
 def gaps(messages):
@@ -129,7 +157,7 @@ def replacement_beliefs(recording):
     return first[-1], second[0]
 
 
-def test_services_are_replaced_while_the_others_run(compose):
+def test_replaced_services(compose):
     project = compose(PRESAGE_VIEWER="0", PRESAGE_MAX_SPEED="0.5")
     project.do("up", "--detach")
     assert project.do("ps", "--all", "--quiet", "viewer") == ""
@@ -182,43 +210,3 @@ def test_services_are_replaced_while_the_others_run(compose):
     assert not any(each.contact for each in truths)
     reasons = [m.reason for _, m, _ in recording.messages(STATUS) if before < m.stamp_ns * 1e-9 + 1 < after + 1]
     assert any("no belief for" in reason for reason in reasons)
-
-
-def send_signal(project, number):
-    """Sends a signal to the service itself, because the container's init process does not forward it."""
-    find = "for p in /proc/[0-9]*; do [ $p = /proc/1 ] || [ $p = /proc/$$ ] || "
-    find += "! grep -qs services.estimator $p/cmdline || "
-    project.do("exec", "-T", "estimator", "sh", "-c", f"{find} kill -{number} ${{p#/proc/}}; done")
-
-
-def test_a_frozen_service_is_unhealthy_until_it_continues(compose):
-    project = compose(PRESAGE_VIEWER="0")
-    project.do("up", "--detach", "router", "simulator", "estimator")
-    for service in ("router", "simulator", "estimator"):
-        project.becomes(service, "healthy")
-    send_signal(project, "STOP")
-    project.becomes("estimator", "unhealthy")
-    output = project.state("estimator")["Health"]["Log"][-1]["Output"]
-    assert "no heartbeat for" in output
-    assert project.health("simulator") == "healthy"
-    send_signal(project, "CONT")
-    project.becomes("estimator", "healthy")
-
-    # A killed service is restarted by the engine.
-    began = project.state("estimator")["StartedAt"]
-    send_signal(project, "KILL")
-    assert wait_until(lambda: project.state("estimator")["StartedAt"] > began, TIMEOUT_S, 0.5)
-    project.becomes("estimator", "healthy")
-
-
-def test_two_robots(compose):
-    project = compose(ROBOTS="2", GOAL_X="6", PRESAGE_VIEWER="0")
-    project.do("up", "--detach")
-    assert project.ends("goal", 2 * TIMEOUT_S) == 0, project.explain("goal")
-    log = project.do("logs", "--no-log-prefix", "goal")
-    for robot in ("robot-1", "robot-2"):
-        assert f"{robot} | reached: within 0.2 m of the goal" in log
-    project.down()
-    assert sorted(file.name.rsplit("-", 1)[0][:15] for file in project.recordings()) == [
-        "presage-robot-1", "presage-robot-2",
-    ]  # fmt: skip

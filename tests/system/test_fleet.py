@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import signal
-
 import numpy as np
 import pytest
 
-from common.bus.bus import Link, open_bus, wait_until
+from common.bus.bus import open_bus, wait_until
 from common.bus.inbox import Inbox, Sample
 from common.messages.definitions import Belief, Health, Truth
 from common.messages.requests import ConfigReply, ModelReply, ModelRequest, Request
@@ -68,7 +66,7 @@ def simulate(process, names):
     return start
 
 
-def test_one_estimator_process_serves_three_robots(process, bus, link, names, simulate):
+def test_one_estimator_for_three_robots(process, bus, link, names, simulate):
     estimator = process("estimator", "--robots", f"{names[1]},{link.robot}-?", "--forget", "1.5")
     listeners = {k: RobotListener(bus, name) for k, name in names.items()}
     simulators = {k: simulate(k) for k in NUMBERS}
@@ -126,7 +124,7 @@ def test_one_estimator_process_serves_three_robots(process, bus, link, names, si
     assert estimator.stop()[0] == 0
 
 
-def test_the_robot_limit_holds_and_robots_with_an_estimator_are_skipped(process, bus, link, names, simulate):
+def test_robot_limit(process, bus, link, names, simulate):
     own = process("estimator", env={"PRESAGE_ROBOT": names[1]})
     assert wait_until(lambda: "estimator" in bus.alive(robot=names[1]), 60)
     simulators = [simulate(k) for k in NUMBERS]
@@ -141,39 +139,10 @@ def test_the_robot_limit_holds_and_robots_with_an_estimator_are_skipped(process,
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--robots", "a b"), "robots"),
-        (("--robots", "a,b", "--initial-pose", "3,1.5"), "--initial-pose"),
-        (("--robots", "a,b,c", "--max-robots", "2"), "--max-robots"),
-    ],
-)
-def test_invalid_robot_options_are_refused_in_one_line(process, arguments, words):
-    refused = process("estimator", *arguments)
-    assert refused.wait(60) == 2
-    assert len(refused.output.strip().splitlines()) == 1
-    assert words in refused.output
-
-
-def test_up_with_two_robots(process, free_port):
-    port = free_port()
-    settings = {"PRESAGE_ROBOT": "r", "PRESAGE_BEAMS": "64"}
-    up = process("presage.__main__", "up", "--robots", "2", "--no-viewer", "--port", str(port), env=settings)
-    up.wait_for("all alive", 120)
-    with open_bus(Link(robot="r-1", connect=(f"tcp/127.0.0.1:{port}",))) as bus:
-        for robot in ("r-1", "r-2"):
-            listener = RobotListener(bus, robot)
-            listener.wait(listener.localised, "localised")
-            assert bus.alive(robot=robot) == {"estimator", "simulator", "controller"}
-    assert up.output.count("estimator | ") > 0
-    assert up.stop(signal.SIGINT, 60)[0] == 130
-
-
-@pytest.mark.parametrize(
     ("pattern", "hears", "not_heard"),
     [("*", "a-1", ""), ("a-*", "a-1", "b-1"), ("a-?", "a-1", "b-1"), ("*-1", "b-1", "b-2"), ("??", "ab", "")],
 )
-def test_a_pattern_matches_robots_by_their_scans(bus, link, pattern, hears, not_heard):
+def test_robot_patterns(bus, link, pattern, hears, not_heard):
     prefix = "" if pattern in {"*", "??"} else link.robot
     inbox = Inbox()
     bus.subscribe(SCAN, inbox, keep_all=True, robot=key_expression(prefix + pattern))

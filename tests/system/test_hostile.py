@@ -1,4 +1,4 @@
-"""A running system survives more than 10 000 malformed payloads on every key."""
+"""A running system survives malformed payloads on every key."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from common.bus.bus import Link, open_bus, wait_until
 from common.bus.inbox import Inbox, Sample
-from common.errors import UserError
 from common.messages.definitions import Health, Scan, Truth
 from common.messages.requests import ConfigReply, Request
 from common.messages.topics import CONFIG, HEALTH, MAX_BYTES, QUERIES, SCAN, TOPICS, TRUTH
@@ -19,7 +18,7 @@ from tests.common.samples import message_of
 from tests.conftest import Processes
 
 SERVICES = ("simulator", "estimator", "controller", "recorder")
-EXAMPLES = 400  # per key; there are 26 keys
+EXAMPLES = 80  # per key
 SUBSCRIBED_TOPICS = {
     "simulator": ["cmd_vel"],
     "estimator": ["scan", "goal"],
@@ -109,7 +108,7 @@ def before(system):
 
 
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
-def test_hostile_payloads_on_every_topic(system, before, topic):
+def test_payloads(system, before, topic):
     bus, running, _ = system
 
     @settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck))
@@ -120,7 +119,6 @@ def test_hostile_payloads_on_every_topic(system, before, topic):
     send()
     for oversized in (b"\x00" * (MAX_BYTES + 1), b"\xc1" * (4 * MAX_BYTES)):
         bus.put(topic, oversized, service="intruder")
-    assert before.seq >= 0
     assert all(process.running for process in running.values())
 
 
@@ -129,37 +127,31 @@ ANSWERED = [query for query in QUERIES if query.server in (*SERVICES, "every ser
 
 
 @pytest.mark.parametrize("query", ANSWERED, ids=lambda query: query.name)
-def test_hostile_requests_are_refused_with_a_reason(system, before, query):
+def test_requests(system, before, query):
     bus, running, _ = system
     service = "estimator" if query is CONFIG else "*"
 
     @settings(max_examples=EXAMPLES, suppress_health_check=list(HealthCheck))
     @given(malformed_payloads(query.request))
     def ask(payload):
-        answers = list(bus._session.get(query.key(bus.robot, service), payload=payload, timeout=30))
-        assert len(answers) == 1
-        assert answers[0].err is not None
-        assert query.request.__name__ in answers[0].err.payload.to_string()
+        (answer,) = bus._session.get(query.key(bus.robot, service), payload=payload, timeout=30)
+        assert answer.err is not None
+        assert query.request.__name__ in answer.err.payload.to_string()
 
     ask()
-    assert before.seq >= 0
     assert all(process.running for process in running.values())
 
 
-def test_afterwards_everything_runs_and_the_robot_has_not_moved(system, before):
-    bus, running, _ = system
+def test_afterwards(system, before):
+    """The robot has not moved, all services answer, and have counted, logged and recorded what they received."""
+    bus, running, folder = system
     after = next_message(bus, TRUTH, Truth, lambda truth: truth.stamp_ns > before.stamp_ns + 10**9)
     assert after.pose.array() == pytest.approx(before.pose.array(), abs=1e-3)
     first = next_message(bus, SCAN, Scan)
     assert next_message(bus, SCAN, Scan, lambda scan: scan.seq > first.seq + 5)
     for name in SERVICES:
-        assert running[name].running
         assert bus.ask(CONFIG, Request(), ConfigReply, service=name).service == name
         assert "Traceback" not in running[name].output, running[name].output[-3000:]
-
-
-def test_malformed_payloads_are_counted_and_logged_at_a_limited_rate(system, before):
-    bus, running, _ = system
     for name, topics in SUBSCRIBED_TOPICS.items():
         health = next_message(bus, HEALTH, Health, lambda h, n=name: h.service == n)
         rows = {row.key: row for row in health.topics}
@@ -168,18 +160,9 @@ def test_malformed_payloads_are_counted_and_logged_at_a_limited_rate(system, bef
             assert row.received >= EXAMPLES
             assert row.undecodable > 0
         assert health.counters["failed"] == 0
-        assert "payload dropped" in running[name].output
-        assert running[name].output.count("payload dropped") < EXAMPLES  # at most once per second and key
-    assert before.seq >= 0
-
-
-def test_the_recorder_has_recorded_every_payload(system):
-    bus, running, folder = system
+        assert 0 < running[name].output.count("payload dropped") < EXAMPLES  # at most once per second and key
     assert running["recorder"].stop()[0] == 0
     (file,) = folder.glob("*.mcap")
     counts = read_recording(file).counts()
     for topic in TOPICS:
-        key = topic.key(bus.robot, "intruder")
-        assert counts[key] >= EXAMPLES, topic.name
-    with pytest.raises(UserError, match="no service answers"):
-        bus.ask(CONFIG, Request(), ConfigReply, timeout=1, service="recorder")
+        assert counts[topic.key(bus.robot, "intruder")] >= EXAMPLES, topic.name

@@ -13,7 +13,7 @@ from services.recorder.reader import read_recording
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_the_documented_three_hosts_drive_the_robot_to_its_goal(process, tmp_path):
+def test_documented_hosts(process, tmp_path):
     if why := missing_for_namespaces():
         print(f"\n==== NO NETWORK NAMESPACES HERE ({why}): several hosts were NOT tested ====", file=sys.__stderr__)
         pytest.skip(f"several hosts were NOT tested: {why}")

@@ -42,7 +42,7 @@ def estimator(bus, process):
     return running
 
 
-def test_predictions_answer_blocking_and_asynchronous_queries(estimator, bus):
+def test_predictions(estimator, bus):
     rng = np.random.default_rng(0)
     poses = np.column_stack([WORLD.sample_free(100, rng, 0.27), rng.uniform(-np.pi, np.pi, 100)])
     request = PredictRequest(poses=poses, beams=61)

@@ -61,7 +61,7 @@ def truths(bus):
 
 
 @pytest.mark.parametrize("stop", ["--obstacle-stop", "--no-obstacle-stop"])
-def test_the_obstacle_stop_of_the_base_prevents_contact_whatever_the_command(process, bus, truths, stop):
+def test_obstacle_stop_of_the_base(process, bus, truths, stop):
     simulator = process("simulator", *START, "--wait-for", TEST_DRIVER, stop)
     assert wait_until(lambda: "simulator" in bus.alive(), TIMEOUT_S), simulator.output
     assert bus.wait_matching(CMD_VEL, TIMEOUT_S)
@@ -79,7 +79,7 @@ def test_the_obstacle_stop_of_the_base_prevents_contact_whatever_the_command(pro
 
 
 @pytest.mark.parametrize("base", ["holonomic", "differential"])
-def test_the_controller_alone_prevents_contact_without_the_obstacle_stop(process, bus, truths, base):
+def test_controller_without_obstacle_stop(process, bus, truths, base):
     """The controller's map has no box, so it can only see the box in the scan. The belief is the true pose."""
     statuses = Inbox()
     bus.subscribe(STATUS, statuses, keep_all=True)

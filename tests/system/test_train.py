@@ -1,4 +1,4 @@
-"""`presage train`: samples from the running scanner or from its own simulator, resuming, and use of the weights."""
+"""`presage train`: weights that an estimator uses, from its own simulator or the running scanner; resuming."""
 
 from __future__ import annotations
 
@@ -7,77 +7,69 @@ import signal
 import pytest
 
 from common.bus.bus import wait_until
-from common.bus.inbox import Inbox, Sample
+from common.bus.inbox import Inbox
 from common.messages.definitions import Belief
 from common.messages.topics import BELIEF
+from tests.conftest import wait_for_message
 
 WORLD = """
 name: closet
-boundary: [[0, 0], [5, 0], [5, 3], [0, 3]]
+boundary: [[0, 0], [3, 0], [3, 2], [0, 2]]
 obstacles:
-  - circle: {center: [4, 2], radius: 0.3}
-start: {x: 1.5, y: 1.5, yaw_deg: 90}
+  - circle: {center: [2.4, 1.4], radius: 0.3}
+start: {x: 1, y: 1, yaw_deg: 90}
 """
-SMALL = ("--beams", "61", "--samples", "300")
 
 
-def train(process, tmp_path, preset, epochs=1):
+@pytest.fixture
+def world(tmp_path):
+    path = tmp_path / "world.yaml"
+    path.write_text(WORLD)
+    return str(path)
+
+
+@pytest.fixture
+def train(process, world, tmp_path):
+    """A function that starts a training; the weights get into ``tmp_path / "models"``."""
+
     config = tmp_path / "train.yaml"
-    config.write_text(f"train: {{batch: 50, epochs: {epochs}}}")
-    where = ("--world", str(tmp_path / "w.yaml"), "--out", str(tmp_path / "m"), "--config", str(config))
-    return process("presage.__main__", "train", "--preset", preset, *where, *SMALL)
+    config.write_text("train: {batch: 50, epochs: 12}")
+    args = ("--world", world, "--out", str(tmp_path / "models"), "--config", str(config), "--beams", "61")
+
+    def start(preset, samples):
+        return process("presage.__main__", "train", "--preset", preset, "--samples", str(samples), *args)
+
+    return start
 
 
-@pytest.mark.parametrize(("preset", "stem"), [("precise", "closet-precise"), ("paper", "closet-paper-61")])
-def test_training_for_a_custom_world_gives_beliefs(process, bus, tmp_path, preset, stem):
-    (tmp_path / "w.yaml").write_text(WORLD)
-    folder = str(tmp_path / "m")
-    estimator = ("estimator", "--world", str(tmp_path / "w.yaml"), "--models", folder, "--estimator", preset)
-    without = process(*estimator)
-    assert without.wait(60) == 2
-    assert f"presage train --world {tmp_path / 'w.yaml'}" in without.output
+def assert_used(preset, process, bus, world, tmp_path):
+    """An estimator with the trained weights publishes beliefs of a running simulator's scans."""
+    stem = {"precise": "closet-precise", "paper": "closet-paper-61"}[preset]
+    names = {path.name for path in (tmp_path / "models").iterdir()}
+    assert names == {f"{stem}.json", f"{stem}.png", f"{stem}.safetensors"}
+    beliefs = Inbox()
+    bus.subscribe(BELIEF, beliefs)
+    process("estimator", "--world", world, "--models", str(tmp_path / "models"), "--estimator", preset)
+    wait_for_message(beliefs, Belief, lambda belief: belief.estimator == preset)
 
-    training = train(process, tmp_path, preset, 3)
+
+def test_precise_with_own_simulator(process, bus, world, train, tmp_path):
+    training = train("precise", 300)
     assert training.wait(120) == 0, training.output
-    assert sorted(p.name for p in (tmp_path / "m").iterdir()) == [
-        f"{stem}.json", f"{stem}.png", f"{stem}.safetensors",
-    ]  # fmt: skip
-
-    inbox = Inbox()
-    bus.subscribe(BELIEF, inbox)
-    process(*estimator)
-    process("simulator", "--world", str(tmp_path / "w.yaml"), "--beams", "61")
-    assert wait_until(lambda: len(inbox) > 0, 60)
-    sample = inbox.get(0)
-    assert isinstance(sample, Sample)
-    assert Belief.decode(sample.payload).estimator == preset
+    process("simulator", "--world", world, "--beams", "61")
+    assert_used("precise", process, bus, world, tmp_path)
 
 
-def test_a_running_scanner_provides_the_samples(process, bus, tmp_path):
-    (tmp_path / "w.yaml").write_text(WORLD)
-    process("simulator", "--world", str(tmp_path / "w.yaml"))
+def test_paper_with_running_scanner_and_interrupt(process, bus, world, train, tmp_path):
+    process("simulator", "--world", world, "--beams", "61")
     assert wait_until(lambda: "simulator" in bus.alive(), 60)
-    training = train(process, tmp_path, "paper")
-    assert training.wait(120) == 0, training.output
+    training = train("paper", 100)
+    state = tmp_path / "models" / ".closet-paper-61.unfinished" / "state.safetensors"
+    assert wait_until(lambda: state.exists() or not training.running, 60)
     assert "samples come from the running scanner tim571 in closet" in training.output
-
-
-def test_an_interrupted_training_continues_and_gives_the_same_weights(process, tmp_path):
-    (tmp_path / "w.yaml").write_text(WORLD)
-    whole = train(process, tmp_path, "paper", 15)
-    assert whole.wait(150) == 0, whole.output
-    weights = tmp_path / "m" / "closet-paper-61.safetensors"
-    first = weights.read_bytes()
-    weights.unlink()
-
-    cut = train(process, tmp_path, "paper", 15)
-    state = tmp_path / "m" / ".closet-paper-61.unfinished" / "state.safetensors"
-    assert wait_until(lambda: state.exists() or not cut.running, 60)
-    cut.send(signal.SIGINT)
-    assert cut.wait(30) == 130, cut.output
-    assert not weights.exists()
-
-    again = train(process, tmp_path, "paper", 15)
+    assert training.stop(signal.SIGINT, 30)[0] == 130, training.output
+    assert not list((tmp_path / "models").glob("*.safetensors"))
+    again = train("paper", 100)
     assert again.wait(150) == 0, again.output
     assert "an interrupted run" in again.output
-    assert weights.read_bytes() == first
+    assert_used("paper", process, bus, world, tmp_path)

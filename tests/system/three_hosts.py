@@ -40,7 +40,7 @@ def main(page: Path, folder: Path) -> int:
                         [*prefix, "bash", "-c", script],
                         env=environment,
                         cwd=folder,
-                        preexec_fn=end_with_this_process(),  # noqa: PLW1509 - one call, before any thread of the child
+                        preexec_fn=end_with_this_process(),
                     )
                 )
             return retry_goal(GOAL, environment, folder)

@@ -11,7 +11,6 @@ from services.controller.policies.geodesic_field import CostField, FreeSpaceGrap
 from services.viewer.state.goal_field import field_of
 
 RADIUS = 0.27  # m
-AHEAD = 0.8  # m of the path, the point that is driven to
 
 
 class Planner:
@@ -24,9 +23,9 @@ class Planner:
         self.field: CostField | None = None
         self.news: bytes | None = None  # the field, until somebody has sent it
 
-    def aim(self, goal: np.ndarray | None, t: float) -> None:
-        """Another goal (2,) m, or none; at a time, s."""
-        if goal is None or (self.goal is not None and np.allclose(goal, self.goal)):
+    def aim(self, goal: np.ndarray, t: float) -> None:
+        """Another goal (2,) m at a time, s."""
+        if self.goal is not None and np.allclose(goal, self.goal):
             return
         self.goal, self.field = goal, self.graph.cost_field(goal)
         if self.field is None:
@@ -42,14 +41,6 @@ class Planner:
     def path(self, place: np.ndarray) -> np.ndarray:
         """(K, 2) m to the goal."""
         return self.field.path(place) if self.field is not None else np.zeros((0, 2))
-
-    def ahead(self, place: np.ndarray) -> np.ndarray | None:
-        """(2,) m on the path, some way on."""
-        path = self.path(place)
-        if not len(path):
-            return None
-        gone = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-        return np.asarray(path[min(np.searchsorted(gone, AHEAD), len(path) - 1)])
 
 
 def motion(pose: np.ndarray, twist: np.ndarray) -> np.ndarray:

@@ -70,20 +70,8 @@ class Visitor:
                     await self.socket.send_bytes(self.field)
             if count % 15 == 0:
                 await self.tell(**pulses(session.scene))
-            if session.position >= 0 and count % 3 == 0:
-                session.position = min(31.5, session.position + 3 * DT)
-                await self.tell(
-                    type="player",
-                    ok=True,
-                    paused=False,
-                    position_s=session.position,
-                    duration_s=31.5,
-                    rate=1.0,
-                    loop=False,
-                    file="presage-robot-1.mcap",
-                )
             count += 1
-            await asyncio.sleep(DT / session.speed)
+            await asyncio.sleep(DT)
 
     async def listen(self) -> None:
         """Answers until it leaves."""
@@ -92,8 +80,6 @@ class Visitor:
             await self.tell(type="answer", id=ask.get("id"), **self.session.act(ask))
             if ask.get("do") == "obstacle":
                 await self.world()
-            if ask.get("do") == "close":
-                await self.tell(type="closed")
 
 
 def application(warm: float) -> Starlette:

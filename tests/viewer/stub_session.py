@@ -1,4 +1,4 @@
-"""A robot that is only made up, for the stub server: where it is, what it sees, what an estimator would say."""
+"""A standing robot for the stub server: what its scanner, an estimator and a controller would publish."""
 
 from __future__ import annotations
 
@@ -28,7 +28,6 @@ PLANNED = tuple(WORLDS)
 REASONS = {
     "blocked": "somebody stands in the only way, 0.62 m ahead: waiting until 12 s are over, then another way is tried",
     "exploring": "2 places are possible: going to (6.3, 4.1) to tell them apart",
-    "manual": "driven by hand",
 }
 PAST = (("idle", ""), ("navigating", ""), ("blocked", "the scan shows something in the way"), ("navigating", ""))
 SCANNER = SCANNERS["tim571"]
@@ -38,60 +37,30 @@ WIDE = (0.09, 0.02, 0, 0.02, 0.04, 0, 0, 0, 0.02)
 
 
 class Session:
-    """A robot that drives from goal to goal, and what an estimator would say of it."""
+    """A robot at the world's start with a goal across the room."""
 
     def __init__(self, world: World, scene: str) -> None:
-        """At the world's start, on the way to a goal."""
         self.map, self.world, self.scene = world, world, scene
         self.rng = np.random.default_rng(1)
         self.pose = np.array([*world.start_pose(0.3)])
-        self.t, self.twist, self.seek = 0.0, np.zeros(3), 0.0  # s, m/s and rad/s, s of searching still to do
+        self.t = 0.0  # s
         self.planner = stub_plan.Planner(world) if scene in PLANNED else None
-        self.goal: np.ndarray | None = self.far_goal()
-        self.drive, self.driven = np.zeros(3), -1.0
+        places = world.sample_free(60, self.rng, 0.5)
+        self.goal = np.asarray(places[np.argmax(np.hypot(*(places - self.pose[:2]).T))])  # x, y and perhaps yaw
         self.history: deque[list[float]] = deque(maxlen=900)
-        self.paused, self.recording, self.position = False, False, -1.0
-        self.speed = 1.0
-
-    def far_goal(self) -> np.ndarray:
-        """Somewhere across the room."""
-        places = self.map.sample_free(60, self.rng, 0.5)
-        return np.asarray(places[np.argmax(np.hypot(*(places - self.pose[:2]).T))])
+        self.paused = False
 
     def step(self) -> bytes:
         """One scan later: the frame."""
         self.t += DT
-        self.twist += np.clip(self.wish() - self.twist, -0.08, 0.08)
-        c, s = np.cos(self.pose[2]), np.sin(self.pose[2])
-        step = (
-            np.array([c * self.twist[0] - s * self.twist[1], s * self.twist[0] + c * self.twist[1], self.twist[2]]) * DT
-        )
-        if self.world.clearance((self.pose + step)[None, :2])[0] > 0.27:
-            self.pose = self.pose + step
         return self.frame()
-
-    def wish(self) -> np.ndarray:
-        """m/s and rad/s in base_link."""
-        if self.t - self.driven < 0.5:
-            return self.drive
-        if self.goal is None or self.seek > 0 or self.scene in {"lost", "blocked"}:
-            return np.zeros(3)
-        if np.hypot(*(self.goal[:2] - self.pose[:2])) < 0.15:
-            self.goal = self.far_goal()
-        ahead = self.planner.ahead(self.pose[:2]) if self.planner is not None else None
-        away = (self.goal[:2] if ahead is None else ahead) - self.pose[:2]
-        direction = np.arctan2(away[1], away[0]) - self.pose[2]
-        speed = min(0.9, float(np.hypot(*away)))
-        turn = 0.9 * np.arctan2(np.sin(direction), np.cos(direction))
-        return np.array([speed * np.cos(direction), speed * np.sin(direction), turn])
 
     def believed(self) -> tuple[str, np.ndarray, list[dict]]:
         """State, pose, mixture."""
         x0, y0, x1, y1 = self.map.bounds
-        self.seek = max(0.0, self.seek - DT)
         if self.scene == "lost":
             return "lost", self.pose + np.array([2.6, -0.4, 0.5]), []
-        if self.seek > 0 or self.scene in {"ambiguous", "exploring"}:
+        if self.scene in {"ambiguous", "exploring"}:
             mirror = np.array([x0 + x1 - self.pose[0], y0 + y1 - self.pose[1], self.pose[2] + np.pi])
             poses = [
                 mirror,
@@ -100,7 +69,7 @@ class Session:
             ]
             weights = (0.46, 0.38, 0.11, 0.05)
             mixture = [mode(p, w, WIDE) for p, w in zip(poses, weights, strict=True)]
-            return ("ambiguous" if self.seek < 1.5 else "localising"), mirror, mixture
+            return "ambiguous", mirror, mixture
         pose = self.pose + self.rng.normal(0, [0.0015, 0.0012, 0.001])
         return "tracking", pose, [mode(pose, 1.0, COV)]
 
@@ -115,16 +84,15 @@ class Session:
         z = np.where(np.isfinite(measured), (measured - expected) / sigma, 0)
         accuracy = float(np.sum(np.minimum(0.5 * z**2, 12) + np.log(sigma * np.sqrt(2 * np.pi))))
         complexity = 7.5 + 1.2 * float(self.rng.normal()) + (30 if state != "tracking" else 0)
-        speed = float(np.hypot(*self.twist[:2]))
         error = float(np.hypot(*(pose - self.pose)[:2]))
-        self.history.append([self.t, accuracy + complexity, accuracy, complexity, error, speed])
+        self.history.append([self.t, accuracy + complexity, accuracy, complexity, error, 0.0])
         blind = self.scene == "half-dead"
         status = self.status(state)
-        away = float(np.hypot(*(self.goal[:2] - self.pose[:2]))) if self.goal is not None else None
+        away = float(np.hypot(*(self.goal[:2] - self.pose[:2])))
         reason = {"lost": f"the belief is {state}: standing until it tracks", **REASONS}.get(status, "")
         goal = self.goal
         if self.planner is not None:
-            self.planner.aim(None if goal is None else goal[:2], self.t)
+            self.planner.aim(goal[:2], self.t)
         header = {
             "type": "frame", "t": self.t, "stamp_ns": int(self.t * 1e9), "robot": "robot",
             "truth": {**as_pose(self.pose), "contact": False, "stopped": False},
@@ -133,10 +101,10 @@ class Session:
                 "free_energy": accuracy + complexity, "accuracy": accuracy, "complexity": complexity,
                 "hypotheses": mixture, "estimator": "stub",
             },
-            "odom": None, "cmd": None, "error": None if blind else error, "speed": speed,
+            "odom": None, "cmd": None, "error": None if blind else error, "speed": 0.0,
             "status": {
                 "state": status, "reason": reason, "distance": away,
-                "goal": None if goal is None else {
+                "goal": {
                     "x": goal[0], "y": goal[1], "yaw": goal[2] if len(goal) > 2 else 0.0, "tolerance": 0.2,
                     "yaw_tolerance": 0.15 if len(goal) > 2 else None,
                 },
@@ -158,11 +126,9 @@ class Session:
 
     def status(self, state: str) -> str:
         """The controller's, with such a belief."""
-        if self.t - self.driven < 0.5:
-            return "manual"
         if self.scene in REASONS:
             return self.scene
-        return "lost" if state != "tracking" else "idle" if self.goal is None else "navigating"
+        return "lost" if state != "tracking" else "navigating"
 
     def plan(self, pose: np.ndarray) -> dict[str, np.ndarray]:
         """Points in map, m, of one that plans."""
@@ -170,10 +136,11 @@ class Session:
             return {}
         people = stub_plan.people(self.t, self.map)
         return {
-            "path": self.planner.path(pose[:2]) if self.goal is not None else [],
-            "motion": stub_plan.motion(pose, self.twist), "people": people,
+            "path": self.planner.path(pose[:2]),
+            "motion": stub_plan.motion(pose, np.array([0.5, 0.0, 0.2])),
+            "people": people,
             "obstacles": stub_plan.seen_of(people, pose[:2]),
-        }  # fmt: skip
+        }
 
     def journal(self) -> dict:
         """What the controller said."""
@@ -199,15 +166,6 @@ class Session:
         self.goal = np.array([ask["x"], ask["y"], *([ask["yaw"]] if "yaw" in ask else [])])
         return ""
 
-    def do_cancel(self, _: dict) -> None:
-        self.goal = None
-
-    def do_teleport(self, ask: dict) -> None:
-        self.seek, self.pose = 3.0, np.array([ask["x"], ask["y"], ask["yaw"]])
-
-    def do_localise(self, _: dict) -> None:
-        self.seek = 3.0
-
     def do_obstacle(self, ask: dict) -> None:
         others = [o for o in self.world.obstacles if o.name != ask["name"]]
         new = [] if ask["action"] == "remove" else [Obstacle.model_validate(ask["obstacle"])]
@@ -218,30 +176,6 @@ class Session:
 
     def do_resume(self, _: dict) -> None:
         self.paused = False
-
-    def do_drive(self, ask: dict) -> None:
-        self.drive, self.driven = np.array([ask["vx"], ask["vy"], ask["wz"]]), self.t
-
-    def do_speed(self, ask: dict) -> None:
-        self.speed = ask["factor"]
-
-    def do_record(self, ask: dict) -> dict:
-        self.recording = {"start": True, "stop": False}.get(ask["action"], self.recording)
-        return {"recording": self.recording}
-
-    def do_recordings(self, _: dict) -> dict:
-        names = [f"presage-robot-20261121-12090{n}.mcap" for n in (1, 2)]
-        return {"files": [{"name": name, "size": 8_400_000, "duration": 31.5} for name in names]}
-
-    def do_open(self, _: dict) -> None:
-        self.position = 0.0
-
-    def do_close(self, _: dict) -> None:
-        self.position = -1.0
-
-    def do_player(self, ask: dict) -> None:
-        if ask["action"] == "seek":
-            self.position = ask["value"]
 
 
 def as_pose(pose: np.ndarray) -> dict:

@@ -70,55 +70,48 @@ class Pretence:
         raise AssertionError("no frame as wanted")
 
 
-def test_an_empty_system_is_shown_as_such(viewer, link):
+def test_empty_system(viewer, link):
     _, where = viewer()
     with Page(where) as page:
         hello = page.told("hello")
-        assert hello == {"type": "hello", "control": True, "version": hello["version"], "robots": [link.robot],
-                         "robot": link.robot}  # fmt: skip
+        assert (hello["control"], hello["robots"], hello["robot"]) == (True, [link.robot], link.robot)
         assert page.told("history")["samples"]["t"] == []
         services = page.told("services", lambda m: m["linked"])
         assert [row["name"] for row in services["missing"]] == ["simulator", "estimator", "controller"]
         start = services["missing"][1]["start"]
         assert start == f"python -m services.estimator --robot {link.robot} --connect {link.connect[0]}"
-        assert page.told("services", lambda m: m["services"] and m["services"][0]["rates"])["services"][0]["name"] == (
-            "viewer"
-        )
-        began = time.monotonic()
-        answer = page.ask("teleport", x=1, y=1)
-        assert not answer["ok"]
+        rows = page.told("services", lambda m: m["services"] and m["services"][0]["rates"])["services"]
+        assert rows[0]["name"] == "viewer"
+        answer = page.ask("teleport", x=1, y=1, timeout=2.0)  # the viewer does not wait for a missing service
         assert "the simulator is not running; start it with: python -m services.simulator" in answer["reason"]
-        assert time.monotonic() - began < 2.0  # the viewer does not wait for a service that is not alive
 
 
-def test_the_page_is_served_with_headers_that_keep_it_to_itself(viewer):
+def test_headers_and_origins(viewer):
     _, where = viewer()
     status, headers, text = fetch(where)
     assert status == 200
     assert "<html" in text.lower()
     assert headers["content-security-policy"].startswith("default-src 'self';")
     assert headers["x-content-type-options"] == "nosniff"
-    assert "http://" not in text.replace("http://www.w3.org", "")  # nothing from other hosts
-    assert "https://" not in text
     for outside in ("../settings.py", "%2e%2e/settings.py", "..%2fsettings.py", "ws", "no/such"):
         assert fetch(where + outside)[0] in {400, 403, 404, 426}, outside
-
-
-def test_only_the_own_page_may_connect(viewer):
-    _, where = viewer()
     port = int(where.rstrip("/").rsplit(":", 1)[1])
     for origin in ("http://evil.example", f"http://127.0.0.1:{port + 1}", f"http://localhost:{port}", "null"):
-        with pytest.raises(InvalidStatus) as refused:
-            Page(where, origin=origin)
-        assert refused.value.response.status_code == 403, origin
-    # A name of somebody else's that leads here.
-    status, _, text = fetch(where, Host=f"evil.example:{port}")
+        assert refused(where, origin=origin) == 403, origin
+    status, _, text = fetch(where, Host=f"evil.example:{port}")  # a foreign name that leads here
     assert (status, "token" in text) == (403, True)
     assert fetch(where, Host=f"localhost:{port}")[0] == 200
 
 
-def test_a_token_is_asked_for(viewer):
-    running, where = viewer(env={"PRESAGE_VIEWER_TOKEN": "tea-2"})
+def refused(where, **options):
+    """The status with which a web socket is refused."""
+    with pytest.raises(InvalidStatus) as error:
+        Page(where, **options)
+    return error.value.response.status_code
+
+
+def test_token(viewer):
+    _, where = viewer(env={"PRESAGE_VIEWER_TOKEN": "tea-2"})
     assert where.endswith("/?token=tea-2")
     base = where.split("?")[0]
     for url in (base, base + "?token=coffee", base + "js/main.js"):
@@ -126,22 +119,17 @@ def test_a_token_is_asked_for(viewer):
         assert (status, headers["set-cookie"]) == (401, None), url
     status, headers, _ = fetch(where)
     assert status == 200
-    cookie = headers["set-cookie"].split(";")[0]
     assert "HttpOnly" in headers["set-cookie"]
+    cookie = headers["set-cookie"].split(";")[0]
     assert fetch(base, Cookie=cookie)[0] == 200
     assert fetch(base, Cookie=cookie, Host="robot.example")[0] == 200  # a page of another host does not have the cookie
-    with pytest.raises(InvalidStatus) as refused:
-        Page(base)
-    assert refused.value.response.status_code == 401
-    with pytest.raises(InvalidStatus) as refused:
-        Page(where, origin="http://evil.example")
-    assert refused.value.response.status_code == 403
+    assert refused(base) == 401
+    assert refused(where, origin="http://evil.example") == 403
     with Page(base, additional_headers={"Cookie": cookie}) as page:
         assert page.told("hello")["control"] is True
-    assert running.running
 
 
-def test_beyond_loopback_visitors_watch(viewer, bus, link):
+def test_visitors_beyond_loopback(viewer, bus, link):
     _, where = viewer("--host", "0.0.0.0")
     inbox = Inbox()
     for topic in TOPICS:
@@ -152,25 +140,20 @@ def test_beyond_loopback_visitors_watch(viewer, bus, link):
             ("goal", {"x": 1, "y": 1}), ("drive", {"vx": 1}), ("pause", {}), ("recordings", {}),
             ("open", {"name": "a.mcap"}), ("player", {"action": "pause"}), ("record", {"action": "start"}),
         ]:  # fmt: skip
-            answer = page.ask(do, **fields)
-            assert not answer["ok"]
-            assert "only watch" in answer["reason"]
+            assert "only watch" in page.ask(do, **fields)["reason"]
         page.done("watch", robot=link.robot)
         page.told("services", lambda m: any(row["name"] == "viewer" for row in m["services"]))
-    heard = set()
-    while isinstance(sample := inbox.get(0), Sample):
-        heard.add(sample.topic)
+    heard = {sample.topic for sample in iter(lambda: inbox.get(0), None) if isinstance(sample, Sample)}
     assert heard <= {HEALTH}
-    _, where = viewer("--host", "0.0.0.0", "--allow-control")
-    with Page(where) as page:
-        assert page.told("hello")["control"] is True
 
 
-def test_a_robot_made_of_messages_is_shown(viewer, bus):
+def test_messages_and_late_visitors(viewer, bus):
     _, where = viewer()
     robot = Pretence(bus)
     with Page(where) as page:
-        page.told("hello")
+        page.told("history")
+        bus.put(PREFERENCE, preference(1.0).encode())
+        assert page.told("field").header["goal"]["x"] == 9.0
         frame = robot.keep_saying(page, lambda h: all(h[k] for k in ("truth", "belief", "cmd", "status", "error")))
         header = frame.header
         assert header["robot"] == bus.robot
@@ -178,65 +161,45 @@ def test_a_robot_made_of_messages_is_shown(viewer, bus):
         assert header["error"] == pytest.approx(0.5)
         np.testing.assert_array_equal(frame.arrays["ranges"], RANGES)
         np.testing.assert_array_equal(frame.arrays["predicted"], np.arange(5))
-        services = page.told("services", lambda m: len(m["missing"]) < 3)
-        assert "simulator" not in [
-            row["name"] for row in services["missing"]
-        ]  # scans arrive, so no simulator is missing
-    with Page(where) as page:  # a later visitor gets the last frame and the history
-        assert page.frame().header["stamp_ns"] == header["stamp_ns"]
-        assert len(page.last["history"]["samples"]["t"]) > 0
-        errors = page.last["history"]["samples"]["error"]
-        assert errors == [pytest.approx(0.5)] * len(errors)
-
-
-def test_who_comes_late_is_told_the_field_and_what_was_done(viewer, bus):
-    _, where = viewer()
-    robot = Pretence(bus)
-    with Page(where) as page:
-        page.told("history")
-        bus.put(PREFERENCE, preference(1.0).encode())
-        first = page.told("field")
-        robot.keep_saying(page, lambda h: h["status"])
         rows = page.by_now("journal", lambda m: m["rows"])["rows"]
         assert [row["state"] for row in rows] == ["navigating"]
+        services = page.told("services", lambda m: len(m["missing"]) < 3)
+        assert "simulator" not in [row["name"] for row in services["missing"]]  # scans arrive
         bus.put(PREFERENCE, preference(2.0, x=3.0).encode())
-        second = page.told("field")
-        assert [field.header["goal"]["x"] for field in (first, second)] == [9.0, 3.0]
+        assert page.told("field").header["goal"]["x"] == 3.0
     bus.put(PREFERENCE, preference(3.0, x=4.0).encode())  # without visitors
     time.sleep(0.2)
     with Page(where) as page:
+        assert page.frame().header["stamp_ns"] == header["stamp_ns"]
+        errors = page.last["history"]["samples"]["error"]
+        assert errors == [pytest.approx(0.5)] * len(errors) != []
         assert page.by_now("field", lambda f: f.header["goal"]["x"] == 4.0).arrays["distance"][-1] == np.inf
         assert page.by_now("journal", lambda m: m["rows"])["rows"] == rows
-
-
-def test_time_that_goes_back_is_told(viewer, bus):
-    _, where = viewer()
-    robot = Pretence(bus)
-    with Page(where) as page:
         robot.keep_saying(page, lambda h: h["t"] > 100, begin=100.0)
-        robot.keep_saying(page, lambda h: h["t"] < 10)
+        robot.keep_saying(page, lambda h: h["t"] < 10)  # time goes back
         assert max(page.last["history"]["samples"]["t"], default=0) < 10
 
 
 def test_several_robots(viewer, bus, link):
     _, where = viewer()
-    with Page(where) as page, Page(where) as other, open_bus(Link("two" + link.robot, link.connect)) as second:
+    name = "two" + link.robot
+    with Page(where) as page, Page(where) as other, open_bus(Link(name, link.connect)) as second:
         page.told("hello")
-        assert not page.ask("watch", robot="two" + link.robot)["ok"]
+        assert not page.ask("watch", robot=name)["ok"]
         second.declare_alive("simulator")
-        assert page.told("hello", lambda m: len(m["robots"]) == 2)["robots"] == [link.robot, "two" + link.robot]
-        page.done("watch", robot="two" + link.robot)
-        assert page.last["hello"]["robot"] == "two" + link.robot
-        Pretence(second).keep_saying(page, lambda h: h["robot"] == "two" + link.robot)
+        assert page.told("hello", lambda m: len(m["robots"]) == 2)["robots"] == [link.robot, name]
+        page.done("watch", robot=name)
+        assert page.last["hello"]["robot"] == name
+        Pretence(second).keep_saying(page, lambda h: h["robot"] == name)
         Pretence(bus).keep_saying(other, lambda h: h["robot"] == link.robot)
         second.put(PREFERENCE, preference(1.0).encode())
-        page.told("field", lambda f: f.header["robot"] == "two" + link.robot)
+        page.told("field", lambda f: f.header["robot"] == name)
         page.done("watch", robot=link.robot)
         assert page.frame().header["robot"] == link.robot
-        page.told("services")
-        page.told("services")  # long enough to unfollow a robot without visitors
-        page.done("watch", robot="two" + link.robot)
-        assert page.told("field").header["robot"] == "two" + link.robot
+        for _ in range(2):  # long enough to unfollow a robot without visitors
+            page.told("services")
+        page.done("watch", robot=name)
+        assert page.told("field").header["robot"] == name
 
 
 class Servant:
@@ -263,7 +226,7 @@ class Servant:
         raise AssertionError(f"nobody asked for {name}")
 
 
-def test_the_world_is_told_and_told_again_when_it_changes(viewer, bus):
+def test_world_that_changes(viewer, bus):
     _, where = viewer()
     servant = Servant(bus, WORLD)
     bus.declare_alive("simulator")
@@ -286,9 +249,9 @@ HOSTILE = [
 ]  # fmt: skip
 
 
-# All but the one that only names a file that is not there; and one that is too long.
-def test_hostile_messages_are_answered_and_do_nothing(viewer, bus):
+def test_hostile_visitors(viewer, bus):
     running, where = viewer()
+    address = ("127.0.0.1", int(where.rstrip("/").rsplit(":", 1)[1]))
     inbox = Inbox()
     bus.subscribe(HEALTH, inbox)
     with Page(where) as page:
@@ -302,19 +265,21 @@ def test_hostile_messages_are_answered_and_do_nothing(viewer, bus):
             page.socket.send("x" * 200_000)
             for _ in range(100):
                 page.next()
-    raw = socket.create_connection(("127.0.0.1", int(where.rstrip("/").rsplit(":", 1)[1])), WAIT_TIMEOUT_S)
-    with raw:
+    with socket.create_connection(address, WAIT_TIMEOUT_S) as raw:
         raw.sendall(b"GET /ws HTTP/1.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Key: \xff\r\n\r\n")
         raw.shutdown(socket.SHUT_WR)
         while raw.recv(4096):
             pass
-    with Page(where) as page:
+    with Page(where) as flood, Page(where) as page:
         page.told("hello")
-        assert page.ask("recordings")["ok"]
+        with contextlib.suppress(ConnectionClosed, TimeoutError):
+            for i in range(1000):
+                flood.socket.send(json.dumps({"id": i, "do": "recordings"}))
+        assert page.ask("recordings", timeout=5.0)["ok"]  # others do not wait
 
     def counted():
         return any(
-            health.service == "viewer" and health.counters.get("malformed", 0) == len(HOSTILE)
+            health.service == "viewer" and health.counters.get("malformed", 0) >= len(HOSTILE)
             for health in received_messages(inbox, Health)
         )
 
@@ -323,21 +288,7 @@ def test_hostile_messages_are_answered_and_do_nothing(viewer, bus):
     assert "Traceback" not in running.output
 
 
-def test_a_flood_is_read_no_faster_than_anybody_clicks(viewer):
-    running, where = viewer()
-    with Page(where) as flood, Page(where) as page:
-        page.told("hello")
-        with contextlib.suppress(ConnectionClosed, TimeoutError):
-            for i in range(1000):
-                flood.socket.send(json.dumps({"id": i, "do": "recordings"}))
-        began = time.monotonic()
-        assert page.ask("recordings")["ok"]
-        assert time.monotonic() - began < 5.0
-    assert running.running
-    assert "Traceback" not in running.output
-
-
-def test_who_does_not_read_slows_nobody_and_then_sees_the_newest(viewer, bus):
+def test_slow_visitor(viewer, bus):
     _, where = viewer()
     Pretence(bus)
     base = where.rstrip("/")
@@ -365,7 +316,7 @@ def test_who_does_not_read_slows_nobody_and_then_sees_the_newest(viewer, bus):
         assert len(stamps) < sent / 2
 
 
-def test_a_router_that_comes_back_is_found_again(processes, tmp_path):
+def test_router_that_comes_back(processes, tmp_path):
     router, port = processes.start_router()
     env = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "again"}
     running = processes.start("viewer", "--port", "0", env=env)
@@ -380,7 +331,7 @@ def test_a_router_that_comes_back_is_found_again(processes, tmp_path):
             Pretence(bus).keep_saying(page, lambda h: h["belief"])
 
 
-def test_it_ends_at_once_though_visitors_watch(viewer):
+def test_end_with_visitors(viewer):
     running, where = viewer()
     with Page(where) as page:
         page.told("hello")
@@ -395,7 +346,7 @@ def test_it_ends_at_once_though_visitors_watch(viewer):
     assert "Traceback" not in running.output
 
 
-def test_an_answer_that_does_not_come_is_said(viewer, bus):
+def test_answer_that_does_not_come(viewer, bus):
     _, where = viewer()
     bus.declare_alive("simulator")
     bus.serve(PAUSE, Inbox())  # receives the query but never answers

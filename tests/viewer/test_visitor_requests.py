@@ -35,11 +35,11 @@ GOOD = [
 
 
 @pytest.mark.parametrize(("message", "action"), GOOD)
-def test_every_action_is_understood(message, action):
+def test_actions(message, action):
     assert requests.parse(json.dumps({"id": 5, **message, "later": "field"})) == (5, action)
 
 
-def test_an_obstacle_is_one_as_in_a_world_file():
+def test_obstacle():
     _, action = requests.parse(
         json.dumps({"id": 1, "do": "obstacle", "action": "add", "name": "crate", "obstacle": BOX})
     )
@@ -77,7 +77,7 @@ def test_an_obstacle_is_one_as_in_a_world_file():
         ('{"do": "goal", "x": 1, "y": 2, "pad": "' + "x" * 4096 + '"}', "too long"),
     ],
 )
-def test_what_is_none_is_refused_with_a_reason(text, says):
+def test_refusals(text, says):
     with pytest.raises(requests.InvalidRequestError) as refused:
         requests.parse(text)
     assert says in str(refused.value)
@@ -85,14 +85,14 @@ def test_what_is_none_is_refused_with_a_reason(text, says):
 
 
 @pytest.mark.parametrize("number", [3, None])
-def test_a_refusal_bears_the_number_of_what_it_refuses(number):
+def test_number_of_a_refusal(number):
     with pytest.raises(requests.InvalidRequestError) as refused:
         requests.parse(json.dumps({"id": number, "do": "goal"}))
     assert refused.value.number == number
 
 
 @pytest.mark.parametrize("number", ["5", 1.5, True, [1], {"a": 1}, 2**60])
-def test_a_number_that_is_none_is_not_repeated(number):
+def test_invalid_numbers(number):
     assert requests.parse(json.dumps({"id": number, "do": "cancel"}))[0] is None
 
 
@@ -115,7 +115,7 @@ SHAPES = st.fixed_dictionaries({}, optional=dict.fromkeys(("box", "circle", "pol
         VALUES | SHAPES,
     )
 )
-def test_whatever_comes_is_an_action_or_refused(text):
+def test_any_text(text):
     try:
         number, action = requests.parse(text)
     except requests.InvalidRequestError as refused:

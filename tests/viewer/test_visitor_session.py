@@ -30,7 +30,7 @@ def talk(send, messages, act=None):
     asyncio.run(whole())
 
 
-def test_a_socket_that_the_server_has_closed_already_is_gone_and_no_error():
+def test_closed_socket():
     async def send(message):
         if message["type"] == "websocket.send":  # as uvicorn raises it after a message that was too long
             raise RuntimeError("Unexpected ASGI message 'websocket.send', after sending 'websocket.close'.")
@@ -38,7 +38,7 @@ def test_a_socket_that_the_server_has_closed_already_is_gone_and_no_error():
     talk(send, [])
 
 
-def test_an_error_of_ours_is_not_hidden():
+def test_error_of_an_action():
     async def send(_message):
         pass
 

@@ -49,7 +49,7 @@ def run(story):
     asyncio.run(whole())
 
 
-def test_a_slow_visitor_gets_fewer_frames_and_slows_nobody():
+def test_slow_visitor():
     async def story(tasks):
         quick, slow = Line(), Line(slow=True)
         hub, visitors, running = scene(quick, slow)
@@ -75,7 +75,7 @@ def test_a_slow_visitor_gets_fewer_frames_and_slows_nobody():
     run(story)
 
 
-def test_answers_keep_their_order_and_news_its_newest():
+def test_order_of_answers():
     async def story(tasks):
         line = Line(slow=True)
         _, (visitor,), running = scene(line)
@@ -96,7 +96,7 @@ def test_answers_keep_their_order_and_news_its_newest():
     run(story)
 
 
-def test_who_takes_no_answers_is_sent_away():
+def test_visitor_that_reads_nothing():
     async def story(tasks):
         line = Line(slow=True)
         _, (visitor,), running = scene(line)
@@ -111,7 +111,7 @@ def test_who_takes_no_answers_is_sent_away():
     run(story)
 
 
-def test_another_robot_another_view():
+def test_change_of_robot():
     async def story(tasks):
         line = Line(slow=True)
         hub, (visitor,), running = scene(line)
@@ -134,7 +134,7 @@ def test_another_robot_another_view():
     run(story)
 
 
-def test_a_hub_without_a_loop_is_silent():
+def test_hub_without_a_loop():
     hub, called = Hub(), []
     hub.call_soon(lambda: called.append(1))
     loop = asyncio.new_event_loop()

@@ -1,1 +1,1 @@
-"""How the controller chooses a velocity."""
+"""The policies that choose the velocity."""

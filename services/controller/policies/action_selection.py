@@ -29,7 +29,7 @@ CHANGE_COST = 0.02  # m per m/s of change of the velocity, so that equivalent ac
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a motion must keep away from, in the present base_link."""
+    """Walls and obstacles that a motion must keep away from, in the present base_link."""
 
     wall_distance: Callable[[Array], Array]  # (..., 2) m -> (...,) m to the nearest mapped wall; inf without a map
     points: Array  # (K, 2) m, obstacles that are not in the map
@@ -37,7 +37,7 @@ class Surroundings:
     min_wall_distance: float  # m from the robot's centre
     min_point_distance: float  # m from the robot's centre
     walking_speed: float = 1.0  # m/s assumed for moving points
-    view: Sector = ALL_ROUND  # seen by the scanner
+    view: Sector = ALL_ROUND  # directions that the scanner sees
     may_turn: bool = True  # if the base may turn, it never has to move into a direction that the scanner does not see
 
     def sees(self, bearings: Array | float) -> npt.NDArray[np.bool_]:
@@ -119,7 +119,7 @@ def select_action(current: Array, attractor: Array, surroundings: Surroundings, 
     present_gap = float(surroundings.gaps(np.zeros((1, 1, 3)), np.zeros(1), max_gap=COMFORT_GAP_M)[0, 0])
     # If the robot is too close to something already, every motion that leads away from it counts as free.
     free = np.all(gaps >= min(0.0, present_gap) - 1e-3, axis=1)
-    progress = to_go(poses[0, -1], attractor, robot) - to_go(poses[:, -1], attractor, robot)
+    progress = remaining_distance(poses[0, -1], attractor, robot) - remaining_distance(poses[:, -1], attractor, robot)
     tightness = np.clip(1 - np.min(gaps, axis=1) / COMFORT_GAP_M, 0, 1)
     value = np.where(progress > 0, progress * (1 - MAX_DISCOUNT * tightness**2), progress)
     value = value - CHANGE_COST * np.hypot(*(actions - current)[:, :2].T)
@@ -134,7 +134,7 @@ def select_action(current: Array, attractor: Array, surroundings: Surroundings, 
     return SelectedAction(actions[best], poses[best], float(progress[best]), hindered=hindered)
 
 
-def to_go(poses: Array, attractor: Array, robot: Robot) -> Array:
+def remaining_distance(poses: Array, attractor: Array, robot: Robot) -> Array:
     """Distance (...,) m from poses (..., 3) to the attractor.
 
     For a differential base it includes the distance that could be driven in the time that the turn takes.

@@ -2,7 +2,7 @@
 
 While several places are possible, destinations are rated by how well a scan taken there is expected to tell the places
 apart (`epistemic`). While no place is known at all, the robot drives where there is most room, because scans from there
-show the most that is new.
+show the largest part of the surroundings.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 from common.robot.scan_geometry import Sweep
 from services.controller.policies.action_selection import Surroundings, select_action
 from services.controller.policies.decision import Decision
@@ -32,12 +32,12 @@ MAX_HYPOTHESES = 6
 DESTINATION_SPACING_M = 1.0
 MIN_PATH_M, MAX_PATH_M = 0.8, 12.0  # length of the path to a destination
 MAX_DESTINATIONS = 60
-CHOICE_PERIOD_NS = 1_000_000_000  # least time between two choices of a destination
+CHOICE_PERIOD_NS = 1_000_000_000  # minimum time between two choices of a destination
 MAX_SPEED = 0.5  # m/s, because it is not known what is behind and beside the robot
 INITIAL_WAIT_NS = 1_000_000_000  # time for the estimator to localise before the robot moves
-MAX_USEFUL_ROOM_M = 5.0  # more room than this makes a direction no better
-WINDOW_RAD = 0.35  # to either side of a direction; the least range within counts as its room
-MIN_ROOM_M = 0.7  # with less in every direction, the robot turns on the spot
+MAX_USEFUL_ROOM_M = 5.0  # more room than this is no advantage
+WINDOW_RAD = 0.35  # to either side of a direction; its room is the shortest range in this window
+MIN_ROOM_M = 0.7  # if every direction has less, the robot turns on the spot
 
 
 class ActiveLocaliser:
@@ -46,14 +46,14 @@ class ActiveLocaliser:
     def __init__(
         self, robot: Robot, graph: FreeSpaceGraph, min_point_distance: float, *, may_turn: bool = True
     ) -> None:
-        """``min_point_distance`` m from the robot's centre to anything in the scan; ``may_turn``: heading is free."""
+        """Keep ``min_point_distance`` m from the robot's centre to scan points; ``may_turn``: the heading is free."""
         self.may_turn = may_turn
         self.robot = robot.model_copy(update={"max_speed": min(robot.max_speed, MAX_SPEED)})
         self.graph, self.min_point_distance = graph, min_point_distance
         self.selector = DestinationSelector()
         self._requested: tuple[int, CandidateMotions] | None = None  # stamp in ns and motions of the last request
         self._field: tuple[Array, CostField | None] | None = None  # a destination (2,) m and its field
-        self._unknown_since_ns: int | None = None  # since when no place is known
+        self._unknown_since_ns: int | None = None  # stamp since which there are no likely hypotheses
 
     def reset(self) -> None:
         """Forget everything. Call it when the pose is known, or the goal has changed."""
@@ -61,7 +61,7 @@ class ActiveLocaliser:
         self._requested, self._field, self._unknown_since_ns = None, None, None
 
     def prediction_request(self, belief: Belief) -> CandidateMotions | None:
-        """Candidate motions for whose end poses scans must be predicted; pass the answer to `use_predictions`.
+        """Candidate motions; scans must be predicted for their end poses and passed to `use_predictions`.
 
         Returns None if no predictions are needed now.
         """
@@ -124,7 +124,7 @@ class ActiveLocaliser:
         # Thin out to MAX_DESTINATIONS, evenly over the costs.
         selected = np.argsort(cost, kind="stable")[:: max(1, -(-len(cost) // MAX_DESTINATIONS))]
         cells, cost = cells[selected], cost[selected]
-        # The field leads to the hypothesis, so a cell's next one is the one before it on the way there.
+        # Paths of the field lead to the hypothesis, so a cell's next cell is the previous one on the way there.
         places, previous = self.graph.grid.centres(cells), self.graph.grid.centres(field.next_cell[cells])
         heading = np.arctan2(*(places - previous).T[::-1])  # on arrival
         return se2.between(pose, np.column_stack([places, heading])), cost
@@ -132,7 +132,7 @@ class ActiveLocaliser:
     def _drive_to(
         self, pose: Array, destination: Array, surroundings: Surroundings, velocity: Array, count: int
     ) -> Decision:
-        """Drives from the first of ``count`` hypotheses towards a destination (3,)."""
+        """Drive from the first of ``count`` hypotheses towards a destination (3,)."""
         target = destination[:2]
         if self._field is None or np.hypot(*(self._field[0] - target)) > self.graph.grid.resolution:
             field = self.graph.cost_field(target, self.min_point_distance + DESTINATION_SPACING_M)
@@ -148,15 +148,15 @@ class ActiveLocaliser:
         return self._approach(attractor, surroundings, velocity, reason, path)
 
     def _wander(self, belief: Belief, scan: Scan, surroundings: Surroundings, velocity: Array) -> Decision:
-        """Drives in the direction with the most room, preferring directions ahead."""
+        """Drive in the direction with the most room, preferring directions ahead."""
         ranges = np.where(np.isneginf(scan.ranges), 0.0, scan.ranges.astype(np.float64))
         ranges = np.minimum(ranges, MAX_USEFUL_ROOM_M)
         # Beams that were not measured, or were cut out, must not limit the room: their neighbours decide.
-        ranges[~surfaces(scan.ranges) & ~np.isinf(scan.ranges)] = np.inf
+        ranges[~is_surface(scan.ranges) & ~np.isinf(scan.ranges)] = np.inf
         angles = scan.angles() + scan.mount.yaw
         sweep = Sweep.of(scan)
         half = max(1, round(WINDOW_RAD / max(sweep.spacing, WINDOW_RAD / 1000)))  # beams
-        # Outside the field of view nothing counts as free.
+        # Padding with 0: outside the field of view there is no room.
         padded = np.pad(ranges, half, mode="wrap") if sweep.all_round else np.pad(ranges, half)
         room = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1).min(axis=1)
         room[np.isinf(room)] = 0.0  # no beam in the window measured anything

@@ -36,7 +36,7 @@ class Policy(Protocol):
     """Turns a goal and beliefs into velocities. The setting `preset` selects one."""
 
     def refusal(self, goal: Array) -> str | None:
-        """Why a goal (2,) m in map cannot be reached. None if nothing known so far speaks against it.
+        """The reason why a goal (2,) m in map cannot be reached, or None if nothing is known to prevent it.
 
         What becomes known only on the way is reported by `decide`, as `Decision.refused`.
         """
@@ -51,7 +51,7 @@ class Policy(Protocol):
         """Undo the last `interrupt`: the simulation was only paused, no simulated time has passed."""
 
     def observe(self, scan: Scan, belief: Belief) -> None:
-        """Take a scan and the belief computed from it."""
+        """Process a scan and the belief computed from it."""
 
     def decide(self, belief: Belief, velocity: Array) -> Decision:
         """Choose a velocity towards the goal when the pose is known; ``velocity`` (3,) is the latest command."""

@@ -31,7 +31,7 @@ MAX_TRIED_DESTINATIONS = 20
 
 @dataclass(frozen=True)
 class PredictionTrust:
-    """How far differences between predicted scans are trusted to tell hypotheses apart.
+    """Parameters that limit how much evidence differences between predicted scans can give.
 
     A beam is an outlier with probability e = ``outliers``; every range is then equally likely:
     p(o) = (1 - e) N(o; r, s²) + e / R.
@@ -117,7 +117,7 @@ def expected_free_energy(gain: Array, length: Array, nats_per_metre: float) -> A
 
 
 def best_index(energy: Array, length: Array) -> int | None:
-    """Index of the least expected free energy (M,), or None if none is finite.
+    """Index of the lowest expected free energy (M,), or None if none is finite.
 
     Among equal ones, the shortest path is preferred, then the first.
     """
@@ -183,7 +183,7 @@ class DestinationSelector:
     def choose(
         self, stamp_ns: int, motions: CandidateMotions, ranges: Array, sigma: Array, range_max: float
     ) -> Array | None:
-        """The destination (3,) in map under the first hypothesis. None if no motion gains enough.
+        """The destination (3,) in map under the first hypothesis, or None if no motion gains enough.
 
         ``ranges`` and ``sigma`` (K, M, B) m are the predictions for `CandidateMotions.poses`. The previous destination
         is kept unless another one is better by ``switch_margin`` or its gain has dropped.
@@ -245,7 +245,7 @@ class DestinationSelector:
         self.chosen = None
 
     def _index_of_chosen(self, places: Array, gain: Array, motions: CandidateMotions) -> int | None:
-        """Index of the candidate (M, 3) at the kept destination. None if there is none, or its gain has dropped."""
+        """Index of the candidate (M, 3) at the kept destination, or None if there is none or its gain has dropped."""
         chosen = self.chosen
         if chosen is None or not len(places):
             return None

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.controller.policies.free_space import FreeSpace
 
-WALL_GAP_M = 0.03  # least distance between footprint and wall, a little more than the obstacle stop needs
-WALL_COST_RANGE_M = 0.35  # beyond the least clearance, up to where a metre costs more
-MAX_WALL_COST = 1.0  # additional cost of a metre at the least clearance
+WALL_GAP_M = 0.03  # minimum distance between footprint and wall, a little more than the obstacle stop needs
+WALL_COST_RANGE_M = 0.35  # range of clearances beyond the minimum within which a metre costs more
+MAX_WALL_COST = 1.0  # additional cost of a metre at the minimum clearance
 ATTRACTOR_RANGE_M = 3.0  # length of the path within which the attractor is chosen
 MAX_ATTRACTOR_CANDIDATES = 12
 MAX_LINE_COST_RATIO = 1.02  # cost of the straight line to the attractor, relative to the path on the grid
@@ -72,7 +72,7 @@ class FreeSpaceGraph:
         self._update_weights(before | self._near_obstacles)
 
     def _update_weights(self, changed: npt.NDArray[np.bool_]) -> None:
-        """Recomputes the weights of all edges of the ``changed`` cells (cells,) bool."""
+        """Recompute the weights of all edges of the ``changed`` cells (cells,) bool."""
         clearance, slow = self.clearance.ravel(), self.slowness.ravel()
         slow[changed] = slowness(clearance[changed], self.min_clearance)
         outgoing = np.flatnonzero(changed[self._from])
@@ -83,7 +83,7 @@ class FreeSpaceGraph:
     def nearest_free(
         self, point: Array, within: float = np.inf, component: int | None = None, *, map_only: bool = False
     ) -> int | None:
-        """Flat index of the free cell nearest to a point (2,) m. None if there is none within ``within`` m.
+        """Flat index of the free cell nearest to a point (2,) m, or None if there is none within ``within`` m.
 
         ``component`` restricts the search to one connected component; ``map_only`` ignores temporary obstacles.
         """
@@ -106,7 +106,7 @@ class FreeSpaceGraph:
         return int(cells[best]) if distance[best] <= within else None
 
     def cost_field(self, point: Array, within: float = np.inf) -> CostField | None:
-        """Cost from every cell to the free cell nearest to ``point`` (2,) m. None if none is within ``within`` m."""
+        """Costs from all cells to the free cell nearest to ``point`` (2,) m, or None if none is within ``within`` m."""
         cell = self.nearest_free(point, within)
         if cell is None:
             return None
@@ -123,7 +123,7 @@ class FreeSpaceGraph:
         fraction = np.linspace(0, 1, steps)[:, None, None]
         points = start + fraction * (ends - start)
         clearance = self.grid.interpolate(self.clearance, points)
-        # The robot may stand closer to a wall than the least clearance. From there every line that leads away is free.
+        # The robot may stand closer to a wall than min_clearance. From there every line that leads away is free.
         free = np.all((clearance >= self.min_clearance - 1e-9) | (clearance >= clearance[:1] - 1e-9), axis=0)
         return free, length * self.grid.interpolate(self.slowness, points).mean(axis=0)
 
@@ -153,7 +153,7 @@ class CostField:
         return np.concatenate([np.atleast_2d(point), centres[1:-1], self.goal[None]])
 
     def attractor(self, point: Array, path: Array) -> Array:
-        """The point (2,) m of ``path`` that attracts a robot at ``point``: the farthest one in free straight line."""
+        """The point (2,) m of ``path`` that attracts a robot at ``point``: the farthest on a free straight line."""
         distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
         near = np.flatnonzero(distance[1:] <= ATTRACTOR_RANGE_M) + 1
         tried = np.array([1])
@@ -172,7 +172,7 @@ class CostField:
         return np.where(np.isfinite(cost), cost, 0.0)
 
     def _entry_cell(self, point: Array) -> int | None:
-        """First cell of the path from ``point``: its own, or one within about a footprint. None if there is none."""
+        """First cell of the path from ``point``: its own, or one within about a footprint; None if there is none."""
         grid = self.graph.grid
         cell = int(grid.cell_of(np.asarray(point)))
         if np.isfinite(self.cost.ravel()[cell]):
@@ -186,13 +186,13 @@ class CostField:
 
 
 def slowness(clearance: Array, min_clearance: float) -> Array:
-    """Cost of a metre at a clearance (N,) m: 1 far from walls, 1 + MAX_WALL_COST at the least clearance."""
+    """Cost of a metre at a clearance (N,) m: 1 far from walls, 1 + MAX_WALL_COST at ``min_clearance``."""
     closeness = np.clip(1 - (clearance - min_clearance) / WALL_COST_RANGE_M, 0, 1)
     return np.asarray(1 + MAX_WALL_COST * closeness**2)
 
 
 def _dilate(cells: npt.NDArray[np.bool_], by: int) -> npt.NDArray[np.bool_]:
-    """Dilates a mask (rows, columns) bool by a square of ``by`` cells to each side."""
+    """Dilate a mask (rows, columns) bool by a square of ``by`` cells to each side."""
     for _ in range(2):  # one axis after the other; the transpose swaps them
         dilated = cells.copy()
         for shift in range(1, by + 1):

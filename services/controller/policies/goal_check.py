@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def wall_refusal(world: World, goal: Array, radius: float) -> str | None:
-    """Why a robot of ``radius`` m cannot stand at a goal (2,) m. None if it can."""
+    """The reason why a robot of ``radius`` m cannot stand at a goal (2,) m, or None if it can."""
     if world.has_room(goal, radius):
         return None
     clearance = float(world.clearance(goal)[0])

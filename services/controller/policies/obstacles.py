@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from common.geometry import se2
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 from common.robot.scan_geometry import Sweep
 
 if TYPE_CHECKING:
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from common.messages.definitions import Scan
     from services.controller.policies.free_space import FreeSpace
 
-MIN_WALL_DISTANCE_M = 0.2  # farther from every wall, a return is an obstacle; ten times the scanner's noise
-MAX_RANGE_M = 8.0  # beyond it, an error of the heading displaces a return too far
+MIN_WALL_DISTANCE_M = 0.2  # a return farther than this from every wall is an obstacle; ten times the scanner's noise
+MAX_RANGE_M = 8.0  # an error of the heading displaces returns beyond this too far
 CELL_M = 0.05
 STATIC_AFTER_NS = 1_000_000_000  # a cell hit for at least this long counts as furniture, a younger one as moving
 SAME_OBSTACLE_M = 0.3  # a new cell this close to furniture is another side of it
@@ -45,7 +45,7 @@ class TemporaryObstacles:
         laser = se2.compose(pose, scan.mount.array())
         ranges = scan.ranges.astype(np.float64)
         angles = scan.angles()
-        hit = surfaces(ranges) & (ranges < MAX_RANGE_M)
+        hit = is_surface(ranges) & (ranges < MAX_RANGE_M)
         heading = laser[2] + angles[hit]
         ends = laser[:2] + ranges[hit, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
         unmapped = ends[self._free.grid.inside(ends) & (self._free.clearance_at(ends) > MIN_WALL_DISTANCE_M)]
@@ -60,7 +60,7 @@ class TemporaryObstacles:
     def moving(self, stamp_ns: int) -> npt.NDArray[np.bool_]:
         """Whether each of `points` may be a moving obstacle, (K,) bool: first hit less than a second ago.
 
-        A new cell beside one that is older and still hit is taken for another side of the same furniture. A walking
+        A new cell beside one that is older and still hit counts as another side of the same furniture. A walking
         person leaves every cell within a second, so no cell of theirs becomes old.
         """
         young = stamp_ns - self._first_seen < STATIC_AFTER_NS
@@ -68,7 +68,7 @@ class TemporaryObstacles:
         if young.any() and old.any():
             points = self.points()
             distance, _ = cKDTree(points[old]).query(points[young], distance_upper_bound=SAME_OBSTACLE_M)
-            young[young] = ~np.isfinite(distance)
+            young[young] = ~np.isfinite(distance)  # keeps the young cells without an old one nearby
         return np.asarray(young)
 
     def _cell_of(self, points: Array) -> npt.NDArray[np.int64]:
@@ -88,7 +88,7 @@ class TemporaryObstacles:
         self._last_seen = np.concatenate([self._last_seen, stamps])[order]
 
     def _remove_cleared(self, scan: Scan, laser: Array, stamp_ns: int) -> None:
-        """Removes cells through which a beam passed, cells not seen for long, and cells from before a reset."""
+        """Remove cells through which a beam passed, cells not seen for long, and cells from before a reset."""
         if not len(self._cells):
             return
         offset = self.points() - laser[:2]

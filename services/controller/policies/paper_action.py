@@ -53,19 +53,14 @@ def preferred_position(observed: Array, goal: Array, reach: float) -> Array:
     return np.asarray(observed + to_goal * min(1.0, reach / max(float(np.hypot(*to_goal)), 1e-12)))
 
 
-def action_free_energy(
-    action: Array, observed: Array, preferred: Array, yaw: float, parameters: ActionParameters
-) -> float:
-    """F(a) in units of the pose's precision: half the squared distance to the preferred position, and effort."""
-    outcome = observed + parameters.horizon * se2.rotate(yaw, action)
-    misfit, effort = outcome - preferred, parameters.action_precision * parameters.horizon**2
-    return float(0.5 * misfit @ misfit + 0.5 * effort * action @ action)
-
-
 def action_gradient(
     action: Array, observed: Array, preferred: Array, yaw: float, parameters: ActionParameters
 ) -> Array:
-    """Gradient dF/da (2,). Its negative is the direction of equation 4."""
+    """Gradient dF/da (2,). Its negative is the direction of equation 4.
+
+    With T the horizon, F(a) = |observed + T R(yaw) a - preferred|² / 2 + action_precision T² |a|² / 2, in units of the
+    pose's precision: the distance of the outcome from the preferred position, and the effort.
+    """
     outcome = observed + parameters.horizon * se2.rotate(yaw, action)
     effort = parameters.action_precision * parameters.horizon**2
     return np.asarray(parameters.horizon * se2.rotate(-yaw, outcome - preferred) + effort * action)

@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from services.controller.policies.epistemic import CandidateMotions
 
 OBSTACLE_GAP_M = 0.06  # between footprint and unmapped obstacles: the scanner's noise, and half a cell
-REPLAN_PERIOD_NS = 400_000_000  # least time between two plans when obstacles near the path change
+REPLAN_PERIOD_NS = 400_000_000  # minimum time between two plans when obstacles near the path change
 REPLAN_PERIOD_FAR_NS = 1_500_000_000  # the same when obstacles change elsewhere
 STUCK_AFTER_NS = 3_000_000_000  # time without motion after which the robot backs off
-BACK_OFF_NS = 3_000_000_000  # how long it does
+BACK_OFF_NS = 3_000_000_000  # how long it backs off
 BLIND_AHEAD = "the scanner does not look ahead, and this base goes nowhere else: mount it so that it does"
 OBSTACLE_RANGE_M = 3.0  # obstacles farther from the robot do not matter to its next second
 
@@ -69,7 +69,7 @@ class GeodesicPolicy:
         self._backing_off_until_ns: int | None = None
 
     def refusal(self, goal: Array) -> str | None:
-        """Why a goal (2,) m cannot be reached by the map, with the nearest place that can. None if it can."""
+        """The reason why a goal (2,) m cannot be reached by the map, with the nearest place that can, or None."""
         refusal = wall_refusal(self.world, goal, self.robot.radius)
         if refusal is None:
             cell = self.graph.nearest_free(goal, self.robot.radius, map_only=True)
@@ -115,7 +115,7 @@ class GeodesicPolicy:
                 return Decision(reason=refusal, state="blocked", refused=True)
             self._vetted_component = self._component
         points, moving = self.obstacles.points(), self.obstacles.moving(stamp_ns)
-        self._plan(pose[:2], points[~moving], stamp_ns)  # moving obstacles will have gone on
+        self._plan(pose[:2], points[~moving], stamp_ns)  # without moving obstacles, which will have left
         path = self.field.path(pose[:2]) if self.field is not None else np.zeros((0, 2))
         if not len(path):
             return Decision(reason="no way to the goal from here", state="blocked")
@@ -143,7 +143,7 @@ class GeodesicPolicy:
         return Decision(action, reason, "blocked" if blocked else "navigating", path, motion)
 
     def prediction_request(self, belief: Belief) -> CandidateMotions | None:
-        """Motions for whose end poses scans must be predicted before `decide_unlocalised`. None if none are needed."""
+        """Motions for which scans must be predicted before `decide_unlocalised`; None if none are needed."""
         if self._goal is None or not self.epistemic:
             return None
         return self.localiser.prediction_request(belief)
@@ -166,7 +166,7 @@ class GeodesicPolicy:
         return decision
 
     def _plan(self, position: Array, points: Array, stamp_ns: int) -> None:
-        """Recomputes the field if the goal or the obstacles, ``points`` (K, 2) m in map, changed.
+        """Recompute the field if the goal or the obstacles, ``points`` (K, 2) m in map, changed.
 
         If there is a usable field, the obstacles are given to the graph with one scan and the field follows with the
         next, because each of the two takes milliseconds.
@@ -199,7 +199,7 @@ class GeodesicPolicy:
             self.field, self.closed = self.graph.cost_field(self._goal, max_goal_shift), bool(len(points))
 
     def _near_path(self, position: Array, cells: npt.NDArray[Any]) -> bool:
-        """Whether any of these cells lies near the path from ``position`` (2,) m. True if there is no path yet."""
+        """Whether any of these cells lies near the path from ``position`` (2,) m, or there is no path yet."""
         if self.field is None or not len(cells) or self.closed:
             return True
         path = self.field.path(position)
@@ -225,7 +225,7 @@ class GeodesicPolicy:
         )
 
     def _watch_progress(self, stamp_ns: int, *, moving: bool) -> None:
-        """Starts backing off after `STUCK_AFTER_NS` without motion."""
+        """Start backing off after `STUCK_AFTER_NS` without motion."""
         if moving:
             self._standing_since_ns = None
         elif self._standing_since_ns is None or stamp_ns < self._standing_since_ns:
@@ -234,7 +234,7 @@ class GeodesicPolicy:
             self._standing_since_ns, self._backing_off_until_ns = None, stamp_ns + BACK_OFF_NS
 
     def _back_off(self, pose: Array, velocity: Array, surroundings: Surroundings, path: Array) -> Decision:
-        """Recovery: drives towards the direction with the largest gap to walls and obstacles."""
+        """Recover: drive towards the direction with the largest gap to walls and obstacles."""
         angle = np.arange(16) * np.pi / 8
         targets = 0.4 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         target = targets[int(np.argmax(surroundings.gaps(targets[:, None, :], np.zeros(1))[:, 0]))]
@@ -246,7 +246,7 @@ class GeodesicPolicy:
         return Decision(action, "stuck: backing off", path=path, motion=motion, recovering=True)
 
     def _hindrance(self, pose: Array, surroundings: Surroundings, *, standing: bool) -> str:
-        """The reason to show: what hinders the robot, and where."""
+        """Status text: what hinders the robot, and where."""
         verb = "waiting" if standing else "slowing"
         if not len(surroundings.points):
             return f"{verb}: a wall is near"
@@ -256,13 +256,13 @@ class GeodesicPolicy:
         return f"{verb}: {what}, {np.hypot(*surroundings.points[nearest]):.1f} m away at {position}"
 
     def _no_path(self, pose: Array, surroundings: Surroundings) -> str:
-        """The reason to show when obstacles leave no path."""
+        """Status text for when obstacles leave no path."""
         place = f" at {_nearest_point(pose, surroundings)[1]}" if len(surroundings.points) else ""
         return f"no way around something that is not in the map{place}: waiting until it clears"
 
 
 def _nearest_point(pose: Array, surroundings: Surroundings) -> tuple[int, str]:
-    """Index of the obstacle point nearest to the robot, and its position in map as text. There must be one."""
+    """Index of the obstacle point nearest to the robot, and its position in map as text. Requires at least one."""
     nearest = int(np.argmin(np.hypot(*surroundings.points.T)))
     x, y = se2.transform(pose, surroundings.points[nearest])
     return nearest, f"({x:.1f}, {y:.1f})"

@@ -33,7 +33,7 @@ class StraightLinePolicy:
         self._action_before_interrupt = np.zeros(2)
 
     def refusal(self, goal: Array) -> str | None:
-        """Why a goal (2,) m in map cannot be reached: it is closer to a wall than the robot's radius."""
+        """The reason why a goal (2,) m in map cannot be reached: a wall within the robot's radius; None if it can."""
         return None if self.world is None else wall_refusal(self.world, goal, self.robot.radius)
 
     def set_goal(self, goal: Array | None) -> None:

@@ -24,7 +24,7 @@ class Checkpoint:
     """State of an unfinished training in a folder, from which a training with the same ``recipe`` can resume."""
 
     def __init__(self, folder: Path, recipe: dict[str, Any]) -> None:
-        """Removes the state of a training with another recipe; ``discarded`` tells whether there was any."""
+        """Removes the state of a training with another recipe; ``discarded`` is true if there was one."""
         self.folder, self.recipe = folder, json.loads(json.dumps(recipe))
         self.discarded = False
         if folder.exists() and self._read("recipe.json") != self.recipe:

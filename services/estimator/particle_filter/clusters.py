@@ -36,7 +36,7 @@ def labels(poses: Array) -> npt.NDArray[np.int64]:
     index = np.minimum(np.searchsorted(occupied, beside), len(occupied) - 1)
     offset, a = np.nonzero(occupied[index] == beside)
     b = index[offset, a]
-    # Every bin takes the least label among its neighbours, and then that label's own label, until none changes.
+    # Every bin takes the smallest label among its neighbours, and then the label of that bin, until none changes.
     label = np.arange(len(occupied))
     while True:
         before = label.copy()

@@ -25,11 +25,11 @@ INITIAL_COVARIANCE = np.diag([0.25, 0.25, (np.pi / 12) ** 2])  # nav2's initial_
 COMMAND_NOISE = 0.5  # as a share of the recently commanded speed, because the base lags behind its command
 COMMAND_MEMORY_S = 0.5  # for which a past command may still have effect
 MAX_CLUSTER_DEVIATION_M = 0.3  # position standard deviation of a cluster that counts as one place
-TRACKING_WEIGHT = 0.95  # least weight of the best cluster in state tracking
+TRACKING_WEIGHT = 0.95  # minimum weight of the best cluster in state tracking
 SAMPLED_PLACES = 20_000  # in free space, sampled in advance because sampling takes longer than an update
 LOST_FIT_RATIO = 0.65  # ratio of short- to long-term fit below which the pose is not believed
 FOUND_FIT_RATIO = 0.85  # ratio above which it is believed again
-MAX_SEARCHES = 3  # that end at one place with a poor fit, before the fit is attributed to a change of the world
+MAX_SEARCHES = 3  # after so many searches that end at one place with a poor fit, the world must have changed
 
 
 class ParticleFilter:
@@ -81,8 +81,8 @@ class ParticleFilter:
         self._scans = 0
         # A pose that was given is kept: there is no search, and no particles are drawn elsewhere.
         self._recovers = s.recovery_alpha_fast > 0 and (pose is None or not s.keep_initial_pose)
-        self._searching = pose is None and self.sensor.widest > s.sigma_hit
-        self._sigma = self.sensor.widest if self._searching else s.sigma_hit
+        self._searching = pose is None and self.sensor.max_sigma > s.sigma_hit
+        self._sigma = self.sensor.max_sigma if self._searching else s.sigma_hit
         self._last: Observation | None = None
         self._speed = np.zeros(2)  # m/s and rad/s, recently commanded
 
@@ -129,7 +129,7 @@ class ParticleFilter:
         walk = np.array([s.jitter_position, s.jitter_heading]) * period / NOMINAL_PERIOD_S
         # During a search a particle represents its surroundings, so it must be able to move within them. The distance
         # to its neighbours does not depend on the time between scans.
-        search = self._searching * (self._sigma - s.sigma_hit) / max(self.sensor.widest - s.sigma_hit, 1e-9)
+        search = self._searching * (self._sigma - s.sigma_hit) / max(self.sensor.max_sigma - s.sigma_hit, 1e-9)
         position, heading = np.maximum(
             (s.floor_position, s.floor_heading), (search * s.jitter_position, search * s.jitter_heading)
         )
@@ -157,7 +157,7 @@ class ParticleFilter:
     def _anneal(self) -> None:
         """Adapts sigma of a hit to the spread of the particles; starts a new search if the filter is lost."""
         if self._recovers and self._state == "lost" and not self._searching and self._health.ratio < LOST_FIT_RATIO:
-            self._searching, self._sigma = True, self.sensor.widest
+            self._searching, self._sigma = True, self.sensor.max_sigma
             self._searches += 1
             return
         off = self.particles[:, :2] - np.median(self.particles[:, :2], axis=0)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 BIN_SIZE = (0.5, 0.5, np.pi / 18)  # m, m, rad, as the cells of nav2's kd-tree
 HEADING_BINS = 36
-BIN_OFFSET = 1 << 20  # number of bins to either side of the origin: 500 km
+BIN_OFFSET = 1 << 20  # bins to either side of the origin, which are 500 km
 
 
 def tempered(log_weights: Array, share: float) -> Array:
@@ -40,7 +40,7 @@ def tempered(log_weights: Array, share: float) -> Array:
 
 
 def low_variance(weights: Array, count: int, rng: np.random.Generator) -> Indices:
-    """Draws indices (count,): each index i floor or ceil of count * weights[i] times; weights (N,) sum to 1."""
+    """Draws indices (count,), index i about count * weights[i] times, rounded up or down. Weights (N,) sum to 1."""
     comb = (rng.random() + np.arange(count)) / count
     cumulative = np.cumsum(weights)
     # Rounding may leave the sum below 1; the last particle with weight gets the rest.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from services.estimator.shared.interface import Observation
 
 SIGMA_PER_SPREAD = 1.5  # sigma of a hit, relative to the spread of the particles
-MIN_SIGMA_FACTOR = 0.85  # by which sigma may shrink per scan, so that one scan cannot decide a search
+MIN_SIGMA_FACTOR = 0.85  # limits how fast sigma shrinks per scan, so that one scan cannot decide a search
 GRADIENT_STEP = np.array([0.01, 0.01, 0.002])  # m, m, rad
 
 
@@ -27,7 +27,7 @@ class Explanation(NamedTuple):
     """How well a pose explains a scan."""
 
     accuracy: float  # nats, -ln p(o | pose)
-    xi: Array  # (3,) minus its gradient
+    xi: Array  # (3,) minus the gradient of accuracy
     curvature: Array  # (3, 3) Gauss-Newton Hessian
     fit: float  # mean likelihood of a beam relative to an exact one, in (0, 1]: about the share of beams explained
 
@@ -39,17 +39,17 @@ class Sensor:
         """Builds the distance field of ``world``, and the table of ranges if the settings select the beam model."""
         s = self.settings = settings
         self.field = LikelihoodField(DistanceField(world, s.resolution, s.laser_likelihood_max_dist), s.z_hit, s.z_rand)
-        self.widest = max(s.sigma_hit, s.sigma_search)
+        self.max_sigma = max(s.sigma_hit, s.sigma_search)
         self._table = RangeTable(world, s.resolution) if s.laser_model_type == "beam" else None
         self._beam = BeamModel(s.z_hit, s.z_short, s.z_max, s.z_rand, s.sigma_hit, s.lambda_short)
 
-    def sigma(self, spread: float, before: float) -> float:
-        """Standard deviation of a hit in m for particles spread by ``spread`` m; it was ``before`` at the last scan."""
-        wanted = float(np.clip(SIGMA_PER_SPREAD * spread, self.settings.sigma_hit, self.widest))
-        return max(wanted, MIN_SIGMA_FACTOR * before) if before > self.settings.sigma_hit else wanted
+    def sigma(self, spread: float, previous: float) -> float:
+        """Standard deviation of a hit in m for particles spread by ``spread`` m; ``previous`` is the last scan's."""
+        target = float(np.clip(SIGMA_PER_SPREAD * spread, self.settings.sigma_hit, self.max_sigma))
+        return max(target, MIN_SIGMA_FACTOR * previous) if previous > self.settings.sigma_hit else target
 
     def weigh(self, poses: Array, observation: Observation, sigma: float, beams: int | None) -> Array:
-        """Log weights (N,) of scanner poses (N, 3) in map, from at most ``beams`` beams, or all if None.
+        """Returns log weights (N,) of scanner poses (N, 3) in map, from at most ``beams`` beams, or all if None.
 
         ``sigma`` is the standard deviation of a hit in m; the beam model uses its own instead.
         """

@@ -27,8 +27,8 @@ class Settings:
     alpha5: float = 0.2  # noise sideways, caused by the path; omni only
     robot_model_type: MotionModel = "differential"
     laser_model_type: LaserModel = "likelihood_field"
-    max_beams: int | None = 60  # evenly spaced over the scan; None for all
-    laser_likelihood_max_dist: float = 2.0  # m, at which distances saturate
+    max_beams: int | None = 60  # evenly spaced over the scan; None uses all
+    laser_likelihood_max_dist: float = 2.0  # m, larger distances to obstacles are replaced by this
     z_hit: float = 0.5
     z_short: float = 0.05
     z_max: float = 0.05
@@ -47,11 +47,11 @@ class Settings:
     resolution: float = 0.05  # m, cells of the likelihood field and of the beam model's table
     sigma_search: float = 0.0  # m, replaces sigma_hit while the particles are spread; 0 disables it
     sigma_odometry: float = 0.0  # m, replaces sigma_hit, with all beams, while tracking with odometry; 0 disables it
-    search_share: float = 0.0  # least effective share of particles during a search, by tempering; 0 disables it
+    search_share: float = 0.0  # minimum effective share of particles during a search, by tempering; 0 disables it
     odometry_share: float = 0.0  # the same while sigma_odometry is used: one particle would have no covariance
     jitter_position: float = 0.05  # m per 1/15 s, random walk if there is neither odometry nor a command
     jitter_heading: float = 0.05  # rad per 1/15 s
-    walk_share: float = 1.0  # share of particles in that walk; the others stay, for a robot that stands still
+    walk_share: float = 1.0  # share of particles in that random walk; the others stay, in case the robot stands still
     floor_position: float = 0.0  # m per scan, added to every motion so that copies of one particle separate
     floor_heading: float = 0.0  # rad per scan
 

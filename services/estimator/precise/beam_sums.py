@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     Singles = npt.NDArray[np.float32]
 
-SHORT_MISFIT_FACTOR = 0.6  # a beam that is too short counts less than one too long, because it may be blocked
-UNKNOWN_MISFIT = 0.4  # of a beam for which the model expects nothing
+SHORT_MISFIT_FACTOR = 0.6  # a beam shorter than expected counts less than a longer one, because it may be blocked
+UNKNOWN_MISFIT = 0.4  # of a beam for which the model has no prediction
 
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -81,6 +81,7 @@ def accumulate(
             total[k, 1] += inlier
             weight = inlier / variance
             slope = weight * e - early / (max(g, 1e-3) * density)  # d ln p / dg
+            # The variance grows with g, too.
             slope += inlier * relative * relative * g * (e * e / variance - 1.0) / variance
             for i in range(3):
                 gradient[k, i] += slope * jacobian[k, b, i]
@@ -102,7 +103,8 @@ def rank_places(
 ) -> None:
     """Fills costs (S, H) of every place and heading with the mean over beams of e² / (e² + tolerance²).
 
-    Shortened beams count less, see `SHORT_MISFIT_FACTOR`.
+    ``panoramas`` (S, A) m are ranges all around each place, ``bins`` (B,) the direction of each beam among those A, and
+    ``measured`` (B,) m the scan. Beams shorter than expected count less, see `SHORT_MISFIT_FACTOR`.
     """
     size, headings = panoramas.shape[1], costs.shape[1]
     for s in range(panoramas.shape[0]):

@@ -92,7 +92,7 @@ class Continuity:
         match = self._match(np.array([*(each.mean for each in candidates), start]), points, candidates[-1])
         min_share = MIN_SHARE_TO_CONTINUE if self._last_scan_matched else MIN_SHARE_TO_BEGIN
         self._last_scan_matched = False
-        if match is None or match.share < min_share or match.blind or self._mean_behind_ratio > MAX_BEHIND_RATIO:
+        if match is None or match.share < min_share or match.degenerate or self._mean_behind_ratio > MAX_BEHIND_RATIO:
             return None
         self._matched_pose, self._last_scan_matched = match.pose, True
         turn = _rotation(self._frame[2])

@@ -38,7 +38,7 @@ class Traced:
 
     ranges: Array  # m; +inf if nothing is met within the grid
     jacobian: Array  # (N, B, 3) derivative of the ranges by x, y (m/m) and yaw (m/rad) of the laser
-    dip: Array  # m, least distance at which the beam passed another surface; +inf if it passed none
+    dip: Array  # m, smallest distance at which the beam passed another surface; +inf if it passed none
     edge: Array  # depth behind the end, relative to a plane: 1 on a wall, near 0 at an edge
     facing: Array  # cosine of incidence
 
@@ -78,7 +78,7 @@ class Seen:
     origin: tuple[float, float]  # m in map
 
     def nodes_of(self, field: DistanceField) -> npt.NDArray[np.bool_]:
-        """Whether each node of a field lies in a seen cell: (ny, nx)."""
+        """Mask (ny, nx) of the nodes of a field that lie in seen cells."""
         ny, nx = field.phi.shape
         i, j = (
             np.clip(((start + field.resolution * np.arange(n) - own_start) / SEEN_CELL_M).astype(int), 0, m - 1)
@@ -89,7 +89,7 @@ class Seen:
         return self.cells[np.ix_(i, j)]
 
     def contains(self, points: Array) -> npt.NDArray[np.bool_]:
-        """Whether each of points (N, 2) m in map lies in a seen cell: (N,)."""
+        """Mask (N,) of the points (N, 2) m in map that lie in seen cells."""
         j, i = np.floor((points - self.origin) / SEEN_CELL_M).astype(int).T
         inside = (i >= 0) & (j >= 0) & (i < self.cells.shape[0]) & (j < self.cells.shape[1])
         found = np.zeros(len(points), np.bool_)
@@ -107,9 +107,8 @@ class FieldModel:
     """A generative model: a distance field with a learned precision for each class of beams."""
 
     field: DistanceField
-    scales: Array = dataclasses.field(
-        default_factory=lambda: np.full(int(np.prod(CLASSES)), 1e-3)
-    )  # m, standard deviation of the prediction error in each class
+    # m, standard deviation of the prediction error in each class
+    scales: Array = dataclasses.field(default_factory=lambda: np.full(int(np.prod(CLASSES)), 1e-3))
     ripple: float = 0.0  # rad, see GenerativeModel
     seen: Seen | None = None  # None if the whole grid counts as seen
 

@@ -48,7 +48,7 @@ def lookup(phi: Floats, x: float, y: float) -> tuple[float, float, float, bool]:
 def trace_beam(phi: Floats, h: float, x: float, y: float, ux: float, uy: float) -> tuple[float, float]:
     """Traces one beam by sphere tracing, in grid coordinates.
 
-    Returns the length of the beam and the least distance at which it passed another surface, both in m; inf if none.
+    Returns the length of the beam and the smallest distance at which it passed another surface (inf if none), in m.
     """
     t, step, previous, falling, dip = 0.0, 0.0, 0.0, False, np.inf
     for _ in range(MAX_STEPS):

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.geometry import se2
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 from services.estimator.precise.likelihood import Evidence
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ class View:
     @cached_property
     def points(self) -> Array:
         """End points (K, 2) of the beams that returned, m in the laser frame."""
-        hit = surfaces(self.ranges) & (self.ranges < self.range_max)
+        hit = is_surface(self.ranges) & (self.ranges < self.range_max)
         angles = self.angles[hit]
         return np.asarray(self.ranges[hit, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1))
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 PANORAMA_BINS = 360
 SEED_SPACING_M = 0.3  # between the places at which a search begins
 RANKED_HEADINGS, RANKED_BEAMS = 120, 72  # that are compared with the panorama of each place
-MISFIT_TOLERANCE_M = 0.35  # error of a beam at a place about as far from the true one
+MISFIT_TOLERANCE_M = 0.35  # typical error of a beam if the nearest seed is this far from the true place
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,8 @@ class Seeds:
     """Places in free space, with the panorama of ranges that the model expects at each."""
 
     places: Array  # (S, 2) m in map, of the laser
-    panoramas: np.ndarray[
-        tuple[int, ...], np.dtype[np.float32]
-    ]  # (S, PANORAMA_BINS) m in direction 2 pi k / PANORAMA_BINS; NaN if unknown
+    # (S, PANORAMA_BINS) m, ranges in the directions 2 pi k / PANORAMA_BINS; NaN if unknown
+    panoramas: np.ndarray[tuple[int, ...], np.dtype[np.float32]]
 
     @classmethod
     def at(cls, model: GenerativeModel, places: Array) -> Seeds:
@@ -67,7 +66,7 @@ class Seeds:
 
 
 def _least_costs(costs: np.ndarray[tuple[int, ...], np.dtype[np.float32]], count: int) -> tuple[Array, Array]:
-    """Indices of place and heading of the ``count`` least costs, with at most two separate headings per place."""
+    """Indices of place and heading of the ``count`` lowest costs, with at most two separate headings per place."""
     rows = np.arange(len(costs))
     first = costs.argmin(axis=1)
     rest = costs.copy()

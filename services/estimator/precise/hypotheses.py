@@ -23,7 +23,7 @@ ENERGY_MEMORY = 0.8  # weight of earlier scans: the model's error repeats, so ev
 # A direction counts as unobserved if its information is less than this share of the information across it; a learned
 # field adds a multiple of its squared ripple to the share.
 MIN_INFORMATION_RATIO, RIPPLE_FACTOR = 1e-4, 7.0
-MIN_RIVAL_SCANS = 10  # scans for which a rival with a good inlier ratio must persist
+MIN_RIVAL_SCANS = 10  # age in scans at which a rival with a good inlier ratio may replace the tracked hypothesis
 MIN_WEIGHT = 1e-4  # hypotheses with less weight are dropped
 
 
@@ -55,7 +55,8 @@ def observed_directions(curvature: Array, ripple: float) -> tuple[Array, Array |
     """Returns a projection (3, 3) onto what a scan observes, and the direction (2,) it does not observe, if any.
 
     In a corridor without features a learned field still has ripples: walls tilted by about ``ripple`` rad, which add
-    about ripple² of the curvature across. Information that is not clearly more than that counts as none.
+    along the corridor about ripple² of the curvature across it. Information that does not clearly exceed this counts
+    as none.
     """
     values, vectors = np.linalg.eigh(position_information(curvature))
     if values[0] >= (MIN_INFORMATION_RATIO + RIPPLE_FACTOR * ripple**2) * values[1] and values[1] > 0:
@@ -112,7 +113,7 @@ def update_mode(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: fl
     """The hypothesis after a scan, from its fused prior and the k-th evidence.
 
     The scan's information reduces the noise covariance; the model covariance is that of this scan alone. ``unobserved``
-    tells that the scan has no information along some direction.
+    is true if the scan has no information along some direction.
     """
     inverse = np.linalg.inv(fused.information)
     information = fused.information - evidence.curvature[k]
@@ -147,7 +148,7 @@ def clip_to_map(modes: list[Mode], bounds: tuple[float, float, float, float]) ->
 
 
 def same_place(poses: Array, pose: Array) -> npt.NDArray[np.bool_]:
-    """Whether each of poses (N, 3) is so near to ``pose`` (3,) that both are one hypothesis: (N,)."""
+    """Mask (N,) of the poses (N, 3) that are so near to ``pose`` (3,) that both are one hypothesis."""
     off = np.abs(difference(poses, pose))
     return np.asarray((off[:, :2] < SAME_POSITION_M).all(axis=1) & (off[:, 2] < SAME_HEADING_RAD))
 
@@ -186,7 +187,7 @@ def weigh(modes: list[Mode], evidence_error: float, count: int) -> list[Mode]:
 
 
 def rank_hypotheses(modes: list[Mode], settings: Settings) -> list[Mode]:
-    """Sorts hypotheses by weight, but keeps the tracked one first until a rival has proven itself."""
+    """Sorts hypotheses by weight, but keeps the tracked one first until a rival has better evidence for long enough."""
     tracked = next((mode for mode in modes if mode.tracked), None)
     if tracked is not None and any(_replaces_tracked(mode, tracked, settings) for mode in modes):
         modes = [replace(mode, tracked=False) for mode in modes]

@@ -55,9 +55,9 @@ class Likelihood:
     """Parameters of the density, as the module describes it."""
 
     sigma: float = 0.02  # m
-    short: float = 0.25
-    random: float = 0.005
-    unseen: float = 0.05
+    short: float = 0.25  # share of beams that end early
+    random: float = 0.005  # share of other outliers
+    unseen: float = 0.05  # probability of no return from a surface
     relative: float = 0.0  # standard deviation of the noise that grows with the range, as a share of the range
 
     def evaluate(self, measured: Array, range_max: float, expected: Expected, extra_sigma: float = 0.0) -> Evidence:
@@ -70,13 +70,24 @@ class Likelihood:
         total, gradient = np.zeros((count, 3)), np.zeros((count, 3))
         matrices = np.zeros((count, 3, 3, 3))
         beam_sums.accumulate(
-            measured, expected.ranges, expected.jacobian, expected.scale,
-            self.sigma, self.relative, extra_sigma, self.short, self.random, range_max, self.unseen,
-            total, gradient, matrices,
-        )  # fmt: skip
+            measured,
+            expected.ranges,
+            expected.jacobian,
+            expected.scale,
+            self.sigma,
+            self.relative,
+            extra_sigma,
+            self.short,
+            self.random,
+            range_max,
+            self.unseen,
+            total,
+            gradient,
+            matrices,
+        )
         # A pose from which the model knows only a few beams must not get a high ratio from these alone.
-        least = MIN_KNOWN_SHARE * len(measured) if np.isinf(expected.scale).any() else 1.0
-        inlier_ratio = total[:, 1] / np.maximum(total[:, 2], max(least, 1.0))
+        min_beams = MIN_KNOWN_SHARE * len(measured) if np.isinf(expected.scale).any() else 1.0
+        inlier_ratio = total[:, 1] / np.maximum(total[:, 2], max(min_beams, 1.0))
         return Evidence(total[:, 0], inlier_ratio, gradient, matrices[:, 0], matrices[:, 1], matrices[:, 2])
 
     def deviation(self, expected: Array) -> Array | float:

@@ -1,4 +1,4 @@
-"""How the robot may have moved since the last scan, and fusion with the scan.
+"""Predicts the motion since the last scan, and fuses it with the scan.
 
 The prior is a mixture of motions, here called candidates:
 
@@ -34,7 +34,7 @@ MAX_EXTRA_STEP = 5 * MAX_STEP  # m, m, rad beyond that: the reach of the last st
 class MotionNoise:
     """Noise of the motion model for each axis of base_link; standard deviations unless stated otherwise."""
 
-    period: float = 1 / 15  # s between scans, used if the stamps do not tell
+    period: float = 1 / 15  # s between scans, used if they have no stamps
     acceleration: float = 1.0  # m/s²
     turn_acceleration: float = 3.0  # rad/s²
     speed: float = 1.0  # m/s

@@ -29,7 +29,7 @@ def contradicting_ratio(view: View, expected: Expected) -> float:
 
 
 def behind_ratio(view: View, expected: Expected) -> float:
-    """Share of beams behind the expected surface, among all; it is small if the model expects few surfaces."""
+    """Share of all beams that end behind the expected surface; it is small if the model expects few surfaces."""
     return float((np.isfinite(view.ranges) & (view.ranges > _behind_from(view, expected))).mean())
 
 

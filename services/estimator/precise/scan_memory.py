@@ -39,7 +39,7 @@ class Match:
     covariance: Array  # (3, 3) of x, y, yaw, relative to the stored scans
     share: float  # of the scan's points that were seen before
     score: float  # mean weight of the scan's points, higher for closer matches
-    blind: bool  # next to no information along some direction
+    degenerate: bool  # the points have almost no information along some direction
 
 
 @dataclass
@@ -131,7 +131,7 @@ class RecentScans:
         error = np.einsum("ni,ni->n", self._normals[partner], placed - self._points[partner])
         score = ((distance < 2 * SEEN_RADIUS_M) / (1 + (error / CAUCHY_SCALE_M) ** 2)).mean()
         covariance = np.asarray(CAUCHY_SCALE_M**2 * np.linalg.inv(H + 1e-6 * np.eye(3)), float)
-        return Match(pose, covariance, float((distance < SEEN_RADIUS_M).mean()), float(score), _is_blind(H))
+        return Match(pose, covariance, float((distance < SEEN_RADIUS_M).mean()), float(score), _is_degenerate(H))
 
 
 def _average_in_cells(points: Array) -> Array:
@@ -145,6 +145,6 @@ def _average_in_cells(points: Array) -> Array:
     return np.stack([np.bincount(cell, points[:, k]) / count for k in (0, 1)], axis=-1)
 
 
-def _is_blind(H: Array) -> bool:
+def _is_degenerate(H: Array) -> bool:
     low, high = np.linalg.eigvalsh(position_information(H))
     return bool(low < MIN_INFORMATION_RATIO * high)

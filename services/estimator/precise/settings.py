@@ -39,9 +39,7 @@ class Settings:
     # Hypotheses
     max_hypotheses: int = 8
     evidence_error_nats: float = 20.0  # difference in energy between two poses that the model's error may cause
-    rival_probation_scans: int = (
-        100  # a rival without good inlier ratio must persist so long to replace the tracked pose
-    )
+    rival_probation_scans: int = 100  # age at which a rival with a low inlier ratio may replace the tracked pose
 
     # Covariance
     inflation: float = 1.0  # factor on the covariance, because errors of the model are correlated between beams

@@ -1,1 +1,1 @@
-"""What all estimators use."""
+"""The estimator interface and the generative models, shared by all estimators."""

@@ -20,9 +20,7 @@ class Observation:
     ranges: Array  # (B,) m; +inf: no return within range_max, -inf: not measured (common/robot/ranges.py)
     angles: Array  # (B,) rad in laser
     range_max: float  # m
-    stamp: float | None = (
-        None  # s, time of the measurement; None if there is no clock, and scans come at a nominal rate
-    )
+    stamp: float | None = None  # s, time of the measurement; None if unknown: scans then come at a nominal rate
     odom: Array | None = None  # (3,) base_link in odom at the stamp
     command: Array | None = None  # (3,) the last velocity command: m/s, m/s, rad/s in base_link
     goal: Array | None = None  # (3,) preferred pose, base_link in map; used only by the paper's equation 3
@@ -48,9 +46,8 @@ class Posterior:
     xi: Array  # (3,) minus the gradient of accuracy at the pose, in map
     curvature: Array  # (3, 3) Gauss-Newton Hessian of accuracy, in map
     predicted: Array  # (B,) m, ranges expected at the pose
-    sigma: Array = field(
-        default_factory=lambda: np.zeros(0)
-    )  # (B,) m, standard deviation of these; empty if the estimator states none
+    # (B,) m, standard deviation of these; empty if the estimator states none
+    sigma: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def pose(self) -> Array:
@@ -106,7 +103,7 @@ class SearchingEstimator(Protocol):
     """
 
     def track(self, observation: Observation) -> Posterior | None:
-        """Returns the posterior after one more scan, or None if that takes a `search`, which was not made."""
+        """Returns the posterior after one more scan, or None if the caller has to call `search` for it."""
         ...
 
     def search(self) -> Posterior:

@@ -48,7 +48,7 @@ def summary_of(stream: BinaryIO) -> Summary | None:
     return SeekingReader(stream, record_size_limit=size).get_summary()
 
 
-def in_order(
+def messages_in_order(
     stream: BinaryIO, summary: Summary, keys: Collection[str] | None, start_ns: int | None, end_ns: int | None
 ) -> Iterator[tuple[Channel, Message]]:
     """Yields the selected messages in the order of their log times. Raises if a chunk is damaged."""

@@ -37,7 +37,7 @@ class Player:
         return min(self.end, self._position + max(0.0, now - self._since) * self.rate)
 
     def wait(self, position: float, now: float) -> float:
-        """Seconds until a message at ``position`` is due. 0 if it is due now, infinity while paused."""
+        """Seconds until a message at ``position`` is due: 0 if it is due now, infinity while paused."""
         if self._steps:
             return 0.0
         if self.paused:
@@ -46,12 +46,12 @@ class Player:
             return 0.0
         return max(0.0, (position - self._position) / self.rate - (now - self._since))
 
-    def sent(self, position: float, now: float, *, whole: bool) -> None:
-        """Records that the message at ``position`` was published. ``whole``: it completes a step."""
+    def mark_sent(self, position: float, now: float, *, completes_step: bool) -> None:
+        """Records that the message at ``position`` was published. ``completes_step``: it is the last one of a step."""
         ahead = self.position(now) - position
         if self.paused or self.rate == 0 or ahead > MAX_LAG_S * self.rate:
             self._anchor(position, now)
-        if self._steps and whole:
+        if self._steps and completes_step:
             self._steps -= 1
 
     def handle(self, request: PlayerRequest, now: float) -> PlayerReply:
@@ -140,7 +140,7 @@ def select_topics(
 
 
 def key_for_robot(key: str, robot: str) -> str:
-    """The same key for another robot. Unchanged if ``robot`` is empty."""
+    """The same key for another robot; unchanged if ``robot`` is empty."""
     root, recorded_robot, rest = key.split("/", 2)
     return f"{root}/{robot or recorded_robot}/{rest}"
 

@@ -79,14 +79,14 @@ class ReplayControl:
         self._inbox.wake()
 
 
-Steering = Callable[[ReplayControl], AbstractContextManager[object]]
+ControlContext = Callable[[ReplayControl], AbstractContextManager[object]]
 
 
 class Replay:
     """Publishes one recording on one bus session."""
 
     def __init__(self, recording: Recording, options: ReplayOptions, bus: Bus) -> None:
-        """Selects the topics. Raises UserError if there is nothing to replay."""
+        """Selects the topics; raises UserError if there are none."""
         self.recording, self.options, self.bus = recording, options, bus
         self.topics = select_topics(recording.topics(), options.only, options.leave_out)
         if not self.topics:
@@ -97,8 +97,9 @@ class Replay:
         self.inbox = Inbox()
         self.player = Player(begin, end, options.rate, loop=options.loop)
         self.counts: Counter[str] = Counter()  # messages by published key
-        self.remote = ReplayControl(self.player, self.inbox, self.counts)
-        self._stepwise = SCAN if SCAN in self.topics.values() else None
+        self.control = ReplayControl(self.player, self.inbox, self.counts)
+        # The topic whose messages complete a step; None if every message does.
+        self._step_topic = SCAN if SCAN in self.topics.values() else None
 
     def announce(self) -> None:
         """Declares publishers, queries and liveliness, and waits for subscribers.
@@ -136,7 +137,7 @@ class Replay:
                     break
                 self._send(raw, message_position)
                 on_progress(player.state(time.monotonic()))
-            if stop.is_set() or self.remote.quitting:
+            if stop.is_set() or self.control.quitting:
                 break
             if player.loop and not player.seek_pending:
                 player.restart(time.monotonic())
@@ -162,14 +163,14 @@ class Replay:
                 self._answer(entry)
             if entry is not None or wait > 0:
                 on_progress(self.player.state(time.monotonic()))
-            if stop.is_set() or self.remote.quitting or self.player.seek_pending:
+            if stop.is_set() or self.control.quitting or self.player.seek_pending:
                 return False
             if entry is None and self.player.wait(position, time.monotonic()) <= 0:
                 return True
 
     def _wait_at_end(self, on_progress: Callable[[PlayerReply], None], stop: threading.Event) -> None:
         """Stays paused at the end until a seek is requested."""
-        while not (stop.is_set() or self.remote.quitting or self.player.seek_pending):
+        while not (stop.is_set() or self.control.quitting or self.player.seek_pending):
             self.player.finish(time.monotonic())
             on_progress(self.player.state(time.monotonic()))
             if isinstance(entry := self.inbox.get(POLL_PERIOD_S), Call):
@@ -179,7 +180,7 @@ class Replay:
         topic, key = self.topics[raw.key], self.keys[raw.key]
         self.bus.put(topic, raw.payload, key=key)
         self.counts[key] += 1
-        self.player.sent(position, time.monotonic(), whole=self._stepwise in (None, topic))
+        self.player.mark_sent(position, time.monotonic(), completes_step=self._step_topic in (None, topic))
 
     def _answer(self, call: Call) -> None:
         if call.query is CONFIG:
@@ -229,14 +230,14 @@ def replay(
     *,
     on_progress: Callable[[PlayerReply], None] = lambda _: None,
     stop: threading.Event | None = None,
-    opening: Callable[[Link], AbstractContextManager[Bus]] = open_bus,
-    steering: Steering = lambda _: nullcontext(),
+    open_session: Callable[[Link], AbstractContextManager[Bus]] = open_bus,
+    control_context: ControlContext = lambda _: nullcontext(),
 ) -> Counter[str]:
     """Publishes the recording and returns the number of messages by key.
 
-    Waits briefly for subscribers and warns about keys without one. ``opening`` opens the bus session and may check
-    that the router is reached; ``steering`` is entered for the duration of the replay. Raises UserError if the file
-    cannot be read, the options are invalid, or a live service publishes the same keys.
+    Waits briefly for subscribers and warns about keys without one. ``open_session`` opens the bus session, and may
+    check that the router is reached; ``control_context`` is entered with the replay's control for its duration. Raises
+    UserError if the file cannot be read, the options are invalid, or a live service publishes the same keys.
     """
     options = options or ReplayOptions()
     recording = read_recording(path)
@@ -246,10 +247,10 @@ def replay(
     robot = options.robot or (recorded_robots[0] if recorded_robots else link.robot)
     if not math.isfinite(options.rate):
         options = replace(options, rate=0.0)
-    with opening(replace(link, robot=robot)) as bus:
+    with open_session(replace(link, robot=robot)) as bus:
         running = Replay(recording, options, bus)
         running.announce()
-        with steering(running.remote):
+        with control_context(running.control):
             running.run(on_progress, stop or threading.Event())
     if recording.problem and recording.indexed:  # damage inside a finished file is only found while reading
         print(f"warning: {recording.warning}", file=sys.stderr)

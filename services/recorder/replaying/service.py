@@ -1,4 +1,4 @@
-"""The process that plays a recording in a loop in place of the scanner."""
+"""The process that replays a recording in a loop in place of a scanner."""
 
 from __future__ import annotations
 
@@ -74,25 +74,25 @@ class ReplayHeartbeat:
         self._heart = Heartbeat(settings.heartbeat, NAME, settings.robot)
         self._next_at = 0.0  # monotonic time of the next heartbeat, s
         self._bus: Bus | None = None
-        self._remote: ReplayControl | None = None
+        self._control: ReplayControl | None = None
 
     @contextmanager
-    def opening(self, link: Link) -> Iterator[Bus]:
+    def open_session(self, link: Link) -> Iterator[Bus]:
         """Opens the replay's bus session and keeps it to report the link."""
         with open_bus(link) as self._bus:
             yield self._bus
 
     @contextmanager
-    def steering(self, remote: ReplayControl) -> Iterator[None]:
+    def attach(self, control: ReplayControl) -> Iterator[None]:
         """Keeps the control of the replay to report its counts."""
-        self._remote = remote
+        self._control = control
         yield
 
     def __call__(self, state: PlayerReply) -> None:
         """Writes a heartbeat if one is due."""
-        if self._bus is None or self._remote is None or (now := time.monotonic()) < self._next_at:
+        if self._bus is None or self._control is None or (now := time.monotonic()) < self._next_at:
             return
-        counts = {key: {"published": count} for key, count in self._remote.counts.items()}
+        counts = {key: {"published": count} for key, count in self._control.counts.items()}
         self._heart.beat(counts, linked=self._bus.linked(), note="paused" if state.paused else "", idle=state.paused)
         self._next_at = now + HEARTBEAT_PERIOD_S
 
@@ -114,8 +114,8 @@ def main(argv: list[str] | None = None) -> None:
             options,
             on_progress=heartbeat,
             stop=stop,
-            opening=heartbeat.opening,
-            steering=heartbeat.steering,
+            open_session=heartbeat.open_session,
+            control_context=heartbeat.attach,
         )
         log.info("ended")
     except UserError as error:

@@ -1,1 +1,1 @@
-"""What the page shows, computed from messages."""
+"""Computes the data of the page from messages."""

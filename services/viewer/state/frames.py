@@ -1,4 +1,4 @@
-"""One frame for the page as bytes.
+"""Encodes the frames that the page shows.
 
 Layout: N as a little-endian uint32, then N bytes of JSON (padded with spaces so that 4 + N is a multiple of 4), then
 the arrays one after another, as little-endian float32. The header's field ``arrays`` gives [offset, count] of each

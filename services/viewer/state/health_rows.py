@@ -1,4 +1,4 @@
-"""Health of the services as rows for the page."""
+"""Converts the health of services to rows for the page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Row = dict[str, Any]
 
 
 def rows_of(liveness: RobotLiveness, now: float) -> list[Row]:
-    """One row for each service that is present, or was a short time ago."""
+    """One row for each service that is connected, or was a short time ago."""
     return [_row(each) for each in liveness.services(now) if each.since is not None]
 
 

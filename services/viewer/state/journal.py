@@ -36,9 +36,9 @@ class Journal:
         self._rows.append(self._last)
         return True
 
-    def add_carry(self, before: Truth, after: Truth) -> bool:
+    def add_displacement(self, before: Truth, after: Truth) -> bool:
         """Adds a row and returns True if the robot cannot have driven from one true pose to the next."""
-        if not is_carry(before, after):
+        if not is_displaced(before, after):
             return False
         away = math.hypot(after.pose.x - before.pose.x, after.pose.y - before.pose.y)
         reason = f"{away:.1f} m, to ({after.pose.x:.2f}, {after.pose.y:.2f}); the estimator is not informed"
@@ -55,7 +55,7 @@ class Journal:
         return list(self._rows)
 
 
-def is_carry(before: Truth, after: Truth) -> bool:
+def is_displaced(before: Truth, after: Truth) -> bool:
     """Whether the robot moved or turned further between two true poses than its speed at both ends allows."""
     seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
     away = math.hypot(after.pose.x - before.pose.x, after.pose.y - before.pose.y)

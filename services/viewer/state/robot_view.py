@@ -97,7 +97,7 @@ class RobotView:
         elif topic in SENSOR_TOPICS and self._waiting is not None and message.stamp_ns != self._waiting[0]:
             frame = self._frame(now)
         if isinstance(message, Truth) and last is not None and isinstance(last.message, Truth):
-            self.journal_changed |= self.journal.add_carry(last.message, message)
+            self.journal_changed |= self.journal.add_displacement(last.message, message)
         self._received[topic.name] = ReceivedMessage(message, now, published_ns)
         self._update(message)
         if not self.live:
@@ -146,7 +146,7 @@ class RobotView:
 
     @property
     def stamp_ns(self) -> int:
-        """Stamp of the newest sensor message. 0 before the first."""
+        """Stamp of the newest sensor message; 0 before the first."""
         return max((last.message.stamp_ns for t in SENSOR_TOPICS if (last := self._received.get(t.name))), default=0)
 
     def _restart(self) -> None:

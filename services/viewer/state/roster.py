@@ -1,4 +1,4 @@
-"""Which services of which robots are alive."""
+"""Tracks which services of which robots are alive."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Roster:
         self._alive: dict[str, frozenset[str]] = {}  # replaced as a whole, because other threads read it
 
     def change(self, robot: str, service: str, alive: bool) -> None:  # noqa: FBT001 - called as a callback
-        """Records that a service came or went."""
+        """Records that a service started or ended."""
         services = self._alive.get(robot, frozenset())
         services = services | {service} if alive else services - {service}
         others = {name: known for name, known in self._alive.items() if name != robot}

@@ -7,7 +7,7 @@ import json
 import pytest
 from zenoh import KeyExpr
 
-from common.bus.endpoints import on_loopback, over_tls, refuse_exposure
+from common.bus.endpoints import on_loopback, refuse_exposure, with_tls
 from common.bus.security import (
     ROLES,
     ROUTER,
@@ -182,5 +182,5 @@ def test_exposed_endpoints_are_refused(endpoint, here):
 
 
 def test_endpoints_use_tls():
-    assert over_tls("tcp/host:1") == "tls/host:1"
-    assert over_tls("quic/host:1") == "quic/host:1"
+    assert with_tls("tcp/host:1") == "tls/host:1"
+    assert with_tls("quic/host:1") == "quic/host:1"

@@ -13,7 +13,7 @@ import pytest
 
 from common.bus.bus import wait_until
 from common.containers import healthcheck
-from common.containers.healthcheck import fault_of
+from common.containers.healthcheck import find_fault
 from common.messages.definitions import Scan
 from common.messages.topics import SCAN
 from common.runtime.heartbeat import Heartbeat, read_beats
@@ -35,7 +35,7 @@ NOW = 1000.0
     ],
 )
 def test_every_robot_must_be_healthy(service, beats, fault):
-    assert fault_of(service, beats, ["a", "b"], NOW)[: len(fault) or None] == fault
+    assert find_fault(service, beats, ["a", "b"], NOW)[: len(fault) or None] == fault
 
 
 def test_heartbeats_record_when_counts_increased(tmp_path):

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from common.robot.ranges import normalise_driver_ranges, ranges_for_localisation, surfaces
+from common.robot.ranges import is_surface, normalise_driver_ranges, ranges_for_localisation
 
 NUMBERS = st.one_of(
     st.floats(width=32), st.sampled_from([0.0, -0.0, -1.0, np.nan, np.inf, -np.inf, 0.1, 8.3, 1e-30, 65.533])
@@ -37,7 +37,7 @@ def test_driver_ranges_have_four_meanings(ranges, limits):
 @given(RANGES, LIMITS)
 def test_surfaces_and_ranges_for_localisation(ranges, limits):
     scan = normalise_driver_ranges(ranges, *limits)
-    hit, place = surfaces(scan), ranges_for_localisation(scan)
+    hit, place = is_surface(scan), ranges_for_localisation(scan)
     assert ((scan[hit] >= limits[0]) & (scan[hit] < limits[1])).all()
     assert not np.isfinite(place[~hit]).any()
     np.testing.assert_array_equal(place[hit], scan[hit])

@@ -64,7 +64,7 @@ def test_beams_run_clockwise_upside_down():
 def test_noise_can_grow_with_the_range():
     ranges = np.array([1.0, 10.0, np.inf])
     assert SCANNERS["rplidar-a1"].deviation(ranges) == pytest.approx([0.01, 0.1, np.inf], rel=2e-3)
-    drawn = SCANNERS["rplidar-a1"].noisy(np.tile(ranges, (4000, 1)), np.random.default_rng(0))
+    drawn = SCANNERS["rplidar-a1"].add_noise(np.tile(ranges, (4000, 1)), np.random.default_rng(0))
     assert drawn[:, :2].std(axis=0) == pytest.approx([0.01, 0.1], rel=0.05)
     assert np.isposinf(drawn[:, 2]).all()
 

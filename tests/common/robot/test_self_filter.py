@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from common.errors import UserError
 from common.geometry import se2
 from common.messages.definitions import Scan
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 from common.robot.scan_geometry import ALL_ROUND, Sweep
 from common.robot.self_filter import MIN_TRIMMED_SECTOR_RAD, SelfFilter
 from common.runtime import safety
@@ -49,7 +49,7 @@ def test_narrow_sectors_are_masked():
     """Bounds are included; masked beams are 0 in published scans and NaN for planning."""
     cut = blind(ignore_angles="-92:-88,44:46")
     for found, value in ((cut.mask_for_bus(scan()), 0.0), (cut.mask_for_planning(scan()), np.nan)):
-        hidden = ~surfaces(found.ranges)
+        hidden = ~is_surface(found.ranges)
         np.testing.assert_allclose(degrees(found)[hidden], [-92, -91, -90, -89, -88, 44, 45, 46])
         np.testing.assert_array_equal(found.ranges[hidden], np.float32(value))
         np.testing.assert_array_equal(found.ranges[~hidden], scan().ranges[~hidden])

@@ -47,7 +47,7 @@ def started_long_ago(small, bus):
 def test_a_later_service_with_another_protocol_does_not_start(process, bus):
     small = process(SMALL)
     started_long_ago(small, bus)
-    foreign = process(FOREIGN, env={"FOREIGN_PROTOCOL": str(OTHER), "FOREIGN_PRESAGE": "9.9"})
+    foreign = process(FOREIGN, env={"FOREIGN_PROTOCOL": str(OTHER), "FOREIGN_PRESAGE": "9.9"}, fresh=True)
     assert foreign.wait() == 2
     host = platform.node()
     *ready, line = foreign.output.splitlines()  # on a busy machine it may start, because no reply arrives in time
@@ -89,7 +89,7 @@ def test_a_later_service_ends_when_a_busy_one_replies(process, bus):
     small = process(SMALL)
     started_long_ago(small, bus)
     small.send(signal.SIGSTOP)  # it cannot reply
-    foreign = process(FOREIGN, env={"FOREIGN_PROTOCOL": str(OTHER)})
+    foreign = process(FOREIGN, env={"FOREIGN_PROTOCOL": str(OTHER)}, fresh=True)
     foreign.wait_for("ready")
     small.send(signal.SIGCONT)
     assert foreign.wait() == 2
@@ -113,7 +113,7 @@ def test_an_earlier_service_logs_an_error_and_continues(process, bus, link):
 
 
 def test_other_versions_are_one_warning(process, bus):
-    foreign = process(FOREIGN, env={"FOREIGN_PRESAGE": "9.9"})
+    foreign = process(FOREIGN, env={"FOREIGN_PRESAGE": "9.9"}, fresh=True)
     assert wait_until(lambda: "foreign" in bus.alive(), WAIT_TIMEOUT_S), foreign.output
     small = process(SMALL)
     small.wait_for("other versions in the foreign")

@@ -11,7 +11,7 @@ from common.geometry import se2
 from common.robot.base import Robot
 from common.robot.scan_geometry import Sector
 from common.runtime import safety
-from services.controller.policies.action_selection import Surroundings, select_action, to_go
+from services.controller.policies.action_selection import Surroundings, remaining_distance, select_action
 from services.controller.policies.motion_model import (
     HOLD_S,
     braking_speed,
@@ -78,7 +78,7 @@ def test_selection_never_increases_the_distance(robot, x, y, v, w):
     current, goal = np.array([v, 0.0, w]), np.array([x, y])
     selected = select_action(current, goal, around(), robot)
     poses, _, _ = rollouts(current, np.zeros((1, 3)), robot)
-    assert to_go(selected.motion[-1], goal, robot) <= to_go(poses[0, -1], goal, robot) + 1e-9
+    assert remaining_distance(selected.motion[-1], goal, robot) <= remaining_distance(poses[0, -1], goal, robot) + 1e-9
     assert np.hypot(*selected.action[:2]) <= robot.max_speed + 1e-9
     assert abs(selected.action[2]) <= robot.max_turn + 1e-9
     assert not selected.hindered

@@ -11,7 +11,6 @@ from common.geometry import se2
 from services.controller.policies.paper_action import (
     MAX_CORRECTION_M,
     ActionParameters,
-    action_free_energy,
     action_gradient,
     next_action,
     observed_position,
@@ -27,6 +26,12 @@ parameter_sets = st.builds(
     reach=st.floats(0.1, 3.0),
     action_precision=st.floats(0.1, 3.0),
 )
+
+
+def action_free_energy(action, observed, preferred, yaw, parameters):
+    outcome = observed + parameters.horizon * se2.rotate(yaw, action)
+    misfit, effort = outcome - preferred, parameters.action_precision * parameters.horizon**2
+    return float(0.5 * misfit @ misfit + 0.5 * effort * action @ action)
 
 
 @given(pair, pair, pair, angle, parameter_sets)

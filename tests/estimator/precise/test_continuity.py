@@ -76,7 +76,7 @@ def test_match(x, y, yaw, seed):
     assert np.hypot(off[0], off[1]) < 0.02
     assert abs(off[2]) < 0.01
     assert match.share > 0.7
-    assert not match.blind
+    assert not match.degenerate
 
 
 def test_scan_from_elsewhere():
@@ -97,7 +97,7 @@ def test_featureless_hall():
     recent.add(here, scan(scene, here))
     match = recent.match(here[None], scan(scene, here), Candidate("any", here, STEP, 1.0))
     assert match is not None
-    assert match.blind
+    assert match.degenerate
 
 
 def test_too_few_points():

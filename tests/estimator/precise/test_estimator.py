@@ -13,7 +13,7 @@ from common.limits import MAX_BEAMS
 from lab.accuracy import bound, tasks
 from lab.accuracy.runner import quick_field
 from lab.accuracy.scenes import TWINS, Scene
-from services.estimator.factory import Choice, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, Geometry, prepare
 from services.estimator.precise.estimator import TARGET_BEAMS, PreciseEstimator
 from services.estimator.precise.global_seeds import Seeds, thin_places
 from services.estimator.shared.generative_models import RayCaster
@@ -63,7 +63,7 @@ def test_error_and_bound():
     made, scene = estimator(ROOM)
     outcome = tasks.standing(made, scene, 40, iter)
     one, many = outcome["from nothing, 1 scan"], outcome["standing, 20 scans"]
-    assert one.found == one.of == 40
+    assert one.found == one.total == 40
     rms = [np.sqrt(np.mean(np.square(np.array(o.errors)[:, :2]).sum(1))) for o in (one, many)]
     limit = [np.sqrt(np.mean(np.square(o.bounds))) for o in (one, many)]
     assert 0.7 * limit[0] < rms[0] < 1.4 * limit[0]  # less would be an error of the test
@@ -73,19 +73,19 @@ def test_error_and_bound():
 def test_covariance():
     """NEES of 100 scans: mean of chi squared with 3 degrees of freedom, 99.9 % band."""
     made, scene = estimator(ROOM)
-    outcome = tasks.Outcome()
+    outcome = tasks.TaskOutcome()
     for pose in scene.poses(100):
         made.restart(pose, np.diag([1.0, 1.0, 1.0]))
         outcome.add(feed(made, scene, pose, 1)[0], pose, None)
-    assert len(outcome.misfits) >= 99
-    assert np.mean(outcome.misfits) == pytest.approx(3, abs=3.3 * np.sqrt(6 / 100))
+    assert len(outcome.nees) >= 99
+    assert np.mean(outcome.nees) == pytest.approx(3, abs=3.3 * np.sqrt(6 / 100))
 
 
 @pytest.mark.parametrize("odometry", [False, True])
 def test_tracking(odometry):
     made, scene = estimator(ROOM)
     (outcome,) = tasks.tracking(made, scene, 20.0, iter, odometry=odometry).values()
-    assert outcome.found == outcome.of == 300
+    assert outcome.found == outcome.total == 300
     rms = np.sqrt(np.mean(np.square(np.array(outcome.errors)[:, :2]).sum(1)))
     assert rms < 1.3 * np.sqrt(np.mean(np.square(outcome.bounds)))
 
@@ -175,7 +175,7 @@ def test_shipped_fields(world):
     """Finds 10 of 10 poses to a few millimetres; nothing was tuned on these poses and this noise."""
     scene = Scene.of(load_world(world), 622, 4242)
     scanner = scene.scanner
-    made = prepare(Choice(world))(Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max))
+    made = prepare(EstimatorOptions(world))(Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max))
     errors = []
     for pose in scene.poses(10):
         made.restart()

@@ -9,7 +9,7 @@ import pytest
 
 from common.geometry.world import load_world
 from lab.accuracy.scenes import Scene
-from services.estimator.factory import Choice, Geometry, prepare
+from services.estimator.factory import EstimatorOptions, Geometry, prepare
 
 TWIN = np.array([6.0, 0.0, 0.0])
 WORLD = load_world("twins")
@@ -19,7 +19,8 @@ RATE = 15.0
 def begun(model, seed):
     scene = Scene.of(WORLD, 622, seed)
     scanner = scene.scanner
-    made = prepare(Choice("twins", model=model))(Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max))
+    geometry = Geometry(scanner.angles(), np.array(scanner.mount), scanner.range_max)
+    made = prepare(EstimatorOptions("twins", model=model))(geometry)
     return made, scene
 
 

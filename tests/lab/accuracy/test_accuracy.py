@@ -14,7 +14,7 @@ from common.geometry.world import load_world
 from common.robot.base import Robot
 from lab.accuracy import bound, tasks
 from lab.accuracy.report import _markdown, bench_accuracy, scanners_of
-from lab.accuracy.runner import Job, _row, wilson_interval
+from lab.accuracy.runner import AccuracyJob, _row, wilson_interval
 from lab.accuracy.scenes import TWINS, Scene, alike, twin_of, twin_path
 from services.estimator.shared.interface import Hypothesis, Posterior
 from services.simulator.odometry import Drift
@@ -23,7 +23,7 @@ CONSOLE = Console(quiet=True)
 
 
 @pytest.mark.parametrize("world", ["office", "maze"])
-def test_paths_respect_the_robots_limits(world):
+def test_paths_within_limits(world):
     scene = Scene.of(load_world(world), 60, 0)
     path = scene.path(60)
     assert len(path) == 900
@@ -35,7 +35,7 @@ def test_paths_respect_the_robots_limits(world):
     assert scene.world.clearance(path[:, :2]).min() > Robot().radius - 1e-6
 
 
-def test_the_bound_agrees_with_finite_differences_of_exact_rays():
+def test_bound_by_finite_differences():
     scene = Scene.of(load_world("maze"), 200, 0)
     pose, step = scene.poses(1)[0], 1e-5
     columns = []
@@ -49,7 +49,7 @@ def test_the_bound_agrees_with_finite_differences_of_exact_rays():
     assert bound.information(scene, pose[None])[0] == pytest.approx(by_hand, rel=0.05, abs=0.02 * by_hand.max())
 
 
-def test_odometry_tightens_the_bound_and_standing_scans_add_up():
+def test_bound_along_a_path():
     scene = Scene.of(load_world("maze"), 200, 0)
     path = scene.path(3)
     alone, along = bound.single(scene, path), bound.recursive(scene, path, Drift())
@@ -59,7 +59,7 @@ def test_odometry_tightens_the_bound_and_standing_scans_add_up():
     assert last == pytest.approx(bound.single(scene, path[:1], 20)[0], rel=1e-3)
 
 
-def test_prior_knowledge_and_a_known_heading_tighten_the_bound():
+def test_bound_with_a_prior():
     scene = Scene.of(load_world("maze"), 200, 0)
     path = scene.path(2)
     one = bound.single(scene, path)
@@ -71,11 +71,11 @@ def test_prior_knowledge_and_a_known_heading_tighten_the_bound():
     assert known[0, :2, :2] == pytest.approx(np.linalg.inv(bound.information(scene, path[:1])[0, :2, :2]), rel=1e-6)
 
 
-def test_median_error_at_the_bound():
+def test_median_of_the_bound():
     assert bound.median(np.tile(np.diag([1.0, 1.0, 1.0]), (3, 1, 1))) == pytest.approx(np.sqrt(np.log(4)), rel=0.03)
 
 
-def test_blocked_ranges_are_shorter_and_cover_the_requested_share():
+def test_blocked_ranges():
     scene = Scene.of(load_world("office"), 622, 0)
     for clean in scene.clean(scene.poses(10)):
         blocked = scene.blocked(clean, 0.3)
@@ -83,7 +83,7 @@ def test_blocked_ranges_are_shorter_and_cover_the_requested_share():
         assert (blocked < clean).mean() >= 0.3
 
 
-def test_twin_scans_are_identical_until_the_corridor():
+def test_twin_path():
     scene = Scene.of(TWINS, 200, 1)
     path, same = twin_path(scene)
     assert 5 <= same < len(path)
@@ -141,35 +141,35 @@ def another_heading_in_the_twin(scans, pose, twin):
         (another_heading_in_the_twin, 0, 0),
     ],
 )
-def test_both_rooms_must_have_a_hypothesis_from_scan_20_on(believe, kept, wrong):
+def test_both_rooms_kept(believe, kept, wrong):
     paths = [twin_path(scene)[0] for scene in [Scene.of(TWINS, 60, 4)] for _ in range(2)]
     scene = Scene.of(TWINS, 60, 4)
     scene.observe = lambda clean, stamp: None  # the noise would change the paths drawn after it
     found = tasks.twins(ScriptedEstimator(paths, believe), scene, 2, iter)["two rooms alike: both kept"]
-    assert (found.found, found.of, found.wrong) == (kept, 2, wrong)
+    assert (found.found, found.total, found.wrong) == (kept, 2, wrong)
 
 
-def test_the_short_table_shows_wrong_claims(capsys):
-    outcome = tasks.Outcome(found=1, of=3, wrong=2, errors=[np.array([0.003, 0.004, 0.0])], misfits=[2.5])
-    nothing = tasks.Outcome(of=3, wrong=1)
+def test_short_table(capsys):
+    outcome = tasks.TaskOutcome(found=1, total=3, wrong=2, errors=[np.array([0.003, 0.004, 0.0])], nees=[2.5])
+    nothing = tasks.TaskOutcome(total=3, wrong=1)
     tim = scanners_of("tim571", "")[0]
-    job = Job("precise", "office", tim, 3, 1.0, 0)
+    job = AccuracyJob("precise", "office", tim, 3, 1.0, 0)
     rows = [_row(job, "office", task, each) for task, each in (("kidnapped", outcome), ("blocked", nothing))]
     assert "| kidnapped | 5.00/5.00 mm, 1/3, 2 wrong, NEES 2.50 |" in _markdown(rows, "office")
     assert "| blocked | 0/3, 1 wrong |" in _markdown(rows, "office")
     assert rows[0]["found_share_95"] == pytest.approx([0.061, 0.792], abs=1e-3)
 
 
-def test_counts_of_independent_trials_have_an_interval():
+def test_confidence_intervals():
     assert wilson_interval(294, 300) == pytest.approx([0.9570, 0.9908], abs=1e-3)
     assert wilson_interval(0, 100) == pytest.approx([0.0, 0.0370], abs=1e-3)
     assert wilson_interval(100, 100) == pytest.approx([0.9630, 1.0], abs=1e-3)
     tim = scanners_of("tim571", "")[0]
-    along = tasks.Outcome(found=9, of=9, independent=False)
-    assert _row(Job("precise", "office", tim, 3, 1.0, 0), "office", "tracking", along)["found_share_95"] is None
+    along = tasks.TaskOutcome(found=9, total=9, independent=False)
+    assert _row(AccuracyJob("precise", "office", tim, 3, 1.0, 0), "office", "tracking", along)["found_share_95"] is None
 
 
-def test_result_rows_and_files(tmp_path):
+def test_rows_and_files(tmp_path):
     file, figure = tmp_path / "a.json", tmp_path / "a.png"
     code = bench_accuracy("maze", "200", "precise-exact", "standing,odometry", 3, 0.1, 5, 1, file, figure, CONSOLE)
     assert code == 0
@@ -194,12 +194,12 @@ def test_result_rows_and_files(tmp_path):
         (("office", "622", "precise", "running"), "no task"),
     ],
 )
-def test_unknown_option_values_are_refused(words, why):
+def test_unknown_options(words, why):
     with pytest.raises(UserError, match=why):
         bench_accuracy(*words, 2, 0.1, 0, 1, None, None, CONSOLE)
 
 
-def test_scanners_with_their_numbers_of_beams():
+def test_scanners():
     named = [(one.name, one.beams) for one in scanners_of("tim571,lms200", "")]
     assert named == [("tim571", 622), ("lms200", 181)]
     assert [one.beams for one in scanners_of("tim571", "622,811")] == [622, 811]

@@ -30,14 +30,14 @@ def trained(steps=150, seed=0, **shape):
 
 
 @pytest.mark.parametrize("shape", [{}, {"inputs": "grid"}, {"activation": "relu", "loss": "l1"}])
-def test_training_reduces_the_error(shape):
+def test_training(shape):
     poses = lasers(100, 1)
     exact = ROOM.ray_distances(poses, ANGLES)
     error = np.abs(trained(**shape).expect(poses, ANGLES).ranges - exact)
     assert error.mean() < 0.6 * np.abs(exact - np.median(exact)).mean()
 
 
-def test_the_predicted_precision_is_learned():
+def test_learned_precision():
     poses = lasers(100, 1)
     expected = trained(400).expect(poses, ANGLES)
     error = np.abs(expected.ranges - ROOM.ray_distances(poses, ANGLES))
@@ -45,14 +45,14 @@ def test_the_predicted_precision_is_learned():
     assert error[~surer].mean() > 1.5 * error[surer].mean()
 
 
-def test_training_is_reproducible_with_a_seed():
+def test_reproducible_training():
     poses = lasers(5, 2)
     first, again, other = (trained(20, seed).expect(poses, ANGLES).ranges for seed in (0, 0, 1))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
 
 
-def test_derivatives_agree_with_finite_differences():
+def test_jacobian():
     model = trained(100)
     pose = lasers(1, 3)[0]
     found = model.expect(pose[None], ANGLES).jacobian[0]
@@ -62,7 +62,7 @@ def test_derivatives_agree_with_finite_differences():
         assert found[:, axis] == pytest.approx((ahead - back) / (2 * step), rel=1e-2, abs=1e-2)
 
 
-def test_the_papers_decoder_has_the_same_interface():
+def test_decoder_of_the_paper():
     torch.manual_seed(0)
     model = PaperModel(Decoder(PaperShape(SCANNER.beams, 16, 4)).double(), normalisation())
     scans = PaperScans(model, SCANNER, HEADING, 0.3)

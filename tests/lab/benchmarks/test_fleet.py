@@ -13,11 +13,11 @@ from common.geometry.world import load_world
 from common.messages.definitions import Belief, Pose
 from common.messages.topics import BELIEF, SCAN
 from lab.benchmarks.fleet import max_robots_served
-from lab.benchmarks.fleet_load import CLEARANCE, RADIUS, Load
+from lab.benchmarks.fleet_load import CLEARANCE, RADIUS, FleetLoad
 
 
 @pytest.mark.parametrize("limit", [0, 1, 2, 3, 7, 8, 9, 15, 16, 31, 32])
-def test_the_largest_number_served_is_found_in_few_tries(limit):
+def test_largest_number_served(limit):
     tried = []
 
     def served(count):
@@ -29,9 +29,9 @@ def test_the_largest_number_served_is_found_in_few_tries(limit):
     assert all(1 <= count <= 32 for count in tried)
 
 
-def test_robots_keep_clear_of_walls_and_send_scans_at_regular_stamps(bus):
+def test_load(bus):
     world = load_world("corridor")
-    load = Load(bus, world, 16, 15.0, 3, 1)
+    load = FleetLoad(bus, world, 16, 15.0, 3, 1)
     inbox = Inbox()
     bus.subscribe(SCAN, inbox, keep_all=True, robot="*")
     assert load.wait_matching(3, 10)
@@ -57,9 +57,9 @@ def test_robots_keep_clear_of_walls_and_send_scans_at_regular_stamps(bus):
         assert np.diff(of_one).tolist() == pytest.approx([1e9 / 15] * (len(of_one) - 1), abs=2)
 
 
-def test_an_answer_counts_once_and_only_for_a_scan_that_was_sent(bus, link):
+def test_counted_answers(bus, link):
     """A peer answers every scan of the first robot twice, and once with an unknown stamp."""
-    load = Load(bus, load_world("corridor"), 16, 15.0, 2, 1)
+    load = FleetLoad(bus, load_world("corridor"), 16, 15.0, 2, 1)
     with open_bus(link) as other:
         answering = other.for_robot(load.robots[0].name)
         inbox = Inbox()

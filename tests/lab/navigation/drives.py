@@ -40,7 +40,7 @@ from common.messages.topics import (
 )
 from common.robot.base import Robot
 from services.recorder.files.writer import RecordingWriter
-from services.recorder.service import write_world
+from services.recorder.recording import write_description
 from tests.recorder.sessions import SCANNER, WORLD
 
 STEPS = 12
@@ -128,7 +128,7 @@ def write(path, *leave_out, robot="rob", world=True, finish=True, also=()):
     writer = RecordingWriter(path)
     writer.metadata("presage", {"robot": robot, "commit": "abc"})
     if world:
-        write_world(writer, WorldReply(world=WORLD, scanner=SCANNER, robot=Robot(radius=0.3)))
+        write_description(writer, "simulator", WorldReply(world=WORLD, scanner=SCANNER, robot=Robot(radius=0.3)))
     for topic, key, message, at in events(robot):
         if topic not in leave_out:
             writer.write(topic, key, message.encode(), at, at)

@@ -7,6 +7,7 @@ import signal
 from dataclasses import replace
 
 import numpy as np
+import psutil
 import pytest
 import shapely
 from hypothesis import given, settings
@@ -34,6 +35,7 @@ from lab.navigation.shortest_path import (
     length,
     load_shortest_paths,
 )
+from tests.conftest import ended
 
 QUIET = Console(quiet=True)
 ROBOT, TURNING = Robot(), Robot(drive="differential")
@@ -45,12 +47,12 @@ def block(*boxes, boundary=HALL.boundary, name="block"):
     return World(name=name, boundary=boundary, obstacles=obstacles)
 
 
-def test_the_path_is_straight_without_obstacles():
+def test_straight_path():
     path = ShortestPaths(HALL, 0.3).path(np.array([1.0, 1.0]), np.array([9.0, 5.0]))
     assert path.tolist() == [[1.0, 1.0], [9.0, 5.0]]
 
 
-def test_the_path_around_a_box_consists_of_tangents_and_arcs():
+def test_path_around_a_box():
     """A box from (4, 0) to (6, 3), with start and goal at the height of its top."""
     r = 0.4
     paths = ShortestPaths(block((5.0, 1.5, 2.0, 3.0)), r)
@@ -61,13 +63,13 @@ def test_the_path_around_a_box_consists_of_tangents_and_arcs():
     assert length(paths.path(start, goal)) == pytest.approx(expected, abs=2e-3)
 
 
-def test_the_shorter_way_around_an_obstacle_is_taken():
+def test_shorter_way():
     paths = ShortestPaths(block((5.0, 2.5, 0.2, 3.0)), 0.3)  # from 1 to 4 of 6
     assert paths.path(np.array([2.0, 2.0]), np.array([8.0, 2.0]))[1:-1, 1].max() < 1.01
     assert paths.path(np.array([2.0, 3.0]), np.array([8.0, 3.0]))[1:-1, 1].min() > 3.99
 
 
-def test_a_narrow_door_is_impassable():
+def test_narrow_door():
     start, goal = np.array([1.0, 3.0]), np.array([9.0, 3.0])
     wall = block((5.0, 1.2, 0.2, 2.4), (5.0, 4.5, 0.2, 3.0))  # 0.6 m between
     assert len(ShortestPaths(wall, 0.29).path(start, goal)) >= 3
@@ -76,7 +78,7 @@ def test_a_narrow_door_is_impassable():
 
 @given(st.integers(0, 10_000))
 @settings(max_examples=20, deadline=None)
-def test_shortest_paths_keep_clearance_and_have_no_shortcut(seed):
+def test_clearance_and_no_shortcut(seed):
     world, paths = load_shortest_paths("maze")
     rng = np.random.default_rng(seed)
     start, middle, goal = world.sample_free(3, rng, ROBOT.radius + shortest.START_GOAL_MARGIN)
@@ -93,10 +95,10 @@ def test_shortest_paths_keep_clearance_and_have_no_shortcut(seed):
             assert direct.length == pytest.approx(length(path[k - 1 : k + 2]), abs=1e-6)
 
 
-def test_shortest_paths_are_not_longer_than_grid_paths():
+def test_grid_paths_are_longer():
     """Compares with an independent computation: paths on a 5 cm grid with 16 neighbours are never shorter."""
-    from services.controller.policies.free_space import FreeSpace  # noqa: PLC0415
-    from services.controller.policies.geodesic_field import FreeSpaceGraph  # noqa: PLC0415
+    from services.controller.policies.free_space import FreeSpace
+    from services.controller.policies.geodesic_field import FreeSpaceGraph
 
     world, paths = load_shortest_paths("office")
     graph = FreeSpaceGraph(FreeSpace.of(world), ROBOT.radius)
@@ -108,7 +110,7 @@ def test_shortest_paths_are_not_longer_than_grid_paths():
 
 
 @pytest.mark.parametrize("world", ["maze", "office", "twins"])
-def test_trips_are_valid_and_the_same_for_every_drive(world):
+def test_valid_trips(world):
     known, _ = load_shortest_paths(world)
     trips = [draw_trip(world, np.random.default_rng((1, k)), ROBOT) for k in range(25)]
     for k, trip in enumerate(trips):
@@ -123,7 +125,7 @@ def test_trips_are_valid_and_the_same_for_every_drive(world):
     assert np.ptp([trip.start[2] for trip in trips]) > 4  # any heading
 
 
-def test_a_world_too_small_for_a_trip_is_refused(tmp_path):
+def test_world_too_small(tmp_path):
     cell = tmp_path / "cell.yaml"
     cell.write_text(save_world(World(name="cell", boundary=[(0, 0), (1.5, 0), (1.5, 1.5), (0, 1.5)])))
     with pytest.raises(UserError, match="no two places 2 m apart"):
@@ -132,7 +134,7 @@ def test_a_world_too_small_for_a_trip_is_refused(tmp_path):
 
 @given(st.floats(0.3, np.pi), st.floats(0.5, 4.0), st.floats(0.5, 6.0))
 @settings(max_examples=12, deadline=None)
-def test_no_turn_is_faster_than_the_minimum_time(angle, speed, acceleration):
+def test_minimum_time_of_turns(angle, speed, acceleration):
     """Simulates the turn with the simulator's acceleration limits, braking as late as possible."""
     robot, dt = Robot(max_turn=speed, turn_acceleration=acceleration), 4e-3
     v, turned, seconds = np.zeros(3), 0.0, 0.0
@@ -144,7 +146,7 @@ def test_no_turn_is_faster_than_the_minimum_time(angle, speed, acceleration):
     assert seconds == pytest.approx(least_turn(-angle, robot), abs=6 * dt)
 
 
-def test_minimum_time_in_known_cases():
+def test_minimum_time_of_trips():
     path = [(0.0, 0.0), (0.0, 4.0), (3.0, 4.0)]
     robot = Robot(max_speed=1.0, acceleration=1.0, max_turn=2.0, turn_acceleration=3.0)
     turning = robot.model_copy(update={"drive": "differential"})
@@ -220,7 +222,7 @@ def test_measurements_of_a_drive():
     assert len(found["events"]) == 4  # a different distance is not a new reason
 
 
-def test_errors_while_tracking_are_separate_from_errors_while_lost():
+def test_errors_by_state():
     trace = a_trace()
     trace.beliefs[3] = belief(3, 7.0, "localising")
     found = driven.measure(trace, TRIP, HALL, ROBOT)
@@ -231,7 +233,7 @@ def test_errors_while_tracking_are_separate_from_errors_while_lost():
     assert never["tracking_s"] is never["error_max_m"] is None
 
 
-def test_reasons_are_compared_without_places():
+def test_reasons_without_places():
     for place in ("", ", 0.8 m away at (1.2, -3.4)", " at (-1.0, 2.0)"):
         assert (
             driven.strip_numbers(f"waiting: something{place}: until it clears") == "waiting: something: until it clears"
@@ -241,13 +243,13 @@ def test_reasons_are_compared_without_places():
     )
 
 
-def test_clearance_is_measured_between_scans():
+def test_clearance_between_scans():
     world = block((5.0, 3.0, 0.2, 0.2))
     path = np.array([[4.0, 3.5, 0.0], [6.0, 3.5, 0.0]])  # no scan was taken beside the box
     assert driven._clearance(world, path).min() == pytest.approx(0.4)
 
 
-def test_wrong_refused_late_and_failed_drives_are_not_reached():
+def test_outcomes():
     far = driven.measure(a_trace(ends_at=4.69), TRIP, HALL, ROBOT)
     assert far["outcome"] == "claimed elsewhere"
     assert not far["reached"]
@@ -266,7 +268,7 @@ def test_wrong_refused_late_and_failed_drives_are_not_reached():
     assert driven.measure(trace, TRIP, HALL, ROBOT)["step_mean_ms"] is None
 
 
-def test_the_summary_lists_the_worst_trials():
+def test_worst_trials():
     rows = []
     for number, trace in enumerate([a_trace(), a_trace(ends_at=4.0), a_trace()]):
         rows.append({"trial": number, **driven.measure(trace, TRIP, HALL, ROBOT)})
@@ -288,7 +290,7 @@ def test_the_summary_lists_the_worst_trials():
     assert "–" in driving.table({"x": none})
 
 
-def test_the_drive_ends_with_the_scan_at_which_the_controller_reports_the_goal():
+def test_end_of_a_drive():
     lockstep_run = LockstepRun(Journey((1.0, 1.0), (5.0, 1.0)), 0.0, "maze", 101, 0, (), 100, ends_with_status=True)
     trace, end = RunTrace(), None
     # A possible order: another process's messages about the next scan arrive before this scan's status.
@@ -307,8 +309,8 @@ def test_the_drive_ends_with_the_scan_at_which_the_controller_reports_the_goal()
     assert not _is_final(status(0, "reached", goal_seq=0), RunTrace(), lockstep_run)
 
 
-def test_result_names_depend_on_the_options():
-    job = driving.Job(0, 1)
+def test_result_names():
+    job = driving.NavigationJob(0, 1)
     assert driving.result_name(job, driving.WORLDS, driving.DRIVES) == "navigation"
     assert driving.result_name(replace(job, seed=7, limit=9.0), driving.WORLDS, driving.DRIVES) == "navigation"
     odd = replace(job, start="unknown", people=10, epistemic=False, estimator="particle-filter", prior="odometry")
@@ -319,8 +321,10 @@ def test_result_names_depend_on_the_options():
     )
 
 
-def test_services_get_the_jobs_options():
-    job = driving.Job(3, 2, "office", "differential", "unknown", 4, 0.5, "particle-filter", "odometry", epistemic=False)
+def test_options_of_services():
+    job = driving.NavigationJob(
+        3, 2, "office", "differential", "unknown", 4, 0.5, "particle-filter", "odometry", epistemic=False
+    )
     lockstep_run = job.lockstep_run(Journey((1.0, 1.0), (5.0, 1.0)), 0.5)
     assert lockstep_run.controller == ("--preset", "geodesic", "--drive", "differential", "--no-epistemic")
     assert lockstep_run.simulator == ("--drive", "differential", "--people", "4", "--people-speed", "0.5")
@@ -340,10 +344,10 @@ def test_services_get_the_jobs_options():
         (("--estimator", "paper"), "--estimator 'paper': choose from precise, particle-filter"),
     ],
 )
-def test_invalid_options_are_refused_in_one_line(args, says):
-    from typer.testing import CliRunner  # noqa: PLC0415
+def test_invalid_options(args, says):
+    from typer.testing import CliRunner
 
-    from lab.cli import experiment as cli_experiment  # noqa: PLC0415
+    from lab.cli import experiment as cli_experiment
 
     result = CliRunner().invoke(cli_experiment.app, ["navigation", *args])
     assert isinstance(result.exception, UserError)
@@ -351,9 +355,9 @@ def test_invalid_options_are_refused_in_one_line(args, says):
     assert "\n" not in str(result.exception)
 
 
-def test_a_small_run_writes_all_files_and_is_reproducible(tmp_path):
-    job = driving.Job(0, 1, beams=101, limit=30.0)
-    result = driving.run(job, 1, tmp_path, 2, QUIET, worlds=("maze",))
+def test_small_run(tmp_path, monkeypatch):
+    job = driving.NavigationJob(0, 1, beams=101, limit=30.0)
+    result = driving.run(job, 1, tmp_path, 1, QUIET, worlds=("maze",))
     assert {path.name for path in tmp_path.iterdir()} == {
         f"navigation-maze-beams101{suffix}" for suffix in (".json", ".csv", ".trials.jsonl", ".pdf", ".png")
     }
@@ -370,6 +374,7 @@ def test_a_small_run_writes_all_files_and_is_reproducible(tmp_path):
     holonomic, differential = result.trials
     assert holonomic["goal"] == differential["goal"]
     assert holonomic["x_m"] != differential["x_m"]
+    monkeypatch.setenv("PRESAGE_GAMMA", "0.01")  # the user's own settings must not change a trial
     again = driving.trial(replace(job, drive="differential"))
     timing = ("step_mean_ms", "step_max_ms")
     assert {k: v for k, v in again.items() if k not in timing} == {
@@ -380,12 +385,12 @@ def test_a_small_run_writes_all_files_and_is_reproducible(tmp_path):
     assert "| maze, differential | 1/1 | 0 | 0; 0 |" in text
 
 
-def test_an_interrupted_run_continues_and_leaves_no_process(process, tmp_path):
+def test_interrupted_and_killed_runs(process, tmp_path):
+    """After Ctrl-C the same command continues; a killed one leaves neither workers nor services."""
     args = ("presage.__main__", "experiment", "navigation", "--worlds", "maze", "--drives", "holonomic",
-            "--trials", "3", "--out", str(tmp_path))  # fmt: skip
-    one_worker = {"PRESAGE_WORKERS": "1"}
+            "--trials", "9", "--out", str(tmp_path))  # fmt: skip
     store = tmp_path / ".navigation-maze-holonomic.unfinished.jsonl"
-    run = process(*args, env=one_worker)
+    run = process(*args, env={"PRESAGE_WORKERS": "1"})
     assert wait_until(lambda: store.exists() and len(store.read_text().splitlines()) > 1, 90), run.output
     run.send(signal.SIGINT)
     # Python ignores an interrupt while it forks, so send it again if necessary.
@@ -394,15 +399,21 @@ def test_an_interrupted_run_continues_and_leaves_no_process(process, tmp_path):
         run.send(signal.SIGINT)
     assert run.wait(30) == 130, run.output
     done = len(store.read_text().splitlines()) - 1
-    assert done < 3
-    run = process(*args, env=one_worker)
-    assert run.wait(120) == 0, run.output
-    assert f"going on after {done} of 3" in run.output
-    rows = (tmp_path / "navigation-maze-holonomic.trials.jsonl").read_text().splitlines()
-    assert [json.loads(row)["trial"] for row in rows] == [0, 1, 2]
+    run = process(*args, env={"PRESAGE_WORKERS": "2"})
+    run.wait_for(f"continuing after {done} of 9", 90)
+
+    def services():
+        return [
+            c for c in psutil.Process(run.child.pid).children(recursive=True) if "services" in " ".join(c.cmdline())
+        ]
+
+    assert wait_until(services, 90), run.output
+    children = psutil.Process(run.child.pid).children(recursive=True)
+    run.kill()
+    assert wait_until(lambda: all(map(ended, children)), 20)
 
 
-def test_trips_start_and_end_in_the_defined_rooms():
+def test_rooms_of_trips():
     for name, rooms in shortest.ROOMS.items():
         free = load_world(name).free_space
         for room in rooms:

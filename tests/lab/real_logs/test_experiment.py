@@ -19,7 +19,7 @@ from lab.real_logs.drive import (
     KIDNAPPED,
     LASER,
     MAX_SEARCH_SCANS,
-    Job,
+    StretchJob,
     create_estimator,
     drive_at,
     exchange_halves,
@@ -45,13 +45,13 @@ def folder(tmp_path_factory):
     made = tmp_path_factory.mktemp("drive")
     real_drive.save(made / "drive.npz", real_drive.drive(200))
     (made / "before.yaml").write_text(save_world(real_drive.BEFORE), encoding="utf-8")
-    recipe = Recipe(resolution=0.05, sweeps=4, beams_a_sweep=40_000)
+    recipe = Recipe(resolution=0.05, sweeps=4, beams_per_sweep=40_000)
     job = Training(made / "drive.npz", str(made / "before.yaml"), made, 100, recipe, 0.5, HERE)
     train_from_drive(job, Console(quiet=True))
     return made
 
 
-def test_the_card_has_the_models_origin_and_errors(folder):
+def test_card(folder):
     _, places, card = weights.load(folder / "before-precise.safetensors")
     assert card.source == "100 posed scans of drive.npz; elsewhere 100 simulated scans in map before"
     assert card.calibration is not None
@@ -63,18 +63,18 @@ def test_the_card_has_the_models_origin_and_errors(folder):
     assert raw["calibration"]["log_likelihood"] == pytest.approx(card.calibration.log_likelihood)
 
 
-def test_logs_without_enough_reference_poses_are_refused(tmp_path):
+def test_too_few_reference_poses(tmp_path):
     real_drive.save(tmp_path / "bare.npz", real_drive.drive(60), reference=False)
     with pytest.raises(UserError, match="no reference poses"):
         train_from_drive(Training(tmp_path / "bare.npz", out=tmp_path, reading=HERE), Console(quiet=True))
     real_drive.save(tmp_path / "short.npz", real_drive.drive(60))
-    with pytest.raises(UserError, match="30 scans with a reference pose; at least 50 are needed"):
+    with pytest.raises(UserError, match="30 scans with a reference pose; training needs at least 50"):
         train_from_drive(Training(tmp_path / "short.npz", out=tmp_path, share=0.5, reading=HERE), Console(quiet=True))
 
 
 @pytest.mark.parametrize("estimator", ["precise", "particle-filter"])
-def test_a_kidnapped_robot_is_localised_again(folder, estimator):
-    job = Job(
+def test_kidnapped_robot(folder, estimator):
+    job = StretchJob(
         str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), estimator, KIDNAPPED, 100, to=155,
         model=str(folder / "before-precise.safetensors"),
         particles=(
@@ -91,7 +91,7 @@ def test_a_kidnapped_robot_is_localised_again(folder, estimator):
         assert found["wrong_claim_longest_s"] <= 2
 
 
-def test_tuning_uses_the_second_quarter_in_a_map_of_the_first(folder, tmp_path, monkeypatch):
+def test_scans_used_for_tuning(folder, tmp_path, monkeypatch):
     """The half evaluated later must not affect the settings, and the map must lack rooms, as it does later."""
     tried = []
 
@@ -101,7 +101,9 @@ def test_tuning_uses_the_second_quarter_in_a_map_of_the_first(folder, tmp_path, 
         return {"task": job.task, "error_m": error, "state": ["tracking"] * 20}
 
     monkeypatch.setattr(real_tuning, "trial", fake)
-    job = Job(str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "particle-filter", LASER, 0)
+    job = StretchJob(
+        str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "particle-filter", LASER, 0
+    )
     tuned = real_tuning.tune(job, 100, starting_point(MotionNoise()), tmp_path, lambda *_: None)
     for each in (tuned.odometry, tuned.laser):
         assert dict(each).get("keep_initial_pose", 1.0) == 1.0  # recovery was tried and rejected
@@ -116,12 +118,14 @@ def test_tuning_uses_the_second_quarter_in_a_map_of_the_first(folder, tmp_path, 
     assert (mapped.clearance(poses) > 0).mean() > 0.9
 
 
-def test_amcl_uses_the_omnidirectional_motion_model(folder):
-    job = Job(str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "amcl-defaults", LASER, 100)
+def test_motion_model_of_amcl(folder):
+    job = StretchJob(
+        str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "amcl-defaults", LASER, 100
+    )
     assert create_estimator(job).settings == ParticleSettings(robot_model_type="omni")
 
 
-def test_odometry_does_not_reveal_a_kidnapping():
+def test_odometry_of_a_kidnapping():
     rng = np.random.default_rng(0)
     odom = np.cumsum(rng.normal(0, 0.1, (20, 3)), axis=0)
     told = hide_kidnapping(odom, 12)
@@ -130,8 +134,8 @@ def test_odometry_does_not_reveal_a_kidnapping():
     assert se2.between(told[12], told[15]) == pytest.approx(se2.between(odom[12], odom[15]))
 
 
-def test_time_increases_when_a_robot_is_moved_to_an_earlier_scan(folder):
-    job = Job(
+def test_time_of_a_kidnapping(folder):
+    job = StretchJob(
         str(folder / "drive.npz"), str(folder / "before.yaml"), (0.0, 0.0, 0.0), "precise", KIDNAPPED, 155, to=100,
         model=str(folder / "before-precise.safetensors"),
     )  # fmt: skip
@@ -141,7 +145,7 @@ def test_time_increases_when_a_robot_is_moved_to_an_earlier_scan(folder):
 
 
 @pytest.mark.parametrize("count", [20, 21])
-def test_halves_are_disjoint_and_complete(count):
+def test_halves(count):
     drive = real_drive.drive(count)
     first, second = split(drive)
     assert len(first.ranges) == count // 2
@@ -149,7 +153,7 @@ def test_halves_are_disjoint_and_complete(count):
 
 
 @pytest.mark.parametrize("count", [20, 21])
-def test_time_increases_in_a_drive_with_exchanged_halves(count):
+def test_exchanged_halves(count):
     drive = real_drive.drive(count)
     first, second = split(drive)
     turned = exchange_halves(drive)
@@ -162,12 +166,12 @@ def test_time_increases_in_a_drive_with_exchanged_halves(count):
 
 @pytest.mark.parametrize("count", [100, 101])
 @pytest.mark.parametrize("exchanged", [False, True])
-def test_no_scan_is_used_for_both_training_and_localisation(tmp_path, count, exchanged):
+def test_scans_of_training(tmp_path, count, exchanged):
     log = tmp_path / "drive.npz"
     real_drive.save(log, real_drive.drive(count))
     first, second = split(drive_at(str(log), None))
     learned, localised = (second, first) if exchanged else (first, second)
-    job = Job(str(log), "", None, "precise", LASER, 0, exchanged=exchanged)
+    job = StretchJob(str(log), "", None, "precise", LASER, 0, exchanged=exchanged)
     assert job.drive.poses[: job.learned] == pytest.approx(learned.poses)
     assert job.drive.poses[job.learned :] == pytest.approx(localised.poses)
     assert job.drive.odom[job.learned :] == pytest.approx(localised.odom)
@@ -175,16 +179,16 @@ def test_no_scan_is_used_for_both_training_and_localisation(tmp_path, count, exc
     assert np.hypot(steps[:, 0], steps[:, 1]).max() < 0.4  # the robot drives at most 0.2 m between two scans
 
 
-def test_with_halves_exchanged_the_first_scans_are_localised(folder):
+def test_localised_half(folder):
     where, mount = str(folder / "drive.npz"), (0.0, 0.0, 0.0)
-    job = Job(
+    job = StretchJob(
         where, str(folder / "before.yaml"), mount, "precise", LASER, 100, 30,
         model=str(folder / "before-precise.safetensors"), exchanged=True,
     )  # fmt: skip
     found = real.summarise([one_trial(job)])  # by a model of these very scans
     assert found["error_median_m"] < 0.05
     assert job.drive.poses[100] == pytest.approx(drive_at(where, mount).poses[0])
-    assert real.Job(folder / "drive.npz", "map.yaml", exchange=True).result == "real-drive_exchanged"
+    assert real.RealLogJob(folder / "drive.npz", "map.yaml", exchange=True).result == "real-drive_exchanged"
 
 
 def row(task, error, state, stamps=None):
@@ -195,7 +199,7 @@ def row(task, error, state, stamps=None):
     }  # fmt: skip
 
 
-def test_wrong_claims_and_their_durations():
+def test_durations_of_wrong_claims():
     t, lost = "tracking", "lost"
     found = real.summarise([row("odometry", [0, 9, 9, 9, 9, 0, 9], [t, t, t, t, lost, t, t])])
     assert found["wrong_claim_longest_s"] == pytest.approx(1.0)  # from the second to the fourth scan
@@ -206,22 +210,22 @@ def test_wrong_claims_and_their_durations():
     assert searched["scans_until_found_median"] == 4
 
 
-def test_the_table_of_the_page(tmp_path):
+def test_table(tmp_path):
     assert page.MODULES["real"] == "lab.real_logs.experiment"
     summary = {"a: tracking with odometry, precise": real.summarise([row("odometry", [0.01, 0.02], ["tracking"] * 2)])}
     table = real.table(summary)
     assert "| a, precise | 15.0 |" in table
 
 
-def test_a_log_too_short_is_refused(folder, tmp_path):
+def test_short_log(folder, tmp_path):
     real_drive.save(tmp_path / "few.npz", real_drive.drive(100))
-    job = real.Job(tmp_path / "few.npz", str(folder / "before.yaml"))
+    job = real.RealLogJob(tmp_path / "few.npz", str(folder / "before.yaml"))
     with pytest.raises(UserError, match="100 posed scans; at least 160"):
         real.run(job, tmp_path, 1, Console(quiet=True))
 
 
-def test_a_map_of_another_place_is_refused(folder, tmp_path):
-    job = real.Job(folder / "drive.npz", "office", (0.0, 0.0, 0.0))
+def test_map_of_another_place(folder, tmp_path):
+    job = real.RealLogJob(folder / "drive.npz", "office", (0.0, 0.0, 0.0))
     elsewhere = World(name="elsewhere", boundary=[(50, 50), (60, 50), (60, 60), (50, 60)])
     (tmp_path / "elsewhere.yaml").write_text(save_world(elsewhere), encoding="utf-8")
     with pytest.raises(UserError, match=r"only 0% of the reference poses .* in free space"):

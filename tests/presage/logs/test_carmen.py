@@ -28,7 +28,7 @@ def write(tmp_path, lines, pack=None, name="drive.log"):
 
 def read(path, **said):
     log = open_log(path, Reading(**said))
-    return log, list(log.sweeps())
+    return log, list(log.valid_scans())
 
 
 def close(poses, wanted):
@@ -186,7 +186,7 @@ def test_unusable_scans_are_counted(tmp_path):
         "garbled lines": 2, "scans twice": 1, "scans older than the one before": 1, "scans of other beams": 1,
     }  # fmt: skip
     assert len(sweeps) == SCANS - 4
-    assert list(log.sweeps())  # the counts are of the last pass
+    assert list(log.valid_scans())  # the counts are of the last pass
     assert log.left_out["garbled lines"] == 2
 
 
@@ -218,7 +218,7 @@ def test_refusals(tmp_path):
     for lines, odom_topic, why in (
         (cut, "", "too few usable scans: 3; left out: garbled lines: 9"),
         (["ODOM 0 0 0 0 0 0 1 h 1"], "", "without a scan"),
-        (carmen(), "ODOMETRY", r"odom.topic ODOMETRY: .* only be ODOM, and this one has ODOM lines"),
+        (carmen(), "ODOMETRY", r"odom.topic ODOMETRY: .* only have ODOM, and this one has ODOM lines"),
         (without_odom, "ODOM", "no ODOM lines"),
     ):
         with pytest.raises(UserError, match=why):

@@ -10,7 +10,7 @@ import pytest
 from common.errors import UserError
 from common.messages.ros_messages import Transform, read_rotation
 from presage.logs.frame_history import FrameHistory
-from presage.logs.poses import Track
+from presage.logs.poses import PoseTrack
 
 SECOND = 1_000_000_000
 
@@ -53,7 +53,7 @@ def test_cycles_of_frames():
 
 
 def test_interpolation():
-    track = Track()
+    track = PoseTrack()
     for seconds, yaw in ((2, -3.0), (1, 3.0), (4, 0.0)):  # in any order
         track.add(seconds * SECOND, np.array([seconds, 0.0, yaw]))
     track.add(3 * SECOND, np.array([np.nan, 0, 0]))
@@ -62,11 +62,11 @@ def test_interpolation():
     assert abs(middle[2]) == pytest.approx(np.pi)  # by the shorter turn
     assert track.at(2 * SECOND).tolist() == [2, 0, -3]
     assert [track.at(stamp * SECOND) for stamp in (0, 3, 5)] == [None, None, None]
-    assert Track().at(0) is None
+    assert PoseTrack().at(0) is None
 
 
 def test_standing_still_takes_no_memory():
-    track, still = Track(), np.array([1.0, 2.0, 3.0])
+    track, still = PoseTrack(), np.array([1.0, 2.0, 3.0])
     for k in range(1000):
         track.add(k * SECOND // 100, still)
     assert len(track) < 25

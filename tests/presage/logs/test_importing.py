@@ -19,7 +19,7 @@ from presage.logs.options import LogSettings
 from presage.logs.scan_files import read_scans
 from presage.recordings.info import survey
 from presage.recordings.session_figure import draw_session
-from presage.replay.localize import LocalizeOptions, choice_of, localize
+from presage.replay.localize import LocalizeOptions, build_estimator_options, localize
 from services.recorder.reader import read_recording
 from tests.presage.logs.drives import (
     ANGLES,
@@ -111,9 +111,9 @@ def test_velocities(tmp_path):
 
 
 def position_errors(file, world):
-    choice = choice_of(file, world, "precise", "exact", None, 0.02, 0, "")
+    estimator_options = build_estimator_options(file, world, "precise", "exact", None, 0.02, 0, "")
     options = {"fresh": False, "odometry": True, "out": file.with_name("p.json")}
-    rows = localize(LocalizeOptions.of(file, choice, "track", "base_link", Reading(), **options), CONSOLE)
+    rows = localize(LocalizeOptions.of(file, estimator_options, "track", "base_link", Reading(), **options), CONSOLE)
     return np.hypot(*(np.array([[row["x"], row["y"]] for row in rows]) - truth(STAMPS)[:, :2]).T)
 
 

@@ -75,7 +75,7 @@ def test_unknown_contents(tmp_path, content, why):
     file = tmp_path / "drive.bag"
     file.write_bytes(content)
     with pytest.raises(UserError, match=why):
-        list(open_log(file, Reading()).sweeps())
+        list(open_log(file, Reading()).valid_scans())
     with pytest.raises(UserError, match=why):
         read_scans(file, MOUNT)
 

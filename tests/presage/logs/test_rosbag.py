@@ -18,7 +18,7 @@ from tests.presage.logs.drives import ANGLES, BEAMS, MOUNT, SCANS, STAMPS, Bag, 
 
 def read(path, **said):
     log = open_log(path, Reading(**said))
-    return log, list(log.sweeps())
+    return log, list(log.valid_scans())
 
 
 def close(poses, wanted):

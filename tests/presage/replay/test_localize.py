@@ -23,7 +23,7 @@ from common.robot.scanner import SCANNERS
 from presage.logs.importing import ImportOptions, import_command
 from presage.logs.log import Reading
 from presage.logs.scan_files import Scans, read_scans
-from presage.replay.localize import COLUMNS, LocalizeOptions, choice_of, localize, select_scans
+from presage.replay.localize import COLUMNS, LocalizeOptions, build_estimator_options, localize, select_scans
 from presage.replay.rerun import RerunOptions, rerun_command
 from services.estimator.shared.model_folder import SHIPPED
 from services.recorder.files.writer import RecordingWriter
@@ -54,9 +54,11 @@ def npz(folder: Path, mount=SCANNER.mount, **changes) -> Path:
 def job(file, mode="global", frame="base_link", estimator="precise", model="learned", world="corridor", **more):
     out = more.pop("out", None)
     models = more.pop("models", None)
-    choice = choice_of(file, world, estimator, model, models, 0.02, 0, more.pop("initial_pose", ""))
+    estimator_options = build_estimator_options(
+        file, world, estimator, model, models, 0.02, 0, more.pop("initial_pose", "")
+    )
     given = {"fresh": False, "odometry": True, "out": out, **more}
-    return LocalizeOptions.of(file, choice, mode, frame, given.pop("reading", Reading()), **given)
+    return LocalizeOptions.of(file, estimator_options, mode, frame, given.pop("reading", Reading()), **given)
 
 
 def errors(rows, path=PATH):
@@ -217,9 +219,9 @@ def test_selection_refusals(tmp_path):
     ):
         with pytest.raises(UserError, match=why):
             select_scans(job(file, **wrong), scans)
-    for choice in ({"start": 0.2}, {"end": 0.2}, {"every": 2}):
+    for estimator_options in ({"start": 0.2}, {"end": 0.2}, {"every": 2}):
         with pytest.raises(UserError, match="no stamps, which --start, --end and --every need"):
-            select_scans(job(file, **choice), unstamped)
+            select_scans(job(file, **estimator_options), unstamped)
     with pytest.raises(UserError, match="mode track needs the pose of the first scan"):  # initial_pose is of another
         localize(job(file, start=0.2, mode="track"), CONSOLE)
 

@@ -50,19 +50,19 @@ def test_single_bit_is_noticed(other):
     outcome = ReplayOutcome(lockstep=True)
     outcome.beliefs.add_recorded(belief(1))
     outcome.beliefs.add_new(other)
-    assert (outcome.beliefs.compared, outcome.beliefs.equal, outcome.good) == (1, 0, False)
-    assert ReplayOutcome(lockstep=False, beliefs=outcome.beliefs).good  # within the tolerance
+    assert (outcome.beliefs.compared, outcome.beliefs.equal, outcome.agrees) == (1, 0, False)
+    assert ReplayOutcome(lockstep=False, beliefs=outcome.beliefs).agrees  # within the tolerance
 
 
 def test_verdict_needs_a_comparison():
-    assert not ReplayOutcome(lockstep=True).good
-    assert not ReplayOutcome(lockstep=False).good
+    assert not ReplayOutcome(lockstep=True).agrees
+    assert not ReplayOutcome(lockstep=False).agrees
     outcome = ReplayOutcome(lockstep=True)
     outcome.beliefs.add_recorded(belief(1))
     outcome.beliefs.add_new(belief(1))
-    assert outcome.good
+    assert outcome.agrees
     outcome.damaged = "damaged: a chunk's checksum"
-    assert not outcome.good
+    assert not outcome.agrees
     assert "what comes after that was not compared" in describe(outcome)[-1]
 
 

@@ -42,13 +42,15 @@ def test_arguments_of_services(tmp_path, monkeypatch):
         ({"world": "nowhere"}, "no world 'nowhere'", {}),
         (
             {"world": "maze", "estimator": ["--estimator=paper"]},
-            "presage train --world maze .*--model exact|torch is not installed",
+            "presage train --world maze .*--model exact",
             {},
         ),
         ({"estimator": ["--estimator=paper"], "drive": "differential"}, "preset paper moves without turning", {}),
     ],
 )
 def test_mistakes_are_one_line(wrong, says, variables, monkeypatch):
+    if "--estimator=paper" in wrong.get("estimator", ()):
+        pytest.importorskip("torch")
     for name, value in variables.items():
         monkeypatch.setenv(f"PRESAGE_{name}", value)
     with pytest.raises(UserError, match=says) as error:

@@ -18,8 +18,8 @@ from common.messages.topics import HEALTH, ODOM, SCAN, TOPICS, TRUTH
 from services.recorder.files.chunks import CHUNK_BUILDER, MAGIC
 from services.recorder.files.writer import NameTakenError, RecordingWriter
 from services.recorder.reader import read_recording
-from services.recorder.recording import open_writer
-from services.recorder.service import RecorderService, chosen_topics
+from services.recorder.recording import parts_of
+from services.recorder.service import RecorderService, parse_topics
 from services.recorder.settings import RecorderSettings
 from tests.recorder import sessions
 
@@ -100,19 +100,19 @@ def test_decoded_messages(tmp_path):
 
 def test_names(tmp_path):
     options = RecorderSettings(directory=tmp_path, file="run")
-    writer = open_writer(options)
+    writer = parts_of(options)(1)
     assert [p.name for p in tmp_path.iterdir()] == ["run.mcap.active"]
     with pytest.raises(NameTakenError, match=r"run\.mcap\.active: is there already.*--file"):
-        open_writer(options)
+        parts_of(options)(1)
     whole = writer.finish().read_bytes()
     with pytest.raises(NameTakenError, match=r"run\.mcap: is there already.*--file"):
-        open_writer(options)
+        parts_of(options)(1)
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("run.mcap", whole)]
 
 
 def test_generated_names(tmp_path, monkeypatch):
     monkeypatch.setattr("services.recorder.recording.file_path", lambda _: tmp_path / "now.mcap")
-    writers = [open_writer(RecorderSettings(directory=tmp_path)) for _ in range(3)]
+    writers = [parts_of(RecorderSettings(directory=tmp_path))(1) for _ in range(3)]
     assert [writer.finish().name for writer in writers] == ["now.mcap", "now-2.mcap", "now-3.mcap"]
 
 
@@ -180,7 +180,7 @@ def test_other_files(tmp_path, make, message):
 
 def test_chosen_topics():
     recorded = tuple(topic for topic in TOPICS if topic.recorded)
-    assert set(RecorderService.inputs) == set(chosen_topics("")) == set(recorded)
-    assert chosen_topics("odom, scan,odom") == (ODOM, SCAN)
+    assert set(RecorderService.inputs) == set(parse_topics("")) == set(recorded)
+    assert parse_topics("odom, scan,odom") == (ODOM, SCAN)
     with pytest.raises(UserError, match="no topic skan: choose from scan, odom"):
-        chosen_topics("skan")
+        parse_topics("skan")

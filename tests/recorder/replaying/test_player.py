@@ -30,7 +30,7 @@ def play(player, times, now=0.0):
     published = []
     for at in times:
         now += player.wait(at, now)
-        player.sent(at, now, whole=True)
+        player.mark_sent(at, now, completes_step=True)
         published.append(now)
     return published
 
@@ -89,7 +89,7 @@ def test_steps(scans, steps):
     for number, scan in enumerate(scans):
         if player.wait(float(number), 0.0):
             break
-        player.sent(float(number), 0.0, whole=scan)
+        player.mark_sent(float(number), 0.0, completes_step=scan)
         sent.append(scan)
     assert player.paused
     assert sum(sent) == min(steps, sum(scans))
@@ -112,13 +112,13 @@ def test_long_delay():
     assert play(player, [0.0, 2.0]) == [0.0, 1.0]
     late = 1.0 + MAX_LAG_S * 50
     assert player.wait(4.0, late) == 0.0
-    player.sent(4.0, late, whole=True)
+    player.mark_sent(4.0, late, completes_step=True)
     assert player.wait(6.0, late) == pytest.approx(1.0)
 
 
 def test_short_delay():
     player = Player(0.0, 100.0)
-    player.sent(4.0, 4.0 + MAX_LAG_S / 2, whole=True)
+    player.mark_sent(4.0, 4.0 + MAX_LAG_S / 2, completes_step=True)
     assert player.wait(5.0, 4.0 + MAX_LAG_S / 2) == pytest.approx(1.0 - MAX_LAG_S / 2)
 
 

@@ -76,14 +76,14 @@ def start(scans, link, bus):
         there, remotes, counts = threading.Event(), [], {}
 
         @contextmanager
-        def steering(remote):
+        def get_control(remote):
             remotes.append(remote)
             there.set()
             yield
 
         def work():
             try:
-                counts.update(replay(path, link, choice, stop=stop, steering=steering))
+                counts.update(replay(path, link, choice, stop=stop, control_context=get_control))
             except BaseException as error:
                 failed.append(error)
                 there.set()

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.geometry import se2
-from common.robot.ranges import surfaces
+from common.robot.ranges import is_surface
 from services.estimator.precise import obstruction
 from services.estimator.precise.gauss_newton import View, difference, polish
 from services.estimator.precise.likelihood import Likelihood
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from services.estimator.shared.generative_models import Expected, GenerativeModel
 
 EM_STEPS = 30
-PRIOR_BEAMS = 10.0  # pseudo-count: as if this many beams of every kind had been seen in addition
+PRIOR_BEAMS = 10.0  # pseudo-count of each kind of beam
 MIN_SIGMA_M = 0.003
 CHI2_MEDIAN = 2.366  # median of chi squared with three degrees of freedom
-MAX_POSITION_ERROR_M = 0.3  # beyond it another place was found, for which the covariance does not hold
+MAX_POSITION_ERROR_M = 0.3  # larger errors mean that another place was found; the covariance does not describe them
 PROBABILITIES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 
 
@@ -198,7 +198,7 @@ def estimate_noise(ranges: Array, angles: Array) -> float:
     """
     turn = 2 * np.cos(np.diff(angles).mean())
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1 / np.where(surfaces(ranges), ranges, np.nan)
+        inverse = 1 / np.where(is_surface(ranges), ranges, np.nan)
         bend = (inverse[:, 2:] - turn * inverse[:, 1:-1] + inverse[:, :-2]) * ranges[:, 1:-1] ** 2
     return max(MIN_SIGMA_M, float(1.4826 * np.nanmedian(np.abs(bend)) / np.sqrt(2 + turn**2)))
 

@@ -21,14 +21,14 @@ from services.estimator.precise.learning.calibration import (
 from services.estimator.precise.learning.field_learning import (
     Recipe,
     learn_field,
-    learn_ripple,
     learn_scales,
+    measure_ripple,
     reachable,
     seen_cells,
 )
 from services.estimator.precise.learning.surfaces import Beams
 
-HELD_OUT_EVERY = 5  # one scan in so many is held out to measure the precision
+HELD_OUT_EVERY = 5  # every fifth scan is held out, to measure the precision
 MIN_SCANS = 50
 Report = Callable[[str, float], None]
 
@@ -64,7 +64,7 @@ def learn_drive(drive: Drive, recipe: Recipe, simulated: Beams | None, report: R
     )
     lasers = se2.compose(held_out.poses, held_out.mount)
     scales = learn_scales(trial.field, held_out.poses, held_out.mount, held_out.angles, held_out.ranges, sigma)
-    trial = replace(trial, scales=scales, ripple=learn_ripple(trial.field, lasers, held_out.angles))
+    trial = replace(trial, scales=scales, ripple=measure_ripple(trial.field, lasers, held_out.angles))
     report("calibration", 0.45)
     motion = learn_motion(drive.stamps, drive.poses, drive.odom)
     calibration = calibrate(trial, held_out, motion, sigma)

@@ -28,11 +28,11 @@ from services.estimator.precise.learning.surfaces import (
 )
 from services.estimator.shared.generative_models import CORNER_ANGLE_RAD
 
-CARVED_DISTANCE_CELLS = 0.5  # phi of a node through which beams pass is at least so much
+CARVED_DISTANCE_CELLS = 0.5  # minimum of phi at a node through which beams pass
 EM_STEPS = 15
-OUTLIER_SHARE, OUTLIER_RANGE_M = 0.1, 25.0  # of the uniform part of the density
+OUTLIER_SHARE, OUTLIER_RANGE_M = 0.1, 25.0  # weight and width of the uniform part of the density
 MAX_ERROR_M = 0.1  # a larger error means that the beam ended at another surface
-MIN_FACING = 0.15  # least |n . u| of a beam that shapes the field
+MIN_FACING = 0.15  # minimum of |n . u| of a beam that shapes the field
 PRIOR_COUNT, PRIOR_SCALE_M = 20, 0.05  # pseudo-count of each class, and its error, for classes that are seldom seen
 MIN_SCALE_M = 1e-3
 
@@ -43,7 +43,7 @@ class Recipe:
 
     resolution: float = 0.04  # m
     sweeps: int = 10  # of step 3
-    beams_a_sweep: int = 2_000_000
+    beams_per_sweep: int = 2_000_000
     seed: int = 0
 
 
@@ -52,7 +52,7 @@ def learn_field(
     recipe: Recipe,
     report: Callable[[str, float], None] = lambda _title, _done: None,
 ) -> DistanceField:
-    """Learns the field that predicts the beams; ``report`` is called with the stage and the share done."""
+    """Learns the field that predicts the beams; calls ``report`` with the name of the stage and the share done."""
     report("surfaces", 0.0)
     beams = beams.part(has_neighbours(beams.ends()))
     field = field_of_surfaces(beams, recipe.resolution)
@@ -60,7 +60,7 @@ def learn_field(
     phi = field.phi.copy()
     for sweep in range(recipe.sweeps):
         report("prediction errors", sweep / recipe.sweeps)
-        sample = rng.integers(0, len(beams.ranges), min(recipe.beams_a_sweep, len(beams.ranges)))
+        sample = rng.integers(0, len(beams.ranges), min(recipe.beams_per_sweep, len(beams.ranges)))
         rate = 1 / (1 + sweep / 2)  # decreases, so that the noise averages out in the last sweeps
         phi = _descend(DistanceField(phi, field.origin, field.resolution), beams.part(sample), rate)
     return DistanceField(phi, field.origin, field.resolution)
@@ -90,11 +90,11 @@ def reachable(field: DistanceField, visited: Array, clearance: float = 0.1, seen
     return np.asarray(np.array(field.origin) + field.resolution * np.column_stack([j, i]))
 
 
-def learn_ripple(field: DistanceField, lasers: Array, angles: Array, apart: int = 10) -> float:
+def measure_ripple(field: DistanceField, lasers: Array, angles: Array, apart: int = 10) -> float:
     """Standard deviation in rad of the normals of flat surfaces in the field.
 
-    Compares the normal at a beam's end with the mean of those ``apart`` beams to either side. Larger differences than
-    0.3 rad are corners and do not count.
+    Compares the normal at a beam's end with the mean of the normals ``apart`` beams to its left and right. Differences
+    of more than `CORNER_ANGLE_RAD` are corners and do not count.
     """
     normal = field.trace(lasers, angles).jacobian[..., :2]
     yaw = np.arctan2(normal[..., 1], normal[..., 0])
@@ -134,8 +134,8 @@ def _descend(field: DistanceField, beams: Beams, rate: float) -> Floats:
 def _carve(field: DistanceField, beams: Beams, ranges: Array, hit: np.ndarray, behind: Array) -> DistanceField:
     """Removes surfaces that most beams passed through: planes extended past an edge, things that moved away.
 
-    ``hit`` (R,) tells which beams ended at the surface. ``behind`` (R,) m is how far behind the surface, perpendicular
-    to it, a beam ended.
+    ``hit`` (R,) is a mask of the beams that ended at the surface. ``behind`` (R,) m is how far behind the surface,
+    perpendicular to it, a beam ended.
     """
     through = np.isfinite(ranges) & (behind > PASSED_DEPTH_M)
     counts = []

@@ -15,8 +15,8 @@ from services.estimator.precise.learning.beam_cells import count_crossings
 POOL_CELLS = 1  # cells to each side whose points are pooled to find a normal
 ELEMENT_RADIUS_CELLS = 2.0  # around a surface element, within which it shapes the field
 MIN_POINTS_PER_CELL = 3  # cells with fewer points are no surface
-PASSED_DEPTH_M = 0.06  # a beam that ends so far behind a surface has passed through it
-MIN_PRESENT_SHARE = 0.3  # least share of the beams meeting a surface that end there; with fewer it is removed
+PASSED_DEPTH_M = 0.06  # a beam that ends farther behind a surface has passed through it
+MIN_PRESENT_SHARE = 0.3  # a surface is removed if a smaller share of the beams that meet it end there
 STRAY_CELL_M = 1.0
 
 
@@ -30,7 +30,7 @@ class Beams:
 
     @classmethod
     def of(cls, poses: Array, mount: Array, angles: Array, ranges: Array) -> Beams:
-        """Every beam that returned, from scans ``ranges`` (N, B) at base_link poses (N, 3)."""
+        """All beams with a return, from scans ``ranges`` (N, B) m at base_link poses (N, 3)."""
         lasers = compose(poses, mount)
         returned = np.isfinite(ranges) & (ranges > 0)
         row, column = np.nonzero(returned)
@@ -45,7 +45,7 @@ class Beams:
         return np.stack([np.cos(self.directions), np.sin(self.directions)], -1)
 
     def part(self, which: np.ndarray) -> Beams:
-        """Returns some of the beams."""
+        """Returns the beams that a mask or indices select."""
         return Beams(self.starts[which], self.directions[which], self.ranges[which])
 
     def joined(self, other: Beams) -> Beams:
@@ -55,7 +55,7 @@ class Beams:
 
 
 def has_neighbours(ends: Array) -> np.ndarray:
-    """Whether each end point (R, 2) has others near it: (R,).
+    """Mask (R,) of the end points (R, 2) that have others near them.
 
     Without this filter a few stray beams would make the grid as large as the scanner's range.
     """
@@ -96,7 +96,7 @@ def field_of_surfaces(beams: Beams, h: float) -> DistanceField:
 
 
 def _distances(surface: np.ndarray, mx: Array, my: Array, nx: Array, ny: Array, own: Array, h: float) -> Floats:
-    """Distances phi at the nodes: near surface elements from their planes, elsewhere to the nearest element."""
+    """Distances phi at the nodes: near surface elements to their planes, elsewhere to the nearest element."""
     rows, columns = np.nonzero(surface)
     ex, ey, ax, ay = (a[surface] for a in (mx, my, nx, ny))
     total, weight = np.zeros(surface.shape), np.zeros(surface.shape)

@@ -19,7 +19,7 @@ from services.estimator.shared.interface import Observation
 from tests.lab.real_logs import drives as real_drive
 from tests.lab.real_logs.drives import ANGLES, BEFORE, LONG, NONE, POSED, RANGE_MAX, SHORT, SIGMA, disturbed
 
-RECIPE = Recipe(resolution=0.05, sweeps=5, beams_a_sweep=60_000)
+RECIPE = Recipe(resolution=0.05, sweeps=5, beams_per_sweep=60_000)
 SCANS = 160
 
 

@@ -17,7 +17,7 @@ from tests.estimator.models import ROOM, SCANNER
 
 ANGLES = np.deg2rad(np.linspace(-135, 135, 271))
 NONE = np.zeros(3)
-RECIPE = Recipe(resolution=0.05, sweeps=4, beams_a_sweep=60_000)
+RECIPE = Recipe(resolution=0.05, sweeps=4, beams_per_sweep=60_000)
 
 
 def scans(count, seed, sigma):

@@ -1,4 +1,4 @@
-"""`presage doctor` finds real faults: in other processes, in misbehaving sessions and on a small full disk."""
+"""`presage doctor` finds real faults of sessions, connections and disks; `presage top` shows a session."""
 
 from __future__ import annotations
 
@@ -11,17 +11,21 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from common.bus.bus import open_bus, wait_until
+from common.bus.bus import Link, open_bus, wait_until
 from common.bus.inbox import Call, Inbox
 from common.messages.definitions import Health, Scan, TopicHealth
 from common.messages.topics import CONFIG, HEALTH, ODOM, SCAN
 from common.runtime.protocol_check import build_config_reply
 from common.versions import PROTOCOL
+from presage.diagnosis.bus_observation import observe_bus
 from tests.conftest import ROOT, WAIT_TIMEOUT_S
 
 
@@ -86,7 +90,15 @@ def find_fault(found: list[dict], code: str, words: str) -> dict:
 
 
 @pytest.fixture
-def faulty_session(link):
+def stopped_recorder(process, bus, tmp_path):
+    recorder = process("recorder", "--directory", str(tmp_path), fresh=True)  # doctor looks for its command line
+    assert wait_until(lambda: "recorder" in bus.alive(), WAIT_TIMEOUT_S), recorder.output
+    recorder.send(signal.SIGSTOP)
+    return recorder
+
+
+@pytest.fixture
+def faulty_session(stopped_recorder, link):
     """Two estimators of other versions with wrong clocks, two simulators, and a frozen viewer."""
     made = [
         Participant(link, "estimator", reply_fields={"protocol": PROTOCOL + 1, "host": "far"}, ahead_s=60.0),
@@ -102,7 +114,7 @@ def faulty_session(link):
         each.stop()
 
 
-def test_all_faults_of_a_session_are_found(process, bus, faulty_session, tmp_path):
+def test_faulty_session(process, bus, stopped_recorder, faulty_session, tmp_path):
     assert wait_until(lambda: {"viewer", "estimator", "simulator"} <= bus.alive(), WAIT_TIMEOUT_S)
     running = run_doctor(process, tmp_path, "--seconds", "4")
     assert running.wait(90) == 1, running.output
@@ -114,6 +126,7 @@ def test_all_faults_of_a_session_are_found(process, bus, faulty_session, tmp_pat
     assert find_fault(found, "versions", "presage")["where"] == "estimator on near"
     assert "ahead of" in find_fault(found, "clocks", "estimator on far, near: its clock is 60.0 s")["what"]
     assert find_fault(found, "frozen", "no sign of life")["where"] == "viewer"
+    find_fault(found, "frozen", str(stopped_recorder.child.pid))
     assert "python -m services.controller" in find_fault(found, "missing", "controller")["advice"]
     find_fault(found, "rate", "scan: ")
     find_fault(found, "rate", "cmd_vel: 0.0 of 15 Hz")
@@ -126,41 +139,34 @@ def test_all_faults_of_a_session_are_found(process, bus, faulty_session, tmp_pat
     assert "install the same version of presage" in " ".join(running.output.split())
 
 
-def test_a_frozen_process_is_distinguished_from_a_missing_one(process, bus, tmp_path):
-    controller = process("controller", fresh=True)  # found by its command line
-    assert wait_until(lambda: "controller" in bus.alive(), WAIT_TIMEOUT_S), controller.output
-    controller.send(signal.SIGSTOP)
-    running = run_doctor(process, tmp_path)
-    assert running.wait(90) == 1, running.output
-    found = read_findings(tmp_path)
-    frozen = [f for f in found if f["code"] == "frozen" and f["ok"] is False]
-    assert frozen, running.output
-    assert any(str(controller.child.pid) in f["what"] or f["where"].startswith("controller") for f in frozen)
-
-
-def test_the_reason_for_a_missing_session_is_given(processes, free_port, tmp_path):
-    with socket.socket() as silent, socket.socket() as full, socket.socket() as first, socket.socket() as second:
-        for listener, backlog in ((silent, 5), (full, 0)):
+def test_no_session():
+    """At three endpoints at once, because zenoh waits for each."""
+    with ExitStack() as stack:
+        sockets = [stack.enter_context(socket.socket()) for _ in range(5)]
+        silent, full, closed, *fillers = sockets
+        for listener, queue in ((silent, 5), (full, 0), (closed, None)):
             listener.bind(("127.0.0.1", 0))
-            listener.listen(backlog)
-        for filler in (first, second):  # a full queue drops further connections, as a firewall does
+            if queue is not None:
+                listener.listen(queue)
+        for filler in fillers:  # a full queue drops further connections, as a firewall does
             filler.setblocking(False)
             filler.connect_ex(full.getsockname())
-        ports = [silent.getsockname()[1], full.getsockname()[1], free_port()]
-        started = []
-        for number, port in enumerate(ports):
-            folder = tmp_path / str(number)
-            folder.mkdir()
-            started.append(run_doctor(processes.start, folder, "--connect", f"tcp/127.0.0.1:{port}"))
-        for running in started:
-            assert running.wait(120) == 1, running.output
-    findings = [read_findings(tmp_path / str(number)) for number in range(3)]
-    assert "TLS" in find_fault(findings[0], "no_router", "something listens there")["advice"]
-    assert "firewall" in find_fault(findings[1], "blocked", "no answer")["advice"]
-    assert "presage up" in find_fault(findings[2], "no_router", "nothing listens there")["advice"]
+        links = [Link(connect=(f"tcp/127.0.0.1:{each.getsockname()[1]}",)) for each in sockets[:3]]
+        with ThreadPoolExecutor(3) as pool:
+            found = [finding for (finding,) in pool.map(partial(observe_bus, seconds=0.1), links)]
+    for finding, code, what, advice in zip(
+        found,
+        ("no_router", "blocked", "no_router"),
+        ("something listens there", "no answer", "nothing listens there"),
+        ("TLS", "firewall", "presage up"),
+        strict=True,
+    ):
+        assert (finding.code, finding.ok) == (code, False)
+        assert what in finding.what
+        assert advice in finding.advice
 
 
-def test_a_full_read_only_disk_and_a_world_without_weights(tmp_path, free_port):
+def test_read_only_disk_and_no_weights(tmp_path, free_port):
     if shutil.which("unshare") is None or subprocess.run(["unshare", "-m", "true"], capture_output=True).returncode:
         pytest.skip("needs `unshare -m` (root): a small disk is mounted for this test alone")
     disk, world = tmp_path / "disk", tmp_path / "shed.yaml"
@@ -179,3 +185,40 @@ def test_a_full_read_only_disk_and_a_world_without_weights(tmp_path, free_port):
     assert "Read-only file system" in find_fault(found, "not_writable", "recordings cannot be written to")["what"]
     assert find_fault(found, "disk", "MB free")["where"] == str(disk)
     assert f"presage train --world {world}" in find_fault(found, "weights", "no field of world 'shed'")["what"]
+
+
+def words(text: str) -> str:
+    """The text without the table's lines, so that wrapped words are joined."""
+    return " ".join("".join(" " if c in "│┃─━┏┓┗┛└┘├┤┡┩╇╋┳┬┴┻┼" else c for c in text).split())
+
+
+def row_of(output: str, service: str) -> str:
+    return next(words(line) for line in output.splitlines() if words(line).startswith(service))
+
+
+def test_missing_services_of_two_robots(presage, process, bus, link):
+    process("controller")
+    assert wait_until(lambda: "controller" in bus.alive(), 60)
+    status, output = presage("top", "--once", "--connect", link.connect[0], "--robot", bus.robot, "--robot", "nobody")
+    assert status == 1
+    assert row_of(output, "controller").startswith("controller alive")
+    assert row_of(output, "estimator").startswith("estimator missing")
+    start = f"python -m services.simulator --robot {bus.robot} --connect {link.connect[0]}"
+    assert start.replace(" ", "") in words(output).replace(" ", "")
+    assert "robot nobody" in output
+    assert words(output).count("controller missing") == 1
+
+
+def test_live_table(process, bus):
+    top = process("presage.__main__", "top", env={"FORCE_COLOR": "1", "COLUMNS": "160", "LINES": "40"})
+    top.wait_for("missing")
+    controller = process("controller")
+    top.wait_for("alive")
+    controller.kill()
+    top.wait_for("gone")
+    status, seconds = top.stop(signal.SIGINT)
+    assert status == 0
+    assert seconds < 5
+    assert "\x1b[?1049h" in top.output
+    assert top.output.rstrip().endswith(("\x1b[?25h", "\x1b[?1049l"))  # the terminal is restored
+    assert "Traceback" not in top.output

@@ -27,15 +27,15 @@ WORLD_PERIOD_S = 5.0  # how often the world is queried, because other programs m
 MIN_WORLD_PERIOD_S = 0.1  # between two queries, e.g. while a visitor drags an obstacle
 PLAYER_PERIOD_S = 0.2  # how often the player's state is queried
 UNWATCHED_TIMEOUT_S = 60.0  # a recording without visitors is closed after this
-END_MARGIN_S = 0.05  # so close to a recording's end, play restarts from the beginning
+END_MARGIN_S = 0.05  # this close to the end of a recording, "resume" restarts it from the beginning
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class DeskContext:
-    """The objects that the desk works with."""
+class RequestContext:
+    """The objects that requests act on."""
 
     hub: Hub
     control: Control
@@ -47,10 +47,10 @@ class DeskContext:
     on_new_recording: Callable[[str], None]  # called with a robot's name when another recording replaces its messages
 
 
-class Desk:
+class RequestHandler:
     """Handles the requests of all visitors."""
 
-    def __init__(self, context: DeskContext) -> None:
+    def __init__(self, context: RequestContext) -> None:
         self.context = context
         self.worlds: dict[str, WorldReply] = {}  # by robot
         self._world_texts: dict[str, str] = {}  # by robot; the worlds as JSON messages for visitors
