@@ -1,4 +1,4 @@
-"""`make install` does what is asked for, and nothing where nothing changed; looked at with --dry-run."""
+"""`make install` and `make demo` install only what changed, as shown by --dry-run."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ def python(path, version):
 
 @pytest.fixture
 def install(tmp_path):
-    """Calls say what `make install` would do in a checkout that is installed with Python 3.11.9."""
-    for number, name in enumerate(("Makefile", "pyproject.toml", "constraints.txt", ".venv/.installed")):
+    """Shows what `make install` would do in a checkout that is installed with Python 3.11.9."""
+    stamps = (".venv/.installed-demo", ".venv/.installed")
+    for number, name in enumerate(("Makefile", "pyproject.toml", "constraints.txt", *stamps)):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
         os.utime(tmp_path / name, (number, number))
     shutil.copy(ROOT / "Makefile", tmp_path)
     python(tmp_path / ".venv/bin/python", "3.11.9")
 
-    def run(*args):
-        command = ["make", "--dry-run", "install", *args]
+    def run(*args, target="install"):
+        command = ["make", "--dry-run", target, *args]
         return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=60).stdout
 
     return run
@@ -54,3 +55,11 @@ def test_another_python(install, tmp_path):
 def test_changed_requirements(install, tmp_path):
     os.utime(tmp_path / "pyproject.toml")
     assert "pip install" in install()
+
+
+def test_demo_and_development_are_installed_separately(install, tmp_path):
+    (tmp_path / ".venv/.installed").unlink()
+    assert "pip install" not in install(target="demo")
+    assert "-e '.[dev]'" in install()
+    (tmp_path / ".venv/.installed-demo").unlink()
+    assert "-e '.'" in install(target="demo")

@@ -185,6 +185,8 @@ def test_command_as_prior(precise):
 
 @pytest.mark.parametrize("estimator", ["precise", "paper"])
 def test_other_world_of_same_name(tmp_path, estimator):
+    if estimator == "paper":
+        pytest.importorskip("torch")
     file = tmp_path / "mine.yaml"
     file.write_text("name: corridor\nboundary: [[0, 0], [14, 0], [14, 4.5], [0, 4.5]]\n")
     with pytest.raises(UserError, match="another world of the same name 'corridor'"):
