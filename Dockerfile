@@ -89,11 +89,8 @@ USER presage
 HEALTHCHECK --interval=5s --timeout=10s --start-period=60s CMD ["python", "-m", "common.containers.healthcheck", "controller"]
 CMD ["python", "-m", "common.containers.run_per_robot", "each", "services.controller"]
 
-# Debug symbols are 126 of the 134 MB of pybullet's library.
 FROM controller-packages AS simulator
-RUN apt-get update && apt-get install --yes --no-install-recommends binutils \
-    && python install.py simulator && find /usr/local/lib -name 'pybullet*.so' -exec strip --strip-debug {} + \
-    && apt-get purge --yes --auto-remove binutils && rm -rf /var/lib/apt/lists/*
+RUN python install.py simulator
 COPY --from=program /app /app
 WORKDIR /tmp
 USER presage

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import struct
 import subprocess
 import sys
 import sysconfig
@@ -20,11 +21,12 @@ import tomllib
 
 HERE = Path(__file__).resolve().parent
 # Not used by the services, and large: example robots of pybullet, headers and test programs of PyTorch, Pillow's AVIF
-# codec, and subpackages of scipy.
+# codec and fonts, build tools of numpy, subpackages of scipy, and the fonts of matplotlib's PDF files.
 UNUSED = (
     "pybullet_data", "pybullet_envs", "pybullet_examples", "pybullet_robots", "pybullet_utils", "eglRenderer*.so",
     "torch/bin/test_*", "torch/bin/*Test", "torch/bin/protoc*", "torch/include", "torch/test", "torch/share",
-    "PIL/_avif*", "pillow.libs/libavif*",
+    "PIL/_avif*", "pillow.libs/libavif*", "PIL/_imagingft*", "pillow.libs/libharfbuzz*", "pillow.libs/libfreetype*",
+    "fontTools", "numpy/distutils", "numpy/_core/include", "numpy/_core/_simd*",
     "scipy/cluster", "scipy/datasets", "scipy/fft", "scipy/fftpack", "scipy/integrate", "scipy/interpolate",
     "scipy/io", "scipy/odr", "scipy/optimize", "scipy/signal", "scipy/stats",
 )  # fmt: skip
@@ -38,8 +40,29 @@ def requirements(group: str) -> list[str]:
     return found
 
 
+def strip_symbols(library: Path) -> None:
+    """Removes the symbols for debuggers: in a 64-bit ELF file, all that follows the segments that are loaded.
+
+    In pybullet's library they are 126 of 134 MB. The image has no `strip`.
+    """
+    data = library.read_bytes()
+    if data[:6] != b"\x7fELF\x02\x01":
+        return
+    (table,), (entry_size, count) = struct.unpack_from("<Q", data, 32), struct.unpack_from("<HH", data, 54)
+    end = table + count * entry_size
+    for entry in range(table, end, entry_size):
+        offset, _, _, size = struct.unpack_from("<4Q", data, entry + 8)
+        end = max(end, offset + size)
+    if end == len(data):  # stripped before, in another layer of the image
+        return
+    header = bytearray(data[:64])
+    struct.pack_into("<Q", header, 40, 0)  # no table of sections
+    struct.pack_into("<HH", header, 60, 0, 0)
+    library.write_bytes(header + data[64:end])
+
+
 def main() -> None:
-    """Installs the groups named on the command line, then removes tests and other unused files."""
+    """Installs the groups named on the command line, then removes tests, unused parts and debug symbols."""
     index = os.environ.get("WHEEL_INDEX", "")
     pip = [sys.executable, "-m", "pip", "install", "--no-cache-dir", "--constraint", str(HERE / "constraints.txt")]
     pip += ["--extra-index-url", index] if index else []
@@ -49,6 +72,8 @@ def main() -> None:
         for pattern in (*UNUSED, "*/tests", "*/*/tests"):
             for path in packages.glob(pattern):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
+        for library in packages.rglob("*.so*"):
+            strip_symbols(library)
 
 
 if __name__ == "__main__":
