@@ -21,12 +21,13 @@ import tomllib
 
 HERE = Path(__file__).resolve().parent
 # Not used by the services, and large: example robots of pybullet, headers and test programs of PyTorch, Pillow's AVIF
-# codec and fonts, build tools of numpy, subpackages of scipy, and the fonts of matplotlib's PDF files.
+# codec and fonts, build tools of numpy, subpackages of scipy, variable fonts, and the compiled copies of modules of fontTools.
 UNUSED = (
     "pybullet_data", "pybullet_envs", "pybullet_examples", "pybullet_robots", "pybullet_utils", "eglRenderer*.so",
     "torch/bin/test_*", "torch/bin/*Test", "torch/bin/protoc*", "torch/include", "torch/test", "torch/share",
     "PIL/_avif*", "pillow.libs/libavif*", "PIL/_imagingft*", "pillow.libs/libharfbuzz*", "pillow.libs/libfreetype*",
-    "fontTools", "numpy/distutils", "numpy/_core/include", "numpy/_core/_simd*",
+    "fontTools/*/*.so", "fontTools/feaLib", "fontTools/qu2cu", "fontTools/ufoLib", "fontTools/varLib",
+    "pygments/lexers/_*_builtins.py", "numpy/distutils", "numpy/_core/include", "numpy/_core/_simd*",
     "scipy/cluster", "scipy/datasets", "scipy/fft", "scipy/fftpack", "scipy/integrate", "scipy/interpolate",
     "scipy/io", "scipy/odr", "scipy/optimize", "scipy/signal", "scipy/stats",
 )  # fmt: skip
