@@ -104,7 +104,7 @@ COPY --from=program /app /app
 # The compiled loops are kept in the image; on another processor they are compiled again. Numba insists on a folder it
 # can write to: each container takes a copy.
 RUN NUMBA_CACHE_DIR=/numba python -c \
-    'from services.estimator.factory import *; [prepare(Choice(model=m)) for m in ("learned", "exact")]'
+    'from services.estimator.factory import *; [prepare(EstimatorOptions(model=m)) for m in ("learned", "exact")]'
 ENV NUMBA_CACHE_DIR=/tmp/numba
 WORKDIR /tmp
 USER presage
