@@ -1,10 +1,16 @@
 # One image for each service, with only its own packages. `docker compose build` builds the images that compose uses;
 # `make images` builds all of them and prints their sizes.
+FROM python:3.11-slim AS binutils
+RUN apt-get update && apt-get install -y --no-install-recommends binutils
+# Of binutils, the images get only this program and the libraries that came with it.
+RUN mkdir /strip && cp /usr/bin/strip $(ldd /usr/bin/strip | grep -o '/[^ ]*lib\(bfd\|sframe\)[^ ]*') /strip
+
 FROM python:3.11-slim AS base
 # URL of an additional package index, such as PyTorch's index of CPU builds, which are much smaller.
 ARG WHEEL_INDEX=""
 ENV PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore
 WORKDIR /install
+COPY --from=binutils /strip strip
 COPY docker/install.py pyproject.toml constraints.txt ./
 # Packages are installed before the code is copied, so that a change of code does not install them again.
 RUN python install.py router

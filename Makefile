@@ -100,8 +100,8 @@ images: ## build all container images, and print how much each adds to its base,
 	PRESAGE_ESTIMATOR=paper docker compose build $(if $(WHEEL_INDEX),--build-arg WHEEL_INDEX='$(WHEEL_INDEX)') estimator
 	@base=$$(docker image inspect --format '{{.Size}}' python:3.11-slim); \
 	for name in router none bridge_ros2 recorder replay controller simulator viewer cli estimator-precise estimator-paper; do \
-	  size=$$(docker image inspect --format '{{.Size}}' presage-$$name) || exit 1; \
-	  echo "presage-$$name: $$(( ($$size - $$base) / 1000000 )) MB"; \
+	  size=$$(docker image inspect --format '{{.Size}}' $${PRESAGE_IMAGE:-presage}-$$name) || exit 1; \
+	  echo "$$name: $$(( ($$size - $$base) / 1000000 )) MB"; \
 	done
 
 lock: install ## pin every dependency in constraints.txt, for all platforms; ARGS=--upgrade takes newer versions

@@ -52,7 +52,8 @@ def main() -> None:
                     errors.append(f"{name}, Python {version}, {what}: {error}")
                     cells.append("no")
             print(f"| {name}, {what}", *cells, "", sep=" | ", flush=True)
-    sys.exit("\n".join(errors))
+    if errors:
+        sys.exit("\n".join(errors))
 
 
 if __name__ == "__main__":
