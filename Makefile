@@ -108,7 +108,8 @@ lock: install ## pin every dependency in constraints.txt, for all platforms; ARG
 	$(BIN)/uv pip compile --quiet --universal --all-extras --python-version 3.10 --no-annotate \
 	  --custom-compile-command 'make lock' -o constraints.txt pyproject.toml $(ARGS)
 
-platforms: install ## check that every dependency has a wheel for each platform and Python; print the size of the download
+platforms: install ## check types for Windows, and that all dependencies have wheels everywhere; print download sizes
+	$(BIN)/mypy --platform win32 --follow-imports silent -p common -p services -p presage
 	$(BIN)/python -m tests.platforms
 
 clean: ## remove .venv and caches; recordings are kept

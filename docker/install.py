@@ -23,14 +23,15 @@ STRIP = HERE / "strip"  # a folder with the program and its libraries
 # Not used by the services, and large: tests, example robots, headers, build tools, image formats, fonts, lexers,
 # subpackages of scipy, and the compiled copies of fontTools' modules.
 UNUSED = (
-    "**/tests", "**/*.pyi",
+    "**/tests", "**/*.py[ix]", "**/*.a",
     "pybullet_*", "eglRenderer*.so",
     "torch/bin/test_*", "torch/bin/*Test", "torch/bin/protoc*", "torch/include", "torch/test", "torch/share",
     "PIL/_avif*", "pillow.libs/libavif*", "PIL/_imagingft*", "pillow.libs/libharfbuzz*", "pillow.libs/libfreetype*",
     "numpy/distutils", "numpy/_core/include", "numpy/_core/_simd*",
     "scipy/cluster", "scipy/datasets", "scipy/fft", "scipy/fftpack", "scipy/integrate", "scipy/interpolate",
     "scipy/io", "scipy/odr", "scipy/optimize", "scipy/signal", "scipy/stats",
-    "fontTools/*/*.so", "matplotlib/mpl-data/fonts/[ap]*", "pygments/lexers/[!_p]*", "apsw/sqlite_extra_binaries",
+    "fontTools/*/*.so", "matplotlib/mpl-data/fonts/[ap]*", "pygments/lexers/[!_p]*", "pygments/lexers/__pycache__",
+    "pygments/lexers/_*_builtins.py", "tzdata/zoneinfo",
 )  # fmt: skip
 # Half of these libraries is symbols for debuggers. `strip` damages those that patchelf has changed, such as numpy's.
 WITH_SYMBOLS = (

@@ -6,7 +6,9 @@ certificate, the password and, for each message, the role. docs/security.md expl
 
 from __future__ import annotations
 
+import getpass
 import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -241,8 +243,12 @@ def _read(folder: Path) -> Credentials:
             with (folder / file).open("rb"):
                 pass
     except OSError as error:
+        if sys.platform == "win32":
+            user = getpass.getuser()
+        else:
+            user = str(os.geteuid())  # a container's user may have no name
         raise UserError(
-            f"{error.filename}: {error.strerror} (read by user {os.geteuid()}): check the files' owner and permissions"
+            f"{error.filename}: {error.strerror} (read by user {user}): check the files' owner and permissions"
         ) from None
     except ValidationError as error:
         raise UserError(f"{folder / IDENTITY}: {first_fault(error)}") from None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import time
 from contextlib import ExitStack
 from typing import Annotated, ClassVar
 
@@ -21,6 +22,7 @@ from common.router.refusals import LOG_FILTER, Refusals, capture_zenoh_log
 from common.runtime.config import ServiceSettings, load_settings, split_endpoints
 
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
+STOP_PERIOD_S = 0.1  # of looking for a signal
 
 
 class RouterSettings(ServiceSettings):
@@ -70,21 +72,22 @@ def main(argv: list[str] | None = None) -> None:
 
     Exits with status 2 and a one-line message if the settings or endpoints cannot be used.
     """
-    # Blocked from the start, so that a signal that arrives early stays pending until sigwait.
-    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+    received: list[int] = []  # signals, also those that arrive before the router listens
+    for number in STOP_SIGNALS:
+        signal.signal(number, lambda number, _frame: received.append(number))
     begin_logging(RouterSettings.service, argv)
     try:
         settings = load_settings(RouterSettings, argv)
         set_up_logging(settings.log_level, as_json=settings.log_json, service=RouterSettings.service)
         log = logger(RouterSettings.service)
-        route(settings.link(), log, settings.metrics)
+        route(settings.link(), log, received, settings.metrics)
     except UserError as error:
         report_failure(RouterSettings.service, error)
         sys.exit(2)
 
 
-def route(link: Link, log: Logger, metrics: str = "") -> None:
-    """Run a router until a signal arrives; ``metrics`` is the address of the metrics endpoint, or empty for none."""
+def route(link: Link, log: Logger, received: list[int], metrics: str = "") -> None:
+    """Run a router until ``received`` has a signal; ``metrics`` is the address for metrics, or empty for none."""
     refusals, facts = Refusals(log), {}
     with ExitStack() as stack:
         if link.security is None:
@@ -99,7 +102,8 @@ def route(link: Link, log: Logger, metrics: str = "") -> None:
 
             log.info("metrics", address=stack.enter_context(serve(router_metrics(bus), metrics)))
         log.info("router listens", endpoints=", ".join(link.listen), **facts)
-        signal.sigwait(STOP_SIGNALS)
+        while not received:  # Windows has no sigwait
+            time.sleep(STOP_PERIOD_S)
     log.info("ended", **({"refused": dict(refusals.counts)} if link.security is not None else {}))
 
 

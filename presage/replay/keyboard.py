@@ -5,14 +5,16 @@ from __future__ import annotations
 import os
 import select
 import sys
-import termios
 import threading
-import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from common.messages.requests import PlayerReply, PlayerRequest
 from services.recorder.replaying.replay import ReplayControl
+
+if sys.platform != "win32":
+    import termios
+    import tty
 
 HELP = "space: pause/resume, .: one scan, left/right or h/l: 5 s back/forward, down/up: slower/faster, q: quit"
 JUMP_S = 5.0
@@ -52,27 +54,30 @@ def request_of(key: str, state: PlayerReply) -> PlayerRequest | None:
 @contextmanager
 def keyboard(remote: ReplayControl) -> Iterator[bool]:
     """Controls the replay with the keyboard in the block; yields False if standard input is not a usable terminal."""
-    try:
-        terminal = sys.stdin.fileno()
-        attributes = termios.tcgetattr(terminal)
-    except (OSError, ValueError, termios.error):  # standard input is a pipe, a file or closed
+    if sys.platform == "win32":
         yield False
-        return
-    if os.tcgetpgrp(terminal) != os.getpgrp():  # reading in a background process would stop it
-        yield False
-        return
-    wake, waker = os.pipe()
-    thread = threading.Thread(target=_listen, args=(terminal, wake, remote), name="keyboard", daemon=True)
-    try:
-        tty.setcbreak(terminal)  # keys come without Enter; Ctrl-C still raises KeyboardInterrupt
-        thread.start()
-        yield True
-    finally:
-        termios.tcsetattr(terminal, termios.TCSADRAIN, attributes)
-        os.close(waker)
-        if thread.ident is not None:
-            thread.join(1.0)
-        os.close(wake)
+    else:
+        try:
+            terminal = sys.stdin.fileno()
+            attributes = termios.tcgetattr(terminal)
+        except (OSError, ValueError, termios.error):  # standard input is a pipe, a file or closed
+            yield False
+            return
+        if os.tcgetpgrp(terminal) != os.getpgrp():  # reading in a background process would stop it
+            yield False
+            return
+        wake, waker = os.pipe()
+        thread = threading.Thread(target=_listen, args=(terminal, wake, remote), name="keyboard", daemon=True)
+        try:
+            tty.setcbreak(terminal)  # keys come without Enter; Ctrl-C still raises KeyboardInterrupt
+            thread.start()
+            yield True
+        finally:
+            termios.tcsetattr(terminal, termios.TCSADRAIN, attributes)
+            os.close(waker)
+            if thread.ident is not None:
+                thread.join(1.0)
+            os.close(wake)
 
 
 def _listen(terminal: int, wake: int, remote: ReplayControl) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -38,7 +39,11 @@ def runtime_folder() -> Path:
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")
     if os.access(runtime, os.W_OK):
         return Path(runtime, "presage")
-    return Path(tempfile.gettempdir(), f"presage-{os.getuid()}")
+    if sys.platform == "win32":
+        name = "presage"  # each user has a folder for temporary files
+    else:
+        name = f"presage-{os.getuid()}"
+    return Path(tempfile.gettempdir(), name)
 
 
 @contextmanager
@@ -62,10 +67,14 @@ def running_sessions() -> list[RunningSession]:
     for path in sorted(runtime_folder().glob("*.json")):
         with suppress(OSError, ValueError, TypeError, psutil.Error):
             session = RunningSession(**json.loads(path.read_text(encoding="utf-8")))
-            # Other users may write into a folder for temporary files.
-            if path.stat().st_uid == os.getuid() and psutil.Process(session.pid).create_time() == session.started:
+            if _is_own(path) and psutil.Process(session.pid).create_time() == session.started:
                 sessions.append(replace(session, robots=tuple(session.robots)))
     return sessions
+
+
+def _is_own(path: Path) -> bool:
+    """False if another user wrote the file; except on Windows, anyone may write into a folder for temporary files."""
+    return sys.platform == "win32" or path.stat().st_uid == os.getuid()
 
 
 def find_session(connect: str) -> RunningSession:

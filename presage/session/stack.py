@@ -25,6 +25,9 @@ from presage.session.ports import accepts, check_port, free_port
 
 COLOURS = {"router": 37, "simulator": 36, "estimator": 35, "controller": 33, "recorder": 32, "viewer": 34}
 SECURITY_VARIABLES = {"PRESAGE_SECURITY", "PRESAGE_ROLE"}  # choose this process's credentials, not the children's
+INTERRUPTS = [signal.SIGINT, signal.SIGTERM]
+if sys.platform != "win32":
+    INTERRUPTS.append(signal.SIGHUP)
 TERMINATION_TIMEOUT_S = 5.0  # between SIGTERM and SIGKILL
 # The controller stops the robot first; the recorder ends late, to record how the others stop.
 SHUTDOWN_ORDER = ("controller", "estimator", "simulator", "viewer", "recorder", "router")
@@ -259,7 +262,7 @@ def _end(process: Process) -> int:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Makes SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt in the block, so that it cleans up as after Ctrl-C.
+    """Makes `INTERRUPTS` raise KeyboardInterrupt in the block, so that it cleans up as after Ctrl-C.
 
     A script's shell starts background commands with SIGINT ignored, which is undone here. SIGHUP stays ignored where
     it is, as under nohup.
@@ -268,9 +271,11 @@ def interruptible() -> Iterator[None]:
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    handled = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
-        handled.append(signal.SIGHUP)
+    handled = [
+        number
+        for number in INTERRUPTS
+        if number in {signal.SIGINT, signal.SIGTERM} or signal.getsignal(number) != signal.SIG_IGN
+    ]
     previous = {s: signal.signal(s, interrupt) for s in handled}
     try:
         yield
@@ -281,10 +286,9 @@ def interruptible() -> Iterator[None]:
 
 @contextmanager
 def ignoring_interrupts() -> Iterator[None]:
-    """Ignores SIGINT, SIGTERM and SIGHUP in the block, so that a second Ctrl-C does not interrupt the cleanup."""
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    """Ignores `INTERRUPTS` in the block, so that a second Ctrl-C does not interrupt the cleanup."""
     previous: dict[int, Callable[[int, FrameType | None], object] | int | None] = {
-        s: signal.signal(s, signal.SIG_IGN) for s in numbers
+        s: signal.signal(s, signal.SIG_IGN) for s in INTERRUPTS
     }
     try:
         yield

@@ -26,7 +26,7 @@ HOLDS = {
     "router": set(), "none": set(), "recorder": {"mcap"}, "replay": {"mcap"}, "controller": {"scipy"},
     "bridge_ros2": {"rosbags"}, "simulator": {"pybullet", "scipy"}, "estimator-precise": {"numba", "scipy"},
     "estimator-paper": {"torch", "numba", "scipy"},
-    "viewer": {"mcap", "starlette", "typer"}, "cli": {"mcap", "typer", "matplotlib", "rosbags"},
+    "viewer": {"mcap", "starlette", "typer"}, "cli": {"mcap", "typer", "matplotlib"},
 }  # fmt: skip
 
 

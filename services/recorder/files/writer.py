@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
+import sys
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
@@ -14,6 +14,9 @@ from pathlib import Path
 from common.errors import UserError
 from common.messages.topics import Topic
 from services.recorder.files.chunks import mcap_writer
+
+if sys.platform != "win32":
+    import fcntl
 
 PROFILE = "presage"
 LIBRARY = "presage recorder"
@@ -108,6 +111,8 @@ class RecordingWriter:
             self._writer.finish()  # type: ignore[no-untyped-call]
             self._stream.flush()
             os.fsync(self._stream.fileno())
+            if sys.platform == "win32":  # which renames only closed files
+                self._stream.close()
             self.active.rename(self.path)  # before closing, which releases the lock
             self._stream.close()
 
@@ -147,14 +152,18 @@ def is_there(path: Path, stream: BufferedWriter) -> bool:
 
 
 def is_being_written(path: Path) -> bool:
-    """Whether a running process is writing this file. The lock is released whenever that process ends."""
-    try:
-        with path.open("rb") as stream:
-            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:  # the file is gone, or the file system has no locks
-        return False
+    """Whether a running process is writing this file; unknown, and so False, on Windows.
+
+    The lock is released whenever that process ends.
+    """
+    if sys.platform != "win32":
+        try:
+            with path.open("rb") as stream:
+                fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:  # the file is gone, or the file system has no locks
+            return False
     return False
 
 
@@ -167,8 +176,9 @@ def claim(path: Path, active: Path, remedy: str = "--file") -> BufferedWriter:
     taken = f"is there already; choose another name with {remedy}, or another folder"
     try:
         stream = active.open("xb")
-        with suppress(OSError):  # some network file systems have no locks
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if sys.platform != "win32":
+            with suppress(OSError):  # some network file systems have no locks
+                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except FileExistsError:
         raise NameTakenError(f"{active}: {taken}") from None
     if path.exists():
