@@ -47,6 +47,17 @@ def bench_viewer(seconds: Seconds = 20.0, rounds: Rounds = 3, json_file: Json = 
     raise typer.Exit(run(seconds, rounds, BEAMS, json_file, console))
 
 
+@app.command("cpu")
+def bench_cpu(seconds: Seconds = 60.0, json_file: Json = None) -> None:
+    """Processor time and memory of each service at 15 Hz, while the robot drives and one browser shows the page.
+
+    Example: `presage bench cpu --json cpu.json`.
+    """
+    from lab.benchmarks.cpu import bench_cpu as run
+
+    raise typer.Exit(run(seconds, BEAMS, json_file, console))
+
+
 @app.command("map")
 def bench_map(
     world: Annotated[str, typer.Option(help="A ROS map.yaml or any world. Defaults to a generated map.")] = "",

@@ -1,4 +1,4 @@
-"""`presage bench latency`, `viewer` and `recorder` measure what they say."""
+"""`presage bench latency`, `viewer`, `cpu` and `recorder` measure what they say."""
 
 from __future__ import annotations
 
@@ -38,6 +38,13 @@ def test_viewer(bench):
     assert 0 < numbers["viewer_cpu_share"] < 1
     for name in ("without", "with"):
         assert 0 < numbers[f"scan_to_command_median_{name}_ms"] <= numbers[f"scan_to_command_p99_{name}_ms"]
+
+
+def test_cpu(bench):
+    numbers = bench("cpu", "--seconds", "3")
+    assert numbers["beliefs_hz"] > 1
+    assert all(0 < share < 1 for share in numbers["cpu_share"].values())
+    assert all(megabytes > 10 for megabytes in numbers["memory_mb"].values())
 
 
 def test_recorder(bench, tmp_path):

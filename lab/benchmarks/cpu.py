@@ -1,0 +1,102 @@
+"""`presage bench cpu`."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+import psutil
+from rich.console import Console
+from rich.table import Table
+
+from common.bus.bus import open_bus
+from common.messages.definitions import Belief, Goal, Pose, Status
+from common.messages.topics import BELIEF, GOAL, STATUS
+from common.versions import commit, versions
+from lab.benchmarks.viewer import ROBOT, Visitor
+from presage.live.bus_watch import Watch
+from presage.session.ports import free_port
+from presage.session.stack import Stack
+from presage.terminal.output import check_file, write_json
+
+ON_THE_ROBOT = ("router", "estimator", "controller", "recorder")
+SERVICES = (*ON_THE_ROBOT, "simulator", "viewer")
+WARM_UP_S = 10.0  # before the measurement; it includes the search for the robot
+GOALS = (Pose(x=15.5, y=1.5), Pose(x=3.0, y=1.5))  # in the world corridor
+
+
+def measure(seconds: float, beams: int) -> dict[str, Any]:
+    """Processor seconds per second and resident memory in MB of each service while the robot drives to and fro."""
+    port = free_port()
+    with tempfile.TemporaryDirectory() as folder, Stack(ROBOT, quiet=True) as stack:
+        stack.start_router()
+        stack.start("viewer", "--port", str(port))
+        stack.start("recorder", "--directory", folder)
+        stack.start("controller")
+        stack.start("estimator")
+        stack.start("simulator", "--beams", str(beams))
+        processes = {name: psutil.Process(stack.processes[name].child.pid) for name in SERVICES}
+        with open_bus(stack.link()) as bus:
+            stack.wait_alive(bus)
+            visitor, watch, goals = Visitor(port), Watch(bus, STATUS, BELIEF), cycle(GOALS)
+            _drive(stack, watch, goals, WARM_UP_S)
+            before, began = _cpu_seconds(processes), time.monotonic()
+            beliefs = _drive(stack, watch, goals, seconds)
+            elapsed, after = time.monotonic() - began, _cpu_seconds(processes)
+            memory = {name: process.memory_info().rss / 1e6 for name, process in processes.items()}
+            visitor.close()
+    cpu = {name: (after[name] - before[name]) / elapsed for name in SERVICES}
+    for values in (cpu, memory):
+        values["on_the_robot"] = sum(values[name] for name in ON_THE_ROBOT)
+    return {"beliefs_hz": beliefs / elapsed, "cpu_share": cpu, "memory_mb": memory}
+
+
+def _drive(stack: Stack, watch: Watch, goals: Iterator[Pose], seconds: float) -> int:
+    """Sends the next goal whenever the robot has none; returns the number of beliefs."""
+    beliefs, end = 0, time.monotonic() + seconds
+    while (left := end - time.monotonic()) > 0:
+        stack.check()
+        message = watch.next(min(0.5, left))
+        beliefs += isinstance(message, Belief)
+        if isinstance(message, Status) and message.state in {"idle", "reached"}:
+            goal = Goal(stamp_ns=message.stamp_ns, seq=message.goal_seq + 1, pose=next(goals))
+            watch.bus.put(GOAL, goal.encode())
+    return beliefs
+
+
+def _cpu_seconds(processes: dict[str, psutil.Process]) -> dict[str, float]:
+    times = {name: process.cpu_times() for name, process in processes.items()}
+    return {name: used.user + used.system for name, used in times.items()}
+
+
+def bench_cpu(seconds: float, beams: int, json_file: Path | None, console: Console) -> int:
+    """Runs the benchmark, prints the table and writes it to ``json_file`` if given. Returns exit status 0."""
+    check_file(json_file, "--json")
+    result = measure(seconds, beams)
+    title = f"{beams} beams, {result['beliefs_hz']:.1f} beliefs/s, {seconds:g} s"
+    table = Table(title=title, title_justify="left")
+    for column in ("service", "CPU s/s", "memory MB"):
+        table.add_column(column, justify="left" if column == "service" else "right")
+    for name, share in result["cpu_share"].items():
+        table.add_row(
+            name.replace("_", " "), f"{share:.3f}", f"{result['memory_mb'][name]:.0f}", end_section=name == SERVICES[-1]
+        )
+    console.print(table)
+    console.print(f"on the robot: {', '.join(ON_THE_ROBOT)}", highlight=False)
+    result |= {
+        "seconds": seconds,
+        "beams": beams,
+        "commit": commit(),
+        "versions": versions(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "arguments": sys.argv[1:],
+    }
+    write_json(json_file, result)
+    return 0
