@@ -141,6 +141,39 @@ def bench_accuracy(
     raise typer.Exit(code)
 
 
+@app.command("integrity")
+def bench_integrity(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results and the learned models.")],
+    worlds: Annotated[int, typer.Option(min=1, max=1000, help="Number of generated buildings.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, max=2**20, help="Each seed has its own buildings.")] = 1,
+    cases: Annotated[str, typer.Option(help="Comma-separated, as in docs/integrity.md. Defaults to all.")] = "",
+    estimators: Annotated[
+        str, typer.Option(help="Comma-separated: precise, particle-filter, amcl-defaults.")
+    ] = "precise,particle-filter",
+    model: Annotated[
+        str, typer.Option(help="Of precise: learned (30 s for each map), or exact for a quick run.")
+    ] = "learned",
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="Length of a drive. Defaults to 120 s for moved-*, 60 s otherwise.")
+    ] = None,
+) -> None:
+    """Whether estimators are right about themselves in generated buildings that differ from their maps.
+
+    Each trial is one case in one building. After Ctrl-C, the same command continues. Prints a table for each estimator,
+    and writes integrity.md, .json, .trials.jsonl and a reliability diagram.
+
+    Examples: `presage bench integrity --out results`;
+    `presage bench integrity --worlds 5 --cases moved-50,wrong-map --model exact --estimators precise --out quick`.
+    """
+    from lab.integrity.cases import CASES
+    from lab.integrity.report import bench_integrity as run
+    from lab.integrity.runner import Plan
+
+    names = tuple(cases.split(",")) if cases else tuple(CASES)
+    plan = Plan(worlds, seed, names, tuple(estimators.split(",")), model, seconds)
+    raise typer.Exit(run(plan, out, worker_count(), console))
+
+
 @app.command("speed")
 def bench_speed(world: WorldName = "office", json_file: Json = None) -> None:
     """Update time and memory of every estimator on one core, each in its own process, with 622 and 811 beams.

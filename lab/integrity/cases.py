@@ -111,7 +111,7 @@ class Trial:
 def make_trial(case: Case, seed: int, seconds: float | None = None) -> Trial:
     """The trial of a case in the world of a seed; ``seconds`` defaults to the case's."""
     rng = np.random.default_rng([seed, zlib.crc32(case.name.encode())])
-    stated = Scanner.model_validate({**TIM571.model_dump(), "beams": BEAMS, "range_max": case.range_max})
+    stated = scanner_of(case)
     scanner = _real_scanner(case, stated)
     building = make_building(seed, case.building)
     changed = _changed(case, building, rng)
@@ -132,6 +132,11 @@ def make_trial(case: Case, seed: int, seconds: float | None = None) -> Trial:
     return Trial(
         map_of(case, seed), stated, observations, truths, start, case.map_is_correct, kidnappings, case.single_scans > 0
     )
+
+
+def scanner_of(case: Case) -> Scanner:
+    """The scanner as stated to the estimator."""
+    return Scanner.model_validate({**TIM571.model_dump(), "beams": BEAMS, "range_max": case.range_max})
 
 
 def map_of(case: Case, seed: int) -> World:
