@@ -12,12 +12,41 @@ from rich.console import Console
 
 from lab.experiments.trials import run_trials
 from lab.integrity.cases import CASES, Trial, make_trial, map_of, scanner_of
+from lab.integrity.logs import LogCase, log_field_file, log_trial
 from lab.integrity.models import field_file
 from lab.integrity.scoring import Scans, score_case, score_trial
 from services.estimator.factory import EstimatorOptions, Factory, Geometry, Name, prepare
 from services.estimator.shared.interface import Posterior
 
 SEEDS_PER_RUN = 1000  # worlds of one run; the next seed of a run has other worlds
+
+
+@dataclass(frozen=True)
+class TrialSource:
+    """A case in the world of a seed, or in a real log; the values are plain, so that they can be compared."""
+
+    case: str
+    seed: int
+    seconds: float | None = None  # of a drive; defaults to the case's
+    log: LogCase | None = None
+
+    def trial(self) -> Trial:
+        """The scans."""
+        return log_trial(self.log) if self.log else make_trial(CASES[self.case], self.seed, self.seconds)
+
+    @property
+    def map_key(self) -> tuple[str, str, int]:
+        """What the map depends on."""
+        if self.log:
+            return "log", self.log.drive_name, 0
+        return CASES[self.case].building, CASES[self.case].map, self.seed
+
+    def field_file(self, folder: Path) -> Path:
+        """The weights of preset `precise` for the map; learned now unless the folder has them."""
+        if self.log:
+            return log_field_file(folder, self.log, log_trial(self.log).map_world)
+        case = CASES[self.case]
+        return field_file(folder, map_of(case, self.seed), scanner_of(case))
 
 
 @dataclass(frozen=True)
@@ -30,51 +59,47 @@ class Plan:
     estimators: tuple[str, ...]
     model: str = "learned"  # of estimator precise: learned or exact
     seconds: float | None = None  # of a drive; defaults to each case's
+    logs: tuple[LogCase, ...] = ()
 
-    def jobs(self, out: Path) -> list[IntegrityJob]:
-        """One job for each world, case and estimator."""
-        return [
-            IntegrityJob(case, self.seed * SEEDS_PER_RUN + world, estimator, self.model, self.seconds, str(out))
-            for world in range(self.worlds)
-            for case in self.cases
-            for estimator in self.estimators
-        ]
+    def sources(self) -> list[TrialSource]:
+        """All trials of one estimator."""
+        seeds = [self.seed * SEEDS_PER_RUN + world for world in range(self.worlds)]
+        generated = [TrialSource(case, seed, self.seconds) for seed in seeds for case in self.cases]
+        return [*generated, *(TrialSource(log.name, self.seed, log=log) for log in self.logs)]
 
 
 @dataclass(frozen=True)
 class IntegrityJob:
-    """One trial of one estimator; the values are plain, so that jobs can be compared and pickled."""
+    """One trial of one estimator."""
 
-    case: str
-    seed: int  # of the world
+    source: TrialSource
     estimator: str
     model: str
-    seconds: float | None
     out: str  # folder of the results
 
     @property
     def scans_file(self) -> Path:
         """The file with what the estimator reported for every scan."""
-        return Path(self.out) / "scans" / f"{self.case}-{self.seed}-{self.estimator}.npz"
+        return Path(self.out) / "scans" / f"{self.source.case}-{self.source.seed}-{self.estimator}.npz"
 
-
-@dataclass(frozen=True)
-class LearningJob:
-    """The map of one case in one world, for which a field is learned."""
-
-    case: str
-    seed: int
-    out: str
+    @property
+    def models(self) -> Path:
+        """The folder of the weights."""
+        return Path(self.out) / "models"
 
 
 def run(
     plan: Plan, out: Path, workers: int, console: Console
 ) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
     """Scores by estimator and case, and the rows of all trials."""
-    jobs = plan.jobs(out)
+    jobs = [
+        IntegrityJob(source, estimator, plan.model, str(out))
+        for source in plan.sources()
+        for estimator in plan.estimators
+    ]
     (out / "scans").mkdir(parents=True, exist_ok=True)
-    if "precise" in plan.estimators and plan.model == "learned":
-        maps = {map_key(job.case, job.seed): LearningJob(job.case, job.seed, job.out) for job in jobs}
+    if plan.model == "learned":
+        maps = {job.source.map_key: job for job in jobs if job.estimator == "precise"}
         run_trials("learning", learn, list(maps.values()), out, workers, console)
     rows = run_trials("integrity", run_trial, jobs, out, workers, console)
     scores = {
@@ -96,30 +121,23 @@ def _groups(rows: list[dict[str, Any]]) -> Iterator[tuple[str, list[dict[str, An
     yield "all", rows
 
 
-def map_key(case: str, seed: int) -> tuple[str, str, int]:
-    """What the map of a case depends on."""
-    return CASES[case].building, CASES[case].map, seed
-
-
-def learn(job: LearningJob) -> dict[str, Any]:
-    """Learns the field of a map."""
-    case = CASES[job.case]
-    return {"file": str(field_file(Path(job.out) / "models", map_of(case, job.seed), scanner_of(case)))}
+def learn(job: IntegrityJob) -> dict[str, Any]:
+    """Learns the field of the job's map."""
+    return {"file": str(job.source.field_file(job.models))}
 
 
 def run_trial(job: IntegrityJob) -> dict[str, Any]:
     """Runs the job's estimator, writes what it reported for every scan, and returns the scores of the trial."""
-    trial = make_trial(CASES[job.case], job.seed, job.seconds)
+    trial = job.source.trial()
     scans = localise(trial, make_factory(job, trial))
     scans.save(job.scans_file)
-    scores = score_trial(scans, trial.scanner.rate, trial.kidnappings.tolist(), separate=trial.separate)
     return {
-        "case": job.case,
-        "seed": job.seed,
+        "case": job.source.case,
+        "seed": job.source.seed,
         "estimator": job.estimator,
         "map_is_correct": trial.map_is_correct,
         "scans_file": str(job.scans_file.relative_to(job.out)),
-        **scores,
+        **score_trial(scans, trial.scanner.rate, trial.kidnappings.tolist(), separate=trial.separate),
     }
 
 
@@ -127,8 +145,8 @@ def make_factory(job: IntegrityJob, trial: Trial) -> Factory:
     """The estimators of a trial, made as by the estimator service."""
     model = job.model
     if job.estimator == "precise" and model == "learned":
-        model = str(field_file(Path(job.out) / "models", trial.map_world, trial.scanner))
-    return prepare(EstimatorOptions(trial.map_world, cast("Name", job.estimator), model, seed=job.seed))
+        model = str(job.source.field_file(job.models))
+    return prepare(EstimatorOptions(trial.map_world, cast("Name", job.estimator), model, seed=job.source.seed))
 
 
 def localise(trial: Trial, factory: Factory) -> Scans:
