@@ -146,7 +146,7 @@ def bench_integrity(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results and the learned models.")],
     worlds: Annotated[int, typer.Option(min=0, max=1000, help="Number of generated buildings.")] = 20,
     seed: Annotated[int, typer.Option(min=0, max=2**20, help="Each seed has its own buildings.")] = 1,
-    cases: Annotated[str, typer.Option(help="Comma-separated, as in docs/integrity.md. Defaults to all.")] = "",
+    cases: Annotated[str, typer.Option(help="Comma-separated cases of docs/integrity.md. Defaults to all.")] = "",
     estimators: Annotated[
         str, typer.Option(help="Comma-separated: precise, particle-filter, amcl-defaults.")
     ] = "precise,particle-filter",
