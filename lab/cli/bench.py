@@ -175,12 +175,12 @@ def bench_integrity(
     from lab.integrity.cases import CASES
     from lab.integrity.logs import cases_of
     from lab.integrity.report import bench_integrity as run
-    from lab.integrity.runner import Plan
+    from lab.integrity.runner import IntegrityPlan
 
     names = tuple(cases.split(",")) if cases else tuple(CASES)
     laser_pose: Any = tuple(pose_of_text(mount, "--mount").tolist()) if mount else None
     of_logs = [case for log in logs.split(",") if log for case in cases_of(log, laser_pose)]
-    plan = Plan(worlds, seed, names, tuple(estimators.split(",")), model, seconds, tuple(of_logs))
+    plan = IntegrityPlan(worlds, seed, names, tuple(estimators.split(",")), model, seconds, tuple(of_logs))
     raise typer.Exit(run(plan, out, worker_count(), console))
 
 

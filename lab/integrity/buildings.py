@@ -104,12 +104,15 @@ def make_building(seed: int, kind: Kind = "office") -> Building:
     ``symmetric`` has identical rooms on both sides of a corridor; ``corridor`` is 35 m of plain walls with one room.
     """
     rng = np.random.default_rng([seed, 20])
-    plans = {"office": (_corridor, _corner, _ring)[rng.integers(3)], "symmetric": _corridor, "corridor": _long_corridor}
     alike = kind == "symmetric"
-    boundary, walls, rooms = plans[kind](rng, alike)
+    if alike:
+        boundary, walls, rooms = _corridor(rng, alike=True)
+    else:
+        plan = _long_corridor if kind == "corridor" else (_corridor, _corner, _ring)[rng.integers(3)]
+        boundary, walls, rooms = plan(rng)
     empty = Building(f"{kind}-{seed}", tuple(boundary), tuple(walls), tuple(rooms))
     floor = empty.floor()
-    templates = [_template(rng, rng.integers(9, 14)) for _ in range(1 if alike else TEMPLATES)]
+    templates = [_template(rng, int(rng.integers(9, 14))) for _ in range(1 if alike else TEMPLATES)]
     for room in rooms:
         if room.door is not None:
             items = templates[rng.integers(len(templates))]
@@ -120,10 +123,10 @@ def make_building(seed: int, kind: Kind = "office") -> Building:
     return empty.furnished(floor.pieces)
 
 
-Plan = tuple[list[Point], list[Obstacle], list[Room]]
+FloorPlan = tuple[list[Point], list[Obstacle], list[Room]]
 
 
-def _corridor(rng: np.random.Generator, alike: bool) -> Plan:
+def _corridor(rng: np.random.Generator, *, alike: bool = False) -> FloorPlan:
     """Rooms on both sides of a straight corridor."""
     length, wide, depth, other = rng.uniform(12, 22), rng.uniform(1.7, 2.4), *rng.uniform(3.2, 5.0, 2)
     other = depth if alike else other
@@ -135,9 +138,8 @@ def _corridor(rng: np.random.Generator, alike: bool) -> Plan:
     return _rectangle(length, height), walls, [*south, *north, Room((0.0, depth, 0.0), length, wide)]
 
 
-def _corner(rng: np.random.Generator, alike: bool) -> Plan:
+def _corner(rng: np.random.Generator) -> FloorPlan:
     """A corridor with a corner, and rooms on its outer side."""
-    del alike
     length, height = rng.uniform(13, 18), rng.uniform(11, 16)
     depth, wide = rng.uniform(3.5, 4.5), rng.uniform(1.7, 2.2)
     inner, top = length - depth, depth + wide
@@ -148,9 +150,8 @@ def _corner(rng: np.random.Generator, alike: bool) -> Plan:
     return boundary, [*_walls_of(south), *_walls_of(east)], [*south, *east, *corridors]
 
 
-def _ring(rng: np.random.Generator, alike: bool) -> Plan:
+def _ring(rng: np.random.Generator) -> FloorPlan:
     """A ring of corridors around a block of rooms, and a row of rooms on one side."""
-    del alike
     length, wide, depth, block = rng.uniform(12, 17), rng.uniform(1.6, 2.0), rng.uniform(3.2, 4.5), rng.uniform(3, 4.5)
     south = _row(rng, (0.0, 0.0, 0.0), length, depth)
     low, high = depth + wide, depth + wide + block
@@ -167,9 +168,8 @@ def _ring(rng: np.random.Generator, alike: bool) -> Plan:
     return _rectangle(length, high + wide), walls, [*south, *core, *corridors]
 
 
-def _long_corridor(rng: np.random.Generator, alike: bool) -> Plan:
+def _long_corridor(rng: np.random.Generator) -> FloorPlan:
     """A long corridor with plain walls, and one room at its end."""
-    del alike
     length, wide, depth = 35.0, rng.uniform(1.8, 2.4), rng.uniform(3.5, 4.5)
     room = Room((0.0, 0.0, 0.0), 4.5, depth, 2.0)
     walls = [_wall((0.0, depth), (2.0 - DOOR_M / 2, depth)), _wall((2.0 + DOOR_M / 2, depth), (4.5, depth))]
@@ -261,7 +261,7 @@ def _template(
 
 
 def _item(rng: np.random.Generator, catalogue: Sequence[tuple[Shape, Point, Point, bool]]) -> Item:
-    shape, small, large, at_wall = catalogue[rng.integers(len(catalogue))]
+    shape, small, large, at_wall = catalogue[int(rng.integers(len(catalogue)))]
     size = rng.uniform(small, large).tolist()
     if shape == "disc":
         size[1] = size[0]

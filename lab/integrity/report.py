@@ -13,7 +13,7 @@ from rich.console import Console
 from common.errors import UserError
 from lab.experiments.results import Result, markdown, millimetres, number
 from lab.integrity.cases import CASES
-from lab.integrity.runner import Plan, run
+from lab.integrity.runner import IntegrityPlan, run
 from lab.integrity.scoring import MAX_WRONG_S, RECOVERY_SCANS
 from presage.plotting.style import BOUND, COLOURS, GOAL, figure_of, legend_below
 from presage.terminal.output import make_folder
@@ -41,7 +41,7 @@ ideal. *Error* of correct scans. *Found*: `tracking` at the right place after a 
 of scans whose error along x, along y and in yaw exceeds the protection level."""
 
 
-def bench_integrity(plan: Plan, out: Path, workers: int, console: Console) -> int:
+def bench_integrity(plan: IntegrityPlan, out: Path, workers: int, console: Console) -> int:
     """Runs the benchmark, prints a Markdown table for each estimator, and writes the results into ``out``."""
     _check(plan)
     make_folder(out, "--out")
@@ -57,7 +57,7 @@ def bench_integrity(plan: Plan, out: Path, workers: int, console: Console) -> in
     return 0
 
 
-def _check(plan: Plan) -> None:
+def _check(plan: IntegrityPlan) -> None:
     """Raises UserError for unknown names."""
     for kind, given, known in (
         ("case", plan.cases, CASES),

@@ -14,7 +14,7 @@ from lab.experiments.trials import run_trials
 from lab.integrity.cases import CASES, Trial, make_trial, map_of, scanner_of
 from lab.integrity.logs import LogCase, log_field_file, log_trial
 from lab.integrity.models import field_file
-from lab.integrity.scoring import Scans, score_case, score_trial
+from lab.integrity.scoring import Estimates, score_case, score_trial
 from services.estimator.factory import EstimatorOptions, Factory, Geometry, Name, prepare
 from services.estimator.shared.interface import Posterior
 
@@ -50,7 +50,7 @@ class TrialSource:
 
 
 @dataclass(frozen=True)
-class Plan:
+class IntegrityPlan:
     """What one run of the benchmark measures."""
 
     worlds: int
@@ -89,7 +89,7 @@ class IntegrityJob:
 
 
 def run(
-    plan: Plan, out: Path, workers: int, console: Console
+    plan: IntegrityPlan, out: Path, workers: int, console: Console
 ) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
     """Scores by estimator and case, and the rows of all trials."""
     jobs = [
@@ -104,7 +104,7 @@ def run(
     rows = run_trials("integrity", run_trial, jobs, out, workers, console)
     scores = {
         estimator: {
-            name: score_case(own, Scans.joined([Scans.load(out / row["scans_file"]) for row in own]))
+            name: score_case(own, Estimates.joined([Estimates.load(out / row["scans_file"]) for row in own]))
             for name, own in _groups([row for row in rows if row["estimator"] == estimator])
         }
         for estimator in plan.estimators
@@ -149,7 +149,7 @@ def make_factory(job: IntegrityJob, trial: Trial) -> Factory:
     return prepare(EstimatorOptions(trial.map_world, cast("Name", job.estimator), model, seed=job.source.seed))
 
 
-def localise(trial: Trial, factory: Factory) -> Scans:
+def localise(trial: Trial, factory: Factory) -> Estimates:
     """What an estimator reports for the scans of a trial."""
     geometry = Geometry.of(trial.scanner)
     factory(geometry).update(trial.observations[0])  # compiles what is compiled at the first scan
@@ -163,4 +163,4 @@ def localise(trial: Trial, factory: Factory) -> Scans:
         began = time.process_time()
         posteriors.append(estimator.update(observation))
         seconds.append(time.process_time() - began)
-    return Scans.of(posteriors, trial.truths, seconds)
+    return Estimates.of(posteriors, trial.truths, seconds)

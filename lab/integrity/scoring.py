@@ -26,7 +26,7 @@ PROBABILITY_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.99, 0.999, 0.9999, 1.0)
 
 
 @dataclass(frozen=True)
-class Scans:
+class Estimates:
     """What an estimator reported for the N scans of a trial, compared with the truth."""
 
     error: Array  # (N, 3) m, m, rad in map; NaN where the robot is not in the map
@@ -37,7 +37,7 @@ class Scans:
     update_s: Array  # (N,) processor time
 
     @classmethod
-    def of(cls, posteriors: Sequence[Posterior], truths: Array, update_s: Sequence[float]) -> Scans:
+    def of(cls, posteriors: Sequence[Posterior], truths: Array, update_s: Sequence[float]) -> Estimates:
         """Compares posteriors with true poses (N, 3)."""
         error = np.array([posterior.pose for posterior in posteriors]) - truths
         error[:, 2] = se2.wrap(error[:, 2])
@@ -51,12 +51,12 @@ class Scans:
         )
 
     @classmethod
-    def joined(cls, parts: Sequence[Scans]) -> Scans:
+    def joined(cls, parts: Sequence[Estimates]) -> Estimates:
         """The scans of several trials."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
     @classmethod
-    def load(cls, path: Path) -> Scans:
+    def load(cls, path: Path) -> Estimates:
         """Reads the file of a trial."""
         with np.load(path) as stored:
             return cls(**{f.name: stored[f.name] for f in fields(cls)})
@@ -99,7 +99,7 @@ def _or_nan(value: float | None) -> float:
     return np.nan if value is None else value
 
 
-def score_trial(scans: Scans, rate: float, kidnappings: Sequence[int], *, separate: bool) -> dict[str, Any]:
+def score_trial(scans: Estimates, rate: float, kidnappings: Sequence[int], *, separate: bool) -> dict[str, Any]:
     """Scores of one trial whose scans come at ``rate`` Hz; ``separate`` scans are not one stretch of time."""
     right = scans.tracking & scans.correct
     recovered = [bool(right[first : first + RECOVERY_SCANS].any()) for first in kidnappings]
@@ -121,7 +121,7 @@ def longest_run(values: Mask) -> int:
     return int(np.diff(edges)[::2].max(initial=0))
 
 
-def score_case(trials: Sequence[dict[str, Any]], scans: Scans) -> dict[str, Any]:
+def score_case(trials: Sequence[dict[str, Any]], scans: Estimates) -> dict[str, Any]:
     """Scores of a case, from those of its trials and from all their scans. Shares have Wilson's 95 % interval."""
     count, tracking, correct, wrong, kidnapped, recovered = (
         sum(trial[name] for trial in trials)
@@ -129,7 +129,7 @@ def score_case(trials: Sequence[dict[str, Any]], scans: Scans) -> dict[str, Any]
     )
     longest = [trial["longest_wrong_s"] for trial in trials]
     distance = np.hypot(scans.error[:, 0], scans.error[:, 1])[scans.correct]
-    in_map = bool(np.isfinite(scans.error).all())
+    in_map = int(np.isfinite(scans.error[:, 0]).sum())
     return {
         "trials": len(trials),
         "scans": count,
@@ -137,7 +137,7 @@ def score_case(trials: Sequence[dict[str, Any]], scans: Scans) -> dict[str, Any]
         "wrong": share(wrong, tracking),
         "longest_wrong_s": max(longest),
         "trials_wrong_longer": sum(value > MAX_WRONG_S for value in longest),
-        "correct": share(correct, count) if in_map else None,
+        "correct": share(correct, in_map),
         "nees_xy": _mean(scans.nees[scans.tracking, 0]),
         "nees_xy_median": _quantile(scans.nees[scans.tracking, 0], 0.5),
         "nees": _mean(scans.nees[scans.tracking, 1]),

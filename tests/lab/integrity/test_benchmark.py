@@ -11,7 +11,7 @@ from rich.console import Console
 from common.errors import UserError
 from lab.integrity.cases import BEAMS, CASES, make_trial
 from lab.integrity.report import bench_integrity
-from lab.integrity.runner import Plan
+from lab.integrity.runner import IntegrityPlan
 
 
 @pytest.mark.parametrize("name", ["kidnapped-similar", "crowd", "slip", "wrong-map"])
@@ -40,7 +40,7 @@ def test_scans_agree_with_the_map():
 
 
 def test_run(tmp_path, capsys):
-    plan = Plan(1, 1, ("unchanged",), ("precise",), "exact", 0.4)
+    plan = IntegrityPlan(1, 1, ("unchanged",), ("precise",), "exact", 0.4)
     assert bench_integrity(plan, tmp_path, 1, Console(quiet=True)) == 0
     stored = json.loads((tmp_path / "integrity.json").read_text())["summary"]["precise"]["unchanged"]
     assert stored["correct"]["count"] == stored["correct"]["of"] == 6
@@ -54,4 +54,4 @@ def test_run(tmp_path, capsys):
 )
 def test_unknown_names(cases, estimators, model, tmp_path):
     with pytest.raises(UserError, match="choose from"):
-        bench_integrity(Plan(1, 1, cases, estimators, model), tmp_path, 1, Console(quiet=True))
+        bench_integrity(IntegrityPlan(1, 1, cases, estimators, model), tmp_path, 1, Console(quiet=True))

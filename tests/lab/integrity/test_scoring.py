@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lab.integrity.report import reliability_diagram, table
-from lab.integrity.scoring import Scans, longest_run, reliability, score_case, score_trial
+from lab.integrity.scoring import Estimates, longest_run, reliability, score_case, score_trial
 from services.estimator.shared.interface import Hypothesis, Posterior
 
 TRUTHS = np.tile([1.0, 2.0, np.pi - 0.01], (6, 1))
@@ -28,7 +28,7 @@ def posterior(pose, state, **fields):
 @pytest.fixture
 def scans():
     posteriors = [posterior(pose, state) for pose, state in zip(TRUTHS + ERRORS, STATES, strict=True)]
-    return Scans.of(posteriors, TRUTHS, [0.001] * 6)
+    return Estimates.of(posteriors, TRUTHS, [0.001] * 6)
 
 
 def test_correct_and_wrong(scans):
@@ -46,7 +46,7 @@ def test_trial(scans):
 
 def test_case(scans):
     trial = score_trial(scans, 1.0, [], separate=False)
-    row = score_case([trial, trial], Scans.joined([scans, scans]))
+    row = score_case([trial, trial], Estimates.joined([scans, scans]))
     assert (row["wrong"]["count"], row["wrong"]["of"]) == (4, 8)
     assert row["trials_wrong_longer"] == 2
     assert row["nees_xy"] == pytest.approx((0 + 1 + 9 + 9) / 4)
@@ -83,7 +83,7 @@ def test_protection_in_base_link():
     facing_left = np.array([0.0, 0.0, np.pi / 2])
     protection = np.array([0.1, 0.01, 0.1])
     made = posterior(np.array([0.0, 0.05, np.pi / 2]), "tracking", probability=0.99, protection=protection)
-    scans = Scans.of([made], facing_left[None], [0.001])
+    scans = Estimates.of([made], facing_left[None], [0.001])
     assert scans.excess[0] == pytest.approx([0.5, 0.0, 0.0])
     row = score_case([score_trial(scans, 1.0, [], separate=False)], scans)
     assert row["beyond_protection"] == [0.0, 0.0, 0.0]
@@ -92,4 +92,4 @@ def test_protection_in_base_link():
 
 def test_scans_file(scans, tmp_path):
     scans.save(tmp_path / "trial.npz")
-    assert Scans.load(tmp_path / "trial.npz").error == pytest.approx(scans.error)
+    assert Estimates.load(tmp_path / "trial.npz").error == pytest.approx(scans.error)
