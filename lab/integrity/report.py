@@ -96,7 +96,7 @@ def _percent(share: dict[str, Any] | None, *, interval: bool = False) -> str:
         return "–"
     text = f"{100 * share['count'] / share['of']:.4g} %"
     low, high = (100 * bound for bound in share["interval_95"])
-    return f"{text} ({low:.2g} to {high:.2g})" if interval else text
+    return f"{text} ({low:.3g} to {high:.3g})" if interval else text
 
 
 def _short(value: float | None) -> str:
