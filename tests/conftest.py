@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import os
 import signal
 import socket
@@ -14,6 +15,7 @@ from pathlib import Path
 import hypothesis
 import psutil
 import pytest
+import structlog
 
 from common.bus.bus import Link, open_bus, wait_until
 from common.bus.inbox import Sample
@@ -66,6 +68,15 @@ def _no_settings_from_outside(monkeypatch, tmp_path):
     for name in [name for name in os.environ if name.startswith("PRESAGE_")]:
         monkeypatch.delenv(name)
     monkeypatch.setenv("PRESAGE_RUNTIME_DIR", str(tmp_path / "sessions"))
+
+
+@pytest.fixture(autouse=True)
+def _restored_logging():
+    """Undoes the set-up of logging by commands that a test runs in this process, such as `presage replay --with`."""
+    level = logging.root.level
+    yield
+    logging.root.setLevel(level)
+    structlog.reset_defaults()
 
 
 def free_tcp_port() -> int:

@@ -117,17 +117,20 @@ def test_tools_beside_a_session(presage, process, bus, link, monkeypatch):
     def healthy():
         status, output = presage("top", "--once")
         outputs.append(output)
-        return status == 0 and "ms" in row_of(output, "controller")
+        rates = zip(names, ("scan", "belief", "cmd_vel"), strict=True)
+        return (
+            status == 0
+            and all(re.search(rf"^{name} alive.* {topic} [0-9.]*[1-9]", row_of(output, name)) for name, topic in rates)
+            and all("ms" in row_of(output, name) for name in names[1:])
+        )
 
     assert wait_until(healthy, 60), outputs[-1]  # the first scans take longer
     assert f"robot {link.robot}" in outputs[-1]
-    for name, sends in zip(names, ("scan", "belief", "cmd_vel"), strict=True):
-        assert re.search(rf"^{name} alive.* {sends} [0-9.]*[1-9]", row_of(outputs[-1], name)), outputs[-1]
-    assert "ms" in row_of(outputs[-1], "estimator")
     assert "not running" in row_of(outputs[-1], "recorder")
     status, output = presage("doctor")
     faults = [line for line in output.splitlines() if line.split()[:1] == ["no"]]
-    assert all(" Hz" in line for line in faults), output  # a machine under load may be slow
+    # This machine may be slow, and another test that runs at the same time may have stopped a process.
+    assert all(" Hz" in line or "of this machine is stopped" in line for line in faults), output
     assert status == (1 if faults else 0)
     for name in names:
         assert f"{name} of '{link.robot}': alive" in output

@@ -198,7 +198,7 @@ def test_missing_service(page, system):
 def test_two_visitors(system):
     """Without a browser: what both see, and what the page's buttons do not reach."""
     with Page(system.address) as page, Page(system.address) as other:
-        frame = page.frame(lambda h: h["belief"] and h["error"] is not None)
+        frame = page.frame(lambda h: h["belief"] and h["error"] is not None and h["latency_ms"] is not None)
         assert len(frame.arrays["ranges"]) == len(frame.arrays["predicted"]) == len(frame.arrays["sigma"])
         assert frame.header["latency_ms"] > 0
         page.done("obstacle", action="add", name="crate", obstacle=CRATE)
