@@ -387,8 +387,8 @@ def test_small_run(tmp_path, monkeypatch):
 
 def test_interrupted_and_killed_runs(process, tmp_path):
     """After Ctrl-C the same command continues; a killed one leaves neither workers nor services."""
-    args = ("presage.__main__", "experiment", "navigation", "--worlds", "maze", "--drives", "holonomic",
-            "--trials", "9", "--out", str(tmp_path))  # fmt: skip
+    options = ("--worlds", "maze", "--drives", "holonomic", "--trials", "9")
+    args = ("presage.__main__", "experiment", "--out", str(tmp_path), "navigation", *options)
     store = tmp_path / ".navigation-maze-holonomic.unfinished.jsonl"
     run = process(*args, env={"PRESAGE_WORKERS": "1"})
     assert wait_until(lambda: store.exists() and len(store.read_text().splitlines()) > 1, 90), run.output
