@@ -9,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import hypothesis
@@ -144,7 +143,7 @@ class Running:
         wait_until(lambda: text in self.output or not self.running, timeout)
         assert text in self.output, f"{self.name} did not print {text!r}:\n{self.output}"
 
-    def wait(self, timeout: float = WAIT_TIMEOUT_S) -> int:
+    def wait(self, timeout: float = 10.0) -> int:
         """Waits until the process ends by itself. Returns its exit status."""
         try:
             return self.child.wait(timeout)
@@ -154,11 +153,10 @@ class Running:
     def send(self, number: int) -> None:
         self.child.send_signal(number)
 
-    def stop(self, number: int = signal.SIGTERM, timeout: float = 10.0) -> tuple[int, float]:
-        """Sends a signal and waits for the end. Returns the exit status and the duration in s."""
-        began = time.monotonic()
+    def stop(self, number: int = signal.SIGTERM, timeout: float = 10.0) -> int:
+        """Sends a signal and waits for the end. Returns the exit status."""
         self.send(number)
-        return self.wait(timeout), time.monotonic() - began
+        return self.wait(timeout)
 
     def kill(self) -> None:
         self.child.kill()

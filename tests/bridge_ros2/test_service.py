@@ -124,7 +124,7 @@ def beside(tmp_path_factory, router):
 
             assert wait_until(heard, WAIT_TIMEOUT_S), bridge.output
             yield found
-            assert bridge.stop()[0] == 0
+            assert bridge.stop() == 0
     finally:
         processes.close()
 
@@ -217,4 +217,4 @@ def test_it_says_what_it_waits_for_and_what_is_wrong(processes, router):
         assert wait_until(complains_about_tf, WAIT_TIMEOUT_S), bridge.output
     theirs.kill()
     bridge.wait_for("the connection is lost")
-    assert nowhere.stop()[0] == bridge.stop()[0] == 0
+    assert nowhere.stop() == bridge.stop() == 0

@@ -54,7 +54,7 @@ def test_exceptions_and_zenohs_lines_are_json_objects(process, bus):
     assert bus.wait_matching(GOAL, WAIT_TIMEOUT_S)
     bus.put(GOAL, Goal(stamp_ns=0, pose=Pose(x=-1.0, y=0.0)).encode())
     running.wait_for("step failed")
-    assert running.stop()[0] == 0
+    assert running.stop() == 0
     found = objects(running.output)
     assert {(line["service"], line["robot"]) for line in found} == {("small", bus.robot)}
     failed = next(line for line in found if line["event"] == "step failed")
@@ -69,7 +69,7 @@ def test_the_routers_lines_are_json_objects(processes, free_port):
     port = free_port()
     running = processes.start("common.router", "--listen", f"tcp/127.0.0.1:{port}", "--log-json")
     running.wait_for("router listens")
-    assert running.stop()[0] == 0
+    assert running.stop() == 0
     assert {line["service"] for line in objects(running.output)} == {"router"}
 
 

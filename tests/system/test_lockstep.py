@@ -70,7 +70,7 @@ class Session:
             active = self.folder / f"{name}.mcap.active"
             assert wait_until(lambda: b"model/world.yaml" in active.read_bytes(), 30), started[0].output
             for running in reversed(started):
-                assert running.stop()[0] == 0, running.output
+                assert running.stop() == 0, running.output
         return read_recording(self.folder / f"{name}.mcap")
 
 
@@ -190,6 +190,6 @@ def test_settings_of_a_killed_service_and_its_successor(process, tmp_path):
         running = process("controller", "--gamma", gamma)
         assert wait_until(lambda at=known, t=setting: t in active.read_bytes()[at:], 30), recorder.output
         running.kill()  # without a clean end; the recorder must notice its successor anyway
-    assert recorder.stop()[0] == 0
+    assert recorder.stop() == 0
     config = json.loads(read_recording(tmp_path / "session.mcap").metadata["config:controller"]["config"])
     assert config["gamma"] == 0.41

@@ -244,8 +244,7 @@ def test_stop_while_waiting_for_the_router(secure_router):
         "simulator", "--security", str(secure_router.keys), "--connect", f"tcp/127.0.0.1:{port}"
     )
     waiting.wait_for("waiting")
-    status, _ = waiting.stop()
-    assert status == 0, waiting.output
+    assert waiting.stop() == 0, waiting.output
 
 
 def test_whole_loop_and_replayed_command(secure_router):
@@ -279,7 +278,7 @@ def test_whole_loop_and_replayed_command(secure_router):
             )  # fmt: skip
             if counter == "other_sources":
                 controller = started[SERVICES.index("controller")]
-                assert controller.stop()[0] == 0, controller.output
+                assert controller.stop() == 0, controller.output
                 assert wait_until(lambda: "controller" not in bus.alive(), 20)
                 bus.subscribe(TRUTH, truths, keep_all=True)
                 there = wait_for_message(truths, Truth, lambda t: np.hypot(t.twist.vx, t.twist.vy) < 1e-3)
@@ -288,7 +287,7 @@ def test_whole_loop_and_replayed_command(secure_router):
         after = wait_for_message(truths, Truth, lambda _: True)
     assert np.hypot(after.pose.x - 4.5, after.pose.y - 1.5) < 0.3
     assert np.hypot(after.pose.x - there.pose.x, after.pose.y - there.pose.y) < 0.05
-    statuses = {process.name: process.stop()[0] for process in reversed(started) if process.running}
+    statuses = {process.name: process.stop() for process in reversed(started) if process.running}
     assert set(statuses.values()) == {0}, statuses
     (recording,) = (started[3].log.parent / "recordings").glob("*.mcap")
     assert recording.stat().st_size > 10_000

@@ -21,6 +21,7 @@ NAMELESS = """[...document.querySelectorAll("button")].filter(
     (button) => !(button.innerText.trim() || button.getAttribute("aria-label"))).length"""
 CUT_OFF = """[...document.querySelectorAll(".keys, .services .scroll, .card h2, .vitals dd, #why")].filter(
     (box) => box.offsetParent && box.scrollWidth > box.clientWidth + 1).map((box) => box.id || box.className)"""
+VISIBLE = "document.getElementById(arg).checkVisibility()"
 OVERLAPPING = """((boxes) => boxes.filter(([, a], i) => boxes.some(([, b], k) => k < i && a.left < b.right - 1
     && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1)).map(([name]) => name))(
     ["#legend", "#zoom", "#why", "#sub", "#toolbar", "#joystick"].map((name) => [name, document.querySelector(name)])
@@ -90,16 +91,14 @@ def test_scenes_on_a_phone(look, scene):
         "matchMedia('(prefers-color-scheme: dark)').matches && document.documentElement.hasAttribute('data-dark')"
     )
     assert seen.see(NAMELESS) == 0
-    assert seen.page.locator("#empty").is_visible() == (scene == "empty")
+    seen.wait(f"{VISIBLE} === {str(scene == 'empty').lower()}", 5, "empty")
     if scene == "watching":
-        assert seen.page.locator("#watch-only").is_visible()
-        assert seen.page.locator("#pause").is_disabled()
+        seen.wait(f"{VISIBLE} && document.getElementById('pause').disabled", 5, "watch-only")
     if scene == "half-dead":
         assert "python -m services.estimator" in seen.page.locator(".notice code").inner_text()
     if scene not in {"empty", "half-dead"}:
         seen.wait("store.frame?.status")
-        assert seen.page.locator("#why").is_visible() == (scene in STANDING)
-        assert seen.see(OVERLAPPING) == []
+        seen.wait(f"{VISIBLE} === {str(scene in STANDING).lower()} && !{OVERLAPPING}.length", 5, "why")
 
 
 def test_widths_and_layouts(look):
@@ -175,7 +174,7 @@ def test_reason_and_journal(look):
     assert len(reason) > 80
     assert why.inner_text().split(":", 1)[1].strip() == reason
     rows = seen.page.locator("#journal li")
-    assert rows.count() == seen.see("store.journal.length")
+    seen.wait("document.querySelectorAll('#journal li').length === store.journal.length", 5)
     assert reason in rows.first.inner_text()
     assert "idle" in rows.last.inner_text()
 

@@ -248,9 +248,7 @@ def test_routers_end_cleanly(processes, free_port, number):
     router = processes.start("common.router", "--listen", endpoint, env=env)
     router.wait_for("router listens")
     assert endpoint in router.output
-    status, seconds = router.stop(number)
-    assert status == 0, router.output
-    assert seconds < 5
+    assert router.stop(number) == 0, router.output
     assert "Traceback" not in router.output
 
 

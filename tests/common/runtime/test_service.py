@@ -138,8 +138,7 @@ def test_requests_to_itself(small):
         assert small.until(lambda h, n=count: h.counters.get("replies") == n), small.running.output
         assert text in small.latest.note
     small.goal(1.0, 1.0, cancel=True)
-    status, seconds = small.running.stop()
-    assert (status, seconds < 5) == (0, True), small.running.output
+    assert small.running.stop() == 0, small.running.output
 
 
 def test_replies_refusals_and_exceptions_of_requests(small):
@@ -171,9 +170,7 @@ def test_a_failing_timer_does_not_block_the_service(bus, process):
 def test_signals(small, number, step_s):
     if step_s:
         small.goal(step_s)
-    status, seconds = small.running.stop(number)
-    assert status == 0, small.running.output
-    assert seconds < PATIENCE / 3  # at once, or after the step, but for a busy machine
+    assert small.running.stop(number) == 0, small.running.output
     assert "closed" in small.running.output
     assert small.running.output.rstrip().endswith("ended")
     assert "Traceback" not in small.running.output
@@ -184,18 +181,14 @@ def test_signals(small, number, step_s):
 def test_signals_before_the_loop(process, when, text):
     running = process(SMALL, "--slow", when)
     running.wait_for(text)
-    status, seconds = running.stop()
-    assert status == 0, running.output
-    assert 0.3 < seconds < PATIENCE / 3
+    assert running.stop() == 0, running.output
     assert "closed" in running.output
 
 
 def test_without_a_router(process, free_port):
     running = process(SMALL, env={"PRESAGE_CONNECT": f"tcp/127.0.0.1:{free_port()}"})
     running.wait_for("ready")
-    status, seconds = running.stop()
-    assert status == 0, running.output
-    assert seconds < PATIENCE / 3  # at once, but for a busy machine
+    assert running.stop() == 0, running.output
 
 
 def test_errors_at_the_start(router, process):
