@@ -102,7 +102,7 @@ def invalid_settings(secure_router):
 def test_invalid_credentials(secure_router):
     for reason, settings in invalid_settings(secure_router).items():
         assert "not let in" in secure_router.intrude(settings), reason
-        secure_router.router.wait_for(f"why='{reason}")
+        secure_router.router.wait_for(f"reason='{reason}")
     # The same client with valid credentials is accepted, so these are the reason.
     assert "not let in" not in secure_router.intrude(secure_router.settings("observer"))
 
@@ -145,7 +145,7 @@ def test_forbidden_actions(secure_router):
             assert wait_until(lambda i=inbox: len(i) > 0, WAIT_TIMEOUT_S)
             assert inbox.get(0).payload == payload
     assert goals.get(0) is calls.get(0) is None
-    for line in (f"key={KEY_PREFIX}/cmd_vel", "observer why=put", "observer why=query", "estimator why=put"):
+    for line in (f"key={KEY_PREFIX}/cmd_vel", "observer reason=put", "observer reason=query", "estimator reason=put"):
         secure_router.router.wait_for(line)
 
 
