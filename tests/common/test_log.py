@@ -26,7 +26,7 @@ def objects(text: str) -> list[dict]:
     return found
 
 
-def test_every_line_is_a_json_object():
+def test_lines_as_json():
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     noisy = Path(__file__).with_name("noisy.py")
     done = subprocess.run([sys.executable, str(noisy)], env=environment, capture_output=True, text=True, timeout=60)
@@ -47,7 +47,7 @@ def test_every_line_is_a_json_object():
     assert "in fail" in thread["exception"]
 
 
-def test_exceptions_and_zenohs_lines_are_json_objects(process, bus):
+def test_exceptions_and_zenohs_lines(process, bus):
     small = Path(__file__).with_name("small_service.py")
     running = process(small, "--log-json", env={"RUST_LOG": "info"})
     assert wait_until(lambda: "small" in bus.alive(), WAIT_TIMEOUT_S), running.output

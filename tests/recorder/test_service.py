@@ -219,9 +219,7 @@ def test_parts_by_time(recorder, recorder_health, bus, logs):
 
 def test_presage_record_beside_a_recorder(recorder, request_recording, process, bus, tmp_path, logs):
     first = recorder("--file", "first")
-    second = process(
-        "presage.__main__", "record", "--out", str(tmp_path / "second")
-    )  # connects as the environment says
+    second = process("presage.__main__", "record", "--out", str(tmp_path / "second"))
     second.wait_for("ready")
     inbox, own, heard = Inbox(), HEALTH.key(bus.robot, "recorder"), Counter()
     bus.subscribe(HEALTH, inbox, keep_all=True)

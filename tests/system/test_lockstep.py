@@ -181,7 +181,7 @@ def test_replay_of_an_imported_log(session, tmp_path):
         assert (status, says in output) == (2, True), output
 
 
-def test_settings_of_a_killed_service_and_its_successor(process, tmp_path):
+def test_settings_of_a_successor(process, tmp_path):
     recorder = process("recorder", "--directory", str(tmp_path), "--file", "session")
     recorder.wait_for("ready")
     active = tmp_path / "session.mcap.active"

@@ -11,11 +11,10 @@ from common.bus.bus import Link, open_bus, wait_until
 from common.geometry import se2
 from common.messages.definitions import Goal, Pose
 from common.messages.topics import GOAL
-from tests.bridge_ros2.independent import encode, header, quaternion, vector
+from tests.bridge_ros2.independent import planar_pose, pose_stamped
 from tests.conftest import WAIT_TIMEOUT_S, Processes
 from tests.system.ros2_robot import Ros
 
-POSE = "geometry_msgs/msg/PoseStamped"
 GOAL_POSE = "geometry_msgs::msg::dds_::PoseStamped_"
 
 
@@ -35,11 +34,6 @@ def assert_no_errors(robot):
     assert robot.running
     assert "Error" not in robot.output
     assert not last_report(robot)["contact"]
-
-
-def goal_message(x, y):
-    pose = {"position": vector(x, y), "orientation": quaternion()}
-    return encode(POSE, {"header": header(0, "map"), "pose": pose})
 
 
 def arrived(now):
@@ -78,9 +72,9 @@ def test_rmw_zenoh_robot(services):
     with Ros(port, "rmw_zenoh", "jazzy") as rviz:
         put = rviz.publisher("goal_pose", GOAL_POSE)
         assert wait_until(lambda: bool(rviz.kept[-1].matching_status.matching), WAIT_TIMEOUT_S)
-        put(goal_message(4.2, 1.5))
+        put(pose_stamped(planar_pose(4.2, 1.5), "map"))
         wait_until_report(robot, arrived, "no way", bridge)
-        put(goal_message(12.0, 1.5))
+        put(pose_stamped(planar_pose(12.0, 1.5), "map"))
         wait_until_report(robot, lambda now: now["speed"] > 0.3, "it does not go on", bridge)
     bridge.kill()
     wait_until_report(robot, lambda now: now["speed"] < 0.01, "it drives on without the bridge")

@@ -106,7 +106,6 @@ def test_death_and_restart(process, bus):
         ("simulator", ("--scanner", "sonar"), "no scanner 'sonar': choose one of tim571"),
         ("simulator", ("--start", "0.1,0.1"), "the robot needs 0.27 m around it"),
         ("simulator", ("--connect", "nonsense"), "nonsense"),
-        ("recorder", ("--directory", "/proc/nowhere"), "/proc/nowhere"),
         ("controller", ("--gamma", "7"), "gamma"),
     ],
 )

@@ -60,7 +60,7 @@ def test_precise_with_own_simulator(process, bus, world, train, tmp_path):
     assert_used("precise", process, bus, world, tmp_path)
 
 
-def test_paper_with_running_scanner_and_interrupt(process, bus, world, train, tmp_path):
+def test_interrupted_paper_training(process, bus, world, train, tmp_path):
     process("simulator", "--world", world, "--beams", "61")
     assert wait_until(lambda: "simulator" in bus.alive(), 60)
     training = train("paper", 100)

@@ -21,7 +21,7 @@ SEEN = """(() => {
         window.seen.push([frame.t, now, belief && truth ? Math.hypot(belief.x - truth.x, belief.y - truth.y) : -1]);
         take(frame, now);
     };
-})()"""  # from here on: stamp in s, arrival in ms, m between what is drawn as believed and as true
+})()"""  # from now on: stamp in s, arrival in ms, distance in m between drawn belief and truth
 COLOURS = """(() => {
     const canvas = document.getElementById("c-scan");
     return new Set(canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data).size;
@@ -30,7 +30,7 @@ CRATE = {"box": {"center": [6.0, 1.5], "size": [0.4, 0.4]}}
 
 
 class System:
-    """Everything that `presage up` starts, and a recorder that waits to be told."""
+    """Everything that `presage up` starts."""
 
     def __init__(self, folder):
         self.processes = Processes(folder)
@@ -59,7 +59,7 @@ def system(tmp_path_factory):
 
 @pytest.fixture
 def page(browser, system):
-    """A visitor who sees the robot tracked."""
+    """A visitor of a robot that is tracked."""
     from tests.viewer.browser import visit  # without playwright these tests are skipped
 
     seen = visit(browser, system.address)

@@ -1,4 +1,4 @@
-"""The page in a real browser, before made-up sessions: every state, several widths, mouse, fingers and keys."""
+"""The page in a real browser with artificial sessions: all states, several widths, mouse, touch and keyboard."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.viewer.stub_server import MAPPED
 
 browser_tools = pytest.importorskip("tests.viewer.browser", reason="NO PLAYWRIGHT: the page is not tested")
 SCENES = ("planning", "blocked", "exploring", "ambiguous", "lost", "half-dead", "empty", "watching")
-STANDING = {"blocked", "exploring", "ambiguous", "lost"}  # and it is said why
+STANDING = {"blocked", "exploring", "ambiguous", "lost"}  # scenes that show a reason
 PHONE = {"width": 360, "height": 740, "has_touch": True, "is_mobile": True}
 NAMELESS = """[...document.querySelectorAll("button")].filter(
     (button) => !(button.innerText.trim() || button.getAttribute("aria-label"))).length"""
@@ -56,7 +56,7 @@ TWO_METRES_TO_GO = """((field) => {
 
 @pytest.fixture(scope="module")
 def stub(tmp_path_factory):
-    """Calls start a visit of a scene."""
+    """Address of the stub server."""
     processes, port = Processes(tmp_path_factory.mktemp("stub")), free_tcp_port()
     processes.start("tests.viewer.stub_server", "--port", str(port))
     try:
@@ -68,7 +68,7 @@ def stub(tmp_path_factory):
 
 @pytest.fixture
 def look(browser, stub):
-    """Calls open a scene; its console must have stayed silent."""
+    """A function that opens a scene. Fails if the browser's console has messages."""
     visits = []
 
     def start(scene, **options):
@@ -179,12 +179,9 @@ def test_reason_and_journal(look):
     assert "idle" in rows.last.inner_text()
 
 
-def test_goals_by_click_and_drag(look):
+def test_goals_by_drag(look):
     seen = look("tracking")
     seen.wait("store.world && store.frame")
-    seen.click(9.0, 1.5)
-    seen.wait("store.frame.status.goal && Math.abs(store.frame.status.goal.x - 9) < 0.05", 10)
-    assert seen.see("store.frame.status.goal.yaw_tolerance") is None
     seen.drag((12.0, 1.5), (12.0, 2.5))
     seen.wait("store.frame.status.goal.yaw_tolerance === 0.15", 10)
     assert seen.see("store.frame.status.goal.yaw") == pytest.approx(1.571, abs=0.05)
@@ -207,7 +204,7 @@ def test_axis_labels(look):
 
 
 class Fingers:
-    """On a touch screen."""
+    """Touches of a touch screen."""
 
     def __init__(self, seen):
         self.session = seen.page.context.new_cdp_session(seen.page)
@@ -259,7 +256,7 @@ def test_space_key_after_a_click(look):
     seen.wait("store.paused", 5)
     seen.page.locator("#pause").focus()
     seen.page.keyboard.press("Tab")
-    assert seen.see("document.activeElement.id") == "step"  # who goes by keys stays where they are
+    assert seen.see("document.activeElement.id") == "step"  # the focus follows the keyboard
 
 
 def test_server_that_comes_back(browser, processes):

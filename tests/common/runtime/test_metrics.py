@@ -106,7 +106,7 @@ def test_metrics_of_a_real_service(bus, process):
     assert "Traceback" not in running.output
 
 
-def test_prometheus_is_imported_only_if_it_is_used():
+def test_lazy_import_of_prometheus():
     program = "import sys, common.runtime.service, common.router; print('prometheus_client' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

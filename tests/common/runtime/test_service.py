@@ -99,7 +99,7 @@ def test_health_is_published_once_a_second(small):
     assert small.latest.uptime - last.uptime > 0.5
 
 
-def test_undecodable_payloads_are_counted_logged_and_dropped(small):
+def test_undecodable_payloads(small):
     # On health, where every payload is kept: on a newest-only key one may take the place of another before it is read.
     key = HEALTH.key(small.bus.robot, "intruder")
     assert small.bus.wait_matching(HEALTH, PATIENCE, key=key)
@@ -113,7 +113,7 @@ def test_undecodable_payloads_are_counted_logged_and_dropped(small):
     assert small.latest.counters["failed"] == 0
 
 
-def test_exceptions_are_counted_and_user_errors_end_the_service(small):
+def test_exceptions_and_user_errors(small):
     small.goal(-1)
     assert small.until(lambda h: h.counters["failed"] == 1)
     assert "a bug in on_message" in small.running.output
@@ -141,7 +141,7 @@ def test_requests_to_itself(small):
     assert small.running.stop() == 0, small.running.output
 
 
-def test_replies_refusals_and_exceptions_of_requests(small):
+def test_results_of_requests(small):
     def ask(x: float) -> Reply:
         return small.bus.ask(TELEPORT, PoseRequest(pose=Pose(x=x, y=0.0)), Reply)
 
@@ -160,7 +160,7 @@ def test_replies_refusals_and_exceptions_of_requests(small):
     assert reply.versions["python"]
 
 
-def test_a_failing_timer_does_not_block_the_service(bus, process):
+def test_failing_timer(bus, process):
     beside = Beside(bus, process(SMALL, "--fail", "timer"))
     beside.bus.put(SCAN, scan(5))
     assert wait_until(lambda: len(beside.commands) == 1, PATIENCE)

@@ -219,10 +219,10 @@ def test_selection_refusals(tmp_path):
     ):
         with pytest.raises(UserError, match=why):
             select_scans(job(file, **wrong), scans)
-    for estimator_options in ({"start": 0.2}, {"end": 0.2}, {"every": 2}):
+    for wrong in ({"start": 0.2}, {"end": 0.2}, {"every": 2}):
         with pytest.raises(UserError, match="no stamps, which --start, --end and --every need"):
-            select_scans(job(file, **estimator_options), unstamped)
-    with pytest.raises(UserError, match="mode track needs the pose of the first scan"):  # initial_pose is of another
+            select_scans(job(file, **wrong), unstamped)
+    with pytest.raises(UserError, match="mode track needs the pose of the first scan"):  # initial_pose is of scan 0
         localize(job(file, start=0.2, mode="track"), CONSOLE)
 
 
