@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import hypothesis
@@ -44,7 +45,8 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if (ROOT / "tests" / "system") in item.path.parents:
             item.add_marker(pytest.mark.system)
-    waiting = {item.path for item in items if {"processes", "router", "browser"} & set(item.fixturenames)}
+    starting = {"processes", "module_processes", "router", "browser"}
+    waiting = {item.path for item in items if starting & set(item.fixturenames)}
     items.sort(key=lambda item: (item.get_closest_marker("docker") is None, item.path not in waiting))
 
 
@@ -199,11 +201,11 @@ class Processes:
                 preexec_fn=end_with_this_process(signal.SIGKILL),  # pytest-timeout ends this process without a teardown
             )
 
-    def start_router(self) -> tuple[Running, int]:
+    def start_router(self, *args: str) -> tuple[Running, int]:
         """Starts a router. Returns it and its port; tries another port if a process has just taken the first one."""
         for _ in range(5):
             port = free_tcp_port()
-            running = self.start("common.router", "--listen", f"tcp/127.0.0.1:{port}")
+            running = self.start("common.router", "--listen", f"tcp/127.0.0.1:{port}", *args)
             wait_until(lambda r=running, p=port: not r.running or accepts(p), WAIT_TIMEOUT_S)
             if running.running:
                 return running, port
@@ -227,11 +229,8 @@ class Processes:
 @pytest.fixture(scope="module")
 def router(tmp_path_factory):
     """Port of a router process, one for each test module."""
-    processes = Processes(tmp_path_factory.mktemp("router"))
-    try:
-        yield processes.start_router()[1]
-    finally:
-        processes.close()
+    with closing(Processes(tmp_path_factory.mktemp("router"))) as started:
+        yield started.start_router()[1]
 
 
 @pytest.fixture
@@ -251,26 +250,27 @@ def bus(link):
 @pytest.fixture
 def process(tmp_path, link):
     """A function that starts processes of this test's robot, connected to its router. They end after the test."""
-    processes = Processes(tmp_path)
+    with closing(Processes(tmp_path)) as started:
 
-    def start(name, *args, env=None, fresh=False):
-        talk = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": link.robot}
-        return processes.start(name, *args, env={**talk, **(env or {})}, fresh=fresh)
+        def start(name, *args, env=None, fresh=False):
+            talk = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": link.robot}
+            return started.start(name, *args, env={**talk, **(env or {})}, fresh=fresh)
 
-    try:
         yield start
-    finally:
-        processes.close()
 
 
 @pytest.fixture
 def processes(tmp_path):
     """Starts processes without a router, for tests of routers and of processes that fail before they connect."""
-    started = Processes(tmp_path)
-    try:
+    with closing(Processes(tmp_path)) as started:
         yield started
-    finally:
-        started.close()
+
+
+@pytest.fixture(scope="module")
+def module_processes(tmp_path_factory):
+    """Starts processes that all tests of a module share."""
+    with closing(Processes(tmp_path_factory.mktemp("module"))) as started:
+        yield started
 
 
 @pytest.fixture

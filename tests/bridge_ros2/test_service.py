@@ -20,7 +20,7 @@ from common.messages.requests import LocaliseRequest, Reply
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, LOCALISE, ODOM, SCAN
 from tests.bridge_ros2 import independent as other
 from tests.bridge_ros2.made import belief
-from tests.conftest import WAIT_TIMEOUT_S, Processes
+from tests.conftest import WAIT_TIMEOUT_S
 from tests.system.ros2_robot import BEGIN, Ros, transform, transforms
 
 LASER, ODOMETRY = "sensor_msgs::msg::dds_::LaserScan_", "nav_msgs::msg::dds_::Odometry_"
@@ -81,34 +81,30 @@ class Beside:
 
 
 @pytest.fixture(scope="module")
-def beside(tmp_path_factory, router):
+def beside(module_processes, router):
     """A bridge between both sides, which here share one router."""
-    processes = Processes(tmp_path_factory.mktemp("beside"))
-    try:
-        link = Link(robot="rover", connect=(f"tcp/127.0.0.1:{router}",))
-        with open_bus(link) as bus, Ros(router, "rmw_zenoh", "jazzy") as node:
-            found = Beside(bus, node)
-            environment = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": "rover"}
-            args = ("--ros-connect", f"tcp/127.0.0.1:{router}", "--publish-map", "--world", "maze")
-            bridge = processes.start("bridge_ros2", *args, env=environment)
-            bridge.wait_for("ready")
-            assert bus.wait_matching(BELIEF, WAIT_TIMEOUT_S)
-            assert bus.wait_matching(CMD_VEL, WAIT_TIMEOUT_S)
-            last = time.monotonic()
+    link = Link(robot="rover", connect=(f"tcp/127.0.0.1:{router}",))
+    with open_bus(link) as bus, Ros(router, "rmw_zenoh", "jazzy") as node:
+        found = Beside(bus, node)
+        environment = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": "rover"}
+        args = ("--ros-connect", f"tcp/127.0.0.1:{router}", "--publish-map", "--world", "maze")
+        bridge = module_processes.start("bridge_ros2", *args, env=environment)
+        bridge.wait_for("ready")
+        assert bus.wait_matching(BELIEF, WAIT_TIMEOUT_S)
+        assert bus.wait_matching(CMD_VEL, WAIT_TIMEOUT_S)
+        last = time.monotonic()
 
-            def heard():  # the first messages may be sent before the bridge's subscription is known
-                nonlocal last
-                if time.monotonic() - last > 0.2:
-                    last, found.stamp = time.monotonic(), found.stamp + 10**8
-                    found.put["odom"](odometry(found.stamp))
-                    found.put["scan"](other.laser_scan(found.stamp, RANGES))
-                return all(found.inbox.received[topic.key("rover")] > 0 for topic in (SCAN, ODOM))
+        def heard():  # the first messages may be sent before the bridge's subscription is known
+            nonlocal last
+            if time.monotonic() - last > 0.2:
+                last, found.stamp = time.monotonic(), found.stamp + 10**8
+                found.put["odom"](odometry(found.stamp))
+                found.put["scan"](other.laser_scan(found.stamp, RANGES))
+            return all(found.inbox.received[topic.key("rover")] > 0 for topic in (SCAN, ODOM))
 
-            assert wait_until(heard, WAIT_TIMEOUT_S), bridge.output
-            yield found
-            assert bridge.stop() == 0
-    finally:
-        processes.close()
+        assert wait_until(heard, WAIT_TIMEOUT_S), bridge.output
+        yield found
+        assert bridge.stop() == 0
 
 
 def test_published_beliefs(beside):

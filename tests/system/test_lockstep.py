@@ -15,7 +15,7 @@ from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, PREDICTI
 from presage.logs.importing import ImportOptions, import_command
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.reader import read_recording
-from tests.conftest import ROOT, Processes, wait_for_message
+from tests.conftest import ROOT, wait_for_message
 from tests.estimator.models import change_weights
 from tests.presage.logs.drives import SCANS as SCANS_OF_LOG
 from tests.presage.logs.drives import Bag, write_bag
@@ -29,8 +29,8 @@ WEIGHTS = "corridor-precise"
 class Session:
     """Records localisation and driving for SCANS scans, with weights that differ from the shipped ones."""
 
-    def __init__(self, folder, port) -> None:
-        self.folder, self.models, self.processes = folder, folder / "models", Processes(folder)
+    def __init__(self, processes, port) -> None:
+        self.folder, self.models, self.processes = processes.folder, processes.folder / "models", processes
         self.link = Link(robot="lockstep", connect=(f"tcp/127.0.0.1:{port}",))
         self.models.mkdir()
         for suffix in ("safetensors", "json"):
@@ -75,12 +75,8 @@ class Session:
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory, router):
-    made = Session(tmp_path_factory.mktemp("lockstep"), router)
-    try:
-        yield made
-    finally:
-        made.processes.close()
+def session(module_processes, router):
+    return Session(module_processes, router)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from common.geometry import se2
 from common.messages.definitions import Goal, Pose
 from common.messages.topics import GOAL
 from tests.bridge_ros2.independent import planar_pose, pose_stamped
-from tests.conftest import WAIT_TIMEOUT_S, Processes
+from tests.conftest import WAIT_TIMEOUT_S
 from tests.system.ros2_robot import Ros
 
 GOAL_POSE = "geometry_msgs::msg::dds_::PoseStamped_"
@@ -44,24 +44,20 @@ def arrived(now):
 
 
 @pytest.fixture(scope="module")
-def services(tmp_path_factory):
+def services(module_processes):
     """Estimator and controller, which take seconds to start, on one router; the robot uses a second router."""
-    processes = Processes(tmp_path_factory.mktemp("ros2"))
-    try:
-        port, ros = processes.start_router()[1], processes.start_router()[1]
-        environment = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "rover", "OMP_NUM_THREADS": "1"}
+    port, ros = module_processes.start_router()[1], module_processes.start_router()[1]
+    environment = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "rover", "OMP_NUM_THREADS": "1"}
 
-        def start(name, *args):
-            return processes.start(name, *args, env=environment)
+    def start(name, *args):
+        return module_processes.start(name, *args, env=environment)
 
-        start("estimator")
-        controller = start("controller")
-        link = Link(robot="rover", connect=(environment["PRESAGE_CONNECT"],))
-        with open_bus(link) as bus:
-            assert wait_until(lambda: {"estimator", "controller"} <= bus.alive(timeout=0.5), 60)
-            yield start, bus, ros, controller
-    finally:
-        processes.close()
+    start("estimator")
+    controller = start("controller")
+    link = Link(robot="rover", connect=(environment["PRESAGE_CONNECT"],))
+    with open_bus(link) as bus:
+        assert wait_until(lambda: {"estimator", "controller"} <= bus.alive(timeout=0.5), 60)
+        yield start, bus, ros, controller
 
 
 def test_rmw_zenoh_robot(services):

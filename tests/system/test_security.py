@@ -31,23 +31,18 @@ SERVICES = ("simulator", "estimator", "controller", "recorder", "viewer")
 class SecureRouter:
     """A router in secure mode, and clients with valid or invalid credentials."""
 
-    def __init__(self, folder: Path) -> None:
-        self.processes = Processes(folder)
-        self.keys, self.others = folder / "keys", folder / "others"
+    def __init__(self, processes: Processes) -> None:
+        self.processes = processes
+        self.keys, self.others = processes.folder / "keys", processes.folder / "others"
         secure.init(self.keys)
         secure.init(self.others)
-        self.router, self.port = self.start_router()
+        self.router, self.port = processes.start_router("--security", str(self.keys))
 
-    def start_router(self, port=None):
-        for _ in range(5):
-            taken = port or free_tcp_port()
-            running = self.processes.start(
-                "common.router", "--listen", f"tcp/127.0.0.1:{taken}", "--security", str(self.keys)
-            )
-            wait_until(lambda r=running, p=taken: not r.running or accepts(p), WAIT_TIMEOUT_S)
-            if running.running:
-                return running, taken
-        raise AssertionError(running.output)
+    def restart_router(self):
+        self.router.stop()
+        listen = f"tcp/127.0.0.1:{self.port}"
+        self.router = self.processes.start("common.router", "--listen", listen, "--security", str(self.keys))
+        assert wait_until(lambda: accepts(self.port), WAIT_TIMEOUT_S), self.router.output
 
     @contextmanager
     def session(self, name, **more):
@@ -73,12 +68,8 @@ class SecureRouter:
 
 
 @pytest.fixture(scope="module")
-def secure_router(tmp_path_factory):
-    made = SecureRouter(tmp_path_factory.mktemp("guarded"))
-    try:
-        yield made
-    finally:
-        made.processes.close()
+def secure_router(module_processes):
+    return SecureRouter(module_processes)
 
 
 def invalid_settings(secure_router):
@@ -187,15 +178,13 @@ def test_tokens_seen_by_newcomers(secure_router):
 
 def test_removed_user(secure_router):
     secure.add(secure_router.keys, "operator", "anna")
-    secure_router.router.stop()
-    secure_router.router, _ = secure_router.start_router(secure_router.port)
+    secure_router.restart_router()
     annas = secure_router.settings("anna")
     assert "not let in" not in secure_router.intrude(annas)
     kept = secure_router.keys / "kept"
     (secure_router.keys / "anna").rename(kept)  # a copy of the removed user's credentials
     secure.remove(secure_router.keys, "anna")
-    secure_router.router.stop()
-    secure_router.router, _ = secure_router.start_router(secure_router.port)
+    secure_router.restart_router()
     kept.rename(secure_router.keys / "anna")
     assert "not let in" in secure_router.intrude({**annas, "connect/timeout_ms": 1000})
     secure_router.router.wait_for("password'")

@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from tests.conftest import ROOT, Processes
+from tests.conftest import ROOT
 from tests.viewer.client import Page, is_complete, page_of
 
 STATIC = ROOT / "services" / "viewer" / "static"
@@ -32,11 +32,11 @@ CRATE = {"box": {"center": [6.0, 1.5], "size": [0.4, 0.4]}}
 class System:
     """Everything that `presage up` starts."""
 
-    def __init__(self, folder):
-        self.processes = Processes(folder)
+    def __init__(self, processes):
+        self.processes = processes
         _, port = self.processes.start_router()
         self.environment = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "robot"}
-        self.folder, self.running = folder / "recordings", {}
+        self.folder, self.running = processes.folder / "recordings", {}
         self.folder.mkdir()
         for name in ("simulator", "estimator", "controller"):
             self.start(name)
@@ -49,12 +49,8 @@ class System:
 
 
 @pytest.fixture(scope="module")
-def system(tmp_path_factory):
-    made = System(tmp_path_factory.mktemp("system"))
-    try:
-        yield made
-    finally:
-        made.processes.close()
+def system(module_processes):
+    return System(module_processes)
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 from common.bus.bus import wait_until
 from common.geometry.cell_distance import signed_distance
 from common.geometry.occupancy_grid import FREE, OCCUPIED, UNKNOWN
-from tests.conftest import WAIT_TIMEOUT_S, Processes, accepts, free_tcp_port
+from tests.conftest import WAIT_TIMEOUT_S, accepts, free_tcp_port
 from tests.viewer.stub_server import MAPPED
 
 browser_tools = pytest.importorskip("tests.viewer.browser", reason="NO PLAYWRIGHT: the page is not tested")
@@ -55,15 +55,12 @@ TWO_METRES_TO_GO = """((field) => {
 
 
 @pytest.fixture(scope="module")
-def stub(tmp_path_factory):
+def stub(module_processes):
     """Address of the stub server."""
-    processes, port = Processes(tmp_path_factory.mktemp("stub")), free_tcp_port()
-    processes.start("tests.viewer.stub_server", "--port", str(port))
-    try:
-        assert wait_until(lambda: accepts(port), WAIT_TIMEOUT_S)
-        yield f"http://127.0.0.1:{port}"
-    finally:
-        processes.close()
+    port = free_tcp_port()
+    module_processes.start("tests.viewer.stub_server", "--port", str(port))
+    assert wait_until(lambda: accepts(port), WAIT_TIMEOUT_S)
+    return f"http://127.0.0.1:{port}"
 
 
 @pytest.fixture
