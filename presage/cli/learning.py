@@ -73,7 +73,7 @@ def train(
     from presage.learning.train_drive import TrainDriveOptions, train_from_drive
     from presage.logs.options import LogSettings
     from presage.session.running import link_of
-    from services.estimator.paper.training import Recipe as PaperRecipe
+    from services.estimator.paper.training import TrainingParameters
     from services.estimator.precise.learning.field_learning import Recipe
     from services.estimator.precise.learning.weights import FOLDER
     from services.simulator.settings import SimulatorSettings
@@ -102,9 +102,9 @@ def train(
             precise.TrainPreciseOptions(world, chosen, tuple(simulator), folder, samples or 5000, recipe), link, console
         )
     else:
-        paper_recipe = PaperRecipe(tuning.epochs, tuning.batch, tuning.learning_rate, seed)
+        parameters = TrainingParameters(tuning.epochs, tuning.batch, tuning.learning_rate, seed)
         options = paper.TrainPaperOptions(
-            world, preset, chosen, tuple(simulator), folder, samples or 13_000, paper_recipe
+            world, preset, chosen, tuple(simulator), folder, samples or 13_000, parameters
         )
         paper.train(options, link, console)
 
