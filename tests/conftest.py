@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import os
 import signal
 import socket
 import subprocess
 import sys
-import time
+from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 
 import hypothesis
 import psutil
 import pytest
+import structlog
 
 from common.bus.bus import Link, open_bus, wait_until
 from common.bus.inbox import Sample
@@ -77,7 +79,8 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if (ROOT / "tests" / "system") in item.path.parents:
             item.add_marker(pytest.mark.system)
-    waiting = {item.path for item in items if {"processes", "router", "browser"} & set(item.fixturenames)}
+    starting = {"processes", "module_processes", "router", "browser"}
+    waiting = {item.path for item in items if starting & set(item.fixturenames)}
     items.sort(key=lambda item: (item.get_closest_marker("docker") is None, item.path not in waiting))
 
 
@@ -100,6 +103,15 @@ def _no_settings_from_outside(monkeypatch, tmp_path):
     for name in [name for name in os.environ if name.startswith("PRESAGE_")]:
         monkeypatch.delenv(name)
     monkeypatch.setenv("PRESAGE_RUNTIME_DIR", str(tmp_path / "sessions"))
+
+
+@pytest.fixture(autouse=True)
+def _restored_logging():
+    """Undoes the set-up of logging by commands that a test runs in this process, such as `presage replay --with`."""
+    level = logging.root.level
+    yield
+    logging.root.setLevel(level)
+    structlog.reset_defaults()
 
 
 def free_tcp_port() -> int:
@@ -167,7 +179,7 @@ class Running:
         wait_until(lambda: text in self.output or not self.running, timeout)
         assert text in self.output, f"{self.name} did not print {text!r}:\n{self.output}"
 
-    def wait(self, timeout: float = WAIT_TIMEOUT_S) -> int:
+    def wait(self, timeout: float = 10.0) -> int:
         """Waits until the process ends by itself. Returns its exit status."""
         try:
             return self.child.wait(timeout)
@@ -177,11 +189,10 @@ class Running:
     def send(self, number: int) -> None:
         self.child.send_signal(number)
 
-    def stop(self, number: int = signal.SIGTERM, timeout: float = 10.0) -> tuple[int, float]:
-        """Sends a signal and waits for the end. Returns the exit status and the duration in s."""
-        began = time.monotonic()
+    def stop(self, number: int = signal.SIGTERM, timeout: float = 10.0) -> int:
+        """Sends a signal and waits for the end. Returns the exit status."""
         self.send(number)
-        return self.wait(timeout), time.monotonic() - began
+        return self.wait(timeout)
 
     def kill(self) -> None:
         self.child.kill()
@@ -224,11 +235,11 @@ class Processes:
                 preexec_fn=end_with_this_process(signal.SIGKILL),  # pytest-timeout ends this process without a teardown
             )
 
-    def start_router(self) -> tuple[Running, int]:
+    def start_router(self, *args: str) -> tuple[Running, int]:
         """Starts a router. Returns it and its port; tries another port if a process has just taken the first one."""
         for _ in range(5):
             port = free_tcp_port()
-            running = self.start("common.router", "--listen", f"tcp/127.0.0.1:{port}")
+            running = self.start("common.router", "--listen", f"tcp/127.0.0.1:{port}", *args)
             wait_until(lambda r=running, p=port: not r.running or accepts(p), WAIT_TIMEOUT_S)
             if running.running:
                 return running, port
@@ -252,11 +263,8 @@ class Processes:
 @pytest.fixture(scope="module")
 def router(tmp_path_factory):
     """Port of a router process, one for each test module."""
-    processes = Processes(tmp_path_factory.mktemp("router"))
-    try:
-        yield processes.start_router()[1]
-    finally:
-        processes.close()
+    with closing(Processes(tmp_path_factory.mktemp("router"))) as started:
+        yield started.start_router()[1]
 
 
 @pytest.fixture
@@ -276,26 +284,27 @@ def bus(link):
 @pytest.fixture
 def process(tmp_path, link):
     """A function that starts processes of this test's robot, connected to its router. They end after the test."""
-    processes = Processes(tmp_path)
+    with closing(Processes(tmp_path)) as started:
 
-    def start(name, *args, env=None, fresh=False):
-        talk = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": link.robot}
-        return processes.start(name, *args, env={**talk, **(env or {})}, fresh=fresh)
+        def start(name, *args, env=None, fresh=False):
+            talk = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": link.robot}
+            return started.start(name, *args, env={**talk, **(env or {})}, fresh=fresh)
 
-    try:
         yield start
-    finally:
-        processes.close()
 
 
 @pytest.fixture
 def processes(tmp_path):
     """Starts processes without a router, for tests of routers and of processes that fail before they connect."""
-    started = Processes(tmp_path)
-    try:
+    with closing(Processes(tmp_path)) as started:
         yield started
-    finally:
-        started.close()
+
+
+@pytest.fixture(scope="module")
+def module_processes(tmp_path_factory):
+    """Starts processes that all tests of a module share."""
+    with closing(Processes(tmp_path_factory.mktemp("module"))) as started:
+        yield started
 
 
 @pytest.fixture

@@ -118,8 +118,8 @@ class Refusals:
             # Only known topics, because a peer may invent keys.
             topic = next((name for name in found.key.split("/")[2:3] if name in NAMES), "")
             if self._may_log(f"{found.reason} {found.name} {topic}"):
-                named = {name: value for name, value in (("who", found.name), ("key", found.key)) if value}
-                self._log.warning("refused", why=found.reason, **named, so_far=self.counts[found.reason])
+                named = {name: value for name, value in (("name", found.name), ("key", found.key)) if value}
+                self._log.warning("refused", reason=found.reason, **named, so_far=self.counts[found.reason])
 
 
 @contextmanager

@@ -82,10 +82,10 @@ def paper(epochs: int) -> Learn:
 
     def learn(scans: TrainingScans) -> tuple[GenerativeModel, int]:
         norm = Normalisation.of(scans.world.bounds, float(scans.ranges.max()))
-        recipe = training.Recipe(epochs=epochs, learning_rate=3e-3)
+        parameters = training.TrainingParameters(epochs=epochs, learning_rate=3e-3)
         data = training.Data(scans.poses, scans.ranges)
         held_out = training.Data(scans.calibration, scans.calibration_ranges)
-        trainer = training.Trainer(decoder.Shape(len(scans.angles), 128, 8), norm, recipe, data, held_out)
+        trainer = training.Trainer(decoder.Shape(len(scans.angles), 128, 8), norm, parameters, data, held_out)
         model = trainer.run()
         size = sum(x.numel() for x in trainer.decoder.parameters())
         return PaperScans(model, scans.scanner, HEADING, trainer.progress.test_l1[-1]), size

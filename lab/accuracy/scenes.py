@@ -67,15 +67,16 @@ class Scene:
                 break
         return np.asarray(ranges)
 
-    def path(self, seconds: float, speed: float = 1.0) -> Array:
+    def path(self, seconds: float, speed: float = 1.0, start: Array | None = None) -> Array:
         """Poses (N, 3), one per scan, of a drive between random places along free straight lines.
 
-        Speeds are up to ``speed`` m/s and 1 rad/s, and accelerations are within the robot's limits.
+        The drive begins at rest at ``start`` (3,), or at a random pose. Speeds are up to ``speed`` m/s and 1 rad/s, and
+        accelerations are within the robot's limits.
         """
         dt = 1 / self.scanner.rate
         room = shapely.buffer(self.world.free_space, -ROBOT.radius)
         shapely.prepare(room)
-        pose, velocity, turn = self.poses(1)[0], np.zeros(2), 0.0
+        pose, velocity, turn = self.poses(1)[0] if start is None else start, np.zeros(2), 0.0
         target, wanted_speed, wanted_turn = pose[:2], 0.0, 0.0
         poses = [pose]
         while len(poses) < seconds * self.scanner.rate:

@@ -22,7 +22,7 @@ from presage.learning.grid_map import rooms, write_map
 from presage.terminal.output import check_file, make_folder, write_json
 from services.controller.policies.free_space import FreeSpace
 from services.controller.policies.geodesic_field import FreeSpaceGraph
-from services.estimator.particle_filter.likelihood_field import DistanceField
+from services.estimator.particle_filter.likelihood_field import SurfaceDistances
 from services.simulator.people import People
 from services.simulator.simulation import Setup, Simulation
 
@@ -75,7 +75,7 @@ def measure(path: str, beams: int, seed: int) -> list[tuple[str, float, str]]:
     timed("exact rays", lambda: world.ray_distances(lasers, angles), SCANS)
     free = timed("controller: free space", lambda: FreeSpace.of(world))
     timed("controller: graph of free space", lambda: FreeSpaceGraph(free, Robot().radius))
-    timed("particle filter: likelihood field", lambda: DistanceField(world))
+    timed("particle filter: likelihood field", lambda: SurfaceDistances(world))
     start = world.start_pose(Robot().radius)[:2]
     timed("simulator: room for 10 people", lambda: People(world, 10, 1.0, rng, start, Robot().radius))
     return rows

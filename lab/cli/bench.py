@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from common.robot.scanner import SCANNERS
 from lab.cli.options import Trials, worker_count
-from presage.terminal.options import Json, WorldName, console
+from presage.terminal.options import Json, MountText, WorldName, console
 
 app = typer.Typer(help="Benchmarks. Each compares with a baseline or a limit in the same run.", no_args_is_help=True)
 
@@ -150,6 +150,49 @@ def bench_accuracy(
         scanner=scanner,
     )
     raise typer.Exit(code)
+
+
+@app.command("integrity")
+def bench_integrity(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results and the learned models.")],
+    worlds: Annotated[int, typer.Option(min=0, max=1000, help="Number of generated buildings.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, max=2**20, help="Each seed has its own buildings.")] = 1,
+    cases: Annotated[str, typer.Option(help="Comma-separated cases of docs/integrity.md. Defaults to all.")] = "",
+    estimators: Annotated[
+        str, typer.Option(help="Comma-separated: precise, particle-filter, amcl-defaults.")
+    ] = "precise,particle-filter",
+    model: Annotated[
+        str, typer.Option(help="Of precise: learned (30 s for each map), or exact for a quick run.")
+    ] = "learned",
+    seconds: Annotated[
+        float | None, typer.Option(min=0.1, help="Length of a drive. Defaults to 120 s for moved-*, 60 s otherwise.")
+    ] = None,
+    logs: Annotated[
+        str,
+        typer.Option(help="Comma-separated logs with reference poses: each half is localised in a map of the other."),
+    ] = "",
+    mount: MountText = "",
+) -> None:
+    """Whether estimators are right about themselves in generated buildings that differ from their maps.
+
+    Each trial is one case in one building. After Ctrl-C, the same command continues. Prints a table for each estimator,
+    and writes integrity.md, .json, .trials.jsonl and a reliability diagram.
+
+    Examples: `presage bench integrity --out results`;
+    `presage bench integrity --worlds 5 --cases moved-50,wrong-map --model exact --estimators precise --out quick`;
+    `presage bench integrity --logs uwb.npz,fr079.npz --mount 0,0,0 --out results`.
+    """
+    from common.geometry.pose_text import pose_of_text
+    from lab.integrity.cases import CASES
+    from lab.integrity.logs import cases_of
+    from lab.integrity.report import bench_integrity as run
+    from lab.integrity.runner import IntegrityPlan
+
+    names = tuple(cases.split(",")) if cases else tuple(CASES)
+    laser_pose: Any = tuple(pose_of_text(mount, "--mount").tolist()) if mount else None
+    of_logs = [case for log in logs.split(",") if log for case in cases_of(log, laser_pose)]
+    plan = IntegrityPlan(worlds, seed, names, tuple(estimators.split(",")), model, seconds, tuple(of_logs))
+    raise typer.Exit(run(plan, out, worker_count(), console))
 
 
 @app.command("speed")

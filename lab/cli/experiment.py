@@ -11,43 +11,39 @@ import typer
 
 from common.errors import UserError
 from lab.cli.navigation import navigate
-from lab.cli.options import (
-    OUT,
-    Alpha,
-    Estimators,
-    ExperimentSeed,
-    Out,
-    Trials,
-    show,
-    worker_count,
-)
+from lab.cli.options import Alpha, Estimators, ExperimentSeed, Out, Trials, show, worker_count
 from presage.terminal.options import console
 from presage.terminal.output import make_folder
 
-app = typer.Typer(
-    help="The experiments of Burghardt & Lanillos 2021 with presets paper and precise and the particle filter, "
-    "navigation around walls and people, and localisation on real logs.",
-    no_args_is_help=True,
-)
+app = typer.Typer(no_args_is_help=True)
+
+
+@app.callback()
+def common_options(context: typer.Context, seed: ExperimentSeed = 1, out: Out = Path("experiments")) -> None:
+    """The experiments of Burghardt & Lanillos 2021 with presets paper and precise and the particle filter.
+
+    Also navigation around walls and people, and localisation on real logs.
+    """
+    context.obj = seed, out
 
 
 @app.command("e1")
 def e1(
+    context: typer.Context,
     trials: Trials = 100,
     iterations: Annotated[int, typer.Option(min=1, help="Scans per trial.")] = 50,
     estimators: Estimators = "",
     alpha: Alpha = None,
-    seed: ExperimentSeed = 1,
-    out: Out = OUT,
 ) -> None:
     """E1: global localisation of a standing robot; error over iterations.
 
-    Examples: `presage experiment e1 --trials 5`; `presage experiment e1 --alpha 5e-4 --out slow`;
+    Examples: `presage experiment e1 --trials 5`; `presage experiment --out slow e1 --alpha 5e-4`;
     `presage experiment e1 --estimators "paper,precise" --iterations 200`.
     """
     from lab.experiments.estimators import PAPER_DESCENT, parse_estimators
     from lab.paper import e1_localisation as localisation
 
+    seed, out = context.obj
     job = localisation.LocalisationJob(0, seed, iterations)
     job = replace(job, descent=replace(PAPER_DESCENT, alpha=alpha)) if alpha is not None else job
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
@@ -56,10 +52,9 @@ def e1(
 
 @app.command("e2")
 def e2(
+    context: typer.Context,
     trials: Trials = 12,
     estimators: Estimators = "",
-    seed: ExperimentSeed = 1,
-    out: Out = OUT,
 ) -> None:
     """E2: crossing the map by small teleports at constant heading; error over time, with and without odometry.
 
@@ -68,6 +63,7 @@ def e2(
     from lab.experiments.estimators import parse_estimators
     from lab.paper import e2_crossing as crossing
 
+    seed, out = context.obj
     job = crossing.CrossingJob(0, seed)
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
     show(crossing, lambda: crossing.run(job, trials, out, worker_count(), console), out)
@@ -75,22 +71,22 @@ def e2(
 
 @app.command("e3")
 def e3(
+    context: typer.Context,
     trials: Trials = 50,
     free: Annotated[
         bool, typer.Option("--free/--any", help="Require a free straight line from start to goal, or allow any pair.")
     ] = True,
     estimators: Estimators = "",
-    seed: ExperimentSeed = 1,
-    out: Out = OUT,
 ) -> None:
     """E3: navigation from a known start to a goal, through the real processes in lockstep over zenoh.
 
-    Examples: `presage experiment e3 --trials 2`; `presage experiment e3 --estimators precise --out near`;
-    `presage experiment e3 --any --trials 20 --estimators precise --out any`.
+    Examples: `presage experiment e3 --trials 2`; `presage experiment --out near e3 --estimators precise`;
+    `presage experiment --out any e3 --any --trials 20 --estimators precise`.
     """
     from lab.experiments.estimators import parse_estimators
     from lab.paper import e3_navigation as navigation
 
+    seed, out = context.obj
     job = navigation.NavigationJob(0, seed, free=free)
     job = replace(job, estimators=parse_estimators(estimators)) if estimators else job
     show(navigation, lambda: navigation.run(job, trials, out, worker_count(), console), out)
@@ -98,9 +94,8 @@ def e3(
 
 @app.command("alpha")
 def alpha_sweep(
+    context: typer.Context,
     trials: Trials = 25,
-    seed: ExperimentSeed = 1,
-    out: Out = OUT,
 ) -> None:
     """E1 with a range of values for the paper's step size α.
 
@@ -109,6 +104,7 @@ def alpha_sweep(
     from lab.paper import alpha_sweep as step_size
     from lab.paper import e1_localisation as localisation
 
+    seed, out = context.obj
     show(
         step_size,
         lambda: step_size.run(localisation.LocalisationJob(0, seed, 50), trials, out, worker_count(), console),
@@ -117,20 +113,20 @@ def alpha_sweep(
 
 
 @app.command("steps")
-def step_sizes(trials: Trials = 10, seed: ExperimentSeed = 1, out: Out = OUT) -> None:
+def step_sizes(context: typer.Context, trials: Trials = 10) -> None:
     """E3 with a range of step sizes β and γ, also with the paper's teleports: which give the paper's 12.5 iterations.
 
     Example: `presage experiment steps --trials 2`.
     """
     from lab.paper import step_sizes as stepping
 
+    seed, out = context.obj
     show(stepping, lambda: stepping.run(stepping.StepSizeJob(0, seed), trials, out, worker_count(), console), out)
 
 
 @app.command("samples")
 def samples_needed(
-    seed: ExperimentSeed = 1,
-    out: Out = OUT,
+    context: typer.Context,
 ) -> None:
     """Prediction error and localisation error as functions of the number of training samples.
 
@@ -138,14 +134,14 @@ def samples_needed(
     """
     from lab.paper import samples
 
+    seed, out = context.obj
     show(samples, lambda: samples.run(samples.SamplesJob(seed), out, worker_count(), console), out)
 
 
 @app.command("aliasing")
 def similar_objects(
+    context: typer.Context,
     trials: Trials = 30,
-    seed: ExperimentSeed = 1,
-    out: Out = OUT,
 ) -> None:
     """Worlds with similar objects or two identical rooms: places found, wrong claims, and ambiguity kept.
 
@@ -153,25 +149,27 @@ def similar_objects(
     """
     from lab.paper import aliasing
 
+    seed, out = context.obj
     show(aliasing, lambda: aliasing.run(aliasing.AliasingJob(seed, places=trials), out, worker_count(), console), out)
 
 
 @app.command("prediction")
 def predicted(
-    seed: ExperimentSeed = 1,
-    out: Out = OUT,
+    context: typer.Context,
 ) -> None:
     """Predicted and measured scans compared, with the models' stated precision (the paper's figure 2c).
 
-    Example: `presage experiment prediction --seed 7 --out other`.
+    Example: `presage experiment --seed 7 --out other prediction`.
     """
     from lab.paper import prediction
 
+    seed, out = context.obj
     show(prediction, lambda: prediction.run(prediction.PredictionJob(seed), out, 1, console), out)
 
 
 @app.command("real")
 def real_drive(
+    context: typer.Context,
     log: Annotated[Path, typer.Option(help="Recording or log with reference poses (docs/logs.md).")],
     world: Annotated[str, typer.Option(help="World file or ROS map.yaml of the training half.")],
     name: Annotated[str, typer.Option(help="Results are named real-NAME. Defaults to the log's name.")] = "",
@@ -185,8 +183,6 @@ def real_drive(
     exchange: Annotated[
         bool, typer.Option("--exchange", help="Train on the second half and localise on the first.")
     ] = False,
-    seed: ExperimentSeed = 1,
-    out: Out = OUT,
 ) -> None:
     """A real log: trains and tunes on its first half, and localises on its second half.
 
@@ -195,11 +191,12 @@ def real_drive(
     poses. After Ctrl-C the same command continues.
     Examples: `presage map drive.npz --mount 0,0,0 --half first -o first_half.yaml`, then
     `presage experiment real --log drive.npz --mount 0,0,0 --world first_half.yaml --quick`;
-    `presage experiment real --log fr079.mcap --world fr079.yaml --name fr079 --every 50 --out mine`.
+    `presage experiment --out mine real --log fr079.mcap --world fr079.yaml --name fr079 --every 50`.
     """
     from common.geometry.pose_text import pose_of_text
     from lab.real_logs import experiment as real
 
+    seed, out = context.obj
     if not re.fullmatch(r"[\w.-]*", name):
         raise UserError(f"--name {name!r}: use only letters, digits, '.', '_' and '-', as it becomes a file name")
     laser_pose: Any = tuple(pose_of_text(mount, "--mount").tolist()) if mount else None
@@ -209,35 +206,36 @@ def real_drive(
 
 @app.command("all")
 def all_experiments(
+    context: typer.Context,
     trials: Annotated[
         int,
         typer.Option(min=0, help="Maximum number of trials of each experiment; 0 for each one's own number."),
     ] = 0,
-    seed: ExperimentSeed = 1,
-    out: Out = OUT,
 ) -> None:
     """Every experiment of the paper, one after another. After Ctrl-C the same command continues.
 
-    Examples: `presage experiment all`; `presage experiment all --trials 3 --out look`.
+    Examples: `presage experiment all`; `presage experiment --out look all --trials 3`.
     """
     from lab.paper.suite import run_all
 
+    seed, out = context.obj
     make_folder(out, "--out")
     run_all(trials, seed, out, worker_count(), console)
 
 
 @app.command("tables")
 def tables(
-    out: Out = OUT,
+    context: typer.Context,
     page: Annotated[Path | None, typer.Option(help="Markdown file in which to replace the marked tables.")] = None,
 ) -> None:
     """Tables of existing results, as Markdown or inserted into a page.
 
     Examples: `presage experiment tables`;
-    `presage experiment tables --page docs/experiments.md --out docs/experiments`.
+    `presage experiment --out docs/experiments tables --page docs/experiments.md`.
     """
     from lab.experiments.tables_page import MODULES, fill_tables, table_of
 
+    _, out = context.obj
     if page is not None:
         page.write_text(fill_tables(page.read_text(encoding="utf-8"), out), encoding="utf-8")
         return
@@ -245,7 +243,7 @@ def tables(
     names += sorted(path.stem for kind in ("navigation", "real") for path in out.glob(f"{kind}-*.json"))
     if not names:
         raise UserError(
-            f"no results in {out}: create them with `presage experiment all`, or give their folder with --out"
+            f"no results in {out}: create them with `presage experiment all`, or give `presage experiment --out`"
         )
     for name in names:
         print(f"\n{name}\n\n{table_of(name, out)}")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lab.cli.options import OUT, ExperimentSeed, Out, Trials, show, worker_count
+from lab.cli.options import Trials, show, worker_count
 from presage.terminal.options import console
 
 if TYPE_CHECKING:
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 
 def navigate(
+    context: typer.Context,
     trials: Trials = 100,
     worlds: Annotated[str, typer.Option(help="Comma-separated names or files.")] = "maze,office",
     drives: Annotated[str, typer.Option(help="Comma-separated: holonomic, differential.")] = "holonomic,differential",
@@ -25,8 +26,6 @@ def navigate(
     epistemic: Annotated[
         bool, typer.Option(help="While the pose is ambiguous, drive to where scans resolve the ambiguity.")
     ] = True,
-    seed: ExperimentSeed = 1,
-    out: Out = OUT,
 ) -> None:
     """Navigation between random places, around walls and people.
 
@@ -38,10 +37,11 @@ def navigate(
     Examples: `presage experiment navigation --trials 2`;
     `presage experiment navigation --worlds office --people 10`;
     `presage experiment navigation --worlds twins --start unknown --trials 50 --no-epistemic`;
-    `presage experiment navigation --worlds my.yaml --drives differential --seed 7 --out mine`.
+    `presage experiment --seed 7 --out mine navigation --worlds my.yaml --drives differential`.
     """
     from lab.navigation import experiment as driving
 
+    seed, out = context.obj
     job = driving.NavigationJob(0, seed, start=start, people=people, estimator=estimator, epistemic=epistemic)
     world_names, drive_names = (
         tuple(part.strip() for part in text.split(",") if part.strip()) for text in (worlds, drives)

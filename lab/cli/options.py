@@ -35,7 +35,6 @@ Alpha = Annotated[
         min=1e-8, max=1.0, help="Step size of estimator paper in m². Defaults to the best value of the sweep."
     ),
 ]
-OUT = Path("experiments")
 
 
 def worker_count(extra: int = 0) -> int:

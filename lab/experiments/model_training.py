@@ -88,10 +88,12 @@ def train_paper(scene: Scene, heading: float, samples: int, steps: int, seed: in
     train = _usable(sample_scans(scene, samples, heading), scene)
     judge = _usable(sample_scans(scene, TEST_SCANS, heading, noise=False), scene)
     watch = Data(judge.poses[:CURVE_SCANS], judge.ranges[:CURVE_SCANS])
-    recipe = training.Recipe(max(1, -(-steps // -(-samples // BATCH_SIZE))), BATCH_SIZE, LEARNING_RATE, seed)
+    parameters = training.TrainingParameters(
+        max(1, -(-steps // -(-samples // BATCH_SIZE))), BATCH_SIZE, LEARNING_RATE, seed
+    )
     norm = Normalisation.of(scene.world.bounds, float(train.ranges.max()))
     began = time.process_time()
-    trainer = training.Trainer(Shape(scene.scanner.beams, HIDDEN_UNITS, CHANNELS), norm, recipe, train, watch)
+    trainer = training.Trainer(Shape(scene.scanner.beams, HIDDEN_UNITS, CHANNELS), norm, parameters, train, watch)
     model = trainer.run()
     took = time.process_time() - began
     error = np.abs(model.ranges(judge.poses) - judge.ranges)
@@ -101,7 +103,7 @@ def train_paper(scene: Scene, heading: float, samples: int, steps: int, seed: in
         scanner=scene.scanner,
         heading=heading,
         samples=samples,
-        epochs=recipe.epochs,
+        epochs=parameters.epochs,
         batch=BATCH_SIZE,
         learning_rate=LEARNING_RATE,
         seed=seed,

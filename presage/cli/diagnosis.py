@@ -7,8 +7,9 @@ from typing import Annotated
 import typer
 
 from common.bus.bus import Link
-from presage.session.running import OBSERVER, find_session, link_of
-from presage.terminal.options import Connect, Json, RobotName, WorldName, console
+from presage.cli.session_options import chosen_link
+from presage.session.running import OBSERVER, find_session
+from presage.terminal.options import Json, WorldName, console
 
 app = typer.Typer()
 
@@ -26,10 +27,9 @@ def topics() -> None:
 
 @app.command(rich_help_panel="Diagnose", short_help="Measure message rates on the bus.")
 def hz(
+    context: typer.Context,
     topic: Annotated[str | None, typer.Argument(help="Topic to measure. Defaults to all topics.")] = None,
     seconds: Annotated[float, typer.Option(min=0.1, help="Duration of the measurement, s.")] = 3.0,
-    robot: RobotName = "",
-    connect: Connect = "",
 ) -> None:
     """Measure the message rates on the bus.
 
@@ -37,32 +37,32 @@ def hz(
     """
     from presage.live.commands import show_rates
 
-    raise typer.Exit(show_rates(link_of(connect, robot, OBSERVER), topic, seconds, console))
+    raise typer.Exit(show_rates(chosen_link(context, OBSERVER), topic, seconds, console))
 
 
 @app.command(rich_help_panel="Diagnose", short_help="Health of every service, until Ctrl-C.")
 def top(
-    robot: Annotated[
-        list[str] | None,
-        typer.Option(envvar="PRESAGE_ROBOT", help="Robot name; may be repeated. Defaults to the session's robots."),
-    ] = None,
+    context: typer.Context,
+    robots: Annotated[list[str] | None, typer.Argument(help="Robots. Defaults to all of the session.")] = None,
     once: Annotated[
         bool, typer.Option("--once", help="Print one table and exit, with status 1 if a service is missing.")
     ] = False,
-    connect: Connect = "",
 ) -> None:
     """Show the health of every service until Ctrl-C: rates, latency, drops, missing services and how to start them.
 
-    Examples: `presage top`; `presage top --once`; `presage top --robot one --robot two`.
+    Examples: `presage top`; `presage top --once`; `presage top one two`.
     """
     from presage.diagnosis.top import run_top
 
-    robots = list(dict.fromkeys(robot or find_session(connect).robots))
-    raise typer.Exit(run_top(link_of(connect, robots[0], OBSERVER), robots, console, once=once))
+    chosen = context.find_root().params
+    shown = robots or [name for name in (chosen["robot"],) if name] or find_session(chosen["connect"]).robots
+    link = chosen_link(context, OBSERVER, shown[0])
+    raise typer.Exit(run_top(link, list(dict.fromkeys(shown)), console, once=once))
 
 
 @app.command(rich_help_panel="Diagnose", short_help="Find problems of the installation and the session.")
 def doctor(
+    context: typer.Context,
     seconds: Annotated[
         float,
         typer.Option(
@@ -70,8 +70,6 @@ def doctor(
             help="How long to observe the bus, s. Detecting a frozen service takes at least 2.5 s.",
         ),
     ] = 3.0,
-    robot: RobotName = "",
-    connect: Connect = "",
     world: WorldName = "corridor",
     json_file: Json = None,
 ) -> None:
@@ -80,18 +78,19 @@ def doctor(
     Exits with status 1 if there is a problem.
 
     Examples: `presage doctor`; `presage doctor --seconds 10 --json findings.json`; `presage doctor --world my.yaml`;
-    `presage doctor --connect tcp/192.168.0.10:7447 --robot two`.
+    `presage --connect tcp/192.168.0.10:7447 --robot two doctor`.
     """
     from common.runtime.config import load_settings
     from presage.diagnosis.doctor import run_doctor
     from services.recorder.settings import RecorderSettings
 
-    link, recordings = link_of(connect, robot, OBSERVER), load_settings(RecorderSettings, []).directory
+    link, recordings = chosen_link(context, OBSERVER), load_settings(RecorderSettings, []).directory
     raise typer.Exit(run_doctor(link, seconds, console, world=world, recordings=recordings, json_file=json_file))
 
 
 @app.command(rich_help_panel="Diagnose", short_help="Print messages of a topic or a recording as JSON.")
 def echo(
+    context: typer.Context,
     source: Annotated[str, typer.Argument(help="A topic on the bus, or a recording.", metavar="TOPIC|FILE")],
     topic: Annotated[
         str | None, typer.Argument(help="Topic or key of the recording to print. Defaults to all topics.")
@@ -104,8 +103,6 @@ def echo(
         float, typer.Option(min=0.0, help="Skip this many seconds at the beginning of the recording.")
     ] = 0.0,
     full: Annotated[bool, typer.Option("--full", help="Print long arrays completely.")] = False,
-    robot: RobotName = "",
-    connect: Connect = "",
 ) -> None:
     """Print messages as JSON lines, either live from a topic, or from a recording with their keys and times.
 
@@ -118,6 +115,6 @@ def echo(
     from presage.recordings.printing import echo_either
 
     def link() -> Link:  # a recording needs no session
-        return link_of(connect, robot, OBSERVER)
+        return chosen_link(context, OBSERVER)
 
     raise typer.Exit(echo_either(link, source, topic, count, start, console, full=full))

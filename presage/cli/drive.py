@@ -11,8 +11,8 @@ import typer
 from common.errors import UserError
 from common.geometry import se2
 from common.limits import MAX_COORDINATE_M
-from presage.session.running import link_of
-from presage.terminal.options import ALLOW_NEGATIVE_NUMBERS, Connect, RobotName, console
+from presage.cli.session_options import chosen_link
+from presage.terminal.options import ALLOW_NEGATIVE_NUMBERS, console
 
 if TYPE_CHECKING:
     from common.messages.definitions import Pose
@@ -24,7 +24,9 @@ def _number(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise typer.BadParameter(f"{text} is neither a number nor an option") from None
+        raise typer.BadParameter(
+            f"{text} is neither a number nor an option of this command; --connect and --robot stand before the command"
+        ) from None
 
 
 @app.command(
@@ -33,6 +35,7 @@ def _number(text: str) -> float:
     short_help="Send the robot to a goal, or cancel it.",
 )
 def goal(
+    context: typer.Context,
     x: Annotated[float | None, typer.Argument(help="x of the goal in the map, m.")] = None,
     y: Annotated[float | None, typer.Argument(help="y of the goal in the map, m.")] = None,
     yaw: Annotated[
@@ -44,8 +47,6 @@ def goal(
         bool, typer.Option("--wait", help="Wait until the goal is reached, refused, or blocked for 30 s.")
     ] = False,
     cancel: Annotated[bool, typer.Option("--cancel", help="Cancel the current goal and stop the robot.")] = False,
-    robot: RobotName = "",
-    connect: Connect = "",
 ) -> None:
     """Send the robot to a goal, or cancel its goal.
 
@@ -68,18 +69,17 @@ def goal(
         yaw_tolerance=None if yaw is None else 0.1,
         cancel=cancel,
     )
-    raise typer.Exit(send_goal(link_of(connect, robot), request, console, wait=wait))
+    raise typer.Exit(send_goal(chosen_link(context), request, console, wait=wait))
 
 
 @app.command(
     context_settings=ALLOW_NEGATIVE_NUMBERS, rich_help_panel="Drive", short_help="Move the simulated robot elsewhere."
 )
 def teleport(
+    context: typer.Context,
     x: Annotated[float, typer.Argument(help="x in the map, m.")],
     y: Annotated[float, typer.Argument(help="y in the map, m.")],
     yaw: Annotated[float, typer.Argument(parser=_number, help="Heading, deg, counter-clockwise from x.")] = 90.0,
-    robot: RobotName = "",
-    connect: Connect = "",
 ) -> None:
     """Move the simulated robot to another place, without any trace in its odometry.
 
@@ -88,7 +88,7 @@ def teleport(
     """
     from presage.live.commands import teleport as run
 
-    run(link_of(connect, robot), _pose(x, y, yaw), console)
+    run(chosen_link(context), _pose(x, y, yaw), console)
 
 
 @app.command(
@@ -97,13 +97,12 @@ def teleport(
     short_help="Restart localisation, near a position or globally.",
 )
 def relocalise(
+    context: typer.Context,
     x: Annotated[
         float | None, typer.Argument(help="x in the map, m. Defaults to the estimator's initial pose.")
     ] = None,
     y: Annotated[float | None, typer.Argument(help="y in the map, m.")] = None,
     yaw: Annotated[float, typer.Argument(parser=_number, help="Heading, deg.")] = 0.0,
-    robot: RobotName = "",
-    connect: Connect = "",
 ) -> None:
     """Reset the estimator and localise again, near a given position or globally.
 
@@ -114,7 +113,7 @@ def relocalise(
     if (x is None) != (y is None):
         raise UserError("a position is two numbers, X Y in m")
     pose = _pose(x, y, yaw) if x is not None and y is not None else None
-    run(link_of(connect, robot), pose, console)
+    run(chosen_link(context), pose, console)
 
 
 def _pose(x: float, y: float, yaw: float = 0.0) -> Pose:

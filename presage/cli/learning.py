@@ -101,11 +101,11 @@ def train(
         )
     else:
         from presage.learning import train_paper as paper  # imports torch, which need not be installed
-        from services.estimator.paper.training import Recipe as PaperRecipe
+        from services.estimator.paper.training import TrainingParameters
 
-        paper_recipe = PaperRecipe(tuning.epochs, tuning.batch, tuning.learning_rate, seed)
+        parameters = TrainingParameters(tuning.epochs, tuning.batch, tuning.learning_rate, seed)
         options = paper.TrainPaperOptions(
-            world, preset, chosen, tuple(simulator), folder, samples or 13_000, paper_recipe
+            world, preset, chosen, tuple(simulator), folder, samples or 13_000, parameters
         )
         paper.train(options, link, console)
 

@@ -23,6 +23,7 @@ from presage.cli import obstacle as cli_obstacle
 from presage.cli import recording as cli_recording
 from presage.cli import replay as cli_replay
 from presage.cli import security as cli_secure
+from presage.cli.session_options import Connect, RobotName
 from presage.session.stack import ignoring_interrupts, interruptible
 from presage.terminal.options import (
     Config,
@@ -57,6 +58,8 @@ def _print_version(requested: bool) -> None:
 
 @app.callback()
 def options(
+    connect: Connect = "",
+    robot: RobotName = "",
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print versions and exit.")
     ] = False,
@@ -100,7 +103,7 @@ def up(
 
     Examples: `presage up`, then in another terminal `presage goal 15 1.5 --wait`;
     `presage up --world office --people 10 --record recordings --seed 7`; `presage up --estimator particle-filter`;
-    `presage up --robots 3`, then `presage goal 15 1.5 --robot robot-2`; `presage up --config turtlebot.yaml`.
+    `presage up --robots 3`, then `presage --robot robot-2 goal 15 1.5`; `presage up --config turtlebot.yaml`.
     """
     from presage.session.up import UpOptions, run_up
 

@@ -9,8 +9,9 @@ import typer
 from pydantic import ValidationError
 
 from common.errors import UserError, first_fault
-from presage.session.running import OBSERVER, link_of
-from presage.terminal.options import ALLOW_NEGATIVE_NUMBERS, Connect, RobotName, console
+from presage.cli.session_options import chosen_link
+from presage.session.running import OBSERVER
+from presage.terminal.options import ALLOW_NEGATIVE_NUMBERS, console
 
 if TYPE_CHECKING:
     from common.geometry.world import Obstacle
@@ -30,61 +31,60 @@ Radius = Annotated[float, typer.Option(help="Radius of a round obstacle, m. 0 ma
 
 @app.command(context_settings=ALLOW_NEGATIVE_NUMBERS)
 def add(
+    context: typer.Context,
     name: Name,
     x: X,
     y: Y,
     size: Size = (0.5, 0.5),
     yaw: Yaw = 0.0,
     radius: Radius = 0.0,
-    robot: RobotName = "",
-    connect: Connect = "",
 ) -> None:
     """Add an obstacle.
 
     Examples: `presage obstacle add crate 6 1.5`; `presage obstacle add door 4 2 --size 0.9 0.05 --yaw 90`;
     `presage obstacle add pillar 6 1 --radius 0.2`.
     """
-    _change("add", name, _shape(x, y, size, yaw, radius), connect, robot)
+    _change(context, "add", name, _shape(x, y, size, yaw, radius))
 
 
 @app.command(context_settings=ALLOW_NEGATIVE_NUMBERS)
-def move(name: Name, x: X, y: Y, robot: RobotName = "", connect: Connect = "") -> None:
+def move(context: typer.Context, name: Name, x: X, y: Y) -> None:
     """Move an obstacle; it keeps its shape and orientation.
 
     Example: `presage obstacle move crate 6 2`.
     """
-    obstacles = {each.name: each for each in _obstacles(connect, robot)}
+    obstacles = {each.name: each for each in _obstacles(context)}
     if name not in obstacles:
         raise UserError(f"there is no obstacle {name!r} (there: {', '.join(obstacles) or 'none'})")
-    _change("move", name, _moved(obstacles[name], x, y), connect, robot)
+    _change(context, "move", name, _moved(obstacles[name], x, y))
 
 
 @app.command()
-def remove(name: Name, robot: RobotName = "", connect: Connect = "") -> None:
+def remove(context: typer.Context, name: Name) -> None:
     """Remove an obstacle; furniture of the world file can be removed too.
 
     Example: `presage obstacle remove crate`.
     """
-    _change("remove", name, None, connect, robot)
+    _change(context, "remove", name, None)
 
 
 @app.command("list")
-def list_(robot: RobotName = "", connect: Connect = "") -> None:
+def list_(context: typer.Context) -> None:
     """List the obstacles of the simulator with their shapes; those of the world file have numbers as names.
 
     Example: `presage obstacle list`.
     """
-    for obstacle in _obstacles(connect, robot):
+    for obstacle in _obstacles(context):
         shape = obstacle.model_dump_json(exclude={"name"}, exclude_none=True)
         console.print(f"{obstacle.name}: {shape}", markup=False, highlight=False, soft_wrap=True)
 
 
-def _obstacles(connect: str, robot: str) -> list[Obstacle]:
+def _obstacles(context: typer.Context) -> list[Obstacle]:
     from common.messages.requests import Request, WorldReply
     from common.messages.topics import WORLD
     from presage.live.bus_watch import session
 
-    with session(link_of(connect, robot, OBSERVER)) as bus:
+    with session(chosen_link(context, OBSERVER)) as bus:
         reply = bus.ask(WORLD, Request(), WorldReply)
     if reply.world is None:
         raise UserError(f"refused: {reply.reason}")
@@ -112,7 +112,7 @@ def _shape(x: float, y: float, size: tuple[float, float], yaw: float, radius: fl
         raise UserError(f"the obstacle: {first_fault(error)}") from None
 
 
-def _change(action: str, name: str, obstacle: Obstacle | None, connect: str, robot: str) -> None:
+def _change(context: typer.Context, action: str, name: str, obstacle: Obstacle | None) -> None:
     from common.messages.requests import ObstacleRequest, Reply
     from common.messages.topics import OBSTACLE
     from presage.live.bus_watch import session
@@ -121,7 +121,7 @@ def _change(action: str, name: str, obstacle: Obstacle | None, connect: str, rob
         request = ObstacleRequest.model_validate({"action": action, "name": name, "obstacle": obstacle})
     except ValidationError as error:
         raise UserError(f"obstacle {name!r}: {first_fault(error)}") from None
-    with session(link_of(connect, robot)) as bus:
+    with session(chosen_link(context)) as bus:
         reply = bus.ask(OBSTACLE, request, Reply)
     if not reply.ok:
         raise UserError(f"refused: {reply.reason}")

@@ -7,21 +7,20 @@ from typing import Annotated
 
 import typer
 
-from presage.session.running import link_of
-from presage.terminal.options import Connect, RobotName, arguments, console
+from presage.cli.session_options import chosen_link
+from presage.terminal.options import arguments, console
 
 app = typer.Typer()
 
 
 @app.command(rich_help_panel="Record", short_help="Record a session into an MCAP file, until Ctrl-C.")
 def record(
+    context: typer.Context,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the recording.")] = Path("recordings"),
     topics: Annotated[str, typer.Option(help="Topics to record, separated by commas. Defaults to all topics.")] = "",
     split_minutes: Annotated[
         float | None, typer.Option(min=0.0, help="Start a new complete file after this many minutes.")
     ] = None,
-    robot: RobotName = "",
-    connect: Connect = "",
 ) -> None:
     """Record a running session into an MCAP file until Ctrl-C.
 
@@ -38,7 +37,7 @@ def record(
         # The live page controls the session's own recorder, not this one.
         return RecorderService(settings, remote=False)
 
-    link = link_of(connect, robot, ("recorder",))
+    link = chosen_link(context, ("recorder",))
     keys = None if link.security is None else link.security.folder.parent
     args = arguments(directory=out, robot=link.robot, connect=",".join(link.connect), security=keys)
     args += arguments(split_minutes=split_minutes, topics=topics)

@@ -9,10 +9,9 @@ import typer
 
 from common.errors import UserError
 from common.runtime.config import read_section
-from presage.session.running import link_of
+from presage.cli.session_options import chosen_link
 from presage.terminal.options import (
     Config,
-    Connect,
     EstimatorName,
     Json,
     ModelName,
@@ -27,6 +26,7 @@ app = typer.Typer()
 
 @app.command(rich_help_panel="Record", short_help="Publish a recording again, or compare services on it.")
 def replay(
+    context: typer.Context,
     file: Annotated[Path, typer.Argument(help="Recording to replay.")],
     only: Annotated[
         str, typer.Option(help="Topics to replay, separated by commas. Defaults to all except health.")
@@ -69,7 +69,6 @@ def replay(
         typer.Option("--every-scan", help="With --with: also send the scans for which the recording has no belief."),
     ] = False,
     json_file: Json = None,
-    connect: Connect = "",
 ) -> None:
     """Publish a recording's messages again, with their original stamps; or compare services on recorded inputs.
 
@@ -94,7 +93,7 @@ def replay(
     if not with_services:
         if json_file is not None or every_scan:
             raise UserError("--json and --every-scan go with --with: a plain replay compares nothing")
-        run_replay(file, link_of(connect, robot or "robot", ("replay",)), bus_options, console)
+        run_replay(file, chosen_link(context, ("replay",), robot or "robot"), bus_options, console)
         return
     chosen = (rate, start, end)
     if only or leave_out or robot or force or loop or paused or any(value is not None for value in chosen):

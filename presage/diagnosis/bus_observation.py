@@ -49,7 +49,9 @@ def check_endpoint(endpoint: str) -> Finding | None:
         with socket.create_connection((found[1], int(found[2])), TCP_TIMEOUT_S):
             return None
     except ConnectionRefusedError:
-        advice = "start one with `presage up` or `python -m common.router`, or name its endpoint with --connect"
+        advice = (
+            "start one with `presage up` or `python -m common.router`, or name its endpoint with `presage --connect`"
+        )
         return Finding("no_router", False, f"no session at {endpoint}: nothing listens there", endpoint, advice)
     except socket.gaierror:
         return Finding("no_router", False, f"{endpoint}: no such host", endpoint, "check the host name")

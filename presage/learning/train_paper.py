@@ -22,7 +22,7 @@ from presage.learning.simulated_scans import collect, scanner_on_bus
 from services.estimator.paper import training, weights
 from services.estimator.paper.checkpoint import Checkpoint
 from services.estimator.paper.decoder import Normalisation, PaperModel, Shape
-from services.estimator.paper.training import Data, Recipe, Trainer, usable_ranges
+from services.estimator.paper.training import Data, Trainer, TrainingParameters, usable_ranges
 
 TEST_SAMPLES = 1000
 
@@ -37,7 +37,7 @@ class TrainPaperOptions:
     simulator_arguments: tuple[str, ...]  # that select the scanner
     out: Path
     samples: int
-    recipe: Recipe
+    parameters: TrainingParameters
     shape_hidden: int = 128
     shape_channels: int = 8
 
@@ -54,9 +54,9 @@ def train(options: TrainPaperOptions, link: Link, console: Console) -> Path:
         "scanner": scanner.model_dump(mode="json"),
         "n": options.samples,
     }
-    checkpoint = Checkpoint(options.out / f".{path.stem}.unfinished", {**described, **asdict(options.recipe)})
+    checkpoint = Checkpoint(options.out / f".{path.stem}.unfinished", {**described, **asdict(options.parameters)})
     heading = float(world.start_pose(Robot().radius)[2])
-    rng = np.random.default_rng(options.recipe.seed)
+    rng = np.random.default_rng(options.parameters.seed)
     with Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=console
     ) as bar:
@@ -66,7 +66,7 @@ def train(options: TrainPaperOptions, link: Link, console: Console) -> Path:
             samples = checkpoint.samples(name)
             if samples is None:
                 with scanner_on_bus(link, options.world, options.simulator_arguments, world, scanner, console) as bus:
-                    noise_seed = options.recipe.seed if name == "train" else None  # test scans have no noise
+                    noise_seed = options.parameters.seed if name == "train" else None  # test scans have no noise
                     ranges = collect(bus, poses, scanner, noise_seed, bar, f"{name} samples")
                 samples = Data(poses, usable_ranges(ranges, scanner.range_max))
                 checkpoint.keep_samples(name, samples)
@@ -93,10 +93,10 @@ def _fit(
 ) -> tuple[Trainer, float]:
     norm = Normalisation.of(world.bounds, float(data["train"].ranges.max()))
     shape = Shape(scanner.beams, options.shape_hidden, options.shape_channels)
-    trainer = Trainer(shape, norm, options.recipe, data["train"], data["test"])
+    trainer = Trainer(shape, norm, options.parameters, data["train"], data["test"])
     if checkpoint.restore(trainer):
         bar.console.print(f"resuming an interrupted run after epoch {trainer.progress.epoch}")
-    task = bar.add_task("epochs", total=options.recipe.epochs, completed=trainer.progress.epoch)
+    task = bar.add_task("epochs", total=options.parameters.epochs, completed=trainer.progress.epoch)
     start = time.monotonic()
 
     def report(progress: training.Progress) -> None:
@@ -134,17 +134,17 @@ def _save(
     trainer.decoder.load_state_dict(model_state)
     predicted = PaperModel(trainer.decoder, trainer.norm).ranges(data["test"].poses)
     error = np.abs(predicted - data["test"].ranges)
-    recipe = options.recipe
+    parameters = options.parameters
     card = weights.ModelCard(
         preset=options.preset,
         world=world,
         scanner=scanner,
         heading=heading,
         samples=options.samples,
-        epochs=recipe.epochs,
-        batch=recipe.batch,
-        learning_rate=recipe.learning_rate,
-        seed=recipe.seed,
+        epochs=parameters.epochs,
+        batch=parameters.batch,
+        learning_rate=parameters.learning_rate,
+        seed=parameters.seed,
         hidden=options.shape_hidden,
         channels=options.shape_channels,
         center=trainer.norm.center,

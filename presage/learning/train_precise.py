@@ -60,30 +60,47 @@ def train_precise(options: TrainPreciseOptions, link: Link, console: Console) ->
     weights.refuse_to_overwrite(path, world)
     rng = np.random.default_rng(options.recipe.seed)
     poses = {
-        name: _random_poses(world, count, rng) for name, count in (("train", options.samples), ("test", TEST_SAMPLES))
+        name: random_poses(world, count, rng) for name, count in (("train", options.samples), ("test", TEST_SAMPLES))
     }
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as bar:
         with scanner_on_bus(link, options.world, options.simulator_arguments, world, scanner, console) as bus:
             train = collect(bus, poses["train"], scanner, options.recipe.seed, bar, "training scans")
             test = collect(bus, poses["test"], scanner, None, bar, "test scans")
-        start = time.monotonic()
-        model, quality = _train(options, scanner, poses, {"train": train, "test": test}, bar)
-    seconds = time.monotonic() - start
-    visited = se2.compose(poses["train"], np.array(scanner.mount))[:, :2]
-    places = thin_places(np.concatenate([visited, reachable(model.field, visited)]), SEED_SPACING_M)
-    card = _card(options, world, scanner, model, quality, seconds)
-    weights.save(path, model, places, card)
+        card = learn_and_save(path, options, world, poses, {"train": train, "test": test}, bar)
     _draw(weights.load(path)[0], card, path.with_suffix(".png"))
     console.print(
-        f"{path}: {path.stat().st_size / 1e6:.2f} MB, trained in {seconds:.0f} s; range error median "
-        f"{quality.range_error_median * 1e3:.2f} mm, {quality.share_above_5_cm:.2%} above 5 cm; "
-        f"position error from scans without noise {quality.position_error_rms * 1e3:.2f} mm RMS"
+        f"{path}: {path.stat().st_size / 1e6:.2f} MB, trained in {card.learning_s:.0f} s; range error median "
+        f"{card.test_range_error_median_m * 1e3:.2f} mm, {card.test_share_above_5_cm:.2%} above 5 cm; "
+        f"position error from scans without noise {card.test_position_error_rms_m * 1e3:.2f} mm RMS"
     )
     return path
 
 
-def _random_poses(world: World, count: int, rng: np.random.Generator) -> se2.Array:
+def learn_and_save(
+    path: Path,
+    options: TrainPreciseOptions,
+    world: World,
+    poses: dict[str, se2.Array],
+    scans: dict[str, se2.Array],
+    bar: Progress,
+) -> weights.FieldCard:
+    """Learns from the `train` scans at their poses, saves the weights with their errors on the `test` scans.
+
+    The test scans have no noise. Returns the model card.
+    """
+    start = time.monotonic()
+    model, quality = _train(options, options.scanner, poses, scans, bar)
+    seconds = time.monotonic() - start
+    visited = se2.compose(poses["train"], np.array(options.scanner.mount))[:, :2]
+    places = thin_places(np.concatenate([visited, reachable(model.field, visited)]), SEED_SPACING_M)
+    card = _card(options, world, options.scanner, model, quality, seconds)
+    weights.save(path, model, places, card)
+    return card
+
+
+def random_poses(world: World, count: int, rng: np.random.Generator) -> se2.Array:
+    """Random poses (count, 3) at places where the robot fits."""
     positions = world.sample_free(count, rng, Robot().radius)
     return np.column_stack([positions, rng.uniform(-np.pi, np.pi, count)])
 

@@ -56,6 +56,6 @@ def session(link: Link, timeout: float = 3.0) -> Iterator[Bus]:
         if link.connect and not wait_until(bus.linked, timeout):
             raise UserError(
                 f"nothing answers at {', '.join(link.connect)}: start a session with `presage up`, "
-                "or give the endpoint of a running one with --connect"
+                "or give the endpoint of a running one with `presage --connect`"
             )
         yield bus

@@ -85,7 +85,7 @@ def find_session(connect: str) -> RunningSession:
     sessions = [session for session in running_sessions() if connect in {"", session.endpoint}]
     if len(sessions) > 1:
         known = "; ".join(f"{session.endpoint} ({', '.join(session.robots)})" for session in sessions)
-        raise UserError(f"several sessions run on this machine, choose one with --connect: {known}")
+        raise UserError(f"several sessions run on this machine, choose one with `presage --connect`: {known}")
     return sessions[0] if sessions else RunningSession(connect or DEFAULT_ENDPOINT)
 
 
@@ -93,7 +93,9 @@ def link_of(connect: str, robot: str, roles: Sequence[str] = OPERATOR) -> Link:
     """Link to a robot of the session that `find_session` finds; ``robot`` defaults to the session's only one."""
     session = find_session(connect)
     if not robot and len(session.robots) > 1:
-        raise UserError(f"several robots run in this session, choose one with --robot: {', '.join(session.robots)}")
+        raise UserError(
+            f"several robots run in this session, choose one with `presage --robot`: {', '.join(session.robots)}"
+        )
     robot = robot or session.robots[0]
     return Link(
         robot, split_endpoints(session.endpoint), security=credentials_for(robot, roles, folder=session.security)

@@ -46,7 +46,7 @@ def run_up(options: UpOptions, console: Console) -> None:
     robots = [robot] if options.robots == 1 else [f"{robot}-{k}" for k in range(1, options.robots + 1)]
     if options.robots > 1 and options.record is not None:
         raise UserError(
-            f"--record records one robot only: leave it out, and run `presage record --robot {robots[0]}` beside it"
+            f"--record records one robot only: leave it out, and run `presage --robot {robots[0]} record` beside it"
         )
     if not simulated and (options.robots > 1 or pace != "realtime"):
         raise UserError("--no-simulator allows one robot in real time only: leave out --robots, and the setting pace")
@@ -90,10 +90,10 @@ def _show_hints(stack: Stack, world: str, robots: list[str], console: Console) -
     if len(robots) > 1:
         console.print(f"robots: {', '.join(robots)}, with one estimator for all", soft_wrap=True)
     goal = "15 1.5" if world == "corridor" else "X Y"
-    robot = "" if len(robots) == 1 else f" --robot {robots[0]}"
+    presage = "presage" if len(robots) == 1 else f"presage --robot {robots[0]}"
     console.print(
-        f"[bold green]all alive[/] at {stack.endpoint}. In another terminal: presage goal {goal} --wait{robot} | "
-        f"presage echo belief{robot} | presage hz{robot}. Ctrl-C ends all services.",
+        f"[bold green]all alive[/] at {stack.endpoint}. In another terminal: {presage} goal {goal} --wait | "
+        f"{presage} echo belief | {presage} hz. Ctrl-C ends all services.",
         soft_wrap=True,
     )
 

@@ -21,16 +21,6 @@ err_console = Console(stderr=True, width=None if sys.stderr.isatty() else 150)
 # misspelt option is still rejected, because it is not a number.
 ALLOW_NEGATIVE_NUMBERS = {"ignore_unknown_options": True}
 
-RobotName = Annotated[
-    str, typer.Option(envvar="PRESAGE_ROBOT", help="Robot name. Defaults to the only robot of the session.")
-]
-Connect = Annotated[
-    str,
-    typer.Option(
-        envvar="PRESAGE_CONNECT",
-        help="Zenoh endpoints, separated by commas. Defaults to the session that runs on this machine.",
-    ),
-]
 WorldName = Annotated[str, typer.Option(help="World name, world file, or ROS map.yaml.")]
 EstimatorName = Annotated[str, typer.Option(help="Estimator preset: precise, paper, particle-filter or amcl-defaults.")]
 ModelName = Annotated[

@@ -94,7 +94,7 @@ class FleetService(Service):
         """Raises UserError if a setting is only for one robot."""
         super().__init__(settings)
         if settings.initial_pose:
-            raise UserError("--initial-pose is for one robot: with --robots, set the pose of each robot by `localise`")
+            raise UserError("--initial-pose is for one robot: with --robots, set each pose with `presage relocalise`")
 
     def make_loop(self, bus: Bus) -> Runnable:
         """See Service."""

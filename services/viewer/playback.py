@@ -94,8 +94,8 @@ class Playback:
             return self._end() if self._child is child else None
 
     def _start(self, name: str) -> Child:
-        command = [sys.executable, "-m", "presage", "replay", str(self.folder / name), "--robot", self.robot]
-        command += ["--connect", self._connect, "--force", "--paused"]
+        command = [sys.executable, "-m", "presage", "--connect", self._connect, "replay", str(self.folder / name)]
+        command += ["--robot", self.robot, "--force", "--paused"]
         stderr = tempfile.TemporaryFile()  # noqa: SIM115 - closed in _end
         process = subprocess.Popen(  # noqa: S603 - runs this package; `open` checked the name against the folder
             command,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
@@ -42,3 +43,30 @@ def vector(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> dict:
 
 def quaternion(x: float = 0.0, y: float = 0.0, z: float = 0.0, w: float = 1.0) -> dict:
     return {"x": float(x), "y": float(y), "z": float(z), "w": float(w)}
+
+
+def laser_scan(stamp_ns: int, ranges: list[float], frame: str = "laser", **fields: float) -> bytes:
+    """An encoded LaserScan; by default of five beams from -1 to 1 rad."""
+    defaults = {
+        "angle_min": -1.0, "angle_max": 1.0, "angle_increment": 0.5, "time_increment": 0.0, "scan_time": 0.1,
+        "range_min": 0.1, "range_max": 10.0, "ranges": ranges, "intensities": [],
+    }  # fmt: skip
+    return encode("sensor_msgs/msg/LaserScan", {"header": header(stamp_ns, frame), **defaults, **fields})
+
+
+def odometry(
+    stamp_ns: int, pose: dict, twist: tuple[float, float, float], child: str = "base_link", covariance=(0.0,) * 36
+) -> bytes:
+    """An encoded Odometry; ``pose`` as of `planar_pose`, ``twist`` is vx, vy and wz in the child frame."""
+    velocity = {"linear": vector(*twist[:2]), "angular": vector(z=twist[2])}
+    six = list(covariance)
+    message = {"pose": {"pose": pose, "covariance": six}, "twist": {"twist": velocity, "covariance": six}}
+    return encode("nav_msgs/msg/Odometry", {"header": header(stamp_ns, "odom"), "child_frame_id": child, **message})
+
+
+def planar_pose(x: float, y: float, yaw: float = 0.0) -> dict:
+    return {"position": vector(x, y), "orientation": quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))}
+
+
+def pose_stamped(pose: dict, frame: str) -> bytes:
+    return encode("geometry_msgs/msg/PoseStamped", {"header": header(0, frame), "pose": pose})

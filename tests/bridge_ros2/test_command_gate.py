@@ -58,9 +58,9 @@ def test_repeated_stop():
     gate = driving()
     gate.command(command(1000), 0.0)
     gate.stop_for_silence(0.2)
-    said = [now for now in np.arange(0.2, 1.2, 0.05).tolist() if gate.repeat_stop(now) is not None]
-    assert 4 <= len(said) <= STOP_REPEAT_S / 0.1
-    assert max(said) <= 0.2 + STOP_REPEAT_S + 1e-9
+    stops = [now for now in np.arange(0.2, 1.2, 0.05).tolist() if gate.repeat_stop(now) is not None]
+    assert 4 <= len(stops) <= STOP_REPEAT_S / 0.1
+    assert max(stops) <= 0.2 + STOP_REPEAT_S + 1e-9
     assert gate.repeat_due(1.2) is None
     gate.add_scan(scan(1300), 1.3)
     gate.command(command(1300), 1.3)
@@ -97,14 +97,14 @@ def test_standing_robot():
     assert gate.command(command(1000, vx=0.0), 0.0) is None  # the robot has not moved
     gate.add_scan(scan(1066), 0.066)
     gate.command(command(1066), 0.07)
-    told = []
+    repeated = []
     for k in range(2, 12):
         stamp, now = 1000 + 66 * k, 0.066 * k
         gate.add_scan(scan(stamp), now)
-        told.append((now, gate.command(command(stamp, vx=0.0), now) is not None))
-    assert [said for now, said in told] == [now - 0.07 <= STOP_REPEAT_S for now, _ in told]
-    assert told[0][1]
-    assert not told[-1][1]
+        repeated.append((now, gate.command(command(stamp, vx=0.0), now) is not None))
+    assert [sent for now, sent in repeated] == [now - 0.07 <= STOP_REPEAT_S for now, _ in repeated]
+    assert repeated[0][1]
+    assert not repeated[-1][1]
     assert not gate.moving
 
 

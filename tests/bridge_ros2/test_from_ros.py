@@ -13,13 +13,8 @@ from services.bridge_ros2.ros_types import LASER_SCAN, ODOMETRY, POSE_STAMPED, d
 from tests.bridge_ros2 import independent as other
 
 
-def laser(ranges, first=-1.0, step=0.5, last=1.0, nearest=0.1, farthest=10.0, scan_time=0.1):
-    payload = other.encode(LASER_SCAN, {
-        "header": other.header(5, "laser"), "angle_min": first, "angle_max": last, "angle_increment": step,
-        "time_increment": 0.0, "scan_time": scan_time, "range_min": nearest, "range_max": farthest, "ranges": ranges,
-        "intensities": [],
-    })  # fmt: skip
-    return decode(LASER_SCAN, payload)
+def laser(ranges, **fields):
+    return decode(LASER_SCAN, other.laser_scan(5, ranges, **fields))
 
 
 def test_plain_scan():
@@ -43,7 +38,7 @@ def test_unmeasured_ranges():
 def test_directions_of_beams(upside_down, step):
     """Whatever the order of beams and the side that is up: the same points in base_link."""
     ranges, mount = np.array([1.0, 2.0, 3.0, 4.0], np.float32), Mount((0.5, -0.2, 0.7), upside_down)
-    scan = scan_of(laser(ranges.tolist(), first=0.2, step=step), mount, 0)
+    scan = scan_of(laser(ranges.tolist(), angle_min=0.2, angle_increment=step), mount, 0)
     assert scan.angle_increment > 0
     angles = np.float32(0.2) + step * np.arange(4)
     in_laser = np.stack([ranges * np.cos(angles), ranges * np.sin(angles), np.zeros(4)], axis=-1)
@@ -56,15 +51,17 @@ def test_directions_of_beams(upside_down, step):
 
 
 def test_full_circle():
-    scan = scan_of(laser([1.0] * 360, first=0.0, step=np.deg2rad(1), last=np.deg2rad(359)), Mount(), 0)
+    scan = scan_of(
+        laser([1.0] * 360, angle_min=0.0, angle_increment=np.deg2rad(1), angle_max=np.deg2rad(359)), Mount(), 0
+    )
     assert scan.angle_min == 0
     assert len(scan.ranges) == 360
-    missing = scan_of(laser([1.0] * 5, step=0.0), Mount(), 0)  # no increment said
+    missing = scan_of(laser([1.0] * 5, angle_increment=0.0), Mount(), 0)  # without an increment
     assert missing.angle_increment == pytest.approx(0.5)
 
 
 def test_largest_range_max():
-    scan = scan_of(laser([1.0, 2.0, np.inf], farthest=float(np.finfo(np.float32).max)), Mount(), 0)
+    scan = scan_of(laser([1.0, 2.0, np.inf], range_max=float(np.finfo(np.float32).max)), Mount(), 0)
     assert scan.range_max == MAX_DISTANCE_M
     assert scan.ranges.tolist() == [1.0, 2.0, np.inf]
 
@@ -74,10 +71,10 @@ def test_largest_range_max():
     [
         {"ranges": []},
         {"ranges": [1.0] * 32_769},
-        {"first": np.nan},
-        {"farthest": 0.0},
-        {"farthest": np.inf},
-        {"step": 0.0, "last": -1.0},
+        {"angle_min": np.nan},
+        {"range_max": 0.0},
+        {"range_max": np.inf},
+        {"angle_increment": 0.0, "angle_max": -1.0},
     ],
     ids=lambda wrong: str(wrong)[:40],
 )
@@ -86,17 +83,8 @@ def test_invalid_scans(wrong):
         scan_of(laser(**{"ranges": [1.0, 1.0], **wrong}), Mount(), 0)
 
 
-def odometry(x=1.0, y=2.0, yaw=0.0, twist=(0.3, 0.0, 0.5), covariance=None):
-    six = [0.0] * 36 if covariance is None else covariance
-    pose = {"position": other.vector(x, y), "orientation": other.quaternion(z=np.sin(yaw / 2), w=np.cos(yaw / 2))}
-    payload = other.encode(ODOMETRY, {
-        "header": other.header(9, "odom"), "child_frame_id": "base_footprint",
-        "pose": {"pose": pose, "covariance": six},
-        "twist": {
-            "twist": {"linear": other.vector(*twist[:2]), "angular": other.vector(z=twist[2])}, "covariance": six,
-        },
-    })  # fmt: skip
-    return decode(ODOMETRY, payload)
+def odometry(x=1.0, y=2.0, yaw=0.0, twist=(0.3, 0.0, 0.5), covariance=(0.0,) * 36):
+    return decode(ODOMETRY, other.odometry(9, other.planar_pose(x, y, yaw), twist, "base_footprint", covariance))
 
 
 def test_covariance_of_odometry():
@@ -122,10 +110,8 @@ def test_odometry_of_another_frame():
 
 
 def test_frame_of_a_pose():
-    pose = {"position": other.vector(3, 4), "orientation": other.quaternion(z=np.sin(0.5), w=np.cos(0.5))}
-
     def message(frame):
-        return decode(POSE_STAMPED, other.encode(POSE_STAMPED, {"header": other.header(0, frame), "pose": pose}))
+        return decode(POSE_STAMPED, other.pose_stamped(other.planar_pose(3, 4, 1), frame))
 
     for frame in ("map", "/map", ""):
         np.testing.assert_allclose(pose_of(message(frame), "map").array(), [3, 4, 1])

@@ -51,7 +51,7 @@ def test_keys_of_ros2dds():
 
 
 def test_tokens():
-    qos = Qos(depth=42)  # what rmw_zenoh takes unless told
+    qos = Qos(depth=42)  # the default of rmw_zenoh
     assert NODE.endpoint_token("MS", 16, "/nucleo/cmd_vel", TWIST, qos) == TOKEN
     assert NODE.token() == "@ros2_lv/0/100f0e0d0c0b0a090807060504030201/0/0/NN/%/%/nucleo_h743zi2"
     spaced = Node(Names(domain=5), "ab", "/robot1/", "presage").endpoint_token("MP", 1, "/robot1/x", TWIST, qos)

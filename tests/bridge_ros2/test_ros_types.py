@@ -77,11 +77,7 @@ def test_bytes_read_elsewhere():
 )
 def test_bytes_written_elsewhere(ranges, frame, sec):
     """Of every length of the frame's name, which moves what follows."""
-    payload = other.encode(r.LASER_SCAN, {
-        "header": other.header(sec * 10**9 + 5, frame), "angle_min": -1.5, "angle_max": 1.5, "angle_increment": 0.25,
-        "time_increment": 0.0, "scan_time": 0.125, "range_min": 0.5, "range_max": 8.0, "ranges": ranges,
-        "intensities": ranges[:3],
-    })  # fmt: skip
+    payload = other.laser_scan(sec * 10**9 + 5, ranges, frame, intensities=ranges[:3])
     message = r.decode(r.LASER_SCAN, payload)
     assert stamp_of(message.header) == sec * 10**9 + 5
     assert message.header.frame_id == frame

@@ -20,7 +20,7 @@ from common.messages.requests import LocaliseRequest, Reply
 from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, LOCALISE, ODOM, SCAN
 from tests.bridge_ros2 import independent as other
 from tests.bridge_ros2.made import belief
-from tests.conftest import WAIT_TIMEOUT_S, Processes
+from tests.conftest import WAIT_TIMEOUT_S
 from tests.system.ros2_robot import BEGIN, Ros, transform, transforms
 
 LASER, ODOMETRY = "sensor_msgs::msg::dds_::LaserScan_", "nav_msgs::msg::dds_::Odometry_"
@@ -28,29 +28,11 @@ POSED, TF = "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_", "tf2_msgs::m
 TWIST, GOAL_POSE = "geometry_msgs::msg::dds_::Twist_", "geometry_msgs::msg::dds_::PoseStamped_"
 
 
-def laser(stamp_ns, frame="laser"):
-    return other.encode("sensor_msgs/msg/LaserScan", {
-        "header": other.header(stamp_ns, frame), "angle_min": -1.0, "angle_max": 1.0, "angle_increment": 0.5,
-        "time_increment": 0.0, "scan_time": 0.1, "range_min": 0.1, "range_max": 10.0, "ranges": [1.0, 2, 3, 0, 5],
-        "intensities": [],
-    })  # fmt: skip
+RANGES = [1.0, 2.0, 3.0, 0.0, 5.0]
 
 
-def odometry(stamp_ns, x):
-    pose = {"position": other.vector(x), "orientation": other.quaternion()}
-    twist = {"linear": other.vector(0.5), "angular": other.vector()}
-    return other.encode("nav_msgs/msg/Odometry", {
-        "header": other.header(stamp_ns, "odom"), "child_frame_id": "base_link",
-        "pose": {"pose": pose, "covariance": [0.0] * 36}, "twist": {"twist": twist, "covariance": [0.0] * 36},
-    })  # fmt: skip
-
-
-def posed(x, y, frame="map", *, covariance=False):
-    pose = {"position": other.vector(x, y), "orientation": other.quaternion()}
-    if covariance:
-        message = {"header": other.header(0, frame), "pose": {"pose": pose, "covariance": [0.0] * 36}}
-        return other.encode("geometry_msgs/msg/PoseWithCovarianceStamped", message)
-    return other.encode("geometry_msgs/msg/PoseStamped", {"header": other.header(0, frame), "pose": pose})
+def odometry(stamp_ns):
+    return other.odometry(stamp_ns, other.planar_pose(2.0, 0.0), (0.5, 0.0, 0.0))
 
 
 class Beside:
@@ -73,8 +55,8 @@ class Beside:
     def sweep(self):
         """Publishes odometry and, 50 ms later by its stamp, a scan. Returns the bridge's Odom and Scan."""
         self.stamp += 10**8
-        self.put["odom"](odometry(self.stamp - 5 * 10**7, 2.0))
-        self.put["scan"](laser(self.stamp))
+        self.put["odom"](odometry(self.stamp - 5 * 10**7))
+        self.put["scan"](other.laser_scan(self.stamp, RANGES))
         return tuple(self.next(kind, lambda each: each.stamp_ns == self.stamp) for kind in (Odom, Scan))
 
     def next(self, kind, condition=lambda _: True):
@@ -99,37 +81,33 @@ class Beside:
 
 
 @pytest.fixture(scope="module")
-def beside(tmp_path_factory, router):
+def beside(module_processes, router):
     """A bridge between both sides, which here share one router."""
-    processes = Processes(tmp_path_factory.mktemp("beside"))
-    try:
-        link = Link(robot="rover", connect=(f"tcp/127.0.0.1:{router}",))
-        with open_bus(link) as bus, Ros(router, "rmw_zenoh", "jazzy") as node:
-            found = Beside(bus, node)
-            environment = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": "rover"}
-            args = ("--ros-connect", f"tcp/127.0.0.1:{router}", "--publish-map", "--world", "maze")
-            bridge = processes.start("bridge_ros2", *args, env=environment)
-            bridge.wait_for("ready")
-            assert bus.wait_matching(BELIEF, WAIT_TIMEOUT_S)
-            assert bus.wait_matching(CMD_VEL, WAIT_TIMEOUT_S)
-            last = time.monotonic()
+    link = Link(robot="rover", connect=(f"tcp/127.0.0.1:{router}",))
+    with open_bus(link) as bus, Ros(router, "rmw_zenoh", "jazzy") as node:
+        found = Beside(bus, node)
+        environment = {"PRESAGE_CONNECT": link.connect[0], "PRESAGE_ROBOT": "rover"}
+        args = ("--ros-connect", f"tcp/127.0.0.1:{router}", "--publish-map", "--world", "maze")
+        bridge = module_processes.start("bridge_ros2", *args, env=environment)
+        bridge.wait_for("ready")
+        assert bus.wait_matching(BELIEF, WAIT_TIMEOUT_S)
+        assert bus.wait_matching(CMD_VEL, WAIT_TIMEOUT_S)
+        last = time.monotonic()
 
-            def heard():  # the first messages may be sent before the bridge's subscription is known
-                nonlocal last
-                if time.monotonic() - last > 0.2:
-                    last, found.stamp = time.monotonic(), found.stamp + 10**8
-                    found.put["odom"](odometry(found.stamp, 2.0))
-                    found.put["scan"](laser(found.stamp))
-                return all(found.inbox.received[topic.key("rover")] > 0 for topic in (SCAN, ODOM))
+        def heard():  # the first messages may be sent before the bridge's subscription is known
+            nonlocal last
+            if time.monotonic() - last > 0.2:
+                last, found.stamp = time.monotonic(), found.stamp + 10**8
+                found.put["odom"](odometry(found.stamp))
+                found.put["scan"](other.laser_scan(found.stamp, RANGES))
+            return all(found.inbox.received[topic.key("rover")] > 0 for topic in (SCAN, ODOM))
 
-            assert wait_until(heard, WAIT_TIMEOUT_S), bridge.output
-            yield found
-            assert bridge.stop()[0] == 0
-    finally:
-        processes.close()
+        assert wait_until(heard, WAIT_TIMEOUT_S), bridge.output
+        yield found
+        assert bridge.stop() == 0
 
 
-def test_the_belief_is_said_only_while_it_tracks(beside):
+def test_published_beliefs(beside):
     for number, state in enumerate(("localising", "ambiguous", "lost"), 1):
         beside.believe(state)
         beside.counts("beliefs_not_said", number)  # one by one, because a busy bridge only takes the newest of several
@@ -137,30 +115,32 @@ def test_the_belief_is_said_only_while_it_tracks(beside):
     assert not beside.heard["tf"]
     beside.believe("tracking")
     assert wait_until(lambda: bool(beside.heard["amcl_pose"] and beside.heard["tf"]), WAIT_TIMEOUT_S)
-    pose, (said,) = beside.heard["amcl_pose"][-1], beside.heard["tf"][-1].transforms
+    pose, (published,) = beside.heard["amcl_pose"][-1], beside.heard["tf"][-1].transforms
     assert pose.pose.covariance[35] == 0.09
-    assert (said.header.frame_id, said.child_frame_id) == ("map", "odom")
-    at, turn = said.transform.translation, said.transform.rotation
+    assert (published.header.frame_id, published.child_frame_id) == ("map", "odom")
+    at, turn = published.transform.translation, published.transform.rotation
     odom_in_map = [at.x, at.y, 2 * np.arctan2(turn.z, turn.w)]
     np.testing.assert_allclose(se2.compose(odom_in_map, [2.025, 0, 0]), [3.0, -1.5, 0.5], atol=1e-9)
-    stamps = [each.stamp.sec * 10**9 + each.stamp.nanosec for each in (pose.header, said.header)]
+    stamps = [each.stamp.sec * 10**9 + each.stamp.nanosec for each in (pose.header, published.header)]
     assert stamps == [beside.stamp, beside.stamp + 10**9]  # the transform is stamped ahead, as in AMCL
 
 
-def test_rvizs_two_buttons(beside):
-    beside.put["initialpose"](posed(4, 2, covariance=True))
+def test_buttons_of_rviz(beside):
+    posed = {"pose": other.planar_pose(4, 2), "covariance": [0.0] * 36}
+    message = {"header": other.header(0, "map"), "pose": posed}
+    beside.put["initialpose"](other.encode("geometry_msgs/msg/PoseWithCovarianceStamped", message))
     calls = []
     assert wait_until(lambda: (call := beside.calls.get(0)) is not None and not calls.append(call), WAIT_TIMEOUT_S)
     request = LocaliseRequest.decode(calls[0].payload)
     assert (request.pose.x, request.pose.y) == (4, 2)
     calls[0].reply(Reply().encode())
-    beside.put["goal_pose"](posed(9, 9, "odom"))  # in the wrong frame: rejected
-    beside.put["goal_pose"](posed(5, 1))
+    beside.put["goal_pose"](other.pose_stamped(other.planar_pose(9, 9), "odom"))  # in the wrong frame: rejected
+    beside.put["goal_pose"](other.pose_stamped(other.planar_pose(5, 1), "map"))
     goal = beside.next(Goal)
     assert (goal.pose.x, goal.pose.y, goal.seq) == (5, 1, 0)
 
 
-def test_the_map_is_there_for_who_comes_later(beside):
+def test_map_for_late_subscribers(beside):
     """A late subscriber requests the history, as rmw_zenoh does for transient-local topics, and gets it at once."""
     key = "0/map/nav_msgs::msg::dds_::OccupancyGrid_/*"
 
@@ -185,16 +165,16 @@ def test_the_map_is_there_for_who_comes_later(beside):
     assert not again
     sample = heard[0]
     assert len(sample.attachment.to_bytes()) == 33
-    said = other.decode("nav_msgs/msg/OccupancyGrid", sample.payload.to_bytes())
+    published = other.decode("nav_msgs/msg/OccupancyGrid", sample.payload.to_bytes())
     grid = rasterise(load_world("maze"))
-    assert (said.info.width, said.info.height, said.header.frame_id) == (grid.width, grid.height, "map")
-    np.testing.assert_array_equal(np.array(said.data, np.int8).view(np.uint8), grid.values.ravel())
+    assert (published.info.width, published.info.height, published.header.frame_id) == (grid.width, grid.height, "map")
+    np.testing.assert_array_equal(np.array(published.data, np.int8).view(np.uint8), grid.values.ravel())
     tokens = beside.node.session.liveliness().get("@ros2_lv/0/**")
     (token,) = [str(reply.ok.key_expr) for reply in tokens if reply.ok and "/%map/" in str(reply.ok.key_expr)]
     assert token.endswith("/:1:,1:,:,:,,")
 
 
-def test_it_says_what_it_waits_for_and_what_is_wrong(processes, router):
+def test_reported_problems(processes, router):
     ours = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{router}", "PRESAGE_ROBOT": "lost"}
     theirs, port = processes.start_router()
     nowhere = processes.start(
@@ -211,10 +191,10 @@ def test_it_says_what_it_waits_for_and_what_is_wrong(processes, router):
         def complains_about_tf():
             if time.monotonic() - last[0] > 0.2:
                 last[0] = time.monotonic()
-                put(laser(BEGIN, "lidar"))
+                put(other.laser_scan(BEGIN, RANGES, "lidar"))
             return "tf does not connect lidar with base_link" in bridge.output
 
         assert wait_until(complains_about_tf, WAIT_TIMEOUT_S), bridge.output
     theirs.kill()
     bridge.wait_for("the connection is lost")
-    assert nowhere.stop()[0] == bridge.stop()[0] == 0
+    assert nowhere.stop() == bridge.stop() == 0

@@ -79,7 +79,7 @@ def test_stops_before_obstacles(heading):
     assert np.hypot(*log[-1][0].twist.array()[:2]) < 0.05
 
 
-def test_drive_without_beliefs_brakes_after_the_timeout():
+def test_drive_without_beliefs():
     navigator, answers = Navigator(world=ROOM), []
     for number in range(60):
         navigator.on_scan(scan(number * PERIOD_NS, [3.0, 2, 0], ROOM))
@@ -104,7 +104,7 @@ def test_drive_without_beliefs_brakes_after_the_timeout():
         ([(0, 1), (400, 0)], [(900, True), (901, False)]),  # zero velocity once
         ([(0, 0), (400, 0)], [(500, True), (501, False)]),  # repeated: the time counts from the first
         ([(0, 0), (400, 0), (600, 1)], [(1100, True)]),
-        ([(0, 0), (501, 0)], [(1001, True), (1002, False)]),  # after a gap it counts anew
+        ([(0, 0), (501, 0)], [(1001, True), (1002, False)]),  # after a gap the time counts from zero
         ([(100_000, 1)], [(100_000, True), (0, False), (100_000, False)]),  # time went back: a reset
     ],
 )

@@ -31,7 +31,7 @@ def test_goal_is_reached(yaw):
     assert path_length([pose for *_, pose in log]) < 1.02 * np.hypot(7, 1)
 
 
-def test_commands_have_the_stamp_of_the_belief():
+def test_stamps_of_commands():
     command, status = Navigator().step(belief(123, [1, 1, 0]))
     assert command.stamp_ns == status.stamp_ns == 123
     assert (status.state, command.twist.array().any()) == ("idle", False)
@@ -58,14 +58,14 @@ def test_stands_until_localised(navigator, state):
     assert status.state == "navigating"
 
 
-def test_blocked_by_an_obstacle_without_contact(navigator):
+def test_blocked_by_an_obstacle(navigator):
     log = session(navigator, [1.5, 2, 0], [None] * 150, room(10, 4, box(5, 2, 0.2, 3.9)))  # not in its map
     assert log[-1][1].state == "blocked"
     assert "in the way" in log[-1][1].reason
     assert max(pose[0] for *_, pose in log) + Robot().radius < 4.9
 
 
-def test_stops_without_a_belief_and_keeps_the_goal(navigator):
+def test_stop_without_a_belief(navigator):
     session(navigator, [1.5, 2, 0], [None] * 15, ROOM)
     command, status = navigator.stop_without_belief(5, "no belief")
     assert (command.stamp_ns, status.reason, status.state, status.distance) == (5, "no belief", "lost", None)

@@ -32,7 +32,7 @@ def two_rooms(gap):
 
 
 @pytest.mark.parametrize(("robot", "gap"), [(BURGER, 0.45), (HEAVY, 1.3)], ids=["burger", "heavy"])
-def test_drives_through_a_fitting_door_within_its_limits(robot, gap):
+def test_fitting_door(robot, gap):
     world = two_rooms(gap)
     poses, statuses, contacts = drive(world, robot, (2.0, 1.5, 1.0), goal(4.2, 1.5), 400, scanner=CENTRED)
     assert (statuses[-1].state, contacts) == ("reached", 0), statuses[-1]
@@ -63,7 +63,7 @@ def with_posts(scan):
 
 
 @pytest.mark.parametrize(("kind", "self_filter"), list(zip(KINDS, FILTERS, strict=True)))
-def test_robot_in_its_own_scan_drives_with_a_self_filter(kind, self_filter):
+def test_robot_in_its_own_scan(kind, self_filter):
     """It also still sees and avoids the box. Without a self filter the robot does not move."""
     robot, found = Robot(drive=kind), room(6, 4, box(3.0, 2.0, 0.5, 0.5))
 
@@ -77,7 +77,7 @@ def test_robot_in_its_own_scan_drives_with_a_self_filter(kind, self_filter):
     assert np.hypot(*(poses[-1] - poses[0])[:2]) < 0.5
 
 
-def test_obstacle_stop_of_the_bridge_with_a_self_filter():
+def test_obstacle_stop_of_the_bridge():
     with closing(Simulation(Setup(HALL, SCANNER, Robot(), (1.0, 2.0, 0.0)))) as simulation:
         scan = with_posts(simulation.observe()[2])
     command, self_filter, outputs = CmdVel(stamp_ns=scan.stamp_ns, twist=Twist(vx=0.3)), SelfFilter(radius=0.2), []

@@ -64,7 +64,7 @@ def test_actions_stay_within_the_view(centre, half_deg):
 
 
 @pytest.mark.parametrize("name", TURNED)
-def test_removed_obstacle_is_forgotten_for_any_beam_order(name):
+def test_removed_obstacle(name):
     scanner, pose, layer = TURNED[name], np.array([2.0, 1.5, 0.4]), TemporaryObstacles(FREE)
     layer.update(scan(0, pose, CHANGED, scanner), pose)
     assert len(layer.points()) >= 4
@@ -85,7 +85,7 @@ def wander(observed):
 
 
 @pytest.mark.parametrize("name", TURNED)
-def test_wanders_to_free_space_for_any_beam_order(name):
+def test_wandering(name):
     """Unmeasured beams count neither as free nor as wall, unless no beam is measured."""
     whole, actions = scan(2 * 10**9, [1.0, 3.0, 0.0], HALL, TURNED[name]), []
     for unmeasured in (slice(0, 0), slice(0, None, 2), slice(None)):
@@ -99,7 +99,7 @@ def test_wanders_to_free_space_for_any_beam_order(name):
 
 
 @pytest.mark.parametrize("scanner", [LMS, BACKWARDS], ids=["forwards", "backwards"])
-def test_turns_before_driving_with_half_a_view(scanner):
+def test_half_a_view(scanner):
     """The goal lies behind, an unmapped box is in the way, and the simulator's obstacle stop is off."""
     start = (6.0, 1.5, scanner.mount[2])
     poses, statuses, contacts = drive(
@@ -109,7 +109,7 @@ def test_turns_before_driving_with_half_a_view(scanner):
     assert np.hypot(*(poses[5] - poses[0])[:2]) < 0.02  # it turns first
 
 
-def test_differential_base_that_cannot_see_ahead_is_blocked():
+def test_no_view_ahead():
     policy, pose = GeodesicPolicy(Robot(drive="differential"), HALL), np.array([4.0, 3.0, 0.0])
     policy.set_goal(np.array([6.0, 3.0]))
     policy.observe(scan(0, pose, HALL, BACKWARDS), belief(0, pose))

@@ -11,7 +11,7 @@ from common.geometry.world import World
 from common.robot.scanner import SCANNERS
 from services.estimator.factory import EstimatorOptions, Geometry, prepare
 from services.estimator.particle_filter.beam_model import RangeTable
-from services.estimator.particle_filter.likelihood_field import DistanceField
+from services.estimator.particle_filter.likelihood_field import SurfaceDistances
 from services.estimator.shared.interface import Observation
 from tests.common.geometry.maps import rooms
 
@@ -24,7 +24,7 @@ def hall():
 
 
 def test_particle_filter_tables(hall):
-    field = DistanceField(hall)
+    field = SurfaceDistances(hall)
     places = hall.sample_free(300, np.random.default_rng(0), 0.1)
     exact = hall.grid.shapes.distance(OCCUPIED, places)
     assert np.abs(field(places[:, 0], places[:, 1]) - np.minimum(exact, 2.0)).max() < 0.03  # half a cell, at corners

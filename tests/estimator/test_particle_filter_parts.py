@@ -16,7 +16,7 @@ from common.geometry.world import World
 from services.estimator.particle_filter import Settings, motion, resampling
 from services.estimator.particle_filter.beam_model import BeamModel, RangeTable
 from services.estimator.particle_filter.clusters import hypotheses, labels, moments
-from services.estimator.particle_filter.likelihood_field import DistanceField, LikelihoodField
+from services.estimator.particle_filter.likelihood_field import LikelihoodField, SurfaceDistances
 from services.estimator.particle_filter.recovery import Recovery
 from tests.estimator.models import ROOM
 
@@ -25,7 +25,7 @@ ALPHAS = (0.04, 0.02, 0.03, 0.05, 0.01)
 
 
 def test_distance_field():
-    field, rng = DistanceField(ROOM, 0.05), np.random.default_rng(0)
+    field, rng = SurfaceDistances(ROOM, 0.05), np.random.default_rng(0)
     points = rng.uniform((-1, -1), (7, 5), (4000, 2))
     exact = np.clip(ROOM.clearance(points), -2, 2)
     found = field(points[:, 0], points[:, 1])
@@ -38,7 +38,7 @@ def test_distance_field():
 
 def test_surfaces_and_saturation():
     """The distance is 0 on the boundary of free space, to 0.1 mm, so that no pose is drawn into the walls."""
-    field = DistanceField(HALL, 0.07)
+    field = SurfaceDistances(HALL, 0.07)
     along = np.linspace(0.5, 9.5, 50)
     assert np.abs(field(np.zeros(50), along)).max() < 1e-4
     assert np.abs(field(along, np.full(50, 10.0))).max() < 1e-4
@@ -49,7 +49,7 @@ def test_surfaces_and_saturation():
 def test_too_large_world():
     huge = World(name="huge", boundary=[(0, 0), (9000, 0), (9000, 9000), (0, 9000)])
     with pytest.raises(UserError, match="coarser resolution"):
-        DistanceField(huge)
+        SurfaceDistances(huge)
     with pytest.raises(UserError, match="too many"):
         RangeTable(huge)
 
@@ -57,7 +57,7 @@ def test_too_large_world():
 @pytest.mark.parametrize("sigma", [0.05, 0.1, 0.5])
 def test_likelihood_field_is_a_density(sigma):
     """Integrates over all ranges of a beam perpendicular to a wall, without other surfaces nearby."""
-    field = LikelihoodField(DistanceField(HALL, 0.05), 0.95, 0.05)
+    field = LikelihoodField(SurfaceDistances(HALL, 0.05), 0.95, 0.05)
     z, pose = np.linspace(0, 25, 25001), np.array([[5.0, 5.0, 0.0]])
     ends = np.concatenate([field.ends(pose, np.array([r]), np.zeros(1))[0] for r in z[::10]])
     density = field.densities(ends, sigma, 25.0)
@@ -66,7 +66,7 @@ def test_likelihood_field_is_a_density(sigma):
 
 
 def test_product_of_many_beams():
-    field = LikelihoodField(DistanceField(ROOM), 0.95, 0.05)
+    field = LikelihoodField(SurfaceDistances(ROOM), 0.95, 0.05)
     far = np.full((2, 811), 1.5)
     log = field.log_product(far, 0.1, 25.0)
     assert np.allclose(log, 811 * np.log(0.05 / 25), rtol=1e-5)  # e^-5040
@@ -227,5 +227,5 @@ def test_overlapping_obstacles():
     """Of two boxes that overlap, the edge of one inside the other is no surface."""
     boxes = [{"box": {"center": (c, 5), "size": (2, 2)}} for c in (4.5, 5.5)]
     world = World(name="pair", boundary=HALL.boundary, obstacles=boxes)
-    assert DistanceField(world)(np.array([5.5]), np.array([5.0]))[0] == pytest.approx(-1.0, abs=1e-3)
+    assert SurfaceDistances(world)(np.array([5.5]), np.array([5.0]))[0] == pytest.approx(-1.0, abs=1e-3)
     assert shapely.area(world.free_space) == pytest.approx(94)

@@ -41,7 +41,7 @@ def test_a_figure_shows_each_cell_where_it_is(origin):
     assert shown.tolist() == [{FREE: 255, OCCUPIED: 0, UNKNOWN: 0xE4}[value] for value in VALUES.ravel()]
 
 
-def test_foxglove_gets_the_cells_and_the_edges_of_walls():
+def test_map_in_foxglove():
     world = World(name="hut", grid=OccupancyGrid.of(VALUES, 0.5, (1.0, 2.0, 0.0)), obstacles=[CRATE])
     sent = grid(world, 0)
     data = np.frombuffer(sent.data, np.uint8).reshape(-1, sent.column_count, 5)[..., 4]
@@ -60,7 +60,7 @@ def test_foxglove_gets_the_cells_and_the_edges_of_walls():
     assert crate.id == "obstacle 0"
 
 
-def test_the_bench_measures_and_keeps_what_it_made(tmp_path):
+def test_bench_of_maps(tmp_path):
     out, numbers = tmp_path / "made", tmp_path / "map.json"
     run = CliRunner().invoke(app, ["bench", "map", "--size", "300", "--out", str(out), "--json", str(numbers)])
     assert run.exit_code == 0, run.output

@@ -26,7 +26,7 @@ def rules() -> list[dict]:
     return group["rules"]
 
 
-def test_alerts_ask_for_metrics_and_labels_that_exist():
+def test_metrics_of_alerts():
     known = {row.sample: row for row in METRICS} | {r.name + "_bucket": r for r in METRICS if r.kind == "histogram"}
     asked = 0
     for rule in rules():
@@ -40,7 +40,7 @@ def test_alerts_ask_for_metrics_and_labels_that_exist():
     assert "lost" in STATES[Belief]
 
 
-def test_promtool_takes_configuration_and_rules():
+def test_prometheus_configuration():
     if (tool := shutil.which("promtool")) is None:
         pytest.skip("needs promtool, of Prometheus: docs/prometheus is not checked by Prometheus itself")
     done = subprocess.run([tool, "check", "config", "prometheus.yml"], cwd=FOLDER, capture_output=True, text=True)

@@ -39,7 +39,7 @@ def test_one_file_for_each_request(recorder, bus, request_recording, recorder_he
     recorder_health(lambda _, odom: (odom.received, odom.written, odom.missing) == (30, 20, 0))
     second, sent_later = request_recording("start"), publish_odometry(bus, [100, 101, 104])
     recorder_health(lambda health, odom: (odom.received, odom.written, odom.missing) == (33, 23, 2) and not health.note)
-    assert running.stop()[0] == 0  # during the second recording
+    assert running.stop() == 0  # during the second recording
     assert sorted(str(path) for path in logs.iterdir()) == sorted([first.file, second.file])
     for file, payloads, missing in ((first.file, sent, 0), (second.file, sent_later, 2)):
         found, count = odometry_in(file, bus)
@@ -61,7 +61,7 @@ def test_refused_requests(recorder, request_recording, logs):
     (logs / "run-2.mcap.active").unlink()
     assert not request_recording("stop").ok
     assert request_recording("start").ok
-    assert running.stop()[0] == 0
+    assert running.stop() == 0
     assert sorted(path.name for path in logs.iterdir()) == ["run-2.mcap", "run.mcap"]
 
 
@@ -72,7 +72,7 @@ def test_unwritable_folder_is_an_answer(process, request_recording):
     assert not refused.ok
     assert "/dev/null/x: cannot be written to" in refused.reason
     assert not request_recording("status").recording
-    assert running.stop()[0] == 0
+    assert running.stop() == 0
 
 
 def test_files_describe_the_present_session(recorder, simulator, request_recording, bus):
@@ -101,7 +101,7 @@ def test_ended_services_are_not_described(recorder, bus, request_recording, proc
     active = Path(request_recording("start").file + ".active")
     assert wait_until(lambda: b"config:controller" in active.read_bytes(), 20)
     request_recording("stop")
-    assert controller.stop()[0] == 0
+    assert controller.stop() == 0
     assert wait_until(lambda: "controller" not in bus.alive(), 20)
 
     def absent():

@@ -59,9 +59,7 @@ def test_every_payload_is_in_the_file(recorder, recorder_health, simulator, bus,
     assert wait_until(lambda: b"world.yaml" in active.read_bytes(), 20), running.output
     sent = publish(bus, 1000)
     recorder_health(received(bus, 1000))
-    status, duration = running.stop(signal.SIGTERM)
-    assert status == 0, running.output
-    assert duration < 5
+    assert running.stop(signal.SIGTERM) == 0, running.output
     path = only_file(logs)
     assert path.name.startswith(f"presage-{bus.robot}-")
     assert str(path) in running.output
@@ -90,7 +88,7 @@ def test_chosen_topics(recorder, recorder_health, bus, logs):
     bus.put(SCAN, b"no")
     bus.put(ODOM, b"yes")
     recorder_health(lambda _, odom: odom.received == 1)
-    assert running.stop(signal.SIGINT)[0] == 0
+    assert running.stop(signal.SIGINT) == 0
     assert [(r.key, r.payload) for r in read_recording(logs / "some.mcap").raw] == [(ODOM.key(bus.robot), b"yes")]
 
 
@@ -108,7 +106,7 @@ def test_kill_9_keeps_what_was_flushed(recorder, bus, logs):
     third = recorder("--file", "third")
     third.wait_for(f"presage recover {active}")
     assert "second.mcap.active" not in third.output
-    assert alive.stop()[0] == third.stop()[0] == 0
+    assert alive.stop() == third.stop() == 0
     assert [raw.payload for raw in read_recording(recover(active).path).raw] == sent
 
 
@@ -132,7 +130,7 @@ def test_warning_without_router(processes, tmp_path, free_port):
     processes.start("common.router", "--listen", endpoint)
     running.wait_for("connected to the router")
     assert running.output.count("nothing answers") == 1
-    assert running.stop()[0] == 0
+    assert running.stop() == 0
 
 
 @pytest.mark.parametrize(
@@ -193,7 +191,7 @@ def test_invented_keys(recorder, recorder_health, bus, logs):
     for number in range(MAX_KEYS + 200):
         bus.put(HEALTH, b"", service=f"x{number}")
     recorder_health(lambda health, _: health.counters.get("turned_away", 0) >= 200)
-    assert running.stop()[0] == 0
+    assert running.stop() == 0
     recording = read_recording(only_file(logs))
     assert len(recording.counts()) <= MAX_KEYS
     others = from_metadata(recording.metadata["counters"])["others"]
@@ -212,17 +210,16 @@ def test_parts_by_time(recorder, recorder_health, bus, logs):
 
     assert wait_until(two_parts, 20, 0.05)
     recorder_health(received(bus, sum(map(len, sent.values()))))
-    assert running.stop()[0] == 0
+    assert running.stop() == 0
     files = sorted(logs.iterdir())
     assert [file.name for file in files] == [f"run-{k:03d}.mcap" for k in range(1, len(files) + 1)]
     assert payloads_in(files, sent) == sent
     assert "counters" in read_recording(files[0]).metadata
 
 
-def test_presage_record_beside_a_recorder(recorder, request_recording, process, bus, link, tmp_path, logs):
+def test_presage_record_beside_a_recorder(recorder, request_recording, process, bus, tmp_path, logs):
     first = recorder("--file", "first")
-    address = ("--robot", bus.robot, "--connect", link.connect[0])
-    second = process("presage.__main__", "record", "--out", str(tmp_path / "second"), *address)
+    second = process("presage.__main__", "record", "--out", str(tmp_path / "second"))
     second.wait_for("ready")
     inbox, own, heard = Inbox(), HEALTH.key(bus.robot, "recorder"), Counter()
     bus.subscribe(HEALTH, inbox, keep_all=True)
@@ -237,8 +234,8 @@ def test_presage_record_beside_a_recorder(recorder, request_recording, process, 
     assert (state.ok, state.recording) == (True, False)
     assert state.file.endswith("first.mcap")
     assert "recorded" not in second.output
-    assert second.stop(signal.SIGINT)[0] == 0
-    assert first.stop()[0] == 0
+    assert second.stop(signal.SIGINT) == 0
+    assert first.stop() == 0
     for path in (logs / "first.mcap", only_file(tmp_path / "second")):
         recording = read_recording(path)
         (row,) = [row for row in survey(recording).topics if row.key == own]

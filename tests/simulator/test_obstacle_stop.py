@@ -58,7 +58,7 @@ def test_no_contact_at_1_m_s(make, world):
     assert stopped > POSES / 2
 
 
-def test_no_contact_among_furniture_for_random_commands(make):
+def test_random_commands_among_furniture(make):
     simulation, rng = make("office"), np.random.default_rng(0)
     for _ in range(15):
         # Mostly into the field of view: forward and sideways.

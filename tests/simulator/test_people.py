@@ -63,7 +63,7 @@ def longest_stand(moves):
 @pytest.mark.parametrize("name", ["corridor", "maze", "office"])
 @settings(max_examples=4)
 @given(seed=st.integers(0, 2**32 - 1), speed=st.sampled_from([0.3, 1.0, 3.0]))
-def test_people_never_touch_walls_each_other_or_the_robot(name, seed, speed):
+def test_people_touch_nothing(name, seed, speed):
     world = shipped(name)
     robot = world.sample_free(1, np.random.default_rng(seed), ROBOT)[0]
     places = walk(crowd(world, 8, robot, seed, speed), 15, robot)
@@ -82,7 +82,7 @@ def test_one_person_walks_at_the_given_speed():
     assert np.ptp(places, axis=0).min() > 4
 
 
-def test_people_pass_every_door_of_the_office_and_keep_moving():
+def test_doors_of_the_office():
     people = crowd(shipped("office"), 10, OFFICE_START, seed=2)
     places = walk(people, 180, OFFICE_START)
     for door in ((2.2, 2.97), (7.6, 2.97), (13.35, 2.97), (4.4, 4.97), (11.45, 4.97)):
@@ -93,14 +93,14 @@ def test_people_pass_every_door_of_the_office_and_keep_moving():
     assert max(map(longest_stand, moves.T)) < 20.0
 
 
-def test_two_people_turn_back_in_a_narrow_alley():
+def test_people_in_an_alley():
     places = walk(crowd(ALLEY, 2, ALLEY_START), 150, ALLEY_START)
     assert len(np.unique(np.sign(places[:, 0, 0] - places[:, 1, 0]))) == 1
     assert least_gap(places) == pytest.approx(PERSON_DISTANCE, abs=PERIOD)  # they did meet
     assert max(map(longest_stand, moving(places).T)) < 20.0
 
 
-def test_person_stops_before_a_standing_robot_and_turns_back():
+def test_person_before_a_standing_robot():
     robot = np.array([8.0, 0.45])
     places = walk(crowd(ALLEY, 1, robot, seed=3), 150, robot)
     gap = np.abs(places[:, 0, 0] - 8.0) - PERSON_RADIUS_M - ROBOT
@@ -117,7 +117,7 @@ def test_people_walk_around_a_standing_robot():
     assert (np.diff(sides, axis=0) != 0).any(axis=0).all()
 
 
-def test_nobody_steps_in_front_of_a_robot_that_cannot_brake():
+def test_people_keep_out_of_the_way():
     """People within the braking distance of a robot at 1 m/s do not step into its way, or closer if they are in it.
 
     The simulated robot does not brake. People it would have run over are ignored from then on.
@@ -154,7 +154,7 @@ def test_only_people_in_the_way_are_moved():
     assert world.clearance(walk(people, 30, CORNER).reshape(-1, 2)).min() >= PERSON_RADIUS_M
 
 
-def test_without_room_an_error_is_raised_and_nothing_changes():
+def test_no_room_for_people():
     with pytest.raises(UserError, match=r"world 'alley' has room for \d+ people, .* not for 60: ask for fewer"):
         crowd(ALLEY, 60, (8.0, 0.45))
     people = crowd(ALLEY, 1, ALLEY_START)
@@ -165,13 +165,13 @@ def test_without_room_an_error_is_raised_and_nothing_changes():
     assert np.array_equal(people.places, before)
 
 
-def test_grid_is_empty_in_a_world_too_narrow_for_people():
+def test_world_too_narrow_for_people():
     grid = WalkableGrid(World(name="slit", boundary=[(0, 0), (9, 0), (9, 0.5), (0, 0.5)]), PERSON_RADIUS_M)
     assert len(grid.nodes) == len(grid.start_nodes) == 0
     assert not grid.can_start(np.array([4.0, 0.25]))
 
 
-def test_paths_keep_clear_of_walls_and_blocked_discs():
+def test_clearance_of_paths():
     world, rng, paths = shipped("maze"), np.random.default_rng(0), []
     grid, blocked = WalkableGrid(world, PERSON_RADIUS_M), np.array([[2.5, 3.5, 0.6], [7.5, 5.5, 0.6], [9.0, 2.5, 0.6]])
     for place in grid.nodes[rng.permutation(grid.start_nodes)[:40]]:

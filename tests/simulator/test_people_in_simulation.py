@@ -40,7 +40,7 @@ def test_rays_hit_people(make):
     assert hits > 400
 
 
-def test_people_change_only_the_beams_that_hit_them(make):
+def test_beams_that_hit_people(make):
     plain, peopled = (measurements(make("office", people=count, seed=7), 5) for count in (0, 6))
     shorter = 0
     for (odom, truth, scan), (odom_2, truth_2, scan_2) in zip(plain, peopled, strict=True):
@@ -53,7 +53,7 @@ def test_people_change_only_the_beams_that_hit_them(make):
     assert 0 < shorter < 0.5 * len(plain) * SCANNER.beams
 
 
-def test_samples_and_the_world_do_not_contain_people(make):
+def test_samples_without_people(make):
     plain, peopled = make("office"), make("office", people=30)
     poses = np.column_stack([plain.world.sample_free(40, np.random.default_rng(1), 0.3), np.zeros(40)])
     assert np.array_equal(plain.sample(poses, None, 5), peopled.sample(poses, None, 5))
@@ -117,7 +117,7 @@ def test_teleport_onto_a_person_moves_them(make):
     assert not contacts(drive(simulation, Twist(), 3))
 
 
-def test_furniture_put_onto_a_person_moves_them(make):
+def test_furniture_on_a_person(make):
     simulation = make(HALL, people=3, seed=2)
     drive(simulation, Twist(), 2)
     place = tuple(simulation.people.places[1].tolist())

@@ -54,7 +54,7 @@ def test_ranges_match_to_a_millimetre(name, seed):
     assert off.mean() < 0.01  # few beams graze an edge
 
 
-def test_range_limits_give_plus_and_minus_infinity(make):
+def test_range_limits(make):
     pose = np.array([[3.0, 1.5, 0.0]])
     short = SCANNER.model_copy(update={"range_max": 3.0, "range_min": 1.0, "sigma": 0.0})
     exact, seen = exact_ranges(shipped("corridor"), pose), make("corridor", short).sample(pose, None, None)
@@ -63,7 +63,7 @@ def test_range_limits_give_plus_and_minus_infinity(make):
     assert np.isfinite(seen[(exact > 1.001) & (exact < 2.999)]).all()
 
 
-def test_noise_has_the_sigma_of_the_scanner_and_a_seed():
+def test_noise_of_the_scanner():
     pose = np.tile([[3.0, 1.5, 1.0]], (20, 1))
     clean, a, b, c = (simulation_of("corridor").sample(pose, 622, seed) for seed in (None, 1, 1, 2))
     assert np.array_equal(a, b)
@@ -108,7 +108,7 @@ def test_map_stops_the_robot(make, rooms_map):
 
 
 @pytest.mark.parametrize("kind", [OCCUPIED, UNKNOWN])
-def test_map_cells_that_are_not_free_are_refused(make, rooms_map, kind):
+def test_occupied_map_cells(make, rooms_map, kind):
     simulation = make(rooms_map)
     row, column = np.argwhere(rooms_map.grid.values == kind)[7]
     place = np.array([*rooms_map.grid.shapes.points_in_cells(np.array([[column, row]]), 0.5)[0], 0.0])

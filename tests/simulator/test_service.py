@@ -105,7 +105,7 @@ def test_steps_only_while_paused(simulator, pace):
         assert running.scans() == [4]
 
 
-def test_stop_command_during_a_pause_is_ignored(simulator):
+def test_stop_during_a_pause(simulator):
     with simulator() as running:
         running.service.on_timer()
         running.request(PAUSE)
@@ -132,7 +132,7 @@ def test_step_in_lockstep_needs_the_command(simulator):
         assert not running.request(STEP).ok
 
 
-def test_step_after_a_reset_is_the_first_scan(simulator):
+def test_step_after_a_reset(simulator):
     with simulator() as running:
         running.service.on_timer()
         for query, request in ((PAUSE, None), (STEP, None), (RESET, ResetRequest(seed=3))):
@@ -188,7 +188,7 @@ def test_speed_is_refused_at_other_paces(simulator, pace, reason):
         assert running.service.speed == 1.0
 
 
-def test_people_stop_during_a_pause_and_restart_with_a_reset(simulator):
+def test_people_at_pause_and_reset(simulator):
     with simulator(world="office", people=5, seed=2) as running, simulator(world="office") as plain:
         assert running.request(WORLD).encode() == plain.request(WORLD).encode()  # without people
         running.service.on_timer()

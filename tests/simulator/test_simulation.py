@@ -20,7 +20,7 @@ BOX, CIRCLE = ({"box": {"center": (5, 3), "size": (1, 1)}}, {"circle": {"center"
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.2])
-def test_reaches_the_commanded_speed_within_acceleration_limits(make, heading):
+def test_acceleration(make, heading):
     truths = drive(make(start=(2.0, 1.0, heading)), Twist(vx=0.6), 1.5)
     assert speed(truths[-1]) == pytest.approx(0.6, abs=0.01)
     assert abs(truths[-1].twist.vy) < 0.01
@@ -36,7 +36,7 @@ def test_speed_and_turn_are_clipped(make):
     assert speed(drive(make(robot=fast, obstacle_stop=False), Twist(vx=3.0), 0.6)[-1]) == pytest.approx(3.0, abs=0.05)
 
 
-def test_only_a_holonomic_base_moves_sideways(make):
+def test_sideways_motion(make):
     assert drive(make(), Twist(vy=0.5), 1)[-1].pose.y > 3.2
     differential = drive(make(robot=Robot(drive="differential")), Twist(vx=0.3, vy=0.5), 1)[-1]
     assert differential.pose.y == pytest.approx(3.0, abs=1e-3)
@@ -44,7 +44,7 @@ def test_only_a_holonomic_base_moves_sideways(make):
 
 
 @pytest.mark.parametrize(("kind", "repeat"), [("holonomic", True), ("differential", False)])
-def test_stops_within_half_a_second_of_the_last_command(make, kind, repeat):
+def test_stop_after_the_last_command(make, kind, repeat):
     """Also if that command is repeated."""
     simulation = make(start=LEFT, robot=Robot(drive=kind))
     last = Twist(vx=1.0, wz=0.3)
@@ -78,7 +78,7 @@ def test_stamps_of_commands(make, age_ms, accepted):
 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (0.7, 0.7), (0.0, -1.0)])
-def test_obstacle_stop_prevents_contact_at_full_speed(make, direction):
+def test_obstacle_stop_at_full_speed(make, direction):
     """In all directions that the scanner sees. The 90 deg behind the robot are out of its view, as on the real base."""
     truths = drive(make(start=(4.0, 3.0, 0.0)), Twist(vx=direction[0], vy=direction[1]), 6)
     assert max(map(speed, truths)) > 0.9
@@ -96,7 +96,7 @@ def test_moving_away_from_a_wall_is_allowed(make):
 
 
 @pytest.mark.parametrize("radius", [0.105, 0.27, 0.4])
-def test_without_the_obstacle_stop_the_wall_stops_the_body(make, radius):
+def test_wall_without_the_obstacle_stop(make, radius):
     robot = Robot(radius=radius, max_speed=0.6)
     truths = drive(make(start=(7.0, 3.0, 0.0), robot=robot, obstacle_stop=False), FORWARD, 3)
     assert truths[-1].contact
@@ -124,7 +124,7 @@ def test_odometry_without_drift_is_exact(make):
     assert not odom.covariance.any()
 
 
-def test_odometry_drift_matches_its_covariance():
+def test_odometry_drift():
     poses, normalised = [np.zeros(3)], []
     for _ in range(30):
         poses.append(se2.compose(poses[-1], np.array([0.03, 0.01, 0.02])))
@@ -150,7 +150,7 @@ def test_teleport(make):
     assert simulation.observe()[1].pose == truth.pose
 
 
-def test_furniture_is_added_moved_and_removed(make):
+def test_changed_furniture(make):
     simulation = make()
 
     def ahead():

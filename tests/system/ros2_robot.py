@@ -23,7 +23,16 @@ from common.messages.definitions import Twist
 from common.robot.base import Robot
 from common.robot.scanner import SCANNERS
 from services.simulator.simulation import Setup, Simulation
-from tests.bridge_ros2.independent import decode, encode, header, quaternion, vector
+from tests.bridge_ros2.independent import (
+    decode,
+    encode,
+    header,
+    laser_scan,
+    odometry,
+    planar_pose,
+    quaternion,
+    vector,
+)
 
 HASHES = {
     "sensor_msgs::msg::dds_::LaserScan_": "RIHS01_64c191398013af96509d518dac71d5164f9382553fce5c1f8cca5be7924bd828",
@@ -169,24 +178,15 @@ class StandIn:
         with self.lock:
             self.simulation.advance()
             odom, truth, scan = self.simulation.observe()
-        stamp, still = BEGIN + scan.stamp_ns, [0.0] * 36
-        yaw = quaternion(0, 0, np.sin(odom.pose.yaw / 2), np.cos(odom.pose.yaw / 2))
-        self.put_tf(transforms(transform("odom", "base_footprint", odom.pose.x, odom.pose.y, 0, yaw, stamp)))
-        pose = {"position": vector(odom.pose.x, odom.pose.y), "orientation": yaw}
-        twist = {"linear": vector(odom.twist.vx, odom.twist.vy), "angular": vector(0, 0, odom.twist.wz)}
-        odometry = {
-            "header": header(stamp, "odom"), "child_frame_id": "base_footprint",
-            "pose": {"pose": pose, "covariance": still}, "twist": {"twist": twist, "covariance": still},
-        }  # fmt: skip
-        self.put_odom(encode("nav_msgs/msg/Odometry", odometry))
+        stamp, pose = BEGIN + scan.stamp_ns, planar_pose(*odom.pose.array())
+        turn = pose["orientation"]
+        self.put_tf(transforms(transform("odom", "base_footprint", odom.pose.x, odom.pose.y, 0, turn, stamp)))
+        self.put_odom(odometry(stamp, pose, odom.twist.array(), "base_footprint"))
         # The scanner is mounted upside down, so the first beam is the leftmost. It reports no return as 0.
         ranges = np.where(np.isposinf(scan.ranges), 0, scan.ranges)[::-1]
-        sweep = {
-            "header": header(stamp, "laser"), "angle_min": scan.angle_min, "angle_max": -scan.angle_min,
-            "angle_increment": scan.angle_increment, "time_increment": 0.0, "scan_time": 1 / 15,
-            "range_min": scan.range_min, "range_max": scan.range_max, "ranges": ranges.tolist(), "intensities": [],
-        }  # fmt: skip
-        self.put_scan(encode("sensor_msgs/msg/LaserScan", sweep))
+        limits = {"range_min": scan.range_min, "range_max": scan.range_max, "scan_time": 1 / 15}
+        angles = {"angle_min": scan.angle_min, "angle_max": -scan.angle_min, "angle_increment": scan.angle_increment}
+        self.put_scan(laser_scan(stamp, ranges.tolist(), **angles, **limits))
         speed = float(np.hypot(truth.twist.vx, truth.twist.vy))
         odom_pose = odom.pose.array().tolist()
         true = {"truth": truth.pose.array().tolist(), "speed": speed, "contact": truth.contact, "odom": odom_pose}

@@ -31,7 +31,7 @@ NO_SESSION = ("--connect", "tcp/127.0.0.1:9")  # the discard port, on which noth
         (("demo", "--json", "{tmp}/no/x.json"), "x.json: cannot be written to"),
         (("demo", "--seed", "99999999999999999999"), "--seed"),
         (("goal",), "X Y in m"),
-        (("goal", "-1", "2", *NO_SESSION), "start a session with `presage up`"),
+        ((*NO_SESSION, "goal", "-1", "2"), "start a session with `presage up`"),
         (("goal", "nan", "1"), "nan 1: a place is finite numbers"),
         (("goal", "1", "1", "--tolerance", "inf"), "--tolerance inf"),
         (("goal", "1", "2", "--wiat"), "--wiat"),
@@ -55,8 +55,8 @@ NO_SESSION = ("--connect", "tcp/127.0.0.1:9")  # the discard port, on which noth
             ("replay", "{tmp}/run.mcap", "--with", "estimator", "--loop"),
             "leave out the options that choose what to replay",
         ),
-        (("experiment", "e1", "--alpha", "nan", "--out", "{tmp}/e"), "--alpha"),
-        (("experiment", "e1", "--trials", "0", "--out", "{tmp}/e"), "--trials"),
+        (("experiment", "--out", "{tmp}/e", "e1", "--alpha", "nan"), "--alpha"),
+        (("experiment", "--out", "{tmp}/e", "e1", "--trials", "0"), "--trials"),
     ],
     ids=lambda value: " ".join(value)[:40] if isinstance(value, tuple) else "",
 )
@@ -117,17 +117,20 @@ def test_tools_beside_a_session(presage, process, bus, link, monkeypatch):
     def healthy():
         status, output = presage("top", "--once")
         outputs.append(output)
-        return status == 0 and "ms" in row_of(output, "controller")
+        rates = zip(names, ("scan", "belief", "cmd_vel"), strict=True)
+        return (
+            status == 0
+            and all(re.search(rf"^{name} alive.* {topic} [0-9.]*[1-9]", row_of(output, name)) for name, topic in rates)
+            and all("ms" in row_of(output, name) for name in names[1:])
+        )
 
     assert wait_until(healthy, 60), outputs[-1]  # the first scans take longer
     assert f"robot {link.robot}" in outputs[-1]
-    for name, sends in zip(names, ("scan", "belief", "cmd_vel"), strict=True):
-        assert re.search(rf"^{name} alive.* {sends} [0-9.]*[1-9]", row_of(outputs[-1], name)), outputs[-1]
-    assert "ms" in row_of(outputs[-1], "estimator")
     assert "not running" in row_of(outputs[-1], "recorder")
     status, output = presage("doctor")
     faults = [line for line in output.splitlines() if line.split()[:1] == ["no"]]
-    assert all(" Hz" in line for line in faults), output  # a machine under load may be slow
+    # This machine may be slow, and another test that runs at the same time may have stopped a process.
+    assert all(" Hz" in line or "of this machine is stopped" in line for line in faults), output
     assert status == (1 if faults else 0)
     for name in names:
         assert f"{name} of '{link.robot}': alive" in output

@@ -15,7 +15,7 @@ from common.messages.topics import BELIEF, CMD_VEL, GOAL, HEALTH, ODOM, PREDICTI
 from presage.logs.importing import ImportOptions, import_command
 from services.recorder.files.writer import RecordingWriter
 from services.recorder.reader import read_recording
-from tests.conftest import ROOT, Processes, wait_for_message
+from tests.conftest import ROOT, wait_for_message
 from tests.estimator.models import change_weights
 from tests.presage.logs.drives import SCANS as SCANS_OF_LOG
 from tests.presage.logs.drives import Bag, write_bag
@@ -29,8 +29,8 @@ WEIGHTS = "corridor-precise"
 class Session:
     """Records localisation and driving for SCANS scans, with weights that differ from the shipped ones."""
 
-    def __init__(self, folder, port) -> None:
-        self.folder, self.models, self.processes = folder, folder / "models", Processes(folder)
+    def __init__(self, processes, port) -> None:
+        self.folder, self.models, self.processes = processes.folder, processes.folder / "models", processes
         self.link = Link(robot="lockstep", connect=(f"tcp/127.0.0.1:{port}",))
         self.models.mkdir()
         for suffix in ("safetensors", "json"):
@@ -70,17 +70,13 @@ class Session:
             active = self.folder / f"{name}.mcap.active"
             assert wait_until(lambda: b"model/world.yaml" in active.read_bytes(), 30), started[0].output
             for running in reversed(started):
-                assert running.stop()[0] == 0, running.output
+                assert running.stop() == 0, running.output
         return read_recording(self.folder / f"{name}.mcap")
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory, router):
-    made = Session(tmp_path_factory.mktemp("lockstep"), router)
-    try:
-        yield made
-    finally:
-        made.processes.close()
+def session(module_processes, router):
+    return Session(module_processes, router)
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +177,7 @@ def test_replay_of_an_imported_log(session, tmp_path):
         assert (status, says in output) == (2, True), output
 
 
-def test_settings_of_a_killed_service_and_its_successor(process, tmp_path):
+def test_settings_of_a_successor(process, tmp_path):
     recorder = process("recorder", "--directory", str(tmp_path), "--file", "session")
     recorder.wait_for("ready")
     active = tmp_path / "session.mcap.active"
@@ -190,6 +186,6 @@ def test_settings_of_a_killed_service_and_its_successor(process, tmp_path):
         running = process("controller", "--gamma", gamma)
         assert wait_until(lambda at=known, t=setting: t in active.read_bytes()[at:], 30), recorder.output
         running.kill()  # without a clean end; the recorder must notice its successor anyway
-    assert recorder.stop()[0] == 0
+    assert recorder.stop() == 0
     config = json.loads(read_recording(tmp_path / "session.mcap").metadata["config:controller"]["config"])
     assert config["gamma"] == 0.41

@@ -66,5 +66,5 @@ def test_predictions(estimator, bus):
     with pytest.raises(UserError, match=r"refused: PredictRequest\.poses: .* not finite"):
         bus.ask(PREDICT, not_finite, PredictReply)
     assert bus.ask(PREDICT, request, PredictReply) == waited
-    assert estimator.stop()[0] == 0
+    assert estimator.stop() == 0
     assert "Traceback" not in estimator.output

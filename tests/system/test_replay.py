@@ -64,7 +64,7 @@ def terminal(tmp_path, link):
     file = write(tmp_path / "hour.mcap", *((SCAN, link.robot, bytes([n % 256]), n * SECOND) for n in range(3600)))
     with (tmp_path / "output").open("wb") as output:
         child = subprocess.Popen(
-            [sys.executable, "-m", "presage", "replay", str(file), "--connect", link.connect[0]],
+            [sys.executable, "-m", "presage", "--connect", link.connect[0], "replay", str(file)],
             stdin=theirs, stdout=output, stderr=output, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
             preexec_fn=take_terminal,
         )  # fmt: skip
@@ -175,7 +175,7 @@ def test_recording_instead_of_the_simulator(bus, process, recordings, tmp_path):
         return find_fault("replay", read_beats(tmp_path, "replay"), [bus.robot], time.monotonic()) == ""
 
     assert wait_until(healthy, WAIT_TIMEOUT_S), read_beats(tmp_path, "replay")
-    assert running.stop()[0] == 0
+    assert running.stop() == 0
     assert not all_else.received
 
 
@@ -206,4 +206,4 @@ def test_wait_for_a_remote_robot(bus, process, tmp_path):
     running.wait_for("scans are arriving")
     running.wait_for("no scan for 5 s")
     assert wait_until(lambda: "no scan was received for" in fault(), WAIT_TIMEOUT_S), fault()
-    assert running.stop()[0] == 0
+    assert running.stop() == 0

@@ -11,11 +11,10 @@ from common.bus.bus import Link, open_bus, wait_until
 from common.geometry import se2
 from common.messages.definitions import Goal, Pose
 from common.messages.topics import GOAL
-from tests.bridge_ros2.independent import encode, header, quaternion, vector
-from tests.conftest import WAIT_TIMEOUT_S, Processes
+from tests.bridge_ros2.independent import planar_pose, pose_stamped
+from tests.conftest import WAIT_TIMEOUT_S
 from tests.system.ros2_robot import Ros
 
-POSE = "geometry_msgs/msg/PoseStamped"
 GOAL_POSE = "geometry_msgs::msg::dds_::PoseStamped_"
 
 
@@ -37,11 +36,6 @@ def assert_no_errors(robot):
     assert not last_report(robot)["contact"]
 
 
-def goal_message(x, y):
-    pose = {"position": vector(x, y), "orientation": quaternion()}
-    return encode(POSE, {"header": header(0, "map"), "pose": pose})
-
-
 def arrived(now):
     """Whether the robot stands at the goal, with the right pose in ROS and a tf that corrects the odometry's drift."""
     believed, by_tf = now["pose"][:2], se2.compose(now["odom_in_map"], now["odom"])[:2]
@@ -50,24 +44,20 @@ def arrived(now):
 
 
 @pytest.fixture(scope="module")
-def services(tmp_path_factory):
+def services(module_processes):
     """Estimator and controller, which take seconds to start, on one router; the robot uses a second router."""
-    processes = Processes(tmp_path_factory.mktemp("ros2"))
-    try:
-        port, ros = processes.start_router()[1], processes.start_router()[1]
-        environment = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "rover", "OMP_NUM_THREADS": "1"}
+    port, ros = module_processes.start_router()[1], module_processes.start_router()[1]
+    environment = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "rover", "OMP_NUM_THREADS": "1"}
 
-        def start(name, *args):
-            return processes.start(name, *args, env=environment)
+    def start(name, *args):
+        return module_processes.start(name, *args, env=environment)
 
-        start("estimator")
-        controller = start("controller")
-        link = Link(robot="rover", connect=(environment["PRESAGE_CONNECT"],))
-        with open_bus(link) as bus:
-            assert wait_until(lambda: {"estimator", "controller"} <= bus.alive(timeout=0.5), 60)
-            yield start, bus, ros, controller
-    finally:
-        processes.close()
+    start("estimator")
+    controller = start("controller")
+    link = Link(robot="rover", connect=(environment["PRESAGE_CONNECT"],))
+    with open_bus(link) as bus:
+        assert wait_until(lambda: {"estimator", "controller"} <= bus.alive(timeout=0.5), 60)
+        yield start, bus, ros, controller
 
 
 def test_rmw_zenoh_robot(services):
@@ -78,16 +68,16 @@ def test_rmw_zenoh_robot(services):
     with Ros(port, "rmw_zenoh", "jazzy") as rviz:
         put = rviz.publisher("goal_pose", GOAL_POSE)
         assert wait_until(lambda: bool(rviz.kept[-1].matching_status.matching), WAIT_TIMEOUT_S)
-        put(goal_message(4.2, 1.5))
+        put(pose_stamped(planar_pose(4.2, 1.5), "map"))
         wait_until_report(robot, arrived, "no way", bridge)
-        put(goal_message(12.0, 1.5))
+        put(pose_stamped(planar_pose(12.0, 1.5), "map"))
         wait_until_report(robot, lambda now: now["speed"] > 0.3, "it does not go on", bridge)
     bridge.kill()
     wait_until_report(robot, lambda now: now["speed"] < 0.01, "it drives on without the bridge")
     zeros = last_report(robot)["zeros"]
     bridge = start("bridge_ros2", "--ros-connect", f"tcp/127.0.0.1:{port}")
     wait_until_report(robot, lambda now: now["speed"] > 0.3, "it does not go on with another bridge", bridge)
-    assert bridge.stop()[0] == 0
+    assert bridge.stop() == 0
     wait_until_report(robot, lambda now: now["zeros"] > zeros, "a bridge that ends sends no stop", bridge)
     assert_no_errors(robot)
     robot.stop()
@@ -107,4 +97,4 @@ def test_ros2dds_robot(services):
     wait_until_report(robot, lambda now: now["speed"] < 0.01, "it does not stand")
     assert_no_errors(robot)
     robot.stop()
-    assert bridge.stop()[0] == 0
+    assert bridge.stop() == 0

@@ -75,7 +75,7 @@ def test_obstacle_stop_of_the_base(process, bus, truths, stop):
     # Without the obstacle stop there is contact, so the test is meaningful.
     assert seen[-1].contact == (stop == "--no-obstacle-stop")
     assert seen[-1].stopped == (stop == "--obstacle-stop")
-    assert simulator.stop()[0] == 0, simulator.output
+    assert simulator.stop() == 0, simulator.output
 
 
 @pytest.mark.parametrize("base", ["holonomic", "differential"])
@@ -106,4 +106,4 @@ def test_controller_without_obstacle_stop(process, bus, truths, base):
     status = wait_for_message(statuses, Status, lambda status: status.stamp_ns == seen[-2].stamp_ns)
     assert status.reason.startswith("waiting: something")
     for running in (simulator, controller):
-        assert running.stop()[0] == 0, running.output
+        assert running.stop() == 0, running.output

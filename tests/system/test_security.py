@@ -31,23 +31,18 @@ SERVICES = ("simulator", "estimator", "controller", "recorder", "viewer")
 class SecureRouter:
     """A router in secure mode, and clients with valid or invalid credentials."""
 
-    def __init__(self, folder: Path) -> None:
-        self.processes = Processes(folder)
-        self.keys, self.others = folder / "keys", folder / "others"
+    def __init__(self, processes: Processes) -> None:
+        self.processes = processes
+        self.keys, self.others = processes.folder / "keys", processes.folder / "others"
         secure.init(self.keys)
         secure.init(self.others)
-        self.router, self.port = self.start_router()
+        self.router, self.port = processes.start_router("--security", str(self.keys))
 
-    def start_router(self, port=None):
-        for _ in range(5):
-            taken = port or free_tcp_port()
-            running = self.processes.start(
-                "common.router", "--listen", f"tcp/127.0.0.1:{taken}", "--security", str(self.keys)
-            )
-            wait_until(lambda r=running, p=taken: not r.running or accepts(p), WAIT_TIMEOUT_S)
-            if running.running:
-                return running, taken
-        raise AssertionError(running.output)
+    def restart_router(self):
+        self.router.stop()
+        listen = f"tcp/127.0.0.1:{self.port}"
+        self.router = self.processes.start("common.router", "--listen", listen, "--security", str(self.keys))
+        assert wait_until(lambda: accepts(self.port), WAIT_TIMEOUT_S), self.router.output
 
     @contextmanager
     def session(self, name, **more):
@@ -73,12 +68,8 @@ class SecureRouter:
 
 
 @pytest.fixture(scope="module")
-def secure_router(tmp_path_factory):
-    made = SecureRouter(tmp_path_factory.mktemp("guarded"))
-    try:
-        yield made
-    finally:
-        made.processes.close()
+def secure_router(module_processes):
+    return SecureRouter(module_processes)
 
 
 def invalid_settings(secure_router):
@@ -102,7 +93,7 @@ def invalid_settings(secure_router):
 def test_invalid_credentials(secure_router):
     for reason, settings in invalid_settings(secure_router).items():
         assert "not let in" in secure_router.intrude(settings), reason
-        secure_router.router.wait_for(f"why='{reason}")
+        secure_router.router.wait_for(f"reason='{reason}")
     # The same client with valid credentials is accepted, so these are the reason.
     assert "not let in" not in secure_router.intrude(secure_router.settings("observer"))
 
@@ -145,7 +136,7 @@ def test_forbidden_actions(secure_router):
             assert wait_until(lambda i=inbox: len(i) > 0, WAIT_TIMEOUT_S)
             assert inbox.get(0).payload == payload
     assert goals.get(0) is calls.get(0) is None
-    for line in (f"key={KEY_PREFIX}/cmd_vel", "observer why=put", "observer why=query", "estimator why=put"):
+    for line in (f"key={KEY_PREFIX}/cmd_vel", "observer reason=put", "observer reason=query", "estimator reason=put"):
         secure_router.router.wait_for(line)
 
 
@@ -187,15 +178,13 @@ def test_tokens_seen_by_newcomers(secure_router):
 
 def test_removed_user(secure_router):
     secure.add(secure_router.keys, "operator", "anna")
-    secure_router.router.stop()
-    secure_router.router, _ = secure_router.start_router(secure_router.port)
+    secure_router.restart_router()
     annas = secure_router.settings("anna")
     assert "not let in" not in secure_router.intrude(annas)
     kept = secure_router.keys / "kept"
     (secure_router.keys / "anna").rename(kept)  # a copy of the removed user's credentials
     secure.remove(secure_router.keys, "anna")
-    secure_router.router.stop()
-    secure_router.router, _ = secure_router.start_router(secure_router.port)
+    secure_router.restart_router()
     kept.rename(secure_router.keys / "anna")
     assert "not let in" in secure_router.intrude({**annas, "connect/timeout_ms": 1000})
     secure_router.router.wait_for("password'")
@@ -244,8 +233,7 @@ def test_stop_while_waiting_for_the_router(secure_router):
         "simulator", "--security", str(secure_router.keys), "--connect", f"tcp/127.0.0.1:{port}"
     )
     waiting.wait_for("waiting")
-    status, _ = waiting.stop()
-    assert status == 0, waiting.output
+    assert waiting.stop() == 0, waiting.output
 
 
 def test_whole_loop_and_replayed_command(secure_router):
@@ -279,7 +267,7 @@ def test_whole_loop_and_replayed_command(secure_router):
             )  # fmt: skip
             if counter == "other_sources":
                 controller = started[SERVICES.index("controller")]
-                assert controller.stop()[0] == 0, controller.output
+                assert controller.stop() == 0, controller.output
                 assert wait_until(lambda: "controller" not in bus.alive(), 20)
                 bus.subscribe(TRUTH, truths, keep_all=True)
                 there = wait_for_message(truths, Truth, lambda t: np.hypot(t.twist.vx, t.twist.vy) < 1e-3)
@@ -288,7 +276,7 @@ def test_whole_loop_and_replayed_command(secure_router):
         after = wait_for_message(truths, Truth, lambda _: True)
     assert np.hypot(after.pose.x - 4.5, after.pose.y - 1.5) < 0.3
     assert np.hypot(after.pose.x - there.pose.x, after.pose.y - there.pose.y) < 0.05
-    statuses = {process.name: process.stop()[0] for process in reversed(started) if process.running}
+    statuses = {process.name: process.stop() for process in reversed(started) if process.running}
     assert set(statuses.values()) == {0}, statuses
     (recording,) = (started[3].log.parent / "recordings").glob("*.mcap")
     assert recording.stat().st_size > 10_000

@@ -50,9 +50,7 @@ def test_clean_end_alone(process, bus, tmp_path):
     }
     assert wait_until(lambda: SERVICES.keys() <= bus.alive(), 60)
     for name, number in SERVICES.items():
-        status, seconds = started[name].stop(number)
-        assert status == 0, started[name].output
-        assert seconds < 10
+        assert started[name].stop(number) == 0, started[name].output
         assert "Traceback" not in started[name].output
         assert wait_until(lambda n=name: n not in bus.alive(), 10)
 
@@ -108,7 +106,6 @@ def test_death_and_restart(process, bus):
         ("simulator", ("--scanner", "sonar"), "no scanner 'sonar': choose one of tim571"),
         ("simulator", ("--start", "0.1,0.1"), "the robot needs 0.27 m around it"),
         ("simulator", ("--connect", "nonsense"), "nonsense"),
-        ("recorder", ("--directory", "/proc/nowhere"), "/proc/nowhere"),
         ("controller", ("--gamma", "7"), "gamma"),
     ],
 )

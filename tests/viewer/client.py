@@ -35,6 +35,12 @@ def read_frame(data: bytes) -> Frame:
     return Frame(header, arrays, data)
 
 
+def is_complete(header):
+    """Whether a frame shows the answers to its scan; a busy machine sends frames before all of them have arrived."""
+    answered = header["belief"] and header["belief"]["stamp_ns"] == header["stamp_ns"] and header["error"] is not None
+    return answered and header["arrays"]["predicted"][1] > 0
+
+
 def kind_of(message):
     return (message.header if isinstance(message, Frame) else message)["type"]
 

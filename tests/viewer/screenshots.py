@@ -1,6 +1,6 @@
 """`make screenshots`: docs/page.png and docs/page.webp, of a real session in a real browser.
 
-A robot drives through an office with people in it, is carried off on the way, finds itself, and goes on to its goal.
+A robot drives through an office with people, is carried away, localises itself, and continues to its goal.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ LONGEST = 25.0  # s of the robot's time, of one scene
 
 
 def start(processes: Processes) -> str:
-    """Everything, and the page's address."""
+    """Starts all services. Returns the address of the page."""
     _, port = processes.start_router()
     environment = {"PRESAGE_CONNECT": f"tcp/127.0.0.1:{port}", "PRESAGE_ROBOT": "robot"}
     for name, arguments in SERVICES.items():
@@ -48,12 +48,12 @@ def start(processes: Processes) -> str:
 
 
 def picture(seen: Visit) -> Image.Image:
-    """What is on the screen."""
+    """A screenshot."""
     return Image.open(io.BytesIO(seen.page.screenshot())).convert("RGB")
 
 
 def film(seen: Visit, ends: str) -> list[tuple[float, Image.Image]]:
-    """Pictures of the page until an expression is true, small, each with the robot's time."""
+    """Small pictures of the page until an expression is true, each with the robot's time."""
     began = now = seen.see("store.frame.t")
     pictures = []
     while now < began + LONGEST and not seen.see(ends):
@@ -64,12 +64,12 @@ def film(seen: Visit, ends: str) -> list[tuple[float, Image.Image]]:
 
 
 def quiet(seen: Visit) -> None:
-    """No answers over the picture, no ring around what the keyboard is at."""
+    """Hides answers and the ring around the focused element."""
     seen.page.evaluate("document.getElementById('toasts').replaceChildren(); document.activeElement.blur()")
 
 
 def play(seen: Visit) -> tuple[Image.Image, list[tuple[float, Image.Image]]]:
-    """A visitor plays: the picture, and the film of it."""
+    """Drives and carries the robot. Returns a still picture and the frames of the animation."""
     tracked = "store.frame?.belief?.state === 'tracking' && Math.abs(store.frame.belief.x - store.frame.truth.x) < 0.1"
     seen.wait(f"{tracked} && store.history.t.length > 60", 90)
     seen.page.set_viewport_size(SMALL)
@@ -91,7 +91,7 @@ def play(seen: Visit) -> tuple[Image.Image, list[tuple[float, Image.Image]]]:
 
 
 def main() -> None:
-    """From the command line."""
+    """Writes both pictures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "docs", help="folder of page.png and page.webp")
     parser.add_argument("--dark", action="store_true", help="the page's dark colours")

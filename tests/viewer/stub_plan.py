@@ -1,4 +1,4 @@
-"""What a controller that plans would say of the stub's robot: field, path, motion, what the map does not know."""
+"""The plan of the stub's robot: goal field, path, motion, people and unmapped obstacles."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ RADIUS = 0.27  # m
 
 
 class Planner:
-    """In a world that is known."""
+    """Plans paths in a world."""
 
     def __init__(self, world: World) -> None:
-        """No goal yet."""
+        """Without a goal."""
         self.graph = FreeSpaceGraph(FreeSpace.of(world), RADIUS)
         self.goal: np.ndarray | None = None
         self.field: CostField | None = None
-        self.news: bytes | None = None  # the field, until somebody has sent it
+        self.news: bytes | None = None  # the encoded field of the goal
 
     def aim(self, goal: np.ndarray, t: float) -> None:
-        """Another goal (2,) m at a time, s."""
+        """Sets the goal (2,) in m at time ``t`` in s."""
         if self.goal is not None and np.allclose(goal, self.goal):
             return
         self.goal, self.field = goal, self.graph.cost_field(goal)
@@ -39,12 +39,12 @@ class Planner:
         self.news = field_of(message, "robot")
 
     def path(self, place: np.ndarray) -> np.ndarray:
-        """(K, 2) m to the goal."""
+        """Path (K, 2) in m from a place to the goal."""
         return self.field.path(place) if self.field is not None else np.zeros((0, 2))
 
 
 def motion(pose: np.ndarray, twist: np.ndarray) -> np.ndarray:
-    """(T, 2) m, where a velocity (3,) in base_link leads while it brakes at 1 m/s²."""
+    """Places (T, 2) in m of a robot that brakes at 1 m/s² from a velocity (3,) in base_link."""
     speed = float(np.hypot(*twist[:2]))
     heading = pose[2] + np.arctan2(twist[1], twist[0])
     times = np.linspace(0, speed, 12)
@@ -54,7 +54,7 @@ def motion(pose: np.ndarray, twist: np.ndarray) -> np.ndarray:
 
 
 def people(t: float, world: World) -> np.ndarray:
-    """(3, 2) m, three who walk up and down."""
+    """Places (3, 2) in m of three people who walk up and down."""
     x0, y0, x1, y1 = world.bounds
     share = 0.5 + 0.4 * np.sin(0.3 * t + np.array([0.0, 2.0, 4.0]))
     across = np.array([0.5, 0.45, 0.55])
@@ -62,7 +62,7 @@ def people(t: float, world: World) -> np.ndarray:
 
 
 def seen_of(people: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """(M, 2) m, the side of each person and of a box that is turned to the robot."""
+    """Points (M, 2) in m on the sides of near people that face the robot."""
     around = np.linspace(-1.2, 1.2, 9)
     sides = []
     for person in people:

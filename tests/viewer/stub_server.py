@@ -31,26 +31,26 @@ MAPPED = World(name="rooms", grid=OccupancyGrid.of(rooms(260), 0.05, (2.0, -1.0,
 
 
 class Visitor:
-    """One page."""
+    """A connected page."""
 
     def __init__(self, socket: WebSocket, session: Session) -> None:
-        """They share the session's robot."""
+        """Visitors of a scene share its session."""
         self.socket, self.session = socket, session
         self.field: bytes | None = None  # the last one sent
 
     async def tell(self, **message: object) -> None:
-        """As JSON."""
+        """Sends a message as JSON."""
         await self.socket.send_text(json.dumps(message))
 
     async def world(self) -> None:
-        """What the scanner's side knows."""
+        """Sends world, scanner and robot."""
         world = self.session.world.model_dump(mode="json")
         await self.tell(
             type="world", world=world, scanner=SCANNER.model_dump(mode="json"), robot=Robot().model_dump(mode="json")
         )
 
     async def feed(self) -> None:
-        """Frames and pulses until it leaves."""
+        """Sends frames and services until the visitor leaves."""
         session, count = self.session, 0
         live = session.scene != "empty"
         await self.tell(
@@ -74,7 +74,7 @@ class Visitor:
             await asyncio.sleep(DT)
 
     async def listen(self) -> None:
-        """Answers until it leaves."""
+        """Answers requests until the visitor leaves."""
         while True:
             ask = json.loads(await self.socket.receive_text())
             await self.tell(type="answer", id=ask.get("id"), **self.session.act(ask))
@@ -83,7 +83,7 @@ class Visitor:
 
 
 def application(warm: float) -> Starlette:
-    """The page and its socket, for each scene; ``warm`` s of the past to begin with."""
+    """The page and its socket for each scene, with a history of ``warm`` s."""
     sessions: dict[str, Session] = {}
 
     def session_of(scene: str) -> Session:
@@ -113,10 +113,10 @@ def application(warm: float) -> Starlette:
 
 
 def main() -> None:
-    """From the command line."""
+    """Runs the server."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--port", type=int, default=8123)
-    parser.add_argument("--warm", type=float, default=0.0, help="seconds of the past to begin with")
+    parser.add_argument("--warm", type=float, default=0.0, help="duration of the history at the start, s")
     args = parser.parse_args()
     uvicorn.run(application(args.warm), host="127.0.0.1", port=args.port, log_level="warning")
 

@@ -1,4 +1,4 @@
-"""A standing robot for the stub server: what its scanner, an estimator and a controller would publish."""
+"""A standing robot for the stub server, with the messages of its scanner, estimator and controller."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ class Session:
         self.paused = False
 
     def step(self) -> bytes:
-        """One scan later: the frame."""
+        """Advances by one scan and returns the frame."""
         self.t += DT
         return self.frame()
 
     def believed(self) -> tuple[str, np.ndarray, list[dict]]:
-        """State, pose, mixture."""
+        """The belief: state, pose, hypotheses."""
         x0, y0, x1, y1 = self.map.bounds
         if self.scene == "lost":
             return "lost", self.pose + np.array([2.6, -0.4, 0.5]), []
@@ -74,7 +74,7 @@ class Session:
         return "tracking", pose, [mode(pose, 1.0, COV)]
 
     def frame(self) -> bytes:
-        """All of one moment."""
+        """The frame of the current time."""
         angles = SCANNER.angles()
         measured = self.world.ray_distances([self.laser(self.pose)], angles)[0]
         measured = SCANNER.limit(measured + self.rng.normal(0, 0.012, len(measured)))
@@ -125,13 +125,13 @@ class Session:
         })  # fmt: skip
 
     def status(self, state: str) -> str:
-        """The controller's, with such a belief."""
+        """State of the controller for a belief's state."""
         if self.scene in REASONS:
             return self.scene
         return "lost" if state != "tracking" else "navigating"
 
     def plan(self, pose: np.ndarray) -> dict[str, np.ndarray]:
-        """Points in map, m, of one that plans."""
+        """Points of the plan in the map, in m, by name."""
         if self.planner is None:
             return {}
         people = stub_plan.people(self.t, self.map)
@@ -143,17 +143,17 @@ class Session:
         }
 
     def journal(self) -> dict:
-        """What the controller said."""
+        """Earlier states of the controller."""
         past = [{"t": self.t - 9 + 2 * i, "state": s, "reason": r} for i, (s, r) in enumerate(PAST)]
         now = [{"t": self.t, "state": self.scene, "reason": REASONS[self.scene]}] if self.scene in REASONS else []
         return {"type": "journal", "rows": [*past, *now]}
 
     def laser(self, pose: np.ndarray) -> np.ndarray:
-        """The scanner's pose."""
+        """Pose of the scanner for a pose of the robot."""
         return pose + SCANNER.mount[0] * np.array([np.cos(pose[2]), np.sin(pose[2]), 0])
 
     def act(self, ask: dict) -> dict:
-        """What a visitor wants; the answer's fields."""
+        """Handles a visitor's request. Returns the fields of the answer."""
         if self.scene == "watching":
             return {"ok": False, "reason": "visitors only watch here"}
         reason = getattr(self, f"do_{ask.get('do')}", lambda _: "")(ask)
@@ -189,7 +189,7 @@ def mode(pose: np.ndarray, weight: float, cov: tuple[float, ...]) -> dict:
 
 
 def pulses(scene: str) -> dict:
-    """Services as they would be."""
+    """The message about services."""
     sends = {
         "simulator": ("scan", "odom", "truth"),
         "estimator": ("belief", "prediction"),

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Recipe:
+class TrainingParameters:
     """Parameters of training."""
 
     epochs: int = 60
@@ -40,34 +40,38 @@ class Trainer:
     With `state` and `restore` an interrupted run can resume, and ends with the same weights.
     """
 
-    def __init__(self, shape: Shape, norm: Normalisation, recipe: Recipe, train: Data, test: Data) -> None:
+    def __init__(
+        self, shape: Shape, norm: Normalisation, parameters: TrainingParameters, train: Data, test: Data
+    ) -> None:
         """The same seed and samples give the same weights on one machine."""
-        torch.manual_seed(recipe.seed)
-        self.recipe, self.norm = recipe, norm
+        torch.manual_seed(parameters.seed)
+        self.parameters, self.norm = parameters, norm
         self.decoder = Decoder(shape)
-        self.optimiser = torch.optim.Adam(self.decoder.parameters(), recipe.learning_rate)
+        self.optimiser = torch.optim.Adam(self.decoder.parameters(), parameters.learning_rate)
         self.progress = Progress()
         self._train, self._test = train.tensors(norm), test.tensors(norm)
 
     def run(self, report: Callable[[Progress], None] = lambda _: None) -> PaperModel:
-        """Trains the remaining epochs of the recipe; ``report`` is called after each epoch."""
-        while self.progress.epoch < self.recipe.epochs:
+        """Trains the remaining epochs; ``report`` is called after each epoch."""
+        while self.progress.epoch < self.parameters.epochs:
             self._epoch()
             report(self.progress)
         return PaperModel(self.decoder, self.norm)
 
     def _epoch(self) -> None:
-        recipe, epoch = self.recipe, self.progress.epoch
+        parameters, epoch = self.parameters, self.progress.epoch
         positions, ranges = self._train
         # The order depends only on seed and epoch, so that a resumed run has the same batches.
-        order = torch.randperm(len(positions), generator=torch.Generator().manual_seed(recipe.seed * 100_003 + epoch))
-        batches = torch.split(order, recipe.batch)
+        order = torch.randperm(
+            len(positions), generator=torch.Generator().manual_seed(parameters.seed * 100_003 + epoch)
+        )
+        batches = torch.split(order, parameters.batch)
         total = 0.0
         self.decoder.train()
         for number, batch in enumerate(batches):
-            done = (epoch + number / len(batches)) / recipe.epochs
+            done = (epoch + number / len(batches)) / parameters.epochs
             for group in self.optimiser.param_groups:
-                group["lr"] = recipe.learning_rate * 0.5 * (1 + np.cos(np.pi * done))
+                group["lr"] = parameters.learning_rate * 0.5 * (1 + np.cos(np.pi * done))
             loss = (self.decoder(positions[batch]) - ranges[batch]).abs().mean()
             self.optimiser.zero_grad()
             loss.backward()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 MAX_CELLS = 20_000_000  # 320 MB, about 20 s to build
 
 
-class DistanceField:
+class SurfaceDistances:
     """Signed distance to the nearest visible surface, exact at the nodes of a grid and interpolated between them.
 
     Surfaces are the boundary of free space; if all occupied cells of a wall counted, the belief would be drawn into the
@@ -75,7 +75,7 @@ class LikelihoodField:
     close, have no end point and are left out, as in AMCL.
     """
 
-    def __init__(self, field: DistanceField, z_hit: float, z_rand: float) -> None:
+    def __init__(self, field: SurfaceDistances, z_hit: float, z_rand: float) -> None:
         """``field`` is that of the world, z_hit and z_rand are the weights of a hit and of an unexplained range."""
         self.field, self.z_hit, self.z_rand = field, z_hit, z_rand
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from common.geometry import se2
 from services.estimator.particle_filter.beam_model import BeamModel, RangeTable
-from services.estimator.particle_filter.likelihood_field import DistanceField, LikelihoodField
+from services.estimator.particle_filter.likelihood_field import LikelihoodField, SurfaceDistances
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -38,7 +38,9 @@ class Sensor:
     def __init__(self, world: World, settings: Settings) -> None:
         """Builds the distance field of ``world``, and the table of ranges if the settings select the beam model."""
         s = self.settings = settings
-        self.field = LikelihoodField(DistanceField(world, s.resolution, s.laser_likelihood_max_dist), s.z_hit, s.z_rand)
+        self.field = LikelihoodField(
+            SurfaceDistances(world, s.resolution, s.laser_likelihood_max_dist), s.z_hit, s.z_rand
+        )
         self.max_sigma = max(s.sigma_hit, s.sigma_search)
         self._table = RangeTable(world, s.resolution) if s.laser_model_type == "beam" else None
         self._beam = BeamModel(s.z_hit, s.z_short, s.z_max, s.z_rand, s.sigma_hit, s.lambda_short)

@@ -198,7 +198,7 @@ def test_liveliness(bus, link):
     assert wait_until(lambda: bus.alive() == set(), PATIENCE)
 
 
-def test_a_session_closes_while_other_threads_use_it(link):
+def test_closing_a_session_in_use(link):
     ended = threading.Event()
 
     def ask(bus):
@@ -215,7 +215,7 @@ def test_a_session_closes_while_other_threads_use_it(link):
         assert ended.wait(PATIENCE)
 
 
-def test_sessions_survive_a_restart_of_the_router(processes, free_port):
+def test_restart_of_the_router(processes, free_port):
     port = free_port()
     link = Link(robot="late", connect=(f"tcp/127.0.0.1:{port}",))
     inbox = Inbox()
@@ -248,9 +248,7 @@ def test_routers_end_cleanly(processes, free_port, number):
     router = processes.start("common.router", "--listen", endpoint, env=env)
     router.wait_for("router listens")
     assert endpoint in router.output
-    status, seconds = router.stop(number)
-    assert status == 0, router.output
-    assert seconds < 5
+    assert router.stop(number) == 0, router.output
     assert "Traceback" not in router.output
 
 

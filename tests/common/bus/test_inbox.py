@@ -74,7 +74,7 @@ def test_a_busy_key_does_not_displace_another():
     assert inbox.get(0).payload == b"here"
 
 
-def test_sources_do_not_replace_each_others_samples():
+def test_samples_of_several_sources():
     inbox = Inbox()
     for number in range(3):
         for source in ("robot", "repeater"):
@@ -93,7 +93,7 @@ def test_oversized_payloads():
     assert inbox.received == {"scan": 2, "teleport": 1}
 
 
-def test_full_queues_refuse_requests_and_keep_answers():
+def test_full_queues():
     inbox, refused = Inbox(capacity=1), []
     for _ in range(2):
         inbox.put(Call(TELEPORT, b"", lambda _: None, refused.append))
@@ -106,7 +106,7 @@ def test_full_queues_refuse_requests_and_keep_answers():
     assert large.reply() == Reply(ok=False, reason=f"the reply of {64 * MAX_BYTES + 1} bytes is too large")
 
 
-def test_undecodable_answers_become_failed_replies():
+def test_undecodable_answers():
     reply = Answer(TELEPORT, 1, b"\xc1").reply()
     assert not reply.ok
     assert "cannot be decoded" in reply.reason
@@ -160,13 +160,13 @@ for number in range(100):
 """
 
 
-def test_ctrl_c_does_not_leave_the_inbox_locked():
+def test_interrupted_inbox():
     """Otherwise zenoh's threads would wait for the lock, and the session could never close."""
     done = subprocess.run([sys.executable, "-c", INTERRUPTED], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
-def test_entries_of_many_threads_are_all_counted():
+def test_many_threads():
     inbox = Inbox(capacity=50)
     threads = [
         threading.Thread(target=lambda k=k: [inbox.put(sample(k), newest_only=k == "0") for _ in range(2000)])

@@ -14,7 +14,7 @@ names = st.builds(
 
 
 @given(names)
-def test_names_are_valid_key_chunks_and_can_be_parsed(instance):
+def test_names_as_key_chunks(instance):
     name = instance.name
     assert not set(name) & set("/*$#?@")
     again = Instance.parse(name)
@@ -38,7 +38,7 @@ NAMES = [Instance(k, "host", 1, f"{k}").name for k in range(5)]
 
 
 @given(st.lists(st.tuples(st.sampled_from(NAMES), st.booleans(), st.booleans()), max_size=30))
-def test_at_most_one_instance_becomes_the_leader(events):
+def test_one_leader(events):
     """Each instance sees all others; if none leads, exactly one of them may lead."""
     instances_of = {name: Instances(name) for name in NAMES}
     leading, waiting = set(), set()
@@ -54,7 +54,7 @@ def test_at_most_one_instance_becomes_the_leader(events):
 
 
 @given(names, names)
-def test_earlier_tokens_of_this_session_are_ignored(me, other):
+def test_own_earlier_tokens(me, other):
     """Zenoh may report an earlier token of the session itself, which must not prevent it from leading again."""
     instances = Instances(me.name)
     instances.update(Instance(other.started_ms, me.host, me.pid, me.zid).name, leads=True, alive=True)
@@ -64,7 +64,7 @@ def test_earlier_tokens_of_this_session_are_ignored(me, other):
     assert not instances.may_lead()
 
 
-def test_without_a_leader_the_first_source_is_selected_until_it_is_silent():
+def test_source_without_a_leader():
     sources = SourceSelector(0.3)
 
     def takes(source, now, robot="robot"):
@@ -79,7 +79,7 @@ def test_without_a_leader_the_first_source_is_selected_until_it_is_silent():
     assert not takes("a", 0.7)
 
 
-def test_only_the_leader_is_selected_even_if_it_is_silent():
+def test_silent_leader():
     sources = SourceSelector(0.3)
     leader = Instance(1, "host", 2, "0123456789ab")
     sources.update("robot", "simulator", leader.name, True)

@@ -41,7 +41,7 @@ def sample(key, kind):
     return SimpleNamespace(key_expr=key, kind=kind)
 
 
-def test_tokens_missed_by_a_query_are_still_found(session):
+def test_missed_tokens(session):
     presence = Liveliness(session, "robot")
     old, new = (alive_key("robot", "estimator", f"{age:012x}~host~1~ab") for age in (1, 2))
     assert presence.alive() == set()

@@ -39,7 +39,7 @@ def may_send(role: str, message: str, key: str, robots: tuple[str, ...] = ("*",)
     )
 
 
-def test_roles_exist_and_cover_all_topics_and_queries():
+def test_roles_of_topics_and_queries():
     named = {role for topic in TOPICS for role in topic.publisher_roles} | {
         role for query in QUERIES for role in query.requester_roles
     }
@@ -52,13 +52,13 @@ def test_roles_exist_and_cover_all_topics_and_queries():
         assert [role for role in ROLES if may_ask(role, query)], query.name
 
 
-def test_only_the_robot_publishes_scans_and_only_the_controller_commands():
+def test_publishers_of_scans_and_commands():
     stands_in = {"replay"}
     assert {role for role in ROLES if may_put(role, CMD_VEL)} - stands_in == {"controller"}
     assert {role for role in ROLES if may_put(role, SCAN)} - stands_in == {"simulator", "bridge_ros2"}
 
 
-def test_requests_that_change_something_need_a_control_role():
+def test_requests_that_need_a_control_role():
     free = {"sample", "world", "model", "predict", "config"}
     rviz = {"localise": "bridge_ros2"}  # whose "2D Pose Estimate" the bridge passes on
     others = {q.name: set(q.requester_roles) - {rviz.get(q.name)} for q in QUERIES}
@@ -67,7 +67,7 @@ def test_requests_that_change_something_need_a_control_role():
 
 
 @pytest.mark.parametrize("role", sorted(set(ROLES) - {ROUTER}))
-def test_rules_for_publishing_agree_with_the_table(role):
+def test_rules_for_publishing(role):
     for topic in TOPICS:
         key = topic.key("r1", service_of(role) or "other")
         assert may_send(role, "put", key) == may_put(role, topic)
@@ -108,7 +108,7 @@ def test_rules_for_one_robot(message, key):
     assert allowed == {"one"}
 
 
-def test_the_default_is_deny_and_clients_accept_only_routers():
+def test_default_rules():
     members = [Member(name=role, role=role) for role in ROLES]
     for access in (router_rules(members), client_rules()):
         assert access["enabled"]
@@ -130,7 +130,7 @@ def keys(tmp_path_factory):
     return folder
 
 
-def test_credentials_of_the_robot_are_preferred(keys):
+def test_credentials_of_a_robot(keys):
     assert credentials(keys, ("controller",), "one").member.robots == ("one",)
     with pytest.raises(UserError, match="no credentials of 'controller', but of controller-one, estimator-one"):
         credentials(keys, ("controller",), "two")
@@ -157,7 +157,7 @@ def test_passwords_are_not_printed(keys):
     assert mine.password not in repr(mine)
 
 
-def test_missing_rights_raise_an_error_before_sending(keys):
+def test_missing_rights(keys):
     mine = credentials(keys, ("controller",), "one")
     mine.check(may_put, CMD_VEL, "one")
     with pytest.raises(UserError, match="'controller-one' is for one, not for robot 'two'"):

@@ -38,7 +38,7 @@ def test_every_robot_must_be_healthy(service, beats, fault):
     assert find_fault(service, beats, ["a", "b"], NOW)[: len(fault) or None] == fault
 
 
-def test_heartbeats_record_when_counts_increased(tmp_path):
+def test_times_of_heartbeats(tmp_path):
     heart = Heartbeat(tmp_path, "small", "robot")
     heart.beat({"a": {"received": 1}, "b": {"published": 0}}, linked=True)
     first = read_beats(tmp_path, "small")["robot"]
@@ -67,7 +67,7 @@ def check(service, folder=None, **environment):
     return done.returncode, done.stderr.strip()
 
 
-def test_a_frozen_service_is_unhealthy_until_it_continues(bus, process, link, tmp_path):
+def test_frozen_service(bus, process, link, tmp_path):
     running = process(SMALL, "--heartbeat", str(tmp_path))
     beats = lambda: read_beats(tmp_path, "small").get(bus.robot)  # noqa: E731
     assert wait_until(lambda: beats() is not None and beats().linked, 30), running.output
@@ -89,7 +89,7 @@ def test_a_frozen_service_is_unhealthy_until_it_continues(bus, process, link, tm
     assert wait_until(lambda: check("small", tmp_path, PRESAGE_ROBOT=bus.robot)[0] == 0, 30, period=0.5)
 
 
-def test_a_router_is_healthy_if_a_session_opens(router, free_port, monkeypatch):
+def test_healthy_router(router, free_port, monkeypatch):
     monkeypatch.setenv("PRESAGE_CONNECT", f"tcp/127.0.0.1:{router}")
     healthcheck.main("router")
     monkeypatch.setenv("PRESAGE_CONNECT", f"tcp/127.0.0.1:{free_port()}")
@@ -98,6 +98,6 @@ def test_a_router_is_healthy_if_a_session_opens(router, free_port, monkeypatch):
         healthcheck.main("router")
 
 
-def test_a_service_without_a_heartbeat_is_unhealthy(tmp_path):
+def test_no_heartbeat(tmp_path):
     assert check("estimator", tmp_path) == (1, "unhealthy: robot: no heartbeat")
     assert check("estimator", tmp_path, PRESAGE_FLEET="many")[1].startswith("unhealthy: PRESAGE_FLEET='many'")

@@ -9,10 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.errors import UserError
-from common.geometry import se2
 from common.geometry.world import World, known_worlds, load_world, save_world
 from common.robot.base import Robot
-from common.robot.scanner import SCANNERS
 from tests.common.geometry.maps import ROOM
 
 
@@ -69,24 +67,6 @@ def test_corridor():
     along = np.column_stack([np.linspace(0.5, 17.5, 100), np.full(100, 1.5)])
     assert (world.clearance(along) > 0.45).all()  # the middle is free
     assert all(o.shape().bounds[1] > 3 for o in world.obstacles)  # all along one wall
-
-
-def test_twin_rooms():
-    """Scans of most of a room equal those of its twin; from the doorway on, a fifth of the beams differ."""
-    world, scanner, twin = load_world("twins"), SCANNERS["tim571"].with_beams(271), np.array([6.0, 0, 0])
-
-    def differ(poses):
-        scans = [
-            world.ray_distances(se2.compose(each, scanner.mount), scanner.angles()) for each in (poses, poses + twin)
-        ]
-        return (np.abs(scans[0] - scans[1]) > 3 * scanner.sigma).mean(axis=1)
-
-    rng = np.random.default_rng(0)
-    places = world.sample_free(600, rng, Robot().radius)
-    places = places[(places[:, 0] < 5.8) & (places[:, 1] < 4.4)]
-    assert (differ(np.column_stack([places, rng.uniform(-np.pi, np.pi, len(places))])) == 0).mean() > 0.75
-    assert differ(np.array([[2.0, 2.2, yaw] for yaw in np.linspace(-3, 3, 7)])).max() == 0
-    assert differ(np.array([[2.95, y, np.pi / 2] for y in (4.5, 4.8, 5.4)])).min() > 0.2
 
 
 def test_saved_world(tmp_path):

@@ -38,7 +38,7 @@ def test_transforms_have_inverses(x, y, yaw, roll):
 
 
 @given(METRES, METRES, ANGLES, METRES, METRES, ANGLES)
-def test_level_transforms_compose_like_planar_poses(x, y, yaw, u, v, turn):
+def test_level_transforms(x, y, yaw, u, v, turn):
     found = placed(x, y, yaw).then(placed(u, v, turn)).planar()
     wanted = se2.compose([x, y, yaw], [u, v, turn])
     np.testing.assert_allclose(found[:2], wanted[:2], atol=1e-9)
@@ -46,7 +46,7 @@ def test_level_transforms_compose_like_planar_poses(x, y, yaw, u, v, turn):
 
 
 @given(ANGLES, st.booleans(), st.floats(-0.08, 0.08))
-def test_nearly_level_scanners_are_upright_or_upside_down(yaw, hangs, lean):
+def test_nearly_level_scanners(yaw, hangs, lean):
     mount = mount_of(placed(1.0, 2.0, yaw, lean + (np.pi if hangs else 0.0)))
     assert mount.upside_down == hangs
     np.testing.assert_allclose(mount.pose, [1, 2, yaw], atol=1e-9)

@@ -45,7 +45,7 @@ def test_surfaces_and_ranges_for_localisation(ranges, limits):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_maximum_range_is_recognised_in_both_precisions(dtype):
+def test_maximum_range_in_both_precisions(dtype):
     for most in (0.7, 8.1, 8.3, 25.0):
         row = np.array([np.float32(most), most, most * 0.999], dtype)
         assert np.isposinf(normalise_driver_ranges(row, 0.0, most)).tolist() == [True, True, False]

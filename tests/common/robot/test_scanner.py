@@ -34,7 +34,7 @@ def sweep_of(scanner):
     return Sweep(scanner.angle_min, scanner.angle_increment, scanner.beams)
 
 
-def test_the_number_of_beams_keeps_the_field_of_view():
+def test_field_of_view_with_fewer_beams():
     few = TIM571.with_beams(91)
     assert len(few.angles()) == 91
     assert few.angles()[[0, -1]] == pytest.approx(TIM571.angles()[[0, -1]])
@@ -43,13 +43,13 @@ def test_the_number_of_beams_keeps_the_field_of_view():
 
 
 @pytest.mark.parametrize("beams", [-1, 1, 1_000_000])
-def test_invalid_numbers_of_beams_are_explained(beams):
+def test_invalid_numbers_of_beams(beams):
     with pytest.raises(UserError, match=f"tim571 with {beams} beams: beams: Input should be") as error:
         TIM571.with_beams(beams)
     assert "\n" not in str(error.value)
 
 
-def test_full_circle_scans_have_no_duplicate_beams():
+def test_full_circle_scans():
     angles = np.rad2deg(SCANNERS["rplidar-a1"].angles())
     assert angles[[0, -1]] == pytest.approx([-179, 180])
     assert np.diff(angles) == pytest.approx(1)
@@ -140,6 +140,6 @@ def test_invalid_noise_settings_are_refused(noise):
         load_settings(SimulatorSettings, [f"--noise={noise}"])
 
 
-def test_the_noise_option_replaces_the_scanners_noise():
+def test_noise_option():
     scanner = chosen_scanner("rplidar-a1", 30, 0.0)
     assert (scanner.sigma, scanner.sigma_relative, scanner.beams) == (0, 0, 30)

@@ -25,12 +25,12 @@ def read(*lines):
     return [found for line in lines if (found := reader.read(line)) is not None]
 
 
-def test_refused_messages_have_the_certificates_name():
+def test_name_of_a_refused_sender():
     assert read(SHOWN, LET_IN, denied("Put", "presage/r/cmd_vel")) == [Refusal("put", "observer", "presage/r/cmd_vel")]
     assert read(denied("Put", "presage/r/cmd_vel")) == [Refusal("put", "", "presage/r/cmd_vel")]
 
 
-def test_lines_about_cached_permissions_are_not_refusals():
+def test_cached_permissions():
     planned = [f"{AT} TRACE  rx-1 ThreadId(09) {ACCESS}: ACL (ingress): caching permissions for `presage/r/goal` ..."]
     subject = "9e87 on Interface(lo)+CertCommonName(observer)+Username(observer)"
     planned += [denied(f"Kind{what}", "presage/r/goal", subject, how="") for what in range(9)]
@@ -38,7 +38,7 @@ def test_lines_about_cached_permissions_are_not_refusals():
     assert read(SHOWN, LET_IN, *planned, asked) == [Refusal("query", "observer", "presage/r/teleport")]
 
 
-def test_messages_that_are_not_forwarded_are_not_refusals():
+def test_messages_not_forwarded():
     assert read(denied("Put", "presage/r/goal", flow="egress")) == []
     assert read(denied("Put", "presage/r/goal").replace("unauthorized", "authorized")) == []
 
@@ -72,7 +72,7 @@ def test_other_errors_of_zenoh_are_passed_on():
     assert read("") == []
 
 
-def test_repeated_connections_do_not_fill_memory():
+def test_repeated_connections():
     reader = ZenohLogParser()
     for number in range(5000):
         reader.read(SHOWN.replace("10.0.0.2:50998", f"10.0.0.2:{number}"))

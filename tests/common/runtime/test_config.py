@@ -171,7 +171,7 @@ def test_endpoints_are_split_at_commas():
     assert split_endpoints("") == ()
 
 
-def test_a_router_ignores_the_settings_of_services(load, monkeypatch):
+def test_settings_of_a_router(load, monkeypatch):
     monkeypatch.setenv("PRESAGE_CONNECT", "tcp/127.0.0.1:1")
     monkeypatch.setenv("PRESAGE_LISTEN", "tcp/127.0.0.1:2")
     shared = "listen: tcp/127.0.0.1:3\n"

@@ -102,11 +102,11 @@ def test_metrics_of_a_real_service(bus, process):
     assert value(found, "presage_build_info", **whose) == 1
     assert value(found, "presage_uptime_seconds", **whose) > 0
     assert "process_cpu_seconds_total" in scrape(address)
-    assert running.stop()[0] == 0
+    assert running.stop() == 0
     assert "Traceback" not in running.output
 
 
-def test_prometheus_is_imported_only_if_it_is_used():
+def test_lazy_import_of_prometheus():
     program = "import sys, common.runtime.service, common.router; print('prometheus_client' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
@@ -131,7 +131,7 @@ def test_metrics_of_the_router(processes, free_port):
         assert wait_until(bus.linked, WAIT_TIMEOUT_S)
         assert wait_until(lambda: value(read(scrape(address)), "presage_router_sessions") == 1, WAIT_TIMEOUT_S)
     assert value(read(scrape(address)), "presage_build_info", service="router") == 1
-    assert running.stop()[0] == 0
+    assert running.stop() == 0
 
 
 def metrics_of(service: str, **counts) -> ServiceMetrics:

@@ -45,7 +45,7 @@ def test_invalid_limits_are_named(field, value):
         load_settings(ControllerSettings, [f"--{field.replace('_', '-')}={value}"])
 
 
-def test_robots_that_take_long_to_stop_are_refused():
+def test_slowly_stopping_robots():
     with pytest.raises(UserError, match=r"--max-speed 1 m/s with --acceleration 0.01 m/s²: .* 100 s to stop"):
         RobotSettings(acceleration=0.01).build_robot()
     with pytest.raises(UserError, match="--turn-acceleration"):

@@ -18,7 +18,7 @@ clouds = st.lists(st.tuples(st.floats(-4, 4), st.floats(-4, 4)), max_size=30).ma
 
 
 @given(st.tuples(any_float, any_float, any_float).map(np.array))
-def test_clipped_commands_are_finite_and_within_limits(twist):
+def test_clipped_commands(twist):
     clipped = safety.clip_twist(twist, ROBOT)
     assert np.hypot(*clipped[:2]) <= ROBOT.max_speed * (1 + 1e-9)
     assert abs(clipped[2]) <= ROBOT.max_turn
@@ -26,13 +26,13 @@ def test_clipped_commands_are_finite_and_within_limits(twist):
         assert not clipped.any()
 
 
-def test_clipping_keeps_the_direction_and_removes_sideways_motion():
+def test_clipped_direction():
     assert safety.clip_twist(np.array([3.0, 4.0, 0.0]), ROBOT) == pytest.approx([0.6, 0.8, 0.0])
     assert safety.clip_twist(np.array([0.3, 0.4, 0.1]), Robot(drive="differential")) == pytest.approx([0.3, 0, 0.1])
 
 
 @given(twists, twists, st.floats(0, 0.2))
-def test_ramps_approach_the_target_within_the_acceleration(current, wanted, dt):
+def test_ramps(current, wanted, dt):
     after = safety.ramp(current, wanted, ROBOT, dt)
     assert np.hypot(*(after - current)[:2]) <= ROBOT.acceleration * dt + 1e-9
     assert abs(after[2] - current[2]) <= ROBOT.turn_acceleration * dt + 1e-9
@@ -40,7 +40,7 @@ def test_ramps_approach_the_target_within_the_acceleration(current, wanted, dt):
 
 
 @given(twists, clouds)
-def test_limited_speeds_allow_stopping_before_obstacles(twist, points):
+def test_stopping_distance(twist, points):
     limited, held = safety.limit_velocity(twist, points, ROBOT)
     speed = np.hypot(*limited[:2])
     assert speed <= np.hypot(*twist[:2]) + 1e-12
@@ -56,7 +56,7 @@ def test_limited_speeds_allow_stopping_before_obstacles(twist, points):
         assert (gaps[in_front] >= ROBOT.radius - 1e-6).all()
 
 
-def test_driving_away_from_a_touched_wall_is_allowed():
+def test_leaving_a_touched_wall():
     wall = np.column_stack([np.full(21, ROBOT.radius), np.linspace(-1, 1, 21)])
     into, held = safety.limit_velocity(np.array([0.5, 0, 0.3]), wall, ROBOT)
     assert held

@@ -99,7 +99,7 @@ def test_health_is_published_once_a_second(small):
     assert small.latest.uptime - last.uptime > 0.5
 
 
-def test_undecodable_payloads_are_counted_logged_and_dropped(small):
+def test_undecodable_payloads(small):
     # On health, where every payload is kept: on a newest-only key one may take the place of another before it is read.
     key = HEALTH.key(small.bus.robot, "intruder")
     assert small.bus.wait_matching(HEALTH, PATIENCE, key=key)
@@ -113,7 +113,7 @@ def test_undecodable_payloads_are_counted_logged_and_dropped(small):
     assert small.latest.counters["failed"] == 0
 
 
-def test_exceptions_are_counted_and_user_errors_end_the_service(small):
+def test_exceptions_and_user_errors(small):
     small.goal(-1)
     assert small.until(lambda h: h.counters["failed"] == 1)
     assert "a bug in on_message" in small.running.output
@@ -138,11 +138,10 @@ def test_requests_to_itself(small):
         assert small.until(lambda h, n=count: h.counters.get("replies") == n), small.running.output
         assert text in small.latest.note
     small.goal(1.0, 1.0, cancel=True)
-    status, seconds = small.running.stop()
-    assert (status, seconds < 5) == (0, True), small.running.output
+    assert small.running.stop() == 0, small.running.output
 
 
-def test_replies_refusals_and_exceptions_of_requests(small):
+def test_results_of_requests(small):
     def ask(x: float) -> Reply:
         return small.bus.ask(TELEPORT, PoseRequest(pose=Pose(x=x, y=0.0)), Reply)
 
@@ -161,7 +160,7 @@ def test_replies_refusals_and_exceptions_of_requests(small):
     assert reply.versions["python"]
 
 
-def test_a_failing_timer_does_not_block_the_service(bus, process):
+def test_failing_timer(bus, process):
     beside = Beside(bus, process(SMALL, "--fail", "timer"))
     beside.bus.put(SCAN, scan(5))
     assert wait_until(lambda: len(beside.commands) == 1, PATIENCE)
@@ -171,9 +170,7 @@ def test_a_failing_timer_does_not_block_the_service(bus, process):
 def test_signals(small, number, step_s):
     if step_s:
         small.goal(step_s)
-    status, seconds = small.running.stop(number)
-    assert status == 0, small.running.output
-    assert seconds < PATIENCE / 3  # at once, or after the step, but for a busy machine
+    assert small.running.stop(number) == 0, small.running.output
     assert "closed" in small.running.output
     assert small.running.output.rstrip().endswith("ended")
     assert "Traceback" not in small.running.output
@@ -184,18 +181,14 @@ def test_signals(small, number, step_s):
 def test_signals_before_the_loop(process, when, text):
     running = process(SMALL, "--slow", when)
     running.wait_for(text)
-    status, seconds = running.stop()
-    assert status == 0, running.output
-    assert 0.3 < seconds < PATIENCE / 3
+    assert running.stop() == 0, running.output
     assert "closed" in running.output
 
 
 def test_without_a_router(process, free_port):
     running = process(SMALL, env={"PRESAGE_CONNECT": f"tcp/127.0.0.1:{free_port()}"})
     running.wait_for("ready")
-    status, seconds = running.stop()
-    assert status == 0, running.output
-    assert seconds < PATIENCE / 3  # at once, but for a busy machine
+    assert running.stop() == 0, running.output
 
 
 def test_errors_at_the_start(router, process):

@@ -59,13 +59,13 @@ def test_gain_is_between_zero_and_the_entropy(predicted):
 
 @pytest.mark.parametrize("beams", [61, 811])
 @pytest.mark.parametrize("outliers", [0.25, 0.0])
-def test_clearly_different_scans_gain_the_entropy(beams, outliers):
+def test_gain_of_different_scans(beams, outliers):
     weights, ranges = np.array([0.5, 0.3, 0.2]), np.array([1.0, 4.0, 9.0])[:, None, None] * np.ones((3, 1, beams))
     gain = gain_of(ranges, weights=weights, trust=PredictionTrust(outliers=outliers))
     assert gain == pytest.approx(entropy(weights), rel=2e-3)
 
 
-def test_gain_increases_with_the_number_of_differing_beams():
+def test_gain_by_number_of_beams():
     """The numbers in the docstring of PredictionTrust."""
     gain = gain_of(np.stack([np.full((61, 61), 5.0), 5.0 + 3.0 * np.tri(61, 61, -1)]))
     assert (np.diff(gain) > 0).all()
@@ -75,12 +75,12 @@ def test_gain_increases_with_the_number_of_differing_beams():
 
 
 @pytest.mark.parametrize(("first", "low", "high"), [(5.0, 0.6, 0.7), (np.inf, 0, 1e-12), (R - 1e-3, 0, 1e-3)])
-def test_no_return_counts_as_the_maximum_range(first, low, high):
+def test_no_return(first, low, high):
     assert low <= gain_of(np.array([first, np.inf])[:, None, None] * np.ones((2, 1, 61)))[0] <= high
 
 
 @pytest.mark.parametrize(("sigma", "share"), [(0.02, 0.85), (0.05, 0.8), (0.2, 0.65)])
-def test_gain_is_slightly_below_the_mutual_information(sigma, share):
+def test_gain_and_mutual_information(sigma, share):
     """Against Monte Carlo with the same model, including outliers, and as many beams as sectors.
 
     With predictions about three deviations apart the gain is at least ``share`` of it, with eight at least 0.9.
@@ -174,7 +174,7 @@ def test_chooses_the_place_where_scans_differ(rooms, motions, destination):
     assert found is None if destination is None else found == pytest.approx(destination)
 
 
-def test_destination_is_kept_when_hypotheses_swap(rooms):
+def test_swapped_hypotheses(rooms):
     rooms.choose(0, rooms.motions())
     for k in range(1, 30):
         motions = rooms.motions(0.1 * k, swapped=k % 2 == 1)
@@ -183,7 +183,7 @@ def test_destination_is_kept_when_hypotheses_swap(rooms):
         assert rooms.selector.displacement(motions.hypotheses[0]) == pytest.approx([4.0 - 0.1 * k, 0, 0])
 
 
-def test_reached_destination_is_chosen_again_only_after_all_others(rooms):
+def test_reached_destination(rooms):
     assert rooms.choose(0, rooms.motions(moves=[(4, 0), (4, 3)])) == pytest.approx([4, 0, 0])
     for k in range(1, 41):
         rooms.selector.follow(k, rooms.motions(0.1 * k).hypotheses, [0.5, 0.5])
@@ -214,7 +214,7 @@ def test_destination_is_dropped(rooms, stamp, shift, weights, kept):
     assert rooms.selector.follow(5 * SECOND, motions.hypotheses, (0.5, 0.5)) is None
 
 
-def test_destination_changes_only_for_a_clearly_better_one(rooms):
+def test_better_destination(rooms):
     assert rooms.choose(0, rooms.motions(moves=[(4, 0)])) == pytest.approx([4, 0, 0])
     # Slightly shorter with equal gain: kept. Ten metres shorter with equal gain: changed.
     more = [(4, 0), (3.9, 1)]
@@ -224,7 +224,7 @@ def test_destination_changes_only_for_a_clearly_better_one(rooms):
     assert rooms.selector.chosen is None
 
 
-def test_leaves_one_of_two_identical_rooms_through_the_door():
+def test_identical_rooms():
     """World `twins` with exact rays; destinations are spread over the room and the corridor outside."""
     world, scanner, twin = shipped("twins"), SCANNERS["tim571"].with_beams(61), np.array([6.0, 0.0, 0.0])
     here, door = np.array([2.0, 2.2, 0.3]), np.array([2.95, 4.5])

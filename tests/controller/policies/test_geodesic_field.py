@@ -83,7 +83,7 @@ def follow_attractor(field, here, room) -> float:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_paths_keep_clear_and_are_nearly_shortest(name):
+def test_nearly_shortest_paths(name):
     world, graph, rng = shipped(name), graph_of(name), np.random.default_rng(1)
     inner = shapely.buffer(world.free_space, -(RADIUS + WALL_GAP_M) + 0.05)  # the grid may cut corners by 5 cm
     wide, reached = shapely.buffer(world.free_space, -1.0), 0
@@ -108,7 +108,7 @@ def test_paths_keep_clear_and_are_nearly_shortest(name):
     assert reached >= 9
 
 
-def test_path_around_an_obstacle_and_after_its_removal(empty):
+def test_path_around_an_obstacle(empty):
     start, goal = np.array([1.0, 3.0]), np.array([9.0, 3.0])
     free = path_length(empty.cost_field(goal).path(start))
     wall = np.stack([np.full(41, 5.0), np.linspace(1.0, 5.0, 41)], axis=-1)
@@ -124,7 +124,7 @@ def test_path_around_an_obstacle_and_after_its_removal(empty):
 
 
 @pytest.mark.parametrize("name", ["corridor", "office"])
-def test_graph_depends_on_present_obstacles_only(name):
+def test_graph_of_present_obstacles(name):
     graph, rng = FreeSpaceGraph(free_space(name), RADIUS), np.random.default_rng(2)
     x0, y0, x1, y1 = shipped(name).bounds
     for count in (40, 3, 200, 0):
@@ -151,7 +151,7 @@ def test_path_keeps_away_from_a_wall(empty):
     assert path_length(path) < 8.3
 
 
-def test_rooms_without_a_door_are_two_components():
+def test_rooms_without_a_door():
     graph = FreeSpaceGraph(FreeSpace.of(room(10, 6, box(5, 3, 0.2, 6))), RADIUS)
     a, b = np.array([2.0, 3.0]), np.array([8.0, 3.0])
     left, right = (int(graph.component[graph.nearest_free(point)]) for point in (a, b))

@@ -37,7 +37,7 @@ def around(points=(), *, moving=False, **more):
 
 @settings(max_examples=15)
 @given(speeds, speeds, speeds, speeds)
-def test_differential_rollout_matches_a_fine_simulation(v0, w0, v, w):
+def test_differential_rollout(v0, w0, v, w):
     robot, fine = Robot(drive="differential"), 1e-2 / 3
     poses, times, stands = rollouts(np.array([v0, 0, w0]), np.array([[v, 0, w]]), robot)
     velocity, pose, simulated = np.array([v0, 0.0, w0]), np.zeros(3), []
@@ -74,7 +74,7 @@ def test_turn_is_braked_in_time(angle):
 
 @both_drives
 @given(x=st.floats(-4, 4), y=st.floats(-4, 4), v=speeds, w=speeds)
-def test_selection_never_increases_the_distance(robot, x, y, v, w):
+def test_distance_after_selection(robot, x, y, v, w):
     current, goal = np.array([v, 0.0, w]), np.array([x, y])
     selected = select_action(current, goal, around(), robot)
     poses, _, _ = rollouts(current, np.zeros((1, 3)), robot)
@@ -100,7 +100,7 @@ def test_speed_is_kept_up_to_the_goal(robot):
 
 @both_drives
 @given(st.lists(st.tuples(st.floats(-2, 2), st.floats(-2, 2)), max_size=12), st.integers(0, 100))
-def test_selected_motion_is_free_until_standstill(robot, points, seed):
+def test_selected_motion(robot, points, seed):
     v, w = np.random.default_rng(seed).uniform([0, -1], [0.5, 1])
     surroundings = around([p for p in points if np.hypot(*p) > 0.35])
     selected = select_action(np.array([v, 0, w]), np.array([1.5, 0.7]), surroundings, robot)
@@ -111,7 +111,7 @@ def test_selected_motion_is_free_until_standstill(robot, points, seed):
 @pytest.mark.parametrize(
     ("point", "moving", "hindered"), [((1.6, 0.0), False, False), ((1.6, 0.0), True, True), ((0.0, 0.5), False, False)]
 )
-def test_moving_obstacle_slows_the_robot_and_static_one_does_not(point, moving, hindered):
+def test_moving_and_static_obstacles(point, moving, hindered):
     """Driving at a moving one, the robot must be able to stop before it arrives."""
     surroundings = around([point], moving=moving)
     selected = select_action(np.array([0.6, 0.0, 0.0]), np.array([3.0, 0.0]), surroundings, ROBOT)
@@ -119,7 +119,7 @@ def test_moving_obstacle_slows_the_robot_and_static_one_does_not(point, moving, 
     assert (np.hypot(*selected.action[:2]) < 0.6) == hindered
 
 
-def test_turns_or_slows_towards_unseen_directions():
+def test_unseen_directions():
     behind, view = np.array([-3.0, 0.0]), Sector(0.0, np.deg2rad(135))
     action = select_action(np.zeros(3), behind, around(view=view), ROBOT).action
     assert abs(np.arctan2(action[1], action[0])) <= np.pi / 2 + 1e-9  # the body is wide

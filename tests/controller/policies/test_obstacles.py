@@ -45,7 +45,7 @@ def test_new_box_is_found_and_becomes_static(obstacles):
         assert obstacles.moving(stamp).all() == (stamp < STATIC_AFTER_NS)
 
 
-def test_walking_person_stays_moving_and_leaves_no_trail(obstacles):
+def test_walking_person(obstacles):
     for number in range(30):
         stamp, y = number * SECOND // 15, 2.0 + number / 15
         obstacles.update(scan(stamp, HERE, with_box(y)), HERE)

@@ -63,7 +63,7 @@ def test_action_converges_to_half_the_way(observed, preferred, yaw):
     assert se2.rotate(yaw, action) == pytest.approx((preferred - observed) / 2, abs=1e-6)
 
 
-def test_scan_corrects_the_belief_to_first_order():
+def test_correction_of_the_belief():
     """For a linear generative model, the belief plus H^-1 xi is the truth."""
     J = np.random.default_rng(0).normal(size=(50, 3))
     J[:, 2] = 0
@@ -72,7 +72,7 @@ def test_scan_corrects_the_belief_to_first_order():
     assert found == pytest.approx(truth[:2], abs=1e-3)
 
 
-def test_belief_is_kept_without_curvature_or_information():
+def test_no_curvature_or_information():
     pose = np.array([1.0, 2.0, 0.0])
     assert observed_position(pose, np.array([100.0, 0, 0]), None) == pytest.approx(pose[:2])
     assert observed_position(pose, None, np.eye(3)) == pytest.approx(pose[:2])
@@ -81,7 +81,7 @@ def test_belief_is_kept_without_curvature_or_information():
 
 
 @given(pair, st.floats(1e-3, 1e6))
-def test_corrections_and_attraction_are_bounded(xi, scale):
+def test_bounded_corrections(xi, scale):
     found = observed_position(np.zeros(3), np.array([*xi, 0]) * scale, np.diag([1.0, 1.0, 0.0]))
     assert np.linalg.norm(found) <= MAX_CORRECTION_M + 1e-9
     assert np.linalg.norm(preferred_position(found, np.array([100.0, 50.0, 0]), 1.0) - found) == pytest.approx(1.0)

@@ -52,7 +52,7 @@ def test_drives_around_an_unmapped_box(kind):
     assert path_length(poses) < 7.0
 
 
-def test_new_box_counts_as_moving_for_one_second():
+def test_new_box():
     hall, world = room(10, 3), room(10, 3, box(9.5, 1.5, 0.6, 1.2))
 
     def change(simulation):
@@ -66,7 +66,7 @@ def test_new_box_counts_as_moving_for_one_second():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_waits_at_a_closed_door_until_it_opens(kind):
+def test_closed_door(kind):
     def change(simulation):
         if simulation.steps == 240:
             simulation.change_obstacle("remove", "door", None)
@@ -82,7 +82,7 @@ def test_waits_at_a_closed_door_until_it_opens(kind):
     assert sum(status.state == "blocked" for status in waiting) > 0.3 * len(waiting)
 
 
-def test_refusal_names_the_nearest_reachable_place():
+def test_nearest_reachable_place():
     policy = GeodesicPolicy(Robot(), TWO_ROOMS)
     nearest = "; the nearest place that can be reached is ("
     assert f"(5.00, 2.50) in room is inside something, or off the map{nearest}" in policy.refusal(np.array([5.0, 2.5]))
@@ -98,7 +98,7 @@ def test_refusal_names_the_nearest_reachable_place():
     assert f"cannot be reached from here{nearest}4.5" in decision.reason
 
 
-def test_goals_off_the_free_cells_of_a_map_are_refused():
+def test_goals_off_the_map():
     world = World(name="rooms", grid=OccupancyGrid.of(rooms(200), 0.05, (-10.0, -10.0, 0.0)))
     row, column = np.argwhere(world.grid.values == UNKNOWN)[0]
     unknown = world.grid.shapes.points_in_cells(np.array([[column, row]]), 0.5)[0]
@@ -115,7 +115,7 @@ def test_map_of_one_cell():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_contact_with_an_empty_map_and_no_obstacle_stop(kind):
+def test_empty_map_without_obstacle_stop(kind):
     """Every wall within the boundary is unmapped."""
     world, rng, fastest = shipped("maze"), np.random.default_rng(5), 0.0
     empty = World(name="empty", boundary=world.boundary)
@@ -128,7 +128,7 @@ def test_no_contact_with_an_empty_map_and_no_obstacle_stop(kind):
     assert fastest > 0.9  # m/s, so braking was necessary
 
 
-def test_backs_off_if_only_the_limits_stop_the_robot():
+def test_backing_off():
     """As in a doorway that is free for the planner but not for the limits: the velocity stays zero."""
     policy, pose = GeodesicPolicy(Robot(), HALL), np.array([5.0, 1.5, 0.0])
     policy.set_goal(np.array([9.0, 1.5]))

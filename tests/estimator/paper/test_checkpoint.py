@@ -1,4 +1,4 @@
-"""Checkpoints of a training: resumed with the same recipe, discarded with another, damage is one line of error."""
+"""Checkpoints of a training: resumed with the same parameters, discarded with another, damage is one line of error."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from common.errors import UserError
 from services.estimator.paper.checkpoint import Checkpoint
 from services.estimator.paper.decoder import Shape
-from services.estimator.paper.training import Recipe, Trainer
+from services.estimator.paper.training import Trainer, TrainingParameters
 from tests.estimator.paper.training_scans import normalisation, posed_scans
 
 DATA = posed_scans(60, 1)
@@ -20,7 +20,7 @@ RECIPE = {"epochs": 3, "world": "room"}
 
 
 def trainer() -> Trainer:
-    return Trainer(Shape(64, 8, 2), normalisation(), Recipe(epochs=3, batch=20), DATA, DATA)
+    return Trainer(Shape(64, 8, 2), normalisation(), TrainingParameters(epochs=3, batch=20), DATA, DATA)
 
 
 @pytest.fixture

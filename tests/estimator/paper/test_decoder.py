@@ -9,16 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.estimator.paper.decoder import Decoder, PaperModel, Shape
-from services.estimator.paper.training import Recipe, Trainer, usable_ranges
+from services.estimator.paper.training import Trainer, TrainingParameters, usable_ranges
 from tests.estimator.paper.training_scans import normalisation, posed_scans
 
 TRAIN, TEST = posed_scans(400, 1), posed_scans(100, 2)
 SHAPE = Shape(64, hidden=32, channels=4)
-RECIPE = Recipe(epochs=4, batch=50, learning_rate=5e-3)
+PARAMETERS = TrainingParameters(epochs=4, batch=50, learning_rate=5e-3)
 
 
 def trainer() -> Trainer:
-    return Trainer(SHAPE, normalisation(), RECIPE, TRAIN, TEST)
+    return Trainer(SHAPE, normalisation(), PARAMETERS, TRAIN, TEST)
 
 
 @pytest.mark.parametrize("beams", [2, 64, 181, 622, 811])
@@ -44,7 +44,9 @@ def test_jacobian(x, y):
 
 
 def test_learning():
-    one = Trainer(Shape(64, 64, 8), normalisation(), Recipe(epochs=40, batch=50, learning_rate=5e-3), TRAIN, TEST)
+    one = Trainer(
+        Shape(64, 64, 8), normalisation(), TrainingParameters(epochs=40, batch=50, learning_rate=5e-3), TRAIN, TEST
+    )
     one.run()
     flat = np.abs(TEST.ranges - np.median(TRAIN.ranges, axis=0)).mean()  # error of a constant prediction
     assert one.progress.test_l1[-1] < 0.8 * flat
@@ -53,7 +55,9 @@ def test_learning():
 
 def test_seed():
     a, b = trainer().run(), trainer().run()
-    other = Trainer(SHAPE, normalisation(), Recipe(epochs=4, batch=50, learning_rate=5e-3, seed=1), TRAIN, TEST).run()
+    other = Trainer(
+        SHAPE, normalisation(), TrainingParameters(epochs=4, batch=50, learning_rate=5e-3, seed=1), TRAIN, TEST
+    ).run()
     assert np.array_equal(a.ranges(TEST.poses), b.ranges(TEST.poses))
     assert not np.array_equal(a.ranges(TEST.poses), other.ranges(TEST.poses))
 

@@ -187,12 +187,12 @@ def test_tables_of_a_page(name):
 
 def test_files_of_e1(presage, monkeypatch, tmp_path):
     monkeypatch.setenv("PRESAGE_WORKERS", "1")
-    args = ("experiment", "e1", "--trials", "2", "--iterations", "3", "--estimators", "precise")
-    status, output = presage(*args, "--out", str(tmp_path))
+    args = ("e1", "--trials", "2", "--iterations", "3", "--estimators", "precise")
+    status, output = presage("experiment", "--out", str(tmp_path), *args)
     assert status == 0, output
     assert {path.name for path in tmp_path.iterdir()} == {"e1.json", "e1.csv", "e1.trials.jsonl", "e1.pdf", "e1.png"}
     found = json.loads((tmp_path / "e1.json").read_text())
-    assert found["command"].startswith("presage experiment e1 --trials 2")
+    assert found["command"].endswith(" e1 --trials 2 --iterations 3 --estimators precise")
     assert {"seed", "commit", "versions", "parameters"} <= set(found)
     assert found["summary"]["precise"]["found_within_0.5_m"] == 2
 

@@ -72,7 +72,7 @@ def test_twin_scans():
     assert scene.world.clearance(poses[:, :2]).min() > ROBOT.radius
 
 
-def test_the_boxes_are_alike_and_evenly_spaced():
+def test_boxes_of_a_scene():
     boxes = [o.box for o in aliasing.ALIKE.obstacles]
     assert len({box.size for box in boxes}) == 1
     x = np.array([box.center[0] for box in boxes])

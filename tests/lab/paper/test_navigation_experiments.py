@@ -13,7 +13,6 @@ from common.errors import UserError
 from common.geometry.world import World, load_world
 from common.messages.definitions import Belief, Pose, Truth, Twist
 from common.robot.base import Robot
-from common.runtime import safety
 from lab.experiments.estimators import ExperimentWorld
 from lab.experiments.journeys import ARRIVAL_DISTANCE, CLEARANCE, Journey, draw_journey, least_time, path_ratio
 from lab.experiments.lockstep import RunTrace, _is_next
@@ -48,18 +47,6 @@ def test_rejected_pairs():
 def test_world_without_a_journey():
     with pytest.raises(UserError, match=r"no two places 12 m apart"):
         draw_journey(World(name="cell", boundary=[(0, 0), (3, 0), (3, 3), (0, 3)]), np.random.default_rng(0), ROBOT)
-
-
-@given(st.floats(0.81, 30.0), st.floats(0.2, 3.0), st.floats(0.2, 3.0))
-@settings(max_examples=12)
-def test_minimum_time(distance, speed, acceleration):
-    """Simulates full acceleration with the simulator's limits in small steps."""
-    robot, dt = Robot(max_speed=speed, acceleration=acceleration), 5e-3
-    v, way, seconds = np.zeros(3), 0.0, 0.0
-    while distance - way > ARRIVAL_DISTANCE:
-        before, v = v, safety.ramp(v, np.array([speed, 0, 0]), robot, dt)
-        way, seconds = way + (before[0] + v[0]) / 2 * dt, seconds + dt
-    assert seconds == pytest.approx(least_time(distance, robot), abs=2 * dt)
 
 
 def test_least_time():

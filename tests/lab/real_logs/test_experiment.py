@@ -22,7 +22,6 @@ from lab.real_logs.drive import (
     StretchJob,
     create_estimator,
     drive_at,
-    exchange_halves,
     hide_kidnapping,
 )
 from lab.real_logs.drive import trial as one_trial
@@ -150,18 +149,6 @@ def test_halves(count):
     first, second = split(drive)
     assert len(first.ranges) == count // 2
     assert np.concatenate([first.stamps, second.stamps]) == pytest.approx(drive.stamps)
-
-
-@pytest.mark.parametrize("count", [20, 21])
-def test_exchanged_halves(count):
-    drive = real_drive.drive(count)
-    first, second = split(drive)
-    turned = exchange_halves(drive)
-    late = len(second.ranges)
-    assert turned.poses[:late] == pytest.approx(second.poses)
-    assert turned.ranges[late:] == pytest.approx(first.ranges)
-    assert turned.odom[late:] == pytest.approx(first.odom)
-    assert np.diff(turned.stamps) == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize("count", [100, 101])

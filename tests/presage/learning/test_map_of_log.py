@@ -34,7 +34,7 @@ def made(log, tmp_path, half=""):
 
 
 @pytest.mark.parametrize(("half", "world"), [("first", real_drive.BEFORE), ("second", real_drive.AFTER)])
-def test_a_map_of_a_half_is_the_room_of_that_time(log, tmp_path, half, world):
+def test_map_of_a_half(log, tmp_path, half, world):
     mapped = made(log, tmp_path, half)
     other = real_drive.AFTER if world is real_drive.BEFORE else real_drive.BEFORE
     x, y = np.meshgrid(np.arange(0.5, 8.9, 0.1), np.arange(0.5, 5.9, 0.1))
@@ -86,7 +86,7 @@ def test_what_cannot_be_is_said(log, tmp_path):
     assert not list(tmp_path.glob("*.yaml"))
 
 
-def test_a_recording_says_itself_where_its_laser_sits(tmp_path):
+def test_mount_of_a_recording(tmp_path):
     recorded.write(tmp_path / "run.mcap")
     with pytest.raises(UserError, match="contains the description of its scanner"):
         map_command(MapOptions(tmp_path / "run.mcap", tmp_path / "r.yaml", reading=HERE), QUIET, QUIET)

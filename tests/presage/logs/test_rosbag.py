@@ -8,8 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.errors import UserError
-from common.geometry import se2
-from common.geometry.world import load_world
 from presage.logs.log import Reading
 from presage.logs.opening import open_log
 from presage.logs.resampling import resample
@@ -139,30 +137,6 @@ def test_clock_of_the_logger(tmp_path):
     _, sweeps = read(write_bag(tmp_path, Bag()), clock="logger")
     assert [sweep.stamp_ns for sweep in sweeps] == (STAMPS + 20_000_000).tolist()
     close([sweep.odom for sweep in sweeps], odom(STAMPS + 20_000_000))
-
-
-def test_varying_number_of_beams(tmp_path):
-    """An RPLIDAR has another number of beams in every turn, from the first angle to the last."""
-    exact = load_world("corridor")
-
-    def turn(k):
-        beams = 2 * BEAMS + (k * 7) % 5 - 2 if k else 2 * BEAMS
-        angles = np.linspace(ANGLES[0], ANGLES[-1], beams)
-        row = exact.ray_distances(se2.compose(truth(STAMPS[k]), MOUNT)[None], angles)[0]
-        row[5] = 0.0  # no answer there
-        step = (ANGLES[-1] - ANGLES[0]) / (beams - 1)
-        return {"angle_increment": step, "ranges": row.astype(np.float32)}
-
-    log, scans = read(write_bag(tmp_path, Bag(each=turn)))
-    assert len(scans) == SCANS
-    assert not log.left_out
-    assert any("scans with other beam angles are resampled at the angles of the first" in note for note in log.notes)
-    for stamp, scan in zip(STAMPS, scans, strict=True):
-        wanted = exact.ray_distances(se2.compose(truth(stamp), MOUNT)[None], log.angles)[0]
-        off = np.abs(scan.ranges - wanted)
-        assert scan.ranges[5] == 0
-        assert np.median(off) < 1e-3
-        assert np.mean(off < 0.01 * wanted) > 0.95
 
 
 def test_scans_of_other_beams_are_counted(tmp_path):

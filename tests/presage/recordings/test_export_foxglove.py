@@ -248,8 +248,8 @@ def test_wall_clock_of_stamps():
     assert clock.add_sensor_message("truth", 5, 100) == 100
     assert clock.add_sensor_message("scan", 5, 103) == 100
     assert clock.time_of(5, 110) == 100
-    assert clock.time_of(6, 111) == 111  # nothing is known of it
-    assert clock.add_sensor_message("truth", 5, 900) == 900  # again: begun anew
+    assert clock.time_of(6, 111) == 111  # unknown stamp
+    assert clock.add_sensor_message("truth", 5, 900) == 900  # the stamp came again after a restart
     assert clock.add_sensor_message("scan", 5, 902) == 900
     assert clock.time_of(5, 950) == 900
 

@@ -6,7 +6,6 @@ import io
 import json
 
 import pytest
-from mcap.reader import make_reader
 from rich.console import Console
 from typer.testing import CliRunner
 
@@ -93,7 +92,7 @@ def test_info_text_and_json(tmp_path):
     assert {row["key"] for row in numbers["topics"]} >= {KEY, SCAN.key("rob")}
 
 
-@pytest.mark.parametrize("damage", ["active", "cut", "header only", "flipped bit"])
+@pytest.mark.parametrize("damage", ["active", "cut", "header only"])
 def test_info_of_an_incomplete_file(tmp_path, damage):
     path = driven.write(tmp_path / "run.mcap", finish=damage != "active")
     data = bytearray(path.read_bytes())
@@ -101,10 +100,6 @@ def test_info_of_an_incomplete_file(tmp_path, damage):
         del data[-40:]
     elif damage == "header only":
         del data[12:]
-    elif damage == "flipped bit":
-        with path.open("rb") as stream:
-            (chunk,) = make_reader(stream).get_summary().chunk_indexes
-        data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
     path.write_bytes(data)
     console = Console(file=io.StringIO(), width=150)
     assert info(path, None, None, console) == 1
@@ -155,14 +150,6 @@ def test_echo_refusals(tmp_path, monkeypatch, source, topic, message):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=message):
         echo_either(Link(), source, topic, 0, 0.0, Console(), full=False)
-
-
-@pytest.mark.parametrize("command", ["info", "echo", "plot", "export"])
-def test_help_has_examples(command):
-    done = CliRunner().invoke(app, [command, "--help"])
-    assert done.exit_code == 0
-    assert f"presage {command} " in done.stdout
-    assert "Example" in done.stdout
 
 
 def test_commands(tmp_path):

@@ -219,10 +219,10 @@ def test_selection_refusals(tmp_path):
     ):
         with pytest.raises(UserError, match=why):
             select_scans(job(file, **wrong), scans)
-    for estimator_options in ({"start": 0.2}, {"end": 0.2}, {"every": 2}):
+    for wrong in ({"start": 0.2}, {"end": 0.2}, {"every": 2}):
         with pytest.raises(UserError, match="no stamps, which --start, --end and --every need"):
-            select_scans(job(file, **estimator_options), unstamped)
-    with pytest.raises(UserError, match="mode track needs the pose of the first scan"):  # initial_pose is of another
+            select_scans(job(file, **wrong), unstamped)
+    with pytest.raises(UserError, match="mode track needs the pose of the first scan"):  # initial_pose is of scan 0
         localize(job(file, start=0.2, mode="track"), CONSOLE)
 
 
@@ -260,7 +260,7 @@ def test_ctrl_c_ends_with_status_130(tmp_path, processes):
     arguments = ["localize", str(tmp_path / "long.npz"), "--world", "corridor", "--mode", "single", "--out", str(out)]
     running = processes.start("presage.__main__", *arguments)
     assert wait_until(lambda: out.exists() and len(out.read_text().splitlines()) > 3, 4 * WAIT_TIMEOUT_S)
-    assert running.stop(signal.SIGINT)[0] == 130
+    assert running.stop(signal.SIGINT) == 130
     last = running.output.splitlines()[-1]
     assert last.endswith(f" of 3000 scans; their rows are in {out}")
     assert len(out.read_text().splitlines()) == int(last.split()[2]) + 1

@@ -40,7 +40,7 @@ def link_security(folder):
 def test_several_robots_need_a_name():
     with announced(HERE, ["r-1", "r-2"], None):
         assert link_of("", "r-2").robot == "r-2"
-        with pytest.raises(UserError, match=r"several robots .* --robot: r-1, r-2"):
+        with pytest.raises(UserError, match=r"several robots .* --robot`: r-1, r-2"):
             link_of("", "")
 
 

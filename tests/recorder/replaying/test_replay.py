@@ -71,8 +71,8 @@ def start(scans, link, bus):
     """A function that starts a replay in a thread and returns its control, thread and counts."""
     stop, threads, failed = threading.Event(), [], []
 
-    def begin(choice, path=scans):
-        choice = replace(choice, robot=link.robot)
+    def begin(options, path=scans):
+        options = replace(options, robot=link.robot)
         there, remotes, counts = threading.Event(), [], {}
 
         @contextmanager
@@ -83,7 +83,7 @@ def start(scans, link, bus):
 
         def work():
             try:
-                counts.update(replay(path, link, choice, stop=stop, control_context=get_control))
+                counts.update(replay(path, link, options, stop=stop, control_context=get_control))
             except BaseException as error:
                 failed.append(error)
                 there.set()
@@ -168,11 +168,11 @@ def test_key_without_subscriber(tmp_path, link, bus, capsys, monkeypatch):
 
 
 def test_selection(scans, link, listening):
-    choice = ReplayOptions(rate=0, only=frozenset({"odom"}), start=10.0, end=-88.9)
-    assert replay(scans, link, choice) == {ODOM.key(link.robot): 1}
+    options = ReplayOptions(rate=0, only=frozenset({"odom"}), start=10.0, end=-88.9)
+    assert replay(scans, link, options) == {ODOM.key(link.robot): 1}
     assert next_payloads(listening, 1) == [("odom", 10)]
-    choice = ReplayOptions(rate=0, leave_out=frozenset({"odom", "belief"}), start=98.0)
-    assert replay(scans, link, choice) == {SCAN.key(link.robot): 2}
+    options = ReplayOptions(rate=0, leave_out=frozenset({"odom", "belief"}), start=98.0)
+    assert replay(scans, link, options) == {SCAN.key(link.robot): 2}
     with pytest.raises(UserError, match=r"run.mcap: nothing to replay"):
         replay(scans, link, ReplayOptions(leave_out=frozenset({"scan", "odom"})))
 

@@ -116,7 +116,7 @@ def test_silent_topics_are_not_shown():
     assert frame.header["cmd"] is not None
 
 
-def test_no_topic_becomes_silent_during_a_pause():
+def test_topics_during_a_pause():
     view = RobotView("robot")
     feed(view, 1.0)
     assert feed(view, 1.1, 100.0, *REST) == []  # one step after a long pause: the frame waits
@@ -143,7 +143,7 @@ def test_empty_plans_are_not_waited_for():
     assert view.due(1.2) is None
 
 
-def test_latency_is_from_a_scan_to_its_command():
+def test_latency():
     view = RobotView("robot")
     feed(view, 1.0)
     for topic, message in at(1.1).items():

@@ -1,0 +1,97 @@
+"""Real logs as cases: one half of a drive, localised in what the other half learned."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from common.geometry.occupancy_grid import OccupancyGrid
+from common.geometry.world import World
+from lab.integrity.cases import Trial
+from lab.integrity.maps import CELL_M
+from lab.real_logs.drive import START_COVARIANCE, drive_at
+from presage.learning.map_of_log import cells_of
+from presage.learning.train_drive import TrainDriveOptions, card_of, scanner_of, split
+from services.estimator.precise.learning import weights
+from services.estimator.precise.learning.calibration import Drive
+from services.estimator.precise.learning.drive_learning import learn_drive
+from services.estimator.precise.learning.field_learning import Recipe
+from services.estimator.shared.interface import Observation
+
+
+@dataclass(frozen=True)
+class LogCase:
+    """Localisation of the second half of a log with reference poses, or of the first if the halves are exchanged."""
+
+    log: str
+    mount: tuple[float, float, float] | None  # pose of the laser in base_link; None for the log's own
+    exchanged: bool
+    odometry: bool
+
+    @property
+    def drive_name(self) -> str:
+        """Name of the log, and which half is localised."""
+        path = Path(self.log)
+        stem = path.parent.name if path.stem == "log" else path.stem
+        return f"{stem}-{'first' if self.exchanged else 'second'}"
+
+    @property
+    def name(self) -> str:
+        """Name of the case."""
+        return f"{self.drive_name}-{'odometry' if self.odometry else 'laser'}"
+
+    def halves(self) -> tuple[Drive, Drive]:
+        """The half from which the map is made, and the half that is localised."""
+        size = len(split(drive_at(self.log, self.mount, False))[1 if self.exchanged else 0].ranges)
+        drive = drive_at(self.log, self.mount, self.exchanged)
+        numbers = np.arange(len(drive.ranges))
+        return drive.part(numbers < size), drive.part(numbers >= size)
+
+
+def cases_of(log: str, mount: tuple[float, float, float] | None) -> list[LogCase]:
+    """The cases of one log; those with odometry only if the log has it."""
+    kinds = [False] if drive_at(log, mount, False).odom is None else [False, True]
+    return [LogCase(log, mount, exchanged, odometry) for exchanged in (False, True) for odometry in kinds]
+
+
+def log_trial(case: LogCase) -> Trial:
+    """The scans of the half that is localised, in an occupancy grid of the other half."""
+    learned, drive = case.halves()
+    values, (x, y) = cells_of(learned, CELL_M)
+    world = World.model_validate({"name": case.drive_name, "grid": OccupancyGrid.of(values, CELL_M, (x, y, 0.0))})
+    observations = [
+        Observation(
+            ranges,
+            drive.angles,
+            drive.range_max,
+            float(drive.stamps[k]),
+            drive.odom[k] if case.odometry and drive.odom is not None else None,
+        )
+        for k, ranges in enumerate(drive.ranges)
+    ]
+    return Trial(
+        map_world=world,
+        scanner=scanner_of(drive, 0.0, case.drive_name),
+        observations=observations,
+        truths=drive.poses,
+        start=(drive.poses[0], START_COVARIANCE),
+        map_is_correct=False,  # rooms were changed between the halves, or were not visited in the first one
+        kidnappings=np.zeros(0, int),
+        separate=False,
+    )
+
+
+def log_field_file(folder: Path, case: LogCase, world: World) -> Path:
+    """The weights learned from the other half, learned now unless the folder has them."""
+    path = weights.path_of(folder, case.drive_name)
+    if not path.exists():
+        start = time.monotonic()
+        options = TrainDriveOptions(Path(case.log), share=0.5, recipe=Recipe(resolution=0.05))
+        drive, _ = case.halves()
+        learned = learn_drive(drive, options.recipe, None, lambda _stage, _done: None)
+        card = card_of(options, world, drive, learned, time.monotonic() - start)
+        weights.save(path, learned.model, learned.places, card)
+    return path

@@ -1,0 +1,43 @@
+"""Maps given to the estimator that differ from the building."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from common.geometry.occupancy_grid import OccupancyGrid
+from common.geometry.shapes import Circle, Obstacle
+from common.geometry.world import World
+from lab.accuracy.scenes import Scene
+from presage.learning.map_of_log import cells_of
+from services.estimator.precise.learning.calibration import Drive
+
+CELL_M, SCANS = 0.05, 300
+
+
+def scaled_map(world: World, factor: float) -> World:
+    """The world with all coordinates multiplied by ``factor``."""
+    obstacles = [
+        Obstacle(polygon=[(x, y) for x, y in (factor * ring).tolist()])
+        if (ring := obstacle.ring()) is not None
+        else _scaled_circle(obstacle.circle, factor)
+        for obstacle in world.obstacles
+    ]
+    boundary = [(x * factor, y * factor) for x, y in world.boundary]
+    return World(name=f"{world.name}-scaled", boundary=boundary, obstacles=obstacles)
+
+
+def _scaled_circle(circle: Circle | None, factor: float) -> Obstacle:
+    assert circle is not None  # noqa: S101 - for the type checker
+    x, y = circle.center
+    return Obstacle(circle=Circle(center=(x * factor, y * factor), radius=circle.radius * factor))
+
+
+def noisy_grid(scene: Scene) -> World:
+    """An occupancy grid of 5 cm cells, built from noisy scans at known random poses."""
+    poses, scanner = scene.poses(SCANS), scene.scanner
+    ranges = np.array([scene.observe(clean, 0.0).ranges for clean in scene.clean(poses)])
+    stamps, mount = np.arange(len(poses)) / scanner.rate, np.array(scanner.mount)
+    drive = Drive(stamps, poses, ranges, scanner.angles(), mount, scanner.range_max)
+    values, (x, y) = cells_of(drive, CELL_M)
+    grid = OccupancyGrid.of(values, CELL_M, (x, y, 0.0))
+    return World.model_validate({"name": f"{scene.world.name}-grid", "grid": grid})

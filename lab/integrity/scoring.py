@@ -1,0 +1,177 @@
+"""Whether an estimator was right about itself: scores of scans, of trials and of cases."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from common.geometry import se2
+from common.geometry.se2 import Array
+from lab.accuracy.runner import wilson_interval
+from lab.accuracy.tasks import FOUND_DISTANCE, FOUND_YAW
+from services.estimator.shared.interface import Posterior
+
+Mask = npt.NDArray[np.bool_]
+
+MAX_NEES = 1e6  # of a degenerate covariance
+RECOVERY_SCANS = 20  # after a kidnapping, until the robot must be found
+MAX_WRONG_S = 1.0  # a longer wrong stretch fails a trial
+# Edges of the bins of reported probability; the last bins matter for safety.
+PROBABILITY_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.99, 0.999, 0.9999, 1.0)
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """What an estimator reported for the N scans of a trial, compared with the truth."""
+
+    error: Array  # (N, 3) m, m, rad in map; NaN where the robot is not in the map
+    tracking: Mask  # (N,) whether the state was `tracking`
+    nees: Array  # (N, 2) NEES of x and y, and of x, y and yaw; NaN without a covariance
+    probability: Array  # (N,) that the pose is correct, as reported; NaN if not reported
+    excess: Array  # (N, 3) |error| in base_link divided by the protection level; NaN if not reported
+    update_s: Array  # (N,) processor time
+
+    @classmethod
+    def of(cls, posteriors: Sequence[Posterior], truths: Array, update_s: Sequence[float]) -> Estimates:
+        """Compares posteriors with true poses (N, 3)."""
+        error = np.array([posterior.pose for posterior in posteriors]) - truths
+        error[:, 2] = se2.wrap(error[:, 2])
+        return cls(
+            error,
+            np.array([posterior.state == "tracking" for posterior in posteriors]),
+            np.array([_nees(e, posterior.covariance) for e, posterior in zip(error, posteriors, strict=True)]),
+            np.array([_or_nan(getattr(posterior, "probability", None)) for posterior in posteriors]),
+            np.array([_excess(e, posterior) for e, posterior in zip(error, posteriors, strict=True)]),
+            np.array(update_s),
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Estimates]) -> Estimates:
+        """The scans of several trials."""
+        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
+
+    @classmethod
+    def load(cls, path: Path) -> Estimates:
+        """Reads the file of a trial."""
+        with np.load(path) as stored:
+            return cls(**{f.name: stored[f.name] for f in fields(cls)})
+
+    def save(self, path: Path) -> None:
+        """Writes the file of a trial."""
+        np.savez_compressed(path, **{f.name: getattr(self, f.name) for f in fields(self)})
+
+    @property
+    def correct(self) -> Mask:
+        """(N,) whether the error is below 0.2 m and 5 degrees."""
+        near = np.hypot(self.error[:, 0], self.error[:, 1]) < FOUND_DISTANCE
+        return np.asarray(near & (np.abs(self.error[:, 2]) < FOUND_YAW))
+
+    @property
+    def wrong(self) -> Mask:
+        """(N,) whether the state was `tracking` at a pose that is not correct."""
+        return self.tracking & ~self.correct
+
+
+def _nees(error: Array, covariance: Array | None) -> list[float]:
+    """NEES of x and y, and of x, y and yaw: error' covariance^-1 error (Bar-Shalom et al. 2001, section 5.4)."""
+    if covariance is None or not np.isfinite(error).all():
+        return [np.nan, np.nan]
+    sizes = (2, 3)
+    return [
+        min(float(error[:n] @ np.linalg.pinv(covariance[:n, :n], hermitian=True) @ error[:n]), MAX_NEES) for n in sizes
+    ]
+
+
+def _excess(error: Array, posterior: Posterior) -> Array:
+    protection = getattr(posterior, "protection", None)
+    if protection is None:
+        return np.full(3, np.nan)
+    in_base = np.array([*se2.rotate(-float(posterior.pose[2]), error[:2]), error[2]])
+    return np.asarray(np.abs(in_base) / protection)
+
+
+def _or_nan(value: float | None) -> float:
+    return np.nan if value is None else value
+
+
+def score_trial(scans: Estimates, rate: float, kidnappings: Sequence[int], *, separate: bool) -> dict[str, Any]:
+    """Scores of one trial whose scans come at ``rate`` Hz; ``separate`` scans are not one stretch of time."""
+    right = scans.tracking & scans.correct
+    recovered = [bool(right[first : first + RECOVERY_SCANS].any()) for first in kidnappings]
+    longest = min(1, int(scans.wrong.sum())) if separate else longest_run(scans.wrong)
+    return {
+        "scans": len(scans.tracking),
+        "tracking": int(scans.tracking.sum()),
+        "correct": int(scans.correct.sum()),
+        "wrong": int(scans.wrong.sum()),
+        "longest_wrong_s": longest / rate,
+        "kidnapped": len(recovered),
+        "recovered": sum(recovered),
+    }
+
+
+def longest_run(values: Mask) -> int:
+    """Length of the longest run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], values, [False]])))
+    return int(np.diff(edges)[::2].max(initial=0))
+
+
+def score_case(trials: Sequence[dict[str, Any]], scans: Estimates) -> dict[str, Any]:
+    """Scores of a case, from those of its trials and from all their scans. Shares have Wilson's 95 % interval."""
+    count, tracking, correct, wrong, kidnapped, recovered = (
+        sum(trial[name] for trial in trials)
+        for name in ("scans", "tracking", "correct", "wrong", "kidnapped", "recovered")
+    )
+    longest = [trial["longest_wrong_s"] for trial in trials]
+    distance = np.hypot(scans.error[:, 0], scans.error[:, 1])[scans.correct]
+    in_map = int(np.isfinite(scans.error[:, 0]).sum())
+    return {
+        "trials": len(trials),
+        "scans": count,
+        "tracking": share(tracking, count),
+        "wrong": share(wrong, tracking),
+        "longest_wrong_s": max(longest),
+        "trials_wrong_longer": sum(value > MAX_WRONG_S for value in longest),
+        "correct": share(correct, in_map),
+        "nees_xy": _mean(scans.nees[scans.tracking, 0]),
+        "nees_xy_median": _quantile(scans.nees[scans.tracking, 0], 0.5),
+        "nees": _mean(scans.nees[scans.tracking, 1]),
+        "error_median_m": _quantile(distance, 0.5),
+        "error_rms_m": float(np.sqrt(np.mean(distance**2))) if len(distance) else None,
+        "recovered": share(recovered, kidnapped),
+        "beyond_protection": [_mean((axis > 1)[np.isfinite(axis)]) for axis in scans.excess.T],
+        "reliability": reliability(scans.probability, scans.correct),
+        "update_ms": [1e3 * float(np.quantile(scans.update_s, q)) for q in (0.5, 0.95, 1.0)],
+    }
+
+
+def share(count: int, of: int) -> dict[str, Any] | None:
+    """``count``, ``of`` and Wilson's interval; None if ``of`` is 0."""
+    return {"count": count, "of": of, "interval_95": wilson_interval(count, of)} if of else None
+
+
+def reliability(probability: Array, correct: Mask) -> list[dict[str, Any]]:
+    """For each bin of reported probability that has scans: the mean of it, and how many of the scans were correct."""
+    reported = np.isfinite(probability)
+    probability, correct = probability[reported], correct[reported]
+    index = np.clip(np.searchsorted(PROBABILITY_EDGES, probability, side="right") - 1, 0, len(PROBABILITY_EDGES) - 2)
+    return [
+        {"reported": float(probability[here].mean()), "correct": share(int(correct[here].sum()), int(here.sum()))}
+        for here in (index == k for k in range(len(PROBABILITY_EDGES) - 1))
+        if here.any()
+    ]
+
+
+def _mean(values: Array | Mask) -> float | None:
+    known = np.asarray(values, float)[np.isfinite(values)]
+    return float(known.mean()) if len(known) else None
+
+
+def _quantile(values: Array, q: float) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.quantile(known, q)) if len(known) else None

@@ -1,0 +1,57 @@
+"""The trials of every case, and a short run from the command to the table."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from common.errors import UserError
+from lab.integrity.cases import BEAMS, CASES, make_trial
+from lab.integrity.report import bench_integrity
+from lab.integrity.runner import IntegrityPlan
+
+
+@pytest.mark.parametrize("name", ["kidnapped-similar", "crowd", "slip", "wrong-map"])
+def test_trial(name):
+    case = CASES[name]
+    trial = make_trial(case, 1, seconds=4.0)
+    assert len(trial.observations) == len(trial.truths) == 60
+    assert trial.observations[0].ranges.shape == (BEAMS,)
+    assert (trial.observations[0].odom is None) == (case.odometry is None)
+    assert (trial.start is None) == (not case.start_known)
+    assert trial.kidnappings.tolist() == ([30] if case.kidnapping else [])
+    again = make_trial(case, 1, seconds=4.0)
+    assert (again.truths == trial.truths).all() or name == "wrong-map"
+    assert (again.observations[-1].ranges == trial.observations[-1].ranges).all()
+
+
+def test_scans_agree_with_the_map():
+    trial = make_trial(CASES["unchanged"], 2, seconds=0.2)
+    lasers = trial.truths + np.column_stack(
+        [0.2 * np.cos(trial.truths[:, 2]), 0.2 * np.sin(trial.truths[:, 2]), 0 * trial.truths[:, 2]]
+    )
+    expected = trial.map_world.ray_distances(lasers, trial.scanner.angles())
+    residual = np.array([observation.ranges for observation in trial.observations]) - expected
+    assert residual.std() == pytest.approx(trial.scanner.sigma, rel=0.1)
+    assert np.hypot(*(trial.start[0] - trial.truths[0])[:2]) < 0.25
+
+
+def test_run(tmp_path, capsys):
+    plan = IntegrityPlan(1, 1, ("unchanged",), ("precise",), "exact", 0.4)
+    assert bench_integrity(plan, tmp_path, 1, Console(quiet=True)) == 0
+    stored = json.loads((tmp_path / "integrity.json").read_text())["summary"]["precise"]["unchanged"]
+    assert stored["correct"]["count"] == stored["correct"]["of"] == 6
+    assert "| unchanged | 1 | 100 % |" in capsys.readouterr().out
+    assert len((tmp_path / "integrity.trials.jsonl").read_text().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("cases", "estimators", "model"),
+    [(("moved-51",), ("precise",), "exact"), (("crowd",), ("x",), "exact"), (("crowd",), ("precise",), "x")],
+)
+def test_unknown_names(cases, estimators, model, tmp_path):
+    with pytest.raises(UserError, match="choose from"):
+        bench_integrity(IntegrityPlan(1, 1, cases, estimators, model), tmp_path, 1, Console(quiet=True))

@@ -1,0 +1,95 @@
+"""Scores of hand-made sequences of estimates."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lab.integrity.report import reliability_diagram, table
+from lab.integrity.scoring import Estimates, longest_run, reliability, score_case, score_trial
+from services.estimator.shared.interface import Hypothesis, Posterior
+
+TRUTHS = np.tile([1.0, 2.0, np.pi - 0.01], (6, 1))
+ERRORS = np.array([[0, 0, 0], [0.1, 0, 0.02], [0.3, 0, 0], [0, 0.3, 0], [0, 0, 0.1], [0, 0, 0]])
+STATES = ("tracking", "tracking", "tracking", "tracking", "lost", "localising")
+
+
+def posterior(pose, state, **fields):
+    made = Posterior(
+        state, (Hypothesis(pose, np.diag([0.01, 0.01, 0.0004]), 1.0),), 0.0, 0.0, np.zeros(3), np.eye(3), np.zeros(1)
+    )
+    for name, value in fields.items():  # not yet fields of every estimator's posterior
+        object.__setattr__(made, name, value)
+    return made
+
+
+@pytest.fixture
+def scans():
+    posteriors = [posterior(pose, state) for pose, state in zip(TRUTHS + ERRORS, STATES, strict=True)]
+    return Estimates.of(posteriors, TRUTHS, [0.001] * 6)
+
+
+def test_correct_and_wrong(scans):
+    assert scans.correct.tolist() == [True, True, False, False, False, True]
+    assert scans.wrong.tolist() == [False, False, True, True, False, False]
+    assert scans.nees[1] == pytest.approx([1.0, 2.0])
+
+
+def test_trial(scans):
+    scores = score_trial(scans, 10.0, [1, 2], separate=False)
+    counts = {"scans": 6, "tracking": 4, "correct": 3, "wrong": 2, "kidnapped": 2, "recovered": 1}
+    assert scores == {**counts, "longest_wrong_s": 0.2}
+    assert score_trial(scans, 10.0, [], separate=True)["longest_wrong_s"] == 0.1
+
+
+def test_case(scans):
+    trial = score_trial(scans, 1.0, [], separate=False)
+    row = score_case([trial, trial], Estimates.joined([scans, scans]))
+    assert (row["wrong"]["count"], row["wrong"]["of"]) == (4, 8)
+    assert row["trials_wrong_longer"] == 2
+    assert row["nees_xy"] == pytest.approx((0 + 1 + 9 + 9) / 4)
+    assert row["error_median_m"] == 0
+    assert row["recovered"] is None
+    assert "50 % (21.5 to 78.5)" in table({"unchanged": row})
+
+
+def test_robot_outside_the_map(scans):
+    away = replace(scans, error=np.full((6, 3), np.nan), nees=np.full((6, 2), np.nan))
+    row = score_case([score_trial(away, 1.0, [], separate=False)], away)
+    assert row["correct"] is None
+    assert row["wrong"]["count"] == row["wrong"]["of"] == 4
+
+
+@pytest.mark.parametrize(
+    ("values", "longest"), [([], 0), ([0, 0], 0), ([1], 1), ([1, 1, 0, 1, 1, 1], 3), ([1, 1, 0, 1], 2)]
+)
+def test_longest_run(values, longest):
+    assert longest_run(np.array(values, bool)) == longest
+
+
+def test_reliability_bins():
+    probability = np.array([0.95, 0.95, 0.95, 0.95, 1.0, 1.0, np.nan])
+    correct = np.array([True, True, True, False, True, True, False])
+    bins = reliability(probability, correct)
+    assert [(each["reported"], each["correct"]["count"], each["correct"]["of"]) for each in bins] == [
+        (pytest.approx(0.95), 3, 4),
+        (1.0, 2, 2),
+    ]
+
+
+def test_protection_in_base_link():
+    facing_left = np.array([0.0, 0.0, np.pi / 2])
+    protection = np.array([0.1, 0.01, 0.1])
+    made = posterior(np.array([0.0, 0.05, np.pi / 2]), "tracking", probability=0.99, protection=protection)
+    scans = Estimates.of([made], facing_left[None], [0.001])
+    assert scans.excess[0] == pytest.approx([0.5, 0.0, 0.0])
+    row = score_case([score_trial(scans, 1.0, [], separate=False)], scans)
+    assert row["beyond_protection"] == [0.0, 0.0, 0.0]
+    assert reliability_diagram({"precise": {"all": row}}) is not None
+
+
+def test_scans_file(scans, tmp_path):
+    scans.save(tmp_path / "trial.npz")
+    assert Estimates.load(tmp_path / "trial.npz").error == pytest.approx(scans.error)
