@@ -138,7 +138,8 @@ def test_time_that_jumps_back(process, bus, link, tmp_path):
             else:
                 (beliefs if isinstance(message, Belief) else commands).append(message)
         back = sum(b.stamp_ns < a.stamp_ns for a, b in itertools.pairwise(beliefs))
-        return back >= 3 and {"estimator", "controller"} <= failed.keys()
+        answered = len(commands) >= len(beliefs) - 1  # the last command may be on its way
+        return back >= 3 and answered and {"estimator", "controller"} <= failed.keys()
 
     try:
         assert wait_until(three_jumps, 60), [s.output for s in services]
@@ -148,7 +149,6 @@ def test_time_that_jumps_back(process, bus, link, tmp_path):
     assert not any(failed.values()), [s.output for s in services]
     assert max(np.hypot(*(b.pose.array() - truth[b.stamp_ns])[:2]) for b in beliefs) < 0.05
     assert {command.stamp_ns for command in commands if isinstance(command, CmdVel)} <= truth.keys()
-    assert len(commands) >= len(beliefs) - 1  # each answered
 
 
 @pytest.fixture
