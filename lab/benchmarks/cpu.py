@@ -7,7 +7,7 @@ import platform
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -42,15 +42,14 @@ def measure(seconds: float, beams: int) -> dict[str, Any]:
         stack.start("controller")
         stack.start("estimator")
         stack.start("simulator", "--beams", str(beams))
-        processes = {name: psutil.Process(stack.processes[name].child.pid) for name in SERVICES}
         with open_bus(stack.link()) as bus:
             stack.wait_alive(bus)
             visitor, watch, goals = Visitor(port), Watch(bus, STATUS, BELIEF), cycle(GOALS)
             _drive(stack, watch, goals, WARM_UP_S)
-            before, began = _cpu_seconds(processes), time.monotonic()
+            before, began = cpu_seconds(stack, SERVICES), time.monotonic()
             beliefs = _drive(stack, watch, goals, seconds)
-            elapsed, after = time.monotonic() - began, _cpu_seconds(processes)
-            memory = {name: process.memory_info().rss / 1e6 for name, process in processes.items()}
+            elapsed, after = time.monotonic() - began, cpu_seconds(stack, SERVICES)
+            memory = {name: process_of(stack, name).memory_info().rss / 1e6 for name in SERVICES}
             visitor.close()
     cpu = {name: (after[name] - before[name]) / elapsed for name in SERVICES}
     for values in (cpu, memory):
@@ -71,8 +70,14 @@ def _drive(stack: Stack, watch: Watch, goals: Iterator[Pose], seconds: float) ->
     return beliefs
 
 
-def _cpu_seconds(processes: dict[str, psutil.Process]) -> dict[str, float]:
-    times = {name: process.cpu_times() for name, process in processes.items()}
+def process_of(stack: Stack, name: str) -> psutil.Process:
+    """The process of a service."""
+    return psutil.Process(stack.processes[name].child.pid)
+
+
+def cpu_seconds(stack: Stack, names: Sequence[str]) -> dict[str, float]:
+    """Processor time in s that each service has used."""
+    times = {name: process_of(stack, name).cpu_times() for name in names}
     return {name: used.user + used.system for name, used in times.items()}
 
 

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -24,6 +23,7 @@ from common.errors import UserError
 from common.messages.topics import SCAN
 from common.runtime.metrics import ServiceMetrics
 from common.versions import commit, versions
+from lab.benchmarks.cpu import cpu_seconds
 from presage.session.ports import free_port
 from presage.session.stack import Stack
 from presage.terminal.output import check_file, write_json
@@ -65,7 +65,7 @@ def measure(seconds: float, rounds: int, console: Console) -> tuple[Cost, Cost]:
 
 
 def _round(stack: Stack, seconds: float, cost: Cost, ports: dict[str, int]) -> None:
-    before, began = _cpu_seconds(stack), time.monotonic()
+    before, began = cpu_seconds(stack, SERVICES), time.monotonic()
     for second in range(int(seconds)):
         for port in ports.values():
             requested = time.perf_counter()
@@ -78,12 +78,7 @@ def _round(stack: Stack, seconds: float, cost: Cost, ports: dict[str, int]) -> N
         stack.check()
         time.sleep(max(0.0, began + second + 1 - time.monotonic()))
     cost.seconds += time.monotonic() - began
-    cost.cpu_s.update({name: used - before[name] for name, used in _cpu_seconds(stack).items()})
-
-
-def _cpu_seconds(stack: Stack) -> dict[str, float]:
-    times = {name: psutil.Process(stack.processes[name].child.pid).cpu_times() for name in SERVICES}
-    return {name: used.user + used.system for name, used in times.items()}
+    cost.cpu_s.update({name: used - before[name] for name, used in cpu_seconds(stack, SERVICES).items()})
 
 
 def observation_us() -> float:

@@ -19,13 +19,13 @@ from services.estimator.paper.training import Data, usable_ranges
 from services.estimator.paper.weights import ModelCard
 from services.estimator.precise.estimator import PreciseEstimator
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.global_seeds import SEED_SPACING_M, Seeds, thin_places
+from services.estimator.precise.global_seeds import Seeds
 from services.estimator.precise.learning.field_learning import (
     Recipe,
     learn_field,
     learn_scales,
     measure_ripple,
-    reachable,
+    seed_places,
 )
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.precise.likelihood import Likelihood
@@ -137,7 +137,7 @@ def learn_precise(scene: Scene, samples: int, recipe: Recipe | None = None) -> T
     model = FieldModel(field, learn_scales(field, held, mount, angles, scans, scanner.sigma))
     model = replace(model, ripple=measure_ripple(field, se2.compose(held, mount), angles))
     visited = se2.compose(data.poses, mount)[:, :2]
-    places = thin_places(np.concatenate([visited, reachable(field, visited)]), SEED_SPACING_M)
+    places = seed_places(field, visited)
     return TrainedField(model, Seeds.at(model, places), time.process_time() - began)
 
 

@@ -182,7 +182,7 @@ def _path(case: Case, scene: Scene, seconds: float) -> tuple[Array, npt.NDArray[
 
 def _ranges(case: Case, building: Building, scene: Scene, path: Array) -> Array:
     """Noise-free ranges (N, B) m along the path, with people and surfaces without return."""
-    ranges, scanner = scene.clean(path), scene.scanner
+    scanner = scene.scanner
     lasers = se2.compose(path, np.array(scanner.mount))
     if case.people_per_m2:
         count = round(case.people_per_m2 * scene.world.free_area)
@@ -193,6 +193,8 @@ def _ranges(case: Case, building: Building, scene: Scene, path: Array) -> Array:
                 for laser, discs in zip(lasers, people, strict=True)
             ]
         )
+    else:
+        ranges = scene.clean(path)
     silent = [
         *changes.glass(building, case.glass, scene.rng),
         *changes.black_furniture(building, case.black, scene.rng),

@@ -8,12 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from common.geometry.occupancy_grid import OccupancyGrid
-from common.geometry.world import World
 from lab.integrity.cases import Trial
-from lab.integrity.maps import CELL_M
+from lab.integrity.maps import grid_of
 from lab.real_logs.drive import START_COVARIANCE, drive_at
-from presage.learning.map_of_log import cells_of
 from presage.learning.train_drive import TrainDriveOptions, card_of, scanner_of, split
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.calibration import Drive
@@ -60,8 +57,6 @@ def cases_of(log: str, mount: tuple[float, float, float] | None) -> list[LogCase
 def log_trial(case: LogCase) -> Trial:
     """The scans of the half that is localised, in an occupancy grid of the other half."""
     learned, drive = case.halves()
-    values, (x, y) = cells_of(learned, CELL_M)
-    world = World.model_validate({"name": case.drive_name, "grid": OccupancyGrid.of(values, CELL_M, (x, y, 0.0))})
     observations = [
         Observation(
             ranges,
@@ -73,7 +68,7 @@ def log_trial(case: LogCase) -> Trial:
         for k, ranges in enumerate(drive.ranges)
     ]
     return Trial(
-        map_world=world,
+        map_world=grid_of(case.drive_name, learned),
         scanner=scanner_of(drive, 0.0, case.drive_name),
         observations=observations,
         truths=drive.poses,
@@ -84,7 +79,7 @@ def log_trial(case: LogCase) -> Trial:
     )
 
 
-def log_field_file(folder: Path, case: LogCase, world: World) -> Path:
+def log_field_file(folder: Path, case: LogCase) -> Path:
     """The weights learned from the other half, learned now unless the folder has them."""
     path = weights.path_of(folder, case.drive_name)
     if not path.exists():
@@ -92,6 +87,6 @@ def log_field_file(folder: Path, case: LogCase, world: World) -> Path:
         options = TrainDriveOptions(Path(case.log), share=0.5, recipe=Recipe(resolution=0.05))
         drive, _ = case.halves()
         learned = learn_drive(drive, options.recipe, None, lambda _stage, _done: None)
-        card = card_of(options, world, drive, learned, time.monotonic() - start)
+        card = card_of(options, grid_of(case.drive_name, drive), drive, learned, time.monotonic() - start)
         weights.save(path, learned.model, learned.places, card)
     return path

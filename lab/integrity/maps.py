@@ -38,6 +38,10 @@ def noisy_grid(scene: Scene) -> World:
     ranges = np.array([scene.observe(clean, 0.0).ranges for clean in scene.clean(poses)])
     stamps, mount = np.arange(len(poses)) / scanner.rate, np.array(scanner.mount)
     drive = Drive(stamps, poses, ranges, scanner.angles(), mount, scanner.range_max)
+    return grid_of(f"{scene.world.name}-grid", drive)
+
+
+def grid_of(name: str, drive: Drive) -> World:
+    """The world that an occupancy grid of 5 cm cells shows, built from scans with known poses."""
     values, (x, y) = cells_of(drive, CELL_M)
-    grid = OccupancyGrid.of(values, CELL_M, (x, y, 0.0))
-    return World.model_validate({"name": f"{scene.world.name}-grid", "grid": grid})
+    return World.model_validate({"name": name, "grid": OccupancyGrid.of(values, CELL_M, (x, y, 0.0))})

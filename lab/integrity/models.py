@@ -11,7 +11,7 @@ from rich.progress import Progress
 from common.geometry.world import World
 from common.robot.scanner import Scanner
 from lab.accuracy.scenes import Scene
-from presage.learning.train_precise import TEST_SAMPLES, TrainPreciseOptions, learn_and_save, random_poses
+from presage.learning.train_precise import TEST_SAMPLES, TrainPreciseOptions, learn_and_save
 from services.estimator.precise.learning import weights
 
 
@@ -28,7 +28,7 @@ def _learn(path: Path, world: World, scanner: Scanner) -> None:
     rng = np.random.default_rng(options.recipe.seed)
     scene = Scene(world, scanner, rng)
     counts = {"train": options.samples, "test": TEST_SAMPLES}
-    poses = {name: random_poses(world, count, rng) for name, count in counts.items()}
+    poses = {name: scene.poses(count) for name, count in counts.items()}
     clean = {name: scene.clean(places) for name, places in poses.items()}
     scans = {"train": scanner.add_noise(clean["train"], rng), "test": clean["test"]}
     with Progress(console=Console(quiet=True), disable=True) as bar:

@@ -16,6 +16,7 @@ from lab.integrity.logs import LogCase, log_field_file, log_trial
 from lab.integrity.models import field_file
 from lab.integrity.scoring import Estimates, score_case, score_trial
 from services.estimator.factory import EstimatorOptions, Factory, Geometry, Name, prepare
+from services.estimator.precise.learning import weights
 from services.estimator.shared.interface import Posterior
 
 SEEDS_PER_RUN = 1000  # worlds of one run; the next seed of a run has other worlds
@@ -44,7 +45,7 @@ class TrialSource:
     def field_file(self, folder: Path) -> Path:
         """The weights of preset `precise` for the map; learned now unless the folder has them."""
         if self.log:
-            return log_field_file(folder, self.log, log_trial(self.log).map_world)
+            return log_field_file(folder, self.log)
         case = CASES[self.case]
         return field_file(folder, map_of(case, self.seed), scanner_of(case))
 
@@ -145,7 +146,7 @@ def make_factory(job: IntegrityJob, trial: Trial) -> Factory:
     """The estimators of a trial, made as by the estimator service."""
     model = job.model
     if job.estimator == "precise" and model == "learned":
-        model = str(job.source.field_file(job.models))
+        model = str(weights.path_of(job.models, trial.map_world.name))  # learned before the trials
     return prepare(EstimatorOptions(trial.map_world, cast("Name", job.estimator), model, seed=job.source.seed))
 
 

@@ -20,20 +20,20 @@ from rich.console import Console
 from common.geometry.se2 import Array
 from lab.accuracy import bound
 from lab.experiments import results
-from lab.experiments.estimators import PAPER_DESCENT, TEN_STEPS, ExperimentWorld, create_estimator, knows_heading
+from lab.experiments.estimators import (
+    NAMES,
+    PAPER_DESCENT,
+    ExperimentWorld,
+    create_estimator,
+    knows_heading,
+    uses_odometry,
+)
 from lab.experiments.trials import run_trials
 from presage.plotting import style as drawing
 from services.estimator.paper.perception import Descent
 
 EXPERIMENT_ID = 1  # part of the random seeds
-ESTIMATORS = (
-    "paper",
-    f"paper, {TEN_STEPS}",
-    "precise",
-    "particle-filter",
-    "particle-filter, heading known",
-    "amcl-defaults",
-)
+ESTIMATORS = tuple(name for name in NAMES if not uses_odometry(name))  # the robot stands
 FOUND_DISTANCE = 0.5  # m; an error below it counts as found
 CLOSE_DISTANCE = 0.2  # m; an error below it counts as close
 

@@ -24,8 +24,8 @@ from lab.accuracy import bound
 from lab.accuracy.scenes import Scene
 from lab.experiments import results
 from lab.experiments.estimators import (
+    NAMES,
     PAPER_DESCENT,
-    TEN_STEPS,
     ExperimentWorld,
     create_estimator,
     knows_heading,
@@ -37,17 +37,6 @@ from services.estimator.paper.perception import Descent
 from services.simulator.odometry import Drift, Odometer
 
 EXPERIMENT_ID = 2  # part of the random seeds
-ESTIMATORS = (
-    "paper",
-    f"paper, {TEN_STEPS}",
-    "precise",
-    "particle-filter",
-    "particle-filter, heading known",
-    "amcl-defaults",
-    "precise, odometry",
-    "particle-filter, odometry",
-    "amcl-defaults, odometry",
-)
 START_COVARIANCE = np.diag([0.01, 0.01, 0.01])  # m², m², rad²: 10 cm and 6 degrees
 LOST_DISTANCE = 0.5  # m; a larger error counts as lost
 BOUND_NAMES = ("one scan", "one scan, heading known", "all scans, odometry")
@@ -61,7 +50,7 @@ class CrossingJob:
     index: int
     seed: int
     step: float = 0.05  # m, of each teleport
-    estimators: tuple[str, ...] = ESTIMATORS
+    estimators: tuple[str, ...] = NAMES
     field: ExperimentWorld = ExperimentWorld()  # noqa: RUF009 - frozen
     descent: Descent = PAPER_DESCENT
 

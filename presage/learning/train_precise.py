@@ -22,7 +22,6 @@ from common.versions import commit, versions
 from presage.learning.simulated_scans import collect, scanner_on_bus
 from services.estimator.factory import MIN_SIGMA_M
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.global_seeds import SEED_SPACING_M, thin_places
 from services.estimator.precise.learning import weights
 from services.estimator.precise.learning.evaluation import Quality, evaluate
 from services.estimator.precise.learning.field_learning import (
@@ -30,7 +29,7 @@ from services.estimator.precise.learning.field_learning import (
     learn_field,
     learn_scales,
     measure_ripple,
-    reachable,
+    seed_places,
 )
 from services.estimator.precise.learning.surfaces import Beams
 from services.estimator.shared.model_folder import training_folder
@@ -60,7 +59,7 @@ def train_precise(options: TrainPreciseOptions, link: Link, console: Console) ->
     weights.refuse_to_overwrite(path, world)
     rng = np.random.default_rng(options.recipe.seed)
     poses = {
-        name: random_poses(world, count, rng) for name, count in (("train", options.samples), ("test", TEST_SAMPLES))
+        name: _random_poses(world, count, rng) for name, count in (("train", options.samples), ("test", TEST_SAMPLES))
     }
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as bar:
@@ -90,28 +89,25 @@ def learn_and_save(
     The test scans have no noise. Returns the model card.
     """
     start = time.monotonic()
-    model, quality = _train(options, options.scanner, poses, scans, bar)
+    model, quality = _train(options, poses, scans, bar)
     seconds = time.monotonic() - start
     visited = se2.compose(poses["train"], np.array(options.scanner.mount))[:, :2]
-    places = thin_places(np.concatenate([visited, reachable(model.field, visited)]), SEED_SPACING_M)
-    card = _card(options, world, options.scanner, model, quality, seconds)
+    places = seed_places(model.field, visited)
+    card = _card(options, world, model, quality, seconds)
     weights.save(path, model, places, card)
     return card
 
 
-def random_poses(world: World, count: int, rng: np.random.Generator) -> se2.Array:
+def _random_poses(world: World, count: int, rng: np.random.Generator) -> se2.Array:
     """Random poses (count, 3) at places where the robot fits."""
     positions = world.sample_free(count, rng, Robot().radius)
     return np.column_stack([positions, rng.uniform(-np.pi, np.pi, count)])
 
 
 def _train(
-    options: TrainPreciseOptions,
-    scanner: Scanner,
-    poses: dict[str, se2.Array],
-    scans: dict[str, se2.Array],
-    bar: Progress,
+    options: TrainPreciseOptions, poses: dict[str, se2.Array], scans: dict[str, se2.Array], bar: Progress
 ) -> tuple[FieldModel, Quality]:
+    scanner = options.scanner
     mount, angles = np.array(scanner.mount), scanner.angles()
     task: TaskID = bar.add_task("training", total=1.0)
 
@@ -122,9 +118,7 @@ def _train(
     # The weights are stored in half precision, so that the model is evaluated with the same precision.
     field = replace(field, phi=field.phi.astype(np.float16).astype(np.float32))
     report("precision", 1.0)
-    half = (
-        TEST_SAMPLES // 2
-    )  # the precision is learned from one half of the test scans, the errors are computed from the other
+    half = TEST_SAMPLES // 2  # of the test scans; the precision is learned from it, the errors come from the rest
     scales = learn_scales(field, poses["test"][:half], mount, angles, scans["test"][:half], 0.0)
     ripple = measure_ripple(field, se2.compose(poses["test"][:half], mount), angles)
     model = FieldModel(field, scales, ripple)
@@ -143,11 +137,11 @@ def _train(
 
 
 def _card(
-    options: TrainPreciseOptions, world: World, scanner: Scanner, model: FieldModel, quality: Quality, seconds: float
+    options: TrainPreciseOptions, world: World, model: FieldModel, quality: Quality, seconds: float
 ) -> weights.FieldCard:
     return weights.FieldCard(
         world=world,
-        scanner=scanner,
+        scanner=options.scanner,
         samples=options.samples,
         seed=options.recipe.seed,
         resolution=options.recipe.resolution,

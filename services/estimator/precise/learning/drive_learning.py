@@ -10,7 +10,6 @@ import numpy as np
 from common.geometry import se2
 from common.geometry.se2 import Array
 from services.estimator.precise.field import FieldModel
-from services.estimator.precise.global_seeds import SEED_SPACING_M, thin_places
 from services.estimator.precise.learning.calibration import (
     Calibration,
     Drive,
@@ -23,7 +22,7 @@ from services.estimator.precise.learning.field_learning import (
     learn_field,
     learn_scales,
     measure_ripple,
-    reachable,
+    seed_places,
     seen_cells,
 )
 from services.estimator.precise.learning.surfaces import Beams
@@ -73,7 +72,7 @@ def learn_drive(drive: Drive, recipe: Recipe, simulated: Beams | None, report: R
     final = _learn_model(drive, recipe, simulated, lambda done: report("final field", 0.55 + 0.4 * done))
     final = replace(final, scales=scales, ripple=trial.ripple)
     visited = se2.compose(drive.poses, drive.mount)[:, :2]
-    places = thin_places(np.concatenate([visited, reachable(final.field, visited, seen=final.seen)]), SEED_SPACING_M)
+    places = seed_places(final.field, visited, final.seen)
     report("learned", 1.0)
     return Learned(final, places, calibration, np.abs(held_out.ranges[both] - expected.ranges[both]))
 

@@ -17,6 +17,7 @@ from scipy import ndimage
 
 from common.geometry.se2 import Array, compose, wrap
 from services.estimator.precise.field import CLASSES, SEEN_CELL_M, DistanceField, Floats, Seen
+from services.estimator.precise.global_seeds import SEED_SPACING_M, thin_places
 from services.estimator.precise.learning.beam_cells import mark_seen_cells
 from services.estimator.precise.learning.surfaces import (
     MIN_POINTS_PER_CELL,
@@ -74,6 +75,11 @@ def seen_cells(beams: Beams) -> Seen:
     cells = np.zeros(shape, np.bool_)
     mark_seen_cells(beams.starts - low, beams.unit(), beams.ranges, SEEN_CELL_M, cells)
     return Seen(cells, (float(low[0]), float(low[1])))
+
+
+def seed_places(field: DistanceField, visited: Array, seen: Seen | None = None) -> Array:
+    """Places (K, 2), m in map, where a search for the laser begins: visited ones, and those `reachable` from them."""
+    return thin_places(np.concatenate([visited, reachable(field, visited, seen=seen)]), SEED_SPACING_M)
 
 
 def reachable(field: DistanceField, visited: Array, clearance: float = 0.1, seen: Seen | None = None) -> Array:
