@@ -45,7 +45,7 @@ class Estimates:
             error,
             np.array([posterior.state == "tracking" for posterior in posteriors]),
             np.array([_nees(e, posterior.covariance) for e, posterior in zip(error, posteriors, strict=True)]),
-            np.array([_or_nan(getattr(posterior, "probability", None)) for posterior in posteriors]),
+            np.array([_or_nan(posterior.probability) for posterior in posteriors]),
             np.array([_excess(e, posterior) for e, posterior in zip(error, posteriors, strict=True)]),
             np.array(update_s),
         )
@@ -88,11 +88,10 @@ def _nees(error: Array, covariance: Array | None) -> list[float]:
 
 
 def _excess(error: Array, posterior: Posterior) -> Array:
-    protection = getattr(posterior, "protection", None)
-    if protection is None:
+    if posterior.protection is None:
         return np.full(3, np.nan)
     in_base = np.array([*se2.rotate(-float(posterior.pose[2]), error[:2]), error[2]])
-    return np.asarray(np.abs(in_base) / protection)
+    return np.asarray(np.abs(in_base) / posterior.protection)
 
 
 def _or_nan(value: float | None) -> float:

@@ -48,6 +48,10 @@ class Posterior:
     predicted: Array  # (B,) m, ranges expected at the pose
     # (B,) m, standard deviation of these; empty if the estimator states none
     sigma: Array = field(default_factory=lambda: np.zeros(0))
+    # that the pose is within 0.2 m and 5 degrees of the truth; None if the estimator states none
+    probability: float | None = None
+    # (3,) m along and across base_link, and rad: errors exceeded in one of 10^4 scans; None if none are stated
+    protection: Array | None = None
 
     @property
     def pose(self) -> Array:

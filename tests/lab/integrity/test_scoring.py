@@ -17,12 +17,8 @@ STATES = ("tracking", "tracking", "tracking", "tracking", "lost", "localising")
 
 
 def posterior(pose, state, **fields):
-    made = Posterior(
-        state, (Hypothesis(pose, np.diag([0.01, 0.01, 0.0004]), 1.0),), 0.0, 0.0, np.zeros(3), np.eye(3), np.zeros(1)
-    )
-    for name, value in fields.items():  # not yet fields of every estimator's posterior
-        object.__setattr__(made, name, value)
-    return made
+    hypotheses = (Hypothesis(pose, np.diag([0.01, 0.01, 0.0004]), 1.0),)
+    return Posterior(state, hypotheses, 0.0, 0.0, np.zeros(3), np.eye(3), np.zeros(1), **fields)
 
 
 @pytest.fixture
