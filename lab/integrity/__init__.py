@@ -1,1 +1,1 @@
-"""How often an estimator is wrong about its own pose, in worlds that nobody tuned on."""
+"""How often an estimator reports a wrong pose as right, in generated buildings and real logs."""

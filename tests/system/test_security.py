@@ -126,7 +126,7 @@ def test_forbidden_actions(secure_router):
         assert output.count("answers 0") == 2, output
         assert "done" in secure_router.intrude(mixed, puts[0])
         assert "done" in secure_router.intrude(secure_router.settings("estimator"), ["put", f"{KEY_PREFIX}/scan", "00"])
-        # What those who may send it have sent afterwards arrives, and nothing before it.
+        # The first message to arrive is from a sender with the right, so none of those before it arrived.
         for sender, topic, payload, inbox in (
             (controller, CMD_VEL, own, commands),
             (simulator, SCAN, b"mine", scans),
