@@ -198,6 +198,11 @@ class World(Model):
             found.append(points[shapely.contains(room, shapely.points(points)) & (self.clearance(points) >= clearance)])
         return np.concatenate(found)[:count]
 
+    def sample_poses(self, count: int, rng: np.random.Generator, clearance: float) -> Array:
+        """Random poses (count, 3) at places from `sample_free`, with uniform headings."""
+        places = self.sample_free(count, rng, clearance)
+        return np.column_stack([places, rng.uniform(-np.pi, np.pi, count)])
+
     def _sample_cells(self, count: int, rng: np.random.Generator, clearance: float) -> Array:
         """`sample_free` on a grid: samples points in cells that may have the clearance, and keeps those that do."""
         assert self.grid is not None  # noqa: S101 - for the type checker

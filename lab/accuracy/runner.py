@@ -117,7 +117,7 @@ def quick_field(
 
     With ``limited``, ranges beyond the scanner's maximum count as no return.
     """
-    poses = np.column_stack([world.sample_free(samples, rng, 0.27), rng.uniform(-np.pi, np.pi, samples)])
+    poses = world.sample_poses(samples, rng, 0.27)
     clean = world.ray_distances(se2.compose(poses, geometry.mount), geometry.angles)
     split = samples // 10
     noisy = clean[split:] + geometry.likelihood().deviation(clean[split:]) * rng.standard_normal(clean[split:].shape)

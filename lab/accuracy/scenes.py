@@ -36,8 +36,7 @@ class Scene:
 
     def poses(self, count: int) -> Array:
         """Random poses (count, 3): uniform over places where the robot fits, with uniform headings."""
-        places = self.world.sample_free(count, self.rng, ROBOT.radius)
-        return np.column_stack([places, self.rng.uniform(-np.pi, np.pi, count)])
+        return self.world.sample_poses(count, self.rng, ROBOT.radius)
 
     def clean(self, poses: Array) -> Array:
         """Noise-free ranges (N, B), m, at base_link poses (N, 3)."""

@@ -49,7 +49,7 @@ def measure(seconds: float, beams: int) -> dict[str, Any]:
             before, began = cpu_seconds(stack, SERVICES), time.monotonic()
             beliefs = _drive(stack, watch, goals, seconds)
             elapsed, after = time.monotonic() - began, cpu_seconds(stack, SERVICES)
-            memory = {name: process_of(stack, name).memory_info().rss / 1e6 for name in SERVICES}
+            memory = {name: _process(stack, name).memory_info().rss / 1e6 for name in SERVICES}
             visitor.close()
     cpu = {name: (after[name] - before[name]) / elapsed for name in SERVICES}
     for values in (cpu, memory):
@@ -70,14 +70,14 @@ def _drive(stack: Stack, watch: Watch, goals: Iterator[Pose], seconds: float) ->
     return beliefs
 
 
-def process_of(stack: Stack, name: str) -> psutil.Process:
-    """The process of a service."""
+def _process(stack: Stack, name: str) -> psutil.Process:
+    """The process of the service with this name."""
     return psutil.Process(stack.processes[name].child.pid)
 
 
 def cpu_seconds(stack: Stack, names: Sequence[str]) -> dict[str, float]:
     """Processor time in s that each service has used."""
-    times = {name: process_of(stack, name).cpu_times() for name in names}
+    times = {name: _process(stack, name).cpu_times() for name in names}
     return {name: used.user + used.system for name, used in times.items()}
 
 

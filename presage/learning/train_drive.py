@@ -129,8 +129,7 @@ def rectangle(drive: Drive, log: Path) -> World:
 def simulated_beams(world: World, drive: Drive, samples: int, seed: int) -> Beams:
     """Simulated scans of the drive's scanner at random free poses in a map, without noise."""
     rng = np.random.default_rng(seed)
-    places = world.sample_free(samples, rng, Robot().radius)
-    poses = np.column_stack([places, rng.uniform(-np.pi, np.pi, samples)])
+    poses = world.sample_poses(samples, rng, Robot().radius)
     ranges = RayCaster(world).expect(se2.compose(poses, drive.mount), drive.angles).ranges
     return Beams.of(poses, drive.mount, drive.angles, np.where(ranges > drive.range_max, np.inf, ranges))
 

@@ -58,9 +58,8 @@ def train_precise(options: TrainPreciseOptions, link: Link, console: Console) ->
     path = weights.path_of(options.out, world.name)
     weights.refuse_to_overwrite(path, world)
     rng = np.random.default_rng(options.recipe.seed)
-    poses = {
-        name: _random_poses(world, count, rng) for name, count in (("train", options.samples), ("test", TEST_SAMPLES))
-    }
+    counts = {"train": options.samples, "test": TEST_SAMPLES}
+    poses = {name: world.sample_poses(count, rng, Robot().radius) for name, count in counts.items()}
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as bar:
         with scanner_on_bus(link, options.world, options.simulator_arguments, world, scanner, console) as bus:
@@ -96,12 +95,6 @@ def learn_and_save(
     card = _card(options, world, model, quality, seconds)
     weights.save(path, model, places, card)
     return card
-
-
-def _random_poses(world: World, count: int, rng: np.random.Generator) -> se2.Array:
-    """Random poses (count, 3) at places where the robot fits."""
-    positions = world.sample_free(count, rng, Robot().radius)
-    return np.column_stack([positions, rng.uniform(-np.pi, np.pi, count)])
 
 
 def _train(
