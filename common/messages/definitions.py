@@ -86,7 +86,8 @@ class Belief(Stamped):
     Any estimator can publish it: what it does not compute stays nil.
     """
 
-    state: Literal["localising", "tracking", "ambiguous", "lost"]
+    state: Literal["localising", "tracking", "ambiguous", "lost"]  # precise: tracking if probability is at least 0.999,
+    # else ambiguous if a second hypothesis has over 5 %, else lost if it has been tracking, else localising
     pose: Pose  # base_link in map
     covariance: Matrix3 | None = None  # (3, 3) of x, y, yaw in map; nil if the estimator computes none
     xi: Floats | None = None  # (3,) prediction error in pose space, xi = dg' Pi (o - g),
@@ -97,13 +98,19 @@ class Belief(Stamped):
     complexity: Finite | None = None  # nats, divergence of the posterior from the prior
     hypotheses: Annotated[list[Hypothesis], Field(max_length=64)] = []  # noqa: RUF012
     # best first; the first one is at `pose`
+    probability: Annotated[float, Field(ge=0, le=1)] | None = None  # that `pose` is within 0.2 m and 5 degrees of the
+    # truth; nil if the estimator states none
+    protection: Floats | None = None  # (3,) m along x and y of base_link, and rad: errors exceeded once in
+    # 10^4 scans; nil if the estimator states none
     estimator: Name = ""
     frame_id: Name = "map"
 
     @model_validator(mode="after")
     def _shapes(self) -> Belief:
-        if self.xi is not None and self.xi.shape != (3,):
-            raise ValueError(f"xi has shape {self.xi.shape}, not (3,)")
+        for name in ("xi", "protection"):
+            vector = getattr(self, name)
+            if vector is not None and vector.shape != (3,):
+                raise ValueError(f"{name} has shape {vector.shape}, not (3,)")
         for name in ("covariance", "curvature"):
             matrix = getattr(self, name)
             if matrix is not None and matrix.shape != (3, 3):

@@ -96,6 +96,13 @@ METRICS: tuple[MetricDefinition, ...] = (
         "presage_free_energy_nats", "gauge", SERVICE_LABELS, "Free energy of the last belief", "the estimator"
     ),
     MetricDefinition(
+        "presage_pose_probability",
+        "gauge",
+        SERVICE_LABELS,
+        "Probability that the pose of the last belief is within 0.2 m and 5 degrees of the truth",
+        "the estimator",
+    ),
+    MetricDefinition(
         "presage_estimator_state",
         "gauge",
         (*SERVICE_LABELS, "state"),
@@ -191,6 +198,7 @@ class ServiceMetrics(Collector):
         health_age.labels(*self._labels).set_function(lambda: time.monotonic() - self._last_health_time)
         self._rate = gauge(registry, "presage_message_rate_hertz")
         self._free_energy = gauge(registry, "presage_free_energy_nats")
+        self._probability = gauge(registry, "presage_pose_probability")
         states = {Belief: "presage_estimator_state", Status: "presage_controller_state"}
         self._states = {kind: gauge(registry, name) for kind, name in states.items()}
         self._latency, self._duration = (
@@ -226,6 +234,8 @@ class ServiceMetrics(Collector):
                 self._states[type(message)].labels(robot, self.service, state).set(state == message.state)
             if isinstance(message, Belief) and message.free_energy is not None:
                 self._free_energy.labels(robot, self.service).set(message.free_energy)
+            if isinstance(message, Belief) and message.probability is not None:
+                self._probability.labels(robot, self.service).set(message.probability)
 
     def collect(self) -> Iterator[Metric]:
         """Yield the counters."""

@@ -136,6 +136,10 @@ class PanoramaModel:
         jacobian = np.stack([interpolate(slopes[0]), interpolate(slopes[1]), interpolate(turn)], -1)
         return Expected(np.maximum(interpolate(mean), 0.0), interpolate(scale), jacobian)
 
+    def expect_behind(self, lasers: Array, angles: Array, ranges: Array) -> Array:  # noqa: ARG002
+        """See GenerativeModel. The network knows nothing behind the first surface."""
+        return np.full(ranges.shape, np.inf)
+
 
 def train_panorama(shape: Shape, lasers: Array, angles: Array, ranges: Array, steps: int, seed: int) -> PanoramaModel:
     """Trains on scans ``ranges`` (N, B), m, taken at ``lasers`` (N, 3), the laser's poses.

@@ -60,7 +60,8 @@ def localize(
 ) -> None:
     """Run an estimator over a recording or a log offline, as fast as possible, and write one row for each scan.
 
-    Columns: stamp (s), x, y (m), yaw (rad), covariance (cov_xx ... cov_yawyaw), free_energy (nats), state, update_ms.
+    Columns: stamp (s), x, y (m), yaw (rad), covariance (cov_xx ... cov_yawyaw), free_energy (nats), state,
+    probability (of an error below 0.2 m and 5 degrees), update_ms.
     Rows are written as they are computed, also before Ctrl-C (status 130). Section `estimator` of --config sets the
     estimator's parameters, and section `log` what a log does not state (docs/logs.md).
 

@@ -30,7 +30,7 @@ TIMES = {
 AXES = ("x", "y", "yaw")
 # Column suffixes and indices of the six independent elements of a symmetric 3 x 3 matrix.
 MATRIX = {f".{AXES[i]}_{AXES[j]}": (i, j) for i in range(3) for j in range(i, 3)}
-VECTORS = {"xi"}  # array fields with three elements
+VECTORS = {"xi", "protection"}  # array fields with three elements
 Value = str | int | float | bool | None
 
 

@@ -22,6 +22,10 @@ FIELDS: dict[str, dict[str, tuple[str, str]]] = {
         "sigma_x": ("number", "m"),
         "sigma_y": ("number", "m"),
         "sigma_yaw": ("number", "rad"),
+        "probability": ("number", "that the pose is within 0.2 m and 5 degrees of the truth"),
+        "protection_x": ("number", "m along base_link, an error exceeded in one of 10^4 scans"),
+        "protection_y": ("number", "m across base_link"),
+        "protection_yaw": ("number", "rad"),
     },
     "/error": {
         "stamp_s": ("number", "s"),
@@ -98,6 +102,7 @@ def _known(values: dict[str, Any]) -> dict[str, Any]:
 def of_belief(belief: Belief) -> dict[str, Any]:
     """State, free energy and uncertainty of a belief."""
     spread = [None, None, None] if belief.covariance is None else np.sqrt(np.diag(belief.covariance)).tolist()
+    protection = [None, None, None] if belief.protection is None else belief.protection.tolist()
     weights = [hypothesis.weight for hypothesis in belief.hypotheses]
     return _known(
         {
@@ -109,6 +114,8 @@ def of_belief(belief: Belief) -> dict[str, Any]:
             "hypotheses": len(weights),
             "weight": max(weights, default=None),
             **dict(zip(("sigma_x", "sigma_y", "sigma_yaw"), spread, strict=True)),
+            "probability": belief.probability,
+            **dict(zip(("protection_x", "protection_y", "protection_yaw"), protection, strict=True)),
         }
     )
 

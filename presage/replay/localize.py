@@ -47,6 +47,7 @@ COLUMNS = (
     "cov_yawyaw",
     "free_energy",
     "state",
+    "probability",
     "update_ms",
 )
 STAMP_ROUNDING_S = 1e-6  # precision of a double for a stamp of the year 2020
@@ -250,7 +251,8 @@ def _row(scans: Scans, k: int, localised: Localised, *, laser: bool) -> dict[str
         covariance = None if covariance is None else by_pose @ covariance @ by_pose.T
     values = [None if covariance is None else float(covariance[i, j]) for i, j in UPPER_TRIANGLE]
     stamp = None if scans.stamps is None else float(scans.stamps[k])
-    numbers = [stamp, *map(float, pose), *values, posterior.free_energy, posterior.state, round(localised.update_ms, 3)]
+    belief = [posterior.free_energy, posterior.state, posterior.probability]
+    numbers = [stamp, *map(float, pose), *values, *belief, round(localised.update_ms, 3)]
     return dict(zip(COLUMNS, numbers, strict=True))
 
 

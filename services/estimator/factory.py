@@ -34,7 +34,6 @@ from services.estimator.shared.model_folder import find_folder
 DEFAULT_SIGMA_M = 0.02  # noise of a scanner whose scans state none
 MOUNT_TOLERANCE = 1e-3  # m and rad
 MIN_SIGMA_M = 1e-3  # lower limit of the noise that scans state, because no surface is known more exactly
-TYPICAL_WALL_DISTANCE_M = 5.0  # an error of the map at this distance rotates the pose by error / distance
 Name = Literal["precise", "paper", "particle-filter", "amcl-defaults"]
 
 
@@ -148,9 +147,7 @@ def _precise(options: EstimatorOptions, world: World) -> Factory:
     model, places, card = load_model(options, world)
     calibration = card.calibration if card else None
     settings = calibration.settings() if calibration else Settings(inflation=card.inflation if card else 1.0)
-    if not calibration and (error := map_error(world)):
-        # Errors of neighbouring cells are correlated, so they average out neither over beams nor over scans.
-        settings = replace(settings, floor_position=error, floor_heading=error / TYPICAL_WALL_DISTANCE_M)
+    error = 0.0 if calibration else map_error(world)
     seeds, bounds = Seeds.at(model, places), (card.world if card else world).bounds
     _compile(model, seeds, options.likelihood or Likelihood())
 
@@ -165,7 +162,7 @@ def _precise(options: EstimatorOptions, world: World) -> Factory:
             likelihood = geometry.likelihood(options.sigma)
         rng = np.random.default_rng(options.seed)
         estimator = PreciseEstimator(
-            model, seeds, geometry.mount, likelihood, settings, rng, bounds, optimiser=options.optimiser
+            model, seeds, geometry.mount, likelihood, settings, rng, bounds, options.optimiser, error
         )
         if options.initial_pose is not None:
             estimator.restart(options.initial_pose)

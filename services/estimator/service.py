@@ -219,6 +219,8 @@ def belief_message(scan: Scan, posterior: Posterior, estimator: str) -> Belief:
         free_energy=posterior.free_energy,
         accuracy=posterior.accuracy,
         complexity=posterior.complexity,
+        probability=posterior.probability,
+        protection=None if posterior.protection is None else posterior.protection.astype(np.float32),
         estimator=estimator,
     )
 

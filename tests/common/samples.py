@@ -50,7 +50,8 @@ def message_of(cls: type[Message]) -> st.SearchStrategy:
         rows |= {"width": st.just(3), "height": st.just(2)}
         rows["distance"] = st.lists(st.floats(0, allow_nan=False, width=32), min_size=6, max_size=6)
     if cls is Belief:
-        rows |= {"xi": st.lists(st.floats(-1e6, 1e6, width=32), min_size=3, max_size=3), "curvature": matrix}
+        vector = st.none() | st.lists(st.floats(-1e6, 1e6, width=32), min_size=3, max_size=3)
+        rows |= {"xi": vector, "protection": vector, "curvature": matrix}
     return st.builds(cls, **rows)
 
 

@@ -7,7 +7,8 @@ import pytest
 
 from common.robot.base import Robot
 from services.controller.navigator import Navigator
-from tests.controller.driving import PERIOD_NS, belief, box, goal, path_length, room, session
+from services.controller.policies.planner import GeodesicPolicy
+from tests.controller.driving import PERIOD_NS, PERIOD_S, belief, box, goal, path_length, room, session
 
 ROOM = room(10, 4)
 
@@ -56,6 +57,19 @@ def test_stands_until_localised(navigator, state):
     command, status, _ = session(navigator, [1.5, 2, 0], [None] * 4, ROOM, first=1)[-1]
     assert command.twist.vx > 0
     assert status.state == "navigating"
+
+
+def test_single_lost_scan():
+    """The robot brakes for one scan, and drives on."""
+    robot = Robot()
+    navigator = Navigator(robot, preset=GeodesicPolicy(robot, ROOM))
+    navigator.on_goal(goal(8.5, 2))
+    before = session(navigator, [1.5, 2, 0], [None] * 25, ROOM)[-1]
+    ((lost, status, pose),) = session(navigator, before[2], [None], ROOM, first=25, state="lost")
+    assert status.state == "lost"
+    assert lost.twist.vx == pytest.approx(before[0].twist.vx - robot.acceleration * PERIOD_S)
+    after = session(navigator, pose, [None], ROOM, first=26)[0]
+    assert (after[1].state, after[0].twist.vx) == ("navigating", pytest.approx(before[0].twist.vx, abs=1e-3))
 
 
 def test_blocked_by_an_obstacle(navigator):

@@ -66,7 +66,7 @@ def test_track_and_search_are_update():
             searches.append(k)
             posterior = one.search()
         assert results([posterior]) == results([other.update(scan)])
-    assert searches[:2] == [0, len(scans) // 2]
+    assert {0, len(scans) // 2} <= set(searches)
     assert len(searches) < len(scans) / 2
 
 

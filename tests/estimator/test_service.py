@@ -77,6 +77,7 @@ def test_belief_and_prediction(precise):
     assert np.abs(belief.pose.array() - TRUTH).max() < 0.005
     assert np.abs(prediction.ranges - exact(TRUTH))[prediction.sigma < 0.03].mean() < 0.005
     assert len(prediction.sigma) == 622
+    assert belief.probability > 0.999
     assert np.linalg.eigvalsh(belief.covariance).min() > 0
     assert belief.hypotheses[0].pose == belief.pose
     assert sum(h.weight for h in belief.hypotheses) == pytest.approx(1)
@@ -87,7 +88,7 @@ def test_paper_belief(paper):
     paper.on_message(SCAN, a_scan(7))
     belief = paper.sent[-1]
     assert belief.estimator == "paper"
-    assert belief.covariance is belief.hypotheses[0].covariance is None
+    assert belief.covariance is belief.hypotheses[0].covariance is belief.probability is belief.protection is None
     assert belief.pose.yaw == pytest.approx(np.pi / 2)
 
 

@@ -13,7 +13,7 @@ from common.messages.topics import BELIEF, CONFIG, HEALTH, MODEL, SCAN, TRUTH
 from services.estimator.multi_robot import key_expression
 
 NUMBERS = (1, 2, 3)
-STARTS = {1: "3,1.5,90", 2: "9,1.5,0", 3: "14,1.5,180"}
+STARTS = {1: "3,1.5,90", 2: "9,1.5,0", 3: "14,1.5,90"}
 MAX_ERROR = 0.15  # m, with 64 beams
 
 

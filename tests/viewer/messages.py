@@ -44,6 +44,7 @@ def at(stamp_s: float, x: float = 1.0, error: float = 0.5) -> dict:
         BELIEF: Belief(
             stamp_ns=stamp, state="tracking", pose=believed, covariance=covariance, xi=np.zeros(3, np.float32),
             free_energy=12.0, accuracy=10.0, complexity=2.0, estimator="precise",
+            probability=0.75, protection=np.array([0.5, 0.25, 0.125]),
             hypotheses=[Hypothesis(pose=believed, covariance=covariance, weight=0.75)],
         ),
         PREDICTION: Prediction(

@@ -100,6 +100,7 @@ class Session:
                 "state": state, **as_pose(pose), "cov": list(COV if state == "tracking" else WIDE),
                 "free_energy": accuracy + complexity, "accuracy": accuracy, "complexity": complexity,
                 "hypotheses": mixture, "estimator": "stub",
+                "probability": 0.9999 if state == "tracking" else 0.4, "protection": [0.03, 0.02, 0.005],
             },
             "odom": None, "cmd": None, "error": None if blind else error, "speed": 0.0,
             "status": {

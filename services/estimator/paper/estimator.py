@@ -117,3 +117,7 @@ class PaperScans:
         ranges = np.array([row[0][index] for row in rows])
         jacobian = np.array([row[1][index] for row in rows])
         return Expected(ranges, np.full(ranges.shape, self.scale), jacobian)
+
+    def expect_behind(self, lasers: Array, angles: Array, ranges: Array) -> Array:  # noqa: ARG002
+        """See GenerativeModel. The decoder knows nothing behind the first surface."""
+        return np.full(ranges.shape, np.inf)

@@ -37,6 +37,7 @@ def accumulate(
     random: float,
     range_max: float,
     unseen: float,
+    attention: Array,
     total: Array,
     gradient: Array,
     matrices: Array,
@@ -45,7 +46,8 @@ def accumulate(
 
     Adds to total (N, 3), whose columns are the energy, the expected number of inliers and the number of used beams; to
     gradient (N, 3); and to matrices (N, 3, 3, 3), which are the curvature and the covariances of the gradient caused by
-    the scanner's noise and by the model's error.
+    the scanner's noise and by the model's error. ``attention`` (N, B) scales the derivatives of each beam; it may be
+    empty, for 1.
     """
     flat = random / range_max
     for k in range(expected.shape[0]):
@@ -79,10 +81,11 @@ def accumulate(
             inlier = core / density
             total[k, 0] -= math.log(density * (1.0 - unseen))
             total[k, 1] += inlier
-            weight = inlier / variance
-            slope = weight * e - early / (max(g, 1e-3) * density)  # d ln p / dg
+            share = attention[k, b] if attention.size else 1.0
+            weight = share * inlier / variance
+            slope = weight * e - share * early / (max(g, 1e-3) * density)  # d ln p / dg
             # The variance grows with g, too.
-            slope += inlier * relative * relative * g * (e * e / variance - 1.0) / variance
+            slope += share * inlier * relative * relative * g * (e * e / variance - 1.0) / variance
             for i in range(3):
                 gradient[k, i] += slope * jacobian[k, b, i]
                 for j in range(3):

@@ -1,4 +1,4 @@
-"""The precise estimator: predict, match, associate, fuse, rank, search, publish."""
+"""The precise estimator: predict, match, associate, fuse, weigh, search, publish."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from common.geometry import se2
-from services.estimator.precise import continuity, obstruction
-from services.estimator.precise.continuity import Continuity
-from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton, Optimiser, Prior, View
+from services.estimator.precise.gauss_newton import COARSE_SIGMA_M, GaussNewton, Optimiser, Prior, View, follow
 from services.estimator.precise.hypotheses import (
-    SAME_POSITION_M,
     Mode,
     clip_to_map,
+    constraining_beams,
     observed_directions,
+    probability_of_being_near,
     project_evidence,
-    rank_hypotheses,
+    protection_level,
     same_place,
     update_mode,
+    weigh,
 )
 from services.estimator.precise.likelihood import Likelihood
+from services.estimator.precise.local_map import KeyScan, LocalMap
 from services.estimator.precise.motion_model import (
     Candidate,
     fuse,
@@ -30,22 +31,23 @@ from services.estimator.precise.motion_model import (
     reachable_poses,
     widen_unobserved,
 )
+from services.estimator.precise.precision import Precision
 from services.estimator.precise.search import search_around, search_everywhere, search_near
 from services.estimator.precise.settings import Settings
 from services.estimator.shared.interface import Hypothesis, Observation, Posterior, Predicted, State
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
+
     from common.geometry.se2 import Array
     from services.estimator.precise.global_seeds import Seeds
     from services.estimator.precise.likelihood import Evidence
-    from services.estimator.shared.generative_models import Expected, GenerativeModel
+    from services.estimator.shared.generative_models import GenerativeModel
 
-# Scans between two searches while scans fit badly: the interval doubles from the first to the longest.
-FIRST_SEARCH_INTERVAL, MAX_SEARCH_INTERVAL = 5, 150
-MAX_INTERVAL_IF_LOST, MAX_INTERVAL_IF_DOUBTFUL = 2, 8
+MAX_SEARCH_INTERVAL = 150  # scans between two searches without success; the interval doubles from 1
+CLUTTER = 0.3  # probability that all that is new in a view is clutter
 UNKNOWN_SIGMA_M = 100.0  # published where the model does not know what to expect
 TARGET_BEAMS = 2000  # a scan with at least twice as many is thinned, because the time of a search grows with the beams
-AVERAGE_UPDATE_SHARE = 0.1  # weight of the present scan in the averages of inlier ratio and accuracy
 
 
 class PreciseEstimator:
@@ -63,16 +65,18 @@ class PreciseEstimator:
         rng: np.random.Generator | None = None,
         bounds: tuple[float, float, float, float] | None = None,
         optimiser: Optimiser | None = None,
+        map_error: float = 0.0,
     ) -> None:
         """``mount`` (3,) is the laser in base_link; ``rng`` places the starts of a search near a given pose.
 
-        The belief stays within ``bounds``, the map's x0, y0, x1, y1 in m.
+        The belief stays within ``bounds``, the map's x0, y0, x1, y1 in m. ``map_error`` is the standard deviation in m
+        of the map's surfaces beyond what the model states, as far as known; it is learned while driving.
         """
         self.model, self.seeds, self.mount = model, seeds, np.array(mount, float)
         self.likelihood, self.settings = likelihood or Likelihood(), settings or Settings()
         self.bounds = bounds or (-np.inf, -np.inf, np.inf, np.inf)
         self._rng = rng or np.random.default_rng(0)
-        self._optimiser = optimiser or GaussNewton()
+        self._optimiser, self._map_error = optimiser or GaussNewton(), map_error
         self.restart()
 
     def restart(self, pose: Array | None = None, covariance: Array | None = None) -> None:
@@ -85,11 +89,18 @@ class PreciseEstimator:
         self._was_tracking = False
         self._stamp: float | None = None
         self._odom: Array | None = None
-        self._mean_inlier_ratio, self._mean_accuracy = 1.0, 0.0  # of the last scans
-        self._poor_scans, self._search_interval = 0, FIRST_SEARCH_INTERVAL
-        self._was_believed = False  # at the last scan
-        self._continuity = Continuity(self.mount)
-        self._pose_from_scans = False  # by matching recent scans, since the model explains too little
+        self._local_map = LocalMap(self.mount)
+        self._precision = Precision(excess=self._map_error**2)
+        # That the robot is at none of the hypotheses: unnormalised, of the key scans and of the present one. Only a
+        # share, unmapped, remains once the whole map is searched.
+        self._log_unknown, self._log_unmapped, self._unknown_present = 0.0, 0.0, 0.0
+        self._unknown_weight = 1.0  # its probability
+        self._local = np.zeros(3)  # pose in the local frame
+        self._seen = np.zeros(0, np.bool_)  # beams of the present scan that end at surfaces seen before
+        self._change = 0.0  # nats, of what has changed since the scan before
+        self._explained = 1.0  # share of the last scan's beams
+        self._since_search, self._search_interval = 0, 1  # scans
+        self._last: tuple[Array, View] | None = None  # pose in the local frame, and scan, before the present one
         self._scan: tuple[View, Observation] | None = None  # the present one
 
     def update(self, observation: Observation) -> Posterior:
@@ -99,26 +110,22 @@ class PreciseEstimator:
 
     def track(self, observation: Observation) -> Posterior | None:
         """Returns the posterior after one more scan, or None if the scan cannot be explained without a `search`."""
+        likelihood = self._precision.likelihood(self.likelihood, observation.ranges, observation.angles)
         view = View(
             self.model,
-            self.likelihood,
+            likelihood,
             self.mount,
             observation.angles,
             observation.ranges,
             observation.range_max,
             self._optimiser,
+            self._precision.map_error,
+            self._precision.changed,
         ).thinned(TARGET_BEAMS)
-        period = self._period(observation.stamp)
-        self._continuity.begin_scan(self.settings.motion.speed * period)
         if self.modes:
-            odom = self._odometry_since_last_scan(observation)
-            candidates = [self._predict(mode, period, odom, observation.command) for mode in self.modes]
-            poses, evidence = self._match(view, candidates, period, odom)
-            candidates, poses, evidence = self._associate(view, candidates, poses, evidence)
-            modes = [self._fuse(view, k, candidates[k], poses[k], evidence, period, odom) for k in range(len(poses))]
-            self.modes = rank_hypotheses(modes, self.settings)
+            self._follow(view, observation)
         self._scan = view, observation
-        if not self.modes or self._needs_search(view):
+        if not self.modes or self._needs_search():
             return None
         return self._publish(view, observation)
 
@@ -151,34 +158,47 @@ class PreciseEstimator:
             self.settings.motion, mode.pose, mode.noise_covariance, period, odom, command, mode.velocity
         )
 
+    def _follow(self, view: View, observation: Observation) -> None:
+        """Moves every hypothesis by the motion since the last scan, and fuses it with the scan."""
+        period, odom = self._period(observation.stamp), self._odometry_since_last_scan(observation)
+        motions = [self._predict(mode, period, odom, observation.command) for mode in self.modes]
+        motions, poses, evidence, local = self._match(view, motions, period, odom)
+        modes = [self._fuse(view, k, motions[k], poses[k], evidence, period, odom) for k in range(len(poses))]
+        self._weigh(view, modes, local, period)
+
     def _match(
-        self, view: View, candidates: list[list[Candidate]], period: float, odom: Array | None
-    ) -> tuple[Array, Evidence]:
-        """Matches the scan near the predicted pose of each hypothesis, over a wider area if it fits badly there."""
-        starts = np.array([motions[-2].mean for motions in candidates])
-        widest = Prior(
-            np.array([motions[-1].mean for motions in candidates]),
-            np.array([np.linalg.inv(motions[-1].covariance) for motions in candidates]),
-        )
-        poses, evidence = view.polish(starts, widest)
-        if evidence.inlier_ratio[0] < self._mean_inlier_ratio - self.settings.inlier_ratio_drop:
+        self, view: View, motions: list[list[Candidate]], period: float, odom: Array | None
+    ) -> tuple[list[list[Candidate]], Array, Evidence, Array | None]:
+        """Matches the scan to the map near the predicted pose of each hypothesis.
+
+        Where the map explains too little, recent scans give the motion. Returns the motions, one pose (N, 3) per
+        hypothesis, the evidence there, and the pose (3,) in the local frame if recent scans gave it.
+        """
+        widest = _prior_of([each[-1] for each in motions])
+        poses, evidence = follow(view, np.array([each[-2].mean for each in motions]), widest)
+        explained = view.surface_evidence(poses).explained[0]
+        if explained < self._explained - self.settings.drop:
             extra_starts = np.zeros((0, 3))
             if odom is None:
                 extra_starts = reachable_poses(self.settings.motion, self.modes[0].pose, period, COARSE_SIGMA_M)
-            wider_poses, wider_evidence = search_around(view, starts, widest, extra_starts)
-            if wider_evidence.inlier_ratio[0] > evidence.inlier_ratio[0]:
-                return wider_poses, wider_evidence
-        return poses, evidence
-
-    def _associate(
-        self, view: View, candidates: list[list[Candidate]], poses: Array, evidence: Evidence
-    ) -> tuple[list[list[Candidate]], Array, Evidence]:
-        """Decides whether the scan shows the map or changed surroundings, where recent scans give the pose."""
-        matched = self._match_recent_scans(view, evidence, candidates[0], poses[0])
-        if matched is None:
-            return candidates, poses, evidence
-        # Not a kidnapping: scan matching confirms continuity, so the scene has changed.
-        return [[matched]], *continuity.refine_in_changed_scene(view, matched, self.settings)
+            wider_poses, _ = search_around(view, poses, widest, extra_starts)
+            wider_poses, wider_evidence = follow(view, wider_poses, widest)
+            before, after = view.surface_evidence(np.stack([poses[0], wider_poses[0]])).log_likelihood
+            if after > before:
+                poses, evidence = wider_poses, wider_evidence
+                explained = view.surface_evidence(poses).explained[0]
+        if explained >= self.settings.matching_share:
+            return motions, poses, evidence, None
+        starts = np.array([*(each.mean for each in motions[0]), poses[0]])
+        match = self._local_map.match(starts, view.points, motions[0][-1])
+        if match is None:
+            return motions, poses, evidence, None
+        matched = self._local_map.candidate(match)
+        # All hypotheses share the relative motion.
+        step = se2.between(self.modes[0].pose, matched.mean)
+        motions = [[replace(matched, mean=se2.compose(mode.pose, step))] for mode in self.modes]
+        poses, evidence = follow(view, np.array([each[0].mean for each in motions]), _prior_of([m[0] for m in motions]))
+        return motions, poses, evidence, match.pose
 
     def _fuse(
         self,
@@ -196,10 +216,10 @@ class PreciseEstimator:
         caution = 3 if mode.unobserved_scans else 1
         projection, unobserved = observed_directions(evidence.curvature[k], self.model.ripple * caution)
         min_beams = caution * self.settings.min_constraining_ratio * len(view.angles)
-        if unobserved is not None and obstruction.constraining_beams(view, pose, unobserved) > min_beams:
+        if unobserved is not None and constraining_beams(view, pose, unobserved) > min_beams:
             projection, unobserved = np.eye(3), None
         project_evidence(evidence, k, projection)
-        is_unobserved = unobserved is not None and not self._pose_from_scans
+        is_unobserved = unobserved is not None and len(candidates) > 1
         if unobserved is not None and is_unobserved and odom is None:
             candidates = [
                 widen_unobserved(self.settings.motion, each, unobserved, mode.unobserved_scans, period)
@@ -212,141 +232,133 @@ class PreciseEstimator:
         best = min(fused, key=lambda each: each.surprise)
         return update_mode(mode, best, evidence, k, period, unobserved=is_unobserved)
 
-    def _match_recent_scans(
-        self, view: View, evidence: Evidence, candidates: list[Candidate], start: Array
-    ) -> Candidate | None:
-        """Returns the pose that recent scans give, if the model does not explain the scan; else None."""
-        settings, inlier_ratio = self.settings, float(evidence.inlier_ratio[0])
-        pose_was_from_scans, self._pose_from_scans = self._pose_from_scans, False
-        weak = inlier_ratio < max(settings.good_inlier_ratio, self._mean_inlier_ratio - settings.inlier_ratio_drop)
-        inconclusive = inlier_ratio < settings.conclusive_inlier_ratio
-        if not self.modes[0].tracked or not (weak or (pose_was_from_scans and inconclusive)):
-            return None
-        expected = self._expected(view, start)
-        if inlier_ratio >= settings.min_occluded_inlier_ratio and obstruction.is_only_blocked(
-            view, expected, settings.max_contradicting_ratio
-        ):
-            return None
-        matched = self._continuity.match(candidates, start, view.points, obstruction.behind_ratio(view, expected))
-        if matched is None or (not weak and continuity.is_consistent(start, matched)):
-            return None
-        self._pose_from_scans = True
-        return matched
+    def _weigh(self, view: View, modes: list[Mode], local: Array | None, period: float) -> None:
+        """Weighs hypotheses by how well the map predicts those surfaces of the scan that are new to the robot.
 
-    def _remember_scan(self, view: View, best: Mode) -> None:
-        """Stores the scan for matching, if its pose is known; forgets all scans if the pose is not tracked."""
-        explained = best.inlier_ratio >= self.settings.good_inlier_ratio
-        if not best.tracked:
-            self._pose_from_scans = False
-            self._continuity.reset()
-        elif self._pose_from_scans or explained:
-            self._continuity.add(best.pose, self._covariance(best), view.points, explained=explained)
+        Surfaces that were seen before are no evidence again. ``local`` (3,) is the pose in the local frame, if recent
+        scans gave it.
+        """
+        if local is None:
+            local = self._local_map.local(modes[0].pose)
+        seen, arrived = self._local_map.seen(local, view)
+        old = seen | arrived | view.surfaces.small
+        changes = self._local_map.count_changes(self._last, (local, view), period) if self._last else 0
+        if changes:
+            self._search_interval = 1
+        change = changes * float(np.log(min(0.5, self.settings.change_rate * period)))
+        change += float((view.surfaces.density - view.surfaces.ideal)[arrived & ~seen & ~view.surfaces.small].sum())
+        poses = np.array([mode.pose for mode in modes])
+        explained, present = view.surface_evidence(poses).explained, _novelty(view, poses, old) + change
+        modes = [
+            replace(mode, explained=float(explained[k]), present=float(present[k])) for k, mode in enumerate(modes)
+        ]
+        self._local, self._seen, self._change = local, old, change
+        carried_off = max(mode.log_evidence for mode in modes) + float(np.log(self.settings.unknown))
+        self._log_unmapped = max(self._log_unmapped, carried_off + float(np.log(self.settings.unmapped)))
+        self._log_unknown = max(self._log_unknown, carried_off)
+        self._unknown_present = max(_surprise(view, old) + change, _surprise(view, view.surfaces.small))
+        self._set(modes)
 
-    def _needs_search(self, view: View) -> bool:
-        """Whether the scan suddenly fits worse, has fitted badly for long, or fits too badly to be believed."""
-        best, settings = self.modes[0], self.settings
-        dropped = (
-            best.inlier_ratio < self._mean_inlier_ratio - settings.inlier_ratio_drop
-            or best.accuracy > self._mean_accuracy + settings.energy_jump_nats
+    def _set(self, modes: list[Mode]) -> None:
+        """Sets the hypotheses and their weights."""
+        floor = float(np.log(self.settings.unknown))
+        log_unknown = max(self._log_unknown + self._unknown_present, max(mode.log_weight for mode in modes) + floor)
+        self.modes, self._unknown_weight = weigh(modes, log_unknown, self.settings.max_hypotheses)
+        self._explained = self.modes[0].explained
+
+    def _remember(self, view: View) -> None:
+        """Makes the present scan a key scan: its evidence counts from now on, and its surfaces are known."""
+        best, before = self.modes[0], self._log_unknown
+        if self._probability() >= self.settings.tracking_probability:
+            self._precision.learn_changes(view, best.pose)
+        self._log_unknown += self._unknown_present
+        self._log_unmapped += self._unknown_present
+        self._unknown_present = 0.0
+        self._local_map.add(
+            KeyScan(self._local, view, self._seen, self._change, before), best.pose, self._covariance(best)
         )
-        if self._pose_from_scans:
-            self._poor_scans += 1
-            return self._poor_scans >= MAX_SEARCH_INTERVAL
-        believable, doubtful = self._is_believable(view), self._is_doubtful(view)
-        if best.inlier_ratio >= settings.conclusive_inlier_ratio:
-            self._poor_scans, self._search_interval = 0, FIRST_SEARCH_INTERVAL
-            return dropped
-        if not believable and not best.tracked:
-            return True
-        if self._was_believed and not believable:
-            self._poor_scans, self._search_interval = 0, 1  # search at once, and soon again
-        self._poor_scans += 1
-        longest = MAX_SEARCH_INTERVAL
-        if not believable:
-            longest = MAX_INTERVAL_IF_LOST
-        elif doubtful:
-            longest = MAX_INTERVAL_IF_DOUBTFUL
-        return dropped or self._poor_scans >= min(self._search_interval, longest)
+        self.modes = [replace(mode, log_evidence=mode.log_weight, present=0.0) for mode in self.modes]
 
-    def _is_believable(self, view: View) -> bool:
-        """Whether the model explains enough of the scan, or the rest may be occluded."""
-        return self.modes[0].inlier_ratio >= self.settings.min_inlier_ratio or self._is_occluded(view)
-
-    def _is_continuous(self, view: View) -> bool:
-        """Whether the robot was tracked and the scan continues those before it."""
+    def _needs_search(self) -> bool:
+        """Whether the robot may be elsewhere: its whereabouts are uncertain, or another place could fit much better."""
+        self._since_search += 1
         best = self.modes[0]
-        if self._pose_from_scans or not best.tracked or best.inlier_ratio < self.settings.good_inlier_ratio:
-            return self._pose_from_scans
-        behind_ratio = obstruction.behind_ratio(view, self._expected(view, best.pose))
-        candidates = [continuity.candidate_at(best.pose)]
-        return self._continuity.match(candidates, best.pose, view.points, behind_ratio) is not None
-
-    def _expected(self, view: View, pose: Array) -> Expected:
-        return view.model.expect(se2.compose(pose, view.mount)[None], view.angles)
-
-    def _is_occluded(self, view: View) -> bool:
-        """Whether the pose was tracked, the model still explains a few beams, and few beams contradict it."""
-        best, settings = self.modes[0], self.settings
-        partly_visible = best.tracked and best.inlier_ratio >= settings.min_occluded_inlier_ratio
-        return partly_visible and self._contradicting_ratio(view) <= settings.max_contradicting_ratio
-
-    def _is_doubtful(self, view: View) -> bool:
-        """Whether the model explains little of the scan, and too many beams contradict the pose."""
-        settings = self.settings
-        explains_little = self.modes[0].inlier_ratio < settings.doubtful_inlier_ratio
-        return explains_little and self._contradicting_ratio(view) > settings.max_contradicting_ratio
-
-    def _contradicting_ratio(self, view: View) -> float:
-        return obstruction.contradicting_ratio(view, self._expected(view, self.modes[0].pose))
+        information = best.curvature + np.linalg.inv(self.seeds.spread)
+        another_place = np.log(self.seeds.volume) + 0.5 * (np.linalg.slogdet(information)[1] - 3 * np.log(2 * np.pi))
+        doubtful = self._probability() < self.settings.tracking_probability
+        unknown = max(self._log_unknown, *(key.log_unknown for key in self._local_map.scans))
+        if not doubtful and best.log_weight > unknown - another_place:
+            self._search_interval = 1
+            return False
+        if self._local_map.is_new_view(self._local):
+            return doubtful or self._since_search >= self._search_interval
+        return self._since_search >= self._search_interval
 
     def _relocalise(self, view: View) -> None:
-        """Searches near the initial pose or in the whole map; keeps the hypotheses if nothing better is found."""
+        """Searches near the initial pose or in the whole map, and adds what is found to the hypotheses."""
+        self._since_search, self._search_interval = 0, min(2 * self._search_interval, MAX_SEARCH_INTERVAL)
         if self._initial is not None:
             initial, self._initial = self._initial, None
             found = search_near(view, *initial, self.seeds, self.settings, self._rng)
-            if found[0].inlier_ratio >= self.settings.min_inlier_ratio:
-                # A pose that was given counts as tracked until now.
-                found[0] = replace(found[0], tracked=True)
-                self._continuity.reset(pose_given=True)
+            if not self._begin(view, found, self.settings.unknown, self.settings.all_changed):
+                self._add(self._search_everywhere(view), view)
+        elif not self.modes:
+            self._begin(view, self._search_everywhere(view), 1.0)
         else:
-            found = self._search(view)
-        if self.modes:
-            previous = self.modes[0]
-            # Not the average alone, which still includes scans that fitted better.
-            energy = max(previous.energy, previous.accuracy + previous.complexity)
-            worse = found[0].energy > energy - 3 * self.settings.evidence_error_nats
-            if worse or self._is_implausible_jump(view, found[0]):
-                # The place has changed, or the model errs here: keep the hypotheses and search again later.
-                found = self.modes
-                self._double_search_interval()
-            elif same_place(found[0].pose[None], previous.pose)[0]:
-                found[0] = replace(found[0], age=previous.age, velocity=previous.velocity, tracked=previous.tracked)
-            elif previous.tracked:
-                found = [*self.modes, *found]
-                self._double_search_interval()
-        self.modes = rank_hypotheses(found, self.settings)
-        self._mean_inlier_ratio, self._mean_accuracy = self.modes[0].inlier_ratio, self.modes[0].accuracy
+            found = self._search_everywhere(view)
+            poses = np.array([mode.pose for mode in self.modes])
+            self._add([mode for mode in found if not same_place(poses, mode.pose).any()], view)
 
-    def _double_search_interval(self) -> None:
-        self._poor_scans, self._search_interval = 0, min(2 * self._search_interval, MAX_SEARCH_INTERVAL)
+    def _search_everywhere(self, view: View) -> list[Mode]:
+        """Hypotheses in the whole map that predict the scan clearly better than none does; at least one."""
+        found = search_everywhere(view, self.seeds, self.settings, thorough=True)
+        surprise = _ideal(view, view.surfaces.small) + _surprise(view, view.surfaces.small)
+        return [mode for mode in found if mode.present > surprise + 1] or found[:1]
 
-    def _is_implausible_jump(self, view: View, found: Mode) -> bool:
-        """Whether ``found`` is elsewhere, although nothing contradicts the tracked pose.
+    def _begin(self, view: View, found: list[Mode], unknown: float, all_changed: float = 0.0) -> bool:
+        """Starts with the hypotheses ``found``, and the probability ``unknown`` that the robot is at none.
 
-        This happens where a door was shut or people gather.
+        With the probability ``all_changed`` the map shows nothing that is there. Returns whether the map explains
+        more of the scan than that.
         """
-        if not (self._is_continuous(view) or self._is_occluded(view)):
-            return False
-        best = self.modes[0]
-        covariance = self._covariance(best)[:2, :2] + np.eye(2) * SAME_POSITION_M**2
-        off = found.pose[:2] - best.pose[:2]
-        return bool(off @ np.linalg.solve(covariance, off) > continuity.MAX_SQUARED_DISTANCE)
+        self._forget(view)
+        self._log_unknown = self._log_unmapped = float(np.log(unknown * self.settings.unmapped))
+        known = _ideal(view, self._seen)
+        least = self._unknown_present + float(np.log(all_changed)) if all_changed else -np.inf
+        self._set([replace(mode, present=max(mode.present - known, least)) for mode in found])
+        return found[0].present - known > least
 
-    def _search(self, view: View) -> list[Mode]:
-        best = self.modes[0] if self.modes else None
-        # A tracked pose that still fits well need not compete with poses that are hard to find.
-        fits = best is not None and best.tracked and best.inlier_ratio >= self.settings.good_inlier_ratio
-        return search_everywhere(view, self.seeds, self.settings, thorough=not fits)
+    def _forget(self, view: View) -> None:
+        """Starts another local map at the present scan."""
+        self._local_map.clear()
+        self._local, self._seen, self._change = np.zeros(3), view.surfaces.small, 0.0
+        self._unknown_present = _surprise(view, self._seen)
+
+    def _add(self, found: list[Mode], view: View) -> None:
+        """Adds hypotheses at which the robot may have been for some time, or to which it was just carried."""
+        if not found:
+            self._log_unknown = self._log_unmapped
+            return
+        poses = np.array([mode.pose for mode in found])
+        carried = self._log_unknown + np.array([mode.present for mode in found]) - _ideal(view, view.surfaces.small)
+        since = _novelty(view, poses, self._seen) + self._change
+        stayed = np.full(len(found), -np.inf)  # there since one of the key scans
+        for key in reversed(self._local_map.scans):
+            before = se2.compose(poses, se2.between(self._local, key.pose))
+            since += _novelty(key.view, before, key.seen) + key.change
+            stayed = np.maximum(stayed, since + key.log_unknown)
+        best = int(np.argmax(np.maximum(stayed, carried) + np.array([mode.log_evidence for mode in found])))
+        added = [
+            replace(mode, log_evidence=mode.log_evidence + max(stayed[k], carried[k]), present=0.0)
+            for k, mode in enumerate(found)
+        ]
+        if added[best].log_weight > self.modes[0].log_weight:
+            self._search_interval = 1
+            if carried[best] > stayed[best]:
+                self._forget(view)
+        self._log_unknown = self._log_unmapped
+        self._set([*self.modes, *added])
+        self._remember(view)
 
     def _period(self, stamp: float | None) -> float:
         if stamp is None or self._stamp is None or stamp <= self._stamp:
@@ -357,18 +369,17 @@ class PreciseEstimator:
         """Stores what the next scan needs, and returns the posterior."""
         self.modes = clip_to_map(self.modes, self.bounds)
         self._stamp, self._odom = observation.stamp, observation.odom
+        if self._local_map.is_new_view(self._local):
+            self._remember(view)
+        self._last = self._local, view
         best = self.modes[0]
-        self._remember_scan(view, best)
-        self._mean_inlier_ratio += AVERAGE_UPDATE_SHARE * (best.inlier_ratio - self._mean_inlier_ratio)
-        self._mean_accuracy += AVERAGE_UPDATE_SHARE * (best.accuracy - self._mean_accuracy)
         predicted = self.predict(best.pose[None], observation.angles)
-        believable = self._is_believable(view)
-        self._was_believed = believable or self._pose_from_scans
-        state = self._state(view, best, believable=believable)
-        unknown = self.seeds.spread * (not self._was_believed)
-        hypotheses = tuple(Hypothesis(mode.pose, self._covariance(mode) + unknown, mode.weight) for mode in self.modes)
+        probability = self._probability()
+        if probability >= self.settings.tracking_probability:
+            self._precision.learn(view, best.pose)
+        hypotheses = tuple(Hypothesis(mode.pose, self._covariance(mode), mode.weight) for mode in self.modes)
         return Posterior(
-            state=state,
+            state=self._state(probability),
             hypotheses=hypotheses,
             accuracy=best.accuracy,
             complexity=best.complexity,
@@ -376,33 +387,53 @@ class PreciseEstimator:
             curvature=best.curvature,
             predicted=predicted.ranges[0],
             sigma=predicted.sigma[0],
+            probability=probability,
+            protection=protection_level(best, self._covariance(best), 1 - best.weight * (1 - self._unknown_weight)),
         )
 
     def _covariance(self, mode: Mode) -> Array:
         floor = np.array([self.settings.floor_position] * 2 + [self.settings.floor_heading])
         return np.asarray(mode.covariance(self.settings.inflation) + np.diag(floor**2))
 
-    def _state(self, view: View, best: Mode, *, believable: bool) -> State:
-        settings = self.settings
-        if not believable:
-            return "lost" if self._was_tracking else "localising"
-        if len(self.modes) > 1 and self.modes[1].weight > settings.ambiguous_weight:
-            return "ambiguous"
-        if best.tracked and self._is_doubtful(view):
-            return "lost"
-        variance = np.linalg.eigvalsh(self._covariance(best)[:2, :2])[-1]
-        if variance > settings.max_tracking_deviation**2:
-            return "localising"
-        proven = (
-            best.tracked
-            or best.inlier_ratio >= settings.tracking_inlier_ratio
-            or (
-                best.age >= settings.min_scans_before_tracking
-                and self._contradicting_ratio(view) <= settings.max_contradicting_ratio
-            )
+    def _probability(self) -> float:
+        """Probability that the best hypothesis is within 0.2 m and 5 degrees of the truth."""
+        best = self.modes[0]
+        near = [mode for mode in self.modes if same_place(mode.pose[None], best.pose)[0]]
+        return sum(
+            mode.weight * (1 - self._unknown_weight) * probability_of_being_near(self._covariance(mode))
+            for mode in near
         )
-        if not proven:
-            return "localising"
-        self._was_tracking = True
-        self.modes[0] = replace(best, tracked=True)
-        return "tracking"
+
+    def _state(self, probability: float) -> State:
+        if probability >= self.settings.tracking_probability:
+            self._was_tracking = True
+            return "tracking"
+        known = 1 - self._unknown_weight
+        if len(self.modes) > 1 and self.modes[1].weight * known > self.settings.ambiguous_weight:
+            return "ambiguous"
+        return "lost" if self._was_tracking else "localising"
+
+
+def _ideal(view: View, skip: npt.NDArray[np.bool_]) -> float:
+    """Log likelihood in nats of the beams that are not in ``skip`` (B,), if all surfaces were known."""
+    return float(view.surfaces.ideal[~skip].sum())
+
+
+def _surprise(view: View, skip: npt.NDArray[np.bool_]) -> float:
+    """Log likelihood in nats of the beams that are not in ``skip`` (B,) if no surface was known, minus `_ideal`."""
+    return float((view.surfaces.density - view.surfaces.ideal)[~skip].sum())
+
+
+def _novelty(view: View, poses: Array, old: npt.NDArray[np.bool_]) -> Array:
+    """Log likelihood (N,) in nats at ``poses`` (N, 3) of the beams that are not in ``old`` (B,), minus `_ideal`.
+
+    It may also be clutter, which says nothing about the pose.
+    """
+    mapped = view.surface_evidence(poses, skip=old).log_likelihood - _ideal(view, old)
+    return np.asarray(np.logaddexp(mapped + np.log1p(-CLUTTER), _surprise(view, old) + np.log(CLUTTER)))
+
+
+def _prior_of(candidates: list[Candidate]) -> Prior:
+    return Prior(
+        np.array([each.mean for each in candidates]), np.array([np.linalg.inv(each.covariance) for each in candidates])
+    )

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 
-from services.estimator.precise.field_tracing import end_in_unseen_cells, trace
+from services.estimator.precise.field_tracing import end_in_unseen_cells, mark_crossed, trace, trace_behind
 from services.estimator.shared.generative_models import Expected
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ Floats = npt.NDArray[np.float32]
 DIP_EDGES = np.array([0.001, 0.002, 0.005, 0.01, 0.02, 0.03, 0.05, 0.1])
 DEPTH_EDGES = np.array([0.0, 0.25, 0.5, 0.75])
 FACING_EDGES = np.array([0.05, 0.1, 0.2, 0.5])
+SOLID_DIRECTIONS = 360  # of beams that find out what is solid
+SOLID_MARGIN_CELLS = 2  # between these beams
 SEEN_CELL_M = 0.2  # so large that neighbouring beams leave no gaps
 CLASSES = (len(DIP_EDGES) + 1, len(DEPTH_EDGES) + 1, len(FACING_EDGES) + 1)
 
@@ -60,6 +63,18 @@ class DistanceField:
     origin: tuple[float, float]  # m in map, of node (0, 0)
     resolution: float  # m
 
+    def with_solids(self, places: Array) -> DistanceField:
+        """The field, negative wherever no beam from ``places`` (S, 2) m passes.
+
+        Learning gives the inside of thick things a positive distance, because no beam has ever been there.
+        """
+        crossed = np.zeros(self.phi.shape, np.bool_)
+        lasers = np.column_stack([places, np.zeros(len(places))])
+        directions = np.linspace(0.0, 2 * np.pi, SOLID_DIRECTIONS, endpoint=False)
+        mark_crossed(self.phi, *self.origin, self.resolution, lasers, directions, crossed)
+        solid = ~ndimage.binary_dilation(crossed, iterations=SOLID_MARGIN_CELLS)
+        return dataclasses.replace(self, phi=np.where(solid, -np.abs(self.phi), self.phi))
+
     def trace(self, lasers: Array, angles: Array) -> Traced:
         """Traces beams from laser poses (N, 3) in map along angles (B,) rad in the laser frame."""
         lasers, angles = np.asarray(lasers, float).reshape(-1, 3), np.asarray(angles, float)
@@ -68,6 +83,13 @@ class DistanceField:
         jacobian = np.empty((*shape, 3))
         trace(self.phi, *self.origin, self.resolution, lasers, angles, ranges, jacobian, dip, edge, facing)
         return Traced(ranges, jacobian, dip, edge, facing)
+
+    def trace_behind(self, lasers: Array, angles: Array, ranges: Array) -> Array:
+        """Ranges (N, B) in m to the next surface behind the one at ``ranges`` (N, B) m; +inf if there is none."""
+        lasers, angles = np.asarray(lasers, float).reshape(-1, 3), np.asarray(angles, float)
+        behind = np.empty(ranges.shape)
+        trace_behind(self.phi, *self.origin, self.resolution, lasers, angles, ranges, behind)
+        return behind
 
 
 @dataclass(frozen=True)
@@ -119,3 +141,7 @@ class FieldModel:
         if self.seen is not None:
             self.seen.limit(lasers, angles, traced.ranges, traced.jacobian, scale)
         return Expected(traced.ranges, scale, traced.jacobian)
+
+    def expect_behind(self, lasers: Array, angles: Array, ranges: Array) -> Array:
+        """Ranges to the next surface; see GenerativeModel."""
+        return self.field.trace_behind(lasers, angles, ranges)

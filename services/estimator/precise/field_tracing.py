@@ -50,15 +50,18 @@ def trace_beam(phi: Floats, h: float, x: float, y: float, ux: float, uy: float) 
 
     Returns the length of the beam and the smallest distance at which it passed another surface (inf if none), in m.
     """
-    t, step, previous, falling, dip = 0.0, 0.0, 0.0, False, np.inf
+    t, step, previous, falling, dip, solid = 0.0, 0.0, 0.0, False, np.inf, True
     for _ in range(MAX_STEPS):
         value, _, _, inside = lookup(phi, x + t * ux, y + t * uy)
         if not inside:
             return np.inf, dip
         value /= h
+        if solid:  # a laser cannot be inside something, so what the map has there was removed: leave it first
+            if value <= 0.0:
+                t += max(-value, MIN_STEP_CELLS)
+                continue
+            solid = False
         if value <= 0.0:
-            if step == 0.0:
-                return 0.0, dip
             t -= step * -value / (previous - value)  # regula falsi with the last point in free space
             value, gx, gy, _ = lookup(phi, x + t * ux, y + t * uy)
             slope = gx * ux + gy * uy
@@ -112,6 +115,41 @@ def trace(
                 jacobian[k, b, 2] = r * (ny * ux - nx * uy) / cosine
             behind, _, _, _ = lookup(phi, hx + ux, hy + uy)
             edge[k, b], facing[k, b] = -behind / (h * cosine), cosine
+
+
+@jit
+def trace_behind(
+    phi: Floats, ox: float, oy: float, h: float, lasers: Array, angles: Array, ranges: Array, behind: Array
+) -> None:
+    """Fills behind (N, B) m, ranges to the next surface behind the one at ``ranges`` (N, B) m; none behind +inf."""
+    for k in range(lasers.shape[0]):
+        for b in range(angles.shape[0]):
+            behind[k, b] = np.inf
+            if ranges[k, b] < np.inf:
+                ux, uy = math.cos(lasers[k, 2] + angles[b]), math.sin(lasers[k, 2] + angles[b])
+                inside = ranges[k, b] + 0.5 * h
+                x, y = lasers[k, 0] + inside * ux, lasers[k, 1] + inside * uy
+                behind[k, b] = inside + trace_beam(phi, h, (x - ox) / h, (y - oy) / h, ux, uy)[0]
+
+
+@jit
+def mark_crossed(
+    phi: Floats, ox: float, oy: float, h: float, lasers: Array, angles: Array, crossed: npt.NDArray[np.bool_]
+) -> None:
+    """Marks the nodes (ny, nx) that beams at ``angles`` (B,) from lasers (N, 3) pass."""
+    ny, nx = phi.shape
+    for k in range(lasers.shape[0]):
+        x, y = (lasers[k, 0] - ox) / h, (lasers[k, 1] - oy) / h
+        for b in range(angles.shape[0]):
+            ux, uy = math.cos(lasers[k, 2] + angles[b]), math.sin(lasers[k, 2] + angles[b])
+            end, _ = trace_beam(phi, h, x, y, ux, uy)
+            t = 0.0
+            while t < min(end / h, nx + ny):
+                column, row = int(x + t * ux + 0.5), int(y + t * uy + 0.5)
+                if not (0 <= column < nx and 0 <= row < ny):
+                    break
+                crossed[row, column] = True
+                t += 0.7
 
 
 @jit

@@ -16,11 +16,13 @@ import numpy.typing as npt
 from common.geometry import se2
 from common.robot.ranges import is_surface
 from services.estimator.precise.likelihood import Evidence
+from services.estimator.precise.scan_surfaces import ScanSurfaces
+from services.estimator.precise.surface_evidence import SurfaceEvidence
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.estimator.precise.likelihood import Likelihood
-    from services.estimator.shared.generative_models import GenerativeModel
+    from services.estimator.shared.generative_models import Expected, GenerativeModel
 
 MAX_STEP = np.array([0.5, 0.5, 0.3])  # m, m, rad: beyond this distance the linearisation is not valid
 CONVERGED_STEP = np.array([1e-4, 1e-4, 2e-5])  # m, m, rad: a tenth of the precision of one scan
@@ -28,6 +30,8 @@ SETTLED_STEP = np.array([3e-4, 3e-4, 1e-4])  # m, m, rad: this near, F is quadra
 # Added in quadrature to every beam's standard deviation during a descent from a seed, so that the minimum is wide at
 # first.
 COARSE_SIGMA_M, MEDIUM_SIGMA_M, FINE_SIGMA_M = ANNEALING_SCHEDULE_M = (0.3, 0.1, 0.03)
+FOLLOWING_SCHEDULE_M = (0.05, 0.0, 0.0, 0.0, 0.0)  # the same, from a predicted pose
+CORRELATED_M = 2.0  # along a surface, on which the errors of a map are alike
 DAMPING = np.diag([1.0, 1.0, 1.0]) * 1e-6  # 1/m², 1/rad²: no step along directions without information
 
 
@@ -73,6 +77,9 @@ class View:
     ranges: Array  # (B,) m
     range_max: float  # m
     optimiser: Optimiser = field(default_factory=GaussNewton)
+    map_error: float = 0.0  # m, standard deviation beyond what the model states, alike for neighbouring beams
+    changed: float = 0.25  # share of surfaces that the map does not show as they are
+    _predictions: dict[bytes, tuple[Expected, Array]] = field(default_factory=dict, init=False, repr=False)
 
     def thinned(self, beams: int) -> View:
         """Returns a view with every k-th beam, so that about ``beams`` are left."""
@@ -92,25 +99,87 @@ class View:
         return self.optimiser.polish(self, poses, prior, iterations)
 
     @cached_property
+    def returned(self) -> npt.NDArray[np.bool_]:
+        """Mask (B,) of the beams that returned from a surface."""
+        return np.asarray(is_surface(self.ranges) & (self.ranges < self.range_max))
+
+    @cached_property
     def points(self) -> Array:
         """End points (K, 2) of the beams that returned, m in the laser frame."""
-        hit = is_surface(self.ranges) & (self.ranges < self.range_max)
-        angles = self.angles[hit]
-        return np.asarray(self.ranges[hit, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1))
+        angles = self.angles[self.returned]
+        return np.asarray(self.ranges[self.returned, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1))
 
-    def evidence(self, poses: Array, extra_sigma: float = 0.0) -> Evidence:
+    @cached_property
+    def surfaces(self) -> ScanSurfaces:
+        """The surfaces that the scan shows."""
+        return ScanSurfaces.of(self.ranges, self.angles, self.likelihood)
+
+    def _with_map_error(self, expected: Expected) -> Expected:
+        """Adds the map's error, which is across a surface and so larger along beams that graze it."""
+        if not self.map_error:
+            return expected
+        along = self.map_error * np.hypot(expected.jacobian[..., 0], expected.jacobian[..., 1])
+        return replace(expected, scale=np.hypot(expected.scale, along))
+
+    @cached_property
+    def _correlation(self) -> float:
+        """Factor on the covariance of the model's error, because the map's error is alike for neighbouring beams."""
+        if not self.map_error or len(self.points) < 2:
+            return 1.0
+        spacing = float(np.median(np.hypot(*np.diff(self.points, axis=0).T)))
+        return max(1.0, CORRELATED_M / max(spacing, 1e-3))
+
+    def surface_evidence(
+        self, poses: Array, extra_sigma: float = 0.0, skip: npt.NDArray[np.bool_] | None = None
+    ) -> SurfaceEvidence:
+        """Returns the evidence by surfaces at base_link poses (N, 3); beams in ``skip`` (B,) do not count."""
+        expected, behind = self._expect(poses)
+        return SurfaceEvidence.of(
+            self.ranges,
+            self.range_max,
+            expected,
+            behind,
+            self.surfaces,
+            self.likelihood,
+            self.changed,
+            extra_sigma,
+            skip,
+        )
+
+    def _expect(self, poses: Array) -> tuple[Expected, Array]:
+        """Predicts the scan at poses (N, 3), and the ranges (N, B) behind the surfaces that the scan passed through.
+
+        Keeps the last result, because several kinds of evidence are computed at the same poses.
+        """
+        key = poses.tobytes()
+        if key not in self._predictions:
+            lasers = se2.compose(poses, self.mount)
+            expected = self._with_map_error(self.model.expect(lasers, self.angles))
+            with np.errstate(invalid="ignore"):
+                passed = self.ranges > expected.ranges + self.likelihood.deviation(expected.ranges)
+            behind = self.model.expect_behind(lasers, self.angles, np.where(passed, expected.ranges, np.inf))
+            self._predictions.clear()
+            self._predictions[key] = expected, behind
+        return self._predictions[key]
+
+    def evidence(self, poses: Array, extra_sigma: float = 0.0, attention: Array | None = None) -> Evidence:
         """Returns the evidence of the scan at base_link poses (N, 3), with derivatives by these poses.
 
-        ``extra_sigma`` m is added in quadrature to every beam's standard deviation.
+        ``extra_sigma`` m is added in quadrature to every beam's standard deviation. ``attention`` (N, B) scales the
+        derivatives of each beam.
         """
         lasers = se2.compose(poses, self.mount)
-        expected = self.model.expect(lasers, self.angles)
-        at_laser = self.likelihood.evaluate(self.ranges, self.range_max, expected, extra_sigma)
+        if attention is None:
+            expected = self._with_map_error(self.model.expect(lasers, self.angles))
+        else:
+            expected = self._expect(poses)[0]
+        at_laser = self.likelihood.evaluate(self.ranges, self.range_max, expected, extra_sigma, attention)
         # A rotation of base_link moves the laser sideways: J_base = J_laser T.
         T = np.tile(np.eye(3), (len(poses), 1, 1))
         T[:, 0, 2], T[:, 1, 2] = poses[:, 1] - lasers[:, 1], lasers[:, 0] - poses[:, 0]
         Tt = T.transpose(0, 2, 1)
-        matrices = (at_laser.curvature, at_laser.xi_noise_covariance, at_laser.xi_model_covariance)
+        model_covariance = at_laser.xi_model_covariance * self._correlation
+        matrices = (at_laser.curvature, at_laser.xi_noise_covariance, model_covariance)
         return Evidence(
             at_laser.accuracy,
             at_laser.inlier_ratio,
@@ -191,6 +260,24 @@ def _steps(poses: Array, evidence: Evidence, prior: Prior | None, damping: Array
 def limit_steps(steps: npt.NDArray[np.floating[Any]], largest: Array) -> Array:
     """Shortens steps (..., 3) without changing their direction, so that no component exceeds ``largest`` (3,)."""
     return np.asarray(steps / np.maximum((np.abs(steps) / largest).max(axis=-1, keepdims=True), 1.0))
+
+
+def follow(
+    view: View, poses: Array, prior: Prior | None, schedule: tuple[float, ...] = FOLLOWING_SCHEDULE_M
+) -> tuple[Array, Evidence]:
+    """Finds the minima next to predicted ``poses`` (N, 3), with only those beams that end at surfaces of the map.
+
+    This is expectation maximisation: each step minimises F with the states of the beams held constant.
+    """
+    poses = np.array(poses, float)
+    for extra_sigma in schedule:
+        evidence = view.evidence(poses, extra_sigma, view.surface_evidence(poses, extra_sigma).weights)
+        step = _steps(poses, evidence, prior, np.zeros(len(poses)))
+        if extra_sigma == 0.0 and (np.abs(step) < SETTLED_STEP).all():
+            return poses, evidence
+        poses = poses + step
+        poses[:, 2] = se2.wrap(poses[:, 2])
+    return poses, view.evidence(poses, 0.0, view.surface_evidence(poses).weights)
 
 
 def polish(view: View, poses: Array, prior: Prior | None = None, iterations: int = 5) -> tuple[Array, Evidence]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,20 +13,21 @@ import numpy.typing as npt
 from common.geometry import se2
 from services.estimator.precise.gauss_newton import MAX_STEP, Prior, difference, limit_steps, position_information
 from services.estimator.precise.motion_model import smooth_velocity
+from services.estimator.shared.generative_models import CORNER_ANGLE_RAD
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
+    from services.estimator.precise.gauss_newton import View
     from services.estimator.precise.likelihood import Evidence
     from services.estimator.precise.motion_model import Fused
-    from services.estimator.precise.settings import Settings
 
+NEAR_POSITION_M, NEAR_HEADING_RAD = 0.2, math.radians(5)  # a pose with a larger error is wrong
+EXCEEDED = 1e-4  # share of the scans whose error may exceed the protection level
 SAME_POSITION_M, SAME_HEADING_RAD = 0.1, 0.1  # hypotheses nearer to one another than this are merged
-ENERGY_MEMORY = 0.8  # weight of earlier scans: the model's error repeats, so evidence must not add up without limit
 # A direction counts as unobserved if its information is less than this share of the information across it; a learned
 # field adds a multiple of its squared ripple to the share.
 MIN_INFORMATION_RATIO, RIPPLE_FACTOR = 1e-4, 7.0
-MIN_RIVAL_SCANS = 10  # age in scans at which a rival with a good inlier ratio may replace the tracked hypothesis
-MIN_WEIGHT = 1e-4  # hypotheses with less weight are dropped
+MIN_WEIGHT = 1e-9  # hypotheses with less weight are dropped
 
 
 @dataclass(frozen=True)
@@ -34,17 +37,21 @@ class Mode:
     pose: Array  # (3,) base_link in map
     noise_covariance: Array  # (3, 3) caused by scanner noise and motion: fusion of scans reduces it
     model_covariance: Array  # (3, 3) caused by the model's error, for independent beams: fusion does not reduce it
-    inlier_ratio: float  # of the last scan
+    explained: float  # share of the last scan's beams that end at surfaces of the map
     accuracy: float  # nats, of the last scan
     complexity: float  # nats
-    energy: float  # nats, F averaged over the last scans, from which weights are computed
     xi: Array  # (3,)
     curvature: Array  # (3, 3)
+    log_evidence: float = 0.0  # nats, of the key scans and the prior; unnormalised
+    present: float = 0.0  # nats, of the present scan
     velocity: Array | None = None  # (3,) in base_link; None while unknown
     weight: float = 1.0
     unobserved_scans: int = 0  # number of consecutive scans without information along some direction
-    age: int = 0  # scans since it was found
-    tracked: bool = False  # tracking was reported here, or the robot was started here, and no rival has replaced it
+
+    @property
+    def log_weight(self) -> float:
+        """Unnormalised, in nats."""
+        return self.log_evidence + self.present
 
     def covariance(self, inflation: float) -> Array:
         """Covariance (3, 3) of x, y, yaw in map."""
@@ -96,16 +103,19 @@ def mode_from_search(
         complexity -= 0.5 * float(np.linalg.slogdet(information)[1])
     else:
         complexity = float(np.log(volume)) + 0.5 * (logdet - 3 * np.log(2 * np.pi * np.e))
+    # A hypothesis is one place: what is farther away than this belongs to others.
+    place = np.diag([SAME_POSITION_M**-2, SAME_POSITION_M**-2, SAME_HEADING_RAD**-2])
+    log_volume = 1.5 * np.log(2 * np.pi) - 0.5 * float(np.linalg.slogdet(evidence.curvature[k] + place)[1])
     return Mode(
         pose=pose,
         noise_covariance=inverse @ (evidence.xi_noise_covariance[k] + information) @ inverse,
         model_covariance=inverse @ evidence.xi_model_covariance[k] @ inverse,
-        inlier_ratio=float(evidence.inlier_ratio[k]),
+        explained=float(evidence.inlier_ratio[k]),
         accuracy=accuracy,
         complexity=complexity,
-        energy=accuracy + complexity,
         xi=evidence.xi[k],
         curvature=evidence.curvature[k],
+        log_evidence=0.0 if prior else float(log_volume - np.log(volume)),
     )
 
 
@@ -127,16 +137,14 @@ def update_mode(mode: Mode, fused: Fused, evidence: Evidence, k: int, period: fl
         pose=fused.mean,
         noise_covariance=inverse @ (evidence.xi_noise_covariance[k] + information) @ inverse,
         model_covariance=inverse_of_scan @ evidence.xi_model_covariance[k] @ inverse_of_scan,
-        inlier_ratio=float(evidence.inlier_ratio[k]),
+        explained=float(evidence.inlier_ratio[k]),
         accuracy=accuracy,
         complexity=fused.complexity,
-        energy=ENERGY_MEMORY * mode.energy + (1 - ENERGY_MEMORY) * (accuracy + fused.complexity),
         xi=evidence.xi[k],
         curvature=evidence.curvature[k],
+        log_evidence=mode.log_evidence,
         velocity=velocity,
         unobserved_scans=mode.unobserved_scans + 1 if unobserved else 0,
-        age=mode.age + 1,
-        tracked=mode.tracked,
     )
 
 
@@ -164,42 +172,51 @@ def select_distinct(poses: Array, energy: Array, count: int) -> list[int]:
     return kept
 
 
-def weigh(modes: list[Mode], evidence_error: float, count: int) -> list[Mode]:
-    """Merges hypotheses, weighs them by energy, sorts them best first, and drops those of negligible weight.
+def weigh(modes: list[Mode], log_unknown: float, count: int) -> tuple[list[Mode], float]:
+    """Merges hypotheses, weighs them by evidence, sorts them best first, and drops those of negligible weight.
 
-    Differences in F between places are known only up to the model's error, a few beams of about 9 nats each: up to
-    ``evidence_error`` nats. A tracked hypothesis stays first; `rank_hypotheses` decides when another replaces it.
+    Returns up to ``count`` hypotheses, and the probability that the robot is at none of them; ``log_unknown`` is its
+    unnormalised logarithm. The weights sum to 1.
     """
-    energy = np.array([mode.energy for mode in modes])
-    tracked = next((k for k, mode in enumerate(modes) if mode.tracked), None)
-    if tracked is not None:
-        energy = np.maximum(energy, energy[tracked])
-        energy[tracked] = np.nextafter(energy[tracked], -np.inf)
+    energy = np.array([-mode.log_weight for mode in modes])
     kept = select_distinct(np.array([mode.pose for mode in modes]), energy, count)
-    ordered = [modes[k] for k in kept]
-    weights = np.exp(-(energy[kept] - energy[kept[0]]) / evidence_error)
+    logs = np.array([*(-energy[kept]), log_unknown])
+    weights = np.exp(logs - logs.max())
     weights /= weights.sum()
-    return [
-        replace(mode, weight=float(weight / weights[weights > MIN_WEIGHT].sum()))
-        for mode, weight in zip(ordered, weights, strict=True)
-        if weight > MIN_WEIGHT
-    ]
+    total = weights[:-1].sum()
+    shares = weights[:-1] / total if total > 0 else np.eye(len(kept))[0]
+    used = shares > MIN_WEIGHT
+    shares = shares / shares[used].sum()
+    return [replace(modes[k], weight=float(w)) for k, w in zip(kept, shares, strict=True) if w > MIN_WEIGHT], float(
+        weights[-1]
+    )
 
 
-def rank_hypotheses(modes: list[Mode], settings: Settings) -> list[Mode]:
-    """Sorts hypotheses by weight, but keeps the tracked one first until a rival has better evidence for long enough."""
-    tracked = next((mode for mode in modes if mode.tracked), None)
-    if tracked is not None and any(_replaces_tracked(mode, tracked, settings) for mode in modes):
-        modes = [replace(mode, tracked=False) for mode in modes]
-    return weigh(modes, settings.evidence_error_nats, settings.max_hypotheses)
+def constraining_beams(view: View, pose: Array, direction: Array) -> float:
+    """Expected number of beams on surfaces of the map that face ``direction`` (2,), and so fix ``pose`` along it."""
+    expected = view.model.expect(se2.compose(pose, view.mount)[None], view.angles)
+    normal, surface, scale = expected.jacobian[0, :, :2], expected.ranges[0], expected.scale[0]
+    facing = np.abs(normal @ direction) > np.sin(CORNER_ANGLE_RAD) * np.hypot(*normal.T)
+    used = facing & np.isfinite(view.ranges) & np.isfinite(surface)
+    return float(view.likelihood.inlier(view.ranges[used], surface[used], scale[used], view.range_max).sum())
 
 
-def _replaces_tracked(rival: Mode, tracked: Mode, settings: Settings) -> bool:
-    """Whether the robot was carried to the rival's pose, as opposed to a change of its surroundings.
+def probability_of_being_near(covariance: Array) -> float:
+    """Probability that a pose with ``covariance`` (3, 3) is within 0.2 m and 5 degrees of the truth."""
+    variance = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+    position = 1 - math.exp(-0.5 * NEAR_POSITION_M**2 / max(variance, 1e-12))
+    heading = math.erf(NEAR_HEADING_RAD / math.sqrt(2 * max(float(covariance[2, 2]), 1e-12)))
+    return position * heading
 
-    One scan of a changed place may fit another place better by hundreds of nats; scans from several poses do not.
+
+def protection_level(mode: Mode, covariance: Array, elsewhere: float) -> Array | None:
+    """Errors (3,) m along and m across base_link, and rad, that are exceeded with probability `EXCEEDED`.
+
+    ``elsewhere`` is the probability that the robot is not at this hypothesis. Returns None if that alone is larger.
     """
-    is_good = rival.inlier_ratio >= settings.good_inlier_ratio
-    scans_needed = MIN_RIVAL_SCANS if is_good else settings.rival_probation_scans
-    proven = rival.age >= scans_needed or rival.inlier_ratio >= settings.conclusive_inlier_ratio
-    return proven and rival.energy < tracked.energy - 3 * settings.evidence_error_nats
+    if elsewhere >= EXCEEDED:
+        return None
+    axes = np.eye(3)
+    axes[:2, :2] = se2.rotate(float(mode.pose[2]), np.eye(2))
+    deviation = np.sqrt(np.diagonal(axes @ covariance @ axes.T))
+    return np.asarray(NormalDist().inv_cdf(1 - (EXCEEDED - elsewhere) / 2) * deviation)

@@ -60,11 +60,18 @@ class Likelihood:
     unseen: float = 0.05  # probability of no return from a surface
     relative: float = 0.0  # standard deviation of the noise that grows with the range, as a share of the range
 
-    def evaluate(self, measured: Array, range_max: float, expected: Expected, extra_sigma: float = 0.0) -> Evidence:
+    def evaluate(
+        self,
+        measured: Array,
+        range_max: float,
+        expected: Expected,
+        extra_sigma: float = 0.0,
+        attention: Array | None = None,
+    ) -> Evidence:
         """Returns the evidence of a scan, with derivatives by the laser's poses.
 
         ``measured`` (B,) are ranges in m: +inf is no return, -inf and NaN are not used. ``extra_sigma`` m is added in
-        quadrature to every standard deviation.
+        quadrature to every standard deviation. ``attention`` (N, B) scales the derivatives of each beam, by default 1.
         """
         count = len(expected.ranges)
         total, gradient = np.zeros((count, 3)), np.zeros((count, 3))
@@ -81,6 +88,7 @@ class Likelihood:
             self.random,
             range_max,
             self.unseen,
+            np.zeros((0, 0)) if attention is None else attention,
             total,
             gradient,
             matrices,

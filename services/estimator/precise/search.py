@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,17 +11,23 @@ from services.estimator.precise.gauss_newton import (
     ANNEALING_SCHEDULE_M,
     COARSE_SIGMA_M,
     FINE_SIGMA_M,
+    FOLLOWING_SCHEDULE_M,
     MEDIUM_SIGMA_M,
     Prior,
     View,
+    follow,
 )
-from services.estimator.precise.hypotheses import Mode, mode_from_search, select_distinct, weigh
+from services.estimator.precise.hypotheses import Mode, mode_from_search, select_distinct
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from services.estimator.precise.global_seeds import Seeds
     from services.estimator.precise.likelihood import Evidence
     from services.estimator.precise.settings import Settings
+
+
+# Added in quadrature to every beam's standard deviation, step by step, from poses that may be half a metre off.
+NEAR_SCHEDULE_M = (COARSE_SIGMA_M, COARSE_SIGMA_M, MEDIUM_SIGMA_M, MEDIUM_SIGMA_M, *FOLLOWING_SCHEDULE_M)
 
 
 def search_everywhere(view: View, seeds: Seeds, settings: Settings, *, thorough: bool) -> list[Mode]:
@@ -30,8 +37,8 @@ def search_everywhere(view: View, seeds: Seeds, settings: Settings, *, thorough:
     """
     modes: list[Mode] = []
     for count in (settings.search_seeds, *([settings.thorough_search_seeds] if thorough else [])):
-        modes = _refine(view, seeds.rank(view, count), None, seeds, settings)
-        if modes[0].inlier_ratio >= settings.conclusive_inlier_ratio:
+        modes = _refine(view, seeds.rank(view, count), seeds, settings)
+        if modes[0].explained >= settings.conclusive_share:
             break
     return modes
 
@@ -42,7 +49,9 @@ def search_near(
     """Returns the hypotheses that fit best near ``pose`` (3,), which is known within ``covariance`` (3, 3)."""
     starts = rng.multivariate_normal(pose, covariance, settings.search_seeds)
     starts[0] = pose
-    return _refine(view, starts, Prior.repeated(len(starts), pose, covariance), seeds, settings)
+    prior = Prior.repeated(len(starts), pose, covariance)
+    poses, evidence = follow(view, starts, prior, NEAR_SCHEDULE_M)
+    return _best_modes(view, poses, evidence, prior, seeds, settings)
 
 
 def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) -> tuple[Array, Evidence]:
@@ -63,15 +72,32 @@ def search_around(view: View, starts: Array, prior: Prior, extra_starts: Array) 
     return poses[keep], evidence.part(keep)
 
 
-def _refine(view: View, starts: Array, prior: Prior | None, seeds: Seeds, settings: Settings) -> list[Mode]:
+def _refine(view: View, starts: Array, seeds: Seeds, settings: Settings) -> list[Mode]:
     """Descends from all starts with few beams and wide deviations, then from the best ones with all beams."""
     few = view.thinned(settings.search_beams)
-    poses, evidence = few.descend(starts, prior, COARSE_SIGMA_M, 5)
-    poses, evidence = few.descend(poses, prior, MEDIUM_SIGMA_M, 4)
-    keep = select_distinct(poses, evidence.accuracy, 2 * settings.max_hypotheses)
-    part = Prior(prior.mean[keep], prior.information[keep]) if prior else None
-    poses, evidence = view.descend(poses[keep], part, FINE_SIGMA_M, 4)
-    poses, evidence = view.polish(poses, part)
-    keep = select_distinct(poses, evidence.accuracy, settings.max_hypotheses)
-    modes = [mode_from_search(poses[k], evidence, k, part, seeds.volume, seeds.spread, view.model.ripple) for k in keep]
-    return weigh(modes, settings.evidence_error_nats, settings.max_hypotheses)
+    poses, evidence = few.descend(starts, None, COARSE_SIGMA_M, 5)
+    poses, evidence = few.descend(poses, None, MEDIUM_SIGMA_M, 4)
+    keep = select_distinct(poses, evidence.accuracy, 3 * settings.max_hypotheses)
+    poses, _ = view.descend(poses[keep], None, FINE_SIGMA_M, 4)
+    poses, evidence = follow(view, poses, None)
+    return _best_modes(view, poses, evidence, None, seeds, settings)
+
+
+def _best_modes(
+    view: View, poses: Array, evidence: Evidence, prior: Prior | None, seeds: Seeds, settings: Settings
+) -> list[Mode]:
+    """The hypotheses with most evidence by surfaces among ``poses`` (N, 3), best first."""
+    surfaces = view.surface_evidence(poses, skip=view.surfaces.small)
+    log_prior = -prior.energy(poses) if prior else np.zeros(len(poses))
+    modes = []
+    for k in select_distinct(poses, -surfaces.log_likelihood - log_prior, settings.max_hypotheses):
+        mode = mode_from_search(poses[k], evidence, k, prior, seeds.volume, seeds.spread, view.model.ripple)
+        modes.append(
+            replace(
+                mode,
+                explained=float(surfaces.explained[k]),
+                log_evidence=mode.log_evidence + float(log_prior[k]),
+                present=float(surfaces.log_likelihood[k]),
+            )
+        )
+    return modes

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from common.geometry.ray_casting import cast_rays_with_jacobian
+from common.geometry.ray_casting import cast_rays, cast_rays_with_jacobian
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
     from common.geometry.world import World
 
 CORNER_ANGLE_RAD = 0.3  # a surface tilted by more is a corner, and not a ripple caused by learning
+PASSED_M = 1e-3  # behind a surface, from where the next one is sought
 EXACT_SCALE_M = 1e-4  # stated error of exact rays, for rounding
 
 
@@ -45,6 +46,13 @@ class GenerativeModel(Protocol):
         """Predicts scans at laser poses (N, 3) in map, along beams at ``angles`` (B,) rad in the laser frame."""
         ...
 
+    def expect_behind(self, lasers: Array, angles: Array, ranges: Array) -> Array:
+        """Ranges (N, B) in m to the next surface behind those at ``ranges`` (N, B) m; +inf if there is none.
+
+        A beam ends there if the first surface was removed.
+        """
+        ...
+
 
 def map_error(world: World) -> float:
     """Standard deviation in m of the surfaces in a world: half a cell of a ROS map, else 0.
@@ -56,15 +64,46 @@ def map_error(world: World) -> float:
 
 @dataclass(frozen=True)
 class RayCaster:
-    """The exact model, which casts rays in the world: the limit of what learning can reach.
-
-    Surfaces of a ROS map are known to half a cell.
-    """
+    """The exact model, which casts rays in the world: the limit of what learning can reach."""
 
     world: World
     ripple: float = 0.0
 
     def expect(self, lasers: Array, angles: Array) -> Expected:
         """Predicts scans; see GenerativeModel."""
+        lasers, angles = np.array(lasers, float).reshape(-1, 3), np.asarray(angles, float)
         ranges, jacobian = cast_rays_with_jacobian(self.world, lasers, angles)
-        return Expected(ranges, np.full(ranges.shape, max(EXACT_SCALE_M, map_error(self.world))), jacobian)
+        # A laser cannot be inside something, so what the map has there was removed.
+        for k in np.flatnonzero(self.world.surface_distance(lasers[:, :2]) < 0):
+            rays = _advanced(lasers[k], angles, ranges[k] + PASSED_M)
+            further, derivatives = cast_rays_with_jacobian(self.world, rays, np.zeros(1))
+            ranges[k] += PASSED_M + further[:, 0]
+            jacobian[k] = derivatives[:, 0]
+            hits = np.isfinite(further[:, 0])
+            jacobian[k, hits, 2] *= ranges[k, hits] / np.maximum(further[hits, 0], PASSED_M)
+        return Expected(ranges, np.full(ranges.shape, EXACT_SCALE_M), jacobian)
+
+    def expect_behind(self, lasers: Array, angles: Array, ranges: Array) -> Array:
+        """Ranges to the next surface; see GenerativeModel."""
+        lasers, angles = np.asarray(lasers, float).reshape(-1, 3), np.asarray(angles, float)
+        behind = np.array(ranges, float)
+        for k, row in enumerate(behind):
+            hit = np.flatnonzero(np.isfinite(row))
+            start = row[hit] + PASSED_M
+            inside = _advanced(lasers[k], angles[hit], start)
+            # Out of the thing that was hit; rays do not hit a circle from inside.
+            x, y, radius = self.world.circles.T
+            in_circle = (np.hypot(inside[:, :1] - x, inside[:, 1:2] - y) < radius).any(axis=1)
+            start += np.where(in_circle, 0.0, cast_rays(self.world, inside, np.zeros(1))[:, 0] + PASSED_M)
+            outside = _advanced(lasers[k], angles[hit], start)
+            row[hit] = start + cast_rays(self.world, outside, np.zeros(1))[:, 0]
+        return behind
+
+
+def _advanced(laser: Array, angles: Array, distances: Array) -> Array:
+    """Poses (B,3) of beams from a laser pose (3,), each ``distances`` (B,) m along its own direction."""
+    rays = np.tile(laser, (len(angles), 1))
+    rays[:, 2] += angles
+    ahead = np.where(np.isfinite(distances), distances, 0.0)
+    rays[:, :2] += ahead[:, None] * np.stack([np.cos(rays[:, 2]), np.sin(rays[:, 2])], axis=-1)
+    return rays

@@ -91,6 +91,8 @@ def belief_of(belief: Belief | None) -> Json | None:
         "free_energy": belief.free_energy,
         "accuracy": belief.accuracy,
         "complexity": belief.complexity,
+        "probability": belief.probability,
+        "protection": None if belief.protection is None else belief.protection.tolist(),
         "hypotheses": [{**pose_of(h.pose), "weight": h.weight, "cov": _flat(h.covariance)} for h in belief.hypotheses],
         "estimator": belief.estimator,
     }

@@ -141,7 +141,7 @@ def metrics_of(service: str, **counts) -> ServiceMetrics:
 
 def belief(state: str, energy: float) -> Belief:
     pose = Pose(x=0.0, y=0.0)
-    return Belief(stamp_ns=0, state=state, pose=pose, xi=np.zeros(3), free_energy=energy, accuracy=0.0)
+    return Belief(stamp_ns=0, state=state, pose=pose, xi=np.zeros(3), free_energy=energy, probability=0.25)
 
 
 def numbers(metrics) -> dict:
@@ -157,6 +157,7 @@ def test_several_robots_in_one_process():
     found = numbers(metrics)
     assert value(found, "presage_free_energy_nats", robot="one") == 5.5
     assert value(found, "presage_free_energy_nats", robot="two") == -2.0
+    assert value(found, "presage_pose_probability", robot="two") == 0.25
     assert value(found, "presage_estimator_state", robot="one", state="tracking") == 1
     assert value(found, "presage_estimator_state", robot="one", state="lost") == 0
     assert value(found, "presage_estimator_state", robot="two", state="lost") == 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -9,9 +11,10 @@ from hypothesis import strategies as st
 
 from common.geometry import se2
 from common.geometry.ray_casting import MIN_COSINE
-from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View, descend, difference, polish
+from common.geometry.world import World
+from services.estimator.precise.gauss_newton import MAX_STEP, Prior, View, descend, difference, follow, polish
 from services.estimator.precise.global_seeds import Seeds, thin_places
-from services.estimator.precise.hypotheses import Mode, select_distinct, weigh
+from services.estimator.precise.hypotheses import Mode, constraining_beams, select_distinct, weigh
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import Candidate, MotionNoise, fuse, predict_motion
 from services.estimator.shared.generative_models import Expected, RayCaster
@@ -115,6 +118,30 @@ def test_gradient(seed):
         assert found[axis] == pytest.approx(-(high - low) / (2 * step), rel=1e-4, abs=5e-3)
 
 
+def test_attention():
+    """The derivatives are the sums over the beams, each times its constant weight."""
+    rng = np.random.default_rng(4)
+    seen, poses = view(scan(TRUTH, rng)), TRUTH + rng.normal(0, 0.01, (2, 3))
+    used = rng.random((2, len(ANGLES))) < 0.5
+    for share in (1.0, 0.5):
+        found = seen.evidence(poses, 0.05, share * used)
+        for k in range(2):
+            masked = view(np.where(used[k], seen.ranges, -np.inf)).evidence(poses[k : k + 1], 0.05)
+            for name in ("xi", "curvature", "xi_noise_covariance", "xi_model_covariance"):
+                assert getattr(found, name)[k] == pytest.approx(share * getattr(masked, name)[0], rel=1e-9, abs=1e-9)
+
+
+def test_following():
+    """A sixth of the beams is stopped by something new, which must not pull the estimate."""
+    rng = np.random.default_rng(1)
+    ranges = scan(TRUTH, rng)
+    ranges[80:115] = np.minimum(ranges[80:115], 0.9) - 0.1
+    poses, evidence = follow(view(ranges), TRUTH[None] + [[0.05, -0.05, 0.03]], None)
+    assert np.abs(poses[0] - TRUTH).max() < 0.01
+    deviation = np.sqrt(np.diag(np.linalg.inv(evidence.curvature[0])))
+    assert (np.abs(poses[0] - TRUTH) < 4 * deviation).all()
+
+
 def test_grazing_beam():
     """Where a beam touches a circle its range has no finite derivative, and a step along it would mean nothing."""
     tangent = np.array([4.5 - 2.0, 3 - 0.4 + 1e-7, 0.0])
@@ -195,15 +222,35 @@ def test_motion_priors():
     assert sum(c.probability for c in (standing, going, wide)) == pytest.approx(1)
 
 
-def mode(x, energy):
-    return Mode(np.array([x, 0.0, 0.0]), np.eye(3), np.zeros((3, 3)), 1.0, energy, 0.0, energy, np.zeros(3), np.eye(3))
+def mode(x, log_evidence, present=0.0):
+    nothing = np.zeros((3, 3))
+    return Mode(
+        np.array([x, 0.0, 0.0]), np.eye(3), nothing, 1.0, 0.0, 0.0, np.zeros(3), np.eye(3), log_evidence, present
+    )
 
 
 def test_hypothesis_weights():
-    found = weigh([mode(5.0, 20.0), mode(0.0, 0.0), mode(0.01, 3.0), mode(9.0, 5000.0)], 20.0, 8)
+    modes = [mode(5.0, -1.0), mode(0.0, 3.0, -3.0), mode(0.01, -3.0), mode(9.0, -5000.0)]
+    found, unknown = weigh(modes, -2.0, 8)
     assert [m.pose[0] for m in found] == [0.0, 5.0]
     assert found[0].weight / found[1].weight == pytest.approx(np.e)
     assert sum(m.weight for m in found) == pytest.approx(1)
+    assert unknown / (1 - unknown) == pytest.approx(np.exp(-2) / (1 + np.exp(-1)))
+    (best,), unknown = weigh(modes, 5000.0, 1)
+    assert best.weight == unknown == 1
+
+
+def test_constraining_beams():
+    """Along a hall only the beams that reach its ends fix the position, unless something hides the ends."""
+    hall = RayCaster(World(name="hall", boundary=[(0, 0), (20, 0), (20, 2), (0, 2)]))
+    pose, (along, across) = np.array([10.0, 1.0, 0.0]), np.eye(2)
+    clean = hall.expect(pose[None], ANGLES).ranges[0]
+    at_ends = np.abs(np.sin(ANGLES)) * clean < 0.99
+    seen = View(hall, Likelihood(), np.zeros(3), ANGLES, clean, 25.0)
+    assert constraining_beams(seen, pose, along) == pytest.approx(at_ends.sum(), rel=0.1)
+    assert constraining_beams(seen, pose, across) > 10 * at_ends.sum()
+    hidden = replace(seen, ranges=np.where(at_ends, 0.8, clean))
+    assert constraining_beams(hidden, pose, along) < 0.1
 
 
 def test_headings_across_pi():

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.geometry.world import World
 from services.estimator.precise.field import DistanceField, FieldModel
+from services.estimator.shared.generative_models import RayCaster
 
 ANGLES = np.deg2rad(np.linspace(-135, 135, 61))
 BOX = World(name="box", boundary=[(0, 0), (6, 0), (6, 4), (0, 4)])
@@ -62,4 +64,19 @@ def test_no_surface():
 
 
 def test_inside_a_surface():
-    assert analytic().trace(np.array([[4.5, 3.0, 0.0]]), ANGLES).ranges.max() == 0
+    """A laser cannot be there, so the disc was removed: its beams leave it and meet the walls."""
+    inside = np.array([[4.5, 3.0, 0.0]])
+    assert analytic().trace(inside, ANGLES).ranges == pytest.approx(BOX.ray_distances(inside, ANGLES), abs=2e-3)
+
+
+@pytest.mark.parametrize("model", [FieldModel(analytic(0.02)), RayCaster(ANALYTIC_WORLD)], ids=["field", "exact"])
+def test_surface_behind(model):
+    """Behind the disc is the wall; behind the wall is nothing, nor behind a beam without return."""
+    laser, angles = np.array([[1.0, 3.0, 0.0]]), np.array([0.0, 0.05, 2.0, -1.0])
+    ranges = model.expect(laser, angles).ranges
+    ranges[0, 3] = np.inf
+    behind = model.expect_behind(laser, angles, ranges)
+    walls = BOX.ray_distances(laser, angles)[0]
+    assert (ranges[0, :2] < walls[:2] - 0.5).all()
+    assert behind[0, :2] == pytest.approx(walls[:2], abs=2e-3)
+    assert np.isinf(behind[0, 2:]).all()

@@ -81,6 +81,7 @@ def belief(i):
         stamp_ns=i * PERIOD_NS, seq=i, state="ambiguous" if i < 3 else "tracking", pose=Pose.of(believed(i)),
         covariance=COVARIANCE, xi=[1.0, 2.0, 3.0], free_energy=100.0 + i, accuracy=90.0, complexity=10.0 + i,
         hypotheses=hypotheses, estimator="precise",
+        probability=0.875, protection=[0.5, 0.25, 0.125],
     )  # fmt: skip
 
 

@@ -60,6 +60,8 @@ def test_card(folder):
     assert (folder / "before-precise.png").stat().st_size > 10_000
     raw = json.loads((folder / "before-precise.json").read_text(encoding="utf-8"))
     assert raw["calibration"]["log_likelihood"] == pytest.approx(card.calibration.log_likelihood)
+    older = raw | {"calibration": raw["calibration"] | {"late": 0.1, "dependence": 9.0, "spread": 30.0}}
+    assert weights.FieldCard.model_validate(older).calibration == card.calibration
 
 
 def test_too_few_reference_poses(tmp_path):

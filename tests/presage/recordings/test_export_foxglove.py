@@ -188,6 +188,8 @@ def test_numbers_for_plots(tmp_path):
     belief, error = found["/belief/numbers"][6][1], found["/error"][6][1]
     assert (belief["free_energy"], belief["accuracy"], belief["complexity"]) == (106.0, 90.0, 16.0)
     assert (belief["sigma_x"], belief["sigma_y"], belief["sigma_yaw"]) == pytest.approx((0.2, 0.1, 0.05))
+    assert (belief["protection_x"], belief["protection_y"], belief["protection_yaw"]) == (0.5, 0.25, 0.125)
+    assert belief["probability"] == 0.875
     assert (belief["state"], belief["hypotheses"], belief["weight"]) == ("tracking", 2, 0.75)
     assert (error["position"], error["heading"]) == pytest.approx((0.05, 0.01))
     assert error["goal_distance"] == pytest.approx(8.0 - driven.true(6)[0])

@@ -46,6 +46,7 @@ def test_frames():
     assert [header["belief"][k] for k in ("free_energy", "accuracy", "complexity", "estimator")] == [
         12.0, 10.0, 2.0, "precise",
     ]  # fmt: skip
+    assert (header["belief"]["probability"], header["belief"]["protection"]) == (0.75, [0.5, 0.25, 0.125])
     assert header["odom"]["x"] == 3.0
     assert header["status"] == {
         "state": "navigating", "reason": "", "distance": 8.0, "goal": {"x": 9.0, "y": 2.0, "yaw": 0.0},

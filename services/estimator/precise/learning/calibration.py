@@ -7,14 +7,13 @@ error of the model.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import ConfigDict
 
 from common.geometry import se2
-from common.robot.ranges import is_surface
-from services.estimator.precise import obstruction
 from services.estimator.precise.gauss_newton import View, difference, polish
 from services.estimator.precise.likelihood import Likelihood
 from services.estimator.precise.motion_model import MotionNoise
@@ -22,11 +21,11 @@ from services.estimator.precise.settings import Settings
 
 if TYPE_CHECKING:
     from common.geometry.se2 import Array
+    from services.estimator.precise.likelihood import Evidence
     from services.estimator.shared.generative_models import Expected, GenerativeModel
 
 EM_STEPS = 30
 PRIOR_BEAMS = 10.0  # pseudo-count of each kind of beam
-MIN_SIGMA_M = 0.003
 CHI2_MEDIAN = 2.366  # median of chi squared with three degrees of freedom
 MAX_POSITION_ERROR_M = 0.3  # larger errors mean that another place was found; the covariance does not describe them
 PROBABILITIES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
@@ -36,14 +35,13 @@ PROBABILITIES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 class Calibration:
     """Results from the held-out scans of a drive; `settings` derives the estimator's parameters from them."""
 
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="ignore")  # older model cards have more fields
+
     likelihood: Likelihood
     motion: MotionNoise
     scans: int  # held out
-    usual: float  # inlier ratio at the reference pose: median over the scans
-    unusual: float  # inlier ratio that 95 of 100 scans exceed
-    late: float  # share of a scan's beams that end behind the expected surface; 90 of 100 scans stay below
-    dependence: float  # variance of a scan's log likelihood, relative to that of independent beams
-    spread: float  # nats, standard deviation of a scan's accuracy
+    usual: float  # share of a scan's beams that end at surfaces of the map: median over the scans
+    unusual: float  # the same share, which 95 of 100 scans exceed
     inflation: float  # factor on the covariance
     floor_position: float  # m, remaining deviation in x and in y: error of the reference poses and of the map
     floor_heading: float  # rad
@@ -53,18 +51,12 @@ class Calibration:
     coverage: tuple[tuple[float, float], ...]  # pairs of a range's cumulative probability and the share of beams below
 
     def settings(self) -> Settings:
-        """Parameters of the estimator, with thresholds relative to the inlier ratio that is usual in this place."""
+        """Parameters of the estimator, with shares of explained beams relative to the usual one in this place."""
         default = Settings()
         return Settings(
-            conclusive_inlier_ratio=0.93 * self.usual,
-            good_inlier_ratio=0.77 * self.usual,
-            tracking_inlier_ratio=0.77 * self.usual,
-            doubtful_inlier_ratio=0.77 * self.usual,
-            min_inlier_ratio=default.min_inlier_ratio * self.usual,
-            inlier_ratio_drop=max(default.inlier_ratio_drop, self.usual - self.unusual),
-            energy_jump_nats=max(default.energy_jump_nats, 3 * self.spread),
-            max_contradicting_ratio=max(default.max_contradicting_ratio, self.late),
-            evidence_error_nats=max(default.evidence_error_nats, self.dependence),
+            conclusive_share=0.93 * self.usual,
+            matching_share=0.77 * self.usual,
+            drop=max(default.drop, self.usual - self.unusual),
             inflation=self.inflation,
             floor_position=self.floor_position,
             floor_heading=self.floor_heading,
@@ -100,64 +92,41 @@ def calibrate(model: GenerativeModel, held_out: Drive, motion: MotionNoise, sigm
     lasers = se2.compose(held_out.poses, held_out.mount)
     expected = model.expect(lasers, held_out.angles)
     likelihood = learn_shares(held_out.ranges, expected, held_out.range_max, Likelihood(sigma))
-    inlier_ratios, accuracies, late, beams = [], [], [], []
-    for k, scan in enumerate(held_out.ranges):
-        view = View(model, likelihood, held_out.mount, held_out.angles, scan, held_out.range_max)
-        one = expected.part(slice(k, k + 1))
-        evidence = likelihood.evaluate(scan, held_out.range_max, one)
-        inlier_ratios.append(float(evidence.inlier_ratio[0]))
-        accuracies.append(float(evidence.accuracy[0]))
-        late.append(obstruction.contradicting_ratio(view, one))
-        beams.append(_energy_of_beams(likelihood, scan, held_out.range_max, one))
-    each = np.concatenate(beams)
-    count = float(np.mean([len(b) for b in beams]))
-    floor, inflation, nees = _pose_precision(model, likelihood, held_out)
+    views = [
+        View(model, likelihood, held_out.mount, held_out.angles, scan, held_out.range_max) for scan in held_out.ranges
+    ]
+    fitted = [polish(view, pose[None]) for view, pose in zip(views, held_out.poses, strict=True)]
+    explained = [float(view.surface_evidence(pose).explained[0]) for view, (pose, _) in zip(views, fitted, strict=True)]
+    energy = sum(view.evidence(pose[None]).accuracy[0] for view, pose in zip(views, held_out.poses, strict=True))
+    floor, inflation, nees = _pose_precision(fitted, held_out.poses)
     return Calibration(
         likelihood=likelihood,
         motion=motion,
         scans=len(held_out.ranges),
-        usual=float(np.median(inlier_ratios)),
-        unusual=float(np.quantile(inlier_ratios, 0.05)),
-        late=float(np.quantile(late, 0.9)),
-        dependence=float(np.var(accuracies) / max(count * np.var(each), 1e-9)),
-        spread=float(np.std(accuracies)),
+        usual=float(np.median(explained)),
+        unusual=float(np.quantile(explained, 0.05)),
         inflation=inflation,
         floor_position=floor[0],
         floor_heading=floor[1],
-        log_likelihood=-float(each.mean()),
+        log_likelihood=-float(energy) / max(1, int((held_out.ranges > -np.inf).sum())),
         nees_median=float(np.median(nees)),
         nees_mean=float(np.mean(nees)),
         coverage=_coverage(likelihood, held_out.ranges, expected, held_out.range_max),
     )
 
 
-def _energy_of_beams(likelihood: Likelihood, scan: Array, range_max: float, expected: Expected) -> Array:
-    """Accuracy -ln p (K,) in nats of each beam that is used."""
-    used = np.flatnonzero(~np.isnan(scan) & (scan > -np.inf))
-    single = type(expected)(
-        expected.ranges[0, used, None], expected.scale[0, used, None], expected.jacobian[0, used, None]
-    )
-    return np.array(
-        [
-            likelihood.evaluate(scan[b : b + 1], range_max, single.part(slice(k, k + 1))).accuracy[0]
-            for k, b in enumerate(used)
-        ]
-    )
-
-
 def _pose_precision(
-    model: GenerativeModel, likelihood: Likelihood, held_out: Drive
+    fitted: list[tuple[Array, Evidence]], references: Array
 ) -> tuple[tuple[float, float], float, Array]:
     """Returns the floors of position (m) and heading (rad), the inflation, and the NEES (N,) with both.
 
-    Compares poses found from one scan with the reference. The floors come from robust deviations. The inflation is the
-    one with which the median of the squared errors is right, so that a few poor reference poses do not decide.
+    Compares poses (1, 3) found from one scan each, and the evidence there, with the reference poses (N, 3). The floors
+    come from robust deviations. The inflation is the one with which the median of the squared errors is right, so that
+    a few poor reference poses do not decide.
     """
     errors, covariances = [], []
-    for pose, scan in zip(held_out.poses, held_out.ranges, strict=True):
-        view = View(model, likelihood, held_out.mount, held_out.angles, scan, held_out.range_max)
-        found, evidence = polish(view, pose[None])
-        error = difference(found, pose[None])[0]
+    for reference, (found, evidence) in zip(references, fitted, strict=True):
+        error = difference(found, reference[None])[0]
         if np.hypot(error[0], error[1]) < MAX_POSITION_ERROR_M:
             inverse = np.linalg.inv(evidence.curvature[0] + np.eye(3))
             errors.append(error + inverse @ evidence.xi[0])
@@ -188,19 +157,6 @@ def _coverage(
     use = np.isfinite(measured) & np.isfinite(expected.scale) & (expected.ranges < range_max)
     below = likelihood.cumulative(measured[use], expected.ranges[use], expected.scale[use], range_max)
     return tuple((p, float((below <= p).mean())) for p in PROBABILITIES)
-
-
-def estimate_noise(ranges: Array, angles: Array) -> float:
-    """The scanner's noise in m, from its scans (N, B) alone.
-
-    Along a straight wall 1/r is a sinusoid of the angle, so u(a - d) + u(a + d) = 2 cos(d) u(a) for u = 1/r; the rest
-    is noise. The median absolute deviation is used because the relation does not hold at edges.
-    """
-    turn = 2 * np.cos(np.diff(angles).mean())
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1 / np.where(is_surface(ranges), ranges, np.nan)
-        bend = (inverse[:, 2:] - turn * inverse[:, 1:-1] + inverse[:, :-2]) * ranges[:, 1:-1] ** 2
-    return max(MIN_SIGMA_M, float(1.4826 * np.nanmedian(np.abs(bend)) / np.sqrt(2 + turn**2)))
 
 
 def learn_shares(measured: Array, expected: Expected, range_max: float, start: Likelihood) -> Likelihood:

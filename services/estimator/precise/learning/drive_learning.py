@@ -14,7 +14,6 @@ from services.estimator.precise.learning.calibration import (
     Calibration,
     Drive,
     calibrate,
-    estimate_noise,
     learn_motion,
 )
 from services.estimator.precise.learning.field_learning import (
@@ -26,6 +25,7 @@ from services.estimator.precise.learning.field_learning import (
     seen_cells,
 )
 from services.estimator.precise.learning.surfaces import Beams
+from services.estimator.precise.noise import estimate_noise
 
 HELD_OUT_EVERY = 5  # every fifth scan is held out, to measure the precision
 MIN_SCANS = 50

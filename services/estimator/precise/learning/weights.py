@@ -103,7 +103,7 @@ def load(path: Path) -> tuple[FieldModel, Array, FieldCard]:
         raise UserError(f"weights {path}: an array does not have the shape that a field needs")
     if not all(np.isfinite(a).all() for a in (phi, scales, places)):
         raise UserError(f"weights {path}: the file contains numbers that are not finite")
-    field = DistanceField(phi.astype(np.float32), card.origin, card.resolution)
+    field = DistanceField(phi.astype(np.float32), card.origin, card.resolution).with_solids(places)
     model = FieldModel(field, scales.astype(np.float64), card.ripple, _seen(tensors, path))
     return model, places.astype(np.float64), card
 

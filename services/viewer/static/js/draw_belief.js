@@ -1,6 +1,6 @@
 // The robot: as it believes, as it is, where else it might be, and where it wants to go.
 
-import { degrees, metres } from "./format.js";
+import { degrees, metres, percent } from "./format.js";
 import { ellipse, niceAtLeast } from "./geometry.js";
 import { label } from "./draw_world.js";
 
@@ -173,14 +173,34 @@ export function drawHeading(ctx, px, py, yaw, length) {
   ctx.stroke();
 }
 
-/** What a belief amounts to, in a few words. */
+/** What a belief amounts to, in a few words, after the probability that it is right. */
 export function describeBelief(belief) {
+  const probability = belief.probability != null ? [percent(belief.probability)] : [];
+  return [...probability, describeState(belief)].filter(Boolean).join(", ");
+}
+
+/** Explains `describeBelief`. */
+export function explainBelief(belief) {
+  const lines = [belief.estimator];
+  if (belief.probability != null) lines.push(`${percent(belief.probability)}: probability that the pose is within 0.2 m and 5° of the truth`);
+  if (belief.protection) {
+    const [x, y, yaw] = belief.protection;
+    lines.push(`Errors exceed ${metres(x)} along the robot, ${metres(y)} across it or ${degrees(yaw, 1)} in one of 10 000 scans each`);
+  }
+  return lines.filter(Boolean).join("\n");
+}
+
+function describeState(belief) {
+  if (belief.state === "tracking" && belief.protection) {
+    const [x, y, yaw] = belief.protection;
+    return `≤ ${metres(Math.max(x, y))}, ≤ ${degrees(yaw, 1)}`;
+  }
   if (belief.state === "tracking" && belief.cov) {
     return `± ${metres(2 * ellipse(belief.cov).major)}, ± ${degrees(2 * Math.sqrt(Math.max(0, belief.cov[8])), 1)}`;
   }
   const rivals = (belief.hypotheses ?? []).filter((one) => one.weight > 0.02).length;
   if (belief.state === "ambiguous") return rivals > 1 ? `${rivals} places match the scan` : "more than one place matches the scan";
-  if (belief.state === "lost") return "the scan does not match this place";
-  if (belief.state === "localising") return "searching the whole map";
+  if (belief.state === "lost") return "the pose may be wrong";
+  if (belief.state === "localising") return "no certain pose yet";
   return belief.estimator ?? "";
 }

@@ -13,6 +13,12 @@ export function degrees(radians, digits = 0) {
   return `${((radians * 180) / Math.PI).toFixed(digits)}°`;
 }
 
+/** A probability in percent, rounded down so that only certainty is shown as 100 %. */
+export function percent(probability) {
+  const digits = probability < 0.99 ? 0 : 2, steps = 10 ** digits;
+  return `${(Math.floor(probability * 100 * steps + 1e-9) / steps).toFixed(digits)} %`;
+}
+
 /** s as minutes and seconds. */
 export function clock(seconds) {
   const whole = Math.max(0, seconds);

@@ -2,7 +2,7 @@
 
 import { Chart, cursor, indexAt } from "./chart.js";
 import { $, h, icon, setText } from "./dom.js";
-import { describeBelief } from "./draw_belief.js";
+import { describeBelief, explainBelief } from "./draw_belief.js";
 import { metres, number } from "./format.js";
 import { STATUS } from "./reasons.js";
 import { ScanPlot } from "./scan_plot.js";
@@ -54,7 +54,7 @@ export class Panels {
     this.badges.estimator(...(belief && !gone("estimator") ? [...(BELIEF[belief.state] ?? ["s-ring", ""]), belief.state, describeBelief(belief)] : none("estimator")));
     const why = status?.reason || (status?.state === "navigating" && status.distance !== null ? `${metres(status.distance)} to go` : "");
     this.badges.controller(...(status && !gone("controller") ? [...(STATUS[status.state] ?? ["s-ring", ""]), status.state, why] : none("controller")));
-    $("estimator-badge").title = belief?.estimator ?? "";
+    $("estimator-badge").title = belief ? explainBelief(belief) : "";
     $("scan-band").hidden = Boolean(frame) && frame.sigma.length === 0;
   }
 

@@ -1,0 +1,269 @@
+"""The last key scans: what the robot has seen since its belief began, in a frame of its own.
+
+Scan matching by the distance of points to lines (Censi, ICRA 2008), with the points of several scans instead of one, so
+that the error does not grow with every scan. It gives the motion where the map does not know the surroundings.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from common.geometry import se2
+from common.geometry.se2 import Array
+from services.estimator.precise.gauss_newton import View, difference, position_information
+from services.estimator.precise.motion_model import Candidate
+from services.estimator.precise.scan_surfaces import MIN_BEAMS
+
+MAX_SCANS = 12  # in the local map
+MIN_DISTANCE_M, MIN_TURN_RAD = 0.25, 0.35  # from the last scan of the local map, before another one is added
+CELL_M = 0.05
+NEIGHBOURS, NEIGHBOUR_RADIUS_M = 10, 0.3  # points from which the normal of a surface is estimated
+# Largest distance to a point's partner, iteration by iteration.
+PARTNER_RADII_M = (0.6, 0.6, 0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.1, 0.1)
+CAUCHY_SCALE_M = 0.02
+MATCHED_RADIUS_M = 0.08  # a point of a matched scan this near a stored one counts as matched
+SEEN_RADIUS_M = 0.15  # the same for a surface that was seen before; beams far away are this far apart
+MIN_POINTS = 20
+MAX_SQUARED_DISTANCE = 4.0  # squared standard deviations of the result from the prior
+PASSED_M = 0.3  # behind a surface, from where a beam has passed through it
+MIN_CHANGED_M, WALKING_SPEED = 0.2, 1.5  # m and m/s
+MIN_SHARE = 0.5  # of a scan's points, that must match the stored scans
+CLEAR_SHARE = 0.8  # if the share is smaller, matching is repeated from other headings
+EXTRA_HEADINGS_RAD = np.array([-0.3, -0.15, 0.15, 0.3])
+DRIFT_PER_SCAN = np.array([0.02, 0.02, 0.005])  # m, m, rad: standard deviation that each key scan contributes
+MIN_INFORMATION_RATIO = 0.02  # a direction with less information, as a share of that across it, is unobserved
+
+
+@dataclass(frozen=True)
+class Match:
+    """Pose of a scan relative to the scans before it."""
+
+    pose: Array  # (3,) base_link, in the frame of the stored scans
+    covariance: Array  # (3, 3) of x, y, yaw, relative to the stored scans
+    share: float  # of the scan's points that were seen before
+    score: float  # mean weight of the scan's points, higher for closer matches
+    degenerate: bool  # the points have almost no information along some direction
+
+
+@dataclass(frozen=True)
+class KeyScan:
+    """A scan of the local map."""
+
+    pose: Array  # (3,) base_link in the local frame
+    view: View
+    seen: npt.NDArray[np.bool_]  # (B,) beams that ended at surfaces of earlier scans
+    change: float  # nats, of what had changed since the scan before
+    log_unknown: float  # ln of the unnormalised probability, before this scan, that the robot is somewhere else
+
+
+@dataclass
+class LocalMap:
+    """The last key scans in a local frame; evidence from the map moves this frame, and all scans with it."""
+
+    mount: Array  # (3,) laser in base_link
+    scans: deque[KeyScan] = field(default_factory=lambda: deque(maxlen=MAX_SCANS))
+    frame: Array = field(default_factory=lambda: np.zeros(3))  # (3,) local frame in map
+    covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))  # of the pose at the last key scan
+    _tree: cKDTree | None = None
+    _points: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    _normals: Array | None = None
+
+    def clear(self) -> None:
+        """Removes all scans."""
+        self.scans.clear()
+        self._tree = None
+
+    def local(self, pose: Array) -> Array:
+        """A pose (3,) in map, in the local frame."""
+        return se2.between(self.frame, pose)
+
+    def is_new_view(self, local: Array) -> bool:
+        """Whether ``local`` (3,) is so far from the last key scan that the scan there becomes another one."""
+        if not self.scans:
+            return True
+        off = se2.between(self.scans[-1].pose, local)
+        return bool(np.hypot(off[0], off[1]) >= MIN_DISTANCE_M or abs(off[2]) >= MIN_TURN_RAD)
+
+    def add(self, key: KeyScan, pose: Array, covariance: Array) -> None:
+        """Adds a key scan, taken at ``pose`` (3,) in map with ``covariance`` (3, 3)."""
+        self.scans.append(key)
+        self.frame = se2.compose(pose, se2.inverse(key.pose))
+        self.covariance = covariance + np.diag(DRIFT_PER_SCAN**2)
+        self._tree = None
+
+    def seen(self, local: Array, view: View) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+        """Masks (B,) of the beams of a scan at ``local`` (3,) that are no new evidence.
+
+        The first: beams that end at surfaces of the stored scans. Beams without return have no end, and count as such
+        once there are stored scans. The second: beams that end where a stored scan saw through. What is there has come
+        since then, wherever the robot may be.
+        """
+        seen, arrived = np.zeros(len(view.ranges), np.bool_), np.zeros(len(view.ranges), np.bool_)
+        if not self.scans or not len(self._tree_of_points().data):
+            return seen, arrived
+        placed = se2.transform(se2.compose(local, self.mount), view.points)
+        distance, _ = self._tree_of_points().query(placed, distance_upper_bound=SEEN_RADIUS_M)
+        near = np.isfinite(distance)
+        seen[:] = ~view.returned
+        seen[view.returned] = near
+        free = np.zeros(len(near), np.bool_)
+        free[~near] = self._in_free_space(placed[~near])
+        arrived[view.returned] = free
+        return seen, arrived
+
+    def _in_free_space(self, points: Array) -> npt.NDArray[np.bool_]:
+        """Mask (K,) of local points (K, 2) in m through which a stored scan saw."""
+        free = np.zeros(len(points), np.bool_)
+        for key in self.scans:
+            ranges, beam, inside = _beams_towards(key.view, se2.compose(key.pose, self.mount), points)
+            free |= inside & (_nearest_of_neighbours(key.view.ranges, beam) > ranges + SEEN_RADIUS_M)
+        return free
+
+    def count_changes(self, last: tuple[Array, View], now: tuple[Array, View], period: float) -> int:
+        """Number of things that vanished or appeared between two scans, each with its local pose (3,).
+
+        One thing is as wide as somebody walking can have uncovered or covered in ``period`` s.
+        """
+        width = MIN_CHANGED_M + WALKING_SPEED * period
+        return self._count_passed(last, now, width) + self._count_passed(now, last, width)
+
+    def _count_passed(self, seen: tuple[Array, View], by: tuple[Array, View], width: float) -> int:
+        """How many times ``width`` m of surfaces of one scan another scan passes through."""
+        points = se2.transform(se2.compose(seen[0], self.mount), seen[1].points)
+        ranges, beam, inside = _beams_towards(by[1], se2.compose(by[0], self.mount), points)
+        passed = inside & (_nearest_of_neighbours(by[1].ranges, beam) > ranges + PASSED_M)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], passed.astype(int), [0]])))
+        first, last = edges[::2], edges[1::2] - 1
+        many = last - first + 1 >= MIN_BEAMS
+        widths = np.hypot(*(points[last[many]] - points[first[many]]).T) if len(points) else np.zeros(0)
+        return int((widths[widths > width] / width).sum())
+
+    def match(self, starts: Array, points: Array, prior: Candidate) -> Match | None:
+        """Returns the pose at which a scan continues the stored ones; None if it does not.
+
+        ``starts`` (N, 3) and ``prior`` are poses in map, ``points`` (K, 2) m in the laser frame.
+        """
+        if not self.scans or len(points) < MIN_POINTS:
+            return None
+        turn = rotation(-self.frame[2])
+        covariance = turn @ prior.covariance @ turn.T
+        local_prior = replace(prior, mean=self.local(prior.mean), covariance=covariance)
+        found = self._best(self.local(starts), points, local_prior)
+        if found is None or found.share < CLEAR_SHARE:
+            turned = np.repeat(self.local(starts[:1]), len(EXTRA_HEADINGS_RAD), axis=0)
+            turned[:, 2] = se2.wrap(turned[:, 2] + EXTRA_HEADINGS_RAD)
+            again = self._best(turned, points, local_prior)
+            if again is not None and (found is None or again.score > found.score):
+                found = again
+        return None if found is None or found.share < MIN_SHARE or found.degenerate else found
+
+    def candidate(self, match: Match) -> Candidate:
+        """The pose in map that a match gives."""
+        turn = rotation(self.frame[2])
+        covariance = self.covariance + turn @ match.covariance @ turn.T
+        return Candidate("recent scans", se2.compose(self.frame, match.pose), covariance, 1.0)
+
+    def _best(self, starts: Array, points: Array, prior: Candidate) -> Match | None:
+        information = np.asarray(np.linalg.inv(prior.covariance), float)
+        found = [self._descend(start, points, prior.mean, information) for start in starts]
+        plausible = [
+            each for each in found if each is not None and prior.squared_distance(each.pose) < MAX_SQUARED_DISTANCE
+        ]
+        return max(plausible, key=lambda each: each.score, default=None)
+
+    def _tree_of_points(self) -> cKDTree:
+        """Index of the points of all scans; kept until the scans change."""
+        if self._tree is None:
+            placed = [se2.transform(se2.compose(each.pose, self.mount), each.view.points) for each in self.scans]
+            self._points, self._normals = _average_in_cells(np.concatenate(placed)), None
+            self._tree = cKDTree(self._points)
+        return self._tree
+
+    def _normals_of_points(self) -> Array:
+        """Normals (K, 2) of the surfaces at all points; 0 where there are too few neighbours."""
+        if self._normals is None:
+            _, neighbour = self._tree_of_points().query(
+                self._points, NEIGHBOURS, distance_upper_bound=NEIGHBOUR_RADIUS_M
+            )
+            exists = neighbour < len(self._points)
+            around = self._points[np.where(exists, neighbour, np.arange(len(neighbour))[:, None])]
+            off = around - around.mean(axis=1, keepdims=True)
+            _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))
+            self._normals = np.asarray(vectors[:, :, 0] * (exists.sum(axis=1) > 2)[:, None])
+        return self._normals
+
+    def _descend(self, start: Array, points: Array, mean: Array, information: Array) -> Match | None:
+        tree, normals = self._tree_of_points(), self._normals_of_points()
+        pose, H = np.array(start), np.eye(3)
+        for radius in PARTNER_RADII_M:
+            placed = se2.transform(se2.compose(pose, self.mount), points)
+            distance, partner = tree.query(placed, distance_upper_bound=radius)
+            paired = np.isfinite(distance)
+            if paired.sum() < MIN_POINTS:
+                return None
+            normal, target = normals[partner[paired]], self._points[partner[paired]]
+            error = np.einsum("ni,ni->n", normal, placed[paired] - target)
+            arm = placed[paired] - pose[:2]
+            J = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
+            weight = 1 / (1 + (error / CAUCHY_SCALE_M) ** 2)
+            H = (J.T * weight) @ J
+            to_prior = difference(mean[None], pose[None])[0]
+            step = np.linalg.solve(
+                H + CAUCHY_SCALE_M**2 * information,
+                CAUCHY_SCALE_M**2 * information @ to_prior - (J.T * weight) @ error,
+            )
+            pose = pose + step
+            pose[2] = se2.wrap(pose[2])
+        placed = se2.transform(se2.compose(pose, self.mount), points)
+        distance, partner = tree.query(placed)
+        error = np.einsum("ni,ni->n", normals[partner], placed - self._points[partner])
+        score = ((distance < 2 * MATCHED_RADIUS_M) / (1 + (error / CAUCHY_SCALE_M) ** 2)).mean()
+        covariance = np.asarray(CAUCHY_SCALE_M**2 * np.linalg.inv(H + 1e-6 * np.eye(3)), float)
+        return Match(pose, covariance, float((distance < MATCHED_RADIUS_M).mean()), float(score), _is_degenerate(H))
+
+
+def _average_in_cells(points: Array) -> Array:
+    """Replaces points (K, 2) by their mean in every cell of `CELL_M`.
+
+    The means are less noisy, and the neighbours used for a normal lie farther apart than the noise.
+    """
+    column, row = np.floor(points / CELL_M).astype(np.int64).T
+    _, cell = np.unique(column * 2**32 + row, return_inverse=True)
+    count = np.bincount(cell)
+    return np.stack([np.bincount(cell, points[:, k]) / count for k in (0, 1)], axis=-1)
+
+
+def _is_degenerate(H: Array) -> bool:
+    low, high = np.linalg.eigvalsh(position_information(H))
+    return bool(low < MIN_INFORMATION_RATIO * high)
+
+
+def _beams_towards(
+    view: View, laser: Array, points: Array
+) -> tuple[Array, npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
+    """Distances (K,) in m of points (K, 2) from a laser pose, their beams (K,), and whether they are in its view."""
+    local = se2.transform(se2.inverse(laser), points)
+    first, last, count = view.angles[0], view.angles[-1], len(view.angles)
+    increment = abs(last - first) / max(1, count - 1)
+    turned = np.sign(last - first) * (np.arctan2(local[:, 1], local[:, 0]) - first) % (2 * np.pi)
+    beam = np.round(turned / max(increment, 1e-9)).astype(np.intp)
+    inside = (beam > 0) & (beam < count - 1)
+    return np.hypot(*local.T), np.where(inside, beam, 0), inside
+
+
+def _nearest_of_neighbours(ranges: Array, beam: npt.NDArray[np.intp]) -> Array:
+    """The smallest (K,) of the ranges (B,) at each beam (K,) and its two neighbours; the first and last have one."""
+    around = np.stack([ranges[np.clip(beam + k, 0, len(ranges) - 1)] for k in (-1, 0, 1)])
+    return np.asarray(np.where(np.isnan(around), -np.inf, around).min(axis=0))
+
+
+def rotation(yaw: float) -> Array:
+    """Matrix (3, 3) that rotates a covariance of x, y, yaw by ``yaw`` rad."""
+    matrix = np.eye(3)
+    matrix[:2, :2] = se2.rotate(float(yaw), np.eye(2)).T
+    return matrix

@@ -1,0 +1,131 @@
+"""Splits a scan into the surfaces that it shows, and predicts each range from its neighbours on the same surface.
+
+A surface that the map lacks is as smooth as one in the map. It surprises only where it begins. So a new cupboard is one
+surprise, however many beams it stops.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numba
+import numpy as np
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from common.geometry.se2 import Array
+    from services.estimator.precise.likelihood import Likelihood
+
+MAX_SIGMAS = 4.0  # a range farther from its prediction begins another surface
+CORNER_SIGMAS = 2.5  # a range farther from its prediction may lie behind a corner, where the direction is unknown again
+CORNER = 0.1  # probability of this
+MAX_SLOPE = 2.0  # standard deviation of dr / (r d angle) where a surface begins
+CURVATURE = 0.2  # standard deviation of the change of slope per radian of the scan, as a share of 1 / r
+CORNER_M = 0.2  # typical jump of the range from one surface to the next, for half of the jumps
+FAR_M = 10.0  # typical distance over which the other half is spread
+NO_RETURN = 0.05  # probability that a surface begins from which no beam returns
+CHANGES = 1.0  # of what is seen per radian of the scan, without the start of another surface
+MIN_BEAMS = 3
+OUTLIER = 0.01  # share of single beams with arbitrary ranges
+
+jit = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@dataclass(frozen=True)
+class ScanSurfaces:
+    """The surfaces of one scan."""
+
+    density: Array  # (B,) nats, ln p(range | the beams before it)
+    starts: npt.NDArray[np.bool_]  # (B,) whether another surface begins at this beam
+    ideal: Array  # (B,) nats, ln p(range) if the surface had been known
+    small: npt.NDArray[np.bool_]  # (B,) beams on surfaces of less than `MIN_BEAMS` beams: often dust, or mixed pixels
+    change: float  # probability that something else is seen from one beam to the next on the same surface
+
+    @classmethod
+    def of(cls, ranges: Array, angles: Array, likelihood: Likelihood) -> ScanSurfaces:
+        """Splits a scan (B,) m along ``angles`` (B,) rad."""
+        count = len(ranges)
+        density, starts, ideal = np.zeros(count), np.zeros(count, np.bool_), np.zeros(count)
+        _split(ranges, angles, likelihood.sigma, likelihood.relative, density, starts, ideal)
+        increment = abs(float(angles[-1] - angles[0])) / max(1, count - 1)
+        surface = np.cumsum(starts)
+        small = np.bincount(surface)[surface] < MIN_BEAMS if count else starts
+        return cls(density, starts, ideal, small, min(0.5, CHANGES * increment))
+
+
+@jit
+def _continues(r: float, turn: float, u: float, du: float, variance: float) -> bool:
+    """Whether the next range r (m) lies on the surface with u = 1 / r and its derivative at the beam before."""
+    error = 1 / r - math.cos(turn) * u - math.sin(turn) * du
+    return error * error < MAX_SIGMAS**2 * variance
+
+
+@jit
+def _split(
+    ranges: Array,
+    angles: Array,
+    sigma: float,
+    relative: float,
+    density: Array,
+    starts: npt.NDArray[np.bool_],
+    ideal: Array,
+) -> None:
+    """Fills the fields of `ScanSurfaces`.
+
+    A Kalman filter follows u = 1 / r and its derivative u' by the angle. Along a straight wall u'' = -u exactly.
+    """
+    u, du, p00, p01, p11 = 0.0, 0.0, 0.0, 0.0, 0.0
+    last, returned = -1, False
+    for b in range(ranges.shape[0]):
+        r = ranges[b]
+        if np.isnan(r) or r == -np.inf:
+            continue
+        if r == np.inf:
+            starts[b] = returned or last < 0
+            density[b] = math.log(NO_RETURN if starts[b] else 1 - NO_RETURN)
+            last, returned = b, False
+            continue
+        s = math.sqrt(sigma * sigma + relative * relative * r * r)
+        m = s / (r * r)  # standard deviation of 1 / r
+        peak = 1 / math.sqrt(2 * math.pi * s * s)
+        starts[b] = True
+        if returned:
+            turn = angles[b] - angles[last]
+            c, n = math.cos(turn), math.sin(turn)
+            u, du = c * u + n * du, c * du - n * u
+            a00 = c * c * p00 + 2 * c * n * p01 + n * n * p11
+            a01 = (c * c - n * n) * p01 + c * n * (p11 - p00)
+            a11 = n * n * p00 - 2 * c * n * p01 + c * c * p11 + (CURVATURE * u) ** 2 * abs(turn)
+            variance, error = a00 + m * m, 1 / r - u
+            square = error * error / variance
+            if u > 1e-3 and square < MAX_SIGMAS**2:
+                # The direction of a surface costs nothing, because in a building it is that of other surfaces.
+                density[b] = math.log((1 - OUTLIER) * math.exp(-0.5 * square) * peak + OUTLIER / FAR_M)
+                ideal[b] = density[b]
+                k0, k1 = a00 / variance, a01 / variance
+                u, du = u + k0 * error, du + k1 * error
+                p00, p01, p11 = (1 - k0) * a00, (1 - k0) * a01, a11 - k1 * a01
+                if square > CORNER_SIGMAS**2:
+                    p11 += (MAX_SLOPE * u) ** 2
+                    density[b] += math.log(CORNER)
+                starts[b] = False
+            elif b + 1 < ranges.shape[0] and _continues(ranges[b + 1], angles[b + 1] - angles[b], u, du, variance):
+                # A single beam that met something else, such as dust, is no surface.
+                density[b] = ideal[b] = math.log(OUTLIER / FAR_M)
+                starts[b] = False
+                p00, p01, p11 = a00, a01, a11
+            else:
+                wide = CORNER_M * CORNER_M + s * s
+                jump = r - 1 / u if u > 1e-3 else np.inf
+                near = math.exp(-0.5 * jump * jump / wide) / math.sqrt(2 * math.pi * wide)
+                density[b] = math.log(0.5 * near + 0.5 / FAR_M)
+        else:
+            density[b] = math.log(1 / FAR_M)
+        if starts[b]:
+            ideal[b] = math.log((1 - OUTLIER) * peak) - 0.5
+            u, du = 1 / r, 0.0
+            p00, p01, p11 = m * m, 0.0, (MAX_SLOPE * u) ** 2
+        last, returned = b, True

@@ -1,0 +1,253 @@
+"""Evidence of a scan for poses, by surfaces instead of by beams.
+
+Each beam is in one of four states: it ends at the surface that the map shows, at something new in front of it, at
+something behind it that the map lacks, or at the next surface of the map behind one that was removed. The states are a
+Markov chain along the scan, since neighbouring beams mostly meet the same surface. The forward algorithm sums over all
+sequences of states, and the backward algorithm gives the probability of each state (Rabiner 1989, section III).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numba
+import numpy as np
+
+from services.estimator.precise.scan_surfaces import FAR_M, NO_RETURN, OUTLIER
+
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
+    from common.geometry.se2 import Array
+    from services.estimator.precise.likelihood import Likelihood
+    from services.estimator.precise.scan_surfaces import ScanSurfaces
+    from services.estimator.shared.generative_models import Expected
+
+
+# Probability of each state for a beam that does not end where the map has a surface; the first is never used.
+CHANGED = np.array([0.0, 0.6, 0.2, 0.2])
+COINCIDENCE = 0.3  # probability that something new is within `NEAR_SIGMAS` of a surface of the map
+NEAR_SIGMAS = 3.0
+PLAUSIBLE_SIGMAS = 2.0  # a larger error makes it less plausible that a beam ends at a surface of the map
+PLAUSIBLE_MEAN = 0.04  # nats, mean of what Gaussian errors lose by this
+
+jit = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@dataclass(frozen=True)
+class SurfaceEvidence:
+    """Evidence of one scan at N poses."""
+
+    log_likelihood: Array  # (N,) nats, of the beams that are counted
+    explained: Array  # (N,) expected share of the beams that end at a surface of the map
+    weights: Array  # (N, B) probability that a beam ends at the first surface of the map
+
+    @classmethod
+    def of(
+        cls,
+        ranges: Array,
+        range_max: float,
+        expected: Expected,
+        behind: Array,
+        surfaces: ScanSurfaces,
+        likelihood: Likelihood,
+        changed: float,
+        extra_sigma: float = 0.0,
+        skip: npt.NDArray[np.bool_] | None = None,
+    ) -> SurfaceEvidence:
+        """Compares a scan (B,) m with what is expected.
+
+        ``behind`` (N, B) m are the ranges to the next surface behind the expected one. Beams in ``skip`` (B,) do not
+        count as evidence, but are explained all the same. ``changed`` is the share of surfaces that the map does not
+        show as they are.
+        """
+        count = len(expected.ranges)
+        total, explained, weights = np.empty(count), np.empty(count), np.empty(expected.ranges.shape)
+        skipped = np.zeros(len(ranges), np.bool_) if skip is None else skip
+        sigma = math.hypot(likelihood.sigma, extra_sigma)
+        prior = changed * CHANGED
+        prior[0] = 1 - changed
+        _sum(
+            ranges,
+            expected.ranges,
+            behind,
+            expected.scale,
+            sigma,
+            likelihood.relative,
+            range_max,
+            surfaces.density,
+            surfaces.starts,
+            skipped,
+            prior,
+            surfaces.change,
+            total,
+            explained,
+            weights,
+        )
+        return cls(total, explained, weights)
+
+
+@jit
+def _log_density(error: float, variance: float, own: float, keep: float) -> float:
+    """Log density of a range that differs by ``error`` m from that of a surface of the map.
+
+    Beyond the first beam on a surface, the beams before it predict the range better than a map with errors does
+    (density ``own``). The map only says whether it is plausible.
+    """
+    square = error * error / variance
+    if keep == 0.0:
+        return math.log((1 - OUTLIER) * math.exp(-0.5 * square) / math.sqrt(2 * math.pi * variance) + OUTLIER / FAR_M)
+    excess = 0.5 * max(0.0, square - PLAUSIBLE_SIGMAS**2) - PLAUSIBLE_MEAN
+    return float(max(own - excess, math.log(OUTLIER / FAR_M)))
+
+
+@jit
+def _emit(
+    r: float,
+    surface: float,
+    behind: float,
+    scale: float,
+    sigma: float,
+    relative: float,
+    range_max: float,
+    own: float,
+    keep: float,
+    log_densities: Array,
+) -> None:
+    """Fills the log density (4,) in nats of a range in each state.
+
+    ``own`` is that on a surface that the map lacks; ``keep`` is the probability of the same state as at the beam
+    before, 0 where a surface begins.
+    """
+    outlier = math.log(OUTLIER / FAR_M)
+    log_densities[:] = outlier
+    if scale == np.inf:  # the map knows nothing beyond
+        if r > surface:
+            log_densities[:] = own
+        log_densities[1] = own
+        return
+    if r == np.inf:
+        log_densities[0] = math.log(NO_RETURN if surface < range_max else 1 - NO_RETURN)
+        log_densities[1] = log_densities[2] = own
+        log_densities[3] = math.log(NO_RETURN if behind < range_max else 1 - NO_RETURN)
+        return
+    error, near = -np.inf, False
+    model = scale * scale
+    if surface < range_max:
+        noise = sigma * sigma + relative * relative * surface * surface
+        error = r - surface
+        near = error * error < NEAR_SIGMAS**2 * (noise + model)
+        log_densities[0] = _log_density(error, noise + model, own, keep)
+    coincidence = math.log(COINCIDENCE) if near else 0.0
+    if error < 0 or near:
+        log_densities[1] = own + coincidence
+    if error > 0 or near:
+        log_densities[2] = own + coincidence
+    if behind < range_max:
+        noise = sigma * sigma + relative * relative * behind * behind
+        log_densities[3] = _log_density(r - behind, noise + model, own, keep)
+
+
+@jit
+def _sum(
+    ranges: Array,
+    expected: Array,
+    behind: Array,
+    scale: Array,
+    sigma: float,
+    relative: float,
+    range_max: float,
+    own: Array,
+    starts: npt.NDArray[np.bool_],
+    skip: npt.NDArray[np.bool_],
+    prior: Array,
+    change: float,
+    total: Array,
+    explained: Array,
+    weights: Array,
+) -> None:
+    """Fills the fields of `SurfaceEvidence`."""
+    used = np.flatnonzero(~np.isnan(ranges) & (ranges > -np.inf))
+    size, states = len(used), len(prior)
+    forward, emitted, keep = np.empty((size, states)), np.empty((size, states)), np.empty(size)
+    edge = np.zeros(size, np.bool_)  # next to where a surface begins
+    for n in range(size):
+        keep[n] = 0.0 if n == 0 or starts[used[n]] else 1 - change
+        if keep[n] == 0.0:
+            edge[max(0, n - 1) : n + 1] = True
+    for k in range(expected.shape[0]):
+        total[k], explained[k] = 0.0, 0.0
+        weights[k] = 0.0
+        for n in range(size):
+            b = used[n]
+            at = _nearest_beam(ranges[b], expected[k], b) if edge[n] else b
+            _emit(
+                ranges[b],
+                expected[k, at],
+                behind[k, at],
+                scale[k, at],
+                sigma,
+                relative,
+                range_max,
+                own[b],
+                keep[n],
+                emitted[n],
+            )
+            norm = _step_forward(forward, emitted, prior, keep, n)
+            if not skip[b]:
+                total[k] += norm
+        backward = np.ones(states)
+        for n in range(size - 1, -1, -1):
+            b = used[n]
+            if n < size - 1:
+                _step_backward(backward, emitted[n + 1], prior, keep[n + 1])
+            if scale[k, b] < np.inf:
+                norm = (forward[n] * backward).sum()
+                weights[k, b] = forward[n, 0] * backward[0] / norm
+                explained[k] += (weights[k, b] + forward[n, 3] * backward[3] / norm) / size
+
+
+@jit
+def _nearest_beam(r: float, expected: Array, b: int) -> int:
+    """The beam among b and two neighbours on each side for which the map expects the range nearest to r (m).
+
+    The map has edges at places known to a beam or two only.
+    """
+    best = b
+    for other in (b - 1, b + 1, b - 2, b + 2):
+        if 0 <= other < expected.shape[0] and abs(r - expected[other]) < abs(r - expected[best]):
+            best = other
+    return best
+
+
+@jit
+def _step_forward(forward: Array, emitted: Array, prior: Array, keep: Array, n: int) -> float:
+    """Fills the probabilities forward[n] (4,) of the states, given the beams up to the n-th.
+
+    emitted[n] are log densities, and become densities relative to the largest one. Returns the log density of the n-th
+    beam given those before it.
+    """
+    top, norm = emitted[n].max(), 0.0
+    for i in range(len(prior)):
+        emitted[n, i] = math.exp(emitted[n, i] - top)
+        forward[n, i] = (1 - keep[n]) * prior[i] * emitted[n, i]
+        if keep[n] > 0.0:
+            forward[n, i] += keep[n] * forward[n - 1, i] * emitted[n, i]
+        norm += forward[n, i]
+    forward[n] /= norm
+    return math.log(norm) + top
+
+
+@jit
+def _step_backward(backward: Array, emitted: Array, prior: Array, keep: float) -> None:
+    """Updates the likelihood (4,) of the beams that follow, for each state, by one more beam."""
+    fresh, norm = 0.0, 0.0
+    for i in range(len(prior)):
+        backward[i] *= emitted[i]
+        fresh += (1 - keep) * prior[i] * backward[i]
+    for i in range(len(prior)):
+        backward[i] = keep * backward[i] + fresh
+        norm += backward[i]
+    backward /= norm

@@ -1,0 +1,183 @@
+"""What the estimator believes where the surroundings differ from the map, and after the robot was carried away."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.geometry import se2
+from common.geometry.world import World, load_world
+from lab.accuracy import tasks
+from lab.accuracy.scenes import Scene
+from services.estimator.precise.estimator import PreciseEstimator
+from services.estimator.precise.global_seeds import Seeds, thin_places
+from services.estimator.precise.hypotheses import NEAR_HEADING_RAD, NEAR_POSITION_M, probability_of_being_near
+from services.estimator.shared.generative_models import Expected, RayCaster
+
+BEAMS, RATE = 271, 15.0
+HALL = World(
+    name="hall",
+    boundary=[(0, 0), (16, 0), (16, 5), (0, 5)],
+    obstacles=[
+        {"box": {"center": (2.5, 4.2), "size": (0.8, 0.5), "yaw_deg": 15}},
+        {"circle": {"center": (5.5, 0.8), "radius": 0.3}},
+        {"box": {"center": (9.5, 4.3), "size": (0.7, 0.7), "yaw_deg": 40}},
+        {"circle": {"center": (12.0, 0.9), "radius": 0.4}},
+        {"box": {"center": (14.6, 2.6), "size": (0.5, 1.2)}},
+    ],
+)
+LEARNED = 8.0  # m: the part of HALL with smaller x was learned
+OFFICE = load_world("office")
+FURNITURE = {"desk-1", "cabinet", "plant", "table", "copier", "meeting-table", "whiteboard", "coffee-table", "column"}
+CORRIDOR_Y = 4.0  # m, along which the office is driven through
+CLOSE = np.diag([0.01, 0.01, 0.01])
+
+
+@dataclass(frozen=True)
+class HalfLearned:
+    """A model of the hall that was learned only in its western half."""
+
+    world: World = HALL
+    ripple: float = 0.0
+
+    def expect(self, lasers, angles):
+        whole = RayCaster(self.world).expect(lasers, angles)
+        ahead = np.cos(lasers[:, 2:] + angles)
+        begins = np.where(ahead > 0, np.maximum(LEARNED - lasers[:, :1], 0) / np.maximum(ahead, 1e-9), np.inf)
+        begins = np.where(lasers[:, :1] > LEARNED, 0.0, begins)
+        unknown = whole.ranges > begins
+        return Expected(
+            np.where(unknown, begins, whole.ranges),
+            np.where(unknown, np.inf, whole.scale),
+            np.where(unknown[..., None], 0.0, whole.jacobian),
+        )
+
+    def expect_behind(self, lasers, angles, ranges):
+        return RayCaster(self.world).expect_behind(lasers, angles, ranges)
+
+
+def estimator(mapped, real=None, model=None, keep=lambda places: places[:, 0] > -np.inf):
+    """An estimator with a map, and a scene in the real world."""
+    scene, model = Scene.of(real or mapped, BEAMS, 3), model or RayCaster(mapped)
+    places = thin_places(mapped.sample_free(4000, np.random.default_rng(0), 0.05), 0.3)
+    return PreciseEstimator(model, Seeds.at(model, places[keep(places)]), np.array(scene.scanner.mount)), scene
+
+
+def drive(made, scene, path, first=0):
+    clean = scene.clean(np.asarray(path))
+    return [made.update(scene.observe(scan, (first + k) / RATE)) for k, scan in enumerate(clean)]
+
+
+def moved(world, names, seed):
+    """The world with the named obstacles at other places, but not in the corridor."""
+    rng, obstacles = np.random.default_rng(seed), []
+    for each in world.obstacles:
+        if each.name in names:
+            x, y = next(place for place in world.sample_free(100, rng, 0.5) if abs(place[1] - CORRIDOR_Y) > 1)
+            obstacles.append({"box": {"center": (x, y), "size": (0.7, 0.5), "yaw_deg": rng.uniform(0, 90)}})
+        else:
+            obstacles.append(each)
+    return World(name="changed", boundary=world.boundary, obstacles=obstacles)
+
+
+def test_standing_robot():
+    """The scans of one place are no new evidence: a hundred of them leave the weights as the first one did."""
+    made, scene = estimator(OFFICE)
+    path = np.tile([5.5, CORRIDOR_Y, 0.5], (100, 1))
+    made.restart(path[0], CLOSE)
+    found = drive(made, scene, path[:1])
+    evidence = [mode.log_evidence for mode in made.modes]
+    found += drive(made, scene, path[1:], 1)
+    assert [mode.log_evidence for mode in made.modes] == evidence
+    assert found[-1].probability == pytest.approx(found[0].probability, abs=1e-3)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_changed_furniture(seed):
+    made, scene = estimator(OFFICE, moved(OFFICE, FURNITURE, seed))
+    x = np.linspace(1.5, 16.0, 220)
+    path = np.column_stack([x, np.full(len(x), CORRIDOR_Y), 0.6 * np.sin(x)])
+    made.restart(path[0], CLOSE)
+    found = drive(made, scene, path)
+    assert all(tasks.is_at(posterior.pose, pose) for posterior, pose in zip(found, path, strict=True))
+
+
+def test_wrong_map():
+    made, scene = estimator(load_world("maze"), OFFICE)
+    for start in scene.poses(2):
+        made.restart()
+        found = drive(made, scene, scene.path(0.7, start=start))
+        assert "tracking" not in {posterior.state for posterior in found}
+
+
+@pytest.fixture(scope="module")
+def driven():
+    """An estimator after a drive from the learned half to the other one, its scene, and the path."""
+    made, scene = estimator(HALL, model=HalfLearned(), keep=lambda places: places[:, 0] < LEARNED)
+    x = np.linspace(3.0, 11.5, 170)
+    path = np.column_stack([x, 2.5 + 0.3 * np.sin(x), 0.5 * np.sin(0.7 * x)])
+    made.restart(path[0], CLOSE)
+    found = drive(made, scene, path)
+    assert max(np.hypot(*(p.pose - pose)[:2]) for p, pose in zip(found, path, strict=True)) < 0.15
+    return made, scene, path
+
+
+@pytest.mark.parametrize("kidnapped", [False, True])
+def test_unlearned_room(driven, kidnapped):
+    made, scene, path = copy.deepcopy(driven)
+    then = np.tile([2.0, 1.5, 2.0], (20, 1)) if kidnapped else path[::-1]
+    found = drive(made, scene, then, len(path))
+    assert np.hypot(*(found[-1].pose - then[-1])[:2]) < 0.02
+    # The robot that was carried sees a quarter of the hall, and stands still: too little to be sure.
+    assert found[-1].state == ("lost" if kidnapped else "tracking")
+
+
+def test_crowd_and_kidnapping():
+    """People who gather around the robot and walk past do not contradict the pose; another place does."""
+    made, scene = estimator(load_world("maze"))
+    people = np.repeat(np.random.default_rng(5).uniform(0.5, 1.0, 12), 20)
+    here, there = scene.poses(2)
+    made.restart(here, CLOSE / 100)
+    clean = scene.clean(here[None])[0]
+    for k in range(45):
+        ranges = clean.copy()
+        crowd = people[: int(min(0.75, 0.02 * k) * len(clean))]
+        hidden = (3 * k + np.arange(len(crowd))) % len(clean)
+        ranges[hidden] = np.minimum(ranges[hidden], crowd)
+        posterior = made.update(scene.observe(ranges, k / RATE))
+        assert tasks.is_at(posterior.pose, here), k
+    found = drive(made, scene, np.tile(there, (5, 1)), 45)
+    assert np.hypot(*(found[-1].pose - there)[:2]) < 0.02
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=20, deadline=None)
+def test_probability_of_being_near(seed):
+    """Exact where the covariance is round, and never too high: the truth is sampled around the hypothesis."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(0, 1, (3, 3)) * np.exp(rng.uniform(-4, 0))
+    sigma, yaw = np.exp(rng.uniform(-3, 0)), np.exp(rng.uniform(-4, -1))
+    for covariance, exact in ((root @ root.T + 1e-6 * np.eye(3), False), (np.diag([sigma, sigma, yaw]) ** 2, True)):
+        off = rng.multivariate_normal(np.zeros(3), covariance, 20_000)
+        near = (np.hypot(off[:, 0], off[:, 1]) < NEAR_POSITION_M) & (np.abs(off[:, 2]) < NEAR_HEADING_RAD)
+        found = probability_of_being_near(covariance)
+        assert found < near.mean() + 0.02
+        if exact:
+            assert found == pytest.approx(near.mean(), abs=0.02)
+
+
+def test_heading_of_a_kidnapping():
+    """A robot that was turned on the spot is found again."""
+    made, scene = estimator(OFFICE)
+    here = np.array([7.5, CORRIDOR_Y, 0.0])
+    made.restart(here, CLOSE)
+    drive(made, scene, np.tile(here, (3, 1)))
+    turned = np.array([*here[:2], se2.wrap(2.5)])
+    found = drive(made, scene, np.tile(turned, (10, 1)), 3)
+    assert tasks.is_at(found[-1].pose, turned)
+    assert found[-1].state == "tracking"

@@ -1,0 +1,127 @@
+"""The local map: scan matching, surfaces seen before, and poses in its own frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.geometry import se2
+from common.geometry.world import World
+from lab.accuracy.scenes import Scene
+from services.estimator.precise.gauss_newton import View
+from services.estimator.precise.likelihood import Likelihood
+from services.estimator.precise.local_map import MIN_DISTANCE_M, KeyScan, LocalMap
+from services.estimator.precise.motion_model import Candidate
+from services.estimator.shared.generative_models import RayCaster
+from tests.estimator.models import ROOM
+from tests.estimator.precise.test_changes import HALL
+
+HERE = np.array([3.0, 1.5, 0.4])
+STEP = np.diag([0.2, 0.2, 0.3]) ** 2
+
+
+def view(scene, pose):
+    seen = scene.observe(scene.clean(np.array(pose)[None])[0], 0.0)
+    return View(RayCaster(HALL), Likelihood(), np.zeros(3), seen.angles, seen.ranges, seen.range_max)
+
+
+def local_map(scene, *poses, frame=(0.0, 0.0, 0.0)):
+    """A local map whose frame lies at ``frame`` in map, with a key scan at each of the poses in map."""
+    made = LocalMap(np.array(scene.scanner.mount), frame=np.array(frame))
+    for pose in poses:
+        scan = view(scene, pose)
+        key = KeyScan(made.local(np.array(pose)), scan, np.zeros(len(scan.ranges), np.bool_), 0.0, 0.0)
+        made.add(key, np.array(pose), np.diag([1e-4, 1e-4, 1e-5]))
+    return made
+
+
+@given(
+    offset=st.tuples(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.12, 0.12)),
+    frame=st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(-3, 3)),
+    seed=st.integers(0, 99),
+)
+@settings(max_examples=30, deadline=None)
+def test_match_in_any_frame(offset, frame, seed):
+    scene = Scene.of(ROOM, 361, seed)
+    there = se2.compose(HERE, offset)
+    made = local_map(scene, HERE, frame=frame)
+    match = made.match(HERE[None], view(scene, there).points, Candidate("any", HERE, STEP, 1.0))
+    assert match is not None
+    assert not match.degenerate
+    assert match.share > 0.7
+    off = se2.between(there, made.candidate(match).mean)
+    assert np.hypot(off[0], off[1]) < 0.02
+    assert abs(off[2]) < 0.01
+
+
+def test_covariance_turns_with_the_frame():
+    scene = Scene.of(ROOM, 361, 1)
+    points = view(scene, HERE).points
+    found = []
+    for yaw in (0.0, 1.2):
+        made = local_map(scene, HERE, frame=(1.0, 2.0, yaw))
+        match = made.match(HERE[None], points, Candidate("any", HERE, STEP, 1.0))
+        found.append(made.candidate(match).covariance)
+    assert found[0] == pytest.approx(found[1], rel=0.1, abs=3e-7)
+
+
+@pytest.mark.parametrize("there", [(12.5, 3.5, 2.0), (14.0, 1.2, -2.0), (9.0, 1.0, 1.0)])
+def test_scan_from_elsewhere(there):
+    scene = Scene.of(HALL, 361, 1)
+    made = local_map(scene, (3.0, 2.0, 0.0))
+    assert made.match(HERE[None], view(scene, there).points, Candidate("any", HERE, STEP, 1.0)) is None
+
+
+def test_featureless_hall():
+    bare = World(name="bare", boundary=[(0, 0), (60, 0), (60, 2), (0, 2)])
+    scene, here = Scene.of(bare, 361, 1), np.array([30.0, 1.0, 0.0])
+    made = local_map(scene, here)
+    assert made.match(here[None], view(scene, here).points, Candidate("any", here, STEP, 1.0)) is None
+
+
+def test_too_few_points():
+    made = LocalMap(np.zeros(3))
+    any_motion = Candidate("any", np.zeros(3), STEP, 1.0)
+    assert made.match(np.zeros((1, 3)), np.ones((100, 2)), any_motion) is None
+    assert local_map(Scene.of(ROOM, 361, 1), HERE).match(HERE[None], np.zeros((3, 2)), any_motion) is None
+
+
+def changed(scan, beams, factor):
+    """The scan with some of its ranges multiplied."""
+    ranges = scan.ranges.copy()
+    ranges[beams] *= factor
+    return View(scan.model, scan.likelihood, scan.mount, scan.angles, ranges, scan.range_max)
+
+
+def test_seen_surfaces():
+    scene = Scene.of(ROOM, 361, 1)
+    scan = view(scene, HERE)
+    nothing, arrived = LocalMap(np.array(scene.scanner.mount)).seen(HERE, scan)
+    assert not nothing.any()
+    assert not arrived.any()
+    made = local_map(scene, HERE)
+    here = made.local(HERE)
+    assert made.is_new_view(made.local(HERE + np.array([1.01 * MIN_DISTANCE_M, 0.0, 0.0])))
+    assert not made.is_new_view(here)
+    assert made.seen(here, view(scene, HERE))[0].all()
+    seen, arrived = made.seen(here, changed(scan, slice(100, 150), 0.5))  # a person
+    assert np.flatnonzero(~seen).tolist() == np.flatnonzero(arrived).tolist() == list(range(100, 150))
+    seen, arrived = made.seen(here, changed(scan, slice(100, 150), 1.5))  # a door was opened
+    assert np.flatnonzero(~seen).tolist() == list(range(100, 150))
+    assert not arrived.any()
+
+
+def test_changes_between_scans():
+    scene = Scene.of(ROOM, 361, 1)
+    made, first, now = LocalMap(np.array(scene.scanner.mount)), view(scene, HERE), view(scene, HERE)
+    assert made.count_changes((HERE, first), (HERE, now), 0.1) == 0
+    for factor in (0.5, 2.0):
+        counts = [
+            made.count_changes((HERE, first), (HERE, changed(now, slice(100, last), factor)), 0.1)
+            for last in (103, 170, 240)
+        ]
+        assert counts[0] == 0 < counts[1] < counts[2]
+    step = se2.compose(HERE, [0.05, 0.0, 0.1])
+    assert made.count_changes((HERE, first), (step, view(scene, step)), 0.1) == 0
