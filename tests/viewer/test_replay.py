@@ -54,7 +54,7 @@ def test_recording_of_one_visitor(viewer, bus):
         page.done("player", action="rate", value=8)
         page.done("player", action="resume")
         page.told("player", lambda m: m["paused"] and m["position_s"] == pytest.approx(m["duration_s"]))  # it stays
-        page.done("player", action="rate", value=0.5)  # eight times faster, a slow machine may see no frame of the first second
+        page.done("player", action="rate", value=0.5)  # faster, a slow machine may skip the first second
         page.done("player", action="resume")  # it starts from the beginning
         page.frame(lambda h: h["t"] < 1.0)
 

@@ -237,7 +237,7 @@ def _step_forward(forward: Array, emitted: Array, prior: Array, keep: Array, n: 
             forward[n, i] += keep[n] * forward[n - 1, i] * emitted[n, i]
         norm += forward[n, i]
     forward[n] /= norm
-    return math.log(norm) + top
+    return float(math.log(norm) + top)
 
 
 @jit
