@@ -74,6 +74,27 @@ def bench_map(
     raise typer.Exit(run(world, size, BEAMS, out, 0, json_file, console))
 
 
+@app.command("mapping")
+def bench_mapping(
+    log: Annotated[Path | None, typer.Option(help="A log to map, of any format in docs/logs.md.")] = None,
+    relations: Annotated[
+        Path | None, typer.Option(help="Its true relative poses: two times, x, y, z, roll, pitch, yaw in each line.")
+    ] = None,
+    worlds: Annotated[int, typer.Option(min=0, max=1000, help="Number of generated buildings.")] = 5,
+    seed: Seed = 1,
+    seconds: Annotated[float, typer.Option(min=1, help="Length of a simulated drive.")] = 600.0,
+    json_file: Json = None,
+) -> None:
+    """Errors of `presage map` without reference poses, with odometry and without.
+
+    Examples: `presage bench mapping --worlds 2 --seconds 60`;
+    `presage bench mapping --worlds 0 --log fr079.clf.bz2 --relations fr079.relations --json mapping.json`.
+    """
+    from lab.benchmarks.mapping import bench_mapping as run
+
+    raise typer.Exit(run(log, relations, worlds, seed, seconds, json_file, console))
+
+
 @app.command("metrics")
 def bench_metrics(seconds: Seconds = 20.0, rounds: Rounds = 3, json_file: Json = None) -> None:
     """Processor time that Prometheus metrics cost each service: rounds with one scrape per second, and without.

@@ -189,7 +189,7 @@ def real_drive(
     Compares preset precise with the particle filter in four tasks. a: tracking with odometry; b: tracking without;
     c: global localisation, starting at every 50th scan; d: kidnapping. Errors are relative to the log's reference
     poses. After Ctrl-C the same command continues.
-    Examples: `presage map drive.npz --mount 0,0,0 --half first -o first_half.yaml`, then
+    Examples: `presage map drive.npz --mount 0,0,0 --poses reference --half first -o first_half.yaml`, then
     `presage experiment real --log drive.npz --mount 0,0,0 --world first_half.yaml --quick`;
     `presage experiment --out mine real --log fr079.mcap --world fr079.yaml --name fr079 --every 50`.
     """

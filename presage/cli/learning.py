@@ -110,9 +110,9 @@ def train(
         paper.train(options, link, console)
 
 
-@app.command("map", rich_help_panel="Learn", short_help="Build a ROS map from a drive with known poses.")
+@app.command("map", rich_help_panel="Learn", short_help="Build a ROS map from a drive.")
 def map_(
-    log: Annotated[Path, typer.Argument(help="A recording or log with reference poses (docs/logs.md).")],
+    log: Annotated[Path, typer.Argument(help="A recording or log (docs/logs.md).")],
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Map to write, NAME.yaml. Defaults to the log's name, in this folder."),
@@ -121,15 +121,22 @@ def map_(
         str, typer.Option(help="Half of the drive to use: first or second. Defaults to the whole drive.")
     ] = "",
     cell: Annotated[float, typer.Option(min=0.005, max=1.0, help="Edge length of a cell, m.")] = 0.05,
+    poses: Annotated[
+        str, typer.Option(help="slam: computed from the scans and odometry; reference: the log's own.")
+    ] = "slam",
+    odometry: Annotated[bool, typer.Option(help="Whether slam uses the log's odometry.")] = True,
     mount: MountText = "",
     config: Config = None,
 ) -> None:
-    """Build a ROS map (NAME.yaml and .pgm) from a drive with known poses. This is not SLAM.
+    """Build a ROS map from a drive: NAME.yaml and .pgm, the trajectory NAME.tum and a picture NAME.png.
+
+    The poses come from the scans themselves (SLAM), or with `--poses reference` from the log.
 
     A cell is occupied if beams of at least two scans ended in it, and of at least 60 % of the scans that observed it.
     It is free if a beam passed through it, otherwise unknown.
 
-    Examples: `presage map run.mcap`; `presage map fr079.npz --mount 0,0,0 --half first -o first_half.yaml`, then
+    Examples: `presage map run.mcap`; `presage map fr079.npz --mount 0,0,0 --poses reference --half first
+    -o first_half.yaml`, then
     `presage experiment real --log fr079.npz --mount 0,0,0 --world first_half.yaml`.
     """
     from common.runtime.config import load_section
@@ -138,4 +145,4 @@ def map_(
 
     target = out or Path(f"{log.resolve().name.split('.')[0]}.yaml")
     reading = load_section(LogSettings, config, "log", mount=mount).reading()
-    map_command(MapOptions(log, target, half, cell, reading), console, err_console)
+    map_command(MapOptions(log, target, half, cell, reading, poses, odometry), console, err_console)

@@ -1,4 +1,4 @@
-"""`presage map`: builds a ROS map from a drive with known poses.
+"""`presage map`: builds a ROS map from a drive, with poses from the scans themselves or from the log.
 
 A cell is occupied if beams of at least `MIN_HITS` scans ended in it, and of at least `MIN_HIT_SHARE` of the scans that
 observed it; otherwise it is free if a beam passed through it, and unknown if not. Beams mostly pass through the places
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from rich.console import Console
-from rich.progress import track
+from rich.progress import Progress, track
 
 from common.errors import UserError
 from common.geometry import se2
@@ -21,9 +21,13 @@ from common.geometry.occupancy_grid import FREE, MAX_CELLS, OCCUPIED, UNKNOWN, C
 from common.geometry.se2 import Array
 from common.robot.ranges import is_surface
 from presage.learning.grid_map import write_map
+from presage.learning.map_picture import draw_map
 from presage.learning.train_drive import drive_of, split
 from presage.logs.log import Reading
-from presage.logs.scan_files import read_scans
+from presage.logs.scan_files import Scans, read_scans
+from presage.mapping.drive import RawDrive
+from presage.mapping.slam import build_trajectory
+from presage.recordings.tum import write_tum
 from presage.terminal.output import make_folder
 from services.estimator.precise.learning.calibration import Drive
 from services.estimator.precise.learning.surfaces import Beams, has_neighbours
@@ -31,6 +35,7 @@ from services.estimator.precise.learning.surfaces import Beams, has_neighbours
 # With a smaller share, noise makes walls grow towards the scanner; with a larger one, corners disappear.
 MIN_HITS, MIN_HIT_SHARE = 2, 0.6
 MARGIN_M = 0.5  # around the observed area
+MIN_SCANS = 2
 
 
 @dataclass(frozen=True)
@@ -42,28 +47,38 @@ class MapOptions:
     half: str = ""  # first or second; defaults to the whole drive
     cell: float = 0.05  # m
     reading: Reading | None = None
+    poses: str = "slam"  # slam: from scans and odometry; reference: the log's own
+    odometry: bool = True  # whether slam uses the log's odometry
 
 
 def map_command(options: MapOptions, console: Console, progress: Console) -> Path:
     """Writes the map and its image, and returns its path; raises UserError if that fails."""
     if options.half not in ("", "first", "second"):
         raise UserError(f"no half {options.half!r}: choose first or second, or leave out --half")
+    if options.poses not in ("slam", "reference"):
+        raise UserError(f"no poses {options.poses!r}: choose slam or reference with --poses")
     if options.out.suffix != ".yaml":
         raise UserError(f"--out {options.out}: give NAME.yaml; the image is written beside it")
-    image = options.out.with_suffix(".pgm")
-    if existing := next((path for path in (options.out, image) if path.exists()), None):
+    image, trajectory, picture = (options.out.with_suffix(suffix) for suffix in (".pgm", ".tum", ".png"))
+    if existing := next((path for path in (options.out, image, trajectory, picture) if path.exists()), None):
         raise UserError(f"{existing} exists already: choose another name with --out, or remove it")
     make_folder(options.out.parent, "--out")
     scans = read_scans(options.log, reading=options.reading)
     scans.print_notes(progress)
-    if scans.stamps is None:  # not needed for a map, but for a drive
-        scans = replace(scans, stamps=np.arange(len(scans.ranges), dtype=np.float64))
+    stamps = scans.stamps
+    if stamps is None:  # not needed for a map, but for a drive
+        stamps = np.arange(len(scans.ranges), dtype=np.float64)
+    scans = replace(scans, stamps=stamps)
+    if options.poses == "slam":
+        scans = replace(scans, truth=_build_poses(scans, stamps, options, console, progress))
     drive = drive_of(scans, options.log)
     if options.half:
         drive = split(drive)[0 if options.half == "first" else 1]
     values, origin = cells_of(drive, options.cell, progress)
     keys = {"resolution": options.cell, "origin": [round(origin[0], 6), round(origin[1], 6), 0.0]}
     path = write_map(options.out.parent, values, name=options.out.stem, image=image.name, **keys)
+    write_tum(trajectory, drive.stamps, drive.poses)
+    draw_map(picture, values, origin, options.cell, drive.poses)
     rows, columns = values.shape
     console.print(
         f"{path}: {columns} x {rows} cells of {options.cell:g} m from {len(drive.ranges)} scans; "
@@ -71,6 +86,29 @@ def map_command(options: MapOptions, console: Console, progress: Console) -> Pat
         soft_wrap=True,
     )
     return path
+
+
+def _build_poses(scans: Scans, stamps: Array, options: MapOptions, console: Console, progress: Console) -> Array:
+    """Poses (N, 3) computed from the scans."""
+    if len(scans) < MIN_SCANS:
+        raise UserError(f"{options.log}: {len(scans)} scans; a map needs at least {MIN_SCANS}")
+    geometry = scans.geometry
+    complete = scans.odom is not None and bool(np.isfinite(scans.odom).all())
+    odom = scans.odom if options.odometry and complete else None
+    drive = RawDrive(stamps, scans.ranges, geometry.angles, geometry.mount, geometry.range_max, odom)
+    with Progress(*Progress.get_default_columns(), console=progress, transient=True) as bar:
+        task = bar.add_task("mapping", total=1.0)
+
+        def report(title: str, done: float) -> None:
+            bar.update(task, description=title, completed=done)
+
+        built = build_trajectory(drive, report)
+    console.print(
+        f"{len(built.keys)} key scans, {len(built.closures)} loop closures, {built.lost} scans that matched nothing "
+        f"before; {'with' if odom is not None else 'without'} odometry",
+        soft_wrap=True,
+    )
+    return built.poses
 
 
 def cells_of(drive: Drive, cell: float, progress: Console | None = None) -> tuple[Cells, tuple[float, float]]:

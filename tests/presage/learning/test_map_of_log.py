@@ -30,7 +30,9 @@ def log(tmp_path_factory):
 
 
 def made(log, tmp_path, half=""):
-    return load_world(str(map_command(MapOptions(log, tmp_path / "made.yaml", half, reading=HERE), QUIET, QUIET)))
+    return load_world(
+        str(map_command(MapOptions(log, tmp_path / "made.yaml", half, reading=HERE, poses="reference"), QUIET, QUIET))
+    )
 
 
 @pytest.mark.parametrize(("half", "world"), [("first", real_drive.BEFORE), ("second", real_drive.AFTER)])
@@ -71,16 +73,18 @@ def test_who_walks_through_is_not_in_the_map():
 
 def test_what_cannot_be_is_said(log, tmp_path):
     with pytest.raises(UserError, match="no half 'third'"):
-        map_command(MapOptions(log, tmp_path / "a.yaml", "third", reading=HERE), QUIET, QUIET)
+        map_command(MapOptions(log, tmp_path / "a.yaml", "third", reading=HERE, poses="reference"), QUIET, QUIET)
     with pytest.raises(UserError, match=r"give NAME\.yaml"):
-        map_command(MapOptions(log, tmp_path / "a.png", reading=HERE), QUIET, QUIET)
+        map_command(MapOptions(log, tmp_path / "a.png", reading=HERE, poses="reference"), QUIET, QUIET)
+    with pytest.raises(UserError, match="no poses 'none'"):
+        map_command(MapOptions(log, tmp_path / "a.yaml", poses="none"), QUIET, QUIET)
     (tmp_path / "a.pgm").write_bytes(b"mine")
     with pytest.raises(UserError, match=r"a\.pgm exists already"):
-        map_command(MapOptions(log, tmp_path / "a.yaml", reading=HERE), QUIET, QUIET)
+        map_command(MapOptions(log, tmp_path / "a.yaml", reading=HERE, poses="reference"), QUIET, QUIET)
     bare = tmp_path / "bare.npz"
     real_drive.save(bare, real_drive.drive(20), reference=False)
     with pytest.raises(UserError, match="no reference poses"):
-        map_command(MapOptions(bare, tmp_path / "b.yaml", reading=HERE), QUIET, QUIET)
+        map_command(MapOptions(bare, tmp_path / "b.yaml", reading=HERE, poses="reference"), QUIET, QUIET)
     with pytest.raises(UserError, match="larger --cell"):
         cells_of(real_drive.drive(20), 0.0005)
     assert not list(tmp_path.glob("*.yaml"))
@@ -89,13 +93,17 @@ def test_what_cannot_be_is_said(log, tmp_path):
 def test_mount_of_a_recording(tmp_path):
     recorded.write(tmp_path / "run.mcap")
     with pytest.raises(UserError, match="contains the description of its scanner"):
-        map_command(MapOptions(tmp_path / "run.mcap", tmp_path / "r.yaml", reading=HERE), QUIET, QUIET)
+        map_command(
+            MapOptions(tmp_path / "run.mcap", tmp_path / "r.yaml", reading=HERE, poses="reference"), QUIET, QUIET
+        )
 
 
 def test_a_map_needs_no_stamps(log, tmp_path):
     with np.load(log) as arrays:
         np.savez(tmp_path / "bare.npz", **{name: values for name, values in arrays.items() if name != "stamps"})
-    bare = map_command(MapOptions(tmp_path / "bare.npz", tmp_path / "bare.yaml", reading=HERE), QUIET, QUIET)
+    bare = map_command(
+        MapOptions(tmp_path / "bare.npz", tmp_path / "bare.yaml", reading=HERE, poses="reference"), QUIET, QUIET
+    )
     assert load_world(str(bare)).grid.values.tolist() == made(log, tmp_path).grid.values.tolist()
 
 
@@ -103,4 +111,14 @@ def test_a_log_without_returns_is_refused(tmp_path):
     path, drive = tmp_path / "empty.npz", real_drive.drive(20)
     real_drive.save(path, replace(drive, ranges=np.full_like(drive.ranges, np.inf)))
     with pytest.raises(UserError, match="no beam of the scans"):
-        map_command(MapOptions(path, tmp_path / "e.yaml", reading=HERE), QUIET, QUIET)
+        map_command(MapOptions(path, tmp_path / "e.yaml", reading=HERE, poses="reference"), QUIET, QUIET)
+
+
+@pytest.mark.parametrize("odometry", [True, False])
+def test_map_without_reference_poses(log, tmp_path, odometry):
+    options = MapOptions(log, tmp_path / "own.yaml", reading=HERE, odometry=odometry)
+    world = load_world(str(map_command(options, QUIET, QUIET)))
+    width, height = np.ptp(np.argwhere(world.grid.values == OCCUPIED), axis=0) * 0.05
+    assert sorted((width, height)) == pytest.approx([6, 9], abs=1.0)
+    assert len(np.loadtxt(tmp_path / "own.tum")) == 200
+    assert (tmp_path / "own.png").exists()

@@ -1,0 +1,1 @@
+"""Builds maps from scans: simultaneous localisation and mapping, without a bus or files."""

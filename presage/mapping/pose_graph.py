@@ -1,0 +1,135 @@
+"""Pose graph: the poses that agree best with all links between them (Lu & Milios 1997).
+
+A sparse Gauss-Newton method with scipy. The library gtsam does the same, but weighs 34 MB and installs pytest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+from scipy.sparse.linalg import SuperLU, splu
+
+from common.geometry import se2
+from common.geometry.se2 import Array
+
+MAX_STEPS = 20
+CONVERGED = 1e-5  # m and rad
+ANCHOR = 1e8  # information that holds the first pose
+ROBUST_SCALE = 3.0  # standard deviations, of the Cauchy weights of robust links
+
+
+@dataclass(frozen=True)
+class Link:
+    """Measured pose (3,) of pose number ``second`` in the frame of ``first``, with its information (3, 3)."""
+
+    first: int
+    second: int
+    pose: Array
+    information: Array
+    robust: bool = False  # whether the link may be wrong
+
+
+class LinkTable:
+    """Links as arrays."""
+
+    def __init__(self, links: Sequence[Link]) -> None:
+        self.first = np.array([link.first for link in links], int)
+        self.second = np.array([link.second for link in links], int)
+        self.poses = np.array([link.pose for link in links]).reshape(-1, 3)
+        self.information = np.array([link.information for link in links]).reshape(-1, 3, 3)
+        self.robust = np.array([link.robust for link in links], bool)
+
+    def errors(self, poses: Array) -> Array:
+        """Errors (L, 3) of the links at poses (N, 3), in the frame of the first pose of each."""
+        error = se2.between(poses[self.first], poses[self.second]) - self.poses
+        error[:, 2] = se2.wrap(error[:, 2])
+        return np.asarray(error)
+
+    def squared_deviations(self, poses: Array) -> Array:
+        """Squared Mahalanobis distances (L,) of the links at poses (N, 3)."""
+        error = self.errors(poses)
+        return np.asarray(np.einsum("li,lij,lj->l", error, self.information, error))
+
+    def jacobians(self, poses: Array) -> tuple[Array, Array]:
+        """Derivatives (L, 3, 3) of `errors` with respect to the first and the second pose of each link."""
+        a, b = poses[self.first], poses[self.second]
+        cos, sin = np.cos(a[:, 2]), np.sin(a[:, 2])
+        x, y = (b - a)[:, :2].T
+        zero, one = np.zeros(len(a)), np.ones(len(a))
+        by_second = _rows((cos, sin, zero), (-sin, cos, zero), (zero, zero, one))
+        by_first = -by_second
+        by_first[:, 0, 2], by_first[:, 1, 2] = cos * y - sin * x, -cos * x - sin * y
+        return by_first, by_second
+
+    def normal_equations(self, poses: Array) -> tuple[sparse.csc_array, Array]:
+        """Hessian (3 N, 3 N) and gradient (3 N,) of half the sum of the squared deviations, robustly weighted."""
+        deviation = self.squared_deviations(poses)
+        weight = np.where(self.robust, 1 / (1 + deviation / ROBUST_SCALE**2), 1.0)
+        information, error = weight[:, None, None] * self.information, self.errors(poses)
+        sides = list(zip((self.first, self.second), self.jacobians(poses), strict=True))
+        gradient = np.zeros((len(poses), 3))
+        blocks, rows, columns = [], [], []
+        for i, by_i in sides:
+            np.add.at(gradient, i, np.einsum("lki,lkj,lj->li", by_i, information, error))
+            for j, by_j in sides:
+                blocks.append(np.einsum("lki,lkm,lmj->lij", by_i, information, by_j))
+                rows.append(i)
+                columns.append(j)
+        hessian = block_matrix(np.concatenate(blocks), np.concatenate(rows), np.concatenate(columns), len(poses))
+        return hessian, gradient.ravel()
+
+
+def optimise(poses: Array, links: Sequence[Link]) -> Array:
+    """The poses (N, 3) that minimise the squared deviations of the links; the first one stays."""
+    table, poses = LinkTable(links), poses.copy()
+    for _ in range(MAX_STEPS):
+        hessian, gradient = table.normal_equations(poses)
+        step = anchored(hessian).solve(-gradient).reshape(-1, 3)
+        poses += step
+        poses[:, 2] = se2.wrap(poses[:, 2])
+        if np.abs(step).max() < CONVERGED:
+            break
+    return poses
+
+
+class Uncertainty:
+    """Covariances between some poses of a graph (linearised)."""
+
+    def __init__(self, poses: Array, links: Sequence[Link], chosen: npt.NDArray[np.integer]) -> None:
+        factor = anchored(LinkTable(links).normal_equations(poses)[0])
+        columns = (3 * np.asarray(chosen)[:, None] + np.arange(3)).ravel()
+        unit = np.zeros((3 * len(poses), len(columns)))
+        unit[columns, np.arange(len(columns))] = 1.0
+        count = len(chosen)
+        self._poses = poses[chosen]
+        self._covariance = factor.solve(unit)[columns].reshape(count, 3, count, 3).transpose(0, 2, 1, 3)
+
+    def of_pair(self, first: int, second: int) -> Array:
+        """Covariance (3, 3) of the pose of a chosen pose in the frame of another, by their numbers."""
+        table = LinkTable([Link(0, 1, np.zeros(3), np.eye(3))])
+        (by_first,), (by_second,) = table.jacobians(self._poses[[first, second]])
+        J = np.concatenate([by_first, by_second], axis=1)
+        joint = np.block([[self._covariance[i, j] for j in (first, second)] for i in (first, second)])
+        return np.asarray(J @ joint @ J.T)
+
+
+def anchored(hessian: sparse.csc_array) -> SuperLU:
+    """Factorisation of a Hessian (3 N, 3 N) with the first pose held."""
+    anchor = np.zeros(hessian.shape[0])
+    anchor[:3] = ANCHOR
+    return splu((hessian + sparse.diags_array(anchor)).tocsc())
+
+
+def block_matrix(blocks: Array, rows: Array, columns: Array, count: int) -> sparse.csc_array:
+    """Sparse matrix (3 count, 3 count) that sums blocks (M, 3, 3) at block rows (M,) and columns (M,)."""
+    i = np.broadcast_to(3 * rows[:, None, None] + np.arange(3)[:, None], blocks.shape)
+    j = np.broadcast_to(3 * columns[:, None, None] + np.arange(3), blocks.shape)
+    return sparse.coo_array((blocks.ravel(), (i.ravel(), j.ravel())), shape=(3 * count, 3 * count)).tocsc()
+
+
+def _rows(*rows: tuple[Array, Array, Array]) -> Array:
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
